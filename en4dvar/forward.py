@@ -1,0 +1,144 @@
+"""What a forward model is: a state-vector operator F, seen through an observation operator H.
+
+A model author writes ``layout``, ``parameters``, ``initial_state`` and ``step``; everything else has a default.
+A model that can integrate many members at once overrides ``trajectories``, the fast path.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Protocol, runtime_checkable
+
+import numpy as np
+
+from en4dvar.state import Array, Parameter, StateLayout
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One member's path: ``states`` (K, n_state) at ``times`` (K,) in seconds (or the model's own time unit)."""
+
+    times: Array
+    states: Array
+    layout: StateLayout
+
+    def __getitem__(self, name: str) -> Array:
+        """The field ``name`` along the path: (K,) or (K, size)."""
+        return self.layout.unpack(self.states)[name]
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A member that could not be integrated. A value, never an exception: it is carried through the iterations."""
+
+    reason: str
+    time: float = float("nan")
+
+
+@runtime_checkable
+class ObservationOperator(Protocol):
+    """H: maps a trajectory to predictions (Ny,), one per observation time."""
+
+    def __call__(self, trajectory: Trajectory) -> Array: ...
+
+
+@runtime_checkable
+class RateOperator(Protocol):
+    """The time derivative of an observation operator's output (Ny,); needed where ``time_std`` is given."""
+
+    def rate(self, trajectory: Trajectory) -> Array: ...
+
+
+@dataclass(frozen=True)
+class StateField:
+    """H that reads one scalar field of the state, and its rate from another field where the model has it.
+
+    >>> import numpy as np
+    >>> from en4dvar.state import Field
+    >>> layout = StateLayout((Field("x"), Field("v")))
+    >>> path = Trajectory(np.array([0.0, 1.0]), np.array([[1.0, 2.0], [3.0, 4.0]]), layout)
+    >>> StateField("x", rate_of="v")(path), StateField("x", rate_of="v").rate(path)
+    (array([1., 3.]), array([2., 4.]))
+    """
+
+    name: str
+    rate_of: str | None = None
+
+    def __call__(self, trajectory: Trajectory) -> Array:
+        return trajectory[self.name]
+
+    def rate(self, trajectory: Trajectory) -> Array:
+        if self.rate_of is None:
+            raise NotImplementedError(f"the model does not provide d({self.name})/dt")
+        return trajectory[self.rate_of]
+
+
+@dataclass(frozen=True)
+class Observable:
+    """A quantity that can be measured: its name in YAML and netCDF, its units, and the operator H that predicts it."""
+
+    name: str
+    unit: str
+    operator: ObservationOperator
+    symbol: str = ""
+    display_unit: str = ""
+    label: str = ""
+
+    def __post_init__(self) -> None:
+        for key, value in (("symbol", self.name), ("display_unit", self.unit), ("label", self.name)):
+            object.__setattr__(self, key, getattr(self, key) or value)
+
+
+class ForwardModel(ABC):
+    """F. Subclasses set ``parameters``, ``layout`` and ``observables`` (the first is the default).
+
+    ``time_unit`` / ``time_display_unit`` label the time axis of observations.
+    """
+
+    parameters: tuple[Parameter, ...]
+    layout: StateLayout
+    observables: tuple[Observable, ...]
+    time_unit: ClassVar[str] = "s"
+    time_display_unit: ClassVar[str] = "s"
+
+    @abstractmethod
+    def initial_state(self, theta: Mapping[str, float]) -> Array:
+        """State vector (n_state,) at time zero for the physical parameters ``theta``, parameters appended."""
+
+    @abstractmethod
+    def step(self, x: Array, t0: float, t1: float) -> Array:
+        """F_{t1←t0}: advance one state (n_state,). May raise; the caller turns it into a :class:`Failure`."""
+
+    def trajectories(self, x: Array, times: Array) -> Sequence[Trajectory | Failure]:
+        """Integrate a batch of members from time zero.
+
+        Parameters
+        ----------
+        x: initial states (N, n_state).
+        times: increasing observation times (K,), or (N, K) where each member has its own.
+
+        Returns
+        -------
+        N items in the order of the members. This default repeats :meth:`step`.
+        """
+        own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+        return [self._march(x[i], own[i]) for i in range(len(x))]
+
+    def _march(self, x: Array, times: Array) -> Trajectory | Failure:
+        states = np.empty((len(times), self.layout.size))
+        t = 0.0
+        for k, t_next in enumerate(times):
+            if t_next != t:
+                try:
+                    x = np.asarray(self.step(x, t, float(t_next)), dtype=float)
+                except Exception as error:  # a model may fail in any way; the reason is kept
+                    return Failure(f"{type(error).__name__}: {error}", t)
+                t = float(t_next)
+            if x.shape != (self.layout.size,):
+                return Failure(f"step returned shape {x.shape}, expected ({self.layout.size},)", t)
+            if not np.all(np.isfinite(x)):
+                return Failure("non-finite state", t)
+            states[k] = x
+        return Trajectory(np.asarray(times, dtype=float), states, self.layout)

@@ -1,0 +1,107 @@
+"""What goes into :func:`en4dvar.assimilate.assimilate` and what comes out of it, for one data set."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+from en4dvar.forward import ForwardModel, Observable
+from en4dvar.observations import Observations
+from en4dvar.state import Array, Parameter
+
+if TYPE_CHECKING:
+    from en4dvar.prior import Prior
+
+
+@dataclass(frozen=True)
+class InverseProblem:
+    """Everything that defines a posterior: F, H, y, R, the prior, and the values held fixed.
+
+    The control vector holds ``prior.parameters`` in transformed space. A parameter named ``t_s`` shifts the observation
+    times: member i is observed at t_k + t_s,i. ``fixed`` are physical SI values of the model's other parameters.
+    """
+
+    model: ForwardModel
+    observable: Observable
+    observations: Observations
+    prior: Prior
+    fixed: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class AssimilationSettings:
+    """The scheme's settings; defaults are the recommended ones of ``ASSIMILATION.md``."""
+
+    scheme: Literal["en4dvar"] = "en4dvar"
+    members: int = 48
+    sampling: Literal["exact", "random"] = "exact"
+    linearisation: Literal["bundle", "transform"] = "bundle"
+    epsilon: float = 1e-3
+    step_control: Literal["line-search", "levenberg-marquardt", "full"] = "line-search"
+    start: Literal["best-member", "prior-mean"] = "best-member"
+    max_iterations: int = 30
+    step_tolerance: float = 1e-3
+    cost_tolerance: float = 1e-4
+    min_active_fraction: float = 0.5
+
+
+@dataclass(frozen=True)
+class IterationRecord:
+    """Diagnostics of one iteration (glossary of the field). Parameters are physical, SI.
+
+    ``cost = background + observation`` is J of the central trajectory at the iterate that *starts* the iteration;
+    the last record is the accepted end point (its ``step_length`` is 0). ``members`` (N, n) is the ensemble that the
+    scheme's weights and transform describe at that iterate. ``active`` counts the members whose forecast succeeded.
+    """
+
+    iteration: int
+    cost: float
+    background: float
+    observation: float
+    step_norm: float
+    step_length: float
+    chi2_per_observation: float
+    dfs: float
+    spread: float
+    active: int
+    members: Array
+    centre: Array
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """The outcome for one data set: arrays only, members in order, physical SI values, NaN where a member failed.
+
+    Shapes: N members, n estimated parameters, K observations, M points of the plotting grid.
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    fixed: Mapping[str, float]
+    fixed_parameters: tuple[Parameter, ...]
+    observable: Observable
+    observations: Observations
+    time_unit: str
+    time_display_unit: str
+    prior: Array  # (N, n)
+    posterior: Array  # (N, n)
+    centre: Array  # (n,) the minimum of J
+    prior_predictions: Array  # (N, K) noise-free H(F(x))
+    posterior_predictions: Array  # (N, K)
+    centre_predictions: Array  # (K,)
+    error_std: Array  # (K,) total observation-error std at the centre, timing error included
+    log_likelihood: Array  # (N, K) of the posterior members
+    trajectory_times: Array  # (M,) model time
+    prior_trajectories: Array  # (N, M) observable along the path
+    posterior_trajectories: Array  # (N, M)
+    prior_failures: tuple[str, ...]  # (N,) reason, "" where the member is alive
+    posterior_failures: tuple[str, ...]  # (N,)
+    iterations: tuple[IterationRecord, ...]
+    dfs_per_parameter: Array  # (n,) 1 - posterior variance / prior variance, in transformed space
+    converged: bool
+    stop_reason: str
+    forward_runs: int
+    seed: int
+    settings: AssimilationSettings
+    warnings: tuple[str, ...] = ()

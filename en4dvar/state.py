@@ -1,0 +1,143 @@
+"""Names and arrays: parameters, the layout of a state vector, an ensemble of control vectors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+TransformName = Literal["normal", "lognormal", "logit"]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A quantity that can be fixed or estimated; everything downstream derives from this declaration.
+
+    Attributes
+    ----------
+    name: key in the YAML, variable in the netCDF.
+    unit: unit of every stored value (SI), e.g. ``"Pa"``.
+    display_unit: unit of reports and tables, e.g. ``"kPa"``.
+    transform: default map to the unbounded space where the prior is Gaussian.
+    bounds: physical range (inclusive limits, ±inf allowed); outside it a value is an error.
+    label: what it is called in prose (``long_name`` in the netCDF).
+    symbol: how it is written in a figure (matplotlib mathtext allowed).
+    source: where the definition comes from.
+    """
+
+    name: str
+    unit: str
+    transform: TransformName = "normal"
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+    label: str = ""
+    symbol: str = ""
+    display_unit: str = ""
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.name.isidentifier():
+            raise ValueError(f"parameter name {self.name!r} is not an identifier")
+        object.__setattr__(self, "label", self.label or self.name)
+        object.__setattr__(self, "symbol", self.symbol or self.name)
+        object.__setattr__(self, "display_unit", self.display_unit or self.unit)
+
+
+TIME_SHIFT = Parameter(
+    name="t_s",
+    unit="s",
+    bounds=(-np.inf, np.inf),
+    label="time shift",
+    symbol="$t_s$",
+    display_unit="us",
+    source="Spratt et al. (2021); the model is observed at t_k + t_s",
+)
+
+
+@dataclass(frozen=True)
+class Field:
+    """A named block of a state vector."""
+
+    name: str
+    size: int = 1
+    unit: str = "1"
+
+
+@dataclass(frozen=True)
+class StateLayout:
+    """Names ↔ slices of a flat state vector.
+
+    >>> layout = StateLayout((Field("R", unit="m"), Field("T", 3, "K")))
+    >>> layout.size, layout["T"]
+    (4, slice(1, 4, None))
+    """
+
+    fields: tuple[Field, ...]
+
+    def __post_init__(self) -> None:
+        names = [f.name for f in self.fields]
+        if len(set(names)) != len(names):
+            raise ValueError(f"duplicate names in the state layout: {names}")
+
+    @cached_property
+    def slices(self) -> dict[str, slice]:
+        edges = np.cumsum([0, *(f.size for f in self.fields)])
+        return {f.name: slice(int(a), int(b)) for f, a, b in zip(self.fields, edges[:-1], edges[1:], strict=True)}
+
+    @property
+    def size(self) -> int:
+        return sum(f.size for f in self.fields)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(f.name for f in self.fields)
+
+    def __getitem__(self, name: str) -> slice:
+        return self.slices[name]
+
+    def __iter__(self) -> Iterator[Field]:
+        return iter(self.fields)
+
+    def pack(self, values: Mapping[str, npt.ArrayLike]) -> Array:
+        """Assemble a state vector (n_state,) from a mapping that names every field."""
+        x = np.empty(self.size)
+        for name, where in self.slices.items():
+            x[where] = values[name]
+        return x
+
+    def unpack(self, x: Array) -> dict[str, Array]:
+        """Views of the fields of ``x`` (…, n_state); blocks of size one lose their last axis."""
+        sizes = {f.name: f.size for f in self.fields}
+        return {n: x[..., s.start] if sizes[n] == 1 else x[..., s] for n, s in self.slices.items()}
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """Members as rows of ``values`` (N, n); ``names`` labels the n columns."""
+
+    values: Array
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 2 or self.values.shape[1] != len(self.names):
+            raise ValueError(f"ensemble of shape {self.values.shape} does not match {len(self.names)} names")
+
+    @property
+    def n_members(self) -> int:
+        return int(self.values.shape[0])
+
+    @property
+    def mean(self) -> Array:
+        return np.asarray(self.values.mean(axis=0))
+
+    @property
+    def anomalies(self) -> Array:
+        """Unscaled anomalies (N, n): members minus their mean."""
+        return self.values - self.mean
+
+    def column(self, name: str) -> Array:
+        return self.values[:, self.names.index(name)]
