@@ -94,7 +94,12 @@ class Observable:
 class ForwardModel(ABC):
     """F. Subclasses set ``parameters``, ``layout`` and ``observables`` (the first is the default).
 
-    ``time_unit`` / ``time_display_unit`` label the time axis of observations.
+    ``time_unit`` / ``time_display_unit`` label the time axis of observations. ``batch`` is the number of members the
+    fast path likes to get at once (executors cut chunks at multiples of it); ``compiled`` says that ``trajectories``
+    releases the interpreter lock, so that threads serve it.
+
+    To be usable from YAML a model class also has ``Settings`` (a pydantic model of its ``model:`` section) and
+    ``from_settings``.
     """
 
     parameters: tuple[Parameter, ...]
@@ -102,6 +107,8 @@ class ForwardModel(ABC):
     observables: tuple[Observable, ...]
     time_unit: ClassVar[str] = "s"
     time_display_unit: ClassVar[str] = "s"
+    batch: ClassVar[int] = 1
+    compiled: ClassVar[bool] = False
 
     @abstractmethod
     def initial_state(self, theta: Mapping[str, float]) -> Array:

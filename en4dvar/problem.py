@@ -92,7 +92,7 @@ class Analysis:
     centre_predictions: Array  # (K,)
     error_std: Array  # (K,) total observation-error std at the centre, timing error included
     log_likelihood: Array  # (N, K) of the posterior members
-    trajectory_times: Array  # (M,) model time
+    trajectory_times: Array  # (M,) on the clock of the observations (member i is seen at t + t_s,i)
     prior_trajectories: Array  # (N, M) observable along the path
     posterior_trajectories: Array  # (N, M)
     prior_failures: tuple[str, ...]  # (N,) reason, "" where the member is alive
