@@ -1,0 +1,81 @@
+"""Units: exact factors, the grammar, and messages that say what to write."""
+
+from typing import Annotated
+
+import numpy as np
+import pytest
+from pydantic import BaseModel, Field, ValidationError
+
+from en4dvar.units import Quantity, UnitError, convert, parse_quantity, parse_unit
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("0.42 kPa", "Pa", 420.0),
+        ("2.5 us", "s", 2.5e-6),
+        ("2.5 µs", "s", 2.5e-6),
+        ("2.5 μs", "s", 2.5e-6),
+        ("1.4um", "m", 1.4e-6),
+        ("1e-6 m", "m", 1e-6),
+        ("-.5 K", "K", -0.5),
+        ("0.1 Pa s", "Pa s", 0.1),
+        ("1 cP", "Pa s", 1e-3),
+        ("100 mPa·s", "Pa s", 0.1),
+        ("1 g/cm^3", "kg/m^3", 1000.0),
+        ("56 mN/m", "N/m", 0.056),
+        ("0.6 W/(m K)", "W/(m K)", 0.6),
+        ("0.6 W m⁻¹ K⁻¹", "W/(m K)", 0.6),
+        ("1.587 1/us", "Hz", 1.587e6),
+        ("5.28e-5 W/(m K^2)", "kg m/(s^3 K**2)", 5.28e-5),
+        ("1 %", "1", 0.01),
+        ("0.03", "1", 0.03),
+        (3, "1", 3.0),
+        ("1 atm", "bar", 1.01325),
+    ],
+)
+def test_quantity(text: str, unit: str, value: float) -> None:
+    assert parse_quantity(text, unit) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "message"),
+    [
+        ("1e-6", "m", "1e-6 has no unit; write e.g. '1e-6 m'"),
+        (1.4, "m", "1.4 has no unit"),
+        ("1 kpa", "Pa", "unknown unit 'kpa'; did you mean 'kPa'"),
+        ("2 sec", "s", "did you mean 's'"),
+        ("20 degC", "K", "did you mean 'K'"),
+        ("1 um", "Pa", "'um' cannot be converted to 'Pa'"),
+        ("1 %", "Pa", "'%' cannot be converted to 'Pa'"),
+        ("kPa", "Pa", "not a quantity"),
+        ("nan Pa", "Pa", "not a quantity"),
+        ("1.2.3 Pa", "Pa", "not a quantity"),
+        (True, "1", "not a quantity"),
+        (None, "1", "not a quantity"),
+        ("1 W/m K", "W/(m K)", "ambiguous"),
+        ("1 W/(m K", "W/(m K)", "unbalanced"),
+        ("1 W/", "W", "a unit is missing"),
+        ("1 $", "W", "cannot read unit"),
+    ],
+)
+def test_refused(text: str, unit: str, message: str) -> None:
+    with pytest.raises(UnitError, match="^.*" + message.replace("(", r"\(").replace("$", r"\$")):
+        parse_quantity(text, unit)
+
+
+def test_convert_arrays_round_once() -> None:
+    values = np.array([1.4, 194.55, 517.0])
+    assert convert(values, "um", "m").tolist() == [1.4e-6, 194.55e-6, 517e-6]
+    assert convert(1.5, "kPa", "Pa") == 1500.0
+    assert parse_unit("m/s^2") == parse_unit("N/kg")
+
+
+def test_pydantic_annotation() -> None:
+    class Settings(BaseModel):
+        pressure: Annotated[float, Quantity("Pa"), Field(gt=0)]
+
+    assert Settings.model_validate({"pressure": "0.42 kPa"}).pressure == 420.0
+    for bad, message in (("0.42", "has no unit"), ("-1 Pa", "greater than 0")):
+        with pytest.raises(ValidationError, match=message):
+            Settings.model_validate({"pressure": bad})
