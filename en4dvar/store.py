@@ -1,0 +1,200 @@
+"""Result ⇄ netCDF: what a run hands back, written as one file that xarray, ArviZ and ncdump open as it is."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from en4dvar.errors import OutputError
+from en4dvar.groups import build_tree
+from en4dvar.problem import Analysis
+from en4dvar.state import Array
+from en4dvar.units import convert
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+GROUPS = ("prior", "posterior", "posterior_predictive", "observed_data", "sample_stats", "iterations")
+
+
+@dataclass(frozen=True)
+class ParameterSummary:
+    """One row of the summary table; all values in ``unit``, the display unit."""
+
+    name: str
+    label: str
+    symbol: str
+    unit: str
+    prior_mean: float
+    prior_std: float
+    mean: float
+    std: float
+    q05: float
+    q50: float
+    q95: float
+    centre: float
+    dfs: float
+
+
+@dataclass(frozen=True)
+class Result:
+    """The posterior ensemble of one data set with everything that led to it: a thin view of ``tree``.
+
+    Values are SI; members are draws of one chain; a failed member is NaN and ``sample_stats.active`` is False there.
+    """
+
+    tree: xr.DataTree
+
+    @classmethod
+    def from_analysis(cls, analysis: Analysis, attributes: Mapping[str, Any]) -> Result:
+        """Lay out an analysis; ``attributes`` (see :func:`en4dvar.provenance.provenance`) join the root's."""
+        return cls(build_tree(analysis, attributes))
+
+    @property
+    def prior(self) -> xr.Dataset:
+        """Parameters (chain, draw) before the data."""
+        return self.tree["prior"].to_dataset()
+
+    @property
+    def posterior(self) -> xr.Dataset:
+        """Parameters (chain, draw) given the data."""
+        return self.tree["posterior"].to_dataset()
+
+    @property
+    def observed_data(self) -> xr.Dataset:
+        """Observations (time), their error std and weights."""
+        return self.tree["observed_data"].to_dataset()
+
+    @property
+    def sample_stats(self) -> xr.Dataset:
+        """Members alive and reasons (chain, draw), centre and DFS (parameter); scalars of the fit as attributes."""
+        return self.tree["sample_stats"].to_dataset()
+
+    @property
+    def iterations(self) -> xr.Dataset:
+        """J and its terms (iteration), parameters (iteration, draw)."""
+        return self.tree["iterations"].to_dataset()
+
+    @property
+    def attributes(self) -> Mapping[Hashable, Any]:
+        """Root attributes of the file."""
+        return self.tree.attrs
+
+    @property
+    def name(self) -> str:
+        """Name of the data set."""
+        return str(self.tree.attrs["dataset"])
+
+    @property
+    def observable(self) -> str:
+        """Name of the observed quantity."""
+        return str(next(iter(self.tree["log_likelihood"].data_vars)))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the assimilation found worth a warning."""
+        return tuple(str(self.tree.attrs["warnings"]).splitlines())
+
+    def members(self, group: str, name: str) -> Array:
+        """(N',) finite values of a parameter in ``group`` (prior or posterior), display unit, members in order."""
+        variable = self.tree[group][name]
+        values = np.asarray(variable.values, dtype=float).ravel()
+        values = convert(values, variable.attrs["units"], variable.attrs["display_units"])
+        alive = self.sample_stats["active"].values.ravel() if group == "posterior" else True
+        return values[np.isfinite(values) & alive]
+
+    def summary(self) -> tuple[ParameterSummary, ...]:
+        """One row a parameter: prior, mean, std (N−1), 5/50/95 %, centre, DFS; NaN where too few members live."""
+        return tuple(self._summarise(str(name)) for name in self.posterior.data_vars)
+
+    def _summarise(self, name: str) -> ParameterSummary:
+        attrs = self.posterior[name].attrs
+        at = self.sample_stats.sel(parameter=name)
+        prior_mean, prior_std = _moments(self.members("prior", name))
+        posterior = self.members("posterior", name)
+        mean, std = _moments(posterior)
+        q05, q50, q95 = np.quantile(posterior, (0.05, 0.5, 0.95)) if posterior.size else (np.nan,) * 3
+        return ParameterSummary(
+            name=name,
+            label=attrs["long_name"],
+            symbol=attrs["symbol"],
+            unit=attrs["display_units"],
+            prior_mean=prior_mean,
+            prior_std=prior_std,
+            mean=mean,
+            std=std,
+            q05=float(q05),
+            q50=float(q50),
+            q95=float(q95),
+            centre=convert(float(at["centre"]), attrs["units"], attrs["display_units"]),
+            dfs=float(at["dfs"]),
+        )
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Posterior members as rows (index ``draw``), parameters as columns, SI; NaN where a member failed."""
+        return self.posterior.isel(chain=0, drop=True).to_dataframe()
+
+    def plot_histograms(self) -> Figure:
+        """Posterior over prior, one panel a parameter, in display units."""
+        from en4dvar.report.figures import histograms
+
+        return histograms(self)
+
+
+def _moments(values: Array) -> tuple[float, float]:
+    if values.size < 2:
+        return (float(values[0]) if values.size else np.nan), np.nan
+    return float(values.mean()), float(values.std(ddof=1))
+
+
+def save(result: Result, path: str | Path) -> Path:
+    """Write ``path`` (NETCDF4); it appears complete or not at all. Raises :class:`OutputError`."""
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        partial.touch(exist_ok=False)  # an unwritable place gives the system's reason, not netCDF's guess
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from None
+    try:
+        result.tree.to_netcdf(partial, format="NETCDF4", engine="netcdf4")
+        _fsync(partial)
+        partial.replace(path)
+        if os.name == "posix":  # elsewhere a directory cannot be opened
+            _fsync(path.parent)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from None
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+def load_result(path: str | Path) -> Result:
+    """Read a file of :func:`save` into memory and close it. Raises :class:`OutputError` if it is not one."""
+    path = Path(path)
+    if not path.is_file():
+        raise OutputError(f"{path}: no such file")
+    try:
+        with xr.open_datatree(path, engine="netcdf4", decode_timedelta=False) as tree:
+            # a plain copy: the file can be replaced (or deleted) while the result is in use
+            nodes = {node.path: node.to_dataset(inherit=False).load() for node in tree.subtree}
+    except OSError as error:
+        raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
+    missing = [group for group in GROUPS if f"/{group}" not in nodes]
+    if missing:
+        raise OutputError(f"{path}: not a result of en4dvar: no group {', '.join(missing)}")
+    return Result(xr.DataTree.from_dict(nodes))
+
+
+def _fsync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

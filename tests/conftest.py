@@ -1,0 +1,116 @@
+"""Fixtures shared by the tests of what comes after the assimilation: a synthetic analysis with a failed member."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from en4dvar.forward import Observable, StateField
+from en4dvar.observations import Observations
+from en4dvar.problem import Analysis, AssimilationSettings, IterationRecord
+from en4dvar.state import TIME_SHIFT, Array, Parameter
+
+FAILED = 3
+
+PARAMETERS = (
+    Parameter("G", "Pa", "lognormal", (0.0, np.inf), "shear modulus", "$G$", "kPa", "a test"),
+    Parameter("mu", "Pa s", "lognormal", (0.0, np.inf), "viscosity", r"$\mu$", "Pa s", "a test"),
+    Parameter("R0", "m", "lognormal", (0.0, np.inf), "stress-free radius", "$R_0$", "um", "a test"),
+    TIME_SHIFT,
+)
+FIXED = (Parameter("p_inf", "Pa", label="far-field pressure", symbol=r"$p_\infty$", display_unit="kPa"),)
+MEAN = np.array([2500.0, 0.09, 40e-6, 0.0])
+PRIOR_RELATIVE = np.array([0.4, 0.5, 0.2, 1.0])
+SCALE = np.array([2500.0, 0.09, 40e-6, 0.4e-6])
+SHRINK = np.array([0.12, 0.25, 0.97, 0.6])
+
+
+def _path(theta: Array, times: Array) -> Array:
+    """A damped bounce (N, K): any smooth observable with the right feel would do."""
+    g, mu, r0, t_s = (theta[:, i, None] for i in range(4))
+    t = times[None, :] + t_s
+    period = 45e-6 * (g / 2500.0) ** -0.15
+    return r0 * (1.0 + 6.0 * np.exp(-t / 60e-6 * mu / 0.09) * np.abs(np.cos(np.pi * t / 2 / period)))
+
+
+def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
+    rng = np.random.default_rng(7)
+    noise = rng.standard_normal((n_members, 4))
+    prior = np.where(np.arange(4) < 3, MEAN * np.exp(PRIOR_RELATIVE * noise), PRIOR_RELATIVE * SCALE * noise)
+    truth = MEAN + np.array([300.0, -0.01, 0.0, 0.1e-6])
+
+    def ensemble(shrink: Array, centre: Array) -> Array:
+        return centre + shrink * (prior - prior.mean(axis=0))
+
+    times, grid = np.linspace(2e-6, 80e-6, 40), np.linspace(0.0, 85e-6, 200)
+    std = np.full(40, 4e-6)
+    values = _path(truth[None], times)[0] + std * rng.standard_normal(40)
+    observable = Observable("R", "m", StateField("R"), "$R$", "um", "bubble radius")
+    posterior = ensemble(SHRINK, truth)
+    predictions = _path(posterior, times)
+    for rows in (posterior, predictions):
+        rows[FAILED] = np.nan
+    paths = _path(ensemble(SHRINK, truth), grid)
+    paths[FAILED] = np.nan
+    centre_predictions = _path(truth[None], times)[0]
+    records = []
+    for i in range(6):
+        part = 1.0 - 0.35**i
+        background, observation = 4.0 * part, 900.0 * 0.2**i + 19.0
+        members = ensemble(1 + part * (SHRINK - 1), MEAN + part * (truth - MEAN))
+        records.append(
+            IterationRecord(
+                i, background + observation, background, observation, 0.5**i, 1.0 if i < 5 else 0.0,
+                2 * observation / 40, 2.3 * part, 1 - 0.8 * part, n_members - 1, members, members.mean(axis=0),
+            )
+        )  # fmt: skip
+    failures = tuple("collapse too violent" if i == FAILED else "" for i in range(n_members))
+    analysis = Analysis(
+        name="A_E2_synthetic",
+        parameters=PARAMETERS,
+        fixed={"p_inf": 101325.0},
+        fixed_parameters=FIXED,
+        observable=observable,
+        observations=Observations(
+            times, values, std, np.zeros(40), np.ones(40), "A_E2_synthetic", "made/up.csv", {"Req": 4e-5}
+        ),
+        time_unit="s",
+        time_display_unit="us",
+        prior=prior,
+        posterior=posterior,
+        centre=truth,
+        prior_predictions=_path(prior, times),
+        posterior_predictions=predictions,
+        centre_predictions=centre_predictions,
+        error_std=std,
+        log_likelihood=-0.5 * ((values - predictions) / std) ** 2 - np.log(std * np.sqrt(2 * np.pi)),
+        trajectory_times=grid,
+        prior_trajectories=_path(prior, grid),
+        posterior_trajectories=paths,
+        prior_failures=("",) * n_members,
+        posterior_failures=failures,
+        iterations=tuple(records),
+        dfs_per_parameter=1 - SHRINK**2,
+        converged=True,
+        stop_reason="step norm below 1e-3",
+        forward_runs=6 * n_members,
+        seed=11,
+        settings=AssimilationSettings(members=n_members),
+        warnings=("1 of 24 members lost: collapse too violent",),
+    )
+    return replace(analysis, **changes)
+
+
+@pytest.fixture
+def make_analysis() -> Callable[..., Analysis]:
+    """``make_analysis(n_members=24, **fields)``: deterministic, member 3 failed in the posterior forecast."""
+    return _analysis
+
+
+@pytest.fixture
+def analysis() -> Analysis:
+    return _analysis()
