@@ -1,0 +1,212 @@
+"""Priors: independent Gaussians in transformed space, physical values outside, never clipped.
+
+Each parameter θ has a transform x = f(θ) to an unbounded coordinate in which its prior is N(mean, std²):
+
+    normal     x = θ
+    lognormal  x = ln θ                          θ > 0
+    logit      x = ln((θ − a) / (b − θ))         a < θ < b
+
+Random numbers are counter-based (Philox; Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"): the key is
+(seed, parameter name), the counter is the member. Growing N leaves the first members' draws as they were, adding a
+parameter leaves the others' draws as they were.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from en4dvar.errors import ConfigError
+from en4dvar.state import Array, Parameter, TransformName
+
+Sampling = Literal["exact", "random"]
+
+
+@dataclass(frozen=True)
+class PriorTerm:
+    """The prior of one parameter; ``mean`` and ``std`` are those of the transformed coordinate.
+
+    Use the constructors, which take physical values. ``bounds`` (a, b) belong to ``logit`` and are physical.
+
+    Raises
+    ------
+    ConfigError: a value that defines no proper prior (std ≤ 0, median outside the bounds, …).
+    """
+
+    parameter: Parameter
+    transform: TransformName
+    mean: float
+    std: float
+    bounds: tuple[float, float] = (-math.inf, math.inf)
+
+    def __post_init__(self) -> None:
+        self._require(math.isfinite(self.mean), "the mean must be finite")
+        self._require(
+            math.isfinite(self.std) and self.std > 0, f"the standard deviation must be positive, not {self.std:g}"
+        )
+        if self.transform == "logit":
+            low, high = self.bounds
+            self._require(
+                -math.inf < low < high < math.inf, f"logit needs finite bounds, low < high, not {self.bounds}"
+            )
+
+    def _require(self, condition: bool, message: str) -> None:
+        if not condition:
+            raise ConfigError(f"prior of {self.parameter.name}: {message}")
+
+    @classmethod
+    def normal(cls, parameter: Parameter, mean: float, std: float) -> PriorTerm:
+        """θ ~ N(mean, std²), both in the parameter's unit."""
+        return cls(parameter, "normal", mean, std)
+
+    @classmethod
+    def lognormal(cls, parameter: Parameter, median: float, log_std: float) -> PriorTerm:
+        """ln θ ~ N(ln median, log_std²); ``median`` in the parameter's unit, ``log_std`` dimensionless."""
+        return cls(parameter, "lognormal", _log(parameter, "median", median), log_std)
+
+    @classmethod
+    def lognormal_moments(cls, parameter: Parameter, mean: float, std: float) -> PriorTerm:
+        """The lognormal whose physical mean and standard deviation are ``mean`` and ``std``.
+
+        >>> term = PriorTerm.lognormal_moments(Parameter("G", "Pa"), mean=2.0, std=1.0)
+        >>> float(np.exp(term.mean + term.std**2 / 2))
+        2.0
+        """
+        log_mean = _log(parameter, "mean", mean)
+        if not std > 0:
+            raise ConfigError(f"prior of {parameter.name}: the standard deviation must be positive, not {std:g}")
+        variance = math.log1p((std / mean) ** 2)
+        return cls(parameter, "lognormal", log_mean - variance / 2, math.sqrt(variance))
+
+    @classmethod
+    def logit(cls, parameter: Parameter, bounds: tuple[float, float], median: float, logit_std: float) -> PriorTerm:
+        """logit((θ − a)/(b − a)) ~ N(logit of the median, logit_std²); ``bounds`` and ``median`` physical."""
+        low, high = bounds
+        if not -math.inf < low < median < high < math.inf:
+            raise ConfigError(
+                f"prior of {parameter.name}: the median {median:g} must lie between finite bounds, not {bounds}"
+            )
+        return cls(parameter, "logit", math.log((median - low) / (high - median)), logit_std, (low, high))
+
+    def to_physical(self, x: Array) -> Array:
+        """θ for transformed values ``x`` of any shape; overflow gives inf, which no model accepts as a value."""
+        x = np.asarray(x, dtype=float)
+        if self.transform == "normal":
+            return x
+        if self.transform == "lognormal":
+            with np.errstate(over="ignore"):
+                return np.asarray(np.exp(x))
+        low, high = self.bounds
+        # from the nearer bound, so that values close to it keep their relative precision
+        return np.where(x < 0, low + (high - low) * _sigmoid(x), high - (high - low) * _sigmoid(-x))
+
+    def from_physical(self, theta: Array) -> Array:
+        """x for physical values ``theta`` of any shape.
+
+        Raises
+        ------
+        ValueError: a value outside the range of the transform.
+        """
+        theta = np.asarray(theta, dtype=float)
+        if self.transform == "normal":
+            return theta
+        low, high = (0.0, math.inf) if self.transform == "lognormal" else self.bounds
+        if not np.all((theta > low) & (theta < high)):
+            raise ValueError(f"{self.parameter.name}: values must lie strictly between {low:g} and {high:g}")
+        return np.asarray(np.log(theta) if self.transform == "lognormal" else np.log((theta - low) / (high - theta)))
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Independent prior terms; the control vector holds their parameters in this order."""
+
+    terms: tuple[PriorTerm, ...]
+
+    def __post_init__(self) -> None:
+        if not self.terms:
+            raise ConfigError("prior: at least one parameter must be estimated")
+        if len(set(self.names)) != len(self.names):
+            raise ConfigError(f"prior: a parameter is given twice in {', '.join(self.names)}")
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return tuple(term.parameter for term in self.terms)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(p.name for p in self.parameters)
+
+    @cached_property
+    def mean(self) -> Array:
+        """(n,) in transformed space."""
+        return np.array([term.mean for term in self.terms])
+
+    @cached_property
+    def std(self) -> Array:
+        """(n,) in transformed space."""
+        return np.array([term.std for term in self.terms])
+
+    def to_physical(self, x: Array) -> Array:
+        """Physical values (…, n) of control vectors ``x`` (…, n)."""
+        return np.stack([term.to_physical(x[..., j]) for j, term in enumerate(self.terms)], axis=-1)
+
+    def from_physical(self, theta: Array) -> Array:
+        """Control vectors (…, n) of physical values ``theta`` (…, n). Raises ValueError outside a transform's range."""
+        return np.stack([term.from_physical(theta[..., j]) for j, term in enumerate(self.terms)], axis=-1)
+
+    def log_density(self, x: Array) -> Array:
+        """Normalised log density (…,) in transformed space of control vectors ``x`` (…, n)."""
+        z = (x - self.mean) / self.std
+        constant = np.sum(np.log(self.std)) + 0.5 * len(self.terms) * math.log(2 * math.pi)
+        return np.asarray(-0.5 * np.sum(z * z, axis=-1) - constant)
+
+    def sample(self, n_members: int, seed: int, method: Sampling = "exact") -> Array:
+        """Prior ensemble (N, n) in transformed space.
+
+        ``random``: independent draws. ``exact``: the same draws, affinely corrected so that the sample mean and
+        covariance are the prior's (second-order-exact). The correction is a Gram–Schmidt process in the order of the
+        parameters: one added at the end leaves the others as they were, but growing N moves every member.
+
+        Raises
+        ------
+        ConfigError: fewer than 2 members, or ``exact`` with fewer than n + 1.
+        """
+        n = len(self.terms)
+        needed = n + 1 if method == "exact" else 2
+        if n_members < needed:
+            raise ConfigError(f"sampling {method!r} of {n} parameters needs at least {needed} members, not {n_members}")
+        z = np.column_stack([standard_normal(seed, name, n_members) for name in self.names])
+        if method == "exact":
+            z = _whiten_sample(z)
+        return self.mean + self.std * z
+
+
+def standard_normal(seed: int, name: str, n_members: int) -> Array:
+    """One N(0, 1) number per member (N,), each from the stream of its own (seed, name, member)."""
+    digest = hashlib.blake2b(f"{seed}/{name}".encode(), digest_size=16).digest()
+    key = np.frombuffer(digest, dtype="<u8").astype(np.uint64)
+    counters = np.zeros((n_members, 4), dtype=np.uint64)
+    counters[:, 3] = np.arange(n_members)
+    return np.array([np.random.Generator(np.random.Philox(key=key, counter=c)).standard_normal() for c in counters])
+
+
+def _whiten_sample(z: Array) -> Array:
+    """Members (N, n) with zero mean and unit sample covariance, column j made from columns 0…j."""
+    q, r = np.linalg.qr(z - z.mean(axis=0))
+    q = q * np.sign(np.diag(r))
+    return np.asarray(math.sqrt(len(z) - 1) * (q - q.mean(axis=0)))
+
+
+def _sigmoid(x: Array) -> Array:
+    return np.asarray(np.exp(-np.logaddexp(0.0, -x)))
+
+
+def _log(parameter: Parameter, what: str, value: float) -> float:
+    if not value > 0:
+        raise ConfigError(f"prior of {parameter.name}: the {what} of a lognormal must be positive, not {value:g}")
+    return math.log(value)
