@@ -105,3 +105,4 @@ class Analysis:
     seed: int
     settings: AssimilationSettings
     warnings: tuple[str, ...] = ()
+    log_evidence: float = float("nan")  # ln p(y), Laplace approximation

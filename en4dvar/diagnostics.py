@@ -1,0 +1,112 @@
+"""Diagnostics of an analysis: pure functions of arrays, and the plain words that go with them."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from en4dvar.likelihood import error_std
+from en4dvar.observations import Observations
+from en4dvar.state import Array
+
+TAIL = 0.0005  # each tail of the central 99.9 % interval
+HARDLY_INFORMED = 0.1  # DFS of a parameter below which its posterior is said to be its prior
+
+
+def background_cost(w: Array) -> Array:
+    """J_b = (N−1)/2 ‖w‖² of weights (…, N)."""
+    return np.asarray(0.5 * (w.shape[-1] - 1) * np.sum(w * w, axis=-1))
+
+
+def dfs(singular_values: Array, n_members: int) -> float:
+    """Degrees of freedom for signal: the trace of the influence matrix, Σ σ²/(N−1+σ²), σ the singular values of S."""
+    return float(np.sum(singular_values**2 / (n_members - 1 + singular_values**2)))
+
+
+def dfs_per_parameter(prior: Array, posterior: Array) -> Array:
+    """1 − posterior variance / prior variance (n,), of ensembles (N, n) in transformed space."""
+    return np.asarray(1 - posterior.var(axis=0) / prior.var(axis=0))
+
+
+def spread(members: Array, prior: Array) -> float:
+    """Root mean over the parameters of ensemble variance / prior variance; 1 for the prior. (N, n), transformed."""
+    return float(np.sqrt(np.mean(members.var(axis=0) / prior.var(axis=0))))
+
+
+def chi2_per_observation(observations: Observations, predictions: Array, rates: Array | None) -> float:
+    """Mean of (y − m)²/s² over the observations with β > 0, for predictions (K,)."""
+    z = (observations.values - predictions) / error_std(observations, rates)
+    return float(np.mean(z[observations.weights > 0] ** 2))
+
+
+def nrmse(values: Array, predictions: Array) -> float:
+    """Normalised fit 1 − ‖y − ŷ‖/‖y − ȳ‖ of the rheometry literature: 1 is perfect, 0 is no better than the mean."""
+    return float(1 - np.linalg.norm(values - predictions) / np.linalg.norm(values - np.mean(values)))
+
+
+def log_evidence(cost: float, singular_values: Array, n_members: int, observations: Observations) -> float:
+    """Laplace approximation of ln p(y): −J_min − ½ ln det(A/(N−1)) − Σ β_k ln(std_k √2π).
+
+    Exact for linear F and H. ``cost`` is J at its minimum, ``singular_values`` are those of S there. With β ≠ 1 it is
+    the evidence of the tempered likelihood. Source: MacKay (2003), Information Theory, Inference and Learning
+    Algorithms, chapter 28.
+    """
+    log_det = float(np.sum(np.log1p(singular_values**2 / (n_members - 1))))
+    normalisation = np.sum(observations.weights * (np.log(observations.std) + 0.5 * math.log(2 * math.pi)))
+    return float(-cost - 0.5 * log_det - normalisation)
+
+
+def chi2_interval(degrees: float) -> tuple[float, float]:
+    """Central 99.9 % interval of χ² with ``degrees`` degrees of freedom (need not be whole)."""
+    from scipy.special import gammaincinv  # scipy is not needed to import the package
+
+    return float(2 * gammaincinv(degrees / 2, TAIL)), float(2 * gammaincinv(degrees / 2, 1 - TAIL))
+
+
+def fit_warnings(chi2: float, n_observations: int, total_dfs: float) -> tuple[str, ...]:
+    """Words for a residual χ² (the sum over the observations) that R does not explain.
+
+    At the minimum its expectation is K − DFS, not K (Talagrand 1999): the fit has absorbed DFS of the noise.
+    """
+    degrees = max(1.0, n_observations - total_dfs)
+    low, high = chi2_interval(degrees)
+    fit = f"χ² of the residuals is {chi2:.3g} where about {degrees:.3g} is expected"
+    if chi2 > high:
+        return (f"{fit}: the model does not explain the data within the stated observation error",)
+    if chi2 < low:
+        return (f"{fit}: the stated observation error is larger than the scatter of the data",)
+    return ()
+
+
+def conflict_warnings(names: Sequence[str], centre: Array, mean: Array, std: Array) -> tuple[str, ...]:
+    """Words for a posterior mode far from the prior: 2 J_b beyond the 99.95 % point of χ²_n. All (n,), transformed."""
+    z = (centre - mean) / std
+    if float(z @ z) <= chi2_interval(len(z))[1]:
+        return ()
+    worst = np.argsort(-np.abs(z))
+    listed = ", ".join(f"{names[j]} by {z[j]:+.1f}" for j in worst if abs(z[j]) > 2) or f"{names[worst[0]]} most"
+    return (f"prior and data conflict: the minimum lies far from the prior mean ({listed} prior standard deviations)",)
+
+
+def information_warnings(names: Sequence[str], per_parameter: Array) -> tuple[str, ...]:
+    """Words for parameters the data hardly constrain."""
+    return tuple(
+        f"{name} is hardly informed by the data (DFS {value:.2f}): its posterior is close to its prior"
+        for name, value in zip(names, per_parameter, strict=True)
+        if value < HARDLY_INFORMED
+    )
+
+
+def loss_warning(stage: str, failures: Sequence[str]) -> tuple[str, ...]:
+    """Words for members lost in a forecast; ``failures`` (N,) are reasons, "" for members alive."""
+    lost = sum(1 for reason in failures if reason)
+    return (f"{lost} of {len(failures)} members failed in the {stage}: {common_reasons(failures)}",) if lost else ()
+
+
+def common_reasons(failures: Sequence[str], most: int = 3) -> str:
+    """The most frequent reasons of failure with their counts."""
+    counts = Counter(reason for reason in failures if reason)
+    return "; ".join(f"{reason} ({count}×)" for reason, count in counts.most_common(most))

@@ -1,0 +1,183 @@
+"""The composite operator 𝓗: control vectors → predictions, and the cost and posterior density built on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.errors import ConfigError
+from en4dvar.executor import Executor, SerialExecutor, describe
+from en4dvar.forward import Failure, RateOperator, Trajectory
+from en4dvar.likelihood import needs_rate, observation_cost
+from en4dvar.problem import InverseProblem
+from en4dvar.state import TIME_SHIFT, Array, Parameter
+
+NO_TIMES: Array = np.empty(0)
+SAME_INSTANT = 1e-9  # of the window: an extra time this close to an observation is read at the observation
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Predictions of B members; NaN rows where a member failed.
+
+    ``predictions`` (B, K) at the observations, ``rates`` (B, K) of the observable or None where no observation has a
+    timing error, ``path`` (B, M) at the extra times, ``failures`` (B,) reasons, "" for members alive.
+    """
+
+    predictions: Array
+    rates: Array | None
+    path: Array
+    failures: tuple[str, ...]
+
+    @property
+    def active(self) -> Array:
+        """(B,) bool."""
+        return np.array([not reason for reason in self.failures])
+
+    def __getitem__(self, members: slice) -> Forecast:
+        return Forecast(
+            self.predictions[members],
+            None if self.rates is None else self.rates[members],
+            self.path[members],
+            self.failures[members],
+        )
+
+
+def forecast(
+    problem: InverseProblem, x: Array, executor: Executor | None = None, extra_times: Array = NO_TIMES
+) -> Forecast:
+    """Run control vectors ``x`` (B, n; transformed) through F and H.
+
+    Member i is observed at t_k + t_s,i. ``extra_times`` (M,), on the clock of the observations, are read from the same
+    run. A member fails, without disturbing the others, where a parameter leaves its bounds, ``initial_state`` raises,
+    the model returns a :class:`Failure`, or H gives anything but finite numbers.
+    """
+    executor = executor or SerialExecutor()
+    observations = problem.observations
+    times, at_observations, at_extra = _union(observations.times, extra_times)
+    n_members = len(x)
+    outcomes: dict[int, Trajectory | Failure] = {}
+    failures = [""] * n_members
+    states: list[Array] = []
+    physical = problem.prior.to_physical(x)
+    for i, values in enumerate(physical):
+        try:
+            states.append(_initial_state(problem, values))
+        except Exception as error:  # a model may refuse parameters in any way; the reason is kept
+            failures[i] = str(error) if isinstance(error, _OutOfBounds) else describe(error)
+    alive = [i for i in range(n_members) if not failures[i]]
+    if alive:
+        shifted = times + _time_shift(problem, physical)[alive, None]
+        outcomes = dict(zip(alive, executor.trajectories(problem.model, np.stack(states), shifted), strict=True))
+
+    with_rate = needs_rate(observations)
+    observed = np.full((n_members, len(times)), np.nan)
+    rates = np.full((n_members, len(times)), np.nan) if with_rate else None
+    for i, outcome in outcomes.items():
+        if isinstance(outcome, Failure):
+            failures[i] = outcome.reason
+            continue
+        try:
+            row = _observe(problem, outcome, with_rate)
+        except Exception as error:  # H belongs to the user as well
+            failures[i] = describe(error)
+            continue
+        if not np.all(np.isfinite(row)):
+            failures[i] = "non-finite prediction"
+            continue
+        observed[i] = row[0]
+        if rates is not None:
+            rates[i] = row[1]
+    return Forecast(
+        observed[:, at_observations],
+        None if rates is None else rates[:, at_observations],
+        observed[:, at_extra],
+        tuple(failures),
+    )
+
+
+def cost(problem: InverseProblem, x: Array, executor: Executor | None = None) -> Array:
+    """J (B,) of control vectors ``x`` (B, n), with the prior's own mean and covariance; +inf where the model fails.
+
+    J = ½ Σ_j ((x_j − mean_j)/std_j)² + Σ_k β_k [½ (y_k − m_k)²/s_k² + ln(s_k/std_k)].
+    """
+    run = forecast(problem, x, executor)
+    z = (x - problem.prior.mean) / problem.prior.std
+    return np.asarray(0.5 * np.sum(z * z, axis=-1) + observation_cost(problem.observations, run.predictions, run.rates))
+
+
+def log_posterior(problem: InverseProblem, x: Array, executor: Executor | None = None) -> Array:
+    """Log posterior density (B,) in transformed space up to a constant that does not depend on x: −J.
+
+    The dropped constant is that of the prior, ``Prior.log_density`` at its mean, and −Σ β_k ln(std_k √2π).
+    """
+    return -cost(problem, x, executor)
+
+
+def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
+    """The parameters of ``problem.fixed``, in its order.
+
+    Raises
+    ------
+    ConfigError: a parameter neither fixed nor estimated, both, or unknown to the model; a timing error on an
+        observable without a rate.
+    """
+    known = {p.name: p for p in (TIME_SHIFT, *problem.model.parameters)}
+    estimated, fixed = set(problem.prior.names), set(problem.fixed)
+    required = {p.name for p in problem.model.parameters} - {TIME_SHIFT.name}
+    for names, message in (
+        (required - estimated - fixed, "neither fixed nor estimated"),
+        (estimated & fixed, "both fixed and estimated"),
+        ((estimated | fixed) - set(known), "not a parameter of the model"),
+    ):
+        if names:
+            raise ConfigError(f"{', '.join(sorted(names))}: {message}")
+    if needs_rate(problem.observations) and not isinstance(problem.observable.operator, RateOperator):
+        raise ConfigError(
+            f"a timing error needs the rate of {problem.observable.name}, which the model does not provide"
+        )
+    return tuple(known[name] for name in problem.fixed)
+
+
+class _OutOfBounds(ValueError):
+    pass
+
+
+def _initial_state(problem: InverseProblem, values: Array) -> Array:
+    for parameter, value in zip(problem.prior.parameters, values, strict=True):
+        low, high = parameter.bounds
+        if not (low <= value <= high and np.isfinite(value)):
+            raise _OutOfBounds(f"{parameter.name} outside [{low:g}, {high:g}] {parameter.unit}")
+    theta: dict[str, float] = {**problem.fixed, **dict(zip(problem.prior.names, values.tolist(), strict=True))}
+    if TIME_SHIFT.name in theta and all(p.name != TIME_SHIFT.name for p in problem.model.parameters):
+        del theta[TIME_SHIFT.name]
+    state = np.asarray(problem.model.initial_state(theta), dtype=float)
+    if not np.all(np.isfinite(state)):
+        raise ValueError("non-finite initial state")
+    return state
+
+
+def _time_shift(problem: InverseProblem, physical: Array) -> Array:
+    """t_s (B,) of each member."""
+    if TIME_SHIFT.name in problem.prior.names:
+        return np.asarray(physical[:, problem.prior.names.index(TIME_SHIFT.name)])
+    return np.full(len(physical), problem.fixed.get(TIME_SHIFT.name, 0.0))
+
+
+def _observe(problem: InverseProblem, trajectory: Trajectory, with_rate: bool) -> Array:
+    """Predictions and, where needed, rates, (1 or 2, K)."""
+    operator = problem.observable.operator
+    rows = [np.asarray(operator(trajectory), dtype=float)]
+    if with_rate and isinstance(operator, RateOperator):
+        rows.append(np.asarray(operator.rate(trajectory), dtype=float))
+    return np.stack(rows)
+
+
+def _union(times: Array, extra: Array) -> tuple[Array, npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Increasing union of the times and where the observations and the extra times stand in it."""
+    nearest = times[np.abs(extra[:, None] - times).argmin(axis=1)]
+    extra = np.where(np.abs(extra - nearest) <= SAME_INSTANT * (times[-1] - times[0]), nearest, extra)
+    union: Array = np.unique(np.concatenate([times, extra]))
+    return union, np.searchsorted(union, times), np.searchsorted(union, extra)

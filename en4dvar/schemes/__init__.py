@@ -1,0 +1,83 @@
+"""Assimilation schemes: pure functions of whitened ensemble arrays.
+
+A scheme never sees x, F, H or a truth. It says with which weights to run the members, turns their predictions into a
+linearisation in weight space, and turns the whitened linearisation into a direction and a transform. The loop
+(:mod:`en4dvar.assimilate`) runs the model; step control (:mod:`en4dvar.step_control`) decides how far to go.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from en4dvar.linalg import Hessian
+from en4dvar.state import Array
+
+
+@dataclass(frozen=True)
+class Weights:
+    """An ensemble in weight space: centre ``w`` (N,) and transform ``T`` (N, N), rows of 1wᵀ + T are members."""
+
+    w: Array
+    T: Array
+
+    @property
+    def rows(self) -> Array:
+        """(N, N): member i is x̄0 + X0ᵀ rows[i]."""
+        return np.asarray(self.w + self.T)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What a forecast says about the centre: whitened innovation ``d`` (K',) and whitened anomalies ``S`` (K', N)."""
+
+    d: Array
+    S: Array
+
+
+@dataclass(frozen=True)
+class Step:
+    """An undamped step in weight space and the posterior transform at the point it starts from.
+
+    ``gradient`` g (N,) of J, ``hessian`` A, ``direction`` −A⁻¹g (N,), ``transform`` T = √(N−1) A^{-1/2} (N, N).
+    """
+
+    gradient: Array
+    hessian: Hessian
+    direction: Array
+    transform: Array
+
+    @property
+    def norm(self) -> float:
+        """√(δwᵀ A δw), the Newton decrement: the length of the step in posterior standard deviations."""
+        return float(np.sqrt(max(0.0, -float(self.gradient @ self.direction))))
+
+    @property
+    def predicted_decrease(self) -> float:
+        """Decrease of the quadratic model of J over the full step, ½ norm²."""
+        return 0.5 * self.norm**2
+
+
+class Scheme(Protocol):
+    """The author of a scheme writes these four."""
+
+    def init(self, n_members: int) -> Weights:
+        """Weights of the prior: w = 0, T = I."""
+
+    def member_weights(self, weights: Weights) -> Array:
+        """Weights (N, N) of the members to be run next, as rows."""
+
+    def linearise(
+        self, weights: Weights, basis: Array, predictions: Array, central: Array, active: Array
+    ) -> tuple[Array, Array]:
+        """Reference prediction (Ky,) and anomalies per unit weight (N, Ky).
+
+        ``predictions`` (N, Ky) of the members of :meth:`member_weights`, ``central`` (Ky,) of the centre, ``active``
+        (N,) bool; rows of failed members are not read. ``basis`` (N, r) spans the prior anomalies
+        (:func:`en4dvar.linalg.anomaly_basis`).
+        """
+
+    def step(self, weights: Weights, evaluation: Evaluation) -> Step:
+        """Direction and transform from the whitened linearisation at ``weights``."""

@@ -1,0 +1,130 @@
+"""Small forward models for tests: importable, so that spawned processes find them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from en4dvar.forward import Failure, ForwardModel, Observable, StateField, Trajectory
+from en4dvar.observations import Observations
+from en4dvar.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
+from en4dvar.state import Field, Parameter, StateLayout
+
+OBSERVABLE = Observable("y", "m", StateField("y", rate_of="v"))
+
+
+class Toy(ForwardModel):
+    """A curve y(t; θ) with its rate; the state carries (y, v, θ), so that ``step`` knows the curve."""
+
+    observables = (OBSERVABLE,)
+
+    def __init__(self, names=("a", "b"), batch=1, compiled=False):
+        self.parameters = tuple(Parameter(name, "m") for name in names)
+        self.layout = StateLayout((Field("y"), Field("v"), Field("theta", len(names))))
+        self.batch, self.compiled = batch, compiled
+
+    def curve(self, theta, t):
+        raise NotImplementedError
+
+    def rate(self, theta, t):
+        raise NotImplementedError
+
+    def initial_state(self, theta):
+        values = np.array([theta[p.name] for p in self.parameters])
+        return np.concatenate([[self.curve(values, 0.0), self.rate(values, 0.0)], values])
+
+    def step(self, x, t0, t1):
+        theta = x[2:]
+        return np.concatenate([[self.curve(theta, t1), self.rate(theta, t1)], theta])
+
+
+class Linear(Toy):
+    """y = Σ_j θ_j cos(j t + j²/3): linear in θ."""
+
+    def curve(self, theta, t):
+        j = np.arange(len(theta))
+        return float(theta @ np.cos(j * t + j**2 / 3))
+
+    def rate(self, theta, t):
+        j = np.arange(len(theta))
+        return float(-theta @ (j * np.sin(j * t + j**2 / 3)))
+
+
+class Decay(Toy):
+    """y = a exp(−b t) + 0.3 b t: mildly nonlinear."""
+
+    def curve(self, theta, t):
+        a, b = theta
+        return float(a * np.exp(-b * t) + 0.3 * b * t)
+
+    def rate(self, theta, t):
+        a, b = theta
+        return float(-a * b * np.exp(-b * t) + 0.3 * b)
+
+
+class Wave(Toy):
+    """y = a sin(3 b t) + 0.2 b²: strongly nonlinear in b."""
+
+    def curve(self, theta, t):
+        a, b = theta
+        return float(a * np.sin(3 * b * t) + 0.2 * b * b)
+
+    def rate(self, theta, t):
+        a, b = theta
+        return float(3 * a * b * np.cos(3 * b * t))
+
+
+class Fragile(Linear):
+    """Linear, but it cannot integrate members whose first parameter is beyond ``limit``, in one of three ways."""
+
+    def __init__(self, limit, how="value", **options):
+        super().__init__(**options)
+        self.limit, self.how = limit, how
+
+    def initial_state(self, theta):
+        if self.how == "initial_state" and theta["a"] > self.limit:
+            raise ArithmeticError("no equilibrium")
+        return super().initial_state(theta)
+
+    def trajectories(self, x, times):
+        bad = x[:, 2] > self.limit
+        if self.how == "raise" and bad.any():
+            raise FloatingPointError("overflow")
+        if self.how == "short" and bad.any():
+            return super().trajectories(x[~bad], times[~bad])
+        results = list(super().trajectories(x, times))
+        for i in np.flatnonzero(bad):
+            results[i] = Failure("too stiff", 0.1)
+        return results
+
+
+class Vectorised(Linear):
+    """The fast path: all members in one array expression."""
+
+    def trajectories(self, x, times):
+        own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+        j = np.arange(x.shape[1] - 2)
+        phase = own[:, :, None] * j + j**2 / 3
+        y = np.sum(x[:, None, 2:] * np.cos(phase), axis=-1)
+        v = -np.sum(x[:, None, 2:] * j * np.sin(phase), axis=-1)
+        theta = np.broadcast_to(x[:, None, 2:], (*own.shape, len(j)))
+        states = np.concatenate([y[..., None], v[..., None], theta], axis=-1)
+        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+
+
+def make_observations(times, values, std=0.1, time_std=0.0, weights=1.0, name="toy"):
+    k = len(times)
+    full = [np.broadcast_to(np.asarray(v, dtype=float), (k,)).copy() for v in (std, time_std, weights)]
+    return Observations(np.asarray(times, dtype=float), np.asarray(values, dtype=float), *full, name=name)
+
+
+def make_problem(model, truth, *, std=0.1, time_std=0.0, weights=1.0, seed=1, k=9, prior=None, scale=1.0):
+    """A twin experiment: data of the toy at ``truth`` plus noise, prior N(0.8 truth, scale²) unless given."""
+    times = np.linspace(0.2, 2.0, k)
+    noise = np.random.default_rng(seed).standard_normal(k)
+    values = np.array([model.curve(np.asarray(truth, dtype=float), t) for t in times]) + std * noise
+    terms = prior or tuple(
+        PriorTerm.normal(p, 0.8 * value, scale) for p, value in zip(model.parameters, truth, strict=True)
+    )
+    observations = make_observations(times, values, std, time_std, weights)
+    return InverseProblem(model, OBSERVABLE, observations, Prior(tuple(terms)))
