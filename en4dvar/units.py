@@ -195,7 +195,7 @@ def parse_quantity(value: str | float, unit: str) -> float:
 
 @dataclass(frozen=True)
 class Quantity:
-    """Pydantic annotation: ``Annotated[float, Quantity("Pa")]`` reads ``"0.42 kPa"`` as 420.0."""
+    """Pydantic annotation: ``Annotated[float, Quantity("Pa")]`` reads ``"0.42 kPa"`` as 420.0, dumps JSON with unit."""
 
     unit: str
 
@@ -203,7 +203,11 @@ class Quantity:
         from pydantic_core import core_schema
 
         parse_unit(self.unit)
-        return core_schema.no_info_before_validator_function(self._read, handler(float))
+        dump = core_schema.plain_serializer_function_ser_schema(self._write, when_used="json")
+        return core_schema.no_info_before_validator_function(self._read, handler(float), serialization=dump)
 
     def _read(self, value: Any) -> float:
         return parse_quantity(value, self.unit)
+
+    def _write(self, value: float) -> str | float:
+        return value if self.unit == "1" else f"{value!r} {self.unit}"

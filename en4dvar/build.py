@@ -1,0 +1,128 @@
+"""Settings → inverse problems: reads the data files, cuts the windows, evaluates what refers to the data."""
+
+from __future__ import annotations
+
+import glob
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from en4dvar.config import Config
+from en4dvar.config.data import DataPlan
+from en4dvar.config.parameters import Fixed, Uncertain, located
+from en4dvar.errors import ConfigError, DataError, Fault
+from en4dvar.observations import Observations
+from en4dvar.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
+from en4dvar.readers import read_series
+from en4dvar.units import UnitError, convert
+from en4dvar.window import select
+
+
+def build(config: Config) -> tuple[InverseProblem, ...]:
+    """One inverse problem a data set, in the order of the paths (of a glob: sorted).
+
+    Raises
+    ------
+    ConfigError: there is no ``data:`` section, nothing is estimated, or a prior does not suit the data.
+    DataError: a data file cannot be used.
+    """
+    if config.data is None:
+        raise ConfigError([Fault("required: where the observations are", "data", config.document.file)])
+    if not any(isinstance(entry, Uncertain) for entry in config.parameters):
+        raise ConfigError([config.document.fault(("parameters",), "no parameter has a prior; nothing to estimate")])
+    files = data_files(config.data)
+    return tuple(_problem(config, config.data, path, name) for name, path in files.items())
+
+
+def data_files(plan: DataPlan) -> dict[str, Path]:
+    """Name of the data set (the file's stem, made unique by its folder) → file. Raises :class:`DataError`."""
+    paths: list[Path] = []
+    for text in plan.paths:
+        path = plan.base / Path(text).expanduser()
+        if glob.has_magic(text) and not path.exists():
+            found = sorted(Path(p) for p in glob.glob(str(path), recursive=True))
+            if not found:
+                raise DataError(f"{path}: no file matches")
+            paths += found
+        else:
+            paths.append(path)
+    stems = Counter(p.stem for p in paths)
+    names = [p.stem if stems[p.stem] == 1 else f"{p.parent.name}_{p.stem}" for p in paths]
+    again = [name for name, count in Counter(names).items() if count > 1]
+    if again:
+        raise DataError(f"data sets need different names, but {again[0]!r} occurs more than once")
+    return dict(zip(names, paths, strict=True))
+
+
+def read_observations(plan: DataPlan, path: Path, name: str, weights: str = "sum") -> Observations:
+    """The observations (y, t, R) of one file inside the window. Raises :class:`DataError`."""
+    series = read_series(path, plan.time, plan.value, plan.format)
+    try:
+        window = select(series.times, series.values, plan.start, plan.end, plan.prominence)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
+    times, values = series.times[window], series.values[window]
+    if not len(times):
+        raise DataError(f"{path}: no observation lies in the window")
+    zero = {"file": 0.0, "window": times[0]}.get(str(plan.time_zero), plan.time_zero)
+    times = times - float(zero)
+    if times[0] < 0:
+        raise DataError(f"{path}: the first observation used lies {-times[0]:g} before time zero; see data.time_zero")
+    count = len(times)
+    return Observations(
+        times=times,
+        values=values,
+        std=np.full(count, plan.std.absolute(float(values.max()))),
+        time_std=np.full(count, plan.time_std),
+        weights=np.full(count, 1.0 if weights == "sum" else 1.0 / count),
+        name=name,
+        source=str(path),
+        scalars=series.scalars,
+    )
+
+
+def resolve_parameters(
+    config: Config, observations: Observations | None
+) -> tuple[tuple[PriorTerm, ...], dict[str, float]]:
+    """Prior terms and fixed values, evaluated on the data where they refer to them.
+
+    Raises
+    ------
+    ConfigError: every entry that cannot be evaluated, located in the file.
+    """
+    terms: list[PriorTerm] = []
+    fixed: dict[str, float] = {}
+    faults: list[Fault] = []
+    for entry in config.parameters:
+        path = ("parameters", entry.parameter.name)
+        try:
+            if isinstance(entry, Fixed):
+                fixed[entry.parameter.name] = entry.value
+            elif isinstance(entry, Uncertain):
+                terms.append(entry.term(_maximum(entry, config, observations)))
+            elif observations is None:
+                raise ConfigError("the value comes from the data file, and there is none; set a value")
+            else:
+                fixed[entry.parameter.name] = entry.value(observations.scalars, observations.source)
+        except ConfigError as error:
+            faults += [located(config.document, path, fault) for fault in error.problems]
+        except UnitError as error:
+            faults.append(config.document.fault(path, str(error)))
+    if faults:
+        raise ConfigError(faults)
+    return tuple(terms), fixed
+
+
+def _maximum(entry: Uncertain, config: Config, observations: Observations | None) -> float | None:
+    """The observed maximum in the parameter's unit, where the entry asks for it."""
+    if observations is None or not entry.needs_data:
+        return None
+    return convert(float(observations.values.max()), config.observable.unit, entry.parameter.unit)
+
+
+def _problem(config: Config, plan: DataPlan, path: Path, name: str) -> InverseProblem:
+    observations = read_observations(plan, path, name, config.weights)
+    terms, fixed = resolve_parameters(config, observations)
+    return InverseProblem(config.model, config.observable, observations, Prior(terms), fixed)

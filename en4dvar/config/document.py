@@ -1,0 +1,206 @@
+"""YAML with a memory of where everything stood, and without PyYAML's traps.
+
+Scalars follow YAML 1.2's core schema: only ``true``/``false`` are booleans (``no`` and ``off`` are text), ``1e-6`` is a
+number, dates are text. Duplicate keys, aliases and tags are refused: a configuration is plain data.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from en4dvar.errors import ConfigError, Fault
+from en4dvar.hints import no_such_file
+
+Key = tuple[str | int, ...]
+Mark = tuple[int, int]  # line and column, from 1
+
+_INT = re.compile(r"[-+]?\d{1,18}")
+_FLOAT = re.compile(r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d{1,3})?")
+_WORDS = {"true": True, "True": True, "false": False, "False": False, "null": None, "~": None, "": None}
+
+
+@dataclass(frozen=True)
+class Document:
+    """Plain data read from ``file``, with the position of each key and value, and the verbatim ``text``."""
+
+    data: dict[str, Any]
+    file: str = ""
+    text: str = ""
+    keys: Mapping[Key, Mark] = field(default_factory=dict)
+    values: Mapping[Key, Mark] = field(default_factory=dict)
+    origins: Mapping[Key, str] = field(default_factory=dict)  # what an override came from, instead of the file
+
+    def fault(self, path: Sequence[str | int], message: str, *, at_key: bool = False) -> Fault:
+        """A fault at ``path``, or at its nearest ancestor that is written in the file."""
+        dotted = ".".join(str(p) for p in path)
+        for n in range(len(path), -1, -1):
+            key = tuple(path[:n])
+            if key in self.origins:
+                return Fault(message, dotted, self.origins[key])
+            marks = self.keys if key and (at_key or n < len(path)) else self.values
+            if key in marks:
+                return Fault(message, dotted, self.file, *marks[key])
+        return Fault(message, dotted, self.file)
+
+    def has(self, path: Sequence[str | int]) -> bool:
+        """Whether the data contains ``path``."""
+        node: Any = self.data
+        for part in path:
+            try:
+                node = node[part]
+            except (KeyError, IndexError, TypeError):
+                return False
+        return True
+
+
+def read_document(path: Path) -> Document:
+    """Read and parse a YAML file. Raises :class:`ConfigError` listing every fault found."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigError([Fault(f"not UTF-8 text ({error.reason} at byte {error.start})", file=str(path))]) from None
+    except OSError as error:
+        raise ConfigError([Fault(_unreadable(path, error))]) from None
+    return parse_document(text, str(path))
+
+
+def parse_document(text: str, file: str = "") -> Document:
+    """Parse YAML text whose top level is a mapping. Raises :class:`ConfigError`."""
+    keys: dict[Key, Mark] = {}
+    values: dict[Key, Mark] = {}
+    faults: list[Fault] = []
+    data = _parse(text, file, keys, values, faults)
+    if not faults and not isinstance(data, dict):
+        what = "the file is empty" if data is None else "expected 'key: value' lines at the top level"
+        faults.append(Fault(what, file=file))
+    if faults:
+        raise ConfigError(faults)
+    return Document(data, file, text, keys, values)
+
+
+def override(document: Document, overrides: Mapping[str, Any]) -> Document:
+    """Set values at dotted paths; text is parsed as YAML. Raises :class:`ConfigError`."""
+    data = _copy(document.data)
+    origins = dict(document.origins)
+    faults: list[Fault] = []
+    for dotted, value in overrides.items():
+        path, origin = tuple(dotted.split(".")), f"--set {dotted}"
+        if isinstance(value, str):
+            value = _parse(value, origin, {}, {}, faults)
+        node = data
+        for n, part in enumerate(path[:-1], 1):
+            node = node.setdefault(part, {})
+            if not isinstance(node, dict):
+                faults.append(
+                    Fault(f"{'.'.join(path[:n])!r} is a single value; nothing can be set inside it", file=origin)
+                )
+                break
+        else:
+            if not all(path):
+                faults.append(Fault("expected key=value with a dotted key such as assimilation.members", file=origin))
+            node[path[-1]] = value
+            origins[path] = origin
+    if faults:
+        raise ConfigError(faults)
+    return replace(document, data=data, origins=origins)
+
+
+def _unreadable(path: Path, error: OSError) -> str:
+    if path.is_dir():
+        return f"{path}: is a directory, not a YAML file"
+    return no_such_file(path) if isinstance(error, FileNotFoundError) else f"{path}: {error.strerror}"
+
+
+def _copy(node: Any) -> Any:
+    return {k: _copy(v) for k, v in node.items()} if isinstance(node, dict) else node
+
+
+class _Refused(Exception):
+    """Valid YAML that a configuration does not use: a message and a mark."""
+
+
+class _Loader(yaml.SafeLoader):
+    """Composes the node graph; scalars are resolved by :func:`_scalar`."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        event: Any = self.peek_event()
+        if isinstance(event, yaml.AliasEvent):
+            raise _Refused("aliases are not used here; repeat the value", event.start_mark)
+        if getattr(event, "tag", None) is not None:
+            raise _Refused(f"tag {event.tag!r}: tags are not used here", event.start_mark)
+        return super().compose_node(parent, index)
+
+
+def _parse(text: str, file: str, keys: dict[Key, Mark], values: dict[Key, Mark], faults: list[Fault]) -> Any:
+    loader = None
+    try:
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        return None if node is None else _value(node, (), file, keys, values, faults)
+    except _Refused as error:
+        message, at = error.args
+        faults.append(Fault(message, "", file, at.line + 1, at.column + 1))
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = (mark.line + 1, mark.column + 1) if mark else (0, 0)
+        faults.append(Fault(f"not valid YAML: {error.problem or error.context}", "", file, *where))
+    except yaml.YAMLError as error:
+        faults.append(Fault(f"not valid YAML: {str(error).splitlines()[0]}", file=file))
+    except RecursionError:
+        faults.append(Fault("not valid YAML: nested too deeply", file=file))
+    finally:
+        if loader is not None:
+            loader.dispose()
+    return None
+
+
+def _value(
+    node: yaml.Node, path: Key, file: str, keys: dict[Key, Mark], values: dict[Key, Mark], faults: list[Fault]
+) -> Any:
+    values[path] = _mark(node)
+    if isinstance(node, yaml.SequenceNode):
+        return [_value(n, (*path, i), file, keys, values, faults) for i, n in enumerate(node.value)]
+    if not isinstance(node, yaml.MappingNode):
+        return _scalar(node)
+    result: dict[str, Any] = {}
+    for name, child, where in _pairs(node):
+        here = (*path, name)
+        if name in result:
+            first = keys[here][0]
+            faults.append(Fault(f"duplicate key {name!r}, first given on line {first}", _dotted(path), file, *where))
+            continue
+        keys[here] = where
+        result[name] = _value(child, here, file, keys, values, faults)
+    return result
+
+
+def _pairs(node: yaml.MappingNode) -> Iterator[tuple[str, yaml.Node, Mark]]:
+    for key, child in node.value:
+        if not isinstance(key, yaml.ScalarNode):
+            raise _Refused("a key must be a word", key.start_mark)
+        yield str(key.value), child, _mark(key)
+
+
+def _scalar(node: Any) -> Any:
+    text = node.value
+    if node.style is not None:  # quoted or block: always text
+        return text
+    if text in _WORDS:
+        return _WORDS[text]
+    if _INT.fullmatch(text):
+        return int(text)
+    return float(text) if _FLOAT.fullmatch(text) else text
+
+
+def _mark(node: yaml.Node) -> Mark:
+    return node.start_mark.line + 1, node.start_mark.column + 1
+
+
+def _dotted(path: Key) -> str:
+    return ".".join(str(p) for p in path)

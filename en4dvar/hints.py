@@ -1,0 +1,28 @@
+"""What was probably meant: suggestions for misspelt names and missing files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+from pathlib import Path
+
+
+def suggest(word: object, known: Iterable[str]) -> str:
+    """``"; did you mean 'x'?"``, or else the list of what is known, or nothing."""
+    names = list(known)
+    close = get_close_matches(str(word), names, 1, 0.6)
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    return f"; known: {', '.join(names)}" if names else ""
+
+
+def no_such_file(path: Path) -> str:
+    """``"<path>: no such file"`` and what lies beside it: similar names, else files of the same kind."""
+    try:
+        beside = sorted(p.name for p in path.parent.iterdir() if p.is_file())
+    except OSError:
+        return f"{path}: no such file; the folder {path.parent} cannot be read"
+    close = get_close_matches(path.name, beside, 3, 0.6) or [b for b in beside if Path(b).suffix == path.suffix][:5]
+    if not close:
+        return f"{path}: no such file"
+    return f"{path}: no such file; the folder holds {', '.join(close)}"

@@ -1,0 +1,92 @@
+"""Building: the data complete the settings."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+from toy_config import csv_text, write_toy
+
+from en4dvar.build import build
+from en4dvar.config import load_config
+from en4dvar.errors import ConfigError, DataError
+
+
+def test_one_problem(tmp_path: Path) -> None:
+    (problem,) = build(load_config(write_toy(tmp_path)))
+    assert problem.observations.name == "toy"
+    assert len(problem.observations) == 31
+    assert problem.observations.times[1] == 5e-3
+    assert np.all(problem.observations.std == 2e-6)
+    assert np.all(problem.observations.weights == 1.0)
+    assert problem.prior.names == ("A", "k")
+    assert problem.prior.mean.tolist() == [pytest.approx(1e-4), pytest.approx(np.log(3.0))]
+    assert problem.prior.std.tolist() == [pytest.approx(1e-6), 0.3]
+    assert problem.fixed == {"c": 0.02}
+
+
+def test_window_zero_weights_and_relative_error(tmp_path: Path) -> None:
+    extra = "  window: {from: minimum 1, to: x_max}\n  time_zero: window\n"
+    path = write_toy(
+        tmp_path,
+        ("  error: {position_std: 2 um}\n", "  error: {position_std: 1 % of maximum}\n" + extra),
+        data=csv_text(61),
+    )
+    (problem,) = build(load_config(path, {"assimilation.weights": "mean"}))
+    y = problem.observations
+    assert y.times[0] == 0.0
+    assert y.values[0] < y.values[1] < y.values[-1]
+    assert y.std == pytest.approx(np.full(len(y), 0.01 * y.values.max()))
+    assert y.weights.sum() == pytest.approx(1.0)
+
+
+def test_value_from_a_mat_file(tmp_path: Path) -> None:
+    t = np.arange(31) * 5e-3
+    savemat(tmp_path / "toy.mat", {"x": np.cos(30 * t)[None], "dt": 5.0, "damping": 20.0})
+    path = write_toy(
+        tmp_path,
+        ("toy.csv", "toy.mat"),
+        ("{name: t_ms, unit: ms}", "{step: dt, unit: ms}"),
+        ("x_um", "x"),
+        ("c: 0.02 N s/m", "c: {from_file: damping, unit: mN s/m}"),
+    )
+    (problem,) = build(load_config(path))
+    assert problem.fixed == {"c": 0.02}
+    assert problem.observations.times == pytest.approx(t)
+    path.write_text(path.read_text().replace("from_file: damping", "from_file: dampin"))
+    with pytest.raises(
+        ConfigError, match=r"toy\.yaml:15:6: parameters\.c: .*no scalar 'dampin' for c; did you mean 'dam"
+    ):
+        build(load_config(path))
+
+
+def test_campaign(tmp_path: Path) -> None:
+    path = write_toy(tmp_path)
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        for n in (1, 2):
+            (tmp_path / folder / f"set{n}.csv").write_text(csv_text())
+    names = [p.observations.name for p in build(load_config(path, {"data.path": "a/*.csv"}))]
+    assert names == ["set1", "set2"]
+    names = [p.observations.name for p in build(load_config(path, {"data.path": ["b/set1.csv", "a/*.csv"]}))]
+    assert names == ["b_set1", "a_set1", "set2"]
+    with pytest.raises(DataError, match="occurs more than once"):
+        build(load_config(path, {"data.path": ["a/set1.csv", "a/*.csv"]}))
+    with pytest.raises(DataError, match="no file matches"):
+        build(load_config(path, {"data.path": "c/*.csv"}))
+
+
+def test_refused(tmp_path: Path) -> None:
+    path = write_toy(tmp_path)
+    with pytest.raises(ConfigError, match="nothing to estimate"):
+        build(load_config(path, {"parameters.A": "1 um", "parameters.k": "1 N/m"}))
+    with pytest.raises(DataError, match=r"toy\.csv: the window asks for minimum 9"):
+        build(load_config(path, {"data.window": "{to: minimum 9}"}))
+    with pytest.raises(DataError, match="before time zero"):
+        build(load_config(path, {"data.time_zero": "7 ms"}))
+    with pytest.raises(DataError, match="2 usable observations in the window"):
+        build(load_config(path, {"data.window": "{to: 7 ms}"}))
+    text = path.read_text()
+    path.write_text(text[: text.index("data:")] + text[text.index("model:") :])
+    with pytest.raises(ConfigError, match="data: required"):
+        build(load_config(path))

@@ -1,0 +1,76 @@
+"""YAML: PyYAML's traps are closed and every fault has a place."""
+
+from pathlib import Path
+
+import pytest
+
+from en4dvar.config.document import override, parse_document, read_document
+from en4dvar.errors import ConfigError
+
+
+def test_scalars_of_the_core_schema() -> None:
+    text = "a: 1e-6\nb: no\nc: off\nd: true\ne: 012\nf: 2024-01-01\ng: '3'\nh:\ni: 12:30\nj: .5\nk: +7\nl: 1_000\n"
+    assert parse_document(text).data == {
+        "a": 1e-6, "b": "no", "c": "off", "d": True, "e": 12, "f": "2024-01-01", "g": "3", "h": None, "i": "12:30",
+        "j": 0.5, "k": 7, "l": "1_000",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("a: 1\nb:\n  c: 2\n  c: 3\n", "f.yaml:4:3: b: duplicate key 'c', first given on line 3"),
+        ("a: &x 1\nb: *x\n", "f.yaml:2:4: aliases are not used here"),
+        (
+            "a: !!python/object/apply:os.system ['true']\n",
+            "f.yaml:1:4: tag 'tag:yaml.org,2002:python/object/apply:os.system'",
+        ),
+        ("a: [1\nb: 2\n", "f.yaml:2:2: not valid YAML: "),
+        ("\tb: 2\n", "f.yaml:1:1: not valid YAML: found character '\\t'"),
+        ("a: 1\n---\nb: 2\n", "f.yaml:2:1: not valid YAML: but found another document"),
+        ("[a]: 1\n", "f.yaml:1:1: a key must be a word"),
+        ("a: \x01\n", "f.yaml: not valid YAML: unacceptable character"),
+        ("", "f.yaml: the file is empty"),
+        ("just words\n", "f.yaml: expected 'key: value' lines"),
+        ("a: " + "[" * 3000 + "]" * 3000, "f.yaml: not valid YAML: nested too deeply"),
+    ],
+)
+def test_refused(text: str, fault: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        parse_document(text, "f.yaml")
+    assert str(error.value).startswith(fault)
+
+
+def test_all_duplicates_at_once() -> None:
+    with pytest.raises(ConfigError) as error:
+        parse_document("a: 1\na: 2\nb: 1\nb: 2\n", "f.yaml")
+    assert [f.line for f in error.value.problems] == [2, 4]
+
+
+def test_faults_fall_back_to_the_nearest_ancestor() -> None:
+    document = parse_document("a:\n  b: 1\n", "f.yaml")
+    assert str(document.fault(("a", "b"), "bad")) == "f.yaml:2:6: a.b: bad"
+    assert str(document.fault(("a", "b"), "bad", at_key=True)) == "f.yaml:2:3: a.b: bad"
+    assert str(document.fault(("a", "z"), "missing")) == "f.yaml:1:1: a.z: missing"
+
+
+def test_override_leaves_the_document_and_names_its_origin() -> None:
+    document = parse_document("a: {b: 1}\n", "f.yaml")
+    changed = override(document, {"a.b": "1e-3 m", "c.d": "[1, 2]", "e": 5})
+    assert changed.data == {"a": {"b": "1e-3 m"}, "c": {"d": [1, 2]}, "e": 5}
+    assert document.data == {"a": {"b": 1}}
+    assert str(changed.fault(("a", "b"), "bad")) == "--set a.b: a.b: bad"
+    for bad in ("a.b.c", "a..c", ""):
+        with pytest.raises(ConfigError, match="--set"):
+            override(document, {bad: 1})
+
+
+def test_missing_file_names_its_neighbours(tmp_path: Path) -> None:
+    (tmp_path / "quickstart.yaml").write_text("a: 1\n")
+    with pytest.raises(ConfigError, match=r"no such file; the folder holds quickstart\.yaml"):
+        read_document(tmp_path / "quikstart.yaml")
+    with pytest.raises(ConfigError, match="is a directory"):
+        read_document(tmp_path)
+    (tmp_path / "latin.yaml").write_bytes(b"a: \xb5m\n")
+    with pytest.raises(ConfigError, match="not UTF-8"):
+        read_document(tmp_path / "latin.yaml")

@@ -1,0 +1,124 @@
+"""CSV and .mat files, good and bad."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from en4dvar.errors import DataError
+from en4dvar.readers import Column, Series, Step, read_series
+
+TIME, RADIUS = Column("t", "us", "s"), Column("R", "um", "m")
+
+
+def csv(tmp_path: Path, text: str) -> Series:
+    path = tmp_path / "a.csv"
+    path.write_text(text, encoding="utf-8")
+    return read_series(path, TIME, RADIUS)
+
+
+def mat(tmp_path: Path, time: Column | Step = TIME, **fields: Any) -> Series:
+    savemat(tmp_path / "a.mat", fields)
+    return read_series(tmp_path / "a.mat", time, RADIUS)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t,R\n0,1\n1,2\n2,3\n",
+        "# by hand\n\nid; R ;t\nx;1;0\nx;2;1\n\n# pause\nx;3;2\n",
+        "t\tR\n0\t1\n1\t2\n2\t3\n",
+        "  t   R\n  0   1\n  1   2\n  2   3\n",
+        "\ufefft,R\r\n0,1\r\n0.5,nan\r\n0.6,\r\n1,2\r\n2,3\r\n",
+        't,"R"\n"0","1"\n1,2\n2,3\n',
+    ],
+)
+def test_csv_dialects(tmp_path: Path, text: str) -> None:
+    series = csv(tmp_path, text)
+    assert series.times.tolist() == [0.0, 1e-6, 2e-6]
+    assert series.values.tolist() == [1e-6, 2e-6, 3e-6]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t,r\n0,1\n1,2\n2,3\n", "no column 'R'; the columns are: t, r"),
+        ("t,R,R\n0,1,1\n", "more than one column 'R'"),
+        ("0,1\n1,2\n2,3\n", "the first line must name the columns"),
+        ("t,R\n0,1\n1,abc\n2,3\n", "a.csv:3: 'abc' in column 'R' is not a number"),
+        ("t;R\n0;1\n1;2,5\n2;3\n", "a.csv:3: '2,5' in column 'R' is not a number; write a decimal point"),
+        ("t,R\n0,1\n1,2,5\n2,3\n", "a.csv:3: 3 cells, but the header names 2 columns"),
+        ("t,R\n0,nan\n1,\n2,NA\n", "'R' holds no usable value"),
+        ("t,R\n", "no data"),
+        ("", "the file holds no data"),
+        ("# only this\n", "the file holds no data"),
+        ("t,R\n0,1\n2,2\n1,3\n", "times must increase, but usable sample 2 at 2e-06 is followed by 1e-06"),
+        ("t,R\n0,1\n0,2\n1,3\n", "times must increase"),
+        ("t,R\n0,1\n1,2\n", "2 usable observations; at least 3"),
+        ("t,R\n0,1\n1,inf\n2,3\n", "infinite"),
+    ],
+)
+def test_bad_csv(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(DataError) as error:
+        csv(tmp_path, text)
+    assert message in str(error.value)
+    assert str(tmp_path / "a.csv") in str(error.value)
+
+
+def test_file_not_there(tmp_path: Path) -> None:
+    (tmp_path / "bubble.csv").write_text("t,R\n")
+    with pytest.raises(DataError, match=r"buble\.csv: no such file; the folder holds bubble\.csv"):
+        read_series(tmp_path / "buble.csv", TIME, RADIUS)
+    with pytest.raises(DataError, match="is a directory"):
+        read_series(tmp_path, TIME, RADIUS)
+    (tmp_path / "a.xlsx").write_text("")
+    with pytest.raises(DataError, match=r"suffix '\.xlsx'"):
+        read_series(tmp_path / "a.xlsx", TIME, RADIUS)
+    (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x01")
+    with pytest.raises(DataError, match="not a text file"):
+        read_series(tmp_path / "b.csv", TIME, RADIUS)
+
+
+@pytest.mark.parametrize("shape", [(1, -1), (-1, 1)])
+def test_mat_layouts(tmp_path: Path, shape: tuple[int, int]) -> None:
+    radius = np.array([0.0, np.nan, 0.0, 5.0, np.nan, 6.0, 7.0]).reshape(shape)
+    time = np.arange(7.0).reshape(shape)
+    series = mat(tmp_path, R=radius, t=time, Req=np.uint8(21), nothing=np.nan, note="text", pair=[1.0, 2.0])
+    assert series.times.tolist() == [3e-6, 5e-6, 6e-6]
+    assert series.values.tolist() == [5e-6, 6e-6, 7e-6]
+    assert series.scalars == {"Req": 21.0}
+
+
+def test_mat_time_step(tmp_path: Path) -> None:
+    radius = np.array([np.nan, 5.0, 6.0, 7.0])
+    step = Step(Column("deltat", "us", "s"))
+    assert mat(tmp_path, step, R=radius, deltat=0.5).times.tolist() == [0.5e-6, 1e-6, 1.5e-6]
+    assert mat(tmp_path, Step(value=2e-6), R=radius).times.tolist() == [2e-6, 4e-6, 6e-6]
+    with pytest.raises(DataError, match="no scalar 'deltat' for the time step; did you mean 'delta_t'"):
+        mat(tmp_path, step, R=radius, delta_t=0.5)
+    with pytest.raises(DataError, match="time step 0 is not positive"):
+        mat(tmp_path, step, R=radius, deltat=0.0)
+
+
+def test_bad_mat(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="field 'R' is not in the file; the vectors are: Rnew, t"):
+        mat(tmp_path, Rnew=np.ones(4), t=np.arange(4.0), image=np.ones((3, 3)))
+    with pytest.raises(DataError, match="field 'R' is not a row or column of real numbers"):
+        mat(tmp_path, R=np.ones((2, 2)), t=np.arange(4.0))
+    with pytest.raises(DataError, match="5 times but 4 values of 'R'"):
+        mat(tmp_path, R=np.ones(4), t=np.arange(5.0))
+    with pytest.raises(DataError, match="no usable value"):
+        mat(tmp_path, R=np.full(4, np.nan), t=np.arange(4.0))
+    (tmp_path / "text.mat").write_text("t,R\n0,1\n")
+    with pytest.raises(DataError, match="not a MATLAB v5 file"):
+        read_series(tmp_path / "text.mat", TIME, RADIUS)
+    header = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
+    (tmp_path / "hdf.mat").write_bytes(header + b"\x00" * 400 + b"\x89HDF\r\n\x1a\n")
+    with pytest.raises(DataError, match=r"v7\.3"):
+        read_series(tmp_path / "hdf.mat", TIME, RADIUS)
+    whole = (tmp_path / "a.mat").read_bytes()
+    (tmp_path / "cut.mat").write_bytes(whole[: len(whole) - 60])
+    with pytest.raises(DataError, match="not a MATLAB v5 file"):
+        read_series(tmp_path / "cut.mat", TIME, RADIUS)

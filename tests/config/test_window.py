@@ -1,0 +1,50 @@
+"""The window: extrema that noise does not move, times, and what is refused."""
+
+import numpy as np
+import pytest
+
+from en4dvar.errors import DataError
+from en4dvar.units import UnitError
+from en4dvar.window import Instant, minima, parse_instant, select
+
+T = np.linspace(0.0, 4.0, 161)
+BOUNCES = 1.0 + np.exp(-0.4 * T) * np.abs(np.cos(np.pi * (T - 0.5)))  # cusps at 1, 2, 3, 4
+
+
+def cut(values: np.ndarray, start: str, end: str, prominence: float = 0.1) -> tuple[float, float]:
+    window = select(T, values, parse_instant(start, "s", ("R",)), parse_instant(end, "s"), prominence)
+    return float(T[window][0]), float(T[window][-1])
+
+
+def test_extrema() -> None:
+    peak = float(T[np.argmax(BOUNCES)])
+    assert cut(BOUNCES, "maximum", "minimum 2") == (peak, 2.0)
+    assert cut(BOUNCES, "R_max", "minimum") == (peak, 1.0)
+    assert cut(BOUNCES, "minimum 1", "minimum 2") == (1.0, 3.0)  # counted after the window's start
+    assert cut(BOUNCES, "start", "end") == (0.0, 4.0)
+
+
+def test_noise_makes_no_minimum() -> None:
+    rng = np.random.default_rng(1)
+    noisy = BOUNCES + 0.02 * rng.standard_normal(len(T))
+    assert len(minima(noisy, 1e-6)) > 20
+    assert np.allclose(T[minima(noisy)], [1.0, 2.0, 3.0], atol=0.05)
+
+
+def test_times_include_both_ends() -> None:
+    assert cut(BOUNCES, "500 ms", "1 s") == (0.5, 1.0)
+    assert cut(BOUNCES, "0.51 s", "0.99 s") == pytest.approx((0.525, 0.975))
+    assert cut(BOUNCES, "0.975 s", "0.975 s") == pytest.approx((0.975, 0.975))  # stored as 0.9750000000000001
+
+
+def test_refused() -> None:
+    with pytest.raises(DataError, match="asks for minimum 4, but only 3 minima with a prominence of 10%"):
+        cut(BOUNCES, "start", "minimum 4")
+    with pytest.raises(DataError, match="empty"):
+        cut(BOUNCES, "3 s", "2 s")
+    with pytest.raises(DataError, match="empty"):
+        cut(BOUNCES, "5 s", "6 s")
+    assert parse_instant("minimum 3", "s") == Instant("minimum", 3)
+    for text in ("R_max", "minimum 0", "minimum two", "3", "3 m", 3.0):
+        with pytest.raises(UnitError):
+            parse_instant(text, "s")
