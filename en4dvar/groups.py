@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from en4dvar.diagnostics import nrmse
 from en4dvar.problem import Analysis
 from en4dvar.state import Array, Parameter
 
@@ -66,11 +67,6 @@ def netcdf_attributes(attributes: Mapping[Any, Any]) -> dict[str, Any]:
         return value if isinstance(value, str | int | float | np.number | np.ndarray) else str(value)
 
     return {str(key): plain(value) for key, value in attributes.items()}
-
-
-def nrmse(observed: Array, predicted: Array) -> float:
-    """Goodness of fit 1 − ‖y − ŷ‖/‖y − ȳ‖: 1 is perfect, 0 no better than the mean of the data."""
-    return float(1.0 - np.linalg.norm(observed - predicted) / np.linalg.norm(observed - observed.mean()))
 
 
 def active_members(failures: Sequence[str]) -> npt.NDArray[np.bool_]:
@@ -179,6 +175,7 @@ def _sample_stats(a: Analysis) -> xr.Dataset:
         "chi2_per_observation": last.chi2_per_observation,
         "cost": last.cost,
         "dfs": last.dfs,
+        "log_evidence": a.log_evidence,
         "n_iterations": len(a.iterations),
         "converged": a.converged,
         "stop_reason": a.stop_reason,

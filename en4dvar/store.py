@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from en4dvar.errors import OutputError
+from en4dvar.files import atomic_path
 from en4dvar.groups import build_tree
 from en4dvar.problem import Analysis
 from en4dvar.state import Array
@@ -60,27 +60,27 @@ class Result:
     @property
     def prior(self) -> xr.Dataset:
         """Parameters (chain, draw) before the data."""
-        return self.tree["prior"].to_dataset()
+        return self.dataset("prior")
 
     @property
     def posterior(self) -> xr.Dataset:
         """Parameters (chain, draw) given the data."""
-        return self.tree["posterior"].to_dataset()
+        return self.dataset("posterior")
 
     @property
     def observed_data(self) -> xr.Dataset:
         """Observations (time), their error std and weights."""
-        return self.tree["observed_data"].to_dataset()
+        return self.dataset("observed_data")
 
     @property
     def sample_stats(self) -> xr.Dataset:
         """Members alive and reasons (chain, draw), centre and DFS (parameter); scalars of the fit as attributes."""
-        return self.tree["sample_stats"].to_dataset()
+        return self.dataset("sample_stats")
 
     @property
     def iterations(self) -> xr.Dataset:
         """J and its terms (iteration), parameters (iteration, draw)."""
-        return self.tree["iterations"].to_dataset()
+        return self.dataset("iterations")
 
     @property
     def attributes(self) -> Mapping[Hashable, Any]:
@@ -95,16 +95,20 @@ class Result:
     @property
     def observable(self) -> str:
         """Name of the observed quantity."""
-        return str(next(iter(self.tree["log_likelihood"].data_vars)))
+        return str(next(iter(self.dataset("log_likelihood").data_vars)))
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the assimilation found worth a warning."""
         return tuple(str(self.tree.attrs["warnings"]).splitlines())
 
+    def dataset(self, group: str) -> xr.Dataset:
+        """A group of the file, e.g. ``"prior_predictive"``."""
+        return self.tree.children[group].to_dataset()
+
     def members(self, group: str, name: str) -> Array:
         """(N',) finite values of a parameter in ``group`` (prior or posterior), display unit, members in order."""
-        variable = self.tree[group][name]
+        variable = self.dataset(group)[name]
         values = np.asarray(variable.values, dtype=float).ravel()
         values = convert(values, variable.attrs["units"], variable.attrs["display_units"])
         alive = self.sample_stats["active"].values.ravel() if group == "posterior" else True
@@ -156,23 +160,9 @@ def _moments(values: Array) -> tuple[float, float]:
 
 def save(result: Result, path: str | Path) -> Path:
     """Write ``path`` (NETCDF4); it appears complete or not at all. Raises :class:`OutputError`."""
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        partial.touch(exist_ok=False)  # an unwritable place gives the system's reason, not netCDF's guess
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from None
-    try:
+    with atomic_path(path) as partial:
         result.tree.to_netcdf(partial, format="NETCDF4", engine="netcdf4")
-        _fsync(partial)
-        partial.replace(path)
-        if os.name == "posix":  # elsewhere a directory cannot be opened
-            _fsync(path.parent)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from None
-    finally:
-        partial.unlink(missing_ok=True)
-    return path
+    return Path(path)
 
 
 def load_result(path: str | Path) -> Result:
@@ -190,11 +180,3 @@ def load_result(path: str | Path) -> Result:
     if missing:
         raise OutputError(f"{path}: not a result of en4dvar: no group {', '.join(missing)}")
     return Result(xr.DataTree.from_dict(nodes))
-
-
-def _fsync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

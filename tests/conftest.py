@@ -105,12 +105,12 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
     return replace(analysis, **changes)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_analysis() -> Callable[..., Analysis]:
     """``make_analysis(n_members=24, **fields)``: deterministic, member 3 failed in the posterior forecast."""
     return _analysis
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def analysis() -> Analysis:
     return _analysis()

@@ -1,0 +1,48 @@
+"""Files that appear complete or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from en4dvar.errors import OutputError
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """A partial file beside ``path`` to write to; on leaving it is flushed to disk and renamed to ``path``.
+
+    Where the block raises, ``path`` stays as it was and the partial file is removed. An operating-system error becomes
+    an :class:`OutputError` that names ``path``.
+    """
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        partial.touch()  # an unwritable place gives the system's reason here, not a library's guess later
+        yield partial
+        _fsync(partial)
+        partial.replace(path)
+        if os.name == "posix":  # elsewhere a directory cannot be opened
+            _fsync(path.parent)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from None
+    finally:
+        if partial.exists():
+            partial.unlink()
+
+
+def write_text(path: str | Path, text: str) -> Path:
+    """Write ``text`` (UTF-8) atomically. Raises :class:`OutputError`."""
+    with atomic_path(path) as partial:
+        partial.write_text(text, encoding="utf-8", newline="\n")
+    return Path(path)
+
+
+def _fsync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

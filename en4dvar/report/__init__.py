@@ -1,0 +1,63 @@
+"""A run directory's netCDF → figures (PDF and PNG), ``summary.csv`` and one self-contained ``report.html``.
+
+Nothing is recomputed: whatever is shown was stored by the run.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable
+from dataclasses import fields
+from pathlib import Path
+
+from en4dvar.errors import OutputError
+from en4dvar.files import write_text
+from en4dvar.report.figures import all_figures
+from en4dvar.report.page import Section, make_section, render
+from en4dvar.report.style import save_figure
+from en4dvar.store import ParameterSummary, Result, load_result
+
+
+def write_report(run_dir: str | Path) -> Path:
+    """Write the report of a run and return the path of ``report.html``.
+
+    Reads ``datasets/*.nc`` where the run has several data sets, else ``posterior.nc``. Raises
+    :class:`~en4dvar.errors.OutputError` where there is nothing to read or the directory cannot be written.
+    """
+    run_dir = Path(run_dir)
+    paths = sorted((run_dir / "datasets").glob("*.nc")) or [run_dir / "posterior.nc"]
+    if not run_dir.is_dir():
+        raise OutputError(f"{run_dir}: no such run directory")
+    results = [load_result(path) for path in paths]
+    folder = run_dir / "figures"
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be created: {error.strerror}") from None
+    sections: list[Section] = []
+    for path, result in zip(paths, results, strict=True):
+        prefix = f"{_slug(path.stem)}_" if len(paths) > 1 else ""
+        figures = list(all_figures(result))
+        for name, _, figure in figures:
+            save_figure(figure, folder, f"{prefix}{name}")
+        sections.append(make_section(result, f"d{len(sections)}", figures))
+    write_text(run_dir / "summary.csv", summary_csv(results))
+    return write_text(run_dir / "report.html", render(sections))
+
+
+def summary_csv(results: Iterable[Result]) -> str:
+    """One line a data set and parameter, in display units, every digit kept."""
+    columns = [f.name for f in fields(ParameterSummary) if f.name not in ("label", "symbol")]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["dataset", *columns])
+    for result in results:
+        for row in result.summary():
+            writer.writerow([result.name, *(getattr(row, column) for column in columns)])
+    return text.getvalue()
+
+
+def _slug(name: str) -> str:
+    return re.sub(r"[^\w.-]+", "_", name)

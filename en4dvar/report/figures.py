@@ -1,0 +1,237 @@
+"""The figures of a report, each a pure function Result → Figure in display units, readable at column width (8.5 cm)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from en4dvar.report.style import COLUMN, LIGHT, PAGE, styled
+from en4dvar.report.text import plus_minus, pretty_unit, with_unit
+from en4dvar.state import Array
+from en4dvar.store import Result
+from en4dvar.units import convert
+
+MAX_PAIRS = 6
+
+
+@styled
+def histograms(result: Result) -> Figure:
+    """Posterior over prior, one panel a parameter scaled to its peak. Bar: 5–95 %, ticks: members, line: centre."""
+    rows = result.summary()
+    figure, panels = _panels(len(rows), height=3.6 / 2.54)
+    for ax, row in zip(panels, rows, strict=True):
+        prior, posterior = result.members("prior", row.name), result.members("posterior", row.name)
+        _histogram(ax, prior, "prior", alpha=0.35)
+        _histogram(ax, posterior, "posterior", alpha=0.6)
+        ax.plot(posterior, np.full(posterior.shape, -0.06), "|", color=LIGHT["posterior"], ms=3, mew=0.5)
+        ax.plot([row.q05, row.q95], [1.07, 1.07], color=LIGHT["posterior"], lw=2, solid_capstyle="butt")
+        ax.axvline(row.centre, ymax=0.85, color=LIGHT["centre"], lw=0.9, ls="--")
+        ax.set(yticks=[], ylim=(-0.14, 1.2), xlabel=with_unit(row.symbol, row.unit), xlim=_reach(prior, posterior))
+        ax.set_title(f"{plus_minus(row.mean, row.std)} {pretty_unit(row.unit)}".rstrip(), color=LIGHT["posterior"])
+        ax.spines["left"].set_visible(False)
+        ax.xaxis.set_major_locator(MaxNLocator(4))
+    return figure
+
+
+@styled
+def history(result: Result) -> Figure:
+    """Data ± std, prior and posterior predictive bands (50 and 90 %), the centre; below, residuals over their std."""
+    name = result.observable
+    variable = result.observed_data[name]
+    time, data = _shown(result, "time"), _display(variable.values, variable.attrs)
+    std = _display(result.observed_data[f"{name}_std"].values, variable.attrs)
+    centre = _display(result.sample_stats[f"{name}_centre"].values, variable.attrs)
+    figure = Figure(figsize=(COLUMN, 9.5 / 2.54), layout="constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
+    _band(top, result, "prior_predictive", (0.05, 0.95), "prior", 0.28, "prior 90 %")
+    _band(top, result, "posterior_predictive", (0.05, 0.95), "posterior", 0.3, "posterior 90 %")
+    _band(top, result, "posterior_predictive", (0.25, 0.75), "posterior", 0.6, "posterior 50 %")
+    size = 2.2 if len(time) <= 150 else 1.2
+    top.errorbar(time, data, std, fmt="o", ms=size, lw=0.6, color=LIGHT["ink"], label="data ± std", zorder=4)
+    top.plot(time, centre, lw=0.9, color=LIGHT["centre"], label="centre", zorder=3)
+    attrs = variable.attrs
+    label = str(attrs["long_name"]).removesuffix(", observed")
+    label = label if label == attrs["symbol"] else f"{label} {attrs['symbol']}"
+    top.set_ylabel(with_unit(label, attrs["display_units"]))
+    top.set_ylim(_data_range(data, std))
+    top.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, columnspacing=1.2, handlelength=1.4)
+    residual = (data - centre) / std
+    for limit, alpha in ((2, 0.12), (1, 0.16)):
+        bottom.axhspan(-limit, limit, color=LIGHT["posterior"], alpha=alpha, lw=0)
+    bottom.axhline(0, color=LIGHT["muted"], lw=0.6)
+    bottom.plot(time, residual, "o", ms=size, color=LIGHT["ink"])
+    reach = 1.15 * max(3.0, float(np.max(np.abs(residual))))
+    span = time[-1] - time[0]
+    bottom.set(ylim=(-reach, reach), ylabel="residual / std", xlim=(time[0] - 0.03 * span, time[-1] + 0.03 * span))
+    bottom.set_yticks([-2, 0, 2])
+    bottom.set_xlabel(with_unit("time", result.observed_data["time"].attrs["display_units"]))
+    return figure
+
+
+@styled
+def cost(result: Result) -> Figure:
+    """J and its two terms over the iterations; logarithmic where J falls by more than a factor of 20."""
+    steps = result.iterations["iteration"].values
+    figure = Figure(figsize=(COLUMN, 5.4 / 2.54), layout="constrained")
+    ax = figure.subplots()
+    lines = (
+        ("J", "$J$", "ink", "o-"),
+        ("J_observation", "$J_o$ observations", "posterior", "s--"),
+        ("J_background", "$J_b$ background", "background", "^:"),
+    )
+    for key, label, colour, marker in lines:
+        ax.plot(steps, result.iterations[key].values, marker, ms=3, color=LIGHT[colour], label=label)
+    total = result.iterations["J"].values
+    if total.min() > 0 and total.max() > 20 * total.min():
+        ax.set_yscale("log", nonpositive="mask")
+    ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+    ax.set(xlabel="iteration", ylabel="cost")
+    ax.grid(axis="y", lw=0.5)
+    ax.legend()
+    return figure
+
+
+@styled
+def traces(result: Result) -> Figure:
+    """Each parameter over the iterations: mean ± std of the ensemble the iterate describes, and its centre."""
+    rows = result.summary()
+    steps = result.iterations["iteration"].values
+    figure, panels = _panels(len(rows), height=3.4 / 2.54)
+    for ax, row in zip(panels, rows, strict=True):
+        members = _display(result.iterations[row.name].values, result.iterations[row.name].attrs)
+        centre = _display(result.iterations[f"{row.name}_centre"].values, result.iterations[row.name].attrs)
+        alive = np.isfinite(members).all(axis=0)
+        if alive.sum() > 1:
+            mean, std = members[:, alive].mean(axis=1), members[:, alive].std(axis=1, ddof=1)
+            ax.fill_between(steps, mean - std, mean + std, color=LIGHT["posterior"], alpha=0.3, lw=0)
+            ax.plot(steps, mean, color=LIGHT["posterior"])
+        ax.plot(steps, centre, "--", color=LIGHT["centre"], lw=0.9)
+        ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+        ax.yaxis.set_major_locator(MaxNLocator(4))
+        ax.set(xlabel="iteration", ylabel=with_unit(row.symbol, row.unit))
+    return figure
+
+
+@styled
+def pairs(result: Result) -> Figure:
+    """Posterior members of every pair of parameters; above the diagonal their correlation."""
+    rows = result.summary()
+    n = len(rows)
+    values = {row.name: _alive(result, row.name) for row in rows}
+    side = max(COLUMN, min(PAGE, n * 2.7 / 2.54))
+    figure = Figure(figsize=(side, side), layout="constrained")
+    grid = figure.subplots(n, n, squeeze=False)
+    for i, row in enumerate(rows):
+        for j, column in enumerate(rows):
+            _pair(grid[i, j], i, j, values[column.name], values[row.name])
+            if i == n - 1:
+                grid[i, j].set_xlabel(with_unit(column.symbol, column.unit))
+            if j == 0 and i > 0:
+                grid[i, j].set_ylabel(with_unit(row.symbol, row.unit))
+            grid[i, j].tick_params(labelbottom=i == n - 1, labelleft=j == 0 and i > 0)
+    figure.align_labels()
+    return figure
+
+
+def all_figures(result: Result) -> Iterator[tuple[str, str, Figure]]:
+    """(file name, caption, figure) of everything that the result has enough members for."""
+    yield (
+        "posterior",
+        "Posterior (blue) over prior (grey), each scaled to its peak. Bar: 5–95 % of the posterior; ticks: members; "
+        "dashed: the centre, where J is smallest.",
+        histograms(result),
+    )
+    yield (
+        "history",
+        "Data with their standard deviation, noise-free predictions of the prior and posterior ensembles (bands hold "
+        "50 and 90 % of the members) and of the centre (line through its values at the observation times). Below: "
+        "residual of the centre over its standard deviation.",
+        history(result),
+    )
+    yield "cost", "The cost J and its two terms at the iterate that starts each iteration.", cost(result)
+    yield "iterations", "Parameters over the iterations: ensemble mean ± std (blue), centre (dashed).", traces(result)
+    if 2 <= len(result.summary()) <= MAX_PAIRS and _alive(result, result.summary()[0].name).size > 2:
+        yield "pairs", "Posterior members in pairs of parameters; above the diagonal the correlation.", pairs(result)
+
+
+def _panels(n: int, height: float) -> tuple[Figure, list[Axes]]:
+    """``n`` axes in two columns at column width; surplus axes removed."""
+    rows = -(-n // 2)
+    figure = Figure(figsize=(COLUMN, rows * height), layout="constrained")
+    grid = figure.subplots(rows, 2 if n > 1 else 1, squeeze=False).ravel()
+    for ax in grid[n:]:
+        ax.remove()
+    return figure, list(grid[:n])
+
+
+def _histogram(ax: Axes, values: Array, colour: str, alpha: float) -> None:
+    if values.size < 2 or np.ptp(values) == 0:
+        for value in values[:1]:
+            ax.axvline(value, ymax=0.85, color=LIGHT[colour], alpha=alpha, lw=2)
+        return
+    bins = int(np.clip(np.ceil(2 * values.size ** (1 / 3)), 6, 30))  # Rice's rule
+    counts, edges = np.histogram(values, bins)
+    ax.stairs(counts / counts.max(), edges, fill=True, color=LIGHT[colour], alpha=alpha)
+    ax.stairs(counts / counts.max(), edges, color=LIGHT[colour], lw=0.8)
+
+
+def _reach(prior: Array, posterior: Array) -> tuple[float | None, float | None]:
+    """Limits that hold the posterior and 90 % of the prior: a long tail of the prior does not flatten the picture."""
+    ends = [*np.quantile(prior, (0.05, 0.95)), *posterior] if prior.size else list(posterior)
+    low, high = (min(ends), max(ends)) if ends else (0.0, 0.0)
+    margin = 0.05 * (high - low)
+    return (low - margin, high + margin) if margin > 0 else (None, None)
+
+
+def _display(values: Any, attrs: Mapping[Any, Any]) -> Array:
+    return convert(np.asarray(values, dtype=float), attrs["units"], attrs["display_units"])
+
+
+def _shown(result: Result, coordinate: str, group: str = "observed_data") -> Array:
+    variable = result.dataset(group)[coordinate]
+    return _display(variable.values, variable.attrs)
+
+
+def _band(
+    ax: Axes, result: Result, group: str, levels: tuple[float, float], colour: str, alpha: float, label: str
+) -> None:
+    path = result.dataset(group)[f"{result.observable}_path"]
+    values = _display(path.values[0], path.attrs)
+    seen = np.isfinite(values).any(axis=0)
+    if not seen.any():
+        return
+    low, high = np.nanquantile(values[:, seen], levels, axis=0)
+    time = _shown(result, "path_time", group)[seen]
+    ax.fill_between(time, low, high, color=LIGHT[colour], alpha=alpha, lw=0, label=label)
+
+
+def _data_range(data: Array, std: Array) -> tuple[float, float]:
+    """Limits of the data with room around: a wide prior must not shrink them to a line."""
+    low, high = float((data - std).min()), float((data + std).max())
+    return low - 0.12 * (high - low), high + 0.25 * (high - low)
+
+
+def _alive(result: Result, name: str) -> Array:
+    return result.members("posterior", name)
+
+
+def _pair(ax: Axes, i: int, j: int, x: Array, y: Array) -> None:
+    ax.xaxis.set_major_locator(MaxNLocator(3))
+    ax.yaxis.set_major_locator(MaxNLocator(3))
+    if i == j:
+        _histogram(ax, x, "posterior", alpha=0.6)
+        ax.set_yticks([])
+        ax.spines["left"].set_visible(False)
+    elif i > j:
+        ax.plot(x, y, "o", ms=2, color=LIGHT["posterior"], alpha=0.7, mew=0)
+    else:
+        ax.set_axis_off()
+        known = np.ptp(x) > 0 and np.ptp(y) > 0
+        correlation = float(np.corrcoef(x, y)[0, 1]) if known else float("nan")
+        text = f"{correlation:+.2f}".replace("-", "−") if known else "–"
+        ax.text(0.5, 0.5, text, ha="center", va="center", transform=ax.transAxes)

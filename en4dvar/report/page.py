@@ -1,0 +1,199 @@
+"""What the report page says: results turned into rows, sentences and figures for the template."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from en4dvar.groups import ITERATION_SCALARS
+from en4dvar.report.style import DARK, LIGHT, css_variables, inline_svg
+from en4dvar.report.text import (
+    DFS_WORDS,
+    number_like,
+    plain_number,
+    plus_minus,
+    pretty_unit,
+    symbol_html,
+    words_for,
+)
+from en4dvar.store import ParameterSummary, Result
+from en4dvar.units import convert
+
+PROVENANCE = (
+    "history", "date_created", "seed", "data_source", "git_commit", "configuration_file", "configuration_git_commit",
+    "package_versions", "python_version", "platform", "cpu", "institution", "references", "Conventions",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Section:
+    """One data set on the page: ``figures`` are (identifier, caption, SVG)."""
+
+    anchor: str
+    result: Result
+    figures: Sequence[tuple[str, str, Markup]]
+
+    @property
+    def name(self) -> str:
+        return self.result.name
+
+    @property
+    def stats(self) -> dict[Any, Any]:
+        return self.result.sample_stats.attrs
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The table of parameters, as text."""
+        return [_row(row) for row in self.result.summary()]
+
+    @property
+    def verdicts(self) -> list[tuple[str, str, str, bool]]:
+        """(quantity, value, in plain words, needs attention) for the tiles on top."""
+        s = self.stats
+        alive, members = int(s["n_active"]), int(s["n_members"])
+        chi2_words, chi2_odd = judge_chi2(float(s["chi2_per_observation"]), int(s["n_observations"]))
+        nrmse = float(s["nrmse"])
+        ended = "by its own criterion" if s["converged"] else "not converged"
+        return [
+            ("Fit, NRMSE", plain_number(nrmse, 3), "1 is perfect, 0 is no better than a constant", not nrmse >= 0.9),
+            ("χ² per observation", plain_number(float(s["chi2_per_observation"]), 3), chi2_words, chi2_odd),
+            (
+                "Information, DFS",
+                plain_number(float(s["dfs"]), 3),
+                f"of {len(self.result.posterior.data_vars)} parameters determined by the data",
+                False,
+            ),
+            ("Members alive", f"{alive} of {members}", "of the posterior ensemble", alive < members),
+            ("Iterations", str(s["n_iterations"]), f"{ended}: {s['stop_reason']}", not s["converged"]),
+        ]
+
+    @property
+    def warnings(self) -> list[str]:
+        """The assimilation's own warnings, then what the table says in a sentence."""
+        return [*self.result.warnings, *parameter_notes(self.result)]
+
+    @property
+    def failures(self) -> list[tuple[int, str]]:
+        """(member, reason) of every member that did not survive."""
+        reasons = self.result.sample_stats["failure_reason"].values.ravel()
+        return [(i, str(reason)) for i, reason in enumerate(reasons) if reason]
+
+    @property
+    def fixed(self) -> list[tuple[Markup, str, str, str]]:
+        """(symbol, label, value, unit) of the values held fixed."""
+        shown = []
+        for variable in self.result.dataset("constant_data").data_vars.values():
+            a = variable.attrs
+            unit = a.get("display_units", a["units"])
+            value = convert(float(variable), a["units"], unit)
+            shown.append((symbol_html(a["symbol"]), a["long_name"], plain_number(value, 6), pretty_unit(unit)))
+        return shown
+
+    @property
+    def iterations(self) -> list[list[str]]:
+        """One line an iteration: index, J, terms, step, χ²/Ky, DFS, spread, members."""
+        table = self.result.iterations
+        keys = [key for key in ITERATION_SCALARS if key != "active"]
+        return [
+            [
+                str(int(table["iteration"][i])),
+                *(plain_number(float(table[key][i])) for key in keys),
+                str(int(table["active"][i])),
+            ]
+            for i in range(table.sizes["iteration"])
+        ]
+
+    @property
+    def settings(self) -> list[tuple[str, str]]:
+        """The scheme's settings and how observations are weighted."""
+        given = json.loads(str(self.result.attributes["assimilation_settings"]))
+        weights = self.result.observed_data["weights"].values
+        total = f"{len(weights)} observations, weights sum to {plain_number(float(weights.sum()))}"
+        return [*((key.replace("_", " "), str(value)) for key, value in given.items()), ("observations", total)]
+
+    @property
+    def provenance(self) -> list[tuple[str, str]]:
+        attrs = self.result.attributes
+        return [(key.replace("_", " "), str(attrs[key])) for key in PROVENANCE if str(attrs.get(key, ""))]
+
+    @property
+    def configuration(self) -> str:
+        return str(self.result.attributes.get("configuration", ""))
+
+
+def _row(row: ParameterSummary) -> dict[str, Any]:
+    return {
+        "symbol": symbol_html(row.symbol),
+        "label": row.label,
+        "unit": pretty_unit(row.unit),
+        "prior": plus_minus(row.prior_mean, row.prior_std),
+        "posterior": plus_minus(row.mean, row.std),
+        "mean": number_like(row.mean, row.std),
+        "std": number_like(row.std, row.std),
+        "quantiles": [number_like(q, row.std) for q in (row.q05, row.q50, row.q95)],
+        "centre": number_like(row.centre, row.std),
+        "dfs": f"{100 * row.dfs:.0f} %" if math.isfinite(row.dfs) else "–",
+        "share": min(max(row.dfs, 0.0), 1.0) if math.isfinite(row.dfs) else 0.0,
+        "hint": words_for(row.dfs, DFS_WORDS),
+    }
+
+
+def judge_chi2(chi2: float, n_observations: int) -> tuple[str, bool]:
+    """In plain words what χ² per observation says, and whether it is far from 1 (three std, at least 0.5)."""
+    far = max(0.5, 3 * math.sqrt(2 / n_observations))
+    if not math.isfinite(chi2):
+        return "cannot be told", True
+    if chi2 > 1 + far:
+        return "misfit exceeds the stated noise: model or noise is wrong", True
+    if chi2 < 1 - far:
+        return "misfit is below the stated noise: the noise may be overstated", True
+    return "misfit agrees with the stated noise", False
+
+
+def parameter_notes(result: Result) -> list[str]:
+    """A sentence for every parameter that the data do not inform, or whose posterior left the prior's central 95 %."""
+    notes = []
+    for row in result.summary():
+        low, high = np.quantile(result.members("prior", row.name), (0.025, 0.975))
+        if row.dfs < DFS_WORDS[0][0]:
+            notes.append(f"{row.label} ({row.name}): the data say nothing about it; its posterior is the prior.")
+        if row.q50 < low or row.q50 > high:
+            notes.append(
+                f"{row.label} ({row.name}): posterior at odds with the prior; "
+                "its median lies outside the prior's central 95 %."
+            )
+    return notes
+
+
+def make_section(result: Result, anchor: str, figures: Sequence[tuple[str, str, Figure]]) -> Section:
+    """A section with its figures (name, caption, Figure) drawn as inline SVG."""
+
+    def draw(name: str, caption: str, figure: Figure) -> tuple[str, str, Markup]:
+        return name, caption, Markup(inline_svg(figure, f"{anchor}-{name}", caption))
+
+    return Section(anchor, result, [draw(*figure) for figure in figures])
+
+
+def render(sections: Sequence[Section]) -> str:
+    """The page as one HTML text. Everything that comes from data or configuration is escaped."""
+    environment = Environment(
+        loader=PackageLoader("en4dvar.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("template.html.j2").render(
+        title=sections[0].name if len(sections) == 1 else f"{len(sections)} data sets",
+        sections=sections,
+        light=Markup(css_variables(LIGHT)),
+        dark=Markup(css_variables(DARK)),
+    )

@@ -1,0 +1,114 @@
+"""How figures look and how they are written: PDF and PNG on white, inline SVG that follows light and dark schemes.
+
+Figures are drawn with the object interface in the light palette. In the page each colour of the palette becomes a CSS
+variable, so one drawing serves both schemes. The palette is Okabe & Ito's (safe for colour-blind readers).
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+from matplotlib import style
+from matplotlib.figure import Figure
+
+from en4dvar.files import atomic_path
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+LIGHT = {
+    "paper": "#ffffff",
+    "ink": "#1b1b1f",
+    "muted": "#63636c",
+    "grid": "#dcdce2",
+    "prior": "#85858f",
+    "posterior": "#0072b2",
+    "centre": "#d55e00",
+    "background": "#009e73",
+}
+DARK = {
+    "paper": "#16161a",
+    "ink": "#ececf0",
+    "muted": "#a9a9b4",
+    "grid": "#3b3b44",
+    "prior": "#9c9ca8",
+    "posterior": "#56b4e9",
+    "centre": "#ff9f5a",
+    "background": "#2fd0a2",
+}
+COLUMN = 8.5 / 2.54  # inches: one journal column
+PAGE = 17.5 / 2.54
+
+RC: dict[str, Any] = {
+    "font.size": 8,
+    "axes.labelsize": 8,
+    "axes.titlesize": 8,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "lines.linewidth": 1.1,
+    "text.color": LIGHT["ink"],
+    "axes.labelcolor": LIGHT["ink"],
+    "axes.titlecolor": LIGHT["ink"],
+    "axes.edgecolor": LIGHT["muted"],
+    "xtick.color": LIGHT["muted"],
+    "ytick.color": LIGHT["muted"],
+    "xtick.labelcolor": LIGHT["ink"],
+    "ytick.labelcolor": LIGHT["ink"],
+    "grid.color": LIGHT["grid"],
+    "svg.fonttype": "path",
+    "svg.hashsalt": "en4dvar",
+    "pdf.fonttype": 42,
+}
+
+
+def styled(draw: Callable[P, T]) -> Callable[P, T]:
+    """Run ``draw`` in the report's style, whatever style the caller's process has."""
+
+    @wraps(draw)
+    def inside(*args: P.args, **kwargs: P.kwargs) -> T:
+        with style.context(["default", RC]):
+            return draw(*args, **kwargs)
+
+    return inside
+
+
+@styled
+def save_figure(figure: Figure, folder: Path, name: str) -> None:
+    """``folder/name.pdf`` (vectors) and ``folder/name.png`` (200 dots an inch), undated, each by atomic rename."""
+    with atomic_path(folder / f"{name}.pdf") as partial:
+        figure.savefig(partial, format="pdf", metadata={"CreationDate": None})
+    with atomic_path(folder / f"{name}.png") as partial:
+        figure.savefig(partial, format="png", dpi=200, metadata={"Software": None})
+
+
+@styled
+def inline_svg(figure: Figure, name: str, description: str) -> str:
+    """The figure as an ``<svg>`` element: identifiers unique by ``name``, colours as CSS variables, no addresses."""
+    buffer = io.StringIO()
+    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    figure.savefig(buffer, format="svg", transparent=True, metadata=nothing)
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", svg).replace("xlink:href", "href")
+    svg = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{name}-", svg)
+    for colour, code in LIGHT.items():
+        svg = svg.replace(code, f"var(--{colour})")
+    width, height = figure.get_size_inches()
+    label = description.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
+    head = f'<svg role="img" aria-label="{label}" viewBox="0 0 {width * 72:g} {height * 72:g}"'
+    return re.sub(r"^<svg[^>]*", head, svg, count=1)
+
+
+def css_variables(palette: dict[str, str]) -> str:
+    """Declarations of the palette for a CSS rule."""
+    return " ".join(f"--{name}: {code};" for name, code in palette.items())

@@ -1,0 +1,100 @@
+"""Numbers, units and symbols as people read them. Pure functions of strings and floats."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from markupsafe import Markup, escape
+
+_SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+_NAMES = (
+    "alpha beta gamma delta epsilon zeta eta theta kappa lambda mu nu xi rho sigma tau phi chi psi omega pi infty "
+    "Gamma Delta Theta Lambda Sigma Phi Psi Omega"
+)
+_GREEK = dict(zip(_NAMES.split(), "αβγδεζηθκλμνξρστφχψωπ∞ΓΔΘΛΣΦΨΩ", strict=True))
+
+Words = tuple[tuple[float, str], ...]
+DFS_WORDS: Words = (
+    (0.1, "data say nothing"),
+    (0.5, "weakly informed"),
+    (0.9, "informed"),
+    (math.inf, "determined by the data"),
+)
+
+
+def pretty_unit(unit: str) -> str:
+    """``"um"`` → ``"µm"``, ``"Pa s"`` → ``"Pa·s"``, ``"J/m^2"`` → ``"J/m²"``, ``"1"`` → ``""``.
+
+    >>> pretty_unit("um"), pretty_unit("Pa s"), pretty_unit("J/m^2"), pretty_unit("1"), pretty_unit("m s-1")
+    ('µm', 'Pa·s', 'J/m²', '', 'm·s⁻¹')
+    """
+    if unit == "1":
+        return ""
+    text = re.sub(r"(?<![A-Za-z])u(?=[A-Za-z])", "µ", unit.strip())
+    text = re.sub(r"(?<=[A-Za-zµ])(?:\^|\*\*)?(-?\d+)", lambda m: m[1].translate(_SUPERSCRIPT), text)
+    return re.sub(r"\s*\*\s*|\s+", "·", text)
+
+
+def with_unit(label: str, unit: str) -> str:
+    """``"shear modulus (kPa)"``; the bare label for a dimensionless quantity."""
+    shown = pretty_unit(unit)
+    return f"{label} ({shown})" if shown else label
+
+
+def decimals(std: float) -> int:
+    """Decimals that show ``std`` with two significant digits."""
+    return max(0, 1 - math.floor(math.log10(std))) if std > 0 and math.isfinite(std) else 3
+
+
+def plain_number(value: float, digits: int = 4) -> str:
+    """``digits`` significant digits; powers of ten only where the number would be long; an en dash for NaN."""
+    if not math.isfinite(value):
+        return "–"
+    text = f"{value:.{digits}g}"
+    if "e" in text:
+        mantissa, exponent = text.split("e")
+        text = f"{mantissa}×10{str(int(exponent)).translate(_SUPERSCRIPT)}"
+    return text.replace("-", "−")
+
+
+def number_like(value: float, std: float) -> str:
+    """``value`` rounded to the precision that ``std`` allows.
+
+    >>> number_like(2.80123, 0.104), number_like(-0.0, 0.1), number_like(float("nan"), 1.0)
+    ('2.80', '0.00', '–')
+    """
+    places = decimals(std)
+    if not math.isfinite(value):
+        return "–"
+    if places > 6 or max(abs(value), abs(std) if math.isfinite(std) else 0.0) >= 1e6:
+        return plain_number(value)
+    text = f"{value:.{places}f}"
+    return text.lstrip("-") if float(text) == 0 else text.replace("-", "−")
+
+
+def plus_minus(mean: float, std: float) -> str:
+    """``"2.80 ± 0.10"``: the spread with two significant digits, the mean to the same decimals."""
+    return f"{number_like(mean, std)} ± {number_like(std, std)}"
+
+
+def words_for(value: float, words: Words) -> str:
+    """The phrase of the first limit above ``value``; empty for NaN."""
+    return next((phrase for limit, phrase in words if value < limit or limit == math.inf), "") if value == value else ""
+
+
+def symbol_html(symbol: str) -> Markup:
+    r"""A mathtext symbol as HTML: Greek letters, sub- and superscripts; everything else is escaped text.
+
+    >>> str(symbol_html(r"$\mu$")), str(symbol_html("$R_0$")), str(symbol_html("<b>"))
+    ('<i>μ</i>', '<i>R</i><sub>0</sub>', '&lt;b&gt;')
+    """
+    if not (len(symbol) > 2 and symbol.startswith("$") and symbol.endswith("$")):
+        return escape(symbol)
+    body = re.sub(r"\\(?:mathrm|text|rm|mathit)\b\s*", "", symbol[1:-1])
+    body = re.sub(r"\\([A-Za-z]+)\s?", lambda m: _GREEK.get(m[1], m[1]), body)
+    pieces = re.findall(r"([_^])(\{[^{}]*\}|.)|([^_^]+)", body)
+    tags = {"_": "sub", "^": "sup", "": "i"}
+    return Markup("").join(
+        Markup(f"<{tags[mark]}>{{}}</{tags[mark]}>").format((index or base).strip("{}")) for mark, index, base in pieces
+    )

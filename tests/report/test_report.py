@@ -1,0 +1,224 @@
+"""The report of a run directory: one HTML file that needs no network and escapes what it is given, figures, a table."""
+
+from __future__ import annotations
+
+import csv
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from en4dvar.errors import OutputError
+from en4dvar.provenance import provenance
+from en4dvar.report import write_report
+from en4dvar.report.page import judge_chi2, parameter_notes
+from en4dvar.store import Result, save
+
+FIGURES = ("posterior", "history", "cost", "iterations", "pairs")
+VOID = {"meta", "link", "br", "img", "path", "use"}
+
+
+@pytest.fixture
+def write_run(tmp_path):
+    def write(analysis, config="name: test\n", file="posterior.nc"):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        save(Result.from_analysis(analysis, provenance(config)), tmp_path / file)
+        return tmp_path
+
+    return write
+
+
+@pytest.fixture
+def run_dir(write_run, analysis):
+    return write_run(analysis)
+
+
+@pytest.fixture(scope="module")
+def reported(analysis, tmp_path_factory):
+    """A run directory with its report, to be read only."""
+    folder = tmp_path_factory.mktemp("run")
+    save(Result.from_analysis(analysis, provenance("name: test\n")), folder / "posterior.nc")
+    write_report(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def html(reported):
+    return (reported / "report.html").read_text(encoding="utf-8")
+
+
+class Page(HTMLParser):
+    """Collects what can go wrong in a page: unbalanced tags, repeated or dangling identifiers, addresses."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.open, self.ids, self.targets, self.faults, self.tags, self.text = [], [], [], [], [], []
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        for key, value in attrs:
+            if key == "id":
+                self.ids.append(value)
+            if key in ("href", "src") and value.startswith("#"):
+                self.targets.append(value[1:])
+            elif key in ("href", "src") and not value.startswith("data:"):
+                self.faults.append(f"address {value}")
+            self.targets += re.findall(r"url\(#([^)]+)\)", value or "")
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        if tag not in VOID and (not self.open or self.open.pop() != tag):
+            self.faults.append(f"</{tag}> closes something else")
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def test_page_is_well_formed_and_self_contained(html):
+    page = Page(html)
+    assert page.faults == []
+    assert page.open == []
+    assert len(page.ids) == len(set(page.ids))
+    assert set(page.targets) <= set(page.ids)
+    assert page.tags.count("svg") == len(FIGURES)
+    assert "script" not in page.tags
+    assert not re.search(r"(?:https?:)?//[\w.-]+\.\w", html)
+    assert "prefers-color-scheme: dark" in html
+
+
+def test_page_says_what_was_estimated_and_how_well(html):
+    result_text = " ".join("".join(Page(html).text).split())
+    for phrase in (
+        "2.80", "kPa", "Pa·s", "µm", "determined by the data", "data say nothing", "collapse too violent",
+        "step norm below 1e-3", "23 of 24", "far-field pressure", "101.325", "name: test",
+    ):  # fmt: skip
+        assert phrase in result_text, phrase
+
+
+def test_colours_follow_the_scheme(html):
+    drawings = re.findall(r"<svg.*?</svg>", html, flags=re.S)
+    assert all("var(--ink)" in drawing for drawing in drawings)
+    literal = {colour for drawing in drawings for colour in re.findall(r"#[0-9a-f]{6}\b", drawing)}
+    assert literal == set(), "a colour that stays the same in the dark scheme"
+
+
+def test_strings_of_data_and_configuration_are_escaped(write_run, analysis):
+    evil = "<script>alert(1)</script>"
+    parameters = (replace(analysis.parameters[0], label=evil), *analysis.parameters[1:])
+    bad = replace(analysis, name=evil, warnings=(evil,), stop_reason=evil, parameters=parameters)
+    html = write_report(write_run(bad, config=f"name: '{evil}'\n")).read_text(encoding="utf-8")
+    assert evil not in html
+    assert html.count("&lt;script&gt;alert(1)") >= 5
+    assert "script" not in Page(html).tags
+
+
+def test_figures_are_drawn_as_pdf_and_png(reported):
+    for name in FIGURES:
+        assert (reported / "figures" / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+        with Image.open(reported / "figures" / f"{name}.png") as image:
+            pixels = np.asarray(image.convert("RGB"), dtype=float)
+        assert pixels.std() > 10, name
+        assert np.unique(pixels.reshape(-1, 3), axis=0).shape[0] > 20, name
+    assert len(list((reported / "figures").iterdir())) == 2 * len(FIGURES)
+
+
+def test_report_is_the_same_every_time(reported):
+    files = sorted(p for p in reported.rglob("*") if p.is_file())
+    before = [p.read_bytes() for p in files]
+    write_report(reported)
+    assert [p.read_bytes() for p in files] == before
+    assert sorted(p for p in reported.rglob("*") if p.is_file()) == files
+
+
+def test_summary_table(reported, analysis):
+    with (reported / "summary.csv").open(encoding="utf-8") as file:
+        rows = {row["name"]: row for row in csv.DictReader(file)}
+    assert list(rows) == [p.name for p in analysis.parameters]
+    alive = np.delete(analysis.posterior[:, 2], 3) * 1e6
+    assert rows["R0"]["unit"] == "um"
+    assert float(rows["R0"]["mean"]) == pytest.approx(alive.mean(), rel=1e-12)
+    assert float(rows["R0"]["q95"]) == pytest.approx(np.quantile(alive, 0.95), rel=1e-12)
+    assert float(rows["R0"]["dfs"]) == pytest.approx(analysis.dfs_per_parameter[2], rel=1e-12)
+
+
+def test_campaign_has_a_section_a_data_set(write_run, make_analysis):
+    for name in ("one", "two"):
+        run_dir = write_run(replace(make_analysis(), name=name), file=f"datasets/{name}.nc")
+    page = Page(write_report(run_dir).read_text(encoding="utf-8"))
+    assert page.faults == []
+    assert len(page.ids) == len(set(page.ids))
+    assert page.tags.count("section") == 2
+    assert (run_dir / "figures" / "two_history.png").is_file()
+    assert (run_dir / "summary.csv").read_text(encoding="utf-8").count("\n") == 9
+
+
+@pytest.mark.parametrize("survivors", [0, 1])
+def test_lost_ensemble_still_gets_a_report(write_run, make_analysis, survivors):
+    base = make_analysis()
+    n = len(base.posterior)
+
+    def lose(values):
+        return np.where(np.arange(n)[:, None] < survivors, values, np.nan)
+
+    dead = replace(
+        base,
+        posterior=lose(base.posterior),
+        posterior_predictions=lose(base.posterior_predictions),
+        posterior_trajectories=lose(base.posterior_trajectories),
+        posterior_failures=tuple("" if i < survivors else "gone" for i in range(n)),
+    )
+    html = write_report(write_run(dead)).read_text(encoding="utf-8")
+    assert f"{survivors} of {n}" in html
+    assert "nan" not in "".join(Page(html).text).split()
+
+
+def test_single_parameter_has_no_pairs(write_run, analysis):
+    one = replace(
+        analysis,
+        parameters=analysis.parameters[:1],
+        prior=analysis.prior[:, :1],
+        posterior=analysis.posterior[:, :1],
+        centre=analysis.centre[:1],
+        dfs_per_parameter=analysis.dfs_per_parameter[:1],
+        iterations=tuple(replace(r, members=r.members[:, :1], centre=r.centre[:1]) for r in analysis.iterations),
+    )
+    run_dir = write_run(one)
+    write_report(run_dir)
+    assert not (run_dir / "figures" / "pairs.pdf").exists()
+    assert (run_dir / "figures" / "posterior.pdf").exists()
+
+
+def test_notes_tell_uninformed_and_displaced_parameters(analysis):
+    shifted = analysis.posterior.copy()
+    shifted[:, 0] *= 10
+    notes = parameter_notes(Result.from_analysis(replace(analysis, posterior=shifted), {}))
+    assert [("at odds" in n, "(G)" in n) for n in notes if "at odds" in n] == [(True, True)]
+    assert ["(R0)" in n for n in notes if "say nothing" in n] == [True]
+
+
+@pytest.mark.parametrize(("chi2", "attention"), [(1.0, False), (1.4, False), (4.0, True), (0.05, True), (np.nan, True)])
+def test_chi2_in_words(chi2, attention):
+    assert judge_chi2(chi2, 40)[1] is attention
+
+
+def test_nothing_to_report_is_one_clear_error(tmp_path):
+    with pytest.raises(OutputError, match="no such run directory"):
+        write_report(tmp_path / "absent")
+    with pytest.raises(OutputError, match=r"posterior\.nc: no such file"):
+        write_report(tmp_path)
+
+
+def test_unwritable_run_directory_is_one_clear_error(run_dir):
+    (run_dir / "figures").write_text("in the way")
+    with pytest.raises(OutputError, match="figures: cannot be created"):
+        write_report(run_dir)
