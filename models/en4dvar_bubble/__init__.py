@@ -1,0 +1,23 @@
+"""A bubble in a viscoelastic medium, driven by an acoustic pulse or released from its maximum radius."""
+
+from en4dvar_bubble.api import simulate
+from en4dvar_bubble.driving import Driving, histotripsy, silence
+from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, get_law
+from en4dvar_bubble.medium import WATER_25C, Medium
+from en4dvar_bubble.model import BubbleModel
+from en4dvar_bubble.solver.driver import ACCURACIES, Accuracy
+
+__all__ = [
+    "ACCURACIES",
+    "REGISTRY",
+    "WATER_25C",
+    "Accuracy",
+    "BubbleModel",
+    "ConstitutiveLaw",
+    "Driving",
+    "Medium",
+    "get_law",
+    "histotripsy",
+    "silence",
+    "simulate",
+]

@@ -1,0 +1,25 @@
+"""Quadratic-law Kelvin–Voigt (QLKV): the Fung model to first order in its stiffening."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from en4dvar.state import Array, Parameter
+from en4dvar_bubble.laws.base import ConstitutiveLaw
+from en4dvar_bubble.laws.parameters import ALPHA, MU, G
+
+
+class QuadraticKelvinVoigt(ConstitutiveLaw):
+    r"""$J = -4\mu\dot R/R + \tfrac{G(3\alpha-1)}2[5 - 4\lambda^{-1} - \lambda^{-4}]
+    + 2G\alpha[\tfrac{27}{40} + \tfrac18\lambda^{-8} + \tfrac15\lambda^{-5} + \lambda^{-2} - 2\lambda]$ (Mancia et al.
+    2021, eq. 2).
+    """
+
+    name: ClassVar[str] = "quadratic-kelvin-voigt"
+    title: ClassVar[str] = "quadratic-law Kelvin–Voigt (QLKV)"
+    parameters: ClassVar[tuple[Parameter, ...]] = (G, ALPHA, MU)
+
+    def stress(self, stretch: Array, p: Any) -> Array:
+        neo_hookean = 5 - 4 / stretch - stretch**-4.0
+        stiffening = 27 / 40 + stretch**-8.0 / 8 + stretch**-5.0 / 5 + stretch**-2.0 - 2 * stretch
+        return p.G * ((3 * p.alpha - 1) / 2 * neo_hookean + 2 * p.alpha * stiffening)

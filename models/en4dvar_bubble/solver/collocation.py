@@ -1,0 +1,52 @@
+"""Collocation for spherically symmetric fields in the unit ball: even polynomials in y = r/R, nodes in s = y².
+
+The nodes are the Chebyshev–Radau points of s ∈ (0, 1] with the wall y = 1 last, so no node sits at the centre and the
+fields are smooth there by construction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from scipy.special import roots_jacobi
+
+from en4dvar.state import Array
+
+
+@dataclass(frozen=True)
+class Ball:
+    """Operators on m interior nodes plus the wall.
+
+    ``y`` (m+1,) radii; ``derivative`` (m+1, m+1) d/dy; ``laplacian`` (m+1, m+1) y⁻² d/dy(y² d/dy);
+    ``weights`` (m+1,) of the mean over the ball, 3 ∫ f y² dy, exact for polynomials of degree m in s.
+    """
+
+    y: Array
+    derivative: Array
+    laplacian: Array
+    weights: Array
+
+
+@cache
+def ball(m: int) -> Ball:
+    """Collocation operators for ``m`` ≥ 1 interior nodes (arrays shared: do not write to them)."""
+    n = m + 1
+    s = (np.cos(2 * np.pi * np.arange(m, -1, -1) / (2 * m + 1)) + 1) / 2
+    s[-1] = 1.0
+    gaps = s[:, None] - s[None, :] + np.eye(n)
+    barycentric = 1.0 / np.prod(4 * gaps, axis=1) * 4
+    d_ds = barycentric[None, :] / barycentric[:, None] / gaps
+    np.fill_diagonal(d_ds, 0.0)
+    np.fill_diagonal(d_ds, -d_ds.sum(axis=1))
+    y = np.sqrt(s)
+    derivative = 2 * y[:, None] * d_ds
+    laplacian = 4 * s[:, None] * (d_ds @ d_ds) + 6 * d_ds
+    # Weights: 3 ∫ f y² dy = 3/2 ∫ f √s ds, moments of the Legendre polynomials by Gauss–Jacobi quadrature.
+    x, w = roots_jacobi(n + 1, 0.0, 0.5)
+    moments = np.polynomial.legendre.legvander(x, m).T @ (w / w.sum())
+    weights = np.linalg.solve(np.polynomial.legendre.legvander(2 * s - 1, m).T, moments)
+    for array in (y, derivative, laplacian, weights):
+        array.setflags(write=False)
+    return Ball(y, derivative, laplacian, weights)

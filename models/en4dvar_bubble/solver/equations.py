@@ -1,0 +1,260 @@
+"""The bubble's ordinary differential equations and their Jacobian, eight members at a time.
+
+State rows (n = m + 2): Kirchhoff temperatures τ_1…τ_m, V = Ṙ/R (1/µs), u = ln(R/µm). Units: µm, µs, pressures divided
+by the density (µm²/µs²), so no other scaling is needed. In the logarithmic variables radius and pressure cannot
+become negative.
+
+Gas (Prosperetti 1991, homobaric): with θ = T/T_∞, k = K/K_∞ = a θ + (1−a), τ = ∫ k dθ, E = K_∞T_∞/(p R²), ' = d/dy,
+    τ̇_i = y_i V τ'_i + (κ−1)/κ E [k_iθ_i ∇²τ_i − τ'_i²] + [(κ−1)/κ k_iθ_i + y_i τ'_i/(3κ)] π̇
+    π̇  = d ln p/dt = 3(κ−1) E τ'_wall − 3κ V
+The pressure itself is not integrated: it follows from the mass of gas, p = M e^{−3u}/⟨1/θ⟩, so mass is conserved to
+rounding at every instant. Integrating p instead leaks gas through a violent collapse (0.35 % of R with 400
+finite-difference nodes).
+
+Radial motion (Keller & Miksis 1980; the paper's eq. 1), Mach number m = Ṙ/c:
+    [R²(1−m) + 4νR/c] V̇ = Ṙ²(−5/2 + 3m/2) + (1+m) P + (R/c) dP/dt|_{V̇=0},   P = p_b − p_∞ − p_f − σ/R + J_e − 4νV
+"""
+
+from __future__ import annotations
+
+import numba as nb
+
+from en4dvar_bubble.solver.lanes import any_lane, exp, floor, gather, load, maximum, minimum, select, splat, sqrt, store
+
+# Rows of the parameter array (PARAMETERS, 8): one column per member.
+LOG_GAS = 0  # ln of p R³⟨1/θ⟩ (heat) or ln of p R^{3κ} (polytropic)
+VAPOUR = 1  # constant vapour pressure added to the gas
+AMBIENT = 2  # p_∞
+SURFACE = 3  # 2S
+VISCOSITY = 4  # ν = μ/ρ
+INVERSE_C = 5  # 1/c
+CONDUCTION = 6  # K_∞T_∞/ρ
+KAPPA = 7
+SLOPE = 8  # a = A T_∞/K_∞
+LOG_R0 = 9  # ln of the stress-free radius
+AMPLITUDE = 10  # factor of the driving table
+TABLE = 11  # offset of the member's elastic table
+PARAMETERS = 12
+
+# Readings of p_f in the Keller–Miksis equation.
+INSTANTANEOUS, RETARDED, AS_PRINTED = 0, 1, 2
+
+
+@nb.njit
+def _lookup(table, offset, origin, per_unit, intervals, x):
+    """Value, first and second derivative of a piecewise quintic; beyond its ends the last interval is extended."""
+    position = (x - origin) * per_unit
+    cell = minimum(maximum(floor(position), 0.0), intervals - 1.0)
+    s = position - cell
+    at = offset + cell * 8.0
+    c0, c1, c2 = gather(table, at, 0), gather(table, at, 1), gather(table, at, 2)
+    c3, c4, c5 = gather(table, at, 3), gather(table, at, 4), gather(table, at, 5)
+    value = ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
+    first = (((c5 * 5.0 * s + c4 * 4.0) * s + c3 * 3.0) * s + c2 * 2.0) * s + c1
+    second = ((c5 * 20.0 * s + c4 * 12.0) * s + c3 * 6.0) * s + c2 * 2.0
+    return value, first * per_unit, second * (per_unit * per_unit)
+
+
+@nb.njit
+def _driving(t, drive, span, amplitude):
+    """p_f, dp_f/dt, d²p_f/dt² at the lanes' times; zero outside the table's span (t_0, t_1, intervals per µs,
+    count).
+    """
+    zero = splat(0.0)
+    before = t < span[0]
+    after = t > span[1]
+    inside = select(before, 0.0, select(after, 0.0, 1.0))
+    if not any_lane(inside > 0.5):
+        return zero, zero, zero
+    f, g, h = _lookup(drive, zero, span[0], span[2], span[3], t)
+    scale = amplitude * inside
+    return f * scale, g * scale, h * scale
+
+
+@nb.njit
+def _gas(y, m, par, ops, work):
+    """Pressure p, π̇, E and wall gradient; rows of ``work``: k (0…), θ (m…), τ' (2m…), ∇²τ (3m…)."""
+    V = load(y, m)
+    u = load(y, m + 1)
+    kappa = load(par, KAPPA)
+    zero = splat(0.0)
+    if m == 0:
+        p = exp(load(par, LOG_GAS) - kappa * u * 3.0)
+        return p, kappa * V * (-3.0), zero, zero
+    a = load(par, SLOPE)
+    weights = ops[2 * m + 2]
+    inverse_mean = splat(weights[m])
+    for i in range(m):
+        tau = load(y, i)
+        k = sqrt(maximum(a * tau * 2.0 + 1.0, 1e-12))
+        theta = tau * 2.0 / (k + 1.0) + 1.0
+        store(work, i, k)
+        store(work, m + i, theta)
+        inverse_mean = inverse_mean + weights[i] / theta
+    wall = zero
+    for j in range(m):
+        wall = wall + load(y, j) * ops[m, j]
+    for i in range(m):
+        first = zero
+        second = zero
+        for j in range(m):
+            tau = load(y, j)
+            first = first + tau * ops[i, j]
+            second = second + tau * ops[m + 1 + i, j]
+        store(work, 2 * m + i, first)
+        store(work, 3 * m + i, second)
+    store(work, 4 * m, inverse_mean)
+    p = exp(load(par, LOG_GAS) - u * 3.0) / inverse_mean
+    E = load(par, CONDUCTION) / p * exp(u * (-2.0))
+    rate = (kappa - 1.0) * E * wall * 3.0 - kappa * V * 3.0
+    return p, rate, E, wall
+
+
+@nb.njit
+def rhs(y, t, m, par, ops, elastic, elastic_span, drive, drive_span, reading, work, out):
+    """Write dy/dt (n, 8) to ``out``.
+
+    ``ops`` holds the collocation operators: rows 0…m of d/dy (the last is the wall), m rows of the Laplacian, then
+    radii (row 2m+1) and averaging weights (row 2m+2). ``work`` (4m+1, 8) is scratch.
+    """
+    p, rate, E, _wall = _gas(y, m, par, ops, work)
+    V = load(y, m)
+    u = load(y, m + 1)
+    kappa = load(par, KAPPA)
+    k1 = (kappa - 1.0) / kappa
+    for i in range(m):
+        first = load(work, 2 * m + i)
+        conduct = k1 * load(work, i) * load(work, m + i)
+        radius = ops[2 * m + 1, i]
+        drift = first * radius
+        dtau = drift * V + E * (conduct * load(work, 3 * m + i) - k1 * first * first)
+        store(out, i, dtau + (conduct + drift / (kappa * 3.0)) * rate)
+    R = exp(u)
+    ic = load(par, INVERSE_C)
+    mach = R * V * ic
+    Ric = R * ic
+    when = load(t, 0)
+    if reading != INSTANTANEOUS:
+        when = when + Ric
+    f, g, _ = _driving(when, drive, drive_span, load(par, AMPLITUDE))
+    J, Jx, _ = _lookup(
+        elastic, load(par, TABLE), elastic_span[0], elastic_span[2], elastic_span[3], u - load(par, LOG_R0)
+    )
+    surface = load(par, SURFACE) / R
+    nu4 = load(par, VISCOSITY) * 4.0
+    P = p + load(par, VAPOUR) - load(par, AMBIENT) - f - surface + J - nu4 * V
+    slope = p * rate + (surface + Jx) * V
+    if reading == INSTANTANEOUS:
+        slope = slope - g
+    elif reading == AS_PRINTED:
+        slope = slope - g * (mach + 1.0)
+    Rdot2 = R * R * V * V
+    numerator = Rdot2 * (mach * 1.5 - 2.5) + (mach + 1.0) * P + Ric * slope
+    store(out, m, numerator / (R * R * (1.0 - mach) + nu4 * Ric))
+    store(out, m + 1, V)
+
+
+@nb.njit
+def jacobian(y, t, m, par, ops, elastic, elastic_span, drive, drive_span, reading, work, out, jac, dt):
+    """Write dy/dt to ``out`` (n, 8), ∂f/∂y to ``jac`` (n·n, 8; row i·n+j) and ∂f_V/∂t, the only nonzero one, to
+    ``dt`` (1, 8).
+    """
+    n = m + 2
+    p, rate, E, wall = _gas(y, m, par, ops, work)
+    V = load(y, m)
+    u = load(y, m + 1)
+    kappa = load(par, KAPPA)
+    k1 = (kappa - 1.0) / kappa
+    heat = (kappa - 1.0) * 3.0 * E
+    rate_u = heat * wall
+    rate_V = kappa * (-3.0)
+    zero = splat(0.0)
+
+    R = exp(u)
+    ic = load(par, INVERSE_C)
+    mach = R * V * ic
+    Ric = R * ic
+    when = load(t, 0)
+    if reading != INSTANTANEOUS:
+        when = when + Ric
+    f, g, h = _driving(when, drive, drive_span, load(par, AMPLITUDE))
+    J, Jx, Jxx = _lookup(
+        elastic, load(par, TABLE), elastic_span[0], elastic_span[2], elastic_span[3], u - load(par, LOG_R0)
+    )
+    surface = load(par, SURFACE) / R
+    nu4 = load(par, VISCOSITY) * 4.0
+    P = p + load(par, VAPOUR) - load(par, AMBIENT) - f - surface + J - nu4 * V
+    slope = p * rate + (surface + Jx) * V
+    pressure_u = p * (-3.0)
+    if m == 0:
+        pressure_u = p * rate_V
+        rate_u = zero
+    P_u = pressure_u + surface + Jx
+    slope_u = pressure_u * rate + p * rate_u + (Jxx - surface) * V
+    slope_V = p * rate_V + surface + Jx
+    one = mach + 1.0
+    numerator_t = -(one * g)
+    if reading == INSTANTANEOUS:
+        slope = slope - g
+        numerator_t = numerator_t - Ric * h
+    elif reading == RETARDED:
+        P_u = P_u - g * Ric
+    else:
+        slope = slope - g * one
+        P_u = P_u - g * Ric
+        slope_u = slope_u - h * Ric * one - g * mach
+        slope_V = slope_V - g * Ric
+        numerator_t = numerator_t - Ric * h * one
+    Rdot2 = R * R * V * V
+    numerator = Rdot2 * (mach * 1.5 - 2.5) + one * P + Ric * slope
+    inverse = 1.0 / (R * R * (1.0 - mach) + nu4 * Ric)
+    acceleration = numerator * inverse
+    numerator_u = Rdot2 * (mach * 4.5 - 5.0) + mach * P + one * P_u + Ric * (slope + slope_u)
+    numerator_V = R * R * V * (mach * 4.5 - 5.0) + Ric * P - one * nu4 + Ric * slope_V
+    denominator_u = R * R * (2.0 - mach * 3.0) + nu4 * Ric
+    denominator_V = -(R * R * Ric)
+    store(out, m, acceleration)
+    store(out, m + 1, V)
+    row_V = m * n
+    row_u = row_V + n
+    store(jac, row_V + m, (numerator_V - acceleration * denominator_V) * inverse)
+    store(jac, row_V + m + 1, (numerator_u - acceleration * denominator_u) * inverse)
+    store(dt, 0, numerator_t * inverse)
+    for j in range(m):
+        store(jac, row_u + j, zero)
+    store(jac, row_u + m, splat(1.0))
+    store(jac, row_u + m + 1, zero)
+    if m == 0:
+        return
+
+    a = load(par, SLOPE)
+    mean = load(work, 4 * m)
+    for j in range(m):  # ∂ln p/∂τ_j and ∂π̇/∂τ_j, kept in the rows that the sums below need
+        k = load(work, j)
+        theta = load(work, m + j)
+        share = ops[2 * m + 2, j] / (k * theta * theta * mean)
+        rate_j = heat * (ops[m, j] - share * wall)
+        store(jac, row_V + j, (one * p * share + Ric * p * (share * rate + rate_j)) * inverse)
+        store(work, 4 * m + 1 + j, share)
+        store(work, 5 * m + 1 + j, rate_j)
+    for i in range(m):
+        k = load(work, i)
+        theta = load(work, m + i)
+        first = load(work, 2 * m + i)
+        second = load(work, 3 * m + i)
+        radius = ops[2 * m + 1, i]
+        conduct = k1 * k * theta
+        drift = first * radius
+        coupling = conduct + drift / (kappa * 3.0)
+        diffusion = E * (conduct * second - k1 * first * first)
+        store(out, i, drift * V + diffusion + coupling * rate)
+        on_first = V * radius - k1 * E * first * 2.0 + rate * radius / (kappa * 3.0)
+        on_second = conduct * E
+        for j in range(m):
+            value = on_first * ops[i, j] + on_second * ops[m + 1 + i, j]
+            value = value - load(work, 4 * m + 1 + j) * diffusion + coupling * load(work, 5 * m + 1 + j)
+            if i == j:
+                value = value + k1 * (a * theta + k) / k * (E * second + rate)
+            store(jac, i * n + j, value)
+        store(jac, i * n + m, drift + coupling * rate_V)
+        store(jac, i * n + m + 1, diffusion + coupling * rate_u)

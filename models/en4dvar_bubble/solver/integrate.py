@@ -1,0 +1,296 @@
+"""Adaptive integration of many members: eight lanes, each with its own member, time and step, refilled when one
+finishes.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+
+from en4dvar_bubble.solver import rodas5p
+from en4dvar_bubble.solver.equations import AMPLITUDE, INVERSE_C, PARAMETERS, jacobian, rhs
+from en4dvar_bubble.solver.lanes import WIDTH, absolute, load, maximum, splat, sqrt, store
+
+# Status of a member; the reasons users read are made by ``driver.reason``.
+OK, STEP_LIMIT, NON_FINITE, STEP_UNDERFLOW, MACH_LIMIT = 0, 1, 2, 3, 4
+# Columns of the per-member record.
+STEPS, REJECTED, MAX_MACH, MAX_THETA, MIN_LOG_R, END_TIME = 0, 1, 2, 3, 4, 5
+RECORD = 6
+
+_A, _C, _ALPHA, _D, _H = rodas5p.A, rodas5p.C, rodas5p.ALPHA, rodas5p.D, rodas5p.H
+_GAMMA = rodas5p.GAMMA
+_STAGES = rodas5p.STAGES
+_SAFETY, _SHRINK, _GROW = 0.9, 0.15, 6.0
+_EXPONENT = 1.0 / rodas5p.ORDER
+
+
+@nb.njit
+def _factorise(a, n):
+    """LU without pivoting, in place; the diagonal is replaced by its inverse. Rows i·n+j.
+
+    The temperature block comes first and is diagonally dominant; V and u follow as its border.
+    """
+    for k in range(n):
+        pivot = 1.0 / load(a, k * n + k)
+        store(a, k * n + k, pivot)
+        for i in range(k + 1, n):
+            factor = load(a, i * n + k) * pivot
+            store(a, i * n + k, factor)
+            for j in range(k + 1, n):
+                store(a, i * n + j, load(a, i * n + j) - factor * load(a, k * n + j))
+
+
+@nb.njit
+def _solve(a, n, b, row):
+    """Solve in place for the right-hand side in rows ``row … row+n−1`` of ``b``."""
+    for i in range(1, n):
+        total = load(b, row + i)
+        for j in range(i):
+            total = total - load(a, i * n + j) * load(b, row + j)
+        store(b, row + i, total)
+    for i in range(n - 1, -1, -1):
+        total = load(b, row + i)
+        for j in range(i + 1, n):
+            total = total - load(a, i * n + j) * load(b, row + j)
+        store(b, row + i, total * load(a, i * n + i))
+
+
+@nb.njit
+def _attempt(y, t, h, m, par, ops, elastic, espan, drive, dspan, reading, tol, w):
+    """One RODAS5P step of all lanes: stages to ``k``, the new state to ``y_new``, the error norm to ``norm``."""
+    work, f, jac, dt, k, stage, y_new, t_stage, norm = w
+    n = m + 2
+    jacobian(y, t, m, par, ops, elastic, espan, drive, dspan, reading, work, f, jac, dt)
+    step = load(h, 0)
+    inverse_h = 1.0 / step
+    for i in range(n * n):
+        store(jac, i, -load(jac, i))
+    for i in range(n):
+        store(jac, i * n + i, load(jac, i * n + i) + inverse_h * (1.0 / _GAMMA))
+    _factorise(jac, n)
+    now = load(t, 0)
+    slope_t = load(dt, 0) * step
+    for s in range(_STAGES):
+        if s > 0:
+            for i in range(n):
+                value = load(y, i)
+                for r in range(s):
+                    value = value + load(k, r * n + i) * _A[s, r]
+                store(stage, i, value)
+            store(t_stage, 0, now + step * _ALPHA[s])
+            rhs(stage, t_stage, m, par, ops, elastic, espan, drive, dspan, reading, work, f)
+        for i in range(n):
+            value = splat(0.0)
+            for r in range(s):
+                value = value + load(k, r * n + i) * _C[s, r]
+            store(k, s * n + i, load(f, i) + value * inverse_h)
+        store(k, s * n + m, load(k, s * n + m) + slope_t * _D[s])
+        _solve(jac, n, k, s * n)
+    total = splat(0.0)
+    last = (_STAGES - 1) * n
+    for i in range(n):
+        old = load(y, i)
+        error = load(k, last + i)
+        new = load(stage, i) + error
+        store(y_new, i, new)
+        size = maximum(absolute(old), absolute(new))
+        ratio = error / (size * tol[1, i] + tol[0, i])
+        total = total + ratio * ratio
+    store(norm, 0, sqrt(total * (1.0 / n)))
+
+
+@nb.njit
+def _dense(y, y_new, k, n, coefficients):
+    """Rows 3n of the dense-output polynomial (K1, K2, K3)."""
+    for r in range(3):
+        for i in range(n):
+            value = splat(0.0)
+            for s in range(_STAGES):
+                value = value + load(k, s * n + i) * _H[r, s]
+            store(coefficients, r * n + i, value)
+
+
+@nb.njit
+def _workspace(m):
+    n = m + 2
+    return (
+        np.empty((6 * m + 2, WIDTH)),
+        np.empty((n, WIDTH)),
+        np.empty((n * n, WIDTH)),
+        np.empty((1, WIDTH)),
+        np.empty((_STAGES * n, WIDTH)),
+        np.empty((n, WIDTH)),
+        np.empty((n, WIDTH)),
+        np.empty((1, WIDTH)),
+        np.empty((1, WIDTH)),
+    )
+
+
+@nb.njit(cache=True, nogil=True)
+def integrate(
+    initial,
+    parameters,
+    start,
+    times,
+    m,
+    ops,
+    elastic,
+    espan,
+    drive,
+    dspan,
+    breaks,
+    reading,
+    tol,
+    limits,
+    out,
+    status,
+    record,
+):
+    """Integrate N members and write their states at the output times.
+
+    initial (N, n), parameters (N, PARAMETERS), start (N,) µs, times (N, K) increasing µs; ``tol`` (2, n) absolute and
+    relative tolerances; ``breaks`` increasing instants the steps must not straddle; ``limits`` = (first step, longest
+    step inside the driving, step limit, Mach limit). Outputs: out (N, K, n) with NaN where not reached, status (N,),
+    record (N, RECORD).
+    """
+    n_members, n = initial.shape
+    n_times = times.shape[1]
+    w = _workspace(m)
+    k, y_new, norm = w[4], w[6], w[8]
+    y = np.zeros((n, WIDTH))
+    t = np.zeros((1, WIDTH))
+    h = np.full((1, WIDTH), limits[0])
+    par = np.zeros((PARAMETERS, WIDTH))
+    coefficients = np.empty((3 * n, WIDTH))
+    member = np.full(WIDTH, -1, dtype=np.int64)
+    observed = np.zeros(WIDTH, dtype=np.int64)
+    next_break = np.zeros(WIDTH, dtype=np.int64)
+    proposal = np.empty(WIDTH)  # the step before it was cut at a break
+    old_h = np.empty(WIDTH)
+    old_norm = np.empty(WIDTH)
+    rejected = np.zeros(WIDTH, dtype=np.bool_)
+    waiting = 0
+    running = 0
+    first_step, inside_step, step_limit, mach_limit = limits
+
+    while True:
+        for lane in range(WIDTH):  # refill
+            while member[lane] < 0 and waiting < n_members:
+                i = waiting
+                waiting += 1
+                record[i, :] = 0.0
+                record[i, MIN_LOG_R] = initial[i, n - 1]
+                done = 0
+                while done < n_times and times[i, done] <= start[i]:
+                    for j in range(n):
+                        out[i, done, j] = initial[i, j]
+                    done += 1
+                for q in range(done, n_times):
+                    for j in range(n):
+                        out[i, q, j] = np.nan
+                status[i] = OK
+                record[i, END_TIME] = start[i]
+                if done == n_times:
+                    continue
+                member[lane] = i
+                observed[lane] = done
+                for j in range(n):
+                    y[j, lane] = initial[i, j]
+                for j in range(PARAMETERS):
+                    par[j, lane] = parameters[i, j]
+                t[0, lane] = start[i]
+                h[0, lane] = first_step
+                old_h[lane] = -1.0
+                rejected[lane] = False
+                b = 0
+                while b < len(breaks) and breaks[b] <= start[i]:
+                    b += 1
+                next_break[lane] = b
+                running += 1
+            if member[lane] >= 0:
+                now = t[0, lane]
+                if par[AMPLITUDE, lane] != 0.0 and dspan[0] <= now < dspan[1] and h[0, lane] > inside_step:
+                    h[0, lane] = inside_step
+                proposal[lane] = h[0, lane]
+                if next_break[lane] < len(breaks) and now + h[0, lane] * 1.0001 >= breaks[next_break[lane]]:
+                    h[0, lane] = breaks[next_break[lane]] - now
+        if running == 0:
+            break
+
+        _attempt(y, t, h, m, par, ops, elastic, espan, drive, dspan, reading, tol, w)
+
+        have_dense = False
+        for lane in range(WIDTH):
+            i = member[lane]
+            if i < 0:
+                continue
+            step = h[0, lane]
+            e = norm[0, lane]
+            failure = OK
+            if not math.isfinite(e):
+                rejected[lane] = True
+                record[i, REJECTED] += 1
+                h[0, lane] = step * 0.1
+            else:
+                e = max(e, 1e-8)
+                shrink = e**_EXPONENT / _SAFETY
+                if e > 1.0:
+                    rejected[lane] = True
+                    record[i, REJECTED] += 1
+                    h[0, lane] = step / min(max(shrink, 1.0 / _GROW), 1.0 / _SHRINK)
+                else:
+                    now = t[0, lane]
+                    cut = next_break[lane] < len(breaks) and now + step >= breaks[next_break[lane]]
+                    end = breaks[next_break[lane]] if cut else now + step
+                    if cut:
+                        next_break[lane] += 1
+                    q = observed[lane]
+                    while q < n_times and times[i, q] <= end:
+                        if not have_dense:
+                            _dense(y, y_new, k, n, coefficients)
+                            have_dense = True
+                        theta = (times[i, q] - now) / step
+                        rest = 1.0 - theta
+                        for j in range(n):
+                            bend = coefficients[n + j, lane] + theta * coefficients[2 * n + j, lane]
+                            bend = coefficients[j, lane] + theta * bend
+                            out[i, q, j] = rest * y[j, lane] + theta * (y_new[j, lane] + rest * bend)
+                        q += 1
+                    observed[lane] = q
+                    for j in range(n):
+                        y[j, lane] = y_new[j, lane]
+                    t[0, lane] = end
+                    record[i, STEPS] += 1
+                    record[i, END_TIME] = end
+                    log_r = y[n - 1, lane]
+                    mach = abs(y[n - 2, lane]) * math.exp(log_r) * par[INVERSE_C, lane]
+                    record[i, MAX_MACH] = max(record[i, MAX_MACH], mach)
+                    record[i, MIN_LOG_R] = min(record[i, MIN_LOG_R], log_r)
+                    if m > 0:
+                        record[i, MAX_THETA] = max(record[i, MAX_THETA], y[0, lane])
+                    # Gustafsson's predictive controller: the trend of the error, not only its size, sets the next step.
+                    if old_h[lane] > 0.0:
+                        trend = old_h[lane] / step * (e * e / old_norm[lane]) ** _EXPONENT / _SAFETY
+                        shrink = max(shrink, trend)
+                    grown = step / min(max(shrink, 1.0 / _GROW), 1.0 / _SHRINK)
+                    if rejected[lane]:
+                        grown = min(grown, step)
+                    if cut and grown < proposal[lane] and e < 1.0:
+                        grown = max(grown, min(proposal[lane], step * _GROW))
+                    old_h[lane] = step
+                    old_norm[lane] = max(e, 1e-2)
+                    rejected[lane] = False
+                    h[0, lane] = grown
+                    if mach > mach_limit:
+                        failure = MACH_LIMIT
+            if record[i, STEPS] + record[i, REJECTED] >= step_limit:
+                failure = STEP_LIMIT
+            if h[0, lane] < 1e-13 * max(1.0, abs(t[0, lane])):
+                failure = STEP_UNDERFLOW if math.isfinite(norm[0, lane]) else NON_FINITE
+            if failure != OK or observed[lane] == n_times:
+                status[i] = failure
+                member[lane] = -1
+                h[0, lane] = first_step
+                running -= 1

@@ -1,0 +1,272 @@
+"""Eight members at once: ``<8 x double>`` as a numba value, so that a kernel reads like scalar code and runs as SIMD.
+
+A value of type ``lanes`` holds one number for each of :data:`WIDTH` members; arithmetic, comparison and ``sqrt`` act
+lane by lane, so what one member computes never depends on its neighbours (same bits in any lane, group or chunk).
+Rows of a C-contiguous ``(rows, 8)`` array are read and written with :func:`load` and :func:`store`. Multiply–adds may
+be fused.
+"""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+import numba as nb
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+WIDTH = 8
+
+_F64 = ir.DoubleType()
+_I64 = ir.IntType(64)
+_VEC = ir.VectorType(_F64, WIDTH)
+_MASK = ir.VectorType(ir.IntType(1), WIDTH)
+_IVEC = ir.VectorType(_I64, WIDTH)
+_CONTRACT = ("contract",)
+
+
+class _Lanes(types.Type):
+    def __init__(self) -> None:
+        super().__init__(name="f64x8")
+
+
+class _Mask(types.Type):
+    def __init__(self) -> None:
+        super().__init__(name="i1x8")
+
+
+lanes = _Lanes()
+mask = _Mask()
+
+
+@register_model(_Lanes)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, dmm: Any, fe_type: Any) -> None:
+        super().__init__(dmm, fe_type, _VEC)
+
+
+@register_model(_Mask)
+class _MaskModel(models.PrimitiveModel):
+    def __init__(self, dmm: Any, fe_type: Any) -> None:
+        super().__init__(dmm, fe_type, _MASK)
+
+
+def _splat(builder: Any, value: Any) -> Any:
+    if value.type == _VEC:
+        return value
+    first = builder.insert_element(ir.Constant(_VEC, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
+    return builder.shuffle_vector(first, ir.Constant(_VEC, ir.Undefined), zeros)
+
+
+def _constant(value: float) -> Any:
+    return ir.Constant(_VEC, [value] * WIDTH)
+
+
+def _arithmetic(op: Any, method: str) -> None:
+    @infer_global(op)
+    class _Template(ConcreteTemplate):
+        cases = [  # noqa: RUF012  # numba reads the attribute as a list
+            signature(lanes, lanes, lanes),
+            signature(lanes, lanes, types.float64),
+            signature(lanes, types.float64, lanes),
+        ]
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return getattr(builder, method)(*(_splat(builder, a) for a in args), flags=_CONTRACT)
+
+    for case in _Template.cases:
+        lower_builtin(op, *case.args)(lower)
+
+
+for _op, _method in (
+    (operator.add, "fadd"),
+    (operator.sub, "fsub"),
+    (operator.mul, "fmul"),
+    (operator.truediv, "fdiv"),
+):
+    _arithmetic(_op, _method)
+
+
+@infer_global(operator.neg)
+class _Negate(ConcreteTemplate):
+    cases = [signature(lanes, lanes)]  # noqa: RUF012
+
+
+@lower_builtin(operator.neg, lanes)
+def _lower_negate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    return builder.fneg(args[0])
+
+
+def _comparison(op: Any, predicate: str) -> None:
+    @infer_global(op)
+    class _Template(ConcreteTemplate):
+        cases = [signature(mask, lanes, lanes), signature(mask, lanes, types.float64)]  # noqa: RUF012
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.fcmp_ordered(predicate, *(_splat(builder, a) for a in args))
+
+    for case in _Template.cases:
+        lower_builtin(op, *case.args)(lower)
+
+
+for _op, _predicate in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
+    _comparison(_op, _predicate)
+
+
+def _row_pointer(context: Any, builder: Any, array_type: Any, array: Any, row: Any) -> Any:
+    data = cgutils.create_struct_proxy(array_type)(context, builder, value=array).data
+    pointer = builder.gep(data, [builder.mul(row, ir.Constant(_I64, WIDTH))])
+    return builder.bitcast(pointer, _VEC.as_pointer())
+
+
+@intrinsic
+def load(typingctx, array, row):
+    """The eight numbers of ``array[row]``."""
+
+    def codegen(context, builder, sig, args):
+        row = context.cast(builder, args[1], sig.args[1], types.int64)
+        return builder.load(_row_pointer(context, builder, sig.args[0], args[0], row), align=8)
+
+    return lanes(array, types.int64), codegen
+
+
+@intrinsic
+def store(typingctx, array, row, value):
+    """Write ``value`` (lanes or a number for all) to ``array[row]``."""
+
+    def codegen(context, builder, sig, args):
+        pointer = _row_pointer(context, builder, sig.args[0], args[0], args[1])
+        builder.store(_splat(builder, args[2]), pointer, align=8)
+        return context.get_dummy_value()
+
+    kind = lanes if value is lanes else types.float64
+    return types.void(array, types.int64, kind), codegen
+
+
+@intrinsic
+def splat(typingctx, value):
+    """The same number in every lane."""
+    return lanes(types.float64), lambda context, builder, sig, args: _splat(builder, args[0])
+
+
+@intrinsic
+def select(typingctx, condition, a, b):
+    """``a`` where ``condition``, else ``b``."""
+
+    def codegen(context, builder, sig, args):
+        return builder.select(args[0], _splat(builder, args[1]), _splat(builder, args[2]))
+
+    kinds = [lanes if x is lanes else types.float64 for x in (a, b)]
+    return lanes(mask, *kinds), codegen
+
+
+@intrinsic
+def any_lane(typingctx, condition):
+    """Whether the mask is set in at least one lane."""
+
+    def codegen(context, builder, sig, args):
+        bits = builder.bitcast(args[0], ir.IntType(WIDTH))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(WIDTH), 0))
+
+    return types.boolean(mask), codegen
+
+
+def _unary(name: str) -> Any:
+    @intrinsic
+    def function(typingctx, x):
+        def codegen(context, builder, sig, args):
+            kind = ir.FunctionType(_VEC, [_VEC])
+            return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v8f64"), args)
+
+        return lanes(lanes), codegen
+
+    return function
+
+
+sqrt = _unary("sqrt")
+floor = _unary("floor")
+absolute = _unary("fabs")
+
+
+def _binary(name: str) -> Any:
+    @intrinsic
+    def function(typingctx, a, b):
+        def codegen(context, builder, sig, args):
+            kind = ir.FunctionType(_VEC, [_VEC, _VEC])
+            call = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v8f64")
+            return builder.call(call, [_splat(builder, x) for x in args])
+
+        return lanes(*[lanes if x is lanes else types.float64 for x in (a, b)]), codegen
+
+    return function
+
+
+minimum = _binary("minnum")
+maximum = _binary("maxnum")
+
+
+@intrinsic
+def _scale_by_power_of_two(typingctx, mantissa, exponent):
+    """``mantissa · 2**exponent`` for integral ``exponent`` in [-1022, 1023], by writing the exponent bits."""
+
+    def codegen(context, builder, sig, args):
+        bias = ir.Constant(_IVEC, [1023] * WIDTH)
+        shift = ir.Constant(_IVEC, [52] * WIDTH)
+        bits = builder.shl(builder.add(builder.fptosi(args[1], _IVEC), bias), shift)
+        return builder.fmul(args[0], builder.bitcast(bits, _VEC))
+
+    return lanes(lanes, lanes), codegen
+
+
+@intrinsic
+def gather(typingctx, table, index, column):
+    """``table.ravel()[index + column]`` per lane; ``index`` holds integral numbers, ``table`` is C-contiguous
+    float64.
+    """
+
+    def codegen(context, builder, sig, args):
+        data = cgutils.create_struct_proxy(sig.args[0])(context, builder, value=args[0]).data
+        offsets = builder.fptosi(args[1], _IVEC)
+        result = ir.Constant(_VEC, ir.Undefined)
+        for lane in range(WIDTH):
+            position = ir.Constant(ir.IntType(32), lane)
+            where = builder.add(builder.extract_element(offsets, position), args[2])
+            value = builder.load(builder.gep(data, [where]))
+            result = builder.insert_element(result, value, position)
+        return result
+
+    return lanes(table, lanes, types.int64), codegen
+
+
+_LOG2E = 1.4426950408889634
+_LN2_HIGH = 6.93147180369123816490e-01
+_LN2_LOW = 1.90821492927058770002e-10
+
+
+@nb.njit(inline="always")
+def exp(x):
+    """e^x lane by lane to about 1 ulp, for any |x| (clamped to the range of normal doubles).
+
+    Cody–Waite reduction x = k ln 2 + r, |r| ≤ ln 2 / 2, then the Taylor polynomial of degree 13 (truncation 4e-18).
+    """
+    x = minimum(maximum(x, -708.0), 709.0)
+    k = floor(x * _LOG2E + 0.5)
+    r = (x - k * _LN2_HIGH) - k * _LN2_LOW
+    q = splat(1.0 / 6227020800.0)
+    q = q * r + 1.0 / 479001600.0
+    q = q * r + 1.0 / 39916800.0
+    q = q * r + 1.0 / 3628800.0
+    q = q * r + 1.0 / 362880.0
+    q = q * r + 1.0 / 40320.0
+    q = q * r + 1.0 / 5040.0
+    q = q * r + 1.0 / 720.0
+    q = q * r + 1.0 / 120.0
+    q = q * r + 1.0 / 24.0
+    q = q * r + 1.0 / 6.0
+    q = q * r + 0.5
+    q = q * r + 1.0
+    q = q * r + 1.0
+    return _scale_by_power_of_two(q, k)
