@@ -104,8 +104,10 @@ def cost(problem: InverseProblem, x: Array, executor: Executor | None = None) ->
     J = ½ Σ_j ((x_j − mean_j)/std_j)² + Σ_k β_k [½ (y_k − m_k)²/s_k² + ln(s_k/std_k)].
     """
     run = forecast(problem, x, executor)
-    z = (x - problem.prior.mean) / problem.prior.std
-    return np.asarray(0.5 * np.sum(z * z, axis=-1) + observation_cost(problem.observations, run.predictions, run.rates))
+    observation = observation_cost(problem.observations, run.predictions, run.rates)
+    with np.errstate(over="ignore"):
+        z = (x - problem.prior.mean) / problem.prior.std
+        return np.where(run.active, 0.5 * np.sum(z * z, axis=-1) + observation, np.inf)
 
 
 def log_posterior(problem: InverseProblem, x: Array, executor: Executor | None = None) -> Array:

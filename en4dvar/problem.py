@@ -31,7 +31,11 @@ class InverseProblem:
 
 @dataclass(frozen=True)
 class AssimilationSettings:
-    """The scheme's settings; defaults are the recommended ones of ``ASSIMILATION.md``."""
+    """The scheme's settings; defaults are the recommended ones.
+
+    ``step_tolerance`` is a length in posterior standard deviations, √(δwᵀAδw); ``cost_tolerance`` is relative to J,
+    and absolute below J = 1. ``full`` takes the whole step or, where that raises J, none.
+    """
 
     scheme: Literal["en4dvar"] = "en4dvar"
     members: int = 48
@@ -51,7 +55,8 @@ class IterationRecord:
     """Diagnostics of one iteration (glossary of the field). Parameters are physical, SI.
 
     ``cost = background + observation`` is J of the central trajectory at the iterate that *starts* the iteration;
-    the last record is the accepted end point (its ``step_length`` is 0). ``members`` (N, n) is the ensemble that the
+    the last record is the accepted end point. ``step_norm`` is the undamped step there in posterior standard
+    deviations, ``step_length`` the accepted fraction of it (0: no move). ``members`` (N, n) is the ensemble that the
     scheme's weights and transform describe at that iterate. ``active`` counts the members whose forecast succeeded.
     """
 

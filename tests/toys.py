@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 
 from en4dvar.forward import Failure, ForwardModel, Observable, StateField, Trajectory
@@ -128,3 +130,12 @@ def make_problem(model, truth, *, std=0.1, time_std=0.0, weights=1.0, seed=1, k=
     )
     observations = make_observations(times, values, std, time_std, weights)
     return InverseProblem(model, OBSERVABLE, observations, Prior(tuple(terms)))
+
+
+class Dying(Linear):
+    """Kills its process where the first parameter is negative."""
+
+    def trajectories(self, x, times):
+        if np.any(x[:, 2] < 0):
+            os._exit(3)
+        return super().trajectories(x, times)

@@ -1,0 +1,92 @@
+"""The numbers do not depend on where members run."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from toys import Decay, Dying, Fragile, Vectorised, make_problem
+
+from en4dvar.assimilate import assimilate
+from en4dvar.executor import ProcessesExecutor, SerialExecutor, ThreadsExecutor, cut, make_executor
+from en4dvar.forward import Failure
+from en4dvar.problem import AssimilationSettings
+
+SETTINGS = AssimilationSettings(members=13)
+
+
+def problems():
+    return (
+        make_problem(Decay(), [1.5, 1.2], time_std=0.02),
+        make_problem(Vectorised(("a", "b", "c"), batch=4, compiled=True), [1.0, 0.5, 0.2]),
+        make_problem(Fragile(1.6, how="raise", names=("a", "b")), [1.0, 0.5]),
+    )
+
+
+def assert_same_bits(a, b):
+    for field in fields(a):
+        left, right = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(left, np.ndarray):
+            assert np.array_equal(left, right, equal_nan=True), field.name
+        elif field.name == "iterations":
+            assert len(left) == len(right)
+            for x, y in zip(left, right, strict=True):
+                assert_same_bits(x, y)
+        elif field.name not in ("observations", "observable"):
+            assert left == right, field.name
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3])
+@pytest.mark.parametrize("kind", [ThreadsExecutor, ProcessesExecutor])
+def test_same_bits_for_any_executor(kind, workers):
+    with kind(workers) as executor:
+        for problem in problems():
+            serial = assimilate(problem, SETTINGS, 3)
+            assert_same_bits(assimilate(problem, SETTINGS, 3, executor), serial)
+
+
+def test_seed_decides():
+    problem = problems()[0]
+    assert_same_bits(assimilate(problem, SETTINGS, 3), assimilate(problem, SETTINGS, 3, SerialExecutor()))
+    assert not np.array_equal(assimilate(problem, SETTINGS, 4).prior, assimilate(problem, SETTINGS, 3).prior)
+
+
+@pytest.mark.parametrize("kind", [ThreadsExecutor, ProcessesExecutor])
+def test_exception_fails_only_the_batch_that_raised(kind):
+    model = Fragile(0.0, how="raise", names=("a", "b"), batch=2)
+    x = np.array([model.initial_state({"a": a, "b": 1.0}) for a in (-1, -1, -1, 1, -1, -1, -1)])
+    times = np.array([0.1, 0.2])
+    expected = [False, False, True, True, False, False, False]
+    for executor in (SerialExecutor(), kind(2)):
+        with executor:
+            results = executor.trajectories(model, x, times)
+        assert [isinstance(r, Failure) for r in results] == expected
+        assert results[2].reason == "FloatingPointError: overflow"
+        assert np.array_equal(results[4].states[0], model.step(x[4], 0.0, 0.1))
+
+
+def test_death_of_a_worker_is_a_failure_and_the_pool_recovers():
+    model = Dying()
+    good = np.tile(model.initial_state({"a": 1.0, "b": 1.0}), (4, 1))
+    bad = good.copy()
+    bad[:, 2] = -1.0
+    with ProcessesExecutor(1) as executor:
+        assert [r.reason for r in executor.trajectories(model, bad, np.array([0.1]))] == ["a worker process died"] * 4
+        assert not any(isinstance(r, Failure) for r in executor.trajectories(model, good, np.array([0.1])))
+
+
+@pytest.mark.parametrize("batch", [1, 3, 8])
+@pytest.mark.parametrize("workers", [1, 2, 5, 40])
+def test_chunks_cover_members_and_respect_batches(batch, workers):
+    for n in range(1, 30):
+        chunks = cut(n, batch, workers)
+        assert [i for part in chunks for i in range(n)[part]] == list(range(n))
+        assert len(chunks) <= workers
+        assert all(part.start % batch == 0 and part.stop > part.start for part in chunks)
+
+
+def test_make_executor_chooses_by_model():
+    assert isinstance(make_executor(Decay(), 1), SerialExecutor)
+    assert isinstance(make_executor(Decay(compiled=True), 2), ThreadsExecutor)
+    assert isinstance(make_executor(Decay(), 2), ProcessesExecutor)
+    with pytest.raises(ValueError, match="at least 1"):
+        ThreadsExecutor(0)

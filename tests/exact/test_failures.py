@@ -1,0 +1,99 @@
+"""A failed member is a value with a reason; a linear problem does not notice it."""
+
+import numpy as np
+import pytest
+from toys import Fragile, Linear, make_problem
+
+from en4dvar.assimilate import assimilate, cost, forecast
+from en4dvar.errors import TooFewMembersError
+from en4dvar.prior import PriorTerm
+from en4dvar.problem import AssimilationSettings
+from en4dvar.state import Parameter
+
+NAMES = ("a", "b", "c")
+TRUTH = (-1.0, 0.5, 0.7)  # the prior mean of a is -0.8, and the data pull it down, away from the limit
+LIMIT = -0.8 + 1e-6
+
+
+def settings(linearisation, **changes):
+    options = {"members": 20, "start": "prior-mean", "max_iterations": 1, "min_active_fraction": 0.2}
+    return AssimilationSettings(**{**options, "linearisation": linearisation, **changes})
+
+
+@pytest.mark.parametrize("linearisation", ["transform", "bundle"])
+@pytest.mark.parametrize(
+    ("how", "reason"),
+    [
+        ("value", "too stiff"),
+        ("raise", "FloatingPointError: overflow"),
+        ("initial_state", "ArithmeticError: no equilibrium"),
+        ("short", "the model returned 0 trajectories for 1 members"),
+    ],
+)
+def test_linear_posterior_does_not_notice_failed_members(linearisation, how, reason):
+    whole = assimilate(make_problem(Linear(NAMES), TRUTH), settings(linearisation), 4)
+    problem = make_problem(Fragile(LIMIT, how, names=NAMES), TRUTH)
+    holed = assimilate(problem, settings(linearisation), 4)
+    lost = whole.prior[:, 0] > LIMIT
+    assert 5 < lost.sum() < 15
+    assert holed.iterations[0].active == 20 - lost.sum()
+    assert np.max(np.abs(holed.posterior - whole.posterior)) < 1e-10
+    assert holed.iterations[-1].dfs == pytest.approx(whole.iterations[-1].dfs, abs=1e-10)
+    assert [bool(f) for f in holed.prior_failures] == lost.tolist()
+    assert set(holed.prior_failures) == {"", reason}
+    assert np.array_equal(np.isnan(holed.prior_predictions).all(axis=1), lost)
+    assert np.array_equal(np.isfinite(holed.prior_trajectories).all(axis=1), ~lost)
+    assert any(f"{lost.sum()} of 20 members failed in the prior forecast: {reason}" in w for w in holed.warnings)
+
+
+@pytest.mark.parametrize("linearisation", ["transform", "bundle"])
+def test_too_few_survivors_is_an_error_with_reasons(linearisation):
+    problem = make_problem(Fragile(-1.5, names=NAMES), TRUTH)
+    with pytest.raises(
+        TooFewMembersError, match=r"toy: \d+ of 20 members failed in the prior forecast.*too stiff \(\d+×\)"
+    ):
+        assimilate(problem, settings(linearisation, min_active_fraction=0.5), 4)
+
+
+def test_fewer_survivors_than_parameters_is_an_error():
+    problem = make_problem(Fragile(-0.8 - 1.9, names=NAMES), TRUTH)
+    with pytest.raises(TooFewMembersError, match="at least 4 must survive"):
+        assimilate(problem, settings("bundle", min_active_fraction=0.0), 4)
+
+
+def test_prior_mean_that_fails_falls_back_to_the_best_member():
+    problem = make_problem(Fragile(-0.9, names=NAMES), TRUTH)
+    analysis = assimilate(problem, settings("bundle", max_iterations=20), 4)
+    assert analysis.warnings[0] == "the prior mean cannot be run (too stiff); started from the best prior member"
+    assert analysis.converged
+
+
+def test_trial_that_fails_is_never_accepted():
+    """The minimum lies in the forbidden region: the search stops at its edge, and says so."""
+    problem = make_problem(Fragile(0.9, names=NAMES), (1.0, 0.5, 0.7), std=0.01)
+    for control in ("line-search", "levenberg-marquardt", "full"):
+        analysis = assimilate(problem, settings("bundle", step_control=control, max_iterations=20), 4)
+        assert analysis.centre[0] <= 0.9
+        assert not analysis.converged
+        assert analysis.stop_reason == "no decrease possible along the step"
+        costs = [record.cost for record in analysis.iterations]
+        assert np.all(np.diff(costs) <= 0)
+
+
+def test_parameter_outside_its_bounds_fails_and_is_not_clipped():
+    model = Linear(NAMES)
+    bounded = Parameter("a", "m", bounds=(0.0, np.inf))
+    terms = (PriorTerm.normal(bounded, 0.5, 1.0), *(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters[1:]))
+    problem = make_problem(model, (1.0, 0.5, 0.7), prior=terms)
+    x = np.array([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]])
+    assert forecast(problem, x).failures == ("", "a outside [0, inf] m")
+    assert np.isinf(cost(problem, x)).tolist() == [False, True]
+
+
+def test_non_finite_prediction_is_a_failure():
+    problem = make_problem(Linear(("a", "b")), [1.0, 1.0])
+    with np.errstate(over="ignore"):
+        run = forecast(problem, np.array([[1.0, 1.0], [1.7e308, -1.7e308]]))
+    assert run.failures[0] == ""
+    assert run.failures[1]
+    assert run.active.tolist() == [True, False]

@@ -1,0 +1,33 @@
+"""A scheme sees weights and whitened arrays: no state, no model, no observations, no truth."""
+
+import ast
+import inspect
+from pathlib import Path
+
+import pytest
+
+import en4dvar.schemes
+from en4dvar.schemes import Scheme
+
+ALLOWED = {"en4dvar.linalg", "en4dvar.schemes", "en4dvar.state"}
+FILES = sorted(Path(en4dvar.schemes.__file__).parent.glob("*.py"))
+
+
+def test_signature_of_a_scheme():
+    arguments = {
+        name: tuple(inspect.signature(method).parameters)[1:]
+        for name, method in vars(Scheme).items()
+        if not name.startswith("_")
+    }
+    assert arguments == {
+        "init": ("n_members",),
+        "member_weights": ("weights",),
+        "linearise": ("weights", "basis", "predictions", "central", "active"),
+        "step": ("weights", "evaluation"),
+    }
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda f: f.stem)
+def test_schemes_import_no_model_and_no_data(file):
+    imported = {node.module for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.ImportFrom)}
+    assert {m for m in imported if m and m.startswith("en4dvar")} <= ALLOWED
