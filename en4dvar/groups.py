@@ -170,6 +170,7 @@ def _sample_stats(a: Analysis) -> xr.Dataset:
         "n_members": len(active),
         "n_active": int(active.sum()),
         "n_observations": len(y),
+        "n_weighted": int(np.sum(a.observations.weights > 0)),
         "nrmse": nrmse(y, a.posterior_predictions[active].mean(axis=0)) if active.any() else np.nan,
         "nrmse_centre": nrmse(y, a.centre_predictions),
         "chi2_per_observation": last.chi2_per_observation,

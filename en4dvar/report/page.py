@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from en4dvar.diagnostics import chi2_interval
 from en4dvar.groups import ITERATION_SCALARS
 from en4dvar.report.style import DARK, LIGHT, css_variables, inline_svg
 from en4dvar.report.text import (
@@ -59,7 +59,7 @@ class Section:
         """(quantity, value, in plain words, needs attention) for the tiles on top."""
         s = self.stats
         alive, members = int(s["n_active"]), int(s["n_members"])
-        chi2_words, chi2_odd = judge_chi2(float(s["chi2_per_observation"]), int(s["n_observations"]))
+        chi2_words, chi2_odd = judge_chi2(float(s["chi2_per_observation"]), int(s["n_weighted"]), float(s["dfs"]))
         nrmse = float(s["nrmse"])
         ended = "by its own criterion" if s["converged"] else "not converged"
         return [
@@ -74,11 +74,6 @@ class Section:
             ("Members alive", f"{alive} of {members}", "of the posterior ensemble", alive < members),
             ("Iterations", str(s["n_iterations"]), f"{ended}: {s['stop_reason']}", not s["converged"]),
         ]
-
-    @property
-    def warnings(self) -> list[str]:
-        """The assimilation's own warnings, then what the table says in a sentence."""
-        return [*self.result.warnings, *parameter_notes(self.result)]
 
     @property
     def failures(self) -> list[tuple[int, str]]:
@@ -146,31 +141,16 @@ def _row(row: ParameterSummary) -> dict[str, Any]:
     }
 
 
-def judge_chi2(chi2: float, n_observations: int) -> tuple[str, bool]:
-    """In plain words what χ² per observation says, and whether it is far from 1 (three std, at least 0.5)."""
-    far = max(0.5, 3 * math.sqrt(2 / n_observations))
+def judge_chi2(chi2: float, n_observations: int, dfs: float) -> tuple[str, bool]:
+    """What χ² per observation says in plain words, and whether it needs attention (as warnings of the run do)."""
     if not math.isfinite(chi2):
         return "cannot be told", True
-    if chi2 > 1 + far:
+    low, high = chi2_interval(max(1.0, n_observations - dfs))
+    if chi2 * n_observations > high:
         return "misfit exceeds the stated noise: model or noise is wrong", True
-    if chi2 < 1 - far:
+    if chi2 * n_observations < low:
         return "misfit is below the stated noise: the noise may be overstated", True
     return "misfit agrees with the stated noise", False
-
-
-def parameter_notes(result: Result) -> list[str]:
-    """A sentence for every parameter that the data do not inform, or whose posterior left the prior's central 95 %."""
-    notes = []
-    for row in result.summary():
-        low, high = np.quantile(result.members("prior", row.name), (0.025, 0.975))
-        if row.dfs < DFS_WORDS[0][0]:
-            notes.append(f"{row.label} ({row.name}): the data say nothing about it; its posterior is the prior.")
-        if row.q50 < low or row.q50 > high:
-            notes.append(
-                f"{row.label} ({row.name}): posterior at odds with the prior; "
-                "its median lies outside the prior's central 95 %."
-            )
-    return notes
 
 
 def make_section(result: Result, anchor: str, figures: Sequence[tuple[str, str, Figure]]) -> Section:

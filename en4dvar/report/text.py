@@ -7,6 +7,8 @@ import re
 
 from markupsafe import Markup, escape
 
+from en4dvar.diagnostics import HARDLY_INFORMED
+
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _NAMES = (
     "alpha beta gamma delta epsilon zeta eta theta kappa lambda mu nu xi rho sigma tau phi chi psi omega pi infty "
@@ -16,7 +18,7 @@ _GREEK = dict(zip(_NAMES.split(), "αβγδεζηθκλμνξρστφχψωπ∞
 
 Words = tuple[tuple[float, str], ...]
 DFS_WORDS: Words = (
-    (0.1, "data say nothing"),
+    (HARDLY_INFORMED, "data say nothing"),
     (0.5, "weakly informed"),
     (0.9, "informed"),
     (math.inf, "determined by the data"),
