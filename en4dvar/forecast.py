@@ -53,39 +53,38 @@ def forecast(
     Member i is observed at t_k + t_s,i. ``extra_times`` (M,), on the clock of the observations, are read from the same
     run. A member fails, without disturbing the others, where a parameter leaves its bounds, ``initial_state`` raises,
     the model returns a :class:`Failure`, or H gives anything but finite numbers.
+
+    Raises
+    ------
+    ConfigError: a timing error on an observable without a rate.
     """
     executor = executor or SerialExecutor()
     observations = problem.observations
+    rate_operator = _rate_operator(problem)
     times, at_observations, at_extra = _union(observations.times, extra_times)
     n_members = len(x)
-    outcomes: dict[int, Trajectory | Failure] = {}
-    failures = [""] * n_members
-    states: list[Array] = []
     physical = problem.prior.to_physical(x)
-    for i, values in enumerate(physical):
-        try:
-            states.append(_initial_state(problem, values))
-        except Exception as error:  # a model may refuse parameters in any way; the reason is kept
-            failures[i] = str(error) if isinstance(error, _OutOfBounds) else describe(error)
-    alive = [i for i in range(n_members) if not failures[i]]
-    if alive:
+    states, failures = _initial_states(problem, physical)
+    outcomes: dict[int, Trajectory | Failure] = {}
+    if states:
+        alive = list(states)
         shifted = times + _time_shift(problem, physical)[alive, None]
-        outcomes = dict(zip(alive, executor.trajectories(problem.model, np.stack(states), shifted), strict=True))
+        results = executor.trajectories(problem.model, np.stack(list(states.values())), shifted)
+        outcomes = dict(zip(alive, results, strict=True))
 
-    with_rate = needs_rate(observations)
     observed = np.full((n_members, len(times)), np.nan)
-    rates = np.full((n_members, len(times)), np.nan) if with_rate else None
+    rates = None if rate_operator is None else np.full((n_members, len(times)), np.nan)
     for i, outcome in outcomes.items():
         if isinstance(outcome, Failure):
             failures[i] = outcome.reason
             continue
         try:
-            row = _observe(problem, outcome, with_rate)
+            row = _observe(problem, outcome, rate_operator)
         except Exception as error:  # H belongs to the user as well
             failures[i] = describe(error)
             continue
-        if not np.all(np.isfinite(row)):
-            failures[i] = "non-finite prediction"
+        if row.shape[1:] != times.shape or not np.all(np.isfinite(row)):
+            failures[i] = "non-finite prediction" if row.shape[1:] == times.shape else "misshapen prediction"
             continue
         observed[i] = row[0]
         if rates is not None:
@@ -136,29 +135,53 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
     ):
         if names:
             raise ConfigError(f"{', '.join(sorted(names))}: {message}")
-    if needs_rate(problem.observations) and not isinstance(problem.observable.operator, RateOperator):
-        raise ConfigError(
-            f"a timing error needs the rate of {problem.observable.name}, which the model does not provide"
-        )
+    _rate_operator(problem)
     return tuple(known[name] for name in problem.fixed)
 
 
-class _OutOfBounds(ValueError):
-    pass
+def _rate_operator(problem: InverseProblem) -> RateOperator | None:
+    """What gives the rate of the observable, or None where no observation has a timing error."""
+    if not needs_rate(problem.observations):
+        return None
+    operator = problem.observable.operator
+    if not isinstance(operator, RateOperator):
+        raise ConfigError(
+            f"a timing error needs the rate of {problem.observable.name}, which the model does not provide"
+        )
+    return operator
 
 
-def _initial_state(problem: InverseProblem, values: Array) -> Array:
-    for parameter, value in zip(problem.prior.parameters, values, strict=True):
+def _initial_states(problem: InverseProblem, physical: Array) -> tuple[dict[int, Array], list[str]]:
+    """States (n_state,) of the members that have one, by member, and the reasons (B,) of the others."""
+    failures = [""] * len(physical)
+    for parameter, values in zip(problem.prior.parameters, physical.T, strict=True):
         low, high = parameter.bounds
-        if not (low <= value <= high and np.isfinite(value)):
-            raise _OutOfBounds(f"{parameter.name} outside [{low:g}, {high:g}] {parameter.unit}")
-    theta: dict[str, float] = {**problem.fixed, **dict(zip(problem.prior.names, values.tolist(), strict=True))}
-    if TIME_SHIFT.name in theta and all(p.name != TIME_SHIFT.name for p in problem.model.parameters):
-        del theta[TIME_SHIFT.name]
-    state = np.asarray(problem.model.initial_state(theta), dtype=float)
-    if not np.all(np.isfinite(state)):
-        raise ValueError("non-finite initial state")
-    return state
+        for i in np.flatnonzero(~((values >= low) & (values <= high) & np.isfinite(values))):
+            failures[i] = failures[i] or f"{parameter.name} outside [{low:g}, {high:g}] {parameter.unit}"
+    alive = [i for i, reason in enumerate(failures) if not reason]
+    if not alive:
+        return {}, failures
+    fixed = {name: np.full(len(physical), float(value)) for name, value in problem.fixed.items()}
+    theta = {**fixed, **dict(zip(problem.prior.names, physical.T, strict=True))}
+    if all(p.name != TIME_SHIFT.name for p in problem.model.parameters):
+        theta.pop(TIME_SHIFT.name, None)
+
+    def build(members: list[int]) -> dict[int, Array]:
+        states = np.asarray(problem.model.initial_states({k: v[members] for k, v in theta.items()}), dtype=float)
+        if states.shape != (len(members), problem.model.layout.size) or not np.all(np.isfinite(states)):
+            raise ValueError("non-finite or misshapen initial state")
+        return dict(zip(members, states, strict=True))
+
+    states: dict[int, Array] = {}
+    try:
+        return build(alive), failures
+    except Exception:  # some member has no state: find out which, one by one
+        for member in alive:
+            try:
+                states |= build([member])
+            except Exception as error:  # a model may refuse parameters in any way; the reason is kept
+                failures[member] = describe(error)
+    return states, failures
 
 
 def _time_shift(problem: InverseProblem, physical: Array) -> Array:
@@ -168,12 +191,11 @@ def _time_shift(problem: InverseProblem, physical: Array) -> Array:
     return np.full(len(physical), problem.fixed.get(TIME_SHIFT.name, 0.0))
 
 
-def _observe(problem: InverseProblem, trajectory: Trajectory, with_rate: bool) -> Array:
+def _observe(problem: InverseProblem, trajectory: Trajectory, rate_operator: RateOperator | None) -> Array:
     """Predictions and, where needed, rates, (1 or 2, K)."""
-    operator = problem.observable.operator
-    rows = [np.asarray(operator(trajectory), dtype=float)]
-    if with_rate and isinstance(operator, RateOperator):
-        rows.append(np.asarray(operator.rate(trajectory), dtype=float))
+    rows = [np.asarray(problem.observable.operator(trajectory), dtype=float)]
+    if rate_operator is not None:
+        rows.append(np.asarray(rate_operator.rate(trajectory), dtype=float))
     return np.stack(rows)
 
 

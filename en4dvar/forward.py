@@ -114,6 +114,11 @@ class ForwardModel(ABC):
     def initial_state(self, theta: Mapping[str, float]) -> Array:
         """State vector (n_state,) at time zero for the physical parameters ``theta``, parameters appended."""
 
+    def initial_states(self, theta: Mapping[str, Array]) -> Array:
+        """State vectors (N, n_state) of N members, parameters as name → (N,). This default repeats the above."""
+        n_members = len(next(iter(theta.values())))
+        return np.stack([self.initial_state({k: float(v[i]) for k, v in theta.items()}) for i in range(n_members)])
+
     @abstractmethod
     def step(self, x: Array, t0: float, t1: float) -> Array:
         """F_{t1←t0}: advance one state (n_state,). May raise; the caller turns it into a :class:`Failure`."""

@@ -1,11 +1,14 @@
 """A failed member is a value with a reason; a linear problem does not notice it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from toys import Fragile, Linear, make_problem
 
 from en4dvar.assimilate import assimilate, cost, forecast
 from en4dvar.errors import TooFewMembersError
+from en4dvar.forward import Observable
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import AssimilationSettings
 from en4dvar.state import Parameter
@@ -88,6 +91,20 @@ def test_parameter_outside_its_bounds_fails_and_is_not_clipped():
     x = np.array([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]])
     assert forecast(problem, x).failures == ("", "a outside [0, inf] m")
     assert np.isinf(cost(problem, x)).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("operator", "reason"),
+    [
+        (lambda path: path["y"][:-1], "misshapen prediction"),
+        (lambda path: np.log(-1 - path["y"] ** 2), "RuntimeWarning: invalid value encountered in log"),
+        (lambda path: path["y"] * np.nan, "non-finite prediction"),
+        (lambda path: path["z"], "KeyError: 'z'"),
+    ],
+)
+def test_observation_operator_that_fails_is_a_failure(operator, reason):
+    problem = replace(make_problem(Linear(("a", "b")), [1.0, 1.0]), observable=Observable("y", "m", operator))
+    assert set(forecast(problem, problem.prior.sample(4, 0)).failures) == {reason}
 
 
 def test_non_finite_prediction_is_a_failure():
