@@ -247,6 +247,9 @@ class Paths:
 class BubbleTrajectory(Trajectory):
     """One member of a batch; fields are shared with the batch and computed on demand."""
 
+    _paths: Paths
+    _member: int
+
     def __init__(self, paths: Paths, member: int):
         object.__setattr__(self, "_paths", paths)
         object.__setattr__(self, "_member", member)
@@ -254,8 +257,8 @@ class BubbleTrajectory(Trajectory):
         object.__setattr__(self, "layout", paths.model.layout)
 
     def __getitem__(self, name: str) -> Array:
-        return np.asarray(self._paths[name][self._member])  # type: ignore[attr-defined]
+        return np.asarray(self._paths[name][self._member])
 
     @property
-    def states(self) -> Array:  # type: ignore[override]
-        return np.asarray(self._paths.states[self._member])  # type: ignore[attr-defined]
+    def states(self) -> Array:
+        return np.asarray(self._paths.states[self._member])

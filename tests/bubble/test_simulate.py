@@ -1,0 +1,47 @@
+"""The public function: shapes, units, messages."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import en4dvar_bubble
+from en4dvar.errors import ConfigError
+
+GEL = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}
+TIMES = np.linspace(5e-6, 30e-6, 7)
+
+
+def test_dataset_has_si_fields_with_units_and_the_parameters():
+    data = en4dvar_bubble.simulate(parameters={**GEL, "G": [5e3, 6e3, 7e3]}, times=TIMES)
+    assert data.sizes == {"member": 3, "time": 7}
+    assert {n: data[n].attrs["units"] for n in ("R", "Rdot", "p_b", "time", "G", "R0")} == {
+        "R": "m", "Rdot": "m s-1", "p_b": "Pa", "time": "s", "G": "Pa", "R0": "m",
+    }  # fmt: skip
+    assert data.attrs == {
+        "law": "quadratic-kelvin-voigt", "start": "acoustic", "gas": "heat", "driving_read": "instantaneous",
+    }  # fmt: skip
+    assert (data.status == 0).all()
+    assert list(data.reason.values) == ["", "", ""]
+
+
+def test_velocity_is_the_derivative_of_the_radius():
+    t = np.linspace(10e-6, 20e-6, 1001)
+    data = en4dvar_bubble.simulate(parameters=GEL, times=t, accuracy="reference")
+    np.testing.assert_allclose(np.gradient(data.R[0], t)[1:-1], data.Rdot[0][1:-1], rtol=2e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"parameters": {"G": 1e3, "mu": 0.1}}, r"missing alpha \(1\), R0 \(m\)"),
+        ({"parameters": {**GEL, "beta": 1.0}}, "unknown beta"),
+        ({"parameters": {**GEL, "G": [1.0, 2.0], "mu": [1.0, 2.0, 3.0]}}, "lengths differ"),
+        ({"parameters": {**GEL, "mu": -1.0}}, "mu must lie in"),
+        ({"times": [2e-6, 1e-6]}, "increasing"),
+        ({"law": "rubber"}, "unknown law 'rubber'"),
+    ],
+)
+def test_mistakes_are_named(change, message):
+    with pytest.raises(ConfigError, match=message):
+        en4dvar_bubble.simulate(**{"parameters": GEL, "times": TIMES, **change})

@@ -1,0 +1,185 @@
+"""The integrator: its coefficients, its arithmetic, its independence of batching, its failures."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numba as nb
+import numpy as np
+import pytest
+
+import en4dvar_bubble.solver
+from en4dvar.forward import Failure
+from en4dvar_bubble import Accuracy, BubbleModel, simulate
+from en4dvar_bubble.solver import integrate, lanes, rodas5p
+from en4dvar_bubble.solver.caching import _digest
+from en4dvar_bubble.solver.collocation import ball
+
+TIMES = np.linspace(4e-6, 80e-6, 60)
+
+
+def gels(n, seed=0):
+    rng = np.random.default_rng(seed)
+    centre = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}
+    return {k: v * np.exp(0.3 * rng.standard_normal(n)) for k, v in centre.items()}
+
+
+def rosenbrock(f, jac, f_t, y, t, h):
+    """One step in plain NumPy; returns the new state and the stages."""
+    k = np.zeros((rodas5p.STAGES, len(y)))
+    M = np.eye(len(y)) / (h * rodas5p.GAMMA) - jac(t, y)
+    for i in range(rodas5p.STAGES):
+        right = f(t + rodas5p.ALPHA[i] * h, y + rodas5p.A[i] @ k) + rodas5p.C[i] @ k / h
+        k[i] = np.linalg.solve(M, right + h * rodas5p.D[i] * f_t(t, y))
+    return y + rodas5p.B @ k, k
+
+
+class TestRodas5P:
+    """A nonlinear, non-autonomous problem with a known solution: y' = −y² cos t, y = 1/(2 + sin t)."""
+
+    @staticmethod
+    def solve(steps, inside=None):
+        def f(t, y):
+            return -(y**2) * np.cos(t)
+
+        h = 2.0 / steps
+        y, t = np.array([0.5]), 0.0
+        for _ in range(steps):
+            new, k = rosenbrock(f, lambda t, y: np.diag(-2 * y * np.cos(t)), lambda t, y: y**2 * np.sin(t), y, t, h)
+            if inside is not None:
+                K = rodas5p.H @ k
+                s = inside
+                dense = (1 - s) * y + s * (new + (1 - s) * (K[0] + s * (K[1] + s * K[2])))
+                yield t + s * h, dense[0], k[-1][0]
+            y, t = new, t + h
+        yield t, y[0], k[-1][0]
+
+    @staticmethod
+    def error(steps):
+        t, y, _ = list(TestRodas5P.solve(steps))[-1]
+        return abs(y - 1 / (2 + np.sin(t)))
+
+    def test_order_five(self):
+        order = np.log2(self.error(8) / self.error(16))
+        assert order == pytest.approx(rodas5p.ORDER, abs=0.4)
+        assert np.log2(self.error(16) / self.error(32)) == pytest.approx(rodas5p.ORDER, abs=0.25)
+
+    def test_dense_output_of_order_four(self):
+        def largest(steps):
+            return max(abs(y - 1 / (2 + np.sin(t))) for t, y, _ in list(self.solve(steps, 0.37))[:-1])
+
+        assert np.log2(largest(32) / largest(64)) > 3.8
+
+    def test_stiffly_accurate(self):
+        """On y' = λ(y − g) + g′ with λ → −∞ one step lands on g."""
+        lam = -1e8
+        new, _ = rosenbrock(
+            lambda t, y: lam * (y - np.sin(t)) + np.cos(t),
+            lambda t, y: np.array([[lam]]),
+            lambda t, y: np.array([-lam * np.cos(t) - np.sin(t)]),
+            np.array([0.0]),
+            0.0,
+            0.1,
+        )
+        assert new[0] == pytest.approx(np.sin(0.1), abs=1e-7)
+
+
+class TestLanes:
+    def test_exponential_to_one_ulp(self):
+        @nb.njit
+        def run(x, out):
+            for row in range(x.shape[0]):
+                lanes.store(out, row, lanes.exp(lanes.load(x, row)))
+
+        x = np.random.default_rng(0).uniform(-50, 50, (500, lanes.WIDTH))
+        out = np.empty_like(x)
+        run(x, out)
+        assert np.max(np.abs(out / np.exp(x) - 1)) < 5e-16
+
+    def test_select_min_max_floor(self):
+        @nb.njit
+        def run(x, out):
+            a = lanes.load(x, 0)
+            lanes.store(out, 0, lanes.select(a > 0.5, a * 2.0, -a))
+            lanes.store(out, 1, lanes.minimum(lanes.maximum(a, -1.0), 1.0))
+            lanes.store(out, 2, lanes.floor(a))
+
+        x = np.linspace(-3, 3, lanes.WIDTH)[None].copy()
+        out = np.empty((3, lanes.WIDTH))
+        run(x, out)
+        np.testing.assert_array_equal(out, [np.where(x > 0.5, 2 * x, -x)[0], np.clip(x, -1, 1)[0], np.floor(x)[0]])
+
+
+class TestCollocation:
+    @pytest.mark.parametrize("m", [1, 4, 9])
+    def test_exact_on_even_polynomials(self, m):
+        b = ball(m)
+        for degree in range(0, 2 * m + 1, 2):
+            f = b.y**degree
+            np.testing.assert_allclose(b.derivative @ f, degree * b.y ** max(degree - 1, 0) * (degree > 0), atol=1e-9)
+            expected = degree * (degree + 1) * b.y ** max(degree - 2, 0)
+            np.testing.assert_allclose(b.laplacian @ f, expected, atol=1e-7)
+            assert b.weights @ f == pytest.approx(3 / (degree + 3), rel=1e-12)
+
+
+class TestBatching:
+    def test_members_do_not_influence_each_other(self):
+        together = simulate(parameters=gels(19), times=TIMES).R.values
+        for i in (0, 7, 18):
+            alone = {k: v[i] for k, v in gels(19).items()}
+            np.testing.assert_array_equal(simulate(parameters=alone, times=TIMES).R.values[0], together[i])
+
+    def test_same_bits_for_any_number_of_workers(self):
+        one = simulate(parameters=gels(150), times=TIMES)
+        np.testing.assert_array_equal(one.R, simulate(parameters=gels(150), times=TIMES, workers=2).R)
+        assert (one.status == 0).all()
+
+    def test_output_times_do_not_change_the_path(self):
+        few = simulate(parameters=gels(3), times=TIMES[::7]).R
+        np.testing.assert_array_equal(few, simulate(parameters=gels(3), times=TIMES).R[:, ::7])
+
+    def test_restart_from_any_state_agrees_with_the_continuous_path(self):
+        model = BubbleModel(accuracy=Accuracy(nodes=8, rtol=1e-8))
+        x = model.initial_state({k: v[0] for k, v in gels(1).items()})
+        times = np.array([5.2e-6, 9e-6, 20e-6, 24e-6])
+        path = model.trajectories(x[None], times)[0]
+        t = 0.0
+        for k, t_next in enumerate(times):
+            x = model.step(x, t, t_next)
+            np.testing.assert_allclose(x, path.states[k], rtol=3e-5)
+            t = t_next
+
+
+class TestFailures:
+    def test_step_limit_is_a_reason_not_an_exception(self):
+        model = BubbleModel(accuracy=Accuracy(step_limit=150))
+        theta = gels(3)
+        x = model.initial_states(theta)
+        results = model.trajectories(x, TIMES)
+        assert all(isinstance(r, Failure) and r.reason.startswith("step limit reached at t =") for r in results)
+
+    def test_mach_limit_names_the_mach_number_and_spares_the_others(self):
+        violent = {"G": [420.0, 2e4], "alpha": [0.0, 0.03], "mu": [0.02, 0.3], "R0": [0.43e-6, 3e-6]}
+        data = simulate(parameters=violent, times=TIMES, accuracy=Accuracy(mach_limit=2.0))
+        assert data.reason.values[0].startswith("model validity: wall Mach")
+        assert data.reason.values[1] == ""
+        assert np.isnan(data.R[0]).all()
+        assert np.isfinite(data.R[1]).all()
+        assert data.max_wall_mach[1] < 2
+
+
+class TestCache:
+    def test_compiled_kernels_are_stamped_with_all_their_sources(self, tmp_path):
+        folder = Path(en4dvar_bubble.solver.__file__).parent
+        assert integrate.integrate._cache._cache_file._source_stamp == _digest(folder)
+        (tmp_path / "a.py").write_text("x = 1")
+        before = _digest(tmp_path)
+        (tmp_path / "a.py").write_text("x = 2")
+        assert _digest(tmp_path) != before
+
+    def test_nothing_compiles_at_import(self):
+        code = "import en4dvar_bubble.solver.integrate as i; print(len(i.integrate.signatures))"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert done.stdout.strip() == "0"
