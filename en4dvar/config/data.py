@@ -33,6 +33,19 @@ class Spread:
         return self.value * abs(maximum) if self.relative else self.value
 
 
+def parse_spread(text: str | float, unit: str) -> Spread:
+    """``"1.4 um"`` or ``"1 % of maximum"``. Raises :class:`UnitError`."""
+    word = str(text).strip()
+    relative = _RELATIVE.fullmatch(word)
+    if relative:
+        return Spread(parse_quantity(relative[1], "1"), relative=True)
+    try:
+        return Spread(parse_quantity(text, unit))
+    except UnitError as error:
+        hint = f"; write '{word} of maximum'" if word.endswith("%") else ""
+        raise UnitError(f"{error}{hint}") from None
+
+
 @dataclass(frozen=True)
 class DataPlan:
     """How observations are read: everything but the files' content, in the model's units."""
@@ -160,17 +173,12 @@ def _spread(
     if key not in raw:
         faults.append(document.fault(path, "required: the standard deviation of the observation error"))
         return None
-    text = str(raw[key]).strip()
-    relative = _RELATIVE.fullmatch(text)
     try:
-        spread = Spread(
-            parse_quantity(relative[1] if relative else text, "1" if relative else observable.unit), bool(relative)
-        )
+        spread = parse_spread(raw[key], observable.unit)
     except UnitError as error:
-        hint = f"; write '{text} of maximum'" if text.endswith("%") else ""
-        faults.append(document.fault(path, f"{error}{hint}"))
+        faults.append(document.fault(path, str(error)))
         return None
     if not spread.value > 0:
-        faults.append(document.fault(path, f"must be positive, not {text}"))
+        faults.append(document.fault(path, f"must be positive, not {raw[key]}"))
         return None
     return spread

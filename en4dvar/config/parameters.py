@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from en4dvar.config import schema
 from en4dvar.config.document import Document
@@ -29,6 +29,7 @@ _RECIPES = {
 class Fixed:
     """A parameter held at ``value`` (its own unit)."""
 
+    needs_data: ClassVar[bool] = False
     parameter: Parameter
     value: float
 
@@ -37,6 +38,7 @@ class Fixed:
 class Scalar:
     """A parameter held at a scalar of the data file."""
 
+    needs_data: ClassVar[bool] = True
     parameter: Parameter
     name: str
     unit: str

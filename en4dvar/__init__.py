@@ -1,0 +1,73 @@
+"""En4D-Var: ensemble data assimilation for models that you can run but not differentiate.
+
+    import en4dvar
+    result = en4dvar.run("configs/quickstart.yaml")
+    print(result.to_dataframe().describe())
+
+Names are imported when first used, so that ``import en4dvar`` stays light.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from en4dvar.config import Config as Config
+    from en4dvar.config import load_config as load_config
+    from en4dvar.errors import ConfigError as ConfigError
+    from en4dvar.errors import DataError as DataError
+    from en4dvar.errors import En4dvarError as En4dvarError
+    from en4dvar.errors import OutputError as OutputError
+    from en4dvar.errors import TooFewMembersError as TooFewMembersError
+    from en4dvar.forward import Failure as Failure
+    from en4dvar.forward import ForwardModel as ForwardModel
+    from en4dvar.forward import Observable as Observable
+    from en4dvar.forward import StateField as StateField
+    from en4dvar.forward import Trajectory as Trajectory
+    from en4dvar.observations import Observations as Observations
+    from en4dvar.prior import Prior as Prior
+    from en4dvar.prior import PriorTerm as PriorTerm
+    from en4dvar.problem import Analysis as Analysis
+    from en4dvar.problem import AssimilationSettings as AssimilationSettings
+    from en4dvar.problem import InverseProblem as InverseProblem
+    from en4dvar.runner import run as run
+    from en4dvar.runner import run_campaign as run_campaign
+    from en4dvar.simulation import simulate as simulate
+    from en4dvar.state import Field as Field
+    from en4dvar.state import Parameter as Parameter
+    from en4dvar.state import StateLayout as StateLayout
+    from en4dvar.store import Result as Result
+    from en4dvar.store import load_result as load_result
+    from en4dvar.units import Quantity as Quantity
+
+_HOME = {
+    "config": ("Config", "load_config"),
+    "errors": ("ConfigError", "DataError", "En4dvarError", "OutputError", "TooFewMembersError"),
+    "forward": ("Failure", "ForwardModel", "Observable", "StateField", "Trajectory"),
+    "observations": ("Observations",),
+    "prior": ("Prior", "PriorTerm"),
+    "problem": ("Analysis", "AssimilationSettings", "InverseProblem"),
+    "runner": ("run", "run_campaign"),
+    "simulation": ("simulate",),
+    "state": ("Field", "Parameter", "StateLayout"),
+    "store": ("Result", "load_result"),
+    "units": ("Quantity",),
+}
+_MODULE = {name: module for module, names in _HOME.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("en4dvar")
+    if name not in _MODULE:
+        raise AttributeError(f"module 'en4dvar' has no attribute {name!r}")
+    value = getattr(import_module(f"en4dvar.{_MODULE[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*_MODULE, "__version__"])

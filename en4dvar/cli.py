@@ -1,0 +1,197 @@
+"""The command line. Heavy imports stay inside the commands, so that ``--help`` answers at once.
+
+Exit codes: 0 done; 1 the run failed; 2 usage, configuration, data or output directory; 3 too few surviving members;
+130 interrupted.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import click
+
+from en4dvar.errors import En4dvarError
+
+if TYPE_CHECKING:
+    from en4dvar.config import Config
+
+F = Callable[..., Any]
+
+
+class Failed(click.ClickException):
+    """An error told on standard error, without a traceback, with an exit code of ours."""
+
+    def __init__(self, message: str, exit_code: int):
+        super().__init__(message)
+        self.exit_code = exit_code  # type: ignore[misc]
+
+    def show(self, file: IO[Any] | None = None) -> None:
+        click.echo(self.message, file=file, err=file is None)
+
+
+class Commands(click.Group):
+    """Turns the package's errors and Ctrl-C into messages and exit codes."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except En4dvarError as error:
+            raise Failed(str(error), error.exit_code) from error
+        except (KeyboardInterrupt, click.Abort):
+            raise Failed("interrupted", 130) from None
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(package_name="en4dvar")
+def main() -> None:
+    """Calibrate a model on measured time series with an ensemble (En4D-Var).
+
+    \b
+    Example:
+      en4dvar run configs/quickstart.yaml
+    """
+
+
+def _config_options(command: F) -> F:
+    for decorate in (
+        click.option(
+            "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a value, e.g. assimilation.members=96."
+        ),
+        click.option("--data", metavar="FILE", help="Data file (or glob) instead of data.path."),
+        click.argument("config", type=click.Path()),
+    ):
+        command = decorate(command)
+    return command
+
+
+def _load(config: str, data: str | None, settings: tuple[str, ...], **special: Any) -> Config:
+    from en4dvar.config import load_config
+
+    overrides: dict[str, Any] = {}
+    for item in settings:
+        key, equals, value = item.partition("=")
+        if not equals:
+            raise click.BadParameter(f"{item!r} is not KEY=VALUE", param_hint="--set")
+        overrides[key.strip()] = value
+    # A path on the command line is relative to the shell's folder, one in the file to the file's.
+    special["data.path"] = [str(Path(data).absolute())] if data else None
+    overrides |= {key: value for key, value in special.items() if value is not None}
+    return load_config(config, overrides)
+
+
+@main.command()
+@_config_options
+@click.option("--out", type=click.Path(path_type=Path), help="Run directory; default output.directory or runs/<name>.")
+@click.option("--force", is_flag=True, help="Replace the files of an earlier run in the run directory.")
+@click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
+def run(
+    config: str, data: str | None, settings: tuple[str, ...], out: Path | None, force: bool, workers: int | None
+) -> None:
+    """Estimate the parameters; write posterior and report to the run directory.
+
+    \b
+    Example:
+      en4dvar run configs/quickstart.yaml --out runs/first --set assimilation.members=96
+    """
+    loaded = _load(
+        config, data, settings, **{"output.directory": str(out) if out else None, "execution.workers": workers}
+    )
+    from en4dvar.build import build
+    from en4dvar.describe import results_table
+    from en4dvar.progress import terminal_progress
+    from en4dvar.runner import execute
+
+    problems = build(loaded)
+    with terminal_progress(len(problems)) as progress:
+        results = execute(
+            loaded, problems, force=force, progress=progress, command=shlex.join(["en4dvar", *sys.argv[1:]])
+        )
+    click.echo(results_table(results))
+    for result in results:
+        for warning in result.warnings:
+            click.echo(f"warning: {result.name}: {warning}", err=True)
+    click.echo(f"report: {loaded.directory / 'report.html'}")
+
+
+@main.command()
+@_config_options
+def validate(config: str, data: str | None, settings: tuple[str, ...]) -> None:
+    """Check a configuration and its data without running; tell what would be estimated.
+
+    \b
+    Example:
+      en4dvar validate configs/quickstart.yaml
+    """
+    loaded = _load(config, data, settings)
+    from en4dvar.build import build
+    from en4dvar.describe import problem_summary
+
+    click.echo(problem_summary(loaded, build(loaded)))
+
+
+@main.command()
+@_config_options
+@click.option("--out", type=click.Path(path_type=Path), help="CSV file to write; default standard output.")
+@click.option("--times", metavar="FROM:TO:STEP", help="Instants, e.g. '0 us:60 us:1 us'.")
+@click.option("--noise", metavar="STD", help="Add Gaussian noise, e.g. '1.4 um' or '1 % of maximum'.")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of the noise; default the configuration's.")
+@click.option("--force", is_flag=True, help="Replace the file given by --out.")
+def simulate(
+    config: str,
+    data: str | None,
+    settings: tuple[str, ...],
+    out: Path | None,
+    times: str | None,
+    noise: str | None,
+    seed: int | None,
+    force: bool,
+) -> None:
+    """Run the model once and write the observable as CSV: at fixed values and prior medians.
+
+    Set parameters with --set; the columns are those of the configuration's data section.
+
+    \b
+    Example:
+      en4dvar simulate configs/quickstart.yaml --set parameters.G='0.5 kPa' \\
+          --times '0 us:60 us:1 us' --noise '1.4 um' --out synthetic.csv
+    """
+    loaded = _load(config, data, settings)
+    from en4dvar.errors import OutputError
+    from en4dvar.files import write_text
+    from en4dvar.simulation import noise_level, parse_times, simulate, to_csv
+
+    if out is not None and out.exists() and not force:
+        raise OutputError(f"{out}: exists; give --force to replace it")
+    instants = parse_times(times, loaded.model.time_unit) if times else None
+    simulation = simulate(loaded, instants)
+    if noise:
+        simulation = simulation.with_noise(
+            noise_level(noise, loaded, simulation), loaded.seed if seed is None else seed
+        )
+    text = to_csv(simulation, loaded, shlex.join(["en4dvar", *sys.argv[1:]]))
+    if out is None:
+        click.echo(text, nl=False)
+    else:
+        write_text(out, text)
+
+
+@main.command()
+@click.argument("run_dir", type=click.Path(path_type=Path))
+def report(run_dir: Path) -> None:
+    """Write the report and figures of a finished run again, from its netCDF files.
+
+    \b
+    Example:
+      en4dvar report runs/quickstart
+    """
+    from en4dvar.report import write_report
+
+    click.echo(f"report: {write_report(run_dir)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""Plain-text tables for the terminal: what would be estimated, and what was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from en4dvar.config import Config
+from en4dvar.problem import InverseProblem
+from en4dvar.state import Parameter
+from en4dvar.units import convert
+
+if TYPE_CHECKING:
+    from en4dvar.store import Result
+
+
+def table(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of cells as aligned columns; the first row is the header."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+
+
+def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
+    """What ``validate`` prints: data sets, priors (centre and 5–95 %), fixed values, scheme."""
+    first = problems[0]
+    settings = config.assimilation
+    parts = [
+        f"{config.name}: {len(first.prior.names)} parameters from {len(problems)} data set(s) with "
+        f"{settings.scheme}, {settings.members} members, weights {config.weights}, seed {config.seed}",
+        table([("data set", "observations", "window", "maximum", "error std"), *(_data_row(p) for p in problems)]),
+    ]
+    for problem in problems if any(e.needs_data for e in config.parameters) else problems[:1]:
+        title = f"estimated ({problem.observations.name})" if len(problems) > 1 else "estimated"
+        parts.append(table([(title, "unit", "prior", "median", "5 %", "95 %"), *_prior_rows(problem)]))
+        if problem.fixed:
+            known = {p.parameter.name: p.parameter for p in config.parameters}
+            fixed = [(name, *_shown(known[name], value)) for name, value in problem.fixed.items()]
+            parts.append(table([("fixed", "value", "unit"), *fixed]))
+    parts.append(f"run directory: {config.directory}")
+    return "\n\n".join(parts)
+
+
+def results_table(results: Iterable[Result]) -> str:
+    """Posterior mean, std and 5/50/95 % of every parameter and data set, in display units."""
+    header = ("data set", "parameter", "unit", "mean", "std", "5 %", "50 %", "95 %")
+    rows = [
+        (result.name, row.name, row.unit, *(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q50, row.q95)))
+        for result in results
+        for row in result.summary()
+    ]
+    return table([header, *rows])
+
+
+def _data_row(problem: InverseProblem) -> tuple[str, ...]:
+    y, model, observable = problem.observations, problem.model, problem.observable
+    start, end = (convert(float(t), model.time_unit, model.time_display_unit) for t in y.times[[0, -1]])
+    top, std = (convert(float(v), observable.unit, observable.display_unit) for v in (y.values.max(), np.median(y.std)))
+    timing = convert(float(np.median(y.time_std)), model.time_unit, model.time_display_unit)
+    also = f", {timing:.3g} {model.time_display_unit} in time" if timing else ""
+    unit = observable.display_unit
+    window = f"{start:.4g} to {end:.4g} {model.time_display_unit}"
+    return y.name, str(len(y)), window, f"{top:.4g} {unit}", f"{std:.3g} {unit}{also}"
+
+
+def _prior_rows(problem: InverseProblem) -> list[tuple[str, ...]]:
+    rows = []
+    for term in problem.prior.terms:
+        quantiles = term.to_physical(term.mean + term.std * np.array([0.0, -1.6448536, 1.6448536]))
+        shown = [_shown(term.parameter, float(q))[0] for q in quantiles]
+        rows.append((term.parameter.name, term.parameter.display_unit, term.transform, *shown))
+    return rows
+
+
+def _shown(parameter: Parameter, value: float) -> tuple[str, str]:
+    return f"{convert(value, parameter.unit, parameter.display_unit):.4g}", parameter.display_unit

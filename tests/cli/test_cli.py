@@ -1,0 +1,222 @@
+"""The command line from outside: files, tables, exit codes, and one clear message for each bad input."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from toy_config import YAML, csv_text, write_toy
+
+from en4dvar.cli import main
+from en4dvar.config import load_config
+from en4dvar.store import load_result
+
+
+def call(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
+    """A run of the toy configuration: its directory and what the command said."""
+    folder = tmp_path_factory.mktemp("finished")
+    outcome = call("run", write_toy(folder), "--out", folder / "run")
+    return folder / "run", outcome
+
+
+def test_run_writes_the_run_directory(finished: tuple[Path, Result]) -> None:
+    directory, outcome = finished
+    assert outcome.exit_code == 0, outcome.output
+    names = {p.relative_to(directory).as_posix() for p in directory.rglob("*") if p.is_file()}
+    assert {"config.yaml", "config.resolved.yaml", "posterior.nc", "run.log", "report.html", "summary.csv"} < names
+    assert {"figures/posterior.pdf", "figures/posterior.png", "figures/history.pdf"} < names
+    assert names == {".en4dvar-files", *(directory / ".en4dvar-files").read_text().split()}
+    assert (directory / "config.yaml").read_text() == YAML
+    again = load_config(directory / "config.resolved.yaml")
+    assert again.assimilation.members == 8
+    log = (directory / "run.log").read_text()
+    iterations = re.findall(r"toy: iteration +\d+  J [\d.e+-]+ = .* active 8", log)
+    result = load_result(directory / "posterior.nc")
+    assert len(iterations) == result.iterations.sizes["iteration"]
+    assert log.endswith("done\n")
+
+
+def test_run_recovers_the_truth_and_prints_it(finished: tuple[Path, Result]) -> None:
+    directory, outcome = finished
+    stiffness = {row.name: row for row in load_result(directory / "posterior.nc").summary()}["k"]
+    assert abs(stiffness.mean - 2.0) < 4 * stiffness.std
+    assert stiffness.std < 0.05
+    assert re.search(rf"^toy +k +N/m +{stiffness.mean:.4g} +{stiffness.std:.4g} ", outcome.stdout, re.MULTILINE)
+    assert outcome.stdout.rstrip().endswith(f"report: {directory / 'report.html'}")
+
+
+def test_workers_and_executors_do_not_change_the_numbers(tmp_path: Path, finished: tuple[Path, Result]) -> None:
+    outcome = call(
+        "run", write_toy(tmp_path), "--out", tmp_path / "run", "--workers", "2", "--set", "execution.executor=threads"
+    )
+    assert outcome.exit_code == 0, outcome.output
+    one, two = (load_result(d / "posterior.nc").posterior for d in (finished[0], tmp_path / "run"))
+    assert one.identical(two)
+
+
+def test_campaign(tmp_path: Path) -> None:
+    path = write_toy(tmp_path)
+    for n in (1, 2):
+        (tmp_path / f"set{n}.csv").write_text(csv_text(k=1.5 + n / 4))
+    outcome = call("run", path, "--out", tmp_path / "run", "--data", tmp_path / "set*.csv")
+    assert outcome.exit_code == 0, outcome.output
+    results = [load_result(tmp_path / "run" / "datasets" / f"set{n}.nc") for n in (1, 2)]
+    assert [r.name for r in results] == ["set1", "set2"]
+    means = [r.summary()[1].mean for r in results]
+    assert means == pytest.approx([1.75, 2.0], rel=0.02)
+    assert not (tmp_path / "run" / "posterior.nc").exists()
+
+
+def test_report_again(tmp_path: Path) -> None:
+    call("run", write_toy(tmp_path), "--out", tmp_path / "run")
+    (tmp_path / "run" / "report.html").unlink()
+    outcome = call("report", tmp_path / "run")
+    assert outcome.exit_code == 0
+    assert (tmp_path / "run" / "report.html").stat().st_size > 10_000
+    assert call("report", tmp_path / "nowhere").exit_code == 2
+
+
+def test_validate_tells_what_would_be_estimated(tmp_path: Path) -> None:
+    outcome = call("validate", write_toy(tmp_path))
+    assert outcome.exit_code == 0, outcome.output
+    assert "2 parameters from 1 data set(s) with en4dvar, 8 members" in outcome.stdout
+    assert re.search(r"^toy +31 +0 to 0.15 s +100 um +2 um$", outcome.stdout, re.MULTILINE)
+    assert re.search(r"^k +N/m +lognormal +3 +1\.832 +4\.914$", outcome.stdout, re.MULTILINE)
+    assert re.search(r"^c +0\.02 +N s/m$", outcome.stdout, re.MULTILINE)
+    assert not (Path("runs") / "toy").exists()
+
+
+def test_simulate_makes_data_that_can_be_read_back(tmp_path: Path) -> None:
+    path = write_toy(tmp_path)
+    out = tmp_path / "synthetic.csv"
+    truth = ["--set", "parameters.A=100 um", "--set", "parameters.k=2 N/m"]
+    assert call("simulate", path, *truth, "--out", out).exit_code == 0
+    simulated, exact = (np.loadtxt(t.splitlines()[-31:], delimiter=",") for t in (out.read_text(), csv_text()))
+    assert np.allclose(simulated, exact, atol=1e-3)
+    assert "# parameters: c = 0.02 N s/m" not in out.read_text()  # in the model's order
+    assert "# parameters: A = 0.0001 m, k = 2 N/m, c = 0.02 N s/m" in out.read_text()
+    assert call("validate", path, "--data", out).exit_code == 0
+    assert call("simulate", path, "--out", out).exit_code == 2  # exists
+    assert call("simulate", path, "--out", out, "--force").exit_code == 0
+
+
+def test_simulate_without_data(tmp_path: Path) -> None:
+    path = write_toy(tmp_path)
+    (tmp_path / "toy.csv").unlink()
+    grid = ["--set", "simulate.times={from: 0 ms, to: 150 ms, step: 5 ms}", "--set", "parameters.A=100 um"]
+    clean, noisy, again, other = (
+        call("simulate", path, *grid, *extra).stdout
+        for extra in (
+            [],
+            ["--noise", "1 % of maximum"],
+            ["--noise", "1 um", "--seed", "3"],
+            ["--noise", "1 um", "--seed", "4"],
+        )
+    )
+    values = [np.loadtxt(text.splitlines()[-31:], delimiter=",")[:, 1] for text in (clean, noisy, again, other)]
+    assert values[0][0] == 100
+    assert np.std(values[1] - values[0]) == pytest.approx(1.0, rel=0.4)
+    assert np.array_equal(values[1], values[2])
+    assert not np.array_equal(values[2], values[3])
+    outcome = call("simulate", path, "--times", "0 ms:150 ms:5 ms")
+    assert outcome.exit_code == 2
+    assert "toy.csv: no such file" in outcome.stderr
+    for bad in ("0 ms:1 ms", "0:1:2", "0 ms:1 ms:-1 ms"):
+        assert call("simulate", path, *grid, "--times", bad).exit_code == 2
+
+
+def replaced(old: str, new: str) -> Callable[[Path], list[str | Path]]:
+    return lambda folder: ["run", write_toy(folder, (old, new)), "--out", folder / "out"]
+
+
+def with_data(data: str) -> Callable[[Path], list[str | Path]]:
+    return lambda folder: ["run", write_toy(folder, data=data), "--out", folder / "out"]
+
+
+def full_directory(folder: Path) -> list[str | Path]:
+    (folder / "out").mkdir()
+    (folder / "out" / "notes.txt").write_text("mine")
+    return ["run", write_toy(folder), "--out", folder / "out"]
+
+
+HEAD = "t_ms,x_um\n"
+BAD: dict[str, tuple[Callable[[Path], list[str | Path]], str]] = {
+    "no configuration": (lambda f: ["run", f / "toi.yaml"], "toi.yaml: no such file"),
+    "missing file": (replaced("toy.csv", "toi.csv"), "toi.csv: no such file; the folder holds toy.csv"),
+    "missing --data": (lambda f: ["run", write_toy(f), "--data", f / "x.csv"], "x.csv: no such file"),
+    "wrong column": (replaced("x_um", "R_um"), "toy.csv: no column 'R_um'; the columns are: t_ms, x_um"),
+    "missing unit": (replaced(", unit: um", ""), "toy.yaml:7:5: data.columns.position.unit: required"),
+    "unknown key": (replaced("seed:", "sede:"), "toy.yaml:2:1: sede: unknown key 'sede'; did you mean 'seed'?"),
+    "duplicate key": (replaced("seed: 3", "seed: 3\nseed: 4"), "toy.yaml:3:1: duplicate key 'seed'"),
+    "no unit": (replaced("2 um", "1e-6"), "toy.yaml:8:25: data.error.position_std: 1e-06 has no unit"),
+    "negative std": (replaced("2 um", "-2 um"), "toy.yaml:8:25: data.error.position_std: must be positive"),
+    "negative prior std": (replaced("std: 1 %", "std: -1 um"), "toy.yaml:13:42: parameters.A.std: must be positive"),
+    "empty data": (with_data(""), "toy.csv: the file holds no data"),
+    "all NaN": (with_data(HEAD + "0,nan\n1,nan\n2,nan\n3,\n"), "toy.csv: 'x_um' holds no usable value"),
+    "non-monotone": (with_data(HEAD + "0,1\n2,1\n1,1\n3,1\n"), "toy.csv: times must increase"),
+    "few observations": (with_data(HEAD + "0,1\n1,1\n"), "toy.csv: 2 usable observations; at least 3"),
+    "unknown law": (replaced("mass: 2 g", "law: cubik"), "toy.yaml:11:8: model.law: 'cubik' is not one of"),
+    "no prior": (replaced("  A: {prior: normal, mean: maximum, std: 1 %}\n", ""), "toy.yaml:12:1: parameters.A: "),
+    "not empty": (full_directory, "out: not empty; give --force"),
+    "unwritable": (lambda f: ["run", write_toy(f), "--out", f / "toy.csv" / "out"], "cannot be used as run directory"),
+    "a file as directory": (lambda f: ["run", write_toy(f), "--out", f / "toy.csv"], "cannot be used as run directory"),
+    "bad --set": (lambda f: ["run", write_toy(f), "--set", "members"], "'members' is not KEY=VALUE"),
+    "unknown --set": (lambda f: ["run", write_toy(f), "--set", "assimilation.x=1"], "--set assimilation.x: "),
+    "unknown command": (lambda f: ["rum"], "No such command 'rum'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input(tmp_path: Path, case: str) -> None:
+    arguments, message = BAD[case]
+    outcome = call(*arguments(tmp_path))
+    assert outcome.exit_code == 2
+    assert outcome.stdout == ""
+    assert outcome.stderr.count(message) == 1
+    assert "Traceback" not in outcome.stderr
+    assert len(outcome.stderr.splitlines()) == (4 if "Usage" in outcome.stderr else 1)
+    assert not (tmp_path / "out").exists() or case == "not empty"
+
+
+def test_lost_ensemble(tmp_path: Path) -> None:
+    outcome = call("run", write_toy(tmp_path), "--out", tmp_path / "out", "--set", "model.name=toy_models:Fragile")
+    assert outcome.exit_code == 3
+    assert len(outcome.stderr.splitlines()) == 1
+    assert "failed: TooFewMembersError" in (tmp_path / "out" / "run.log").read_text()
+
+
+def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("en4dvar.runner.assimilate", interrupt)
+    outcome = call("run", write_toy(tmp_path), "--out", tmp_path / "out")
+    assert (outcome.exit_code, outcome.stderr) == (130, "interrupted\n")
+
+
+def test_force_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None:
+    path, out = write_toy(tmp_path), tmp_path / "out"
+    assert call("run", path, "--out", out).exit_code == 0
+    (out / "notes.txt").write_text("mine")
+    (out / "figures" / "mine.png").write_text("mine")
+    (tmp_path / "other.csv").write_text(csv_text())
+    outcome = call("run", path, "--out", out, "--force", "--data", tmp_path / "*.csv")
+    assert outcome.exit_code == 0, outcome.output
+    assert (out / "notes.txt").read_text() == (out / "figures" / "mine.png").read_text() == "mine"
+    assert not (out / "posterior.nc").exists()
+    assert not (out / "figures" / "posterior.png").exists()
+    assert call("run", path, "--out", out, "--force").exit_code == 0
+    assert not (out / "datasets").exists()
+    (out / ".en4dvar-files").unlink()  # now nothing tells that a run wrote the files
+    refused = call("run", path, "--out", out, "--force")
+    assert refused.exit_code == 2
+    assert "was not written by a run" in refused.stderr

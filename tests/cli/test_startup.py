@@ -1,0 +1,46 @@
+"""Start-up: help and the package itself import nothing heavy; the public names are all there."""
+
+import inspect
+import subprocess
+import sys
+import types
+
+import en4dvar
+from en4dvar.cli import main
+
+HEAVY = ("numba", "scipy", "xarray", "matplotlib", "pydantic", "numpy", "yaml", "rich")
+
+
+def loaded(code: str) -> set[str]:
+    """Top-level packages that a fresh interpreter holds after ``code``."""
+    script = code + "\nimport sys; print('\\n'.join({m.partition('.')[0] for m in sys.modules}))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+def test_cli_and_package_import_nothing_heavy() -> None:
+    assert not loaded("import en4dvar, en4dvar.cli").intersection(HEAVY)
+    assert "pydantic" in loaded("import en4dvar; en4dvar.load_config")  # the check can fail
+
+
+def test_units_and_errors_need_no_pydantic() -> None:
+    assert not loaded("import en4dvar.units, en4dvar.errors").intersection({"pydantic", "numba", "scipy"})
+
+
+def test_public_names() -> None:
+    names = [n for n in dir(en4dvar) if not n.startswith("__")]
+    assert {"run", "load_config", "load_result", "Parameter", "ForwardModel"} <= set(names)
+    import en4dvar.runner
+    import en4dvar.simulation
+
+    for name in names:
+        value = getattr(en4dvar, name)
+        assert not isinstance(value, types.ModuleType)
+        assert value.__module__.startswith("en4dvar.")
+    assert en4dvar.__version__.count(".") == 2
+
+
+def test_every_command_has_help_with_an_example() -> None:
+    for name, command in main.commands.items():
+        assert "Example:\n" in inspect.cleandoc(command.help or ""), name
+        assert f"en4dvar {name} " in (command.help or "")
