@@ -4,6 +4,7 @@ import inspect
 import subprocess
 import sys
 import types
+from importlib import import_module
 
 import en4dvar
 from en4dvar.cli import main
