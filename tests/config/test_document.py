@@ -9,7 +9,8 @@ from en4dvar.errors import ConfigError
 
 
 def test_scalars_of_the_core_schema() -> None:
-    text = "a: 1e-6\nb: no\nc: off\nd: true\ne: 012\nf: 2024-01-01\ng: '3'\nh:\ni: 12:30\nj: .5\nk: +7\nl: 1_000\nm: -.inf\n"
+    text = "a: 1e-6\nb: no\nc: off\nd: true\ne: 012\nf: 2024-01-01\ng: '3'\nh:\ni: 12:30\nj: .5\n"
+    text += "k: +7\nl: 1_000\nm: -.inf\n"
     assert parse_document(text).data == {
         "a": 1e-6, "b": "no", "c": "off", "d": True, "e": 12, "f": "2024-01-01", "g": "3", "h": None, "i": "12:30",
         "j": 0.5, "k": 7, "l": "1_000", "m": -float("inf"),
