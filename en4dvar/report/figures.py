@@ -68,7 +68,10 @@ def history(result: Result) -> Figure:
     reach = 1.15 * max(3.0, float(np.max(np.abs(residual))))
     span = time[-1] - time[0]
     bottom.set(ylim=(-reach, reach), ylabel="residual / std", xlim=(time[0] - 0.03 * span, time[-1] + 0.03 * span))
-    bottom.set_yticks([-2, 0, 2])
+    if reach < 8:
+        bottom.set_yticks([-2, 0, 2])
+    else:
+        bottom.yaxis.set_major_locator(MaxNLocator(4))
     bottom.set_xlabel(with_unit("time", result.observed_data["time"].attrs["display_units"]))
     return figure
 
@@ -221,7 +224,7 @@ def _alive(result: Result, name: str) -> Array:
 
 
 def _pair(ax: Axes, i: int, j: int, x: Array, y: Array) -> None:
-    ax.xaxis.set_major_locator(MaxNLocator(3))
+    ax.xaxis.set_major_locator(MaxNLocator(2))
     ax.yaxis.set_major_locator(MaxNLocator(3))
     if i == j:
         _histogram(ax, x, "posterior", alpha=0.6)

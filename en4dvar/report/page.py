@@ -63,7 +63,7 @@ class Section:
         nrmse = float(s["nrmse"])
         ended = "by its own criterion" if s["converged"] else "not converged"
         return [
-            ("Fit, NRMSE", plain_number(nrmse, 3), "1 is perfect, 0 is no better than a constant", not nrmse >= 0.9),
+            ("Fit, NRMSE", number_like(nrmse, 0.01), "1 is perfect, 0 is no better than a constant", not nrmse >= 0.9),
             ("χ² per observation", plain_number(float(s["chi2_per_observation"]), 3), chi2_words, chi2_odd),
             (
                 "Information, DFS",
