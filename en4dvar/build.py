@@ -12,6 +12,7 @@ from en4dvar.config import Config
 from en4dvar.config.data import DataPlan
 from en4dvar.config.parameters import Fixed, Uncertain, located
 from en4dvar.errors import ConfigError, DataError, Fault
+from en4dvar.forecast import check_problem
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
@@ -26,14 +27,22 @@ def build(config: Config) -> tuple[InverseProblem, ...]:
     Raises
     ------
     ConfigError: there is no ``data:`` section, nothing is estimated, or a prior does not suit the data.
-    DataError: a data file cannot be used.
+    DataError: data files cannot be used; names every one of them.
     """
     if config.data is None:
         raise ConfigError([Fault("required: where the observations are", "data", config.document.file)])
     if not any(isinstance(entry, Uncertain) for entry in config.parameters):
         raise ConfigError([config.document.fault(("parameters",), "no parameter has a prior; nothing to estimate")])
-    files = data_files(config.data)
-    return tuple(_problem(config, config.data, path, name) for name, path in files.items())
+    problems: list[InverseProblem] = []
+    unusable: list[DataError] = []
+    for name, path in data_files(config.data).items():
+        try:
+            problems.append(_problem(config, config.data, path, name))
+        except DataError as error:
+            unusable.append(error)
+    if unusable:
+        raise DataError("\n".join(map(str, unusable)))
+    return tuple(problems)
 
 
 def data_files(plan: DataPlan) -> dict[str, Path]:
@@ -125,4 +134,6 @@ def _maximum(entry: Uncertain, config: Config, observations: Observations | None
 def _problem(config: Config, plan: DataPlan, path: Path, name: str) -> InverseProblem:
     observations = read_observations(plan, path, name, config.weights)
     terms, fixed = resolve_parameters(config, observations)
-    return InverseProblem(config.model, config.observable, observations, Prior(terms), fixed)
+    problem = InverseProblem(config.model, config.observable, observations, Prior(terms), fixed)
+    check_problem(problem)
+    return problem

@@ -72,6 +72,10 @@ def test_campaign(tmp_path: Path) -> None:
     assert names == ["b_set1", "a_set1", "set2"]
     with pytest.raises(DataError, match="occurs more than once"):
         build(load_config(path, {"data.path": ["a/set1.csv", "a/*.csv"]}))
+    for n in (1, 2):
+        (tmp_path / "b" / f"set{n}.csv").write_text("t_ms,x_um\n")
+    with pytest.raises(DataError, match=r"b/set1\.csv: .*\n.*b/set2\.csv: "):
+        build(load_config(path, {"data.path": ["a/set1.csv", "b/*.csv"], "name": "all"}))
     with pytest.raises(DataError, match="no file matches"):
         build(load_config(path, {"data.path": "c/*.csv"}))
 
