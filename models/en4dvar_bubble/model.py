@@ -31,8 +31,9 @@ class BubbleModel(ForwardModel):
     """One spherical gas bubble in a viscoelastic medium (Keller–Miksis in pressure; see ``equations`` and the docs).
 
     ``start="acoustic"``: at rest at R0 until the driving arrives, parameters of the law and ``R0``.
-    ``start="laser"``: released from ``R_max`` with the gas that is in equilibrium at ``R_eq``, which is the
-    stress-free radius too. Before time zero the released bubble is taken to be symmetric in time, R(−t) = R(t).
+    ``start="laser"``: released from ``R_max`` at the ambient temperature with the amount of gas that is in equilibrium at
+    ``R_eq``, the stress-free radius: p_g(R_max) = p_g(R_eq) (R_eq/R_max)³, whatever the gas does afterwards.
+    Before time zero the released bubble is taken to be symmetric in time, R(−t) = R(t).
     """
 
     law: ConstitutiveLaw = field(default_factory=QuadraticKelvinVoigt)
@@ -98,11 +99,10 @@ class BubbleModel(ForwardModel):
             raise ValueError("radii must be positive")
         medium = self.medium
         gas = medium.p_inf + 2 * medium.S / rest - medium.p_v
-        exponent = 3.0 * (medium.kappa if self.gas == "polytropic" else 1.0)
         x = np.empty((len(rest), self.layout.size))
         x[:, self.layout["R"].start] = R
         x[:, self.layout["Rdot"].start] = 0.0
-        x[:, self.layout["p_b"].start] = gas * (rest / R) ** exponent + medium.p_v
+        x[:, self.layout["p_b"].start] = gas * (rest / R) ** 3 + medium.p_v
         if self.nodes:
             x[:, self.layout["T"]] = medium.T_inf
         for p in self.parameters:
