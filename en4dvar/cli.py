@@ -15,6 +15,7 @@ from typing import IO, TYPE_CHECKING, Any
 import click
 
 from en4dvar.errors import En4dvarError
+from en4dvar.plugin_commands import PluginCommand, plugin_commands
 
 if TYPE_CHECKING:
     from en4dvar.config import Config
@@ -34,7 +35,15 @@ class Failed(click.ClickException):
 
 
 class Commands(click.Group):
-    """Turns the package's errors and Ctrl-C into messages and exit codes."""
+    """Adds the commands of application packages; turns errors of ours and Ctrl-C into messages and exit codes."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted({*super().list_commands(ctx), *plugin_commands()})
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        built_in = super().get_command(ctx, cmd_name)
+        plugin = None if built_in else plugin_commands().get(cmd_name)
+        return PluginCommand(plugin) if plugin else built_in
 
     def invoke(self, ctx: click.Context) -> Any:
         try:

@@ -85,7 +85,8 @@ def test_files_beside_the_code_are_packaged():
 
 
 def test_every_entry_point_leads_somewhere():
-    declared = {**PROJECT["project"]["scripts"], **PROJECT["project"]["entry-points"]["en4dvar.models"]}
+    groups = [PROJECT["project"]["scripts"], *PROJECT["project"]["entry-points"].values()]
+    declared = {name: value for group in groups for name, value in group.items()}
     assert set(declared) == {e.name for e in distribution("en4dvar").entry_points}, "install the project again"
     for value in declared.values():
         module, _, attribute = value.partition(":")

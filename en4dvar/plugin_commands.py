@@ -1,0 +1,61 @@
+"""Subcommands that application packages add: entry points of group ``en4dvar.commands``, name → click command.
+
+``en4dvar --help`` must stay quick and must not fail because of a package, so help reads the command's docstring from
+its source; only invoking a command imports it.
+"""
+
+from __future__ import annotations
+
+import ast
+from importlib.machinery import PathFinder
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+import click
+
+from en4dvar.errors import En4dvarError
+
+GROUP = "en4dvar.commands"
+
+
+class PluginCommand(click.Command):
+    """Stands for a command until it is invoked."""
+
+    def __init__(self, entry: EntryPoint):
+        super().__init__(entry.name, short_help=_first_sentence(entry) or f"From {entry.module.partition('.')[0]}.")
+        self.entry = entry
+
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
+    ) -> click.Context:
+        """Import the command and let it take over. Raises :class:`En4dvarError` where that fails."""
+        try:
+            command = self.entry.load()
+        except (ImportError, AttributeError) as error:
+            raise En4dvarError(f"command {self.name!r} ({self.entry.value}) cannot be loaded: {error}") from error
+        if not isinstance(command, click.Command):
+            raise En4dvarError(f"command {self.name!r}: {self.entry.value} is not a click command")
+        return command.make_context(info_name, args, parent, **extra)
+
+
+def plugin_commands() -> dict[str, EntryPoint]:
+    """Entry points by name; nothing is imported."""
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def _first_sentence(entry: EntryPoint) -> str:
+    """First sentence of the command's docstring, read without importing; "" where it cannot be found."""
+    top, *rest = entry.module.split(".")
+    spec = PathFinder.find_spec(top)
+    if spec is None or spec.origin is None:
+        return ""
+    base = Path(spec.origin).parent.joinpath(*rest)
+    files = (base.with_suffix(".py"), base / "__init__.py") if rest else (Path(spec.origin),)
+    try:
+        source = next(file for file in files if file.is_file()).read_text(encoding="utf-8")
+        functions = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef))
+        help_text = next(ast.get_docstring(f) or "" for f in functions if f.name == entry.attr)
+    except (OSError, ValueError, SyntaxError, StopIteration):
+        return ""
+    return " ".join(help_text.partition("\n\n")[0].split())
