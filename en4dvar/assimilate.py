@@ -32,6 +32,8 @@ def assimilate(
     seed: int,
     executor: Executor | None = None,
     progress: Progress | None = None,
+    resume: LoopState | None = None,
+    on_iteration: Callable[[LoopState], None] | None = None,
 ) -> Analysis:
     """Estimate the parameters of one data set.
 
@@ -40,13 +42,31 @@ def assimilate(
     seed: of the prior ensemble; the same seed gives the same bits for any executor.
     executor: where members run; default in this process.
     progress: called with the name of the data set and the record of each iteration.
+    resume: where an earlier call with the same arguments was interrupted; the result has the same bits as without.
+    on_iteration: called with the state that the next iteration starts from.
 
     Raises
     ------
     ConfigError: the problem is not complete. TooFewMembersError: too few members survive a forecast.
     """
     with one_blas_thread():
-        return _Run(problem, settings, seed, executor or SerialExecutor(), progress).analysis()
+        return _Run(problem, settings, seed, executor or SerialExecutor(), progress, on_iteration).analysis(resume)
+
+
+@dataclass(frozen=True)
+class LoopState:
+    """All that the rest of the iterations depends on, besides the problem, the settings and the seed.
+
+    ``worst_loss`` (N,) reasons of failure in the iteration that lost most members, or empty.
+    """
+
+    weights: Weights
+    forward_runs: int
+    warnings: tuple[str, ...] = ()
+    records: tuple[IterationRecord, ...] = ()
+    worst_loss: tuple[str, ...] = ()
+    stop_reason: str = ""
+    converged: bool = False
 
 
 @dataclass(frozen=True)
@@ -72,10 +92,11 @@ class _Run:
         seed: int,
         executor: Executor,
         progress: Progress | None,
+        on_iteration: Callable[[LoopState], None] | None,
     ):
         self.fixed_parameters = check_problem(problem)
         self.problem, self.settings, self.seed = problem, settings, seed
-        self.executor, self.progress = executor, progress
+        self.executor, self.progress, self.on_iteration = executor, progress, on_iteration
         self.scheme: Scheme = En4DVar(settings.linearisation, settings.epsilon)
         self.search = STEP_CONTROLS[settings.step_control]
         self.members = problem.prior.sample(settings.members, seed, settings.sampling)
@@ -98,13 +119,14 @@ class _Run:
     def observation_cost(self, run: Forecast) -> Array:
         return observation_cost(self.problem.observations, run.predictions, run.rates)
 
-    def analysis(self) -> Analysis:
+    def analysis(self, resume: LoopState | None) -> Analysis:
         problem, observations = self.problem, self.problem.observations
         grid = np.linspace(observations.times[0], observations.times[-1], GRID_POINTS)
         prior_run = self.forecast(np.vstack([self.members, self.mean]), grid)
         self.require_members(prior_run[:-1], "prior forecast")
-        start, start_warnings = self.start(prior_run)
-        end = self.iterate(start)
+        state = resume or self.start(prior_run)
+        self.forward_runs = state.forward_runs
+        end = self.iterate(state)
 
         posterior = self.control(end.weights.w + end.step.transform)
         mode = self.control(end.weights.w)
@@ -146,7 +168,7 @@ class _Run:
             settings=self.settings,
             log_evidence=diag.log_evidence(end.cost, end.step.hessian.singular_values, len(self.members), observations),
             warnings=(
-                *start_warnings,
+                *state.warnings,
                 *(() if end.converged else (f"not converged: {end.reason}",)),
                 *diag.loss_warning("prior forecast", prior_run.failures[:-1]),
                 *end.warnings,
@@ -157,25 +179,29 @@ class _Run:
             ),
         )
 
-    def start(self, run: Forecast) -> tuple[Array, tuple[str, ...]]:
-        """Weights (N,) to start from, out of the prior members and (last row of ``run``) their mean."""
+    def start(self, run: Forecast) -> LoopState:
+        """Where to start from: one of the prior members or (last row of ``run``) their mean."""
         # e_i moved to the minimum-norm weights of the same member, so that J_b is ½‖x − x̄0‖² in the prior covariance
         candidates = np.vstack([self.basis @ self.basis.T, np.zeros(len(self.members))])
         costs = diag.background_cost(candidates) + self.observation_cost(run)
+        start = candidates[int(np.argmin(costs))]
+        warnings: tuple[str, ...] = ()
         if self.settings.start == "prior-mean":
             if np.isfinite(costs[-1]):
-                return candidates[-1], ()
-            reason = f"the prior mean cannot be run ({run.failures[-1]}); started from the best prior member"
-            return candidates[int(np.argmin(costs))], (reason,)
-        return candidates[int(np.argmin(costs))], ()
+                start = candidates[-1]
+            else:
+                warnings = (f"the prior mean cannot be run ({run.failures[-1]}); started from the best prior member",)
+        return LoopState(Weights(start, self.scheme.init(len(start)).T), self.forward_runs, warnings)
 
-    def iterate(self, start: Array) -> _Outcome:
+    def iterate(self, state: LoopState) -> _Outcome:
         settings, scheme = self.settings, self.scheme
-        weights = Weights(start, scheme.init(len(start)).T)
-        records: list[IterationRecord] = []
-        worst_loss: tuple[str, ...] = ()
-        stop, converged = "", False
+        weights, records, worst_loss = state.weights, list(state.records), state.worst_loss
+        stop, converged = state.stop_reason, state.converged
         while True:
+            if self.on_iteration is not None:
+                self.on_iteration(
+                    LoopState(weights, self.forward_runs, state.warnings, tuple(records), worst_loss, stop, converged)
+                )
             run = self.forecast(self.control(np.vstack([scheme.member_weights(weights), weights.w])))
             members, central = run[:-1], run[-1:]
             self.require_members(members, f"forecast of iteration {len(records) + 1}")

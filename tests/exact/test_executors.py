@@ -1,9 +1,8 @@
 """The numbers do not depend on where members run."""
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
+from same_bits import assert_same_bits
 from toys import Decay, Dying, Fragile, Vectorised, make_problem
 
 from en4dvar.assimilate import assimilate
@@ -20,19 +19,6 @@ def problems():
         make_problem(Vectorised(("a", "b", "c"), batch=4, compiled=True), [1.0, 0.5, 0.2]),
         make_problem(Fragile(1.6, how="raise", names=("a", "b")), [1.0, 0.5]),
     )
-
-
-def assert_same_bits(a, b):
-    for field in fields(a):
-        left, right = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(left, np.ndarray):
-            assert np.array_equal(left, right, equal_nan=True), field.name
-        elif field.name == "iterations":
-            assert len(left) == len(right)
-            for x, y in zip(left, right, strict=True):
-                assert_same_bits(x, y)
-        elif field.name not in ("observations", "observable"):
-            assert left == right, field.name
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3])

@@ -1,0 +1,20 @@
+"""Equality of analyses to the last bit."""
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+
+def assert_same_bits(a: Any, b: Any) -> None:
+    """Every field of two analyses (or records) agrees exactly; NaN equals NaN."""
+    for field in fields(a):
+        left, right = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(left, np.ndarray):
+            assert np.array_equal(left, right, equal_nan=True), field.name
+        elif field.name == "iterations":
+            assert len(left) == len(right)
+            for x, y in zip(left, right, strict=True):
+                assert_same_bits(x, y)
+        elif field.name not in ("observations", "observable"):
+            assert left == right, field.name
