@@ -1,0 +1,63 @@
+"""Every configuration that ships runs; those on measured data where the workshop folder ``../shared/data`` is present."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import en4dvar
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = ROOT.parent / "shared" / "data"
+
+
+def run(name, out, **overrides):
+    return en4dvar.run(ROOT / "configs" / f"{name}.yaml", overrides={"output.directory": str(out), **overrides})
+
+
+def on_file(name, file, out):
+    path = DATA / file
+    if not path.exists():
+        pytest.skip(f"measured data not present: {path}")
+    return run(name, out, **{"data.path": [str(path)]})
+
+
+def mean_and_std(result, name):
+    values = result.posterior[name].values
+    return float(values.mean()), float(values.std(ddof=1))
+
+
+def test_quickstart_recovers_the_synthetic_gel(tmp_path):
+    result = run("quickstart", tmp_path)
+    scores = result.sample_stats.attrs
+    assert scores["converged"] == 1
+    assert scores["n_active"] == 48
+    assert scores["nrmse"] > 0.94
+    truth = {"G": 420.0, "alpha": 0.029, "mu": 0.086, "R0": 0.43e-6, "t_s": 0.25e-6}
+    for name, value in truth.items():
+        mean, std = mean_and_std(result, name)
+        assert abs(mean - value) < 2.5 * std, name
+    for file in ("posterior.nc", "report.html", "summary.csv", "config.yaml", "config.resolved.yaml", "run.log"):
+        assert (tmp_path / file).stat().st_size > 0
+
+
+def test_soft_polyacrylamide(tmp_path):
+    """A least-squares fit of the same model (polytropic gas, saturated vapour): G 1.9 kPa, μ 0.084 Pa s, NRMSE 0.957."""
+    result = on_file("polyacrylamide_soft", "A_E2_002.mat", tmp_path)
+    scores = result.sample_stats.attrs
+    assert scores["converged"] == 1
+    assert scores["n_active"] == 48
+    assert scores["nrmse"] >= 0.95
+    G, G_std = mean_and_std(result, "G")
+    mu, _ = mean_and_std(result, "mu")
+    assert abs(G - 1.9e3) < G_std
+    assert mu == pytest.approx(0.0845, rel=0.03)
+
+
+def test_stiff_polyacrylamide(tmp_path):
+    result = on_file("polyacrylamide_estrada", "PA1_exp2_RofTdata_0.mat", tmp_path)
+    scores = result.sample_stats.attrs
+    assert scores["n_active"] == 48
+    assert scores["converged"] == 1
+    assert scores["nrmse"] > 0.95
