@@ -1,15 +1,16 @@
 """What a constitutive law is.
 
-An author writes one class: its ``name``, its ``parameters`` and either the closed form of the stress integral,
-:meth:`stress`, or W′(λ), :meth:`strain_energy_rate`. Both take the hoop stretch λ = R/R0 and return the same shape;
-``p.G`` etc. broadcast against it. The law is tabulated per member over λ = e^−5 … e^10.5 before the compiled
-integration starts, so its author writes plain NumPy and the kernel does not change.
+An author writes one class: its ``name``, its ``parameters`` and its elastic part, either the closed form of the stress
+integral, :meth:`ConstitutiveLaw.stress`, or W′(λ), :meth:`ConstitutiveLaw.strain_energy_rate` (a :class:`Liquid` has
+none). The viscous part is a Newtonian dashpot where ``parameters`` holds ``mu``, or the method ``viscosity``. Memory
+variables are optional. All take and return NumPy arrays that broadcast: ``p.G`` etc. are (N, 1), stretch and shear
+rate (K,). Everything is tabulated per member before the compiled integration starts, so the kernel does not change.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from difflib import get_close_matches
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -17,8 +18,12 @@ import numpy as np
 
 from en4dvar.errors import ConfigError
 from en4dvar.state import Array, Parameter
+from en4dvar_bubble.laws.memory import MemoryTables, MemoryVariable
 from en4dvar_bubble.laws.parameters import MU
+from en4dvar_bubble.laws.viscous import VISCOUS_GRID, mean_viscosity
 from en4dvar_bubble.tables import Grid, evaluate, from_slopes, from_values
+
+__all__ = ["GRID", "REGISTRY", "VISCOUS_GRID", "ConstitutiveLaw", "Liquid", "MemoryTables", "MemoryVariable"]
 
 GRID = Grid(origin=-5.0, step=1 / 32, cells=496)
 _LOG_STRETCH = GRID.nodes
@@ -28,23 +33,62 @@ _UNSTRETCHED = int(np.flatnonzero(_LOG_STRETCH == 0.0)[0])
 _ACROSS = np.array([0.8, -0.4, 4 / 35, -1 / 70])
 
 REGISTRY: dict[str, type[ConstitutiveLaw]] = {}
+FILE_MODULE = "_en4dvar_bubble_law_"
+"""Module names of laws loaded from a file; such laws are not registered."""
+_EXAMPLE_BY_NAME = {"G": 5e3, "alpha": 0.03, "mu": 0.1}
+_EXAMPLE_BY_UNIT = {"Pa": 5e3, "Pa s": 0.1, "s": 1e-6, "1": 0.5}
+
+
+@dataclass(frozen=True)
+class FileReference:
+    """Where a law was loaded from: absolute path, class name and hash of the source."""
+
+    path: str
+    name: str
+    digest: str
 
 
 class ConstitutiveLaw:
     """Base class of constitutive laws; a subclass with a ``name`` registers itself.
 
-    The stress integral is J = 2 ∫_R^∞ (τ_rr − τ_θθ)/r dr = J_e(λ) − 4μ Ṙ/R. For any incompressible isotropic solid
-    dJ_e/dλ = −W′(λ)/(λ³ − 1), J_e(1) = 0, with W(λ) the strain energy of the equibiaxial stretch λ.
+    The stress integral is J = 2 ∫_R^∞ (τ_rr − τ_θθ)/r dr = J_e(λ) − 4 μ̄(|V|) V + Σ s, with V = Ṙ/R, λ = R/R0.
+
+    - Elastic: for any incompressible isotropic solid dJ_e/dλ = −W′(λ)/(λ³ − 1), J_e(1) = 0, with W(λ) the strain
+      energy of the equibiaxial stretch λ.
+    - Viscous: μ̄ is the parameter ``mu``; or, where ``viscosity`` is defined, ∫₀¹ μ(2√3 |V| s) ds, since the flow
+      u = R²Ṙ/r² has the shear rate γ̇ = 2√3 |Ṙ| R²/r³ and s = (R/r)³.
+    - Memory: each variable adds s (Pa) with ds/dt = −s/θ + k V s + V a(λ) + b(λ)/θ, see :class:`MemoryVariable`.
     """
 
     name: ClassVar[str] = ""
     title: ClassVar[str] = ""
     parameters: ClassVar[tuple[Parameter, ...]] = (MU,)
+    example: ClassVar[Mapping[str, float]] = {}
+    """Typical SI values where the battery tests the law; missing ones are chosen by name or unit."""
+    limits: ClassVar[tuple[tuple[type[ConstitutiveLaw], Mapping[str, float]], ...]] = ()
+    """(parent law, values): with these values of its parameters the law is the parent."""
+    monotone: ClassVar[bool] = True
+    """Whether J_e falls with the stretch everywhere, so that it always opposes the strain."""
+    stretch_range: ClassVar[tuple[float, float]] = (0.2, 400.0)
+    """Stretches over which the battery tests the law at the example values."""
+    reference: ClassVar[FileReference | None] = None
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        if cls.name:
+        if cls.name and not cls.__module__.startswith(FILE_MODULE):
+            present = REGISTRY.get(cls.name, cls)
+            if (present.__module__, present.__qualname__) != (cls.__module__, cls.__qualname__):
+                raise ConfigError(f"two laws are called {cls.name!r}: {present.__module__} and {cls.__module__}")
             REGISTRY[cls.name] = cls
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """A law from a file is pickled by reference: a spawned worker cannot import its module."""
+        reference = type(self).__dict__.get("reference")
+        if reference is None:
+            return super().__reduce_ex__(protocol)
+        from en4dvar_bubble.laws.loading import reload_law
+
+        return reload_law, (reference,), self.__dict__ or None
 
     def stress(self, stretch: Array, p: Any) -> Array:
         """J_e(λ) in Pa: the elastic part of the stress integral."""
@@ -54,10 +98,31 @@ class ConstitutiveLaw:
         """W′(λ) in Pa: derivative of the strain energy density in equibiaxial stretch."""
         raise NotImplementedError
 
+    def viscosity(self, shear_rate: Array, p: Any) -> Array:
+        """μ(γ̇) in Pa s of a generalised Newtonian liquid; ``shear_rate`` in 1/s. Replaces the dashpot ``mu``."""
+        raise NotImplementedError
+
+    def memory(self, p: Any) -> tuple[MemoryVariable, ...]:
+        """Memory variables; none unless overridden."""
+        return ()
+
+    def example_values(self, n: int = 1) -> dict[str, Array]:
+        """Typical values of the parameters, name → (n,), inside their bounds."""
+
+        def value(p: Parameter) -> float:
+            by_unit = _EXAMPLE_BY_UNIT.get(p.unit, 1.0)
+            return float(np.clip(self.example.get(p.name, _EXAMPLE_BY_NAME.get(p.name, by_unit)), *p.bounds))
+
+        return {p.name: np.full(n, value(p)) for p in self.parameters}
+
+    @property
+    def shear_dependent(self) -> bool:
+        """Whether the viscosity is the method, not the parameter ``mu``."""
+        return type(self).viscosity is not ConstitutiveLaw.viscosity
+
     def table(self, values: Mapping[str, Array]) -> Array:
         """J_e against ln λ for N members: (N, cells, 8) coefficients on :data:`GRID`, Pa. ``values``: name → (N,)."""
-        p = SimpleNamespace(**{name: np.asarray(v, dtype=float)[:, None] for name, v in values.items()})
-        n = len(next(iter(values.values())))
+        p, n = _namespace(values)
         with np.errstate(all="ignore"):  # a law may overflow at stretches that no member reaches
             if type(self).stress is not ConstitutiveLaw.stress:
                 samples = np.broadcast_to(self.stress(_STRETCH, p), (n, len(_STRETCH)))
@@ -69,15 +134,62 @@ class ConstitutiveLaw:
             from_halo = _UNSTRETCHED - (len(_STRETCH) - GRID.cells - 1) // 2
             return np.asarray(from_slopes(slopes, GRID.step, from_halo))
 
+    def viscous_table(self, values: Mapping[str, Array]) -> Array:
+        """μ̄ (Pa s) against z = ln(|V| s), constant below the first node: (N, cells, 8) on :data:`VISCOUS_GRID`.
+
+        For laws that are :attr:`shear_dependent`.
+        """
+        p, n = _namespace(values)
+        with np.errstate(over="ignore"):
+            return np.asarray(from_values(mean_viscosity(lambda rate: self.viscosity(rate, p), n)))
+
+    def memory_tables(self, values: Mapping[str, Array]) -> MemoryTables:
+        """θ, k and the tables of a and b for N members and M memory variables (M = 0 for most laws)."""
+        p, n = _namespace(values)
+        variables = self.memory(p)
+
+        def table(source: Any) -> Array:
+            samples = source(_STRETCH) if callable(source) else source
+            return np.asarray(from_values(np.array(np.broadcast_to(samples, (n, len(_STRETCH))), dtype=float)))
+
+        with np.errstate(all="ignore"):
+            shape = (n, len(variables), GRID.cells, 8)
+            stiffness, equilibrium = np.empty(shape), np.empty(shape)
+            times = np.empty((n, len(variables)))
+            for i, variable in enumerate(variables):
+                stiffness[:, i], equilibrium[:, i] = table(variable.stiffness), table(variable.equilibrium)
+                times[:, i] = np.broadcast_to(variable.relaxation_time, (n, 1))[:, 0]
+        return MemoryTables(times, np.array([float(v.convection) for v in variables]), stiffness, equilibrium)
+
     def elastic_stress(self, stretch: Array, values: Mapping[str, Array]) -> Array:
         """J_e at ``stretch`` (N, K) for N members, Pa, from the same table the solver uses."""
         return np.asarray(evaluate(self.table(values), GRID.span, np.log(stretch)))
 
+    def mean_viscosity(self, rate: Array, values: Mapping[str, Array]) -> Array:
+        """μ̄ at |V| = ``rate`` (N, K) in 1/s for N members, Pa s, from the same table the solver uses."""
+        if not self.shear_dependent:
+            n = len(next(iter(values.values())))
+            mu = np.asarray(values["mu"], dtype=float)[:, None] if "mu" in values else np.zeros((n, 1))
+            return np.broadcast_to(mu, rate.shape).copy()
+        span = VISCOUS_GRID.span
+        z = np.clip(np.log(np.maximum(rate, np.exp(span[0]))), span[0], span[1])
+        return np.asarray(evaluate(self.viscous_table(values), span, z))
 
-def get_law(name: str) -> ConstitutiveLaw:
-    """The built-in law called ``name``. Raises :class:`ConfigError` with a suggestion."""
-    if name not in REGISTRY:
-        close = get_close_matches(name, REGISTRY, n=1)
-        hint = f"; did you mean '{close[0]}'?" if close else ""
-        raise ConfigError(f"unknown law '{name}'{hint} (there are: {', '.join(sorted(REGISTRY))})")
-    return REGISTRY[name]()
+    def relaxed(self, stretch: Array, values: Mapping[str, Array]) -> Array:
+        """Memory variables (N, M) in Pa of members at rest at ``stretch`` (N,): s = b(λ)."""
+        b = self.memory_tables(values).equilibrium
+        x = np.log(stretch)[:, None]
+        return np.concatenate([evaluate(b[:, i], GRID.span, x) for i in range(b.shape[1])] or [x[:, :0]], axis=1)
+
+
+class Liquid(ConstitutiveLaw):
+    """A law without a spring: J_e = 0."""
+
+    def stress(self, stretch: Array, p: Any) -> Array:
+        return np.zeros_like(stretch)
+
+
+def _namespace(values: Mapping[str, Array]) -> tuple[SimpleNamespace, int]:
+    """Values as columns (N, 1), so that they broadcast against a row of stretches; and N."""
+    p = SimpleNamespace(**{name: np.asarray(v, dtype=float)[:, None] for name, v in values.items()})
+    return p, len(next(iter(values.values())))

@@ -1,0 +1,106 @@
+"""Whether a class can serve as a constitutive law: asked once, when a law from outside the package is loaded."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from en4dvar.errors import ConfigError
+from en4dvar.state import Array, Parameter
+from en4dvar_bubble.laws.base import ConstitutiveLaw
+from en4dvar_bubble.laws.memory import MemoryVariable
+
+RESERVED = ("R", "Rdot", "p_b", "S", "T", "C", "R0", "R_eq", "R_max", "t_s")
+"""Names of the state vector and of the model's own parameters."""
+_MEMBERS = 3
+
+
+def check_law(found: Any, name: str) -> ConstitutiveLaw:
+    """An instance of the class ``found``. Raises :class:`ConfigError` saying what is wrong with it."""
+    if not (isinstance(found, type) and issubclass(found, ConstitutiveLaw)):
+        raise ConfigError(f"{name}: not a subclass of en4dvar_bubble.ConstitutiveLaw")
+    _check_elastic(found, name)
+    _check_parameters(found, name)
+    try:
+        law = found()
+    except TypeError as error:
+        raise ConfigError(f"{name}: cannot be created without arguments: {error}") from error
+    _probe(law, name)
+    return law
+
+
+def _check_elastic(kind: type[ConstitutiveLaw], name: str) -> None:
+    own = [m for m in ("stress", "strain_energy_rate") if getattr(kind, m) is not getattr(ConstitutiveLaw, m)]
+    if len(own) == 2:
+        raise ConfigError(f"{name}: defines both stress and strain_energy_rate; keep one (the other follows from it)")
+    if not own:
+        raise ConfigError(
+            f"{name}: defines neither stress(stretch, p) nor strain_energy_rate(stretch, p); "
+            "a law without a spring is a subclass of en4dvar_bubble.Liquid"
+        )
+
+
+def _check_parameters(kind: type[ConstitutiveLaw], name: str) -> None:
+    if not (isinstance(kind.parameters, tuple) and all(isinstance(p, Parameter) for p in kind.parameters)):
+        raise ConfigError(f"{name}: parameters must be a tuple of en4dvar.Parameter")
+    names = [p.name for p in kind.parameters]
+    if not names:
+        raise ConfigError(f"{name}: parameters is empty")
+    for n in names:
+        if names.count(n) > 1:
+            raise ConfigError(f"{name}: two parameters are called {n!r}")
+        if n in RESERVED:
+            raise ConfigError(f"{name}: the parameter name {n!r} is taken by the bubble model")
+
+
+def _probe(law: ConstitutiveLaw, name: str) -> None:
+    """Call every method once with three members."""
+    stretch, rate = np.array([0.9, 1.1, 2.0, 3.0]), np.array([1.0, 1e3, 1e6, 1e9])
+    values = law.example_values(_MEMBERS)
+    p = SimpleNamespace(**{n: v[:, None] for n, v in values.items()})
+    elastic = "stress" if type(law).stress is not ConstitutiveLaw.stress else "strain_energy_rate"
+    _call(getattr(law, elastic), stretch, p, f"{name}: {elastic}(stretch, p)")
+    if law.shear_dependent:
+        _call(law.viscosity, rate, p, f"{name}: viscosity(shear_rate, p)")
+    variables = _run(lambda: law.memory(p), f"{name}: memory(p)")
+    if not (isinstance(variables, tuple) and all(isinstance(v, MemoryVariable) for v in variables)):
+        raise ConfigError(f"{name}: memory(p) must return a tuple of MemoryVariable")
+    for i, variable in enumerate(variables):
+        for what in ("stiffness", "equilibrium"):
+            source, where = getattr(variable, what), f"{name}: {what} of memory variable {i + 1}"
+            _call(_source(source), stretch, p, where)
+        times = np.asarray(variable.relaxation_time, dtype=float)
+        if times.shape not in ((), (_MEMBERS, 1)):
+            raise ConfigError(f"{name}: relaxation_time of memory variable {i + 1}: shape {times.shape}, not (N, 1)")
+        if not np.all(times > 0):
+            raise ConfigError(f"{name}: relaxation_time of memory variable {i + 1} must be positive")
+
+
+def _source(source: Any) -> Callable[[Array, Any], Any]:
+    return lambda stretch, p: source(stretch) if callable(source) else source
+
+
+def _call(method: Callable[[Array, Any], Any], x: Array, p: Any, where: str) -> None:
+    result = np.asarray(_run(lambda: method(x, p), where))
+    try:
+        fits = np.broadcast_shapes(result.shape, (_MEMBERS, len(x))) == (_MEMBERS, len(x))
+    except ValueError:
+        fits = False
+    if not fits or result.dtype.kind not in "fiu":
+        raise ConfigError(
+            f"{where}: returned {result.dtype} of shape {result.shape}; for a row ({len(x)},) and parameters of shape "
+            f"({_MEMBERS}, 1) it must be real and broadcast to ({_MEMBERS}, {len(x)})"
+        )
+
+
+def _run(call: Callable[[], Any], where: str) -> Any:
+    try:
+        with np.errstate(all="ignore"):
+            return call()
+    except Exception as error:
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        raise ConfigError(f"{where}: {type(error).__name__}: {error} ({frame.filename}:{frame.lineno})") from error
