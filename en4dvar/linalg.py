@@ -1,4 +1,4 @@
-"""Small dense algebra of an ensemble: centring, the space its anomalies span, the Gauss–Newton Hessian in weight space.
+"""Dense algebra of an ensemble: centring, the space its anomalies span, the Gauss–Newton Hessian, the analysis update.
 
 Nothing here is larger than (N, n) or (K', N); no n×n matrix is ever formed.
 """
@@ -12,11 +12,43 @@ import numpy as np
 
 from en4dvar.state import Array
 
+GRAM_LIMIT = 100.0
+
 
 def centre(ensemble: Array) -> tuple[Array, Array]:
     """Mean (n,) and anomalies (N, n) of members as rows (N, n)."""
     mean = ensemble.mean(axis=0)
     return mean, ensemble - mean
+
+
+def apply_weights(ensemble: Array, rows: Array, out: Array | None = None, chunk: int = 4096) -> Array:
+    """Analysis ensemble 1 x̄ᵀ + rows · X (M, n) of members (N, n) with mean x̄ and anomalies X; ``rows`` (M, N).
+
+    Works through ``chunk`` state variables at a time, so that centring and adding the mean happen in cache and no
+    second array of the size of the ensemble is made besides the result. ``out`` may be ``ensemble`` itself (M = N).
+    """
+    if out is None:
+        out = np.empty((len(rows), ensemble.shape[1]))
+    for first in range(0, ensemble.shape[1], chunk):
+        part = slice(first, first + chunk)
+        mean, anomalies = centre(ensemble[:, part])
+        np.add(mean, rows @ anomalies, out=out[:, part])
+    return out
+
+
+def mean_preserving_rotation(n_members: int, rng: np.random.Generator) -> Array:
+    """A random orthogonal Ω (N, N) with Ω 1 = 1: rotated anomalies keep mean and covariance. Haar-distributed.
+
+    Source: Sakov & Oke (2008), Mon. Wea. Rev. 136, 1042.
+    """
+    q, r = np.linalg.qr(rng.standard_normal((n_members - 1, n_members - 1)))
+    q *= np.sign(np.diag(r))
+    # the Householder reflection that maps 1/√N to the first axis; B (N, N − 1), its other columns, span 1⊥
+    v = np.full(n_members, 1 / np.sqrt(n_members))
+    v[0] -= 1
+    b = -2 / (v @ v) * np.outer(v, v[1:])
+    b[np.arange(1, n_members), np.arange(n_members - 1)] += 1
+    return np.asarray(1 / n_members + b @ q @ b.T)
 
 
 def anomaly_basis(anomalies: Array) -> Array:
@@ -38,9 +70,9 @@ def min_norm_fit(design: Array, values: Array) -> Array:
 
 @dataclass(frozen=True)
 class Hessian:
-    """A = (N−1) I + SᵀS through one economy SVD of the whitened anomalies S (K', N).
+    """A = (N−1) I + SᵀS through one decomposition of the whitened anomalies S (K', N): every analysis starts here.
 
-    ``singular_values`` (m,) and ``right`` (m, N), m = min(K', N), are S = (left) diag(singular_values) right.
+    ``singular_values`` (m,) and ``right`` (m, N), m ≤ N, are such that SᵀS = rightᵀ diag(singular_values²) right.
     """
 
     singular_values: Array
@@ -48,6 +80,15 @@ class Hessian:
 
     @classmethod
     def of(cls, s: Array) -> Hessian:
+        """From an economy SVD of S; from the eigenvectors of SᵀS, twice as fast, where that loses no accuracy.
+
+        Squaring S costs rounding errors of eps · ‖S‖² in A ≥ N − 1: they vanish while the observations inform less
+        than ``GRAM_LIMIT`` times the prior.
+        """
+        n_members = s.shape[1]
+        if len(s) >= n_members and np.vdot(s, s) <= GRAM_LIMIT * (n_members - 1):
+            squares, vectors = np.linalg.eigh(s.T @ s)
+            return cls(np.sqrt(np.maximum(squares[::-1], 0)), vectors.T[::-1])
         _, sigma, right = np.linalg.svd(s, full_matrices=False)
         return cls(sigma, right)
 

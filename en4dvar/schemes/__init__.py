@@ -23,6 +23,11 @@ class Weights:
     w: Array
     T: Array
 
+    @classmethod
+    def prior(cls, n_members: int) -> Weights:
+        """w = 0, T = I."""
+        return cls(np.zeros(n_members), np.eye(n_members))
+
     @property
     def rows(self) -> Array:
         """(N, N): member i is x̄0 + X0ᵀ rows[i]."""
@@ -58,6 +63,13 @@ class Step:
     def predicted_decrease(self) -> float:
         """Decrease of the quadratic model of J over the full step, ½ norm²."""
         return 0.5 * self.norm**2
+
+
+def gauss_newton(weights: Weights, evaluation: Evaluation) -> Step:
+    """The analysis that all schemes share: g = (N−1) w − Sᵀd, A = (N−1) I + SᵀS, δw = −A⁻¹g, T = √(N−1) A^{-1/2}."""
+    hessian = Hessian.of(evaluation.S)
+    gradient = hessian.prior_precision * weights.w - evaluation.S.T @ evaluation.d
+    return Step(gradient, hessian, -hessian.solve(gradient), hessian.transform)
 
 
 class Scheme(Protocol):

@@ -14,8 +14,8 @@ from typing import Literal
 
 import numpy as np
 
-from en4dvar.linalg import Hessian, min_norm_fit
-from en4dvar.schemes import Evaluation, Step, Weights
+from en4dvar.linalg import min_norm_fit
+from en4dvar.schemes import Evaluation, Step, Weights, gauss_newton
 from en4dvar.state import Array
 
 
@@ -32,7 +32,7 @@ class En4DVar:
 
     def init(self, n_members: int) -> Weights:
         """w = 0, T = I."""
-        return Weights(np.zeros(n_members), np.eye(n_members))
+        return Weights.prior(n_members)
 
     def member_weights(self, weights: Weights) -> Array:
         """Rows of 1wᵀ + εI (bundle) or 1wᵀ + T (transform), (N, N)."""
@@ -58,9 +58,7 @@ class En4DVar:
 
     def step(self, weights: Weights, evaluation: Evaluation) -> Step:
         """Gauss–Newton direction and symmetric transform."""
-        hessian = Hessian.of(evaluation.S)
-        gradient = hessian.prior_precision * weights.w - evaluation.S.T @ evaluation.d
-        return Step(gradient, hessian, -hessian.solve(gradient), hessian.transform)
+        return gauss_newton(weights, evaluation)
 
     def _spread(self, weights: Weights) -> Array:
         return weights.T if self.linearisation == "transform" else self.epsilon * np.eye(len(weights.w))

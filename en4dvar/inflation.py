@@ -1,0 +1,57 @@
+"""Inflation: what sequential schemes add to the spread that sampling error and model error take away.
+
+    multiplicative   X ← λ X                                                    Anderson & Anderson (1999)
+    RTPS             X_j ← X_j (1 + α (σ_b,j − σ_a,j) / σ_a,j)                   Whitaker & Hamill (2012)
+
+Both act on the anomalies of the analysis and leave its mean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from en4dvar.linalg import centre
+from en4dvar.state import Array
+
+
+@dataclass(frozen=True)
+class Inflation:
+    """λ ``multiplicative`` and α ``rtps`` (relaxation to prior spread, 0: none, 1: the spread of the prior).
+
+    Raises
+    ------
+    ValueError: a factor that is not positive, or α outside [0, 1].
+    """
+
+    multiplicative: float = 1.0
+    rtps: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.multiplicative > 0:
+            raise ValueError(f"multiplicative inflation must be positive, not {self.multiplicative:g}")
+        if not 0 <= self.rtps <= 1:
+            raise ValueError(f"rtps must lie in [0, 1], not {self.rtps:g}")
+
+    def apply(self, prior: Array, posterior: Array) -> Array:
+        """The posterior ensemble (N, n) inflated; ``prior`` (M, n) is the ensemble before the analysis."""
+        if self.rtps == 0:
+            return posterior if self.multiplicative == 1 else inflate(posterior, self.multiplicative)
+        factor = relaxation(prior.std(axis=0, ddof=1), posterior.std(axis=0, ddof=1), self.rtps)
+        return inflate(posterior, self.multiplicative * factor)
+
+
+def inflate(ensemble: Array, factor: float | Array) -> Array:
+    """Members (N, n) with their anomalies multiplied by ``factor``, a number or (n,)."""
+    mean, anomalies = centre(ensemble)
+    return np.asarray(mean + factor * anomalies)
+
+
+def relaxation(prior_std: Array, posterior_std: Array, alpha: float) -> Array:
+    """Factors (n,) of relaxation to prior spread; 1 where the posterior has no spread.
+
+    Source: Whitaker & Hamill (2012), Mon. Wea. Rev. 140, 3078, eq. 2.
+    """
+    lost = prior_std - posterior_std
+    return 1 + alpha * np.divide(lost, posterior_std, out=np.zeros_like(lost), where=posterior_std > 0)
