@@ -50,6 +50,12 @@ def _fault(item: Any, schema: type[BaseModel], path: tuple[str | int, ...], docu
     for n, part in enumerate(loc):
         if document.has((*real, part)) or (kind == "missing" and n == len(loc) - 1):
             real = (*real, part)
+    if kind == "union_tag_invalid":
+        choices = [c.strip("' ") for c in item["ctx"]["expected_tags"].split(", ")]
+        name, given = item["ctx"]["discriminator"].strip("'"), item["ctx"]["tag"]
+        message = f"{given!r} is not one of {', '.join(choices)}"
+        hint = suggest(given, choices)
+        return document.fault((*real, name), message + (hint if hint.startswith("; did") else ""))
     if kind == "extra_forbidden":
         known = sorted(_known(schema, loc[:-1]))
         return document.fault(real, f"unknown key {str(loc[-1])!r}{suggest(loc[-1], known)}", at_key=True)

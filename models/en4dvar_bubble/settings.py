@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_serializer, field_validator, model_validator
 
-from en4dvar.units import Quantity
-from en4dvar_bubble.driving import Driving, Reading, histotripsy
+from en4dvar.hints import suggest
+from en4dvar.units import Quantity, parse_quantity
+from en4dvar_bubble.driving import Reading
+from en4dvar_bubble.driving.settings import DrivingSettings, Histotripsy, NoDriving, with_kind
 from en4dvar_bubble.laws import get_law
-from en4dvar_bubble.medium import WATER_25C, Medium, saturated_vapour_pressure
+from en4dvar_bubble.medium import CONSTANT_SETS, UNITS, WATER_25C, Medium, saturated_vapour_pressure
 from en4dvar_bubble.solver.driver import ACCURACIES, Accuracy
 
-Density = Annotated[float, Quantity("kg/m^3"), Field(gt=0)]
-Speed = Annotated[float, Quantity("m/s"), Field(gt=0)]
-Pressure = Annotated[float, Quantity("Pa")]
-Tension = Annotated[float, Quantity("N/m"), Field(ge=0)]
-Temperature = Annotated[float, Quantity("K"), Field(gt=0)]
-Frequency = Annotated[float, Quantity("Hz"), Field(gt=0)]
-Time = Annotated[float, Quantity("s")]
+SetName = Literal["water-25C", "imr-v1", "imr-v2"]
+Positive = Field(gt=0)
+NonNegative = Field(ge=0)
+
+_GIVEN = "given in the configuration"
 
 
 class _Section(BaseModel):
@@ -26,29 +27,61 @@ class _Section(BaseModel):
 
 
 class ConstantsSettings(_Section):
-    """Constants of water and air at 25 °C unless given."""
+    """A named set of constants, any of them replaced; ``sources`` says where replaced values come from."""
 
-    rho: Density = WATER_25C.rho
-    c: Speed = WATER_25C.c
-    p_inf: Annotated[Pressure, Field(gt=0)] = WATER_25C.p_inf
-    S: Tension = WATER_25C.S
-    T_inf: Temperature = WATER_25C.T_inf
+    set: SetName = "water-25C"
+    rho: Annotated[float, Quantity(UNITS["rho"]), Positive] = WATER_25C.rho
+    c: Annotated[float, Quantity(UNITS["c"]), Positive] = WATER_25C.c
+    p_inf: Annotated[float, Quantity(UNITS["p_inf"]), Positive] = WATER_25C.p_inf
+    S: Annotated[float, Quantity(UNITS["S"]), NonNegative] = WATER_25C.S
+    T_inf: Annotated[float, Quantity(UNITS["T_inf"]), Positive] = WATER_25C.T_inf
     kappa: Annotated[float, Field(gt=1)] = WATER_25C.kappa
-    A: Annotated[float, Quantity("W/(m K^2)"), Field(ge=0)] = WATER_25C.A
-    B: Annotated[float, Quantity("W/(m K)"), Field(ge=0)] = WATER_25C.B
+    A: Annotated[float, Quantity(UNITS["A"]), NonNegative] = WATER_25C.A
+    B: Annotated[float, Quantity(UNITS["B"]), NonNegative] = WATER_25C.B
+    tait_B: Annotated[float, Quantity(UNITS["tait_B"]), Positive] = WATER_25C.tait_B
+    tait_n: Annotated[float, Field(gt=1)] = WATER_25C.tait_n
+    K_m: Annotated[float, Quantity(UNITS["K_m"]), Positive] = WATER_25C.K_m
+    c_m: Annotated[float, Quantity(UNITS["c_m"]), Positive] = WATER_25C.c_m
+    A_v: Annotated[float, Quantity(UNITS["A_v"]), NonNegative] = WATER_25C.A_v
+    B_v: Annotated[float, Quantity(UNITS["B_v"]), NonNegative] = WATER_25C.B_v
+    D_v: Annotated[float, Quantity(UNITS["D_v"]), Positive] = WATER_25C.D_v
+    L_v: Annotated[float, Quantity(UNITS["L_v"]), Positive] = WATER_25C.L_v
+    M_g: Annotated[float, Quantity(UNITS["M_g"]), Positive] = WATER_25C.M_g
+    M_v: Annotated[float, Quantity(UNITS["M_v"]), Positive] = WATER_25C.M_v
+    sources: dict[str, str] = Field(default_factory=lambda: dict(WATER_25C.sources))
 
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, value: Any) -> Any:
+        """A name stands for its set; what a set leaves open comes from it, with its source."""
+        given = {"set": value} if isinstance(value, str) else value
+        if not isinstance(given, dict):
+            return given
+        chosen = CONSTANT_SETS.get(str(given.get("set", "water-25C")))
+        if chosen is None:
+            return {"set": given["set"]}  # the only fault worth telling
+        sources = given.get("sources", {})
+        if not isinstance(sources, dict):
+            return given
+        inherited = {
+            name: f"{number!r} {UNITS[name]}" if UNITS[name] != "1" else number
+            for name, number in chosen.constants.items()
+        }
+        told = {**chosen.sources, **{name: _GIVEN for name in given if name in UNITS}, **sources}
+        return {**inherited, **given, "sources": told}
 
-class HistotripsySettings(_Section):
-    """The rarefactional half cycle of a histotripsy pulse."""
+    @field_validator("sources")
+    @classmethod
+    def _known(cls, value: dict[str, str]) -> dict[str, str]:
+        for name in value:
+            if name not in UNITS:
+                raise ValueError(f"source of an unknown constant {name!r}{suggest(name, UNITS)}")
+        return value
 
-    kind: Literal["histotripsy"] = "histotripsy"
-    amplitude: Pressure = -24e6
-    frequency: Frequency = 1e6
-    exponent: Annotated[float, Field(ge=1)] = 3.7
-    delay: Time = 5e-6
-
-    def build(self) -> Driving:
-        return histotripsy(self.amplitude, self.frequency, self.exponent, self.delay)
+    @property
+    def medium(self) -> Medium:
+        values = self.model_dump(exclude={"set", "sources"})
+        return Medium(**values, sources=dict(self.sources))
 
 
 class BubbleSettings(_Section):
@@ -58,7 +91,7 @@ class BubbleSettings(_Section):
     radial: Literal["keller-miksis"] = "keller-miksis"
     gas: Literal["heat", "polytropic"] = "heat"
     start: Literal["acoustic", "laser"] = "acoustic"
-    driving: HistotripsySettings = HistotripsySettings()
+    driving: DrivingSettings = Histotripsy()
     driving_read: Reading = "instantaneous"
     vapour_pressure: float | Literal["saturated"] = 0.0
     constants: ConstantsSettings = ConstantsSettings()
@@ -67,6 +100,22 @@ class BubbleSettings(_Section):
     rtol: Annotated[float, Field(ge=1e-11, le=1e-2)] | None = None
     step_limit: Annotated[int, Field(ge=100)] = Accuracy.step_limit
     mach_limit: Annotated[float, Field(gt=0)] = Accuracy.mach_limit
+
+    @model_validator(mode="before")
+    @classmethod
+    def _driving_of_the_start(cls, value: Any) -> Any:
+        """The acoustic start is driven by the histotripsy pulse unless told otherwise, the laser start by nothing."""
+        if isinstance(value, dict):
+            default = {"kind": "none" if value.get("start") == "laser" else "histotripsy"}
+            return {**value, "driving": with_kind(value.get("driving", default))}
+        return value
+
+    @field_validator("driving")
+    @classmethod
+    def _laser_is_not_driven(cls, value: DrivingSettings, info: ValidationInfo) -> DrivingSettings:
+        if info.data.get("start") == "laser" and not isinstance(value, NoDriving):
+            raise ValueError("the laser start takes no driving; leave it out or write driving: none")
+        return value
 
     @field_validator("law")
     @classmethod
@@ -79,15 +128,19 @@ class BubbleSettings(_Section):
 
     @field_validator("vapour_pressure", mode="before")
     @classmethod
-    def _vapour(cls, value: Any) -> Any:
-        return value if value in ("saturated", 0, 0.0) else Quantity("Pa")._read(value)
+    def _read_vapour(cls, value: Any) -> Any:
+        return value if value == "saturated" else 0.0 if value in (0, 0.0) else parse_quantity(value, "Pa")
+
+    @field_serializer("vapour_pressure", when_used="json")
+    def _write_vapour(self, value: float | str) -> str:
+        return value if isinstance(value, str) else f"{value!r} Pa"
 
     @property
     def medium(self) -> Medium:
-        constants = self.constants.model_dump()
+        medium = self.constants.medium
         if self.vapour_pressure == "saturated":
-            return Medium(**constants, p_v=saturated_vapour_pressure(self.constants.T_inf))
-        return Medium(**constants, p_v=float(self.vapour_pressure))
+            return replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))
+        return replace(medium, p_v=float(self.vapour_pressure))
 
     @property
     def solver_accuracy(self) -> Accuracy:

@@ -1,0 +1,135 @@
+"""Driving pressures in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Literal
+
+import numpy as np
+
+from en4dvar.state import Array
+from en4dvar_bubble.driving.base import Driving
+
+Envelope = Literal["none", "hann", "tukey"]
+
+_CELLS_PER_CYCLE = 128
+_WIDTHS = 7.0  # a Gaussian is cut where it has fallen to 2e-11
+
+
+@dataclass(frozen=True)
+class _HalfCycle:
+    frequency: float
+    exponent: float
+    delay: float
+
+    def __call__(self, t: Array) -> Array:
+        phase = 2 * np.pi * self.frequency * (t - self.delay)
+        inside = np.abs(phase) < np.pi
+        base = np.where(inside, 0.5 * (1 + np.cos(np.where(inside, phase, np.pi))), 0.0)
+        return np.asarray(base**self.exponent)
+
+
+def histotripsy(
+    amplitude: float = -24e6, frequency: float = 1e6, exponent: float = 3.7, delay: float = 5e-6
+) -> Driving:
+    """The rarefactional half cycle p_A [(1 + cos ω(t−δ))/2]^n for |t−δ| ≤ π/ω.
+
+    Amplitude and frequency are the paper's; n and δ are from the literature on this array (Vlaisavljevich et al. 2015).
+    """
+    half = 0.5 / frequency
+    return Driving(amplitude, delay - half, delay + half, _HalfCycle(frequency, exponent, delay))
+
+
+@dataclass(frozen=True)
+class _Burst:
+    frequency: float
+    duration: float
+    phase: float
+    delay: float
+    taper: float  # fraction of the duration that rises and falls: 0 no envelope, 1 Hann
+
+    def __call__(self, t: Array) -> Array:
+        wave = np.sin(2 * np.pi * self.frequency * (t - self.delay) + self.phase)
+        if self.taper == 0.0:
+            return np.asarray(wave)
+        from_edge = 0.5 - np.abs((t - self.delay) / self.duration - 0.5)
+        return np.asarray(wave * 0.5 * (1 - np.cos(np.pi * np.clip(2 * from_edge / self.taper, 0.0, 1.0))))
+
+
+def sine_burst(
+    amplitude: float,
+    frequency: float,
+    cycles: float,
+    delay: float = 0.0,
+    phase: float = 0.0,
+    envelope: Envelope = "none",
+    taper: float = 0.5,
+) -> Driving:
+    """p_A sin(2πf(t−δ) + φ) w(t) for 0 ≤ t − δ ≤ cycles/f.
+
+    ``envelope``: w = 1, the Hann window, or the Tukey window whose two cosine tapers together take the fraction
+    ``taper`` of the burst (in steps of 0.001). Raises ValueError where the pressure would jump: without envelope the
+    burst must begin and end at a zero of the sine.
+    """
+    duration = cycles / frequency
+    fraction = {"none": 0.0, "hann": 1.0, "tukey": taper}[envelope]
+    cells = max(256, int(np.ceil(_CELLS_PER_CYCLE * cycles)))
+    stops = [delay + k * duration / (2 * cycles) for k in range(1, int(2 * cycles) + 1)]
+    if 0.0 < fraction < 1.0:
+        # The second derivative jumps where the tapers end: these instants must be edges of cells.
+        edge = Fraction(round(fraction * 1000), 2000)
+        cells = edge.denominator * -(-cells // edge.denominator)
+        fraction = float(2 * edge)
+        stops += [delay + float(edge) * duration, delay + float(1 - edge) * duration]
+    shape = _Burst(frequency, duration, phase, delay, fraction)
+    return Driving(amplitude, delay, delay + duration, shape, cells, tuple(stops))
+
+
+@dataclass(frozen=True)
+class _Gaussian:
+    delay: float
+    width: float
+
+    def __call__(self, t: Array) -> Array:
+        return np.asarray(np.exp(-0.5 * ((t - self.delay) / self.width) ** 2))
+
+
+def gaussian(amplitude: float, delay: float, width: float) -> Driving:
+    """p_A exp(−(t−δ)²/(2σ²)) with σ = ``width``, cut at |t−δ| = 7σ where it is 2e-11 of the amplitude."""
+    half = _WIDTHS * width
+    return Driving(amplitude, delay - half, delay + half, _Gaussian(delay, width), stops=(delay,))
+
+
+@dataclass(frozen=True)
+class _Step:
+    begin: float
+    rise: float
+    duration: float
+
+    def __call__(self, t: Array) -> Array:
+        edge = np.minimum(t - self.begin, self.begin + self.duration - t)
+        s = np.clip(edge / self.rise, 0.0, 1.0)
+        return np.asarray(s**3 * (10 - 15 * s + 6 * s * s))
+
+
+def step(amplitude: float, duration: float, delay: float = 0.0, rise: float = 20e-9) -> Driving:
+    """A pressure p_A from ``delay`` for ``duration``: a step if that outlives the simulation, else an impulse.
+
+    It rises within ``rise`` and falls within the same time at the end, both inside the duration, as the polynomial
+    10 s³ − 15 s⁴ + 6 s⁵ (continuous curvature). A rise in no time would have an infinite dp_f/dt, which the
+    Keller–Miksis equation answers with a jump of the wall velocity by −p_A/(ρc): that is the limit rise → 0. ``rise``
+    is shortened a little where it does not divide the duration. Raises ValueError when duration < 3 rise or is more
+    than 200 000 times longer.
+    """
+    cells = int(np.ceil(duration / rise * (1 - 1e-12)))
+    if not 3 <= cells <= 200_000:
+        raise ValueError(f"the duration {duration:g} s must be between 3 and 200 000 times the rise {rise:g} s")
+    exact = duration / cells
+    stops = (delay + exact, delay + duration - exact)
+    return Driving(amplitude, delay, delay + duration, _Step(delay, exact, duration), cells, stops)
+
+
+def silence() -> Driving:
+    """No driving: the laser-induced bubble."""
+    return Driving(0.0, 0.0, 1e-6, np.zeros_like, cells=1)

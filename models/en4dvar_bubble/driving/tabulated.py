@@ -1,0 +1,97 @@
+"""A measured driving pressure p(t), from a file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.signal import find_peaks
+
+from en4dvar.readers import Column, Format, read_series
+from en4dvar.state import Array
+from en4dvar_bubble.driving.base import Driving
+
+_MOST_CELLS = 200_000
+_PROMINENCE = 0.02  # of the largest |p|: turning points that no time step may straddle
+
+
+@dataclass(frozen=True, eq=False)
+class _Record:
+    """Cubic spline through the samples, led from and to zero by one quintic at either end."""
+
+    spline: CubicSpline
+    first: float
+    last: float
+    lead: float
+
+    def __call__(self, t: Array) -> Array:
+        inside = self.spline(np.clip(t, self.first, self.last))
+        before = self._lead_in((t - self.first) / self.lead + 1, self.first, 1.0)
+        after = self._lead_in((self.last - t) / self.lead + 1, self.last, -1.0)
+        return np.asarray(np.where(t < self.first, before, np.where(t > self.last, after, inside)))
+
+    def _lead_in(self, s: Array, at: float, sign: float) -> Array:
+        """Zero with its derivatives at s = 0; value, slope and curvature of the record at s = 1."""
+        s = np.clip(s, 0.0, 1.0)
+        value = float(self.spline(at))
+        slope = float(self.spline(at, 1)) * self.lead * sign
+        bend = float(self.spline(at, 2)) * self.lead**2
+        third = 10 * value - 4 * slope + 0.5 * bend
+        fourth = -15 * value + 7 * slope - bend
+        fifth = 6 * value - 3 * slope + 0.5 * bend
+        return np.asarray(s**3 * (third + s * (fourth + s * fifth)))
+
+
+def tabulated(times: Array, pressure: Array, delay: float = 0.0, scale: float = 1.0) -> Driving:
+    """p_f through samples (K,) at increasing ``times`` (s), shifted by ``delay`` and multiplied by ``scale``.
+
+    Interpolation is the cubic spline with continuous curvature (not-a-knot). Outside the record p_f is zero: over one
+    sampling interval before the first and after the last sample a quintic leads there smoothly. Raises ValueError for
+    fewer than four samples, times that do not increase, values that are not finite, a record of zeros, or sampling so
+    uneven that it would take more than 200 000 cells.
+    """
+    t = np.asarray(times, dtype=float) + delay
+    p = np.asarray(pressure, dtype=float) * scale
+    if t.ndim != 1 or t.shape != p.shape or len(t) < 4:
+        raise ValueError("a tabulated driving needs at least four samples, one pressure for each time")
+    if not (np.all(np.isfinite(t)) and np.all(np.isfinite(p)) and np.all(np.diff(t) > 0)):
+        raise ValueError("a tabulated driving needs finite pressures at finite, increasing times")
+    largest = float(np.abs(p).max())
+    if largest == 0.0:
+        raise ValueError("the tabulated pressure is zero throughout; write kind: none")
+    span, gaps = t[-1] - t[0], np.diff(t)
+    even = span / (len(t) - 1)
+    # On a uniform grid the knots are edges of cells and the table is exact; otherwise four cells for the shortest gap.
+    uniform = bool(np.all(np.abs(t - (t[0] + even * np.arange(len(t)))) < 1e-3 * even))
+    if uniform:
+        t, lead, inner = t[0] + even * np.arange(len(t)), even, len(t) - 1
+    else:
+        inner = int(np.ceil(4 * span / gaps.min()))
+        lead = span / inner
+    if inner + 2 > _MOST_CELLS:
+        raise ValueError(f"{inner + 2} cells for {len(t)} samples, more than {_MOST_CELLS}: resample the record evenly")
+    peaks = np.concatenate([find_peaks(sign * p, prominence=_PROMINENCE * largest)[0] for sign in (1, -1)])
+    shape = _Record(CubicSpline(t, p / largest), float(t[0]), float(t[-1]), float(lead))
+    stops = (float(t[0]), *(float(t[i]) for i in peaks), float(t[-1]))
+    return Driving(largest, float(t[0] - lead), float(t[-1] + lead), shape, inner + 2, stops)
+
+
+def from_file(
+    path: Path,
+    time: tuple[str, str],
+    pressure: tuple[str, str],
+    delay: float = 0.0,
+    scale: float = 1.0,
+    format: Format | None = None,
+) -> Driving:
+    """:func:`tabulated` from a CSV or ``.mat`` file; ``time`` and ``pressure`` are (column, unit).
+
+    Raises :class:`~en4dvar.errors.DataError` for a file that cannot be read, ValueError as :func:`tabulated`.
+    """
+    series = read_series(path, Column(*time, "s"), Column(*pressure, "Pa"), format)
+    try:
+        return tabulated(series.times, series.values, delay, scale)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
