@@ -11,7 +11,7 @@ from en4dvar.assimilate import assimilate
 from en4dvar.build import build
 from en4dvar.config import Config, load_config
 from en4dvar.errors import ConfigError
-from en4dvar.executor import ProcessesExecutor, SerialExecutor, ThreadsExecutor, make_executor
+from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, ThreadsExecutor, make_executor
 from en4dvar.files import write_text
 from en4dvar.problem import InverseProblem, IterationRecord
 from en4dvar.progress import Progress, RunLog, describe
@@ -118,7 +118,7 @@ def _place(directory: RunDirectory, name: str, n_datasets: int) -> Path:
     return directory.claim(f"datasets/{name}.nc")
 
 
-def _executor(config: Config) -> SerialExecutor | ThreadsExecutor | ProcessesExecutor:
+def _executor(config: Config) -> Executor:
     """As configured; by default threads on every core for compiled models, else this process alone."""
     kind, workers = config.execution.executor, config.execution.workers
     if kind == "serial":

@@ -1,0 +1,82 @@
+"""What every executor does: calls of a function as they end, and members of a forward model in order."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, Self, TypeVar
+
+import numpy as np
+
+from en4dvar.errors import En4dvarError
+from en4dvar.executor.chunks import Outcome, cut, describe, run_chunk
+from en4dvar.forward import Failure, ForwardModel
+from en4dvar.state import Array
+
+T = TypeVar("T")
+ATTEMPTS_ALONE = 2  # before a call is held responsible for the death of its worker
+
+
+class WorkerLostError(Exception):
+    """A worker died under a call, with no other call around that could be the reason, and again when retried."""
+
+
+class ExecutorError(En4dvarError):
+    """The workers cannot be reached; what is finished is kept and the run can be resumed."""
+
+
+class Executor(ABC):
+    """Runs calls on ``workers`` workers; use it as a context manager. The results do not depend on the choice."""
+
+    workers: int = 1
+
+    @abstractmethod
+    def map(self, function: Callable[..., T], calls: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, T | Exception]]:
+        """``function(*call)`` of every call, as they end: (index of the call, value or what it raised).
+
+        ``calls`` is consumed as workers become free, so that neither calls nor values pile up. A call whose worker
+        dies is repeated; :class:`WorkerLostError` is its value where it takes every worker down. ``function`` and calls
+        can be pickled.
+
+        Raises
+        ------
+        ExecutorError: the workers cannot be reached.
+        """
+
+    def trajectories(self, model: ForwardModel, x: Array, times: Array) -> list[Outcome]:
+        """Initial states (B, n_state) and times (K,) or (B, K) → B trajectories or failures, in the order of members.
+
+        Members are cut into chunks at multiples of ``model.batch``, so that every compiled batch holds the same
+        members for any number of workers. A batch that kills its worker fails; the others are not disturbed.
+        """
+        times = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+        return self._chunks(model, x, times, cut(len(x), model.batch, self.workers))
+
+    def _chunks(self, model: ForwardModel, x: Array, times: Array, chunks: list[slice]) -> list[Outcome]:
+        found = dict(self.map(run_chunk, ((model, x[part], times[part]) for part in chunks)))
+        results: list[Outcome] = []
+        for i, part in enumerate(chunks):
+            outcome, size = found[i], part.stop - part.start
+            if not isinstance(outcome, Exception):
+                results += outcome
+            elif size > model.batch:
+                batches = cut(size, model.batch, size)
+                results += self._chunks(model, x[part], times[part], batches)
+            else:
+                reason = str(outcome) if isinstance(outcome, WorkerLostError) else describe(outcome)
+                results += [Failure(reason)] * size
+        return results
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop the workers and wait for them."""
+
+    def kill(self) -> None:
+        """Stop the workers at once, whatever they are doing."""
+        self.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *exception: object) -> None:
+        self.close() if kind is None else self.kill()

@@ -1,0 +1,44 @@
+"""Members in chunks: the unit of work that is sent to a worker."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from en4dvar.forward import Failure, ForwardModel, Trajectory
+from en4dvar.state import Array
+
+Outcome = Trajectory | Failure
+
+
+def cut(n_members: int, batch: int, workers: int) -> list[slice]:
+    """Contiguous chunks of members, at most one per worker, each but the last a multiple of ``batch``.
+
+    >>> cut(10, 4, 2)
+    [slice(0, 8, None), slice(8, 10, None)]
+    """
+    batches = -(-n_members // batch)
+    edges = [min(n_members, batch * -(-batches * i // min(workers, batches))) for i in range(min(workers, batches) + 1)]
+    return [slice(a, b) for a, b in itertools.pairwise(edges)]
+
+
+def run_chunk(model: ForwardModel, x: Array, times: Array) -> list[Outcome]:
+    """Run a chunk; where the model raises, run its batches one by one, so that only a raising batch is lost."""
+    times = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+    try:
+        outcomes = list(model.trajectories(x, times))
+        reason = f"the model returned {len(outcomes)} trajectories for {len(x)} members"
+    except Exception as error:  # a model may fail in any way; the reason is kept
+        outcomes, reason = [], describe(error)
+    if len(outcomes) == len(x):
+        return outcomes
+    if len(x) <= model.batch:
+        return [Failure(reason)] * len(x)
+    parts = [slice(i, i + model.batch) for i in range(0, len(x), model.batch)]
+    return [outcome for part in parts for outcome in run_chunk(model, x[part], times[part])]
+
+
+def describe(error: BaseException) -> str:
+    """An exception as the reason of a failure."""
+    return f"{type(error).__name__}: {error}"
