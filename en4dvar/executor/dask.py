@@ -1,0 +1,160 @@
+"""A dask cluster: one started on this machine, or a running one at an address (extra ``distributed``).
+
+    dask scheduler                       # prints tcp://host:8786
+    dask worker tcp://host:8786          # on every machine that shall help
+    en4dvar run CONFIG --scheduler tcp://host:8786
+
+Workers need the packages of this machine in the same versions; they need none of its files, except those that a model
+reads while it runs. Dask repeats the calls of a worker that dies; a worker that joins later takes part.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import queue
+import time
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from en4dvar.executor.base import ATTEMPTS_ALONE, Executor, ExecutorError, T, WorkerLostError
+from en4dvar.executor.blas import one_blas_thread_for_good
+
+if TYPE_CHECKING:
+    from distributed import Client, Future, LocalCluster
+
+CONNECT_TIMEOUT = 15.0  # s
+NO_WORKER_TIMEOUT = 60.0  # s without any worker before the run is given up
+POLL = 2.0  # s
+
+
+class DaskExecutor(Executor):
+    """Calls as tasks of dask.distributed.
+
+    Parameters
+    ----------
+    workers: processes of the local cluster; with an ``address``, how many calls to keep under way (default: one for
+        each thread of the cluster).
+    address: of a running scheduler, e.g. ``tcp://10.0.0.1:8786``; by default a cluster is started on this machine.
+
+    Raises
+    ------
+    ExecutorError: dask is not installed, the scheduler cannot be reached, or it has no worker.
+    """
+
+    def __init__(self, workers: int | None = None, address: str | None = None):
+        try:
+            import distributed
+        except ImportError:
+            raise ExecutorError("the dask executor needs the extra: pip install 'en4dvar[distributed]'") from None
+        self._address = address
+        self._cluster: LocalCluster | None = None
+        self._client: Client | None = None
+        for name in ("distributed.client", "distributed.comm", "distributed.core", "distributed.batched"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # what they tell of lost connections, we tell once
+        try:
+            if address is None:
+                self._cluster = distributed.LocalCluster(
+                    n_workers=workers or 1,
+                    threads_per_worker=1,
+                    memory_limit=0,  # a member that needs memory is not a reason to kill its worker
+                    dashboard_address=None,
+                    silence_logs=logging.CRITICAL,
+                )
+            self._client = distributed.Client(
+                self._cluster or address, timeout=CONNECT_TIMEOUT, set_as_default=False, heartbeat_interval="1s"
+            )
+            self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT)
+            self.workers = workers or max(1, sum(self._client.nthreads().values()))
+        except (OSError, ValueError) as error:
+            connected = self._client is not None
+            self.kill()
+            message = "has no worker; start some with: dask worker" if connected else "cannot be reached"
+            raise ExecutorError(f"dask scheduler {address or ''}: {message} ({error})") from None
+
+    def map(self, function: Callable[..., T], calls: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, T | Exception]]:
+        ended: queue.SimpleQueue[Future] = queue.SimpleQueue()
+        pending: dict[str, tuple[int, tuple[Any, ...], Future]] = {}
+        following = enumerate(calls)
+
+        def submit(i: int, call: tuple[Any, ...]) -> None:
+            future = self._submit(function, call)
+            pending[future.key] = i, call, future
+            future.add_done_callback(ended.put)
+
+        try:
+            while True:
+                for i, call in itertools.islice(following, max(0, 2 * self.workers - len(pending))):
+                    submit(i, call)
+                if not pending:
+                    return
+                future = self._next(ended)
+                i, call, _ = pending.pop(future.key)
+                value = self._value(future)
+                yield i, self._alone(function, call) if isinstance(value, WorkerLostError) else value
+        finally:
+            for _, _, future in pending.values():
+                future.release()
+
+    def _submit(self, function: Callable[..., T], call: tuple[Any, ...]) -> Future:
+        if self._client is None or self._client.status != "running":
+            raise self._lost()
+        return self._client.submit(_on_worker, function, call, pure=False)
+
+    def _next(self, ended: queue.SimpleQueue[Future]) -> Future:
+        """The next future that ends. Raises :class:`ExecutorError` where the cluster is gone."""
+        last_worker = time.monotonic()
+        while True:
+            try:
+                return ended.get(timeout=POLL)
+            except queue.Empty:
+                if self._client is None or self._client.status != "running":
+                    raise self._lost() from None
+                if self._client.scheduler_info()["workers"]:
+                    last_worker = time.monotonic()
+                elif time.monotonic() - last_worker > NO_WORKER_TIMEOUT:
+                    reason = f"has had no worker for {NO_WORKER_TIMEOUT:.0f} s"
+                    raise ExecutorError(f"dask scheduler {self._address or ''}: {reason}") from None
+
+    def _value(self, future: Future) -> Any:
+        from distributed import KilledWorker
+
+        if future.status not in ("finished", "error"):
+            raise self._lost()
+        error = future.exception() if future.status == "error" else None
+        if isinstance(error, KilledWorker):
+            return WorkerLostError("a worker process died")
+        if error is not None:
+            return error if isinstance(error, Exception) else RuntimeError(str(error))
+        try:
+            return future.result()
+        except Exception as lost:  # finished, but the value cannot be fetched
+            raise self._lost() from lost
+
+    def _alone(self, function: Callable[..., T], call: tuple[Any, ...]) -> T | Exception:
+        """Repeat a call that was under way when several workers died; calls around it may have been the reason."""
+        value: Any = None
+        for _ in range(ATTEMPTS_ALONE):
+            ended: queue.SimpleQueue[Future] = queue.SimpleQueue()
+            future = self._submit(function, call)
+            future.add_done_callback(ended.put)
+            value = self._value(self._next(ended))
+            if not isinstance(value, WorkerLostError):
+                break
+        return value
+
+    def _lost(self) -> ExecutorError:
+        return ExecutorError(f"lost the connection to the dask scheduler {self._address or 'of this machine'}")
+
+    def close(self) -> None:
+        client, cluster = self._client, self._cluster
+        self._client = self._cluster = None
+        if client is not None:
+            client.close(timeout=POLL)
+        if cluster is not None:
+            cluster.close(timeout=POLL)
+
+
+def _on_worker(function: Callable[..., T], call: tuple[Any, ...]) -> T:
+    one_blas_thread_for_good()
+    return function(*call)
