@@ -96,7 +96,8 @@ class ForwardModel(ABC):
 
     ``time_unit`` / ``time_display_unit`` label the time axis of observations. ``batch`` is the number of members the
     fast path likes to get at once (executors cut chunks at multiples of it); ``compiled`` says that ``trajectories``
-    releases the interpreter lock, so that threads serve it.
+    releases the interpreter lock, so that threads serve it. ``autonomous`` says that F depends on elapsed time alone:
+    sequential schemes may start ``trajectories`` at any instant, where otherwise they repeat ``step``.
 
     To be usable from YAML a model class also has ``Settings`` (a pydantic model of its ``model:`` section) and
     ``from_settings``.
@@ -109,6 +110,7 @@ class ForwardModel(ABC):
     time_display_unit: ClassVar[str] = "s"
     batch: ClassVar[int] = 1
     compiled: ClassVar[bool] = False
+    autonomous: ClassVar[bool] = False
 
     @abstractmethod
     def initial_state(self, theta: Mapping[str, float]) -> Array:

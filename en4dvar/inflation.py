@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.linalg import centre
 from en4dvar.state import Array
 
 
@@ -34,18 +33,12 @@ class Inflation:
         if not 0 <= self.rtps <= 1:
             raise ValueError(f"rtps must lie in [0, 1], not {self.rtps:g}")
 
-    def apply(self, prior: Array, posterior: Array) -> Array:
-        """The posterior ensemble (N, n) inflated; ``prior`` (M, n) is the ensemble before the analysis."""
-        if self.rtps == 0:
-            return posterior if self.multiplicative == 1 else inflate(posterior, self.multiplicative)
-        factor = relaxation(prior.std(axis=0, ddof=1), posterior.std(axis=0, ddof=1), self.rtps)
-        return inflate(posterior, self.multiplicative * factor)
-
-
-def inflate(ensemble: Array, factor: float | Array) -> Array:
-    """Members (N, n) with their anomalies multiplied by ``factor``, a number or (n,)."""
-    mean, anomalies = centre(ensemble)
-    return np.asarray(mean + factor * anomalies)
+    def apply(self, prior: Array, anomalies: Array) -> Array:
+        """Analysis anomalies (N, n) inflated; ``prior`` (N, n) is the ensemble before the analysis."""
+        if self.rtps:
+            spread = np.sqrt(np.sum(anomalies**2, axis=0) / (len(anomalies) - 1))
+            anomalies = anomalies * relaxation(prior.std(axis=0, ddof=1), spread, self.rtps)
+        return anomalies if self.multiplicative == 1 else self.multiplicative * anomalies
 
 
 def relaxation(prior_std: Array, posterior_std: Array, alpha: float) -> Array:

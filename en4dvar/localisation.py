@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.linalg import apply_weights
 from en4dvar.schemes import Evaluation, Weights, gauss_newton
@@ -43,7 +44,7 @@ class Localisation:
     State variables in no block keep their forecast.
     """
 
-    blocks: Sequence[Array]
+    blocks: Sequence[npt.NDArray[np.intp]]
     taper: Array
 
     @classmethod

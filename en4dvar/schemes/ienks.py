@@ -25,7 +25,9 @@ from en4dvar.state import Array
 
 @dataclass(frozen=True)
 class IEnKS:
-    """The smoother. Iterations stop once the step is below ``tolerance`` posterior standard deviations, √(δwᵀAδw).
+    """The smoother. Iterations end with the step that is below ``tolerance`` posterior standard deviations, √(δwᵀAδw).
+
+    That step is taken, so what is left is smaller by the square.
 
     ``transform``: members at the rows of 1wᵀ + T, Y = T⁻¹(P − p̄). ``bundle``: at 1wᵀ + εI, Y = (P − p̄)/ε.
     """
@@ -34,7 +36,7 @@ class IEnKS:
     linearisation: Literal["transform", "bundle"] = "transform"
     epsilon: float = 1e-4
     max_iterations: int = 10
-    tolerance: float = 1e-2
+    tolerance: float = 0.05
 
     def init(self, n_members: int) -> Weights:
         """w = 0, T = I."""
@@ -49,7 +51,7 @@ class IEnKS:
         mean, anomalies = centre(predictions)
         if self.linearisation == "bundle":
             return mean, anomalies / self.epsilon
-        return mean, np.linalg.solve(weights.T, anomalies)
+        return mean, np.asarray(np.linalg.solve(weights.T, anomalies))
 
     def step(self, weights: Weights, evaluation: Evaluation) -> Step:
         """Gauss–Newton step and symmetric transform."""

@@ -1,0 +1,45 @@
+r"""A linear model: uncoupled damped oscillators, \(\dot z_j = (iω_j − γ) z_j\) with \(ω_j = j\), solved exactly.
+
+The state is (Re z_1, Im z_1, Re z_2, …). With Gaussian errors the Kalman filter and smoother are exact here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+from pydantic import Field as Setting
+
+from en4dvar import Field
+from en4dvar_lorenz.autonomous import Autonomous, dimensionless
+
+
+class LinearSettings(BaseModel):
+    """``oscillators``: how many; at time zero all have z = 1."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    oscillators: Annotated[int, Setting(ge=1)] = 4
+
+
+def oscillate(start: np.ndarray, times: np.ndarray, longest: float) -> np.ndarray:
+    """States (N, n) at times (N, K) → (N, K, n), in closed form; there is no step to choose."""
+    z = np.ascontiguousarray(start[:, :-1]).view(complex)
+    rates = 1j * np.arange(1, z.shape[1] + 1) - start[:, -1:]
+    paths = z[:, None] * np.exp(rates[:, None] * times[:, :, None])
+    constant = np.broadcast_to(start[:, None, -1:], (*times.shape, 1))
+    return np.concatenate([paths.view(float), constant], axis=-1)
+
+
+class Linear(Autonomous):
+    """Oscillators with a common damping rate."""
+
+    Settings = LinearSettings
+    parameters = (dimensionless("gamma", "damping rate", r"$\gamma$", ""),)
+    defaults: ClassVar[Mapping[str, float]] = {"gamma": 0.0}
+    integrate = staticmethod(oscillate)
+
+    @classmethod
+    def from_settings(cls, settings: LinearSettings) -> Linear:
+        return cls((Field("x", 2 * settings.oscillators),), [1.0, 0.0] * settings.oscillators, np.inf)

@@ -1,0 +1,53 @@
+r"""Lorenz-63: \(\dot x = σ(y − x),\; \dot y = ρx − y − xz,\; \dot z = xy − βz\).
+
+Source: Lorenz (1963), J. Atmos. Sci. 20, 130.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+import numpy as np
+from numba import njit
+from pydantic import BaseModel, ConfigDict
+from pydantic import Field as Setting
+
+from en4dvar import Field
+from en4dvar_lorenz.autonomous import Autonomous, dimensionless
+from en4dvar_lorenz.rk4 import rk4
+
+SOURCE = "Lorenz (1963)"
+
+
+class Lorenz63Settings(BaseModel):
+    """``initial``: the state at time zero. ``step``: longest step of the integration."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    initial: tuple[float, float, float] = (1.509, -1.531, 25.46)
+    step: Annotated[float, Setting(gt=0)] = 0.01
+
+
+@njit
+def tendency(x: np.ndarray, dx: np.ndarray) -> None:
+    dx[0] = x[3] * (x[1] - x[0])
+    dx[1] = x[0] * (x[4] - x[2]) - x[1]
+    dx[2] = x[0] * x[1] - x[5] * x[2]
+    dx[3:] = 0.0
+
+
+class Lorenz63(Autonomous):
+    """Three variables, chaotic at the default parameters."""
+
+    Settings = Lorenz63Settings
+    parameters = (
+        dimensionless("sigma", "Prandtl number", r"$\sigma$", SOURCE),
+        dimensionless("rho", "relative Rayleigh number", r"$\rho$", SOURCE),
+        dimensionless("beta", "aspect parameter", r"$\beta$", SOURCE),
+    )
+    defaults: ClassVar[Mapping[str, float]] = {"sigma": 10.0, "rho": 28.0, "beta": 8 / 3}
+    integrate = staticmethod(rk4(tendency))
+
+    @classmethod
+    def from_settings(cls, settings: Lorenz63Settings) -> Lorenz63:
+        return cls((Field("x"), Field("y"), Field("z")), settings.initial, settings.step)
