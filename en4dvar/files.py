@@ -11,8 +11,8 @@ from en4dvar.errors import OutputError
 
 
 @contextmanager
-def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A partial file beside ``path`` to write to; on leaving it is flushed to disk and renamed to ``path``.
+def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
+    """A partial file beside ``path`` to write to; on leaving it is (``durable``: flushed to disk and) renamed to ``path``.
 
     Where the block raises, ``path`` stays as it was and the partial file is removed. An operating-system error becomes
     an :class:`OutputError` that names ``path``.
@@ -22,9 +22,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     try:
         partial.touch()  # an unwritable place gives the system's reason here, not a library's guess later
         yield partial
-        _fsync(partial)
+        if durable:
+            _fsync(partial)
         partial.replace(path)
-        if os.name == "posix":  # elsewhere a directory cannot be opened
+        if durable and os.name == "posix":  # elsewhere a directory cannot be opened
             _fsync(path.parent)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from None
