@@ -188,11 +188,14 @@ class Prior:
 
 def standard_normal(seed: int, name: str, n_members: int) -> Array:
     """One N(0, 1) number per member (N,), each from the stream of its own (seed, name, member)."""
+    return np.array([member_stream(seed, name, member).standard_normal() for member in range(n_members)])
+
+
+def member_stream(seed: int, name: str, member: int = 0) -> np.random.Generator:
+    """The stream of random numbers that belongs to (seed, name, member) and to nothing else."""
     digest = hashlib.blake2b(f"{seed}/{name}".encode(), digest_size=16).digest()
     key = np.frombuffer(digest, dtype="<u8").astype(np.uint64)
-    counters = np.zeros((n_members, 4), dtype=np.uint64)
-    counters[:, 3] = np.arange(n_members)
-    return np.array([np.random.Generator(np.random.Philox(key=key, counter=c)).standard_normal() for c in counters])
+    return np.random.Generator(np.random.Philox(key=key, counter=np.array([0, 0, 0, member], dtype=np.uint64)))
 
 
 def _whiten_sample(z: Array) -> Array:
