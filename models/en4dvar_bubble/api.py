@@ -13,8 +13,10 @@ from en4dvar.errors import ConfigError
 from en4dvar_bubble.driving import Driving, Reading, histotripsy, silence
 from en4dvar_bubble.laws import ConstitutiveLaw, get_law
 from en4dvar_bubble.medium import WATER_25C, Medium
-from en4dvar_bubble.model import BubbleModel, Gas, Paths, Start
-from en4dvar_bubble.solver.driver import ACCURACIES, Accuracy, AccuracyName
+from en4dvar_bubble.model import BubbleModel, Gas, Heat, Start, Vapour
+from en4dvar_bubble.packing import conduction_slope, from_kirchhoff
+from en4dvar_bubble.paths import Paths
+from en4dvar_bubble.solver.driver import ACCURACIES, Accuracy, AccuracyName, Radial
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -32,6 +34,9 @@ def simulate(
     driving: Driving | None = None,
     driving_read: Reading = "instantaneous",
     medium: Medium = WATER_25C,
+    radial: Radial = "keller-miksis",
+    vapour: Vapour = "none",
+    medium_heat: Heat = "cold",
     accuracy: AccuracyName | Accuracy = "standard",
     workers: int = 1,
 ) -> xr.Dataset:
@@ -44,8 +49,8 @@ def simulate(
     acoustic start,
         ``R_max`` and ``R_eq`` (or ``R0``, the same there) for the laser start.
     times: output times (time,) in s, increasing; time zero is the start of the simulation (laser: the instant of
-    R_max). start, gas, driving, driving_read, medium, accuracy: the model; defaults are the acoustic start with the
-    histotripsy pulse
+    R_max). start, gas, driving, driving_read, medium, radial, vapour, medium_heat, accuracy: the model (see
+    :class:`BubbleModel`); defaults are the acoustic start with the histotripsy pulse
         and the constants of water at 25 °C, p_f read at t, heat equation in the gas with a cold wall.
     workers: threads; the result does not depend on it.
 
@@ -69,6 +74,9 @@ def simulate(
         driving=driving or (histotripsy() if start == "acoustic" else silence()),
         reading=driving_read,
         medium=medium,
+        radial=radial,
+        vapour=vapour,
+        medium_heat=medium_heat,
         accuracy=ACCURACIES[accuracy] if isinstance(accuracy, str) else accuracy,
     )
     theta = _members(model, dict(parameters or {}))
@@ -83,7 +91,7 @@ def simulate(
     chunks = [x[i : i + _CHUNK] for i in range(0, len(x), _CHUNK)]
 
     def run(chunk: npt.NDArray[np.float64]) -> Paths:
-        return model._integrate(chunk, np.broadcast_to(t, (len(chunk), len(t))), 0.0)
+        return model.integrate(chunk, np.broadcast_to(t, (len(chunk), len(t))))
 
     if workers > 1:
         with ThreadPoolExecutor(workers) as pool:
@@ -114,10 +122,8 @@ def simulate(
         "steps": ("member", record[:, 0].astype(int), {"long_name": "accepted time steps"}),
         "max_wall_mach": ("member", record[:, 2], {"units": "1", "long_name": "largest wall Mach number"}),
     }
-    if model.nodes:
-        slope = medium.A * medium.T_inf / medium.K_inf
-        k = np.sqrt(1 + 2 * slope * record[:, 3])
-        hottest = medium.T_inf * (1 + 2 * record[:, 3] / (k + 1))
+    if model.system.gas:
+        hottest = medium.T_inf * from_kirchhoff(record[:, 3], conduction_slope(medium))
         data["max_temperature"] = (
             "member",
             hottest,
@@ -126,7 +132,8 @@ def simulate(
     coordinates = {"time": ("time", t, {"units": "s", "long_name": "time"})} | {
         p.name: ("member", theta[p.name], {"units": p.unit, "long_name": p.label}) for p in model.parameters
     }
-    attributes = {"law": chosen.name, "start": start, "gas": gas, "driving_read": driving_read}
+    attributes = {"law": chosen.name, "start": start, "gas": gas, "driving_read": driving_read, "radial": radial}
+    attributes |= {"vapour": vapour, "medium_heat": medium_heat}
     return xr.Dataset(data, coords=coordinates, attrs=attributes)
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
+
+from en4dvar.state import Array
 
 UNITS: Mapping[str, str] = MappingProxyType(
     {
@@ -158,6 +160,11 @@ CONSTANT_SETS: Mapping[str, Medium] = MappingProxyType(
 )
 
 
-def saturated_vapour_pressure(temperature: float) -> float:
+@overload
+def saturated_vapour_pressure(temperature: float) -> float: ...
+@overload
+def saturated_vapour_pressure(temperature: Array) -> Array: ...
+def saturated_vapour_pressure(temperature: float | Array) -> float | Array:
     """p_sat(T) = 1.17e11 exp(−5200/T) Pa, the fit of the rheometry codes (Estrada 2018); 3.1 kPa at 25 °C."""
-    return float(1.17e11 * np.exp(-5200.0 / temperature))
+    pressure = 1.17e11 * np.exp(-5200.0 / np.asarray(temperature))
+    return np.asarray(pressure) if np.ndim(temperature) else float(pressure)

@@ -11,9 +11,9 @@ from en4dvar.hints import suggest
 from en4dvar.units import Quantity, parse_quantity
 from en4dvar_bubble.driving import Reading
 from en4dvar_bubble.driving.settings import DrivingSettings, Histotripsy, NoDriving, with_kind
-from en4dvar_bubble.laws import get_law
+from en4dvar_bubble.laws import ConstitutiveLaw, get_law
 from en4dvar_bubble.medium import CONSTANT_SETS, UNITS, WATER_25C, Medium, saturated_vapour_pressure
-from en4dvar_bubble.solver.driver import ACCURACIES, Accuracy
+from en4dvar_bubble.solver.driver import ACCURACIES, Accuracy, Radial
 
 SetName = Literal["water-25C", "imr-v1", "imr-v2"]
 Positive = Field(gt=0)
@@ -88,8 +88,10 @@ class BubbleSettings(_Section):
     """What the forward model is; every default is recorded in the resolved configuration."""
 
     law: str = "quadratic-kelvin-voigt"
-    radial: Literal["keller-miksis"] = "keller-miksis"
-    gas: Literal["heat", "polytropic"] = "heat"
+    radial: Radial = "keller-miksis"
+    gas: Literal["heat", "polytropic", "isothermal", "adiabatic"] = "heat"
+    vapour: Literal["none", "frozen", "transport"] = "none"
+    medium_heat: Literal["cold", "conducting"] = "cold"
     start: Literal["acoustic", "laser"] = "acoustic"
     driving: DrivingSettings = Histotripsy()
     driving_read: Reading = "instantaneous"
@@ -97,6 +99,7 @@ class BubbleSettings(_Section):
     constants: ConstantsSettings = ConstantsSettings()
     accuracy: Literal["fast", "standard", "reference"] = "standard"
     nodes: Annotated[int, Field(ge=1, le=128)] | None = None
+    medium_nodes: Annotated[int, Field(ge=4, le=128)] | None = None
     rtol: Annotated[float, Field(ge=1e-11, le=1e-2)] | None = None
     step_limit: Annotated[int, Field(ge=100)] = Accuracy.step_limit
     mach_limit: Annotated[float, Field(gt=0)] = Accuracy.mach_limit
@@ -136,6 +139,10 @@ class BubbleSettings(_Section):
         return value if isinstance(value, str) else f"{value!r} Pa"
 
     @property
+    def constitutive_law(self) -> ConstitutiveLaw:
+        return get_law(self.law)
+
+    @property
     def medium(self) -> Medium:
         medium = self.constants.medium
         if self.vapour_pressure == "saturated":
@@ -148,6 +155,7 @@ class BubbleSettings(_Section):
         return Accuracy(
             nodes=preset.nodes if self.nodes is None else self.nodes,
             rtol=preset.rtol if self.rtol is None else self.rtol,
+            medium_nodes=preset.medium_nodes if self.medium_nodes is None else self.medium_nodes,
             step_limit=self.step_limit,
             mach_limit=self.mach_limit,
         )

@@ -20,6 +20,7 @@ def test_dataset_has_si_fields_with_units_and_the_parameters():
     }  # fmt: skip
     assert data.attrs == {
         "law": "quadratic-kelvin-voigt", "start": "acoustic", "gas": "heat", "driving_read": "instantaneous",
+        "radial": "keller-miksis", "vapour": "none", "medium_heat": "cold",
     }  # fmt: skip
     assert (data.status == 0).all()
     assert list(data.reason.values) == ["", "", ""]

@@ -1,4 +1,6 @@
-"""Every configuration that ships runs; those on measured data where the workshop folder ``../shared/data`` is present."""
+"""Every configuration that ships runs; those on measured data where the workshop folder ``../shared/data`` is
+present.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,9 @@ def test_quickstart_recovers_the_synthetic_gel(tmp_path):
 
 
 def test_soft_polyacrylamide(tmp_path):
-    """A least-squares fit of the same model (polytropic gas, saturated vapour): G 1.9 kPa, μ 0.084 Pa s, NRMSE 0.957."""
+    """A least-squares fit of the same model (polytropic gas, saturated vapour): G 1.9 kPa, μ 0.084 Pa s, NRMSE
+    0.957.
+    """
     result = on_file("polyacrylamide_soft", "A_E2_002.mat", tmp_path)
     scores = result.sample_stats.attrs
     assert scores["converged"] == 1

@@ -50,3 +50,36 @@ def ball(m: int) -> Ball:
     for array in (y, derivative, laplacian, weights):
         array.setflags(write=False)
     return Ball(y, derivative, laplacian, weights)
+
+
+@dataclass(frozen=True)
+class Exterior:
+    """Operators on M interior nodes plus the wall (last) for fields outside the unit ball that vanish at infinity.
+
+    ``x`` (M+1,) = r/R; ``derivative`` and ``laplacian`` (M+1, M+1) with respect to x.
+    """
+
+    x: Array
+    derivative: Array
+    laplacian: Array
+
+
+@cache
+def exterior(m: int, length: float) -> Exterior:
+    """Rational Chebyshev collocation on x = 1 + ``length`` (1−ξ)/(1+ξ), clustered at the wall (arrays shared)."""
+    n = m + 1
+    xi = np.cos(np.pi * np.arange(n + 1) / n)  # 1 (wall) … −1 (infinity)
+    c = np.r_[2.0, np.ones(n - 1), 2.0] * (-1.0) ** np.arange(n + 1)
+    d = (c[:, None] / c[None, :]) / (xi[:, None] - xi[None, :] + np.eye(n + 1))
+    np.fill_diagonal(d, 0.0)
+    np.fill_diagonal(d, -d.sum(axis=1))
+    keep = np.r_[np.arange(1, n), 0]  # infinity, where the field is zero, is dropped; the wall goes last
+    dxi_dx = -((1 + xi) ** 2) / (2 * length)
+    first = dxi_dx[:, None] * d
+    second = (first @ first)[np.ix_(keep, keep)]
+    x = 1 + length * (1 - xi[keep]) / (1 + xi[keep])
+    derivative = first[np.ix_(keep, keep)]
+    laplacian = second + (2 / x)[:, None] * derivative
+    for array in (x, derivative, laplacian):
+        array.setflags(write=False)
+    return Exterior(x, derivative, laplacian)

@@ -1,8 +1,8 @@
-"""The NumPy side of the solver: accuracy, packing of parameters, failure reasons."""
+"""The NumPy side of the solver: accuracy, the arrays a system of equations needs, failure reasons."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -11,54 +11,135 @@ import numpy as np
 
 from en4dvar.state import Array
 from en4dvar_bubble.driving import Driving, Reading
-from en4dvar_bubble.laws.base import GRID
-from en4dvar_bubble.solver import equations, integrate
+from en4dvar_bubble.laws.base import GRID, VISCOUS_GRID
+from en4dvar_bubble.solver import integrate, rows
 from en4dvar_bubble.solver.caching import stamp_with_sources
-from en4dvar_bubble.solver.collocation import ball
+from en4dvar_bubble.solver.collocation import ball, exterior
 
 stamp_with_sources(integrate.integrate, Path(__file__).parent)
 
 AccuracyName = Literal["fast", "standard", "reference"]
+Radial = Literal["rayleigh-plesset", "keller-miksis", "keller-miksis-enthalpy", "gilmore"]
 
 READINGS: dict[Reading, int] = {
-    "instantaneous": equations.INSTANTANEOUS,
-    "retarded": equations.RETARDED,
-    "as-printed": equations.AS_PRINTED,
+    "instantaneous": rows.INSTANTANEOUS,
+    "retarded": rows.RETARDED,
+    "as-printed": rows.AS_PRINTED,
+}
+RADIALS: dict[Radial, int] = {
+    "rayleigh-plesset": rows.PRESSURE,
+    "keller-miksis": rows.PRESSURE,
+    "keller-miksis-enthalpy": rows.ENTHALPY,
+    "gilmore": rows.GILMORE,
 }
 
+MEDIUM_LENGTH = 0.5
+"""Length of the medium's grid map in radii: half of the nodes lie within it of the wall."""
 _FIRST_STEP = 1e-3  # µs
 _STEPS_IN_DRIVING = 32
-_SLOWEST_RATE = (
-    0.01  # 1/µs: errors of V = Ṙ/R below rtol times this are not seen (they accumulate in ln R over about 100 µs)
-)
+_SLOWEST_RATE = 0.01  # 1/µs: errors of V = Ṙ/R below rtol times this are not seen (they accumulate over about 100 µs)
+_STRESS_SCALE = 10.0  # µm²/µs², about 0.1 bar: errors of a memory variable below rtol times this are not seen
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Temperature nodes in the gas and relative tolerance of the time steps, with the limits of an integration.
+    """Nodes in the gas (temperature, vapour) and in the medium, relative tolerance of the time steps, and limits.
 
     ``step_limit`` bounds the work per member; ``mach_limit`` ends a member whose wall Mach number exceeds it.
     """
 
     nodes: int = 8
     rtol: float = 1e-5
+    medium_nodes: int = 24
     step_limit: int = 20_000
     mach_limit: float = np.inf
 
 
 ACCURACIES: dict[AccuracyName, Accuracy] = {
-    "fast": Accuracy(nodes=4, rtol=1e-4),
-    "standard": Accuracy(nodes=8, rtol=1e-5),
-    "reference": Accuracy(nodes=24, rtol=1e-8),
+    "fast": Accuracy(nodes=4, rtol=1e-4, medium_nodes=16),
+    "standard": Accuracy(nodes=8, rtol=1e-5, medium_nodes=24),
+    "reference": Accuracy(nodes=24, rtol=1e-8, medium_nodes=48),
 }
 
 
 @dataclass(frozen=True)
+class System:
+    """Which unknowns there are, in the order of the kernel's rows, and which equations.
+
+    ``gas`` temperature nodes, ``vapour`` mole-fraction nodes (0 or ``gas``), ``medium`` temperature nodes, ``memory``
+    variables; ``shear``: a viscosity that depends on the shear rate.
+    """
+
+    gas: int
+    vapour: int = 0
+    medium: int = 0
+    memory: int = 0
+    radial: Radial = "keller-miksis"
+    shear: bool = False
+
+    @property
+    def wall(self) -> int:
+        """1 where the wall temperature is an unknown."""
+        return int(self.medium > 0)
+
+    @property
+    def general(self) -> bool:
+        """Whether the general equations are needed."""
+        return bool(self.vapour or self.medium or self.memory or self.shear or RADIALS[self.radial] != rows.PRESSURE)
+
+    @property
+    def size(self) -> int:
+        return self.gas + self.vapour + self.medium + self.wall + self.memory + 2
+
+    @property
+    def dims(self) -> tuple[int, ...]:
+        return (self.gas, self.vapour, self.medium, self.wall, self.memory, RADIALS[self.radial], int(self.shear))
+
+    @property
+    def first_vapour(self) -> int:
+        return self.gas
+
+    @property
+    def first_medium(self) -> int:
+        return self.gas + self.vapour
+
+    @property
+    def wall_row(self) -> int:
+        return self.first_medium + self.medium
+
+    @property
+    def first_memory(self) -> int:
+        return self.wall_row + self.wall
+
+    def tolerances(self, rtol: float) -> Array:
+        """(2, n) absolute and relative tolerances; ln R has an absolute one, which is a relative one of R."""
+        tol = np.full((2, self.size), rtol)
+        tol[0, self.first_memory : -2] = rtol * _STRESS_SCALE
+        tol[0, -2] = rtol * _SLOWEST_RATE
+        tol[1, -1] = 0.0
+        return tol
+
+
+_NO_TABLE = np.zeros((1, 1, 8))
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What the laws of N members contribute, over the density: ``elastic`` (N, cells, 8) of J_e, ``viscous`` (N, cells,
+    8) of ν (µm²/µs), ``memory`` (N, q, 2, cells, 8) of stiffness and equilibrium.
+    """
+
+    elastic: Array
+    viscous: Array = field(default_factory=lambda: _NO_TABLE)
+    memory: Array = field(default_factory=lambda: _NO_TABLE)
+
+
+@dataclass(frozen=True)
 class Solution:
-    """Raw solver output. ``states`` (N, K, m+2): τ nodes, V (1/µs), ln(R/µm); NaN where a member did not get.
+    """Raw solver output. ``states`` (N, K, n) in the rows of :class:`System`, NaN where a member did not get.
 
     ``status`` (N,) integers, ``record`` (N, 6): steps, rejected steps, largest wall Mach number, largest τ at the
-    innermost node, smallest ln R, end time (µs).
+    innermost node, smallest ln(R/µm), end time (µs).
     """
 
     states: Array
@@ -88,7 +169,7 @@ def reason(status: int, record: Array) -> str:
 
 
 @cache
-def _operators(m: int) -> Array:
+def _gas_operators(m: int) -> Array:
     """Collocation operators as one array in the kernel's layout (see ``equations.rhs``)."""
     ops = np.zeros((2 * m + 3, m + 1))
     if m:
@@ -98,10 +179,21 @@ def _operators(m: int) -> Array:
     return ops
 
 
+@cache
+def _medium_operators(m: int) -> Array:
+    """The same for the medium: m+1 rows of the derivative, m of the Laplacian, the nodes x."""
+    ops = np.zeros((2 * m + 2, m + 1))
+    if m:
+        e = exterior(m, MEDIUM_LENGTH)
+        ops[: m + 1], ops[m + 1 : 2 * m + 1], ops[2 * m + 1] = e.derivative, e.laplacian[:m], e.x
+    return ops
+
+
 def solve(
+    system: System,
     initial: Array,
     parameters: Array,
-    elastic: Array,
+    tables: Tables,
     start: Array,
     times: Array,
     driving: Driving,
@@ -110,40 +202,34 @@ def solve(
 ) -> Solution:
     """Integrate N members.
 
-    initial (N, m+2) and parameters (N, 12) in the kernel's units; elastic (N, cells, 8) tables of J_e/ρ; start (N,)
-    and times (N, K) in µs, times increasing. Members never influence each other: the bits do not depend on how they
-    are batched.
+    initial (N, n) and parameters (N, rows) in the kernel's units; start (N,) and times (N, K) in µs, times increasing.
+    Members never influence each other: the bits do not depend on how they are batched.
     """
-    n_members, n = initial.shape
-    m = n - 2
-    out = np.empty((n_members, times.shape[1], n))
+    n_members = len(initial)
+    out = np.empty((n_members, times.shape[1], system.size))
     status = np.zeros(n_members, dtype=np.int64)
     record = np.zeros((n_members, integrate.RECORD))
-    tol = np.full((2, n), accuracy.rtol)
-    tol[0, m] = accuracy.rtol * _SLOWEST_RATE
-    tol[1, n - 1] = 0.0  # ln R has an absolute tolerance: a relative one of R
     span = driving.grid.span
-    silent = driving.amplitude == 0.0
-    breaks = np.empty(0) if silent else span[:2].copy()
     inside = (span[1] - span[0]) / _STEPS_IN_DRIVING
-    limits = np.array([_FIRST_STEP, inside, float(accuracy.step_limit), accuracy.mach_limit])
+    member = np.arange(n_members, dtype=float)
     parameters = parameters.copy()
-    parameters[:, equations.TABLE] = np.arange(n_members) * (GRID.cells * 8.0)
+    parameters[:, rows.TABLE] = member * (GRID.cells * 8)
+    parameters[:, rows.VISCOUS_TABLE] = member * (VISCOUS_GRID.cells * 8)
+    for j in range(system.memory):
+        offset = (member * system.memory + j) * (2 * GRID.cells * 8)
+        parameters[:, rows.MEMORY + rows.PER_MEMORY * j + 2] = offset
     integrate.integrate(
         np.ascontiguousarray(initial),
         parameters,
         np.ascontiguousarray(start),
         np.ascontiguousarray(times),
-        m,
-        _operators(m),
-        np.ascontiguousarray(elastic),
-        GRID.span,
-        driving.table,
-        span,
-        breaks,
-        READINGS[reading],
-        tol,
-        limits,
+        system.dims,
+        (_gas_operators(system.gas), tables.elastic, GRID.span, driving.table, span, READINGS[reading]),
+        (_medium_operators(system.medium), tables.viscous, VISCOUS_GRID.span, tables.memory.reshape(-1, 1, 8)),
+        system.general,
+        driving.breaks,
+        system.tolerances(accuracy.rtol),
+        np.array([_FIRST_STEP, inside, float(accuracy.step_limit), accuracy.mach_limit]),
         out,
         status,
         record,

@@ -1,4 +1,7 @@
-"""The bubble's ordinary differential equations and their Jacobian, eight members at a time.
+"""The equations of the paper's bubble and their analytic Jacobian, eight members at a time.
+
+Keller–Miksis in pressure, an elastic solid with a Newtonian dashpot, polytropic gas or heat equation with a cold
+wall. Every other option is in :mod:`general`, which must agree with this module where they overlap.
 
 State rows (n = m + 2): Kirchhoff temperatures τ_1…τ_m, V = Ṙ/R (1/µs), u = ln(R/µm). Units: µm, µs, pressures divided
 by the density (µm²/µs²), so no other scaling is needed. In the logarithmic variables radius and pressure cannot
@@ -19,56 +22,25 @@ from __future__ import annotations
 
 import numba as nb
 
-from en4dvar_bubble.solver.lanes import any_lane, exp, floor, gather, load, maximum, minimum, select, splat, sqrt, store
-
-# Rows of the parameter array (PARAMETERS, 8): one column per member.
-LOG_GAS = 0  # ln of p R³⟨1/θ⟩ (heat) or ln of p R^{3κ} (polytropic)
-VAPOUR = 1  # constant vapour pressure added to the gas
-AMBIENT = 2  # p_∞
-SURFACE = 3  # 2S
-VISCOSITY = 4  # ν = μ/ρ
-INVERSE_C = 5  # 1/c
-CONDUCTION = 6  # K_∞T_∞/ρ
-KAPPA = 7
-SLOPE = 8  # a = A T_∞/K_∞
-LOG_R0 = 9  # ln of the stress-free radius
-AMPLITUDE = 10  # factor of the driving table
-TABLE = 11  # offset of the member's elastic table
-PARAMETERS = 12
-
-# Readings of p_f in the Keller–Miksis equation.
-INSTANTANEOUS, RETARDED, AS_PRINTED = 0, 1, 2
-
-
-@nb.njit
-def _lookup(table, offset, origin, per_unit, intervals, x):
-    """Value, first and second derivative of a piecewise quintic; beyond its ends the last interval is extended."""
-    position = (x - origin) * per_unit
-    cell = minimum(maximum(floor(position), 0.0), intervals - 1.0)
-    s = position - cell
-    at = offset + cell * 8.0
-    c0, c1, c2 = gather(table, at, 0), gather(table, at, 1), gather(table, at, 2)
-    c3, c4, c5 = gather(table, at, 3), gather(table, at, 4), gather(table, at, 5)
-    value = ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
-    first = (((c5 * 5.0 * s + c4 * 4.0) * s + c3 * 3.0) * s + c2 * 2.0) * s + c1
-    second = ((c5 * 20.0 * s + c4 * 12.0) * s + c3 * 6.0) * s + c2 * 2.0
-    return value, first * per_unit, second * (per_unit * per_unit)
-
-
-@nb.njit
-def _driving(t, drive, span, amplitude):
-    """p_f, dp_f/dt, d²p_f/dt² at the lanes' times; zero outside the table's span (t_0, t_1, intervals per µs,
-    count).
-    """
-    zero = splat(0.0)
-    before = t < span[0]
-    after = t > span[1]
-    inside = select(before, 0.0, select(after, 0.0, 1.0))
-    if not any_lane(inside > 0.5):
-        return zero, zero, zero
-    f, g, h = _lookup(drive, zero, span[0], span[2], span[3], t)
-    scale = amplitude * inside
-    return f * scale, g * scale, h * scale
+from en4dvar_bubble.solver.lanes import exp, load, maximum, splat, sqrt, store
+from en4dvar_bubble.solver.lookup import driving, lookup
+from en4dvar_bubble.solver.rows import (
+    AMBIENT,
+    AMPLITUDE,
+    AS_PRINTED,
+    CONDUCTION,
+    INSTANTANEOUS,
+    INVERSE_C,
+    KAPPA,
+    LOG_GAS,
+    LOG_R0,
+    RETARDED,
+    SLOPE,
+    SURFACE,
+    TABLE,
+    VAPOUR,
+    VISCOSITY,
+)
 
 
 @nb.njit
@@ -111,12 +83,13 @@ def _gas(y, m, par, ops, work):
 
 
 @nb.njit
-def rhs(y, t, m, par, ops, elastic, elastic_span, drive, drive_span, reading, work, out):
+def rhs(y, t, m, par, world, work, out):
     """Write dy/dt (n, 8) to ``out``.
 
     ``ops`` holds the collocation operators: rows 0…m of d/dy (the last is the wall), m rows of the Laplacian, then
     radii (row 2m+1) and averaging weights (row 2m+2). ``work`` (4m+1, 8) is scratch.
     """
+    ops, elastic, elastic_span, drive, drive_span, reading = world
     p, rate, E, _wall = _gas(y, m, par, ops, work)
     V = load(y, m)
     u = load(y, m + 1)
@@ -136,8 +109,8 @@ def rhs(y, t, m, par, ops, elastic, elastic_span, drive, drive_span, reading, wo
     when = load(t, 0)
     if reading != INSTANTANEOUS:
         when = when + Ric
-    f, g, _ = _driving(when, drive, drive_span, load(par, AMPLITUDE))
-    J, Jx, _ = _lookup(
+    f, g, _ = driving(when, drive, drive_span, load(par, AMPLITUDE))
+    J, Jx, _ = lookup(
         elastic, load(par, TABLE), elastic_span[0], elastic_span[2], elastic_span[3], u - load(par, LOG_R0)
     )
     surface = load(par, SURFACE) / R
@@ -155,11 +128,12 @@ def rhs(y, t, m, par, ops, elastic, elastic_span, drive, drive_span, reading, wo
 
 
 @nb.njit
-def jacobian(y, t, m, par, ops, elastic, elastic_span, drive, drive_span, reading, work, out, jac, dt):
+def jacobian(y, t, m, par, world, work, out, jac, dt):
     """Write dy/dt to ``out`` (n, 8), ∂f/∂y to ``jac`` (n·n, 8; row i·n+j) and ∂f_V/∂t, the only nonzero one, to
     ``dt`` (1, 8).
     """
     n = m + 2
+    ops, elastic, elastic_span, drive, drive_span, reading = world
     p, rate, E, wall = _gas(y, m, par, ops, work)
     V = load(y, m)
     u = load(y, m + 1)
@@ -177,8 +151,8 @@ def jacobian(y, t, m, par, ops, elastic, elastic_span, drive, drive_span, readin
     when = load(t, 0)
     if reading != INSTANTANEOUS:
         when = when + Ric
-    f, g, h = _driving(when, drive, drive_span, load(par, AMPLITUDE))
-    J, Jx, Jxx = _lookup(
+    f, g, h = driving(when, drive, drive_span, load(par, AMPLITUDE))
+    J, Jx, Jxx = lookup(
         elastic, load(par, TABLE), elastic_span[0], elastic_span[2], elastic_span[3], u - load(par, LOG_R0)
     )
     surface = load(par, SURFACE) / R

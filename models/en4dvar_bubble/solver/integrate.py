@@ -10,8 +10,10 @@ import numba as nb
 import numpy as np
 
 from en4dvar_bubble.solver import rodas5p
-from en4dvar_bubble.solver.equations import AMPLITUDE, INVERSE_C, PARAMETERS, jacobian, rhs
+from en4dvar_bubble.solver.equations import jacobian, rhs
+from en4dvar_bubble.solver.general import general_jacobian, general_rhs
 from en4dvar_bubble.solver.lanes import WIDTH, absolute, load, maximum, splat, sqrt, store
+from en4dvar_bubble.solver.rows import AMPLITUDE, INVERSE_C
 
 # Status of a member; the reasons users read are made by ``driver.reason``.
 OK, STEP_LIMIT, NON_FINITE, STEP_UNDERFLOW, MACH_LIMIT = 0, 1, 2, 3, 4
@@ -58,17 +60,27 @@ def _solve(a, n, b, row):
 
 
 @nb.njit
-def _attempt(y, t, h, m, par, ops, elastic, espan, drive, dspan, reading, tol, w):
-    """One RODAS5P step of all lanes: stages to ``k``, the new state to ``y_new``, the error norm to ``norm``."""
+def _attempt(y, t, h, par, dims, world, extra, general, tol, w):
+    """One RODAS5P step of all lanes: stages to ``k``, the new state to ``y_new``, the error norm to ``norm``.
+
+    ``general`` chooses the equations: the paper's with their analytic Jacobian, or those with every option.
+    """
     work, f, jac, dt, k, stage, y_new, t_stage, norm = w
-    n = m + 2
-    jacobian(y, t, m, par, ops, elastic, espan, drive, dspan, reading, work, f, jac, dt)
+    mT, mY, mM, wall, q, _, _ = dims
+    n = mT + mY + mM + wall + q + 2
+    fast_row = n - 2  # V, the only row with an explicit time dependence
+    algebraic = mT + mY + mM if wall else -1
+    if general:
+        general_jacobian(y, t, par, dims, world, extra, stage, f, y_new, jac, dt)
+    else:
+        jacobian(y, t, mT, par, world, work, f, jac, dt)
     step = load(h, 0)
     inverse_h = 1.0 / step
     for i in range(n * n):
         store(jac, i, -load(jac, i))
     for i in range(n):
-        store(jac, i * n + i, load(jac, i * n + i) + inverse_h * (1.0 / _GAMMA))
+        if i != algebraic:
+            store(jac, i * n + i, load(jac, i * n + i) + inverse_h * (1.0 / _GAMMA))
     _factorise(jac, n)
     now = load(t, 0)
     slope_t = load(dt, 0) * step
@@ -80,13 +92,17 @@ def _attempt(y, t, h, m, par, ops, elastic, espan, drive, dspan, reading, tol, w
                     value = value + load(k, r * n + i) * _A[s, r]
                 store(stage, i, value)
             store(t_stage, 0, now + step * _ALPHA[s])
-            rhs(stage, t_stage, m, par, ops, elastic, espan, drive, dspan, reading, work, f)
+            if general:
+                general_rhs(stage, t_stage, par, dims, world, extra, f)
+            else:
+                rhs(stage, t_stage, mT, par, world, work, f)
         for i in range(n):
             value = splat(0.0)
-            for r in range(s):
-                value = value + load(k, r * n + i) * _C[s, r]
+            if i != algebraic:
+                for r in range(s):
+                    value = value + load(k, r * n + i) * _C[s, r]
             store(k, s * n + i, load(f, i) + value * inverse_h)
-        store(k, s * n + m, load(k, s * n + m) + slope_t * _D[s])
+        store(k, s * n + fast_row, load(k, s * n + fast_row) + slope_t * _D[s])
         _solve(jac, n, k, s * n)
     total = splat(0.0)
     last = (_STAGES - 1) * n
@@ -113,8 +129,7 @@ def _dense(y, y_new, k, n, coefficients):
 
 
 @nb.njit
-def _workspace(m):
-    n = m + 2
+def _workspace(m, n):
     return (
         np.empty((6 * m + 2, WIDTH)),
         np.empty((n, WIDTH)),
@@ -129,40 +144,25 @@ def _workspace(m):
 
 
 @nb.njit(cache=True, nogil=True)
-def integrate(
-    initial,
-    parameters,
-    start,
-    times,
-    m,
-    ops,
-    elastic,
-    espan,
-    drive,
-    dspan,
-    breaks,
-    reading,
-    tol,
-    limits,
-    out,
-    status,
-    record,
-):
+def integrate(initial, parameters, start, times, dims, world, extra, general, breaks, tol, limits, out, status, record):
     """Integrate N members and write their states at the output times.
 
-    initial (N, n), parameters (N, PARAMETERS), start (N,) µs, times (N, K) increasing µs; ``tol`` (2, n) absolute and
-    relative tolerances; ``breaks`` increasing instants the steps must not straddle; ``limits`` = (first step, longest
-    step inside the driving, step limit, Mach limit). Outputs: out (N, K, n) with NaN where not reached, status (N,),
-    record (N, RECORD).
+    initial (N, n), parameters (N, rows), start (N,) µs, times (N, K) increasing µs; ``dims``, ``world``, ``extra`` as
+    for :func:`general.general_rhs`; ``tol`` (2, n) absolute and relative tolerances; ``breaks`` increasing instants
+    the steps must not straddle; ``limits`` = (first step, longest step inside the driving, step limit, Mach limit).
+    Outputs: out (N, K, n) with NaN where not reached, status (N,), record (N, RECORD).
     """
     n_members, n = initial.shape
     n_times = times.shape[1]
-    w = _workspace(m)
+    m = dims[0]
+    dspan = world[4]
+    n_parameters = parameters.shape[1]
+    w = _workspace(m, n)
     k, y_new, norm = w[4], w[6], w[8]
     y = np.zeros((n, WIDTH))
     t = np.zeros((1, WIDTH))
     h = np.full((1, WIDTH), limits[0])
-    par = np.zeros((PARAMETERS, WIDTH))
+    par = np.zeros((n_parameters, WIDTH))
     coefficients = np.empty((3 * n, WIDTH))
     member = np.full(WIDTH, -1, dtype=np.int64)
     observed = np.zeros(WIDTH, dtype=np.int64)
@@ -198,7 +198,7 @@ def integrate(
                 observed[lane] = done
                 for j in range(n):
                     y[j, lane] = initial[i, j]
-                for j in range(PARAMETERS):
+                for j in range(n_parameters):
                     par[j, lane] = parameters[i, j]
                 t[0, lane] = start[i]
                 h[0, lane] = first_step
@@ -219,7 +219,7 @@ def integrate(
         if running == 0:
             break
 
-        _attempt(y, t, h, m, par, ops, elastic, espan, drive, dspan, reading, tol, w)
+        _attempt(y, t, h, par, dims, world, extra, general, tol, w)
 
         have_dense = False
         for lane in range(WIDTH):

@@ -1,0 +1,120 @@
+"""From state vectors to the arrays of the compiled solver, and the thermodynamics of the gas that both sides need."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from en4dvar.state import Array
+from en4dvar_bubble.medium import Medium, saturated_vapour_pressure
+from en4dvar_bubble.solver import rows
+from en4dvar_bubble.solver.collocation import ball
+from en4dvar_bubble.solver.driver import Tables
+
+if TYPE_CHECKING:
+    from en4dvar_bubble.model import BubbleModel
+
+GAS_CONSTANT = 8.314462618
+"""J/(mol K), CODATA 2018."""
+_SATURATION = saturated_vapour_pressure(np.inf)
+_SATURATION_T = -298.15 * float(np.log(saturated_vapour_pressure(298.15) / _SATURATION))
+
+
+def mole_fraction(C: Array, medium: Medium) -> Array:
+    """Mole fraction of vapour from its mass fraction."""
+    return np.asarray(C / medium.M_v / (C / medium.M_v + (1 - C) / medium.M_g))
+
+
+def mass_fraction(chi: Array, medium: Medium) -> Array:
+    """Mass fraction of vapour from its mole fraction."""
+    return np.asarray(chi * medium.M_v / (chi * medium.M_v + (1 - chi) * medium.M_g))
+
+
+def kirchhoff(theta: Array, slope: float) -> Array:
+    """τ = ∫₁^θ k dθ for k = a θ + (1−a)."""
+    return np.asarray(0.5 * slope * (theta**2 - 1) + (1 - slope) * (theta - 1))
+
+
+def from_kirchhoff(tau: Array, slope: float) -> Array:
+    """θ from τ."""
+    return np.asarray(1 + 2 * tau / (np.sqrt(1 + 2 * slope * tau) + 1))
+
+
+def conduction_slope(medium: Medium) -> float:
+    """a = A T_∞/K_∞."""
+    return medium.A * medium.T_inf / medium.K_inf
+
+
+def law_tables(model: BubbleModel, values: Mapping[str, Array]) -> Tables:
+    """The laws of N members as tables in the kernel's units."""
+    law, rho = model.law, model.medium.rho
+    elastic = law.table(values) / rho
+    extra = {}
+    if model.system.shear:
+        extra["viscous"] = law.viscous_table(values) / rho * 1e6
+    if model.system.memory:
+        memory = law.memory_tables(values)
+        extra["memory"] = np.stack([memory.stiffness, memory.equilibrium], axis=2) / rho
+    return Tables(elastic, **extra)
+
+
+def pack(model: BubbleModel, x: Array) -> tuple[Array, Array]:
+    """States (N, n_state) as initial values (N, n) and parameters (N, rows) of the solver."""
+    medium, layout, system = model.medium, model.layout, model.system
+    column = {name: x[:, s.start] for name, s in layout.slices.items()}
+    slope = conduction_slope(medium)
+    log_R = np.log(column["R"] * 1e6)
+    initial = np.zeros((len(x), system.size))
+    initial[:, -2] = column["Rdot"] / column["R"] * 1e-6
+    initial[:, -1] = log_R
+    par = np.zeros((len(x), rows.PARAMETERS + rows.PER_MEMORY * system.memory))
+    gas = (column["p_b"] - medium.p_v) / medium.rho
+    if system.gas:
+        m = system.gas
+        theta = x[:, layout["T"]] / medium.T_inf
+        initial[:, :m] = kirchhoff(theta[:, :m], slope)
+        wall = theta[:, m] if system.wall else np.ones(len(x))
+        share = ball(m).weights[:m] / theta[:, :m]
+        at_wall = ball(m).weights[m] / wall
+        outside = np.zeros(len(x))
+        if system.vapour:
+            chi = mole_fraction(x[:, layout["C"]], medium)
+            initial[:, m : 2 * m] = chi
+            share = share * (1 - chi)
+            outside = saturated_vapour_pressure(wall * medium.T_inf) / medium.rho * at_wall
+        par[:, rows.LOG_GAS] = np.log(gas * (share.sum(axis=1) + at_wall) - outside) + 3 * log_R
+        if system.wall:
+            initial[:, system.first_medium : system.wall_row] = x[:, layout["T_m"]] / medium.T_inf - 1
+            initial[:, system.wall_row] = kirchhoff(wall, slope)
+    else:
+        par[:, rows.LOG_GAS] = np.log(gas) + 3 * model.exponent * log_R
+    if system.memory:
+        initial[:, system.first_memory : -2] = x[:, layout["Z"]] / medium.rho
+        memory = model.law.memory_tables(model.law_values(x))
+        for j in range(system.memory):
+            at = rows.MEMORY + rows.PER_MEMORY * j
+            par[:, at], par[:, at + 1] = memory.relaxation_time[:, j] * 1e6, memory.convection[j]
+
+    par[:, rows.VAPOUR] = medium.p_v / medium.rho
+    par[:, rows.AMBIENT] = medium.p_inf / medium.rho
+    par[:, rows.SURFACE] = 2 * medium.S / medium.rho * 1e6
+    par[:, rows.VISCOSITY] = column["mu"] / medium.rho * 1e6 if "mu" in column and not system.shear else 0.0
+    par[:, rows.INVERSE_C] = 0.0 if system.radial == "rayleigh-plesset" else 1 / medium.c
+    par[:, rows.CONDUCTION] = medium.K_inf * medium.T_inf / medium.rho * 1e6
+    par[:, rows.KAPPA] = medium.kappa if system.gas else model.exponent
+    par[:, rows.SLOPE] = slope
+    par[:, rows.LOG_R0] = np.log(column[model.stress_free_radius] * 1e6)
+    par[:, rows.AMPLITUDE] = model.driving.amplitude / medium.rho
+    par[:, rows.TAIT_B] = medium.tait_B / medium.rho
+    par[:, rows.TAIT_N] = medium.tait_n
+    par[:, rows.DIFFUSION] = medium.D_v * 1e6
+    par[:, rows.SATURATION] = _SATURATION / medium.rho
+    par[:, rows.SATURATION_T] = _SATURATION_T / medium.T_inf
+    R_v = GAS_CONSTANT / medium.M_v
+    par[:, rows.LATENT] = medium.L_v / (R_v * medium.T_inf) * medium.D_v * medium.rho / (medium.K_inf * medium.T_inf)
+    par[:, rows.MEDIUM_K] = medium.K_m / medium.K_inf
+    par[:, rows.MEDIUM_D] = medium.K_m / (medium.rho * medium.c_m) * 1e6
+    par[:, rows.HEATING] = 12 / (medium.c_m * medium.T_inf)
+    return initial, par

@@ -1,0 +1,128 @@
+"""Integrated members as trajectories: fields of the state vector, computed from the raw solution when asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from en4dvar.forward import Trajectory
+from en4dvar.state import Array
+from en4dvar_bubble.laws.base import GRID
+from en4dvar_bubble.medium import saturated_vapour_pressure
+from en4dvar_bubble.packing import conduction_slope, from_kirchhoff, mass_fraction
+from en4dvar_bubble.solver import rows
+from en4dvar_bubble.solver.collocation import ball
+from en4dvar_bubble.solver.driver import Solution, Tables
+from en4dvar_bubble.tables import evaluate
+
+if TYPE_CHECKING:
+    from en4dvar_bubble.model import BubbleModel
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """A batch of integrated members: ``initial`` states (N, n_state), ``times`` (N, K) in s, the raw solution."""
+
+    model: BubbleModel
+    initial: Array
+    times: Array
+    solution: Solution
+    par: Array
+    tables: Tables
+    _fields: dict[str, Array] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> Array:
+        """A field of the state along the paths, (N, K) or (N, K, size), SI."""
+        if name not in self._fields:
+            compute: Any = getattr(self, f"_{name}", None)
+            self._fields[name] = self._constant(name) if compute is None else compute()
+        return self._fields[name]
+
+    @property
+    def states(self) -> Array:
+        """Full state vectors (N, K, n_state) in the model's layout."""
+        blocks = [self[f.name].reshape(*self.times.shape, -1) for f in self.model.layout]
+        return np.concatenate(blocks, axis=2)
+
+    def _constant(self, name: str) -> Array:
+        return np.broadcast_to(self.initial[:, self.model.layout[name].start, None], self.times.shape)
+
+    def _R(self) -> Array:
+        return np.exp(self.solution.states[:, :, -1]) * 1e-6
+
+    def _Rdot(self) -> Array:
+        return self["R"] * self.solution.states[:, :, -2] * 1e6
+
+    def _T(self) -> Array:
+        system, medium = self.model.system, self.model.medium
+        tau = self.solution.states[:, :, : system.gas]
+        if system.wall:
+            tau = np.concatenate([tau, self.solution.states[:, :, system.wall_row, None]], axis=2)
+        return from_kirchhoff(tau, conduction_slope(medium)) * medium.T_inf
+
+    def _chi(self) -> Array:
+        system = self.model.system
+        return self.solution.states[:, :, system.first_vapour : system.first_medium]
+
+    def _C(self) -> Array:
+        return mass_fraction(self["chi"], self.model.medium)
+
+    def _T_m(self) -> Array:
+        system = self.model.system
+        return (1 + self.solution.states[:, :, system.first_medium : system.wall_row]) * self.model.medium.T_inf
+
+    def _Z(self) -> Array:
+        return self.solution.states[:, :, self.model.system.first_memory : -2] * self.model.medium.rho
+
+    def _p_b(self) -> Array:
+        medium, system = self.model.medium, self.model.system
+        log_R = self.solution.states[:, :, -1]
+        gas = self.par[:, None, rows.LOG_GAS]
+        if not system.gas:
+            return np.asarray(np.exp(gas - 3 * self.model.exponent * log_R) * medium.rho + medium.p_v)
+        m, weights = system.gas, ball(system.gas).weights
+        T = self["T"]
+        share = weights[:m] * medium.T_inf / T[:, :, :m]
+        wall = T[:, :, m] if system.wall else np.full(log_R.shape, medium.T_inf)
+        at_wall = weights[m] * medium.T_inf / wall
+        content = np.exp(gas - 3 * log_R) * medium.rho
+        if system.vapour:
+            share = share * (1 - self["chi"])
+            content = content + saturated_vapour_pressure(wall) * at_wall
+        return np.asarray(content / (share.sum(axis=2) + at_wall) + medium.p_v)
+
+    def _S(self) -> Array:
+        system, rho = self.model.system, self.model.medium.rho
+        V = self.solution.states[:, :, -2]
+        log_stretch = self.solution.states[:, :, -1] - self.par[:, None, rows.LOG_R0]
+        stress = evaluate(self.tables.elastic, GRID.span, log_stretch)
+        if system.memory:
+            stress = stress + self.solution.states[:, :, system.first_memory : -2].sum(axis=2)
+        if system.shear:
+            values = self.model.law_values(self.initial)
+            nu = self.model.law.mean_viscosity(np.abs(V) * 1e6, values) / rho * 1e6
+        else:
+            nu = self.par[:, None, rows.VISCOSITY]
+        return np.asarray((stress - 4 * nu * V) * rho)
+
+
+class BubbleTrajectory(Trajectory):
+    """One member of a batch; fields are shared with the batch and computed on demand."""
+
+    _paths: Paths
+    _member: int
+
+    def __init__(self, paths: Paths, member: int):
+        object.__setattr__(self, "_paths", paths)
+        object.__setattr__(self, "_member", member)
+        object.__setattr__(self, "times", paths.times[member])
+        object.__setattr__(self, "layout", paths.model.layout)
+
+    def __getitem__(self, name: str) -> Array:
+        return np.asarray(self._paths[name][self._member])
+
+    @property
+    def states(self) -> Array:
+        return np.asarray(self._paths.states[self._member])

@@ -1,0 +1,217 @@
+"""The bubble with every option: vapour, conducting medium, memory, shear thinning, enthalpy and Gilmore equations.
+
+State rows: Kirchhoff temperatures τ of the gas (mT), mole fractions of vapour (mY), temperatures θ_m − 1 of the
+medium (mM), the wall's τ_w where the medium conducts (an algebraic unknown: RODAS5P integrates the index-1 system as
+it stands), memory variables (q), V, u. Notation and units as in :mod:`equations`. The Jacobian is by one-sided
+differences.
+
+Gas and vapour. Both have the same κ, hence the same molar heat capacity, and with the molar-average velocity u* the
+energy equation is that of a pure gas (diffusion carries no net enthalpy):
+    u*/R = (κ−1)/κ E τ' − y π̇/(3κ),     τ̇ = −(u*/R − yV) τ' + (κ−1)/κ kθ (π̇ + E ∇²τ)
+    χ̇ = −(u*/R − yV) χ' + D/R² (∇²χ − θ'χ'/θ)          (mole fraction χ; Fick's law, ρ D uniform in composition)
+    π̇ = 3(κ−1) E τ'_w − 3κ V + 3κ D/R² χ'_w/(1−χ_w),   χ_w = p_sat(T_w)/p
+which is Prosperetti's ṗ_b with vapour transport, R_v/R_mix · dC/(1−C) being dχ/(1−χ). The non-condensible gas has the
+density p(1−χ)/(R_a T), linear in p at the wall too, so p follows from its mass as in :mod:`equations`.
+
+Medium (x = r/R ≥ 1, on a rational Chebyshev grid):  θ̇_m = V(x − x⁻²) θ_m' + D_m/R² ∇²θ_m + 12 ν V² x⁻⁶/(c_p T_∞)
+Wall: K_m θ_m' = K_∞ τ'_w + latent heat of the evaporating flux.
+
+Radial: enthalpy form and Gilmore with the Tait liquid, ρ = ((p+B)/(p_∞+B))^{1/n}:
+    H = ∫_{p_∞+p_f}^{p_w} dp/ρ,   Keller–Miksis: c constant;   Gilmore: C² = c² + (n−1)H and (R/C)(1−Ṙ/C) Ḣ.
+
+Sources: Prosperetti (1991); Estrada et al. (2018); Warnez & Johnsen (2015); Prosperetti & Lezzi (1986); Gilmore (1952).
+"""
+
+from __future__ import annotations
+
+import numba as nb
+
+from en4dvar_bubble.solver import rows
+from en4dvar_bubble.solver.lanes import absolute, exp, load, log, maximum, splat, sqrt, store
+from en4dvar_bubble.solver.lookup import driving, lookup
+from en4dvar_bubble.solver.rows import AS_PRINTED, GILMORE, INSTANTANEOUS, MEMORY, PER_MEMORY, PRESSURE, RETARDED
+
+_DELTA = 1e-7
+
+
+@nb.njit
+def _derivative(y, first, count, wall, matrix, row):
+    """Row ``row`` of a collocation matrix times the unknowns ``first … first+count−1`` and the wall value."""
+    total = wall * matrix[row, count]
+    for j in range(count):
+        total = total + load(y, first + j) * matrix[row, j]
+    return total
+
+
+@nb.njit
+def _gas_and_medium(y, par, dims, ops, medium, V, u, out):
+    """Pressure and π̇; writes the rates of gas, vapour and medium and the residual of the wall."""
+    mT, mY, mM, wall, _, _, _ = dims
+    kappa = load(par, rows.KAPPA)
+    if mT == 0:
+        return exp(load(par, rows.LOG_GAS) - kappa * u * 3.0), kappa * V * (-3.0)
+    oY, oM = mT, mT + mY
+    oW = oM + mM
+    k1 = (kappa - 1.0) / kappa
+    a = load(par, rows.SLOPE)
+    weights = ops[2 * mT + 2]
+    zero = splat(0.0)
+    tau_w = load(y, oW) if wall else zero
+    k_w = sqrt(maximum(a * tau_w * 2.0 + 1.0, 1e-12))
+    theta_w = tau_w * 2.0 / (k_w + 1.0) + 1.0
+    saturation = zero
+    if mY:
+        saturation = load(par, rows.SATURATION) * exp(-(load(par, rows.SATURATION_T) / theta_w))
+    at_wall = weights[mT] / theta_w
+    inside = at_wall
+    for i in range(mT):
+        tau = load(y, i)
+        k = sqrt(maximum(a * tau * 2.0 + 1.0, 1e-12))
+        share = weights[i] / (tau * 2.0 / (k + 1.0) + 1.0)
+        if mY:
+            share = share * (1.0 - load(y, oY + i))
+        inside = inside + share
+    p = (exp(load(par, rows.LOG_GAS) - u * 3.0) + saturation * at_wall) / inside
+    per_area = exp(u * (-2.0))
+    E = load(par, rows.CONDUCTION) / p * per_area
+    slope_w = _derivative(y, 0, mT, tau_w, ops, mT)
+    rate = (kappa - 1.0) * E * slope_w * 3.0 - kappa * V * 3.0
+    chi_w = zero
+    flux = zero
+    diffusion = zero
+    if mY:
+        chi_w = saturation / p
+        diffusion = load(par, rows.DIFFUSION) * per_area
+        flux = _derivative(y, oY, mY, chi_w, ops, mT) / (1.0 - chi_w)
+        rate = rate + kappa * diffusion * flux * 3.0
+    for i in range(mT):
+        tau = load(y, i)
+        k = sqrt(maximum(a * tau * 2.0 + 1.0, 1e-12))
+        theta = tau * 2.0 / (k + 1.0) + 1.0
+        slope = _derivative(y, 0, mT, tau_w, ops, i)
+        bend = _derivative(y, 0, mT, tau_w, ops, mT + 1 + i)
+        drift = k1 * E * slope - (rate / (kappa * 3.0) + V) * ops[2 * mT + 1, i]
+        store(out, i, k1 * k * theta * (rate + E * bend) - drift * slope)
+        if mY:
+            slope_y = _derivative(y, oY, mY, chi_w, ops, i)
+            bend_y = _derivative(y, oY, mY, chi_w, ops, mT + 1 + i)
+            store(out, oY + i, diffusion * (bend_y - slope / (k * theta) * slope_y) - drift * slope_y)
+    if wall:
+        hot = theta_w - 1.0
+        spread = load(par, rows.MEDIUM_D) * per_area
+        heating = load(par, rows.HEATING) * load(par, rows.VISCOSITY) * V * V
+        for j in range(mM):
+            x = medium[2 * mM + 1, j]
+            slope = _derivative(y, oM, mM, hot, medium, j)
+            bend = _derivative(y, oM, mM, hot, medium, mM + 1 + j)
+            flow = V * (x - 1.0 / (x * x))
+            store(out, oM + j, flow * slope + spread * bend + heating * (1.0 / x**6))
+        outside = load(par, rows.MEDIUM_K) * _derivative(y, oM, mM, hot, medium, mM)
+        store(out, oW, outside - slope_w - load(par, rows.LATENT) * p / theta_w * flux)
+    return p, rate
+
+
+@nb.njit
+def general_rhs(y, t, par, dims, world, extra, out):
+    """Write dy/dt (n, 8) to ``out``; the wall's row holds the residual of its algebraic equation.
+
+    ``dims`` = (mT, mY, mM, wall, q, radial equation, shear thinning); ``world`` as for :func:`equations.rhs`;
+    ``extra`` = (medium operators, viscous tables, their span, memory tables).
+    """
+    mT, mY, mM, wall, q, radial, shear = dims
+    ops, elastic, span, drive, drive_span, reading = world
+    medium, viscous, viscous_span, memory = extra
+    oS = mT + mY + mM + wall
+    V = load(y, oS + q)
+    u = load(y, oS + q + 1)
+    p, rate = _gas_and_medium(y, par, dims, ops, medium, V, u, out)
+
+    x = u - load(par, rows.LOG_R0)
+    J, Jx, _ = lookup(elastic, load(par, rows.TABLE), span[0], span[2], span[3], x)
+    J_rate = Jx * V
+    for j in range(q):
+        s = load(y, oS + j)
+        at = load(par, MEMORY + PER_MEMORY * j + 2)
+        stiffness, _, _ = lookup(memory, at, span[0], span[2], span[3], x)
+        rest, _, _ = lookup(memory, at + span[3] * 8.0, span[0], span[2], span[3], x)
+        convection = load(par, MEMORY + PER_MEMORY * j + 1)
+        change = (rest - s) / load(par, MEMORY + PER_MEMORY * j) + V * (convection * s + stiffness)
+        store(out, oS + j, change)
+        J = J + s
+        J_rate = J_rate + change
+    nu = load(par, rows.VISCOSITY)
+    dashpot = nu * V * 4.0
+    dashpot_V = nu * 4.0
+    if shear:
+        z = maximum(log(maximum(absolute(V) * 1e6, 1e-300)), viscous_span[0])
+        at = load(par, rows.VISCOUS_TABLE)
+        nu, nu_z, _ = lookup(viscous, at, viscous_span[0], viscous_span[2], viscous_span[3], z)
+        dashpot = nu * V * 4.0
+        dashpot_V = (nu + nu_z) * 4.0
+
+    R = exp(u)
+    ic = load(par, rows.INVERSE_C)
+    when = load(t, 0)
+    if reading != INSTANTANEOUS:
+        when = when + R * ic
+    f, g, _ = driving(when, drive, drive_span, load(par, rows.AMPLITUDE))
+    surface = load(par, rows.SURFACE) / R
+    wall_pressure = p + load(par, rows.VAPOUR) - surface + J - dashpot
+    wall_slope = p * rate + surface * V + J_rate
+    Rdot = R * V
+    if reading == RETARDED:
+        g = splat(0.0)
+    elif reading == AS_PRINTED:
+        g = g * (Rdot * ic + 1.0)
+    ambient = load(par, rows.AMBIENT)
+    weight = splat(1.0)
+    damping = splat(1.0)
+    if radial == PRESSURE:
+        H = wall_pressure - ambient - f
+        H_slope = wall_slope - g
+    else:
+        B = load(par, rows.TAIT_B)
+        n = load(par, rows.TAIT_N)
+        scale = 1.0 / (ambient + B)
+        log_wall = log(maximum((wall_pressure + B) * scale, 1e-300))
+        log_far = log(maximum((ambient + f + B) * scale, 1e-300))
+        share = (n - 1.0) / n
+        H = (exp(share * log_wall) - exp(share * log_far)) / (share * scale)
+        damping = exp(-(log_wall / n))
+        H_slope = wall_slope * damping - g * exp(-(log_far / n))
+        if radial == GILMORE:
+            ic = 1.0 / sqrt(maximum(1.0 / (ic * ic) + (n - 1.0) * H, 1e-12))
+            weight = 1.0 - Rdot * ic
+    mach = Rdot * ic
+    Ric = R * ic * weight
+    numerator = Rdot * Rdot * (mach * 1.5 - 2.5) + (mach + 1.0) * H + Ric * H_slope
+    store(out, oS + q, numerator / (R * R * (1.0 - mach) + dashpot_V * Ric * damping))
+    store(out, oS + q + 1, V)
+
+
+@nb.njit
+def general_jacobian(y, t, par, dims, world, extra, shifted, out, changed, jac, dt):
+    """Write dy/dt to ``out`` (n, 8), ∂f/∂y to ``jac`` (row i·n+j) and ∂f_V/∂t to ``dt`` (1, 8), by differences."""
+    mT, mY, mM, wall, q, _, _ = dims
+    n = mT + mY + mM + wall + q + 2
+    general_rhs(y, t, par, dims, world, extra, out)
+    for i in range(n):
+        store(shifted, i, load(y, i))
+    for j in range(n):
+        value = load(y, j)
+        floor_j = 0.01 if j == n - 2 else 1.0
+        delta = _DELTA * maximum(absolute(value), floor_j)
+        store(shifted, j, value + delta)
+        delta = load(shifted, j) - value
+        general_rhs(shifted, t, par, dims, world, extra, changed)
+        inverse = 1.0 / delta
+        for i in range(n):
+            store(jac, i * n + j, (load(changed, i) - load(out, i)) * inverse)
+        store(shifted, j, value)
+    now = load(t, 0)
+    store(dt, 0, splat(0.0))
+    if world[4][1] > world[4][0]:
+        store(t, 0, now + _DELTA)
+        general_rhs(y, t, par, dims, world, extra, changed)
+        store(dt, 0, (load(changed, n - 2) - load(out, n - 2)) / (load(t, 0) - now))
+        store(t, 0, now)

@@ -1,0 +1,38 @@
+"""Smooth functions in the kernel: piecewise quintics, see :mod:`en4dvar_bubble.tables`."""
+
+from __future__ import annotations
+
+import numba as nb
+
+from en4dvar_bubble.solver.lanes import any_lane, floor, gather, maximum, minimum, select, splat
+
+
+@nb.njit
+def lookup(table, offset, origin, per_unit, intervals, x):
+    """Value, first and second derivative of a piecewise quintic; beyond its ends the last interval is extended."""
+    position = (x - origin) * per_unit
+    cell = minimum(maximum(floor(position), 0.0), intervals - 1.0)
+    s = position - cell
+    at = offset + cell * 8.0
+    c0, c1, c2 = gather(table, at, 0), gather(table, at, 1), gather(table, at, 2)
+    c3, c4, c5 = gather(table, at, 3), gather(table, at, 4), gather(table, at, 5)
+    value = ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
+    first = (((c5 * 5.0 * s + c4 * 4.0) * s + c3 * 3.0) * s + c2 * 2.0) * s + c1
+    second = ((c5 * 20.0 * s + c4 * 12.0) * s + c3 * 6.0) * s + c2 * 2.0
+    return value, first * per_unit, second * (per_unit * per_unit)
+
+
+@nb.njit
+def driving(t, drive, span, amplitude):
+    """p_f, dp_f/dt, d²p_f/dt² at the lanes' times; zero outside the table's span (t_0, t_1, intervals per µs,
+    count).
+    """
+    zero = splat(0.0)
+    before = t < span[0]
+    after = t > span[1]
+    inside = select(before, 0.0, select(after, 0.0, 1.0))
+    if not any_lane(inside > 0.5):
+        return zero, zero, zero
+    f, g, h = lookup(drive, zero, span[0], span[2], span[3], t)
+    scale = amplitude * inside
+    return f * scale, g * scale, h * scale
