@@ -20,17 +20,11 @@ from en4dvar.errors import ConfigError
 from en4dvar.state import Array, Parameter
 from en4dvar_bubble.laws.memory import MemoryTables, MemoryVariable
 from en4dvar_bubble.laws.parameters import MU
+from en4dvar_bubble.laws.tabulate import GRID, from_function, from_strain_energy
 from en4dvar_bubble.laws.viscous import VISCOUS_GRID, mean_viscosity
-from en4dvar_bubble.tables import Grid, evaluate, from_slopes, from_values
+from en4dvar_bubble.tables import evaluate, from_values
 
 __all__ = ["GRID", "REGISTRY", "VISCOUS_GRID", "ConstitutiveLaw", "Liquid", "MemoryTables", "MemoryVariable"]
-
-GRID = Grid(origin=-5.0, step=1 / 32, cells=496)
-_LOG_STRETCH = GRID.nodes
-_STRETCH = np.exp(_LOG_STRETCH)
-_UNSTRETCHED = int(np.flatnonzero(_LOG_STRETCH == 0.0)[0])
-# Interpolation of the removable 0/0 at λ = 1 from the four nodes on either side (eighth order).
-_ACROSS = np.array([0.8, -0.4, 4 / 35, -1 / 70])
 
 REGISTRY: dict[str, type[ConstitutiveLaw]] = {}
 FILE_MODULE = "_en4dvar_bubble_law_"
@@ -46,6 +40,9 @@ class FileReference:
     path: str
     name: str
     digest: str
+
+
+Limits = tuple[tuple[type["ConstitutiveLaw"], Mapping[str, float]], ...]
 
 
 class ConstitutiveLaw:
@@ -65,7 +62,7 @@ class ConstitutiveLaw:
     parameters: ClassVar[tuple[Parameter, ...]] = (MU,)
     example: ClassVar[Mapping[str, float]] = {}
     """Typical SI values where the battery tests the law; missing ones are chosen by name or unit."""
-    limits: ClassVar[tuple[tuple[type[ConstitutiveLaw], Mapping[str, float]], ...]] = ()
+    limits: ClassVar[Limits] = ()
     """(parent law, values): with these values of its parameters the law is the parent."""
     monotone: ClassVar[bool] = True
     """Whether J_e falls with the stretch everywhere, so that it always opposes the strain."""
@@ -125,14 +122,8 @@ class ConstitutiveLaw:
         p, n = _namespace(values)
         with np.errstate(all="ignore"):  # a law may overflow at stretches that no member reaches
             if type(self).stress is not ConstitutiveLaw.stress:
-                samples = np.broadcast_to(self.stress(_STRETCH, p), (n, len(_STRETCH)))
-                return np.asarray(from_values(np.ascontiguousarray(samples)))
-            slopes = -_STRETCH * self.strain_energy_rate(_STRETCH, p) / np.expm1(3 * _LOG_STRETCH)
-            slopes = np.array(np.broadcast_to(slopes, (n, len(_STRETCH))))
-            near = [slopes[:, _UNSTRETCHED + k] + slopes[:, _UNSTRETCHED - k] for k in (1, 2, 3, 4)]
-            slopes[:, _UNSTRETCHED] = sum(w * s for w, s in zip(_ACROSS, near, strict=True))
-            from_halo = _UNSTRETCHED - (len(_STRETCH) - GRID.cells - 1) // 2
-            return np.asarray(from_slopes(slopes, GRID.step, from_halo))
+                return from_function(lambda stretch: self.stress(stretch, p), n)
+            return from_strain_energy(lambda stretch: self.strain_energy_rate(stretch, p), n)
 
     def viscous_table(self, values: Mapping[str, Array]) -> Array:
         """μ̄ (Pa s) against z = ln(|V| s), constant below the first node: (N, cells, 8) on :data:`VISCOUS_GRID`.
@@ -149,8 +140,7 @@ class ConstitutiveLaw:
         variables = self.memory(p)
 
         def table(source: Any) -> Array:
-            samples = source(_STRETCH) if callable(source) else source
-            return np.asarray(from_values(np.array(np.broadcast_to(samples, (n, len(_STRETCH))), dtype=float)))
+            return from_function(source if callable(source) else lambda stretch: source, n)
 
         with np.errstate(all="ignore"):
             shape = (n, len(variables), GRID.cells, 8)

@@ -40,3 +40,28 @@ class MemoryTables(NamedTuple):
     """a (N, M, cells, 8) in Pa."""
     equilibrium: Array
     """b (N, M, cells, 8) in Pa."""
+
+
+def linear_maxwell(viscosity: Array, relaxation_time: Array) -> tuple[MemoryVariable, ...]:
+    r"""A dashpot and a linear spring in series: $\dot s = -s/\theta - 4(\mu_p/\theta)\dot R/R$.
+
+    The linear law of the rheometry codes (Warnez & Johnsen 2015; their variable is $Z_1 = R^3 (J_e + s)$). Exact for
+    small strain within a relaxation time.
+    """
+    return (MemoryVariable(relaxation_time, stiffness=-4 * viscosity / relaxation_time),)
+
+
+def upper_convected_maxwell(viscosity: Array, relaxation_time: Array) -> tuple[MemoryVariable, ...]:
+    r"""The upper-convected Maxwell liquid: $\dot s_1 = -s_1/\theta - V s_1 - 2(\mu_p/\theta)V$ and
+    $\dot s_2 = -s_2/\theta - 4V s_2 - 2(\mu_p/\theta)V$ (Warnez & Johnsen 2015: $Z_i = R^3 s_i$).
+
+    Exact at any strain for a liquid at rest before time zero. Along $r^3 - R^3 = y$ the equations
+    $\dot\tau_{rr} + 4\frac{R^2\dot R}{r^3}\tau_{rr} + \tau_{rr}/\theta = -4\frac{\mu_p}\theta\frac{R^2\dot R}{r^3}$,
+    $\dot\tau_{\theta\theta} - 2\frac{R^2\dot R}{r^3}\tau_{\theta\theta} + \tau_{\theta\theta}/\theta
+    = 2\frac{\mu_p}\theta\frac{R^2\dot R}{r^3}$ have integrating factors $r^4$ and $r^{-2}$. The integral over y gives
+    $J = -2\frac{\mu_p}\theta\int e^{-(t-t')/\theta}\,V'\,\frac{q^2-q^{-4}}{q^3-1}\,dt'$ with $q = R(t)/R(t')$, and
+    $(q^2-q^{-4})/(q^3-1) = q^{-1}+q^{-4}$: two exponentials. The two are not the integrals of
+    $\tau_{rr}$ and $\tau_{\theta\theta}$, which do not close on their own; only the sum is exact.
+    """
+    stiffness = -2 * viscosity / relaxation_time
+    return (MemoryVariable(relaxation_time, -1.0, stiffness), MemoryVariable(relaxation_time, -4.0, stiffness))

@@ -64,3 +64,50 @@ R_MAX = Parameter(
     display_unit="um",
     source="Estrada et al. (2018)",
 )
+MU_P = Parameter(
+    "mu_p",
+    unit="Pa s",
+    transform="lognormal",
+    bounds=(0.0, np.inf),
+    label="viscosity of the relaxing part",
+    symbol=r"$\mu_p$",
+    source="Warnez & Johnsen (2015)",
+)
+RELAXATION_TIME = Parameter(
+    "relaxation_time",
+    unit="s",
+    transform="lognormal",
+    bounds=(1e-12, np.inf),
+    label="relaxation time",
+    symbol=r"$\theta$",
+    display_unit="us",
+    source="Warnez & Johnsen (2015)",
+)
+MU_0 = Parameter(
+    "mu_0",
+    unit="Pa s",
+    transform="lognormal",
+    bounds=(0.0, np.inf),
+    label="viscosity at rest",
+    symbol=r"$\mu_0$",
+    source="Carreau (1972); Cross (1965)",
+)
+MU_INF = Parameter(
+    "mu_inf",
+    unit="Pa s",
+    transform="lognormal",
+    bounds=(0.0, np.inf),
+    label="viscosity at high shear rate",
+    symbol=r"$\mu_\infty$",
+    source="Carreau (1972); Cross (1965)",
+)
+SHEAR_TIME = Parameter(
+    "shear_time",
+    unit="s",
+    transform="lognormal",
+    bounds=(0.0, np.inf),
+    label="time constant of shear thinning",
+    symbol=r"$\lambda_c$",
+    display_unit="us",
+    source="Carreau (1972); Cross (1965)",
+)

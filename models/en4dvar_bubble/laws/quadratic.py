@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from en4dvar.state import Array, Parameter
-from en4dvar_bubble.laws.base import ConstitutiveLaw
+from en4dvar_bubble.laws.base import ConstitutiveLaw, Limits
+from en4dvar_bubble.laws.neo_hookean import NeoHookeanKelvinVoigt
 from en4dvar_bubble.laws.parameters import ALPHA, MU, G
 
 
@@ -18,6 +19,7 @@ class QuadraticKelvinVoigt(ConstitutiveLaw):
     name: ClassVar[str] = "quadratic-kelvin-voigt"
     title: ClassVar[str] = "quadratic-law Kelvin–Voigt (QLKV)"
     parameters: ClassVar[tuple[Parameter, ...]] = (G, ALPHA, MU)
+    limits: ClassVar[Limits] = ((NeoHookeanKelvinVoigt, {"alpha": 0.0}),)
 
     def stress(self, stretch: Array, p: Any) -> Array:
         neo_hookean = 5 - 4 / stretch - stretch**-4.0

@@ -1,0 +1,181 @@
+"""What every constitutive law must satisfy: the same checks for the shared tests and for ``en4dvar laws --check``.
+
+A check takes a law and raises :class:`AssertionError` with the reason, which names the parameter values and the worst
+place. All run at the law's example values, over its ``stretch_range``.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from en4dvar.errors import En4dvarError
+from en4dvar.state import Array
+from en4dvar.units import parse_unit
+from en4dvar_bubble.laws.base import GRID, ConstitutiveLaw
+from en4dvar_bubble.laws.response import Cycle, respond
+from en4dvar_bubble.laws.tabulate import differentiate
+from en4dvar_bubble.tables import evaluate
+
+Check = Callable[[ConstitutiveLaw], None]
+_RATES = np.logspace(-2, 12, 57)
+
+
+def cycles(law: ConstitutiveLaw) -> tuple[Cycle, ...]:
+    """Closed cycles inside the stretch range, fast and slow, in tension and in compression."""
+    lowest, highest = law.stretch_range
+    return Cycle(min(3.0, highest), 1e-6), Cycle(min(3.0, highest), 1e-4), Cycle(max(1 / 1.5, lowest), 1e-6)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The outcome of one check; ``reason`` is empty where the law passes."""
+
+    check: str
+    reason: str
+
+
+def run_battery(law: ConstitutiveLaw) -> list[Finding]:
+    """All checks on one law."""
+    return [Finding(describe(check), _reason(check, law)) for check in CHECKS]
+
+
+def describe(check: Check) -> str:
+    """The check in words: the first line of its docstring."""
+    return (check.__doc__ or check.__name__).splitlines()[0].rstrip(".")
+
+
+def documented(law: ConstitutiveLaw) -> None:
+    """Title, formula, and for every parameter unit, bounds and source."""
+    missing = [] if law.title else ["a title"]
+    if "$" not in (type(law).__doc__ or ""):
+        missing.append("a formula in LaTeX ($…$) in the docstring")
+    for p in law.parameters:
+        try:
+            parse_unit(p.unit)
+        except En4dvarError as error:
+            missing.append(f"a unit of {p.name} ({error})")
+        if not p.source:
+            missing.append(f"a source of {p.name}")
+        if p.bounds == (-np.inf, np.inf):
+            missing.append(f"bounds of {p.name}")
+    assert not missing, "the class lacks " + "; ".join(missing)
+
+
+def no_stress_without_strain(law: ConstitutiveLaw) -> None:
+    """No stress without strain: J(λ = 1, at rest) = 0."""
+    values = law.example_values()
+    one = np.ones((1, 1))
+    J = law.elastic_stress(one, values)[0, 0] + law.relaxed(one[:, 0], values).sum()
+    near = law.elastic_stress(np.array([[0.9, 1.1]]), values)
+    assert abs(J) <= 1e-9 * np.max(np.abs(near)), f"J = {J:.3g} Pa at λ = 1 ({_at(values)})"
+
+
+def stress_falls_with_stretch(law: ConstitutiveLaw) -> None:
+    """The elastic stress opposes the strain: J falls as λ grows (where the law claims it: monotone)."""
+    stretch, J = _elastic(law)
+    if not law.monotone or not np.any(J):
+        return
+    rise = np.diff(J) >= 0
+    assert not np.any(rise), f"J rises with λ at λ = {stretch[:-1][rise][0]:.4g} ({_at(law.example_values())})"
+
+
+def finite(law: ConstitutiveLaw) -> None:
+    """Finite over the stretch range, and over shear rates from 1e-2 to 1e12 1/s with viscosity ≥ 0."""
+    values = law.example_values()
+    stretch, J = _elastic(law)
+    bad = ~np.isfinite(J)
+    assert not np.any(bad), f"J is not finite at λ = {stretch[bad][0]:.4g} ({_at(values)})"
+    mu = law.mean_viscosity(_RATES[None], values)[0]
+    bad = ~(np.isfinite(mu) & (mu >= 0))
+    assert not np.any(bad), f"viscosity {mu[bad][0]:.3g} Pa s at |V| = {_RATES[bad][0]:.3g} 1/s ({_at(values)})"
+    tables = law.memory_tables(values)
+    x = np.log(stretch)[None]
+    for i in range(len(tables.convection)):
+        for what, table in (("stiffness", tables.stiffness), ("equilibrium", tables.equilibrium)):
+            bad = ~np.isfinite(evaluate(table[:, i], GRID.span, x)[0])
+            where = f"{what} of memory variable {i + 1}"
+            assert not np.any(bad), f"{where} is not finite at λ = {stretch[bad][0]:.4g} ({_at(values)})"
+
+
+def table_has_the_slope_of_the_law(law: ConstitutiveLaw) -> None:
+    """dJ/dλ of the table agrees with finite differences of the stress, or with −W′/(λ³ − 1), to 1e-6."""
+    values = law.example_values()
+    lowest, highest = np.log(law.stretch_range)
+    x = np.random.default_rng(0).uniform(lowest, highest, 400)
+    stretch = np.exp(x[np.abs(x) > 1e-3])
+    p = SimpleNamespace(**{name: v[:, None] for name, v in values.items()})
+    if type(law).stress is not ConstitutiveLaw.stress:
+        weights = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280])
+        step = 5e-3
+        samples = np.stack([np.broadcast_to(law.stress(stretch * (1 + k * step), p), (1, len(stretch)))[0]
+                            for k in range(-4, 5)])  # fmt: skip
+        exact = weights @ samples / (step * stretch)
+    else:
+        exact = -np.broadcast_to(law.strain_energy_rate(stretch, p), (1, len(stretch)))[0] / (stretch**3 - 1)
+    table = evaluate(differentiate(law.table(values)), GRID.span, np.log(stretch)[None])[0] / stretch
+    scale = np.abs(exact) + 1e-6 * np.max(np.abs(exact * stretch)) / stretch
+    error = np.where(scale > 0, np.abs(table - exact) / np.where(scale > 0, scale, 1), np.abs(table))
+    worst = int(np.argmax(error))
+    assert error[worst] < 1e-6, (
+        f"relative error {error[worst]:.2g} of dJ/dλ at λ = {stretch[worst]:.4g} ({_at(values)})"
+    )
+
+
+def limits_hold(law: ConstitutiveLaw) -> None:
+    """With the declared values of its parameters the law is its parent, over closed cycles."""
+    for parent_type, special in type(law).__dict__.get("limits", ()):
+        parent = parent_type()
+        merged = parent.example_values() | law.example_values() | {n: np.array([v]) for n, v in special.items()}
+        for cycle in cycles(law):
+            own, theirs = (respond(one, {p.name: merged[p.name] for p in one.parameters}, cycle).J
+                           for one in (law, parent))  # fmt: skip
+            scale = np.max(np.abs(theirs)) or np.max(np.abs(respond(law, law.example_values(), cycle).J))
+            error = np.max(np.abs(own - theirs)) / scale
+            assert error < 1e-7, f"differs from {parent.name} by {error:.2g} of its largest stress at {special}"
+
+
+def dissipates(law: ConstitutiveLaw) -> None:
+    """A closed cycle from rest costs work, or none where the law is elastic."""
+    values = law.example_values()
+    for cycle in cycles(law):
+        response = respond(law, values, cycle)
+        scale = response.turnover
+        assert abs(response.elastic_work) <= 1e-7 * scale, f"the spring gives or takes work over {cycle}"
+        assert response.work >= -1e-7 * scale, f"a cycle {cycle} releases energy ({_at(values)})"
+
+
+CHECKS: tuple[Check, ...] = (
+    documented,
+    no_stress_without_strain,
+    stress_falls_with_stretch,
+    finite,
+    table_has_the_slope_of_the_law,
+    limits_hold,
+    dissipates,
+)
+
+
+def _reason(check: Check, law: ConstitutiveLaw) -> str:
+    try:
+        check(law)
+    except AssertionError as error:
+        return str(error)
+    except Exception as error:
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        return f"{type(error).__name__}: {error} ({frame.filename}:{frame.lineno})"
+    return ""
+
+
+def _elastic(law: ConstitutiveLaw) -> tuple[Array, Array]:
+    stretch = np.geomspace(*law.stretch_range, 400)
+    return stretch, law.elastic_stress(stretch[None], law.example_values())[0]
+
+
+def _at(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} = {v[0]:.3g}" for name, v in values.items())
