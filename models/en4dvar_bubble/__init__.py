@@ -2,7 +2,7 @@
 
 from en4dvar_bubble.api import simulate
 from en4dvar_bubble.driving import Driving, histotripsy, silence
-from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, get_law
+from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, Liquid, MemoryVariable, get_law
 from en4dvar_bubble.medium import WATER_25C, Medium
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.solver.driver import ACCURACIES, Accuracy
@@ -15,7 +15,9 @@ __all__ = [
     "BubbleModel",
     "ConstitutiveLaw",
     "Driving",
+    "Liquid",
     "Medium",
+    "MemoryVariable",
     "get_law",
     "histotripsy",
     "silence",

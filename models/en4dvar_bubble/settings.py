@@ -7,11 +7,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_serializer, field_validator, model_validator
 
+from en4dvar.errors import ConfigError
 from en4dvar.hints import suggest
 from en4dvar.units import Quantity, parse_quantity
 from en4dvar_bubble.driving import Reading
 from en4dvar_bubble.driving.settings import DrivingSettings, Histotripsy, NoDriving, with_kind
 from en4dvar_bubble.laws import ConstitutiveLaw, get_law
+from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.medium import CONSTANT_SETS, UNITS, WATER_25C, Medium, saturated_vapour_pressure
 from en4dvar_bubble.solver.driver import ACCURACIES, Accuracy, Radial
 
@@ -122,12 +124,12 @@ class BubbleSettings(_Section):
 
     @field_validator("law")
     @classmethod
-    def _known_law(cls, value: str) -> str:
+    def _known_law(cls, value: str, info: ValidationInfo) -> str:
+        """A law from a file: its path is relative to the configuration's folder, and absolute from here on."""
         try:
-            get_law(value)
-        except Exception as error:
+            return qualified(value, (info.context or {}).get("base"))
+        except ConfigError as error:
             raise ValueError(str(error)) from error
-        return value
 
     @field_validator("vapour_pressure", mode="before")
     @classmethod
