@@ -12,7 +12,9 @@ from en4dvar.errors import OutputError
 
 @contextmanager
 def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
-    """A partial file beside ``path`` to write to; on leaving it is (``durable``: flushed to disk and) renamed to ``path``.
+    """A partial file beside ``path`` to write to; on leaving it is renamed to ``path``.
+
+    ``durable``: it is flushed to disk first, so that it also survives a loss of power.
 
     Where the block raises, ``path`` stays as it was and the partial file is removed. An operating-system error becomes
     an :class:`OutputError` that names ``path``.
@@ -38,6 +40,13 @@ def write_text(path: str | Path, text: str) -> Path:
     """Write ``text`` (UTF-8) atomically. Raises :class:`OutputError`."""
     with atomic_path(path) as partial:
         partial.write_text(text, encoding="utf-8", newline="\n")
+    return Path(path)
+
+
+def write_bytes(path: str | Path, content: bytes) -> Path:
+    """Write ``content`` atomically. Raises :class:`OutputError`."""
+    with atomic_path(path) as partial:
+        partial.write_bytes(content)
     return Path(path)
 
 

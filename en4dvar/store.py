@@ -11,8 +11,9 @@ import numpy as np
 import xarray as xr
 
 from en4dvar.errors import OutputError
-from en4dvar.files import atomic_path
+from en4dvar.files import write_bytes
 from en4dvar.groups import build_tree
+from en4dvar.netcdf import to_bytes
 from en4dvar.problem import Analysis
 from en4dvar.state import Array
 from en4dvar.units import convert
@@ -160,9 +161,7 @@ def _moments(values: Array) -> tuple[float, float]:
 
 def save(result: Result, path: str | Path) -> Path:
     """Write ``path`` (NETCDF4); it appears complete or not at all. Raises :class:`OutputError`."""
-    with atomic_path(path) as partial:
-        result.tree.to_netcdf(partial, format="NETCDF4", engine="netcdf4")
-    return Path(path)
+    return write_bytes(path, to_bytes(result.tree))
 
 
 def load_result(path: str | Path) -> Result:
