@@ -1,0 +1,80 @@
+"""Commands that the bubble adds to ``en4dvar`` (entry points of group ``en4dvar.commands``)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import click
+
+from en4dvar.errors import En4dvarError
+
+if TYPE_CHECKING:
+    from en4dvar_bubble.laws import ConstitutiveLaw
+
+
+class CheckFailed(En4dvarError):
+    """A law does not pass the battery."""
+
+
+@click.command()
+@click.argument("names", nargs=-1, metavar="[LAW]...")
+@click.option("--check", is_flag=True, help="Run the battery on the laws: what every law must satisfy.")
+def laws(names: tuple[str, ...], check: bool) -> None:
+    """List constitutive laws with their parameters and units, or check them.
+
+    LAW is a name of the list, my_law.py:ClassName or package.module:ClassName; default is every registered law.
+
+    \b
+    Example:
+      en4dvar laws --check my_law.py:MyLaw
+    """
+    from en4dvar_bubble.laws.loading import available, get_law
+
+    broken: list[str] = []
+    if names:
+        chosen = [get_law(name) for name in names]
+    else:
+        chosen = []
+        for found in available().values():
+            if isinstance(found, En4dvarError):
+                broken.append(str(found))
+            else:
+                chosen.append(found())
+    if check:
+        broken += _check(chosen)
+    else:
+        click.echo("\n\n".join(_description(law, in_full=bool(names)) for law in chosen))
+    if broken:
+        raise CheckFailed("\n".join(broken))
+
+
+def _check(chosen: Sequence[ConstitutiveLaw]) -> list[str]:
+    """Print the battery's findings; return a line for each law that fails."""
+    from en4dvar_bubble.battery import run_battery
+
+    failing = []
+    for law in chosen:
+        findings = run_battery(law)
+        wrong = [f for f in findings if f.reason]
+        click.echo(f"{law.name}: {len(findings) - len(wrong)} of {len(findings)} checks pass")
+        for finding in findings:
+            click.echo(f"  {'FAIL' if finding.reason else 'ok  '}  {finding.check}")
+            if finding.reason:
+                click.echo(f"        {finding.reason}")
+        if wrong:
+            failing.append(f"{law.name}: {len(wrong)} of {len(findings)} checks fail")
+    return failing
+
+
+def _description(law: ConstitutiveLaw, in_full: bool) -> str:
+    from en4dvar.describe import table
+
+    rows = [
+        (f"  {p.name}", p.unit, f"{p.bounds[0]:g} … {p.bounds[1]:g}", p.transform, p.label, p.source)
+        for p in law.parameters
+    ]
+    parts = [f"{law.name}: {law.title}"]
+    if in_full and type(law).__doc__:
+        parts += [f"  {line.strip()}" for line in (type(law).__doc__ or "").strip().splitlines()]
+    return "\n".join([*parts, table(rows)])
