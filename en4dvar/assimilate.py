@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from en4dvar import diagnostics as diag
+from en4dvar.descent import Local, WeightSpace
 from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
-from en4dvar.forecast import NO_TIMES, Forecast, check_problem, cost, forecast, log_posterior
-from en4dvar.likelihood import Linearisation, error_std, log_likelihood, observation_cost, whiten
-from en4dvar.linalg import anomaly_basis, centre
+from en4dvar.forecast import Forecast, check_problem, cost, forecast, log_posterior
+from en4dvar.likelihood import error_std, log_likelihood
 from en4dvar.problem import Analysis, AssimilationSettings, InverseProblem, IterationRecord
-from en4dvar.schemes import Evaluation, Scheme, Step, Weights
-from en4dvar.schemes.en4dvar import En4DVar
-from en4dvar.state import Array
-from en4dvar.step_control import STEP_CONTROLS
+from en4dvar.schemes import Step, Weights
+from en4dvar.start import choose_start
 
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 
@@ -83,7 +80,7 @@ class _Outcome:
 
 
 class _Run:
-    """One data set seen from weight space: x = x̄0 + X0ᵀw."""
+    """One data set: prior forecast, start, iterations, posterior forecast."""
 
     def __init__(
         self,
@@ -96,44 +93,25 @@ class _Run:
     ):
         self.fixed_parameters = check_problem(problem)
         self.problem, self.settings, self.seed = problem, settings, seed
-        self.executor, self.progress, self.on_iteration = executor, progress, on_iteration
-        self.scheme: Scheme = En4DVar(settings.linearisation, settings.epsilon)
-        self.search = STEP_CONTROLS[settings.step_control]
-        self.members = problem.prior.sample(settings.members, seed, settings.sampling)
-        self.mean, self.anomalies = centre(self.members)
-        self.basis = anomaly_basis(self.anomalies)
-        self.forward_runs = 0
-
-    def control(self, w: Array) -> Array:
-        """Control vectors (…, n) of weights (…, N)."""
-        return np.asarray(self.mean + w @ self.anomalies)
-
-    def forecast(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
-        self.forward_runs += len(x)
-        return forecast(self.problem, x, self.executor, extra_times)
-
-    def cost_of(self, w: Array) -> Array:
-        """J (B,) of central trajectories at weights (B, N)."""
-        return diag.background_cost(w) + self.observation_cost(self.forecast(self.control(w)))
-
-    def observation_cost(self, run: Forecast) -> Array:
-        return observation_cost(self.problem.observations, run.predictions, run.rates)
+        self.progress, self.on_iteration = progress, on_iteration
+        self.space = WeightSpace(problem, settings, seed, executor)
 
     def analysis(self, resume: LoopState | None) -> Analysis:
         problem, observations = self.problem, self.problem.observations
         grid = np.linspace(observations.times[0], observations.times[-1], GRID_POINTS)
-        prior_run = self.forecast(np.vstack([self.members, self.mean]), grid)
-        self.require_members(prior_run[:-1], "prior forecast")
+        space = self.space
+        prior_run = space.forecast(np.vstack([space.members, space.mean]), grid)
+        self.require_members(prior_run[:-1].failures, "prior forecast")
         state = resume or self.start(prior_run)
-        self.forward_runs = state.forward_runs
+        space.forward_runs = state.forward_runs
         end = self.iterate(state)
 
-        posterior = self.control(end.weights.w + end.step.transform)
-        mode = self.control(end.weights.w)
-        final = self.forecast(np.vstack([posterior, mode]), grid)
+        posterior = space.control(end.weights.w + end.step.transform)
+        mode = space.control(end.weights.w)
+        final = space.forecast(np.vstack([posterior, mode]), grid)
         after, last = final[:-1], final[-1:]
         centre_rates = None if last.rates is None else last.rates[0]
-        per_parameter = diag.dfs_per_parameter(self.members, posterior)
+        per_parameter = diag.dfs_per_parameter(space.members, posterior)
         record = end.records[-1]
         used = int(np.sum(observations.weights > 0))
         prior = problem.prior
@@ -146,7 +124,7 @@ class _Run:
             observations=observations,
             time_unit=problem.model.time_unit,
             time_display_unit=problem.model.time_display_unit,
-            prior=prior.to_physical(self.members),
+            prior=prior.to_physical(space.members),
             posterior=prior.to_physical(posterior),
             centre=prior.to_physical(mode),
             prior_predictions=prior_run.predictions[:-1],
@@ -163,10 +141,12 @@ class _Run:
             dfs_per_parameter=per_parameter,
             converged=end.converged,
             stop_reason=end.reason,
-            forward_runs=self.forward_runs,
+            forward_runs=space.forward_runs,
             seed=self.seed,
             settings=self.settings,
-            log_evidence=diag.log_evidence(end.cost, end.step.hessian.singular_values, len(self.members), observations),
+            log_evidence=diag.log_evidence(
+                end.cost, end.step.hessian.singular_values, len(space.members), observations
+            ),
             warnings=(
                 *state.warnings,
                 *(() if end.converged else (f"not converged: {end.reason}",)),
@@ -179,36 +159,22 @@ class _Run:
             ),
         )
 
-    def start(self, run: Forecast) -> LoopState:
-        """Where to start from: one of the prior members or (last row of ``run``) their mean."""
-        # e_i moved to the minimum-norm weights of the same member, so that J_b is ½‖x − x̄0‖² in the prior covariance
-        candidates = np.vstack([self.basis @ self.basis.T, np.zeros(len(self.members))])
-        costs = diag.background_cost(candidates) + self.observation_cost(run)
-        start = candidates[int(np.argmin(costs))]
-        warnings: tuple[str, ...] = ()
-        if self.settings.start == "prior-mean":
-            if np.isfinite(costs[-1]):
-                start = candidates[-1]
-            else:
-                warnings = (f"the prior mean cannot be run ({run.failures[-1]}); started from the best prior member",)
-        return LoopState(Weights(start, self.scheme.init(len(start)).T), self.forward_runs, warnings)
+    def start(self, prior_run: Forecast) -> LoopState:
+        w, warnings = choose_start(self.space, prior_run)
+        return LoopState(Weights(w, self.space.scheme.init(len(w)).T), self.space.forward_runs, warnings)
 
     def iterate(self, state: LoopState) -> _Outcome:
-        settings, scheme = self.settings, self.scheme
+        settings, space = self.settings, self.space
         weights, records, worst_loss = state.weights, list(state.records), state.worst_loss
         stop, converged = state.stop_reason, state.converged
         while True:
             if self.on_iteration is not None:
                 self.on_iteration(
-                    LoopState(weights, self.forward_runs, state.warnings, tuple(records), worst_loss, stop, converged)
+                    LoopState(weights, space.forward_runs, state.warnings, tuple(records), worst_loss, stop, converged)
                 )
-            run = self.forecast(self.control(np.vstack([scheme.member_weights(weights), weights.w])))
-            members, central = run[:-1], run[-1:]
-            self.require_members(members, f"forecast of iteration {len(records) + 1}")
-            worst_loss = max(worst_loss, members.failures, key=lambda failures: sum(map(bool, failures)))
-            step = scheme.step(weights, self.evaluate(weights, members, central))
-            observation = float(self.observation_cost(central)[0])
-            total = float(diag.background_cost(weights.w)) + observation
+            (at,) = space.linearise([weights])
+            step, total = self.require_step(at, f"forecast of iteration {len(records) + 1}"), at.cost
+            worst_loss = max(worst_loss, at.members.failures, key=lambda failures: sum(map(bool, failures)))
 
             move, contracted = None, Weights(weights.w, step.transform)
             if not stop:
@@ -217,12 +183,11 @@ class _Run:
                 elif len(records) == settings.max_iterations:
                     stop = f"iteration limit ({settings.max_iterations}) reached"
                 else:
-                    move = self.search(weights.w, total, step, self.cost_of)
+                    (move,) = space.search([at])
                     if move is None and self.same_members(contracted, weights):
                         stop = "no decrease possible along the step"
                         converged = step.predicted_decrease <= self.small(total)
-            step_length = move.step_length if move else 0.0
-            records.append(self.record(len(records), weights, step, observation, central, members, step_length))
+            records.append(self.record(len(records), at, step, move.step_length if move else 0.0))
             if self.progress is not None:
                 self.progress(self.problem.observations.name, records[-1])
             if stop:
@@ -238,60 +203,45 @@ class _Run:
 
     def same_members(self, a: Weights, b: Weights) -> bool:
         """Whether the scheme would run the same members again, to the step tolerance."""
-        difference = self.scheme.member_weights(a) - self.scheme.member_weights(b)
+        difference = self.space.scheme.member_weights(a) - self.space.scheme.member_weights(b)
         return bool(np.max(np.abs(difference)) <= self.settings.step_tolerance)
 
     def small(self, total: float) -> float:
         """A decrease of J that counts as none; below J = 1 it is absolute, for there J has no more to tell."""
         return self.settings.cost_tolerance * max(total, 1.0)
 
-    def evaluate(self, weights: Weights, members: Forecast, central: Forecast) -> Evaluation:
-        """Linearise predictions (and rates) about the centre and whiten."""
-        k = members.predictions.shape[1]
-        stacked = [
-            np.hstack([f.predictions] if f.rates is None else [f.predictions, f.rates]) for f in (members, central)
-        ]
-        reference, anomalies = self.scheme.linearise(weights, self.basis, stacked[0], stacked[1][0], members.active)
-        at = Linearisation(reference[:k], anomalies[:, :k])
-        if members.rates is not None:
-            at = Linearisation(reference[:k], anomalies[:, :k], reference[k:], anomalies[:, k:])
-        return Evaluation(*whiten(self.problem.observations, at))
-
-    def record(
-        self,
-        iteration: int,
-        weights: Weights,
-        step: Step,
-        observation: float,
-        central: Forecast,
-        members: Forecast,
-        step_length: float,
-    ) -> IterationRecord:
-        background = float(diag.background_cost(weights.w))
-        ensemble = self.control(weights.w + step.transform)
-        rates = None if central.rates is None else central.rates[0]
+    def record(self, iteration: int, at: Local, step: Step, step_length: float) -> IterationRecord:
+        space, w = self.space, at.weights.w
+        ensemble = space.control(w + step.transform)
+        rates = None if at.central.rates is None else at.central.rates[0]
+        predictions = at.central.predictions[0]
         return IterationRecord(
             iteration=iteration,
-            cost=background + observation,
-            background=background,
-            observation=observation,
+            cost=at.cost,
+            background=float(diag.background_cost(w)),
+            observation=at.observation,
             step_norm=step.norm,
             step_length=step_length,
-            chi2_per_observation=diag.chi2_per_observation(self.problem.observations, central.predictions[0], rates),
-            dfs=diag.dfs(step.hessian.singular_values, len(weights.w)),
-            spread=diag.spread(ensemble, self.members),
-            active=int(members.active.sum()),
+            chi2_per_observation=diag.chi2_per_observation(self.problem.observations, predictions, rates),
+            dfs=diag.dfs(step.hessian.singular_values, len(w)),
+            spread=diag.spread(ensemble, space.members),
+            active=at.active,
             members=self.problem.prior.to_physical(ensemble),
-            centre=self.problem.prior.to_physical(self.control(weights.w)),
+            centre=self.problem.prior.to_physical(space.control(w)),
         )
 
-    def require_members(self, run: Forecast, stage: str) -> None:
+    def require_step(self, at: Local, stage: str) -> Step:
+        """The step from there, or an error where the members lost do not allow one."""
+        if at.step is None:
+            self.require_members(at.members.failures, stage)
+            raise TooFewMembersError(f"{self.problem.observations.name}: the centre cannot be run in the {stage}")
+        return at.step
+
+    def require_members(self, failures: tuple[str, ...], stage: str) -> None:
         """Raise unless enough members are active for a regression on the control vector."""
-        n_members, n = self.members.shape
-        needed = max(math.ceil(self.settings.min_active_fraction * n_members), min(n + 1, n_members))
-        active = int(run.active.sum())
-        if active < needed:
+        lost, needed = sum(1 for reason in failures if reason), self.space.needed_members
+        if len(failures) - lost < needed:
             raise TooFewMembersError(
-                f"{self.problem.observations.name}: {n_members - active} of {n_members} members failed in the {stage}; "
-                f"at least {needed} must survive. Most frequent reasons: {diag.common_reasons(run.failures)}"
+                f"{self.problem.observations.name}: {lost} of {len(failures)} members failed in the {stage}; "
+                f"at least {needed} must survive. Most frequent reasons: {diag.common_reasons(failures)}"
             )

@@ -54,12 +54,14 @@ def anomaly_basis(anomalies: Array) -> Array:
     """Orthonormal columns U (N, r) that span the column space of the anomalies X (N, n), r = rank X ≤ min(n, N − 1).
 
     Row i is member i in the coordinates of the ensemble. U Uᵀ projects weights on those that move the state: what it
-    removes, the null space of Xᵀ, has no effect on x̄ + Xᵀw. Columns are scaled first, so units do not matter.
+    removes, the null space of Xᵀ, has no effect on x̄ + Xᵀw. Columns are scaled first, so units do not matter; the
+    largest entry of each is positive.
     """
     scale = np.sqrt(np.mean(anomalies**2, axis=0))
     u, s, _ = np.linalg.svd(anomalies / np.where(scale > 0, scale, 1.0), full_matrices=False)
     rank = int(np.sum(s > s[0] * max(anomalies.shape) * np.finfo(float).eps)) if s[0] > 0 else 0
-    return np.asarray(u[:, :rank])
+    u = u[:, :rank]
+    return np.asarray(u * np.sign(u[np.abs(u).argmax(axis=0), np.arange(rank)]))
 
 
 def min_norm_fit(design: Array, values: Array) -> Array:

@@ -34,7 +34,8 @@ class AssimilationSettings:
     """The scheme's settings; defaults are the recommended ones.
 
     ``step_tolerance`` is a length in posterior standard deviations, √(δwᵀAδw); ``cost_tolerance`` is relative to J,
-    and absolute below J = 1. ``full`` takes the whole step or, where that raises J, none.
+    and absolute below J = 1. ``full`` takes the whole step or, where that raises J, none. ``starts`` prior members of
+    lowest J are compared by a descent from each (see :mod:`en4dvar.start`).
     """
 
     scheme: Literal["en4dvar"] = "en4dvar"
@@ -44,6 +45,7 @@ class AssimilationSettings:
     epsilon: float = 1e-3
     step_control: Literal["line-search", "levenberg-marquardt", "full"] = "line-search"
     start: Literal["best-member", "prior-mean"] = "best-member"
+    starts: int = 3
     max_iterations: int = 30
     step_tolerance: float = 1e-3
     cost_tolerance: float = 1e-4
@@ -57,7 +59,8 @@ class IterationRecord:
     ``cost = background + observation`` is J of the central trajectory at the iterate that *starts* the iteration;
     the last record is the accepted end point. ``step_norm`` is the undamped step there in posterior standard
     deviations, ``step_length`` the accepted fraction of it (0: no move). ``members`` (N, n) is the ensemble that the
-    scheme's weights and transform describe at that iterate. ``active`` counts the members whose forecast succeeded.
+    scheme's weights and transform describe at that iterate. ``active`` counts the members whose forecast
+    succeeded; it is N where fewer runs gave the tangent and none failed.
     """
 
     iteration: int

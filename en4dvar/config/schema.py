@@ -135,6 +135,7 @@ _LIMITS: dict[str, Any] = {
     "members": Field(ge=3),
     "epsilon": Field(gt=0, le=1),
     "max_iterations": Field(ge=1),
+    "starts": Field(ge=1),
     "step_tolerance": Field(gt=0),
     "cost_tolerance": Field(gt=0),
     "min_active_fraction": Field(gt=0, le=1),

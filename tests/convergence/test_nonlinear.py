@@ -103,14 +103,25 @@ def test_stop_on_the_cost_and_on_the_step():
 
 
 def test_progress_and_forward_runs_are_reported():
-    problem = make_problem(Decay(), [1.5, 1.2])
+    class Counting(Decay):
+        runs = 0
+
+        def trajectories(self, x, times):
+            self.runs += len(x)
+            return super().trajectories(x, times)
+
+    problem = make_problem(Counting(), [1.5, 1.2])
     seen = []
     analysis = assimilate(problem, AssimilationSettings(members=16), 1, progress=lambda *args: seen.append(args))
     assert [name for name, _ in seen] == ["toy"] * len(analysis.iterations)
     assert [record for _, record in seen] == list(analysis.iterations)
-    moves = sum(1 for record in analysis.iterations if record.step_length > 0)
-    # prior and posterior forecast, one per record, each with the centre; four trials per accepted first batch
-    assert analysis.forward_runs == 17 * (2 + len(analysis.iterations)) + 4 * moves
+    assert analysis.forward_runs == problem.model.runs
+    single = assimilate(problem, AssimilationSettings(members=16, starts=1), 1)
+    assert single.forward_runs == problem.model.runs - analysis.forward_runs
+    # prior and posterior forecast with the centre; 2 + 1 runs a record; 4 trials a move, 4 bent ones after a short move
+    short = sum(1 for record in single.iterations if 0 < record.step_length < 1)
+    moves = sum(1 for record in single.iterations if record.step_length > 0)
+    assert single.forward_runs == 2 * 17 + 3 * len(single.iterations) + 4 * (moves + short)
 
 
 def test_warnings_speak_of_what_they_see():

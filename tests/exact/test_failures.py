@@ -34,11 +34,12 @@ def settings(linearisation, **changes):
     ],
 )
 def test_linear_posterior_does_not_notice_failed_members(linearisation, how, reason):
-    whole = assimilate(make_problem(Linear(NAMES), TRUTH), settings(linearisation), 4)
+    whole = assimilate(make_problem(Linear(NAMES), TRUTH), settings(linearisation), 3)
     problem = make_problem(Fragile(LIMIT, how, names=NAMES), TRUTH)
-    holed = assimilate(problem, settings(linearisation), 4)
+    holed = assimilate(problem, settings(linearisation), 3)
     lost = whole.prior[:, 0] > LIMIT
     assert 5 < lost.sum() < 15
+    # in the bundle variant one of the three runs of the tangent fails: the whole bundle is run instead
     assert holed.iterations[0].active == 20 - lost.sum()
     assert np.max(np.abs(holed.posterior - whole.posterior)) < 1e-10
     assert holed.iterations[-1].dfs == pytest.approx(whole.iterations[-1].dfs, abs=1e-10)

@@ -1,0 +1,125 @@
+"""The economical tangent, the bent line search, and several starts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from toys import Decay, Toy, Wave, make_problem
+
+from en4dvar.assimilate import assimilate, cost
+from en4dvar.descent import WeightSpace
+from en4dvar.executor import SerialExecutor
+from en4dvar.linalg import Hessian
+from en4dvar.problem import AssimilationSettings
+from en4dvar.schemes import Step, Weights
+from en4dvar.step_control import Point, Tangent, Trials, acceleration, line_search, run_searches
+
+
+@pytest.mark.parametrize("time_std", [0.0, 0.05])
+def test_tangent_of_few_runs_is_the_bundle_of_all_members(time_std):
+    problem = make_problem(Decay(), [1.5, 1.2], time_std=time_std)
+    steps = []
+    for members in (12, 4):  # at N = n + 2 the whole bundle is as cheap, and is run
+        for epsilon in (1e-3, 1e-4):
+            space = WeightSpace(problem, AssimilationSettings(members=members, epsilon=epsilon), 1, SerialExecutor())
+            assert space.economical
+            w = space.basis @ np.array([0.1, -0.2])
+            at, whole = (space.linearise([Weights(w, np.eye(members))])[0] for _ in range(2))
+            rows = space.scheme.member_weights(at.weights)
+            full = space._local(at.weights, replace(at.members, failures=("lost",) * 2), at.central)
+            assert len(full.members.failures) == len(rows) == members
+            steps.append(np.linalg.norm(at.step.direction - full.step.direction) / np.linalg.norm(full.step.direction))
+            assert np.array_equal(at.step.direction, whole.step.direction)
+    assert max(steps[::2]) < 5e-3
+    assert np.allclose(np.array(steps[::2]) / steps[1::2], 10, rtol=0.05)  # first order in ε
+
+
+def test_no_economy_where_the_members_span_no_more_than_their_number():
+    problem = make_problem(Decay(), [1.5, 1.2])
+    for settings in (AssimilationSettings(members=3), AssimilationSettings(members=12, linearisation="transform")):
+        assert not WeightSpace(problem, settings, 1, SerialExecutor()).economical
+
+
+class Bend(Toy):
+    """y_k = a + (k-th power) curvature: a valley b = c a² that only a bent step follows; ``width`` is its width."""
+
+    width = 0.01
+
+    def curve(self, theta, t):
+        a, b = theta
+        return float(a if t < 1.0 else (b - a * a) / self.width)
+
+    def rate(self, theta, t):
+        return 0.0
+
+
+def test_bent_steps_follow_a_curved_valley():
+    problem = make_problem(Bend(), [1.0, 1.0], std=0.1, k=8)
+    settings = AssimilationSettings(members=12, starts=1, start="prior-mean")
+    line = assimilate(problem, settings, 1)
+    assert line.converged
+    straight = assimilate(problem, replace(settings, step_control="levenberg-marquardt"), 1)
+    assert line.iterations[-1].cost <= straight.iterations[-1].cost + 1e-3
+    assert len(line.iterations) < len(straight.iterations)
+    assert line.forward_runs < straight.forward_runs
+
+
+def test_acceleration_is_exact_for_a_parabola():
+    """m(w) = S w + ½ q (v·w)²: the correction solves the normal equations of the curvature."""
+    rng = np.random.default_rng(1)
+    y, q = rng.standard_normal((4, 6)), rng.standard_normal(6)  # N = 4 weights, K = 6
+    scale = rng.uniform(0.5, 2, 6)
+    hessian = Hessian.of((y * scale).T)
+    gradient = rng.standard_normal(4)
+    step = Step(gradient, hessian, -hessian.solve(gradient), hessian.transform)
+    lengths = np.array([1.0, 0.5, 0.25, 0.125])
+    predictions = lengths[:, None] * (step.direction @ y) + 0.5 * lengths[:, None] ** 2 * q
+    predictions[-1] = np.nan  # the shortest cannot be run: the next one serves
+    tangent = Tangent(np.zeros(6), y, scale)
+    a = 3 * np.eye(4) + (y * scale) @ (y * scale).T
+    expected = -np.linalg.solve(a, y @ (scale**2 * q))
+    limit = 2 * np.linalg.norm(step.direction)
+    expected *= min(1.0, limit / np.linalg.norm(expected))
+    assert np.allclose(acceleration(step, tangent, lengths, predictions), expected, rtol=1e-12)
+    nothing = acceleration(step, tangent, lengths, np.full((4, 6), np.nan))
+    assert np.array_equal(nothing, np.zeros(4))
+
+
+def test_searches_side_by_side_find_what_each_finds_alone():
+    def try_out(w):
+        return Trials(np.sum((w - 1) ** 4, axis=1) + np.sum(w[:, :1] * w[:, 1:], axis=1), np.sin(w))
+
+    rng = np.random.default_rng(0)
+    points = []
+    for _ in range(5):
+        w, s = rng.standard_normal(3), rng.standard_normal((3, 3))
+        hessian, gradient = Hessian.of(s), 4 * (w - 1) ** 3
+        step = Step(gradient, hessian, -20 * hessian.solve(gradient), hessian.transform)
+        points.append(Point(w, float(try_out(w[None]).costs[0]), step, Tangent(np.sin(w), np.eye(3), np.ones(3))))
+    together = run_searches([line_search(p) for p in points], try_out)
+    alone = [run_searches([line_search(p)], try_out)[0] for p in points]
+    for a, b, point in zip(together, alone, points, strict=True):
+        assert a is not None
+        assert b is not None
+        assert np.array_equal(a.w, b.w)
+        assert a.cost == b.cost < point.cost
+    assert len({m.step_length for m in together if m}) > 1
+
+
+def lowest(problem, points=401):
+    axes = [m + s * np.linspace(-4, 4, points) for m, s in zip(problem.prior.mean, problem.prior.std, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    return grid[::37], float(cost(problem, grid[::37]).min())
+
+
+def test_several_starts_find_the_lowest_of_many_minima():
+    settings = AssimilationSettings(members=24)
+    ends = {starts: [] for starts in (1, 3, 8)}
+    for seed in range(12):
+        problem = make_problem(Wave(), [1.5, 2.0], scale=0.8, seed=seed)
+        _, best = lowest(problem)
+        for starts, found in ends.items():
+            analysis = assimilate(problem, replace(settings, starts=starts), seed)
+            found.append(analysis.iterations[-1].cost < best + 0.1)
+    assert np.mean(ends[8]) == 1
+    assert np.mean(ends[3]) >= np.mean(ends[1])
