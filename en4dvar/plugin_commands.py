@@ -7,8 +7,8 @@ its source; only invoking a command imports it.
 from __future__ import annotations
 
 import ast
-from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,7 @@ def plugin_commands() -> dict[str, EntryPoint]:
 def _first_sentence(entry: EntryPoint) -> str:
     """First sentence of the command's docstring, read without importing; "" where it cannot be found."""
     top, *rest = entry.module.split(".")
-    spec = PathFinder.find_spec(top)
+    spec = find_spec(top)
     if spec is None or spec.origin is None:
         return ""
     base = Path(spec.origin).parent.joinpath(*rest)

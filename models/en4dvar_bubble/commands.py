@@ -21,7 +21,7 @@ class CheckFailed(En4dvarError):
 @click.argument("names", nargs=-1, metavar="[LAW]...")
 @click.option("--check", is_flag=True, help="Run the battery on the laws: what every law must satisfy.")
 def laws(names: tuple[str, ...], check: bool) -> None:
-    """List constitutive laws with their parameters and units, or check them.
+    """List constitutive laws with parameters and units, or check them.
 
     LAW is a name of the list, my_law.py:ClassName or package.module:ClassName; default is every registered law.
 
