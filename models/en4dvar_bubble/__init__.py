@@ -2,7 +2,15 @@
 
 from en4dvar_bubble.api import simulate
 from en4dvar_bubble.driving import Driving, histotripsy, silence
-from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, Liquid, MemoryVariable, get_law
+from en4dvar_bubble.laws import (
+    REGISTRY,
+    ConstitutiveLaw,
+    Liquid,
+    MemoryVariable,
+    NeoHookeanKelvinVoigt,
+    QuadraticKelvinVoigt,
+    get_law,
+)
 from en4dvar_bubble.medium import WATER_25C, Medium
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.solver.driver import ACCURACIES, Accuracy
@@ -18,6 +26,8 @@ __all__ = [
     "Liquid",
     "Medium",
     "MemoryVariable",
+    "NeoHookeanKelvinVoigt",
+    "QuadraticKelvinVoigt",
     "get_law",
     "histotripsy",
     "silence",
