@@ -18,7 +18,7 @@ from en4dvar.errors import En4dvarError
 from en4dvar.plugin_commands import PluginCommand, plugin_commands
 
 if TYPE_CHECKING:
-    from en4dvar.config import Config
+    from en4dvar.config import Config, TwinConfig
 
 F = Callable[..., Any]
 
@@ -77,9 +77,19 @@ def _config_options(command: F) -> F:
     return command
 
 
-def _load(config: str, data: str | None, settings: tuple[str, ...], **special: Any) -> Config:
+def _load(config: str, data: str | None, settings: tuple[str, ...]) -> Config:
     from en4dvar.config import load_config
 
+    return load_config(config, _overrides(data, settings))
+
+
+def _load_any(config: str, data: str | None, settings: tuple[str, ...], **special: Any) -> Config | TwinConfig:
+    from en4dvar.config import load_any
+
+    return load_any(config, _overrides(data, settings, **special))
+
+
+def _overrides(data: str | None, settings: tuple[str, ...], **special: Any) -> dict[str, Any]:
     overrides: dict[str, Any] = {}
     for item in settings:
         key, equals, value = item.partition("=")
@@ -88,8 +98,7 @@ def _load(config: str, data: str | None, settings: tuple[str, ...], **special: A
         overrides[key.strip()] = value
     # A path on the command line is relative to the shell's folder, one in the file to the file's.
     special["data.path"] = [str(Path(data).absolute())] if data else None
-    overrides |= {key: value for key, value in special.items() if value is not None}
-    return load_config(config, overrides)
+    return overrides | {key: value for key, value in special.items() if value is not None}
 
 
 @main.command()
@@ -102,13 +111,20 @@ def run(
 ) -> None:
     """Estimate the parameters; write posterior and report to the run directory.
 
+    A configuration with a 'twin:' section is a twin experiment: RMSE and spread against its truth.
+
     \b
     Example:
       en4dvar run configs/quickstart.yaml --out runs/first --set assimilation.members=96
     """
-    loaded = _load(
+    loaded = _load_any(
         config, data, settings, **{"output.directory": str(out) if out else None, "execution.workers": workers}
     )
+    from en4dvar.config import TwinConfig
+
+    if isinstance(loaded, TwinConfig):
+        _run_twin(loaded, force)
+        return
     from en4dvar.build import build
     from en4dvar.describe import results_table
     from en4dvar.progress import terminal_progress
@@ -126,6 +142,19 @@ def run(
     click.echo(f"report: {loaded.directory / 'report.html'}")
 
 
+def _run_twin(config: TwinConfig, force: bool) -> None:
+    from en4dvar.progress import cycle_progress
+    from en4dvar.twin_run import run_twin, scores_table
+
+    with cycle_progress(config.experiment.cycles) as on_cycle:
+        result = run_twin(config, force=force, on_cycle=on_cycle, command=shlex.join(["en4dvar", *sys.argv[1:]]))
+    click.echo(scores_table(result))
+    if result.run.failures:
+        lost = f"{len(result.run.failures)} of {config.experiment.members} members lost"
+        click.echo(f"warning: {config.name}: {lost}, the last: {result.run.failures[-1]}", err=True)
+    click.echo(f"result: {config.directory / 'twin.nc'}")
+
+
 @main.command()
 @_config_options
 def validate(config: str, data: str | None, settings: tuple[str, ...]) -> None:
@@ -135,7 +164,14 @@ def validate(config: str, data: str | None, settings: tuple[str, ...]) -> None:
     Example:
       en4dvar validate configs/quickstart.yaml
     """
-    loaded = _load(config, data, settings)
+    loaded = _load_any(config, data, settings)
+    from en4dvar.config import TwinConfig
+
+    if isinstance(loaded, TwinConfig):
+        from en4dvar.twin_run import twin_summary
+
+        click.echo(twin_summary(loaded))
+        return
     from en4dvar.build import build
     from en4dvar.describe import problem_summary
 

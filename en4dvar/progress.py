@@ -79,5 +79,20 @@ def terminal_progress(n_datasets: int) -> Iterator[Progress | None]:
         yield show
 
 
+@contextmanager
+def cycle_progress(cycles: int) -> Iterator[Callable[[int], None] | None]:
+    """A bar of assimilation cycles on the terminal (standard error), or None where there is no terminal."""
+    from rich.console import Console
+    from rich.progress import Progress as Bar
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield None
+        return
+    with Bar(console=console, transient=True) as bar:
+        task = bar.add_task("cycles", total=cycles)
+        yield lambda cycle: bar.update(task, completed=cycle + 1)
+
+
 def _short(name: str, record: IterationRecord) -> str:
     return f"{name}: iteration {record.iteration}, J {record.cost:.5g}, {record.active} members"

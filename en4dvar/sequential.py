@@ -163,6 +163,11 @@ def propagate(
     return executor.trajectories(mover, states, times - start)
 
 
+def predictions(observables: Sequence[Observable], trajectory: Trajectory) -> Array:
+    """(K, p): outputs (K,) or (K, q) of the operators along a trajectory, side by side."""
+    return np.column_stack([observable.operator(trajectory) for observable in observables])
+
+
 @dataclass
 class _Loop:
     model: ForwardModel
@@ -250,8 +255,9 @@ class _Loop:
 
     def predict(self, states: Array, index: int) -> Array:
         """Predictions (N, p): H acts at one instant, so members stand where it expects times."""
-        instant = Trajectory(np.full(len(states), self.times[index]), states, self.model.layout)
-        return np.column_stack([observable.operator(instant) for observable in self.observables])
+        return predictions(
+            self.observables, Trajectory(np.full(len(states), self.times[index]), states, self.model.layout)
+        )
 
     def forecast(self, states: Array, indices: Sequence[int]) -> tuple[list[Array], list[str]]:
         """Members at the start of the window → ensembles (N, n) at times of ``indices``, and reasons (N,)."""

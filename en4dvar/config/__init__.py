@@ -1,5 +1,30 @@
 """YAML → validated, frozen settings; errors as ``file:line:col: path: message``, all at once."""
 
-from en4dvar.config.load import Config, load_config, resolve, time_grid
+from __future__ import annotations
 
-__all__ = ["Config", "load_config", "resolve", "time_grid"]
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from en4dvar.config.document import override, read_document
+from en4dvar.config.load import Config, load_config, resolve, time_grid
+from en4dvar.config.twin import TwinConfig, resolve_twin
+from en4dvar.errors import ConfigError, Fault
+
+__all__ = ["Config", "TwinConfig", "load_any", "load_config", "load_twin", "resolve", "time_grid"]
+
+
+def load_any(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config | TwinConfig:
+    """A twin experiment where the file has a ``twin:`` section, else what :func:`load_config` gives."""
+    path = Path(path)
+    document = override(read_document(path), overrides or {})
+    base = path.resolve().parent
+    return resolve_twin(document, base) if "twin" in document.data else resolve(document, base)
+
+
+def load_twin(path: str | Path, overrides: Mapping[str, Any] | None = None) -> TwinConfig:
+    """As :func:`load_config`, for a twin experiment. Raises :class:`ConfigError`."""
+    config = load_any(path, overrides)
+    if not isinstance(config, TwinConfig):
+        raise ConfigError([Fault("not a twin experiment: it has no twin: section", file=str(path))])
+    return config

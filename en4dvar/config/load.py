@@ -65,6 +65,8 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | None = None) ->
 
 def resolve(document: Document, base: Path) -> Config:
     """Validate a document whose relative paths start at ``base``. Raises :class:`ConfigError`."""
+    if "twin" in document.data:
+        raise ConfigError([document.fault(("twin",), "a twin experiment: it can be run and validated", at_key=True)])
     faults: list[Fault] = []
     top = check(schema.Schema, document.data, (), document, faults)
     model_section = document.data.get("model")

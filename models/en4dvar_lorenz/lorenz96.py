@@ -28,14 +28,18 @@ class Lorenz96Settings(BaseModel):
 
 @njit
 def tendency(x: np.ndarray, dx: np.ndarray) -> None:
-    n = x.shape[0] - 1
-    f = x[n]
-    dx[0] = (x[1] - x[n - 2]) * x[n - 1] - x[0] + f
-    dx[1] = (x[2] - x[n - 1]) * x[0] - x[1] + f
-    for i in range(2, n - 1):
-        dx[i] = (x[i + 1] - x[i - 2]) * x[i - 1] - x[i] + f
-    dx[n - 1] = (x[0] - x[n - 3]) * x[n - 2] - x[n - 1] + f
+    n, forcing = len(x) - 1, x[-1]
+    second, last, here = x[n - 2], x[n - 1], x[0]  # x_{i−2}, x_{i−1}, x_i of the circle
+    for i in range(n):
+        following = x[i + 1] if i < n - 1 else x[0]
+        dx[i] = (following - second) * last - here + forcing
+        second, last, here = last, here, following
     dx[n] = 0.0
+
+
+@njit(nogil=True)
+def integrate(start: np.ndarray, times: np.ndarray, longest: float) -> np.ndarray:
+    return rk4(tendency, start, times, longest)
 
 
 class Lorenz96(Autonomous):
@@ -44,7 +48,7 @@ class Lorenz96(Autonomous):
     Settings = Lorenz96Settings
     parameters = (dimensionless("F", "forcing", "$F$", "Lorenz (1996)"),)
     defaults: ClassVar[Mapping[str, float]] = {"F": 8.0}
-    integrate = staticmethod(rk4(tendency))
+    integrate = staticmethod(integrate)
 
     @classmethod
     def from_settings(cls, settings: Lorenz96Settings) -> Lorenz96:
