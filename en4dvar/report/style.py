@@ -82,9 +82,17 @@ def styled(draw: Callable[P, T]) -> Callable[P, T]:
     return inside
 
 
+def _settle(figure: Figure) -> None:
+    """Compute the layout once; constrained layout would do it again for every format."""
+    if figure.get_layout_engine() is not None:
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
+
+
 @styled
 def save_figure(figure: Figure, folder: Path, name: str) -> None:
     """``folder/name.pdf`` (vectors) and ``folder/name.png`` (200 dots an inch), undated, each by atomic rename."""
+    _settle(figure)
     with atomic_path(folder / f"{name}.pdf") as partial:
         figure.savefig(partial, format="pdf", metadata={"CreationDate": None})
     with atomic_path(folder / f"{name}.png") as partial:
@@ -94,6 +102,7 @@ def save_figure(figure: Figure, folder: Path, name: str) -> None:
 @styled
 def inline_svg(figure: Figure, name: str, description: str) -> str:
     """The figure as an ``<svg>`` element: identifiers unique by ``name``, colours as CSS variables, no addresses."""
+    _settle(figure)
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     figure.savefig(buffer, format="svg", transparent=True, metadata=nothing)

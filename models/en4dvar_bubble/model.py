@@ -164,7 +164,9 @@ class BubbleModel(ForwardModel):
         law_values = {p.name: values[p.name] for p in self.law.parameters}
         relaxed = self.law.relaxed(R / rest, law_values)
         fields["Z"] = relaxed
-        fields["S"] = self.law.elastic_stress((R / rest)[:, None], law_values)[:, 0] + relaxed.sum(axis=1)
+        fields["S"] = relaxed.sum(axis=1)
+        if self.start == "laser":  # at rest there is no elastic stress
+            fields["S"] = fields["S"] + self.law.elastic_stress((R / rest)[:, None], law_values)[:, 0]
         if system.vapour:
             fields["C"] = mass_fraction(p_v / (gas + p_v), medium)[:, None]
         for name, where in layout.slices.items():
