@@ -104,6 +104,7 @@ class BubbleSettings(_Section):
     medium_nodes: Annotated[int, Field(ge=4, le=128)] | None = None
     rtol: Annotated[float, Field(ge=1e-11, le=1e-2)] | None = None
     step_limit: Annotated[int, Field(ge=100)] = Accuracy.step_limit
+    time_limit: Annotated[float, Quantity("s"), Field(gt=0)] = Accuracy.time_limit
     mach_limit: Annotated[float, Field(gt=0)] = Accuracy.mach_limit
 
     @model_validator(mode="before")
@@ -159,5 +160,6 @@ class BubbleSettings(_Section):
             rtol=preset.rtol if self.rtol is None else self.rtol,
             medium_nodes=preset.medium_nodes if self.medium_nodes is None else self.medium_nodes,
             step_limit=self.step_limit,
+            time_limit=self.time_limit,
             mach_limit=self.mach_limit,
         )

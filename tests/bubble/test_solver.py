@@ -160,6 +160,12 @@ class TestFailures:
         results = model.trajectories(x, TIMES)
         assert all(isinstance(r, Failure) and r.reason.startswith("step limit reached at t =") for r in results)
 
+    def test_time_limit_ends_a_member_that_crawls(self):
+        """A tolerance that needs millions of steps: without the limit this would take minutes."""
+        crawl = Accuracy(rtol=1e-17, step_limit=10**9, time_limit=0.5)
+        data = simulate(parameters=gels(1), times=TIMES, accuracy=crawl)
+        assert data.reason.values[0].startswith("time limit reached at t =")
+
     def test_mach_limit_names_the_mach_number_and_spares_the_others(self):
         violent = {"G": [420.0, 2e4], "alpha": [0.0, 0.03], "mu": [0.02, 0.3], "R0": [0.43e-6, 3e-6]}
         data = simulate(parameters=violent, times=TIMES, accuracy=Accuracy(mach_limit=2.0))

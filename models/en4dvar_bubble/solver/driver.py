@@ -45,13 +45,15 @@ _STRESS_SCALE = 10.0  # µm²/µs², about 0.1 bar: errors of a memory variable 
 class Accuracy:
     """Nodes in the gas (temperature, vapour) and in the medium, relative tolerance of the time steps, and limits.
 
-    ``step_limit`` bounds the work per member; ``mach_limit`` ends a member whose wall Mach number exceeds it.
+    ``step_limit`` and ``time_limit`` (seconds of wall clock, to about 1 s) bound the work per member; ``mach_limit`` ends
+    a member whose wall Mach number exceeds it.
     """
 
     nodes: int = 8
     rtol: float = 1e-5
     medium_nodes: int = 24
     step_limit: int = 20_000
+    time_limit: float = 60.0
     mach_limit: float = np.inf
 
 
@@ -165,6 +167,8 @@ def reason(status: int, record: Array) -> str:
             return f"step size underflow {when}"
         case integrate.MACH_LIMIT:
             return f"model validity: wall Mach {record[integrate.MAX_MACH]:.3g} {when}"
+        case integrate.TIME_LIMIT:
+            return f"time limit reached {when}"
     raise ValueError(f"unknown status {status}")
 
 
@@ -229,7 +233,7 @@ def solve(
         system.general,
         driving.breaks,
         system.tolerances(accuracy.rtol),
-        np.array([_FIRST_STEP, inside, float(accuracy.step_limit), accuracy.mach_limit]),
+        np.array([_FIRST_STEP, inside, float(accuracy.step_limit), accuracy.mach_limit, accuracy.time_limit]),
         out,
         status,
         record,

@@ -8,6 +8,7 @@ import math
 
 import numba as nb
 import numpy as np
+from numba.core import types
 
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.equations import jacobian, rhs
@@ -16,7 +17,7 @@ from en4dvar_bubble.solver.lanes import WIDTH, absolute, load, maximum, splat, s
 from en4dvar_bubble.solver.rows import AMPLITUDE, INVERSE_C
 
 # Status of a member; the reasons users read are made by ``driver.reason``.
-OK, STEP_LIMIT, NON_FINITE, STEP_UNDERFLOW, MACH_LIMIT = 0, 1, 2, 3, 4
+OK, STEP_LIMIT, NON_FINITE, STEP_UNDERFLOW, MACH_LIMIT, TIME_LIMIT = 0, 1, 2, 3, 4, 5
 # Columns of the per-member record.
 STEPS, REJECTED, MAX_MACH, MAX_THETA, MIN_LOG_R, END_TIME = 0, 1, 2, 3, 4, 5
 RECORD = 6
@@ -26,6 +27,9 @@ _GAMMA = rodas5p.GAMMA
 _STAGES = rodas5p.STAGES
 _SAFETY, _SHRINK, _GROW = 0.9, 0.15, 6.0
 _EXPONENT = 1.0 / rodas5p.ORDER
+_TURNS_PER_LOOK = 64  # attempted steps between looks at the clock
+
+_clock = types.ExternalFunction("time", types.int64(types.intp))  # time(NULL) of the C library, seconds
 
 
 @nb.njit
@@ -149,7 +153,7 @@ def integrate(initial, parameters, start, times, dims, world, extra, general, br
 
     initial (N, n), parameters (N, rows), start (N,) µs, times (N, K) increasing µs; ``dims``, ``world``, ``extra`` as
     for :func:`general.general_rhs`; ``tol`` (2, n) absolute and relative tolerances; ``breaks`` increasing instants
-    the steps must not straddle; ``limits`` = (first step, longest step inside the driving, step limit, Mach limit).
+    the steps must not straddle; ``limits`` = (first step, longest step inside the driving, step limit, Mach limit, seconds per member).
     Outputs: out (N, K, n) with NaN where not reached, status (N,), record (N, RECORD).
     """
     n_members, n = initial.shape
@@ -173,7 +177,10 @@ def integrate(initial, parameters, start, times, dims, world, extra, general, br
     rejected = np.zeros(WIDTH, dtype=np.bool_)
     waiting = 0
     running = 0
-    first_step, inside_step, step_limit, mach_limit = limits
+    first_step, inside_step, step_limit, mach_limit, seconds = limits
+    began = np.zeros(WIDTH, dtype=np.int64)
+    clock = _clock(0)
+    turn = 0
 
     while True:
         for lane in range(WIDTH):  # refill
@@ -195,6 +202,7 @@ def integrate(initial, parameters, start, times, dims, world, extra, general, br
                 if done == n_times:
                     continue
                 member[lane] = i
+                began[lane] = clock
                 observed[lane] = done
                 for j in range(n):
                     y[j, lane] = initial[i, j]
@@ -218,6 +226,9 @@ def integrate(initial, parameters, start, times, dims, world, extra, general, br
                     h[0, lane] = breaks[next_break[lane]] - now
         if running == 0:
             break
+        turn += 1
+        if turn % _TURNS_PER_LOOK == 0:
+            clock = _clock(0)
 
         _attempt(y, t, h, par, dims, world, extra, general, tol, w)
 
@@ -287,6 +298,8 @@ def integrate(initial, parameters, start, times, dims, world, extra, general, br
                         failure = MACH_LIMIT
             if record[i, STEPS] + record[i, REJECTED] >= step_limit:
                 failure = STEP_LIMIT
+            if clock - began[lane] > seconds + 1.0:  # the clock ticks in seconds
+                failure = TIME_LIMIT
             if h[0, lane] < 1e-13 * max(1.0, abs(t[0, lane])):
                 failure = STEP_UNDERFLOW if math.isfinite(norm[0, lane]) else NON_FINITE
             if failure != OK or observed[lane] == n_times:
