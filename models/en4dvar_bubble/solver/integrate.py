@@ -152,9 +152,9 @@ def integrate(initial, parameters, start, times, dims, world, extra, general, br
     """Integrate N members and write their states at the output times.
 
     initial (N, n), parameters (N, rows), start (N,) µs, times (N, K) increasing µs; ``dims``, ``world``, ``extra`` as
-    for :func:`general.general_rhs`; ``tol`` (2, n) absolute and relative tolerances; ``breaks`` increasing instants
-    the steps must not straddle; ``limits`` = (first step, longest step inside the driving, step limit, Mach limit, seconds per member).
-    Outputs: out (N, K, n) with NaN where not reached, status (N,), record (N, RECORD).
+    for :func:`general.general_rhs`; ``tol`` (2, n) absolute and relative tolerances; ``breaks`` increasing instants the
+    steps must not straddle; ``limits`` = (first step, longest step inside the driving, step limit, Mach limit, seconds
+    per member). Outputs: out (N, K, n) with NaN where not reached, status (N,), record (N, RECORD).
     """
     n_members, n = initial.shape
     n_times = times.shape[1]
