@@ -1,7 +1,7 @@
 """The command line. Heavy imports stay inside the commands, so that ``--help`` answers at once.
 
-Exit codes: 0 done; 1 the run failed; 2 usage, configuration, data or output directory; 3 too few surviving members;
-130 interrupted.
+Exit codes: 0 done; 1 the run failed, or some data sets of a campaign; 2 usage, configuration, data or output directory;
+3 too few surviving members (in a campaign: nothing else failed); 130 interrupted, to be continued with --resume.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from en4dvar.config import Config, TwinConfig
 
 F = Callable[..., Any]
+MOST_TOLD = 30  # data sets, warnings and failures on the terminal; all of them are in the run directory
 
 
 class Failed(click.ClickException):
@@ -50,8 +51,8 @@ class Commands(click.Group):
             return super().invoke(ctx)
         except En4dvarError as error:
             raise Failed(str(error), error.exit_code) from error
-        except (KeyboardInterrupt, click.Abort):
-            raise Failed("interrupted", 130) from None
+        except (KeyboardInterrupt, click.Abort) as interrupt:
+            raise Failed(str(interrupt) or "interrupted", 130) from None
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -104,42 +105,68 @@ def _overrides(data: str | None, settings: tuple[str, ...], **special: Any) -> d
 @main.command()
 @_config_options
 @click.option("--out", type=click.Path(path_type=Path), help="Run directory; default output.directory or runs/<name>.")
-@click.option("--force", is_flag=True, help="Replace the files of an earlier run in the run directory.")
+@click.option("--force", is_flag=True, help="Replace an earlier run in the run directory, once this one is complete.")
+@click.option("--resume", is_flag=True, help="Continue the interrupted run in the run directory, to the same bits.")
 @click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
+@click.option("--scheduler", metavar="ADDRESS", help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786.")
 def run(
-    config: str, data: str | None, settings: tuple[str, ...], out: Path | None, force: bool, workers: int | None
+    config: str,
+    data: str | None,
+    settings: tuple[str, ...],
+    out: Path | None,
+    force: bool,
+    resume: bool,
+    workers: int | None,
+    scheduler: str | None,
 ) -> None:
     """Estimate the parameters; write posterior and report to the run directory.
 
+    Several data files (a list, a pattern or a folder) are a campaign; one that cannot be used does not end it.
     A configuration with a 'twin:' section is a twin experiment: RMSE and spread against its truth.
 
     \b
     Example:
       en4dvar run configs/quickstart.yaml --out runs/first --set assimilation.members=96
     """
-    loaded = _load_any(
-        config, data, settings, **{"output.directory": str(out) if out else None, "execution.workers": workers}
-    )
+    special = {
+        "output.directory": str(out) if out else None,
+        "execution.workers": workers,
+        "execution.address": scheduler,
+    }
+    loaded = _load_any(config, data, settings, **special)
     from en4dvar.config import TwinConfig
 
     if isinstance(loaded, TwinConfig):
         _run_twin(loaded, force)
         return
-    from en4dvar.build import build
+    from en4dvar.build import data_files, inverse_plan
     from en4dvar.describe import results_table
     from en4dvar.progress import terminal_progress
     from en4dvar.runner import execute
 
-    problems = build(loaded)
-    with terminal_progress(len(problems)) as progress:
-        results = execute(
-            loaded, problems, force=force, progress=progress, command=shlex.join(["en4dvar", *sys.argv[1:]])
-        )
-    click.echo(results_table(results))
-    for result in results:
-        for warning in result.warnings:
-            click.echo(f"warning: {result.name}: {warning}", err=True)
-    click.echo(f"report: {loaded.directory / 'report.html'}")
+    words = ["en4dvar", *sys.argv[1:]]
+    with terminal_progress(len(data_files(inverse_plan(loaded)))) as progress:
+        try:
+            campaign = execute(loaded, force=force, resume=resume, progress=progress, command=shlex.join(words))
+        except KeyboardInterrupt as interrupt:
+            again = shlex.join([*(w for w in words if w not in ("--force", "--resume")), "--resume"])
+            raise Failed(f"{interrupt}\nto continue: {again}", 130) from None
+    if len(campaign) <= MOST_TOLD:
+        click.echo(results_table(campaign))
+    for notice in campaign.notices:
+        click.echo(f"warning: {notice}", err=True)
+    told = [f"{o.name}: {warning}" for o in campaign.outcomes for warning in o.warnings]
+    for warning in told[:MOST_TOLD]:
+        click.echo(f"warning: {warning}", err=True)
+    if len(told) > MOST_TOLD:
+        click.echo(f"warning: {len(told) - MOST_TOLD} more; see run.log", err=True)
+    if len(campaign):
+        click.echo(f"report: {campaign.directory / 'report.html'}")
+    if campaign.failures:
+        reasons = [f"{o.name}: {o.failure}" for o in campaign.failures]
+        head = f"{len(reasons)} of {len(campaign.outcomes)} data sets failed:"
+        more = [f"and {len(reasons) - MOST_TOLD} more; see summary.csv"] if len(reasons) > MOST_TOLD else []
+        raise Failed("\n".join([head, *reasons[:MOST_TOLD], *more]), campaign.exit_code)
 
 
 def _run_twin(config: TwinConfig, force: bool) -> None:
@@ -233,9 +260,22 @@ def report(run_dir: Path) -> None:
     Example:
       en4dvar report runs/quickstart
     """
-    from en4dvar.report import write_report
+    from en4dvar.runner import report as write_report
 
     click.echo(f"report: {write_report(run_dir)}")
+
+
+@main.command()
+def models() -> None:
+    """List the models with their observables, parameters, units and settings.
+
+    \b
+    Example:
+      en4dvar models | less
+    """
+    from en4dvar.listing import model_listing
+
+    click.echo(model_listing())
 
 
 if __name__ == "__main__":
