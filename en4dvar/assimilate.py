@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,8 +13,10 @@ from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.forecast import Forecast, check_problem, cost, forecast, log_posterior
 from en4dvar.likelihood import error_std, log_likelihood
+from en4dvar.mda import assimilate_once
 from en4dvar.problem import Analysis, AssimilationSettings, InverseProblem, IterationRecord
 from en4dvar.schemes import Step, Weights
+from en4dvar.schemes.esmda import ESMDA
 from en4dvar.start import choose_start
 
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
@@ -94,6 +96,9 @@ class _Run:
         self.fixed_parameters = check_problem(problem)
         self.problem, self.settings, self.seed = problem, settings, seed
         self.progress, self.on_iteration = progress, on_iteration
+        self.mda = ESMDA(settings.mda_coefficients, settings.mda_form) if settings.scheme == "es-mda" else None
+        if self.mda:  # step and J of its ensembles are regressed over them
+            settings = replace(settings, linearisation="transform")
         self.space = WeightSpace(problem, settings, seed, executor)
 
     def analysis(self, resume: LoopState | None) -> Analysis:
@@ -104,7 +109,7 @@ class _Run:
         self.require_members(prior_run[:-1].failures, "prior forecast")
         state = resume or self.start(prior_run)
         space.forward_runs = state.forward_runs
-        end = self.iterate(state)
+        end = self.assimilate_repeatedly(state, self.mda) if self.mda else self.iterate(state)
 
         posterior = space.control(end.weights.w + end.step.transform)
         mode = space.control(end.weights.w)
@@ -160,6 +165,8 @@ class _Run:
         )
 
     def start(self, prior_run: Forecast) -> LoopState:
+        if self.mda:
+            return LoopState(Weights.prior(len(self.space.members)), self.space.forward_runs)
         w, warnings = choose_start(self.space, prior_run)
         return LoopState(Weights(w, self.space.scheme.init(len(w)).T), self.space.forward_runs, warnings)
 
@@ -200,6 +207,26 @@ class _Run:
                 # one more forecast, to linearise at the end point
                 stop, converged = f"relative decrease of J below {settings.cost_tolerance:g}", True
             weights = Weights(move.w, step.transform)
+
+    def assimilate_repeatedly(self, state: LoopState, scheme: ESMDA) -> _Outcome:
+        """ES-MDA: every iteration is one of its assimilations; the last record is the end point."""
+        space, count = self.space, len(scheme.coefficients)
+        weights, records, worst_loss = state.weights, list(state.records), state.worst_loss
+        while True:
+            if self.on_iteration is not None:
+                self.on_iteration(LoopState(weights, space.forward_runs, state.warnings, tuple(records), worst_loss))
+            (at,) = space.linearise([weights])
+            step = self.require_step(at, f"forecast of iteration {len(records) + 1}")
+            step = replace(step, transform=weights.T)
+            worst_loss = max(worst_loss, at.members.failures, key=lambda failures: sum(map(bool, failures)))
+            done = len(records) == count
+            records.append(self.record(len(records), at, step, 0.0 if done else 1.0))
+            if self.progress is not None:
+                self.progress(self.problem.observations.name, records[-1])
+            if done:
+                warnings = diag.loss_warning("iterations", worst_loss)
+                return _Outcome(weights, step, at.cost, True, f"{count} assimilations", tuple(records), warnings)
+            weights = assimilate_once(space, at, scheme, len(records) - 1, self.seed)
 
     def same_members(self, a: Weights, b: Weights) -> bool:
         """Whether the scheme would run the same members again, to the step tolerance."""

@@ -35,10 +35,12 @@ class AssimilationSettings:
 
     ``step_tolerance`` is a length in posterior standard deviations, √(δwᵀAδw); ``cost_tolerance`` is relative to J,
     and absolute below J = 1. ``full`` takes the whole step or, where that raises J, none. ``starts`` prior members of
-    lowest J are compared by a descent from each (see :mod:`en4dvar.start`).
+    lowest J are compared by a descent from each (see :mod:`en4dvar.start`). ES-MDA reads, besides ``members``,
+    ``sampling`` and ``min_active_fraction``, only ``mda_coefficients``, scaled so that Σ 1/α = 1, and ``mda_form``
+    (see :mod:`en4dvar.schemes.esmda`).
     """
 
-    scheme: Literal["en4dvar"] = "en4dvar"
+    scheme: Literal["en4dvar", "es-mda"] = "en4dvar"
     members: int = 48
     sampling: Literal["exact", "random"] = "exact"
     linearisation: Literal["bundle", "transform"] = "bundle"
@@ -50,6 +52,8 @@ class AssimilationSettings:
     step_tolerance: float = 1e-3
     cost_tolerance: float = 1e-4
     min_active_fraction: float = 0.5
+    mda_coefficients: tuple[float, ...] = (4.0, 4.0, 4.0, 4.0)
+    mda_form: Literal["perturbed", "square-root"] = "perturbed"
 
 
 @dataclass(frozen=True)

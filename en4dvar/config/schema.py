@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
 from en4dvar.problem import AssimilationSettings
 from en4dvar.units import parse_unit
@@ -105,10 +105,22 @@ class FromFile(Section):
 
 
 class Execution(Section):
-    """Where members are integrated; never changes the numbers."""
+    """Where the work is done; never changes the numbers.
 
-    executor: Literal["serial", "threads", "processes"] | None = None
+    ``address`` is that of a running dask scheduler. ``checkpoint_every``: seconds between two checkpoints of a data
+    set; an iteration that follows sooner is not written, 0 writes every one.
+    """
+
+    executor: Literal["serial", "threads", "processes", "dask"] | None = None
     workers: Annotated[int, Field(ge=1)] | None = None
+    address: Annotated[str, Field(pattern=r"^\w+://\S+$")] | None = None
+    checkpoint_every: Annotated[float, Field(ge=0)] = 0.2
+
+    @model_validator(mode="after")
+    def _address_is_of_dask(self) -> Execution:
+        if self.address is not None and self.executor not in (None, "dask"):
+            raise ValueError(f"address is that of a dask scheduler; write executor: dask, not {self.executor}")
+        return self
 
 
 class Output(Section):
@@ -131,6 +143,12 @@ class Simulate(Section):
     times: Times
 
 
+def _positive(values: tuple[float, ...]) -> tuple[float, ...]:
+    if not values or not all(value > 0 for value in values):
+        raise ValueError(f"give one or more positive numbers, not {list(values)}")
+    return values
+
+
 _LIMITS: dict[str, Any] = {
     "members": Field(ge=3),
     "epsilon": Field(gt=0, le=1),
@@ -139,6 +157,7 @@ _LIMITS: dict[str, Any] = {
     "step_tolerance": Field(gt=0),
     "cost_tolerance": Field(gt=0),
     "min_active_fraction": Field(gt=0, le=1),
+    "mda_coefficients": AfterValidator(_positive),
 }
 
 
