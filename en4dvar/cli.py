@@ -225,12 +225,18 @@ def simulate(
     """Run the model once and write the observable as CSV: at fixed values and prior medians.
 
     Set parameters with --set; the columns are those of the configuration's data section.
+    A configuration with a 'campaign:' section instead draws truths and writes a folder of data sets.
 
     \b
     Example:
       en4dvar simulate configs/quickstart.yaml --set parameters.G='0.5 kPa' \\
           --times '0 us:60 us:1 us' --noise '1.4 um' --out synthetic.csv
     """
+    if _has_campaign(config):
+        if data or times or noise:
+            raise click.UsageError("--data, --times and --noise do not apply to a configuration with a 'campaign:'")
+        _simulate_campaign(config, settings, out, seed, force)
+        return
     loaded = _load(config, data, settings)
     from en4dvar.errors import OutputError
     from en4dvar.files import write_text
@@ -249,6 +255,26 @@ def simulate(
         click.echo(text, nl=False)
     else:
         write_text(out, text)
+
+
+def _has_campaign(config: str) -> bool:
+    from en4dvar.config.document import read_document
+
+    return "campaign" in read_document(Path(config)).data
+
+
+def _simulate_campaign(config: str, settings: tuple[str, ...], out: Path | None, seed: int | None, force: bool) -> None:
+    from en4dvar.config.document import override, read_document
+    from en4dvar.config.synthetic import relocated, resolve_campaign
+    from en4dvar.synthetic import draw_campaign, write_campaign
+
+    changes = _overrides(None, settings, seed=seed)
+    plan = resolve_campaign(override(read_document(Path(config)), changes), Path(config).resolve().parent)
+    plan = relocated(plan, out) if out else plan
+    sets = draw_campaign(plan)
+    truth = write_campaign(plan, sets, shlex.join(["en4dvar", *sys.argv[1:]]), force)
+    fits = [s.nrmse for s in sets]
+    click.echo(f"{len(sets)} synthetic data sets, NRMSE of the truth {min(fits):.3f} to {max(fits):.3f}; truth: {truth}")
 
 
 @main.command()

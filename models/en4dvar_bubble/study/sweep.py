@@ -1,0 +1,230 @@
+"""Route 1, the paper's "IMR Approach": every trajectory of one design against every data set, best fit by NRMSE.
+
+The design is a scrambled Sobol sequence, uniform in the transformed coordinates of the priors within ``width`` standard
+deviations of their means. It is shared by the data sets, so a trajectory is computed once. Trajectories stream
+through in chunks; of each chunk only the best fit of every set is kept, on disk where a folder is given, and an
+interrupted sweep continues with the chunks that are missing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from en4dvar.errors import ConfigError, DataError, OutputError
+from en4dvar.files import atomic_path
+from en4dvar.problem import InverseProblem
+from en4dvar.state import TIME_SHIFT, Array, Parameter
+from en4dvar_bubble.model import BubbleModel
+from en4dvar_bubble.study.nearest import Targets, best_over_shifts, targets
+
+BATCH = 128  # trajectories whose full solution is in memory at once, a thread
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class SweepSettings:
+    """``shift`` and ``step`` (s): the largest time shift and the step of the traces' time grid.
+
+    After the design come ``rounds`` of local refinement: ``local`` trajectories a set, uniform about its best fit so
+    far in a box that halves every round, first ``width``/4 prior standard deviations to each side.
+    """
+
+    trajectories: int = 50_000
+    shift: float = 0.8e-6
+    step: float = 0.025e-6
+    width: float = 3.0
+    chunk: int = 2048
+    rounds: int = 0
+    local: int = 64
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best fit of each of S sets so far: transformed ``x`` (S, n), ``shift`` (S,) s, ``nrmse`` (S,)."""
+
+    x: Array
+    shift: Array
+    nrmse: Array
+
+    def merged(self, other: Best) -> Best:
+        """The better of the two, set by set; this one where they are equal."""
+        better = other.nrmse > self.nrmse
+        pick = {f.name: (getattr(self, f.name), getattr(other, f.name)) for f in fields(self)}
+        return Best(**{k: np.where(better[:, None] if a.ndim == 2 else better, b, a) for k, (a, b) in pick.items()})
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """Best fits of S data sets. ``theta`` (S, n) physical, SI, in the order of ``parameters``; ``shift`` (S,) s."""
+
+    names: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
+    theta: Array
+    shift: Array
+    nrmse: Array
+    trajectories: int
+
+    @property
+    def mean(self) -> Array:
+        """(n,) NRMSE-weighted mean over the sets, Σ w θ / Σ w with w the NRMSE of the best fit."""
+        return np.asarray(np.average(self.theta, axis=0, weights=self.nrmse))
+
+    @property
+    def std(self) -> Array:
+        """(n,) NRMSE-weighted standard deviation over the sets, √(Σ w (θ − mean)² / Σ w)."""
+        return np.asarray(np.sqrt(np.average((self.theta - self.mean) ** 2, axis=0, weights=self.nrmse)))
+
+
+def run_sweep(
+    problems: Sequence[InverseProblem],
+    settings: SweepSettings,
+    seed: int,
+    workers: int = 1,
+    folder: Path | None = None,
+    progress: Progress | None = None,
+) -> SweepResult:
+    """Fit every data set.
+
+    Parameters
+    ----------
+    problems: with one model and one prior. A prior on ``t_s`` plays no part: the shift is searched within its limits.
+    folder: where finished chunks are kept, and found again by a sweep that continues; the caller clears it.
+    progress: called with the trajectories done and to do.
+
+    Raises
+    ------
+    ConfigError: the data sets do not share a model, fixed values or prior; nothing but t_s is estimated.
+    DataError: no trajectory fits a set.
+    """
+    sweep = _Sweep(problems, settings, workers, folder)
+    total = settings.trajectories + settings.rounds * settings.local * len(problems)
+    done, best = 0, None
+    for x, found in sweep.run(sobol_box(sweep.mean, settings.width * sweep.std, settings.trajectories, seed), "design"):
+        best = found if best is None else best.merged(found)
+        done += len(x)
+        if progress is not None:
+            progress(done, total)
+    assert best is not None
+    for number in range(settings.rounds):
+        half = settings.width / 4 * 0.5**number * sweep.std
+        boxes = [
+            sobol_box(centre, half, settings.local, seed + 1000 * (number + 1) + s) for s, centre in enumerate(best.x)
+        ]
+        for x, found in sweep.run(np.vstack(boxes), f"round{number}"):
+            best = best.merged(found)
+            done += len(x)
+            if progress is not None:
+                progress(done, total)
+    names = tuple(p.observations.name for p in problems)
+    lost = [name for name, value in zip(names, best.nrmse, strict=True) if not math.isfinite(value)]
+    if lost:
+        raise DataError(f"no trajectory of the design could be integrated for {', '.join(lost)}")
+    return SweepResult(names, sweep.parameters, sweep.physical(best.x), best.shift, best.nrmse, done)
+
+
+def sobol_box(centre: Array, half: Array, count: int, seed: int) -> Array:
+    """Scrambled Sobol points (count, n) in ``centre`` ± ``half``; more points leave the first ones as they were."""
+    from scipy.stats import qmc
+
+    unit = qmc.Sobol(len(centre), rng=seed).random_base2(max(1, math.ceil(math.log2(count))))[:count]
+    return np.asarray(centre + (2 * unit - 1) * half)
+
+
+class _Sweep:
+    """What all chunks share: model, targets, and how a coordinate becomes a state."""
+
+    def __init__(self, problems: Sequence[InverseProblem], settings: SweepSettings, workers: int, folder: Path | None):
+        first = problems[0]
+        if not isinstance(first.model, BubbleModel):
+            raise ConfigError("a sweep needs the model 'bubble'")
+        for other in problems[1:]:
+            if other.prior.terms != first.prior.terms or other.fixed != first.fixed or other.model is not first.model:
+                raise ConfigError(
+                    f"{other.observations.name}: the design is shared, but priors or fixed values refer to the data set"
+                )
+        self.model, self.settings, self.workers, self.folder = first.model, settings, workers, folder
+        self.terms = tuple(t for t in first.prior.terms if t.parameter.name != TIME_SHIFT.name)
+        if not self.terms:
+            raise ConfigError("nothing but the time shift is estimated; a sweep needs a prior on a parameter")
+        self.fixed = {name: v for name, v in first.fixed.items() if name != TIME_SHIFT.name}
+        self.parameters = tuple(t.parameter for t in self.terms)
+        self.mean = np.array([t.mean for t in self.terms])
+        self.std = np.array([t.std for t in self.terms])
+        earliest = 0.0 if first.model.start == "acoustic" else -np.inf
+        try:
+            self.aims: Targets = targets([p.observations for p in problems], settings.shift, settings.step, earliest)
+        except ValueError as error:
+            raise DataError(str(error)) from None
+
+    def physical(self, x: Array) -> Array:
+        return np.stack([t.to_physical(x[:, j]) for j, t in enumerate(self.terms)], axis=1)
+
+    def run(self, design: Array, stage: str) -> Iterator[tuple[Array, Best]]:
+        """Chunks of the design with the best fits among them, in order."""
+        chunks = [design[i : i + self.settings.chunk] for i in range(0, len(design), self.settings.chunk)]
+        with ThreadPoolExecutor(self.workers) as pool:
+            try:
+                yield from zip(chunks, pool.map(self._chunk, chunks, self._files(stage, len(chunks))), strict=True)
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+
+    def _files(self, stage: str, count: int) -> list[Path | None]:
+        return [self.folder / f"{stage}_{i:05d}.npz" if self.folder else None for i in range(count)]
+
+    def _chunk(self, x: Array, file: Path | None) -> Best:
+        if file is not None and file.exists():
+            with np.load(file) as stored:
+                return Best(**{f.name: stored[f.name] for f in fields(Best)})
+        best = self._fit(x[:BATCH])
+        for i in range(BATCH, len(x), BATCH):
+            best = best.merged(self._fit(x[i : i + BATCH]))
+        if file is not None:
+            with atomic_path(file, durable=False) as partial, partial.open("wb") as stream:
+                np.savez(stream, **{f.name: getattr(best, f.name) for f in fields(Best)})
+        return best
+
+    def _fit(self, x: Array) -> Best:
+        theta = {p.name: column for p, column in zip(self.parameters, self.physical(x).T, strict=True)}
+        theta |= {name: np.full(len(x), value) for name, value in self.fixed.items()}
+        states = self.model.initial_states({p.name: theta[p.name] for p in self.model.parameters})
+        path = self.model.integrate(states, np.broadcast_to(self.aims.grid, (len(x), len(self.aims.grid))))
+        traces = np.where(path.solution.status[:, None] == 0, path["R"], np.nan)
+        nrmse, shift = best_over_shifts(traces, self.aims)
+        row, sets = np.argmax(nrmse, axis=0), np.arange(nrmse.shape[1])
+        return Best(x[row], shift[row, sets], nrmse[row, sets])
+
+
+def prepare_folder(folder: Path, key: str, mode: str) -> Path:
+    """The folder of a sweep's chunks: ``new`` wants it empty, ``force`` empties it, ``resume`` wants the same ``key``.
+
+    Raises
+    ------
+    OutputError: it holds another sweep, or cannot be written.
+    """
+    mark = folder / "sweep.key"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        stored = mark.read_text(encoding="utf-8") if mark.exists() else ""
+        if mode == "force":
+            for file in (mark, *folder.glob("*.npz")):
+                file.unlink(missing_ok=True)
+            stored = ""
+        if stored and mode == "new":
+            raise OutputError(f"{folder}: holds a sweep; give --resume to continue it or --force to replace it")
+        if stored and stored != key:
+            raise OutputError(f"{folder}: holds the sweep of another configuration; give --force to replace it")
+        mark.write_text(key, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be used: {error.strerror or error}") from None
+    return folder
+
+
+def with_trajectories(settings: SweepSettings, count: int) -> SweepSettings:
+    """The same sweep with another number of trajectories."""
+    return replace(settings, trajectories=count)

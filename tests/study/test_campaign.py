@@ -1,0 +1,95 @@
+"""The synthetic campaign: what is drawn, what is told, what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from en4dvar.cli import main
+from en4dvar.config.document import override, read_document
+from en4dvar.config.synthetic import resolve_campaign
+from en4dvar.errors import ConfigError
+from en4dvar.synthetic import draw_campaign
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+
+def plan(**changes):
+    return resolve_campaign(override(read_document(CONFIGS / "agarose_twin.yaml"), changes), CONFIGS)
+
+
+@pytest.fixture(scope="module")
+def sets():
+    return draw_campaign(plan())
+
+
+def test_shipped_files_are_what_the_configuration_draws(tmp_path):
+    out = tmp_path / "twin"
+    result = CliRunner().invoke(main, ["simulate", str(CONFIGS / "agarose_twin.yaml"), "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    shipped = CONFIGS / "data" / "agarose_twin"
+    assert sorted(p.name for p in out.iterdir()) == sorted(p.name for p in shipped.iterdir())
+    for file in out.iterdir():
+        told = [line for line in file.read_text().splitlines() if not line.startswith("#")]
+        kept = [line for line in (shipped / file.name).read_text().splitlines() if not line.startswith("#")]
+        assert told[0] == kept[0]
+        assert [row.split(",")[0] for row in told[1:]] == [row.split(",")[0] for row in kept[1:]]
+        if file.name != "truth.csv":
+            assert "SYNTHETIC" in file.read_text().splitlines()[0]
+            np.testing.assert_allclose(
+                np.loadtxt(told[1:], delimiter=","), np.loadtxt(kept[1:], delimiter=","), atol=2e-3
+            )
+
+
+def test_numbers_of_the_experiment(sets):
+    assert [sum(s.group == g for s in sets) for g in ("agarose_03", "agarose_10")] == [19, 20]
+    fits = np.array([s.nrmse for s in sets])
+    assert np.all((fits > 0.94) & (fits < 0.99))
+    gaps = np.concatenate([np.diff(s.times) for s in sets])
+    assert np.all((gaps >= 1.25e-6) & (gaps <= 2e-6))
+    shifts = np.array([s.truth["t_s"] for s in sets])
+    assert np.all(np.abs(shifts) <= 0.8e-6)
+    assert np.std(shifts) > 0.3e-6
+    for s in sets:
+        top = np.maximum.accumulate(s.values)
+        assert s.values[-1] < 0.35 * top[-1]
+        assert np.all(s.values[:-1] >= 0.35 * top[:-1])
+
+
+def test_truths_have_the_moments_of_table_1():
+    """5000 draws of the distributions: mean and standard deviation within four standard errors."""
+    many = plan()
+    paper = {"G": (420.0, 62.0), "alpha": (0.029, 0.011), "mu": (0.086, 0.024), "R0": (0.43e-6, 0.31e-6)}
+    rng = np.random.default_rng(0)
+    for term in many.groups[0].terms:
+        values = term.to_physical(term.mean + term.std * rng.standard_normal(5000))
+        mean, std = paper[term.parameter.name]
+        assert np.all(values > 0)
+        assert abs(values.mean() - mean) < 4 * std / np.sqrt(5000)
+        assert values.std() == pytest.approx(std, rel=0.15)
+
+
+def test_more_data_sets_leave_the_first_as_they_were(sets):
+    fewer = draw_campaign(plan(**{"campaign.groups.agarose_03.datasets": 2, "campaign.groups.agarose_10.datasets": 1}))
+    by_name = {s.name: s for s in sets}
+    for s in fewer:
+        np.testing.assert_array_equal(s.values, by_name[s.name].values)
+
+
+def test_faults_are_located():
+    with pytest.raises(ConfigError) as caught:
+        plan(**{"campaign.noise": "1.2 kPa", "campaign.groups.agarose_03.parameters": {"G": "1 kPa"}})
+    told = str(caught.value)
+    assert "campaign.noise" in told
+    assert "campaign.groups.agarose_03.parameters.mu" in told
+
+
+def test_an_existing_campaign_is_not_overwritten(tmp_path):
+    (tmp_path / "truth.csv").write_text("mine")
+    result = CliRunner().invoke(main, ["simulate", str(CONFIGS / "agarose_twin.yaml"), "--out", str(tmp_path)])
+    assert result.exit_code == 2
+    assert "--force" in result.output
+    assert (tmp_path / "truth.csv").read_text() == "mine"
