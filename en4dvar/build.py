@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import glob
+import itertools
+import os
 from collections import Counter
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from en4dvar.forecast import check_problem
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
-from en4dvar.readers import read_series
+from en4dvar.readers import SUFFIXES, read_series
 from en4dvar.units import UnitError, convert
 from en4dvar.window import select
 
@@ -29,15 +31,12 @@ def build(config: Config) -> tuple[InverseProblem, ...]:
     ConfigError: there is no ``data:`` section, nothing is estimated, or a prior does not suit the data.
     DataError: data files cannot be used; names every one of them.
     """
-    if config.data is None:
-        raise ConfigError([Fault("required: where the observations are", "data", config.document.file)])
-    if not any(isinstance(entry, Uncertain) for entry in config.parameters):
-        raise ConfigError([config.document.fault(("parameters",), "no parameter has a prior; nothing to estimate")])
+    plan = inverse_plan(config)
     problems: list[InverseProblem] = []
     unusable: list[DataError] = []
-    for name, path in data_files(config.data).items():
+    for name, path in data_files(plan).items():
         try:
-            problems.append(_problem(config, config.data, path, name))
+            problems.append(build_one(config, name, path))
         except DataError as error:
             unusable.append(error)
     if unusable:
@@ -45,8 +44,31 @@ def build(config: Config) -> tuple[InverseProblem, ...]:
     return tuple(problems)
 
 
+def inverse_plan(config: Config) -> DataPlan:
+    """How the observations are read. Raises :class:`ConfigError` without data or without anything to estimate."""
+    if config.data is None:
+        raise ConfigError([Fault("required: where the observations are", "data", config.document.file)])
+    if not any(isinstance(entry, Uncertain) for entry in config.parameters):
+        raise ConfigError([config.document.fault(("parameters",), "no parameter has a prior; nothing to estimate")])
+    return config.data
+
+
+def build_one(config: Config, name: str, path: Path) -> InverseProblem:
+    """The inverse problem of one of :func:`data_files`. Raises :class:`ConfigError`, :class:`DataError`."""
+    observations = read_observations(inverse_plan(config), path, name, config.weights)
+    terms, fixed = resolve_parameters(config, observations)
+    problem = InverseProblem(config.model, config.observable, observations, Prior(terms), fixed)
+    check_problem(problem)
+    return problem
+
+
 def data_files(plan: DataPlan) -> dict[str, Path]:
-    """Name of the data set (the file's stem, made unique by its folder) → file. Raises :class:`DataError`."""
+    """Name of the data set → file: the file's stem, made unique by its folders, then by a number.
+
+    Raises
+    ------
+    DataError: no file matches a pattern, or a file is named twice.
+    """
     paths: list[Path] = []
     for text in plan.paths:
         path = plan.base / Path(text).expanduser()
@@ -55,14 +77,27 @@ def data_files(plan: DataPlan) -> dict[str, Path]:
             if not found:
                 raise DataError(f"{path}: no file matches")
             paths += found
+        elif path.is_dir():
+            held = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+            if not held:
+                raise DataError(f"{path}: the folder holds no data file ({', '.join(SUFFIXES)})")
+            paths += held
         else:
             paths.append(path)
-    stems = Counter(p.stem for p in paths)
-    names = [p.stem if stems[p.stem] == 1 else f"{p.parent.name}_{p.stem}" for p in paths]
-    again = [name for name, count in Counter(names).items() if count > 1]
+    again = [path for path, count in Counter(os.path.abspath(p) for p in paths).items() if count > 1]
     if again:
-        raise DataError(f"data sets need different names, but {again[0]!r} occurs more than once")
-    return dict(zip(names, paths, strict=True))
+        raise DataError(f"{again[0]}: occurs more than once in data.path")
+    return dict(zip(_unique_names(paths), paths, strict=True))
+
+
+def _unique_names(paths: list[Path]) -> list[str]:
+    stems = Counter(p.stem for p in paths)
+    names: dict[str, None] = {}
+    for path in paths:
+        name = path.stem if stems[path.stem] == 1 else f"{path.parent.name}_{path.stem}"
+        same = itertools.chain([name], (f"{name}_{i}" for i in itertools.count(2)))
+        names[next(n for n in same if n not in names)] = None
+    return list(names)
 
 
 def read_observations(plan: DataPlan, path: Path, name: str, weights: str = "sum") -> Observations:
@@ -129,11 +164,3 @@ def _maximum(entry: Uncertain, config: Config, observations: Observations | None
     if observations is None or not entry.needs_data:
         return None
     return convert(float(observations.values.max()), config.observable.unit, entry.parameter.unit)
-
-
-def _problem(config: Config, plan: DataPlan, path: Path, name: str) -> InverseProblem:
-    observations = read_observations(plan, path, name, config.weights)
-    terms, fixed = resolve_parameters(config, observations)
-    problem = InverseProblem(config.model, config.observable, observations, Prior(terms), fixed)
-    check_problem(problem)
-    return problem

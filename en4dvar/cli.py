@@ -137,6 +137,8 @@ def run(
     from en4dvar.config import TwinConfig
 
     if isinstance(loaded, TwinConfig):
+        if resume or scheduler:
+            raise click.UsageError("a twin experiment takes neither --resume nor --scheduler")
         _run_twin(loaded, force)
         return
     from en4dvar.build import data_files, inverse_plan
@@ -274,7 +276,9 @@ def _simulate_campaign(config: str, settings: tuple[str, ...], out: Path | None,
     sets = draw_campaign(plan)
     truth = write_campaign(plan, sets, shlex.join(["en4dvar", *sys.argv[1:]]), force)
     fits = [s.nrmse for s in sets]
-    click.echo(f"{len(sets)} synthetic data sets, NRMSE of the truth {min(fits):.3f} to {max(fits):.3f}; truth: {truth}")
+    click.echo(
+        f"{len(sets)} synthetic data sets, NRMSE of the truth {min(fits):.3f} to {max(fits):.3f}; truth: {truth}"
+    )
 
 
 @main.command()

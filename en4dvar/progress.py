@@ -27,9 +27,9 @@ def describe(name: str, record: IterationRecord) -> str:
 class RunLog:
     """``run.log``: time and message, written line by line so that a killed run leaves what it knew."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, append: bool = False):
         try:
-            self._file = path.open("w", encoding="utf-8", buffering=1)
+            self._file = path.open("a" if append else "w", encoding="utf-8", buffering=1)
         except OSError as error:
             raise OutputError(f"{path}: cannot be written: {error.strerror}") from None
 

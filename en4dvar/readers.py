@@ -21,6 +21,7 @@ from en4dvar.state import Array
 from en4dvar.units import convert
 
 Format = Literal["csv", "mat"]
+SUFFIXES: Mapping[str, Format] = {".csv": "csv", ".txt": "csv", ".dat": "csv", ".tsv": "csv", ".mat": "mat"}
 COMMENT = ("#", "%", "//")
 BLANK = ("", "nan", "na", "n/a", "-")
 
@@ -56,9 +57,7 @@ def read_series(path: Path, time: Column | Step, value: Column, format: Format |
     """Read one data set. ``format`` defaults to the one of the suffix. Raises :class:`DataError`."""
     if not path.is_file():
         raise DataError(f"{path}: is a directory" if path.is_dir() else no_such_file(path))
-    kind = format or {".csv": "csv", ".txt": "csv", ".dat": "csv", ".tsv": "csv", ".mat": "mat"}.get(
-        path.suffix.lower()
-    )
+    kind = format or SUFFIXES.get(path.suffix.lower())
     if kind is None:
         raise DataError(f"{path}: the format cannot be told from the suffix {path.suffix!r}; write format: csv or mat")
     wanted = [c.name for c in (value, time if isinstance(time, Column) else None) if c is not None]

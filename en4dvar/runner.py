@@ -1,24 +1,29 @@
-"""The straight line: configuration → inverse problems → analyses → netCDF → report."""
+"""The straight line: configuration → inverse problems → analyses → netCDF → report. Resumable at any moment."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from en4dvar.assimilate import assimilate
-from en4dvar.build import build
+from en4dvar.build import build_one, data_files, inverse_plan
+from en4dvar.campaign import Campaign
+from en4dvar.campaign_file import save_campaign
+from en4dvar.checkpoint import FOLDER, CheckpointError, read_checkpoint, write_checkpoint
 from en4dvar.config import Config, load_config
-from en4dvar.errors import ConfigError
-from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, ThreadsExecutor, make_executor
+from en4dvar.errors import ConfigError, DataError, Fault, OutputError
+from en4dvar.executor import ExecutorError, choose_executor, one_blas_thread
 from en4dvar.files import write_text
-from en4dvar.problem import InverseProblem, IterationRecord
-from en4dvar.progress import Progress, RunLog, describe
+from en4dvar.fingerprint import Identity, identity
+from en4dvar.interrupt import Interrupted, terminate_as_interrupt
+from en4dvar.progress import Progress, RunLog
 from en4dvar.provenance import provenance
-from en4dvar.report import write_report
-from en4dvar.rundir import RunDirectory
-from en4dvar.store import Result, save
+from en4dvar.report import summary_csv, write_report
+from en4dvar.rundir import Mode, RunDirectory
+from en4dvar.store import Result
+from en4dvar.worklist import Dataset, Done, Worklist, datasets
+
+IDENTITY = f"{FOLDER}/run"
 
 
 def run(
@@ -26,6 +31,7 @@ def run(
     *,
     overrides: Mapping[str, Any] | None = None,
     force: bool = False,
+    resume: bool = False,
     progress: Progress | None = None,
     command: str = "",
 ) -> Result:
@@ -35,19 +41,22 @@ def run(
     ----------
     config: a loaded configuration, or the path of a YAML file.
     overrides: of dotted keys, when ``config`` is a path; e.g. ``{"data.path": "/data/gel.csv"}``.
-    force: replace the files of an earlier run in the same directory.
+    force: replace the files of an earlier run in the same directory, once this run is complete.
+    resume: continue an interrupted run in the same directory, to the same bits.
     progress: called with the data set's name and the record of each iteration.
     command: what the user typed, for the file's history.
 
     Raises
     ------
-    ConfigError, DataError, OutputError: before anything is computed. TooFewMembersError: the ensemble is lost.
+    ConfigError, DataError, OutputError: before anything is computed; also where a changed run cannot be resumed.
+    TooFewMembersError: the ensemble is lost. ExecutorError: the workers are gone. Interrupted: Ctrl-C or SIGTERM.
     """
     config = _loaded(config, overrides)
-    problems = build(config)
-    if len(problems) != 1:
-        raise ConfigError(f"data.path names {len(problems)} data sets; use run_campaign, or name one")
-    return execute(config, problems, force=force, progress=progress, command=command)[0]
+    found = len(data_files(inverse_plan(config)))
+    if found != 1:
+        raise ConfigError(f"data.path names {found} data sets; use run_campaign, or name one")
+    (result,) = execute(config, force=force, resume=resume, progress=progress, command=command)
+    return result
 
 
 def run_campaign(
@@ -55,80 +64,150 @@ def run_campaign(
     *,
     overrides: Mapping[str, Any] | None = None,
     force: bool = False,
+    resume: bool = False,
     progress: Progress | None = None,
     command: str = "",
-) -> tuple[Result, ...]:
-    """As :func:`run`, for any number of data sets, each estimated by itself; results in the order of the data."""
+) -> Campaign:
+    """As :func:`run`, for any number of data sets, each estimated by itself.
+
+    A data set that cannot be read or loses its ensemble does not end the campaign: it is named with its reason in
+    ``Campaign.failures``, in ``summary.csv`` and in the log.
+    """
     config = _loaded(config, overrides)
-    return execute(config, build(config), force=force, progress=progress, command=command)
+    return execute(config, force=force, resume=resume, progress=progress, command=command)
 
 
 def execute(
     config: Config,
-    problems: tuple[InverseProblem, ...],
     *,
     force: bool = False,
+    resume: bool = False,
     progress: Progress | None = None,
     command: str = "",
-) -> tuple[Result, ...]:
-    """Assimilate ``problems`` and write the run directory of ``config``."""
-    directory = RunDirectory.create(config.directory, force)
-    with RunLog(directory.claim("run.log")) as log, _executor(config) as executor:
-        write_text(directory.claim("config.yaml"), config.text)
-        write_text(directory.claim("config.resolved.yaml"), config.resolved)
+) -> Campaign:
+    """Assimilate the data sets of ``config`` and write its run directory; arguments and errors as in :func:`run`."""
+    if force and resume:
+        raise ConfigError("force replaces a run, resume continues it; give one of them")
+    files = data_files(inverse_plan(config))
+    _require_one_usable(config, files)
+    execution = config.execution
+    mode: Mode = "force" if force else "resume" if resume else "new"
+    with (
+        one_blas_thread(),
+        terminate_as_interrupt(),
+        choose_executor(config.model, execution.executor, execution.workers, execution.address) as executor,
+        RunDirectory.open(config.directory, mode) as directory,
+    ):
         attributes = {
             **provenance(config.text, config.document.file, command),
             "configuration_resolved": config.resolved,
         }
-        log.write(attributes["history"])
+        with RunLog(directory.work / "run.log", append=resume) as log:
+            log.write(attributes["history"])
+            work = Worklist(
+                config, identity(config.resolved, config.model, files), datasets(files), directory, log, attributes,
+                progress,
+            )  # fmt: skip
+            try:
+                _prepare(work, resume)
+                work.work(executor)
+                _finish(work)
+            except (KeyboardInterrupt, ExecutorError) as error:
+                work.stop.set()
+                executor.kill()
+                kept = f"{len(work.ended)} of {len(work.sets)} data sets are done and kept in {directory.path}"
+                log.write(f"interrupted; {kept}")
+                if isinstance(error, ExecutorError):
+                    raise ExecutorError(f"{error}; {kept}; give --resume to continue") from error
+                raise Interrupted(f"interrupted; {kept}") from None
+            log.write("done")
+        directory.publish()
+        return Campaign(directory.path, work.outcomes(), tuple(work.notices))
 
-        def tell(name: str, record: IterationRecord) -> None:
-            log.write(describe(name, record))
-            if progress is not None:
-                progress(name, record)
 
-        results = []
-        for problem in problems:
-            analysis = assimilate(problem, config.assimilation, config.seed, executor, tell)
-            outcome = "converged" if analysis.converged else "not converged"
-            log.write(f"{analysis.name}: {outcome}: {analysis.stop_reason}; {analysis.forward_runs} forward runs")
-            log.write("\n".join(f"{analysis.name}: warning: {warning}" for warning in analysis.warnings))
-            result = Result.from_analysis(analysis, attributes)
-            save(result, _place(directory, analysis.name, len(problems)))
-            results.append(result)
-        report(directory)
-        log.write("done")
-    return tuple(results)
+def report(path: str | Path) -> Path:
+    """Write (again) the report of a run from its netCDF. Raises :class:`OutputError`."""
+    with RunDirectory.open(path, "report") as directory:
+        return _report(directory)
 
 
-def report(directory: RunDirectory) -> Path:
-    """Write (again) the report of a run from its netCDF, and list the files as the run's own."""
+def _require_one_usable(config: Config, files: Mapping[str, Path]) -> None:
+    """Raise what is wrong with the data files where none of them can be used, before anything is written."""
+    faults: list[Fault] = []
+    unusable: list[DataError] = []
+    for name, path in files.items():
+        try:
+            build_one(config, name, path)
+        except ConfigError as error:
+            faults += error.problems
+        except DataError as error:
+            unusable.append(error)
+        else:
+            return
+    if faults:
+        raise ConfigError(list(dict.fromkeys(faults)))
+    raise DataError("\n".join(map(str, unusable)))
+
+
+def _prepare(work: Worklist, resume: bool) -> None:
+    """Write what the run is, or check that it is the one to be resumed."""
+    directory, config = work.directory, work.config
+    for folder in (FOLDER, *(["datasets"] if len(work.sets) > 1 else [])):
+        directory.folder(folder)
+    earlier = read_checkpoint(directory.work / IDENTITY, "run", Identity) if resume else None
+    if earlier is not None:
+        failed = {d.name: d for d in work.sets if _has_failed(work, d, earlier)}
+        difference = work.identity.difference(earlier, frozenset(failed))
+        if difference:
+            raise OutputError(
+                f"{directory.path}: the run cannot be resumed to the same result, for this has changed:\n{difference}\n"
+                "give --force to estimate everything again, or another --out"
+            )
+        for d in failed.values():  # tried again, on what the data file holds now
+            (directory.work / d.done).unlink()
+    directory.claim(
+        "run.log", "config.yaml", "config.resolved.yaml", "posterior.nc", IDENTITY,
+        *(name for d in work.sets for name in (d.file, d.iteration, d.done)),
+    )  # fmt: skip
+    write_text(directory.work / "config.yaml", config.text)
+    write_text(directory.work / "config.resolved.yaml", config.resolved)
+    write_checkpoint(directory.work / IDENTITY, "run", work.identity)
+    if earlier is not None:
+        work.recall()
+        work.log.write(f"resumed: {len(work.ended)} of {len(work.sets)} data sets are done")
+
+
+def _has_failed(work: Worklist, d: Dataset, earlier: Identity) -> bool:
+    if d.name not in dict(earlier.data):
+        return False
+    try:
+        record = read_checkpoint(work.directory.work / d.done, earlier.of_dataset(d.name), Done)
+    except CheckpointError:
+        return False
+    return record is not None and bool(record.failure)
+
+
+def _finish(work: Worklist) -> None:
+    """The campaign's file and the report."""
+    directory = work.directory
+    good = {d.name: directory.work / d.file for d in work.sets if not work.ended[d.name].failure}
+    failures = {name: record.failure for name, record in work.ended.items() if record.failure}
+    if good and len(work.sets) > 1:
+        longest = max(work.ended[name].n_observations for name in good)
+        save_campaign(directory.work / "posterior.nc", good, longest, work.attributes, failures)
+    if good:
+        _report(directory)
+    else:
+        write_text(directory.claim("summary.csv"), summary_csv((), failures))
+
+
+def _report(directory: RunDirectory) -> Path:
     directory.claim("report.html", "summary.csv")
     before = directory.listing("figures")
     try:
-        return write_report(directory.path)
+        return write_report(directory.work)
     finally:
         directory.claim_folder("figures", before)
-
-
-def _place(directory: RunDirectory, name: str, n_datasets: int) -> Path:
-    if n_datasets == 1:
-        return directory.claim("posterior.nc")
-    directory.folder("datasets")
-    return directory.claim(f"datasets/{name}.nc")
-
-
-def _executor(config: Config) -> Executor:
-    """As configured; by default threads on every core for compiled models, else this process alone."""
-    kind, workers = config.execution.executor, config.execution.workers
-    if kind == "serial":
-        return SerialExecutor()
-    if workers is None:
-        workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        workers = workers if kind or config.model.compiled else 1
-    if kind is None:
-        return make_executor(config.model, workers)
-    return ThreadsExecutor(workers) if kind == "threads" else ProcessesExecutor(workers)
 
 
 def _loaded(config: Config | str | Path, overrides: Mapping[str, Any] | None) -> Config:

@@ -1,5 +1,8 @@
 """Where work runs: in this process, in threads, in processes, on a dask cluster. The numbers do not depend on it."""
 
+import os
+from typing import Literal
+
 from en4dvar.executor.base import Executor, ExecutorError, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread
 from en4dvar.executor.chunks import Outcome, cut, describe, run_chunk
@@ -14,6 +17,7 @@ __all__ = [
     "SerialExecutor",
     "ThreadsExecutor",
     "WorkerLostError",
+    "choose_executor",
     "cut",
     "describe",
     "make_executor",
@@ -27,3 +31,30 @@ def make_executor(model: ForwardModel, workers: int = 1) -> Executor:
     if workers == 1:
         return SerialExecutor()
     return ThreadsExecutor(workers) if model.compiled else ProcessesExecutor(workers)
+
+
+def choose_executor(
+    model: ForwardModel,
+    kind: Literal["serial", "threads", "processes", "dask"] | None = None,
+    workers: int | None = None,
+    address: str | None = None,
+) -> Executor:
+    """As asked for; by default threads on every core for compiled models, else this process alone.
+
+    Raises
+    ------
+    ExecutorError: the dask cluster at ``address`` cannot be reached, or dask is not installed.
+    """
+    if kind == "serial":
+        return SerialExecutor()
+    if workers is None and address is None:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        workers = cores if kind or model.compiled else 1
+    if kind == "dask" or address is not None:
+        from en4dvar.executor.dask import DaskExecutor
+
+        return DaskExecutor(workers, address)
+    workers = workers or 1
+    if kind is None:
+        return make_executor(model, workers)
+    return ThreadsExecutor(workers) if kind == "threads" else ProcessesExecutor(workers)

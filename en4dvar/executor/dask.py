@@ -74,7 +74,7 @@ class DaskExecutor(Executor):
 
     def map(self, function: Callable[..., T], calls: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, T | Exception]]:
         ended: queue.SimpleQueue[Future] = queue.SimpleQueue()
-        pending: dict[str, tuple[int, tuple[Any, ...], Future]] = {}
+        pending: dict[Any, tuple[int, tuple[Any, ...], Future]] = {}
         following = enumerate(calls)
 
         def submit(i: int, call: tuple[Any, ...]) -> None:

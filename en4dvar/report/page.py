@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -162,8 +162,11 @@ def make_section(result: Result, anchor: str, figures: Sequence[tuple[str, str, 
     return Section(anchor, result, [draw(*figure) for figure in figures])
 
 
-def render(sections: Sequence[Section]) -> str:
-    """The page as one HTML text. Everything that comes from data or configuration is escaped."""
+def render(sections: Sequence[Section], failures: Mapping[str, str], left_out: int) -> str:
+    """The page as one HTML text. Everything that comes from data or configuration is escaped.
+
+    ``failures``: name of a data set without a posterior → reason; ``left_out``: data sets that have no section.
+    """
     environment = Environment(
         loader=PackageLoader("en4dvar.report", "."),
         autoescape=True,
@@ -172,8 +175,10 @@ def render(sections: Sequence[Section]) -> str:
         lstrip_blocks=True,
     )
     return environment.get_template("template.html.j2").render(
-        title=sections[0].name if len(sections) == 1 else f"{len(sections)} data sets",
+        title=sections[0].name if len(sections) == 1 else f"{len(sections) + left_out} data sets",
         sections=sections,
+        failures=failures,
+        left_out=left_out,
         light=Markup(css_variables(LIGHT)),
         dark=Markup(css_variables(DARK)),
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from click.testing import CliRunner, Result
 from toy_config import YAML, csv_text, write_toy
 
@@ -73,7 +74,9 @@ def test_campaign(tmp_path: Path) -> None:
     assert [r.name for r in results] == ["set1", "set2"]
     means = [r.summary()[1].mean for r in results]
     assert means == pytest.approx([1.75, 2.0], rel=0.02)
-    assert not (tmp_path / "run" / "posterior.nc").exists()
+    with xr.open_datatree(tmp_path / "run" / "posterior.nc") as tree:
+        assert tree["posterior"]["k"].sizes == {"dataset": 2, "chain": 1, "draw": 8}
+        assert tree["posterior"]["k"].mean(("chain", "draw")).values == pytest.approx(means, rel=1e-12)
 
 
 def test_report_again(tmp_path: Path) -> None:
@@ -166,7 +169,7 @@ BAD: dict[str, tuple[Callable[[Path], list[str | Path]], str]] = {
     "few observations": (with_data(HEAD + "0,1\n1,1\n"), "toy.csv: 2 usable observations; at least 3"),
     "unknown law": (replaced("mass: 2 g", "law: cubik"), "toy.yaml:11:8: model.law: 'cubik' is not one of"),
     "no prior": (replaced("  A: {prior: normal, mean: maximum, std: 1 %}\n", ""), "toy.yaml:12:1: parameters.A: "),
-    "not empty": (full_directory, "out: not empty; give --force"),
+    "not empty": (full_directory, "out: not empty; give --resume to continue its run, --force to"),
     "unwritable": (lambda f: ["run", write_toy(f), "--out", f / "toy.csv" / "out"], "cannot be used as run directory"),
     "a file as directory": (lambda f: ["run", write_toy(f), "--out", f / "toy.csv"], "cannot be used as run directory"),
     "bad --set": (lambda f: ["run", write_toy(f), "--set", "members"], "'members' is not KEY=VALUE"),
@@ -198,9 +201,18 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("en4dvar.runner.assimilate", interrupt)
-    outcome = call("run", write_toy(tmp_path), "--out", tmp_path / "out")
-    assert (outcome.exit_code, outcome.stderr) == (130, "interrupted\n")
+    path, out = write_toy(tmp_path), tmp_path / "out"
+    monkeypatch.setattr("en4dvar.jobs.assimilate", interrupt)
+    monkeypatch.setattr("sys.argv", ["en4dvar", "run", str(path), "--out", str(out), "--force"])
+    outcome = call("run", path, "--out", out)
+    assert outcome.exit_code == 130
+    assert outcome.stderr.splitlines() == [
+        f"interrupted; 0 of 1 data sets are done and kept in {out}",
+        f"to continue: en4dvar run {path} --out {out} --resume",
+    ]
+    monkeypatch.undo()
+    assert call("run", path, "--out", out, "--resume").exit_code == 0
+    assert "resumed: 0 of 1 data sets are done" in (out / "run.log").read_text()
 
 
 def test_force_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None:
@@ -212,7 +224,7 @@ def test_force_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None
     outcome = call("run", path, "--out", out, "--force", "--data", tmp_path / "*.csv")
     assert outcome.exit_code == 0, outcome.output
     assert (out / "notes.txt").read_text() == (out / "figures" / "mine.png").read_text() == "mine"
-    assert not (out / "posterior.nc").exists()
+    assert (out / "datasets" / "other.nc").exists()
     assert not (out / "figures" / "posterior.png").exists()
     assert call("run", path, "--out", out, "--force").exit_code == 0
     assert not (out / "datasets").exists()

@@ -1,0 +1,99 @@
+"""One data set as a unit of work: what a worker gets, what it does, what it hands back."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from en4dvar.assimilate import LoopState, assimilate
+from en4dvar.checkpoint import write_checkpoint
+from en4dvar.executor import Executor
+from en4dvar.netcdf import to_bytes
+from en4dvar.problem import AssimilationSettings, InverseProblem, IterationRecord
+from en4dvar.progress import Progress, describe
+from en4dvar.store import Result
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that the estimate of one data set needs; picklable, so that it can be made anywhere.
+
+    ``attributes`` go into the file. ``checkpoint`` is where the state of the iterations is kept, at most every
+    ``checkpoint_every`` seconds; a worker that does not see that folder keeps none. ``resume`` is where to start.
+    ``stop`` gives the job up after the iteration under way (within one process only).
+    """
+
+    problem: InverseProblem
+    settings: AssimilationSettings
+    seed: int
+    attributes: Mapping[str, Any]
+    fingerprint: str = ""
+    checkpoint: Path | None = None
+    checkpoint_every: float = 0.0
+    resume: LoopState | None = None
+    stop: threading.Event | None = None
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """``content`` is the netCDF file; ``log`` what the iterations had to tell; ``last`` the last of them."""
+
+    content: bytes
+    log: tuple[str, ...]
+    last: IterationRecord
+    summary: str
+    warnings: tuple[str, ...]
+    n_observations: int
+
+
+class StoppedError(Exception):
+    """The job was given up."""
+
+
+def estimate(job: Job, executor: Executor | None = None, progress: Progress | None = None) -> Estimate:
+    """Assimilate one data set; members run on ``executor``, by default in this process.
+
+    Raises
+    ------
+    TooFewMembersError: the ensemble is lost. OutputError: a checkpoint cannot be written.
+    """
+    log: list[str] = []
+
+    def tell(name: str, record: IterationRecord) -> None:
+        log.append(describe(name, record))
+        if progress is not None:
+            progress(name, record)
+
+    analysis = assimilate(
+        job.problem, job.settings, job.seed, executor, tell, job.resume, on_iteration=_checkpoints(job)
+    )
+    outcome = "converged" if analysis.converged else "not converged"
+    return Estimate(
+        content=to_bytes(Result.from_analysis(analysis, job.attributes).tree),
+        log=tuple(log),
+        last=analysis.iterations[-1],
+        summary=f"{outcome}: {analysis.stop_reason}; {analysis.forward_runs} forward runs",
+        warnings=analysis.warnings,
+        n_observations=len(analysis.observations),
+    )
+
+
+def _checkpoints(job: Job) -> Callable[[LoopState], None]:
+    path = job.checkpoint if job.checkpoint is not None and job.checkpoint.parent.is_dir() else None
+    written = time.monotonic()
+
+    def keep(state: LoopState) -> None:
+        nonlocal written
+        if job.stop is not None and job.stop.is_set():
+            raise StoppedError
+        if path is not None and time.monotonic() - written >= job.checkpoint_every:
+            # Not flushed: the file is complete whenever the process is killed, and where the power goes instead,
+            # its checksum tells.
+            write_checkpoint(path, job.fingerprint, state, durable=False)
+            written = time.monotonic()
+
+    return keep
