@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from en4dvar.errors import ConfigError
+from en4dvar.state import Array
 from en4dvar_bubble.driving import Driving, Reading, histotripsy, silence
 from en4dvar_bubble.laws import ConstitutiveLaw, get_law
-from en4dvar_bubble.medium import WATER_25C, Medium
+from en4dvar_bubble.medium import UNITS, WATER_25C, Medium
 from en4dvar_bubble.model import BubbleModel, Gas, Heat, Start, Vapour
 from en4dvar_bubble.packing import conduction_slope, from_kirchhoff
-from en4dvar_bubble.paths import Paths
 from en4dvar_bubble.solver.driver import ACCURACIES, Accuracy, AccuracyName, Radial
+from en4dvar_bubble.solver.integrate import MAX_MACH, MAX_THETA, RECORD, STEPS
+from en4dvar_bubble.solver.lanes import WIDTH
 
 if TYPE_CHECKING:
     import xarray as xr
 
 _CHUNK = 64
+_FIELDS = {
+    "R": ("m", "bubble radius"),
+    "Rdot": ("m s-1", "bubble wall velocity"),
+    "p_b": ("Pa", "pressure in the bubble"),
+}
 
 
 def simulate(
@@ -45,99 +54,136 @@ def simulate(
     Parameters
     ----------
     law: name of a constitutive law (``en4dvar laws``), or an instance.
-    parameters: SI values, name → number or (member,). The law's (``G``, ``alpha``, ``mu``), with ``R0`` for the
-    acoustic start,
-        ``R_max`` and ``R_eq`` (or ``R0``, the same there) for the laser start.
+    parameters: SI values, name → number or (member,): the law's (``G``, ``alpha``, ``mu``, …), with ``R0`` for the
+        acoustic start, ``R_max`` and ``R_eq`` (or ``R0``, the same there) for the laser start.
     times: output times (time,) in s, increasing; time zero is the start of the simulation (laser: the instant of
-    R_max). start, gas, driving, driving_read, medium, radial, vapour, medium_heat, accuracy: the model (see
-    :class:`BubbleModel`); defaults are the acoustic start with the histotripsy pulse
-        and the constants of water at 25 °C, p_f read at t, heat equation in the gas with a cold wall.
+        R_max).
+    start, gas, driving, driving_read, medium, radial, vapour, medium_heat, accuracy: the model, see
+        :class:`BubbleModel`; by default the acoustic start with the histotripsy pulse and the constants of water at
+        25 °C, p_f read at t, heat equation in the gas with a cold wall.
     workers: threads; the result does not depend on it.
 
     Returns
     -------
     Dataset with ``R`` (m), ``Rdot`` (m/s), ``p_b`` (Pa) on (member, time), NaN where a member failed; per member
     ``status`` (0 is ok), ``reason``, ``steps``, ``max_wall_mach`` and, with the heat equation, ``max_temperature``
-    (K, innermost node); the parameters as coordinates.
+    (K, innermost node); the parameters as coordinates; the model and its constants, with unit and source (JSON), as
+    attributes. Beyond the result itself it takes a few MB, whatever the number of members.
 
     Raises
     ------
-    ConfigError: unknown law, missing or unknown parameters, lengths that differ, times that do not increase.
+    ConfigError: unknown law, a model that contradicts itself, missing or unknown parameters, lengths that differ,
+        times that do not increase, fewer than one worker.
     """
-    import xarray as xr
-
+    if workers < 1:
+        raise ConfigError(f"workers: at least 1, not {workers}")
     chosen = get_law(law) if isinstance(law, str) else law
-    model = BubbleModel(
-        law=chosen,
-        gas=gas,
-        start=start,
-        driving=driving or (histotripsy() if start == "acoustic" else silence()),
-        reading=driving_read,
-        medium=medium,
-        radial=radial,
-        vapour=vapour,
-        medium_heat=medium_heat,
-        accuracy=ACCURACIES[accuracy] if isinstance(accuracy, str) else accuracy,
-    )
+    try:
+        model = BubbleModel(
+            law=chosen,
+            gas=gas,
+            start=start,
+            driving=driving or (histotripsy() if start == "acoustic" else silence()),
+            reading=driving_read,
+            medium=medium,
+            radial=radial,
+            vapour=vapour,
+            medium_heat=medium_heat,
+            accuracy=ACCURACIES[accuracy] if isinstance(accuracy, str) else accuracy,
+        )
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
     theta = _members(model, dict(parameters or {}))
-    t = np.atleast_1d(np.asarray([] if times is None else times, dtype=float))
+    t = np.asarray([] if times is None else times, dtype=float)
     if t.ndim != 1 or len(t) == 0 or not np.all(np.isfinite(t)) or np.any(np.diff(t) <= 0):
         raise ConfigError("times: give a one-dimensional, increasing sequence of seconds")
     try:
         x = model.initial_states(theta)
     except ValueError as error:
         raise ConfigError(f"parameters: {error}") from error
+    return _dataset(model, theta, t, _run(model, x, t, workers))
 
-    chunks = [x[i : i + _CHUNK] for i in range(0, len(x), _CHUNK)]
 
-    def run(chunk: npt.NDArray[np.float64]) -> Paths:
-        return model.integrate(chunk, np.broadcast_to(t, (len(chunk), len(t))))
+@dataclass(frozen=True)
+class _Output:
+    """What is kept of N members at K times: fields name → (N, K); status (N,), reasons (N,), record (N, …)."""
 
-    if workers > 1:
-        with ThreadPoolExecutor(workers) as pool:
-            paths = list(pool.map(run, chunks))
+    fields: dict[str, Array]
+    status: Array
+    reasons: Array
+    record: Array
+
+
+def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> _Output:
+    """Integrate chunk by chunk; a chunk writes its rows and is forgotten (law tables alone are 32 kB per member)."""
+    n = len(x)
+    out = _Output(
+        {name: np.empty((n, len(t))) for name in _FIELDS},
+        np.empty(n, dtype=np.int64),
+        np.empty(n, dtype=object),
+        np.empty((n, RECORD)),
+    )
+    share = -(-n // (workers * WIDTH)) * WIDTH
+    chunk = min(_CHUNK, max(WIDTH, share))
+
+    def run(begin: int) -> None:
+        rows = slice(begin, min(begin + chunk, n))
+        paths = model.integrate(x[rows], np.broadcast_to(t, (rows.stop - rows.start, len(t))))
+        solution = paths.solution
+        failed = solution.status != 0
+        for name, values in out.fields.items():
+            values[rows] = paths[name]
+            values[rows][failed] = np.nan
+        out.status[rows], out.record[rows] = solution.status, solution.record
+        out.reasons[rows] = [solution.reason(i) for i in range(len(failed))]
+
+    if workers == 1:
+        for begin in range(0, n, chunk):
+            run(begin)
     else:
-        paths = [run(chunk) for chunk in chunks]
+        with ThreadPoolExecutor(workers) as pool:
+            for _ in pool.map(run, range(0, n, chunk)):
+                pass
+    return out
 
-    status = np.concatenate([p.solution.status for p in paths])
-    record = np.concatenate([p.solution.record for p in paths])
-    failed = status[:, None] != 0
-    fields = {
-        name: (
-            ("member", "time"),
-            np.where(failed, np.nan, np.concatenate([p[name] for p in paths])),
-            {"units": unit, "long_name": text},
-        )
-        for name, unit, text in (
-            ("R", "m", "bubble radius"),
-            ("Rdot", "m s-1", "bubble wall velocity"),
-            ("p_b", "Pa", "pressure in the bubble"),
-        )
+
+def _dataset(model: BubbleModel, theta: Mapping[str, Array], t: Array, out: _Output) -> xr.Dataset:
+    import xarray as xr
+
+    medium, record = model.medium, out.record
+    member = "member"
+    data: dict[str, Any] = {
+        name: ((member, "time"), out.fields[name], {"units": unit, "long_name": text})
+        for name, (unit, text) in _FIELDS.items()
     }
-    reasons = [p.solution.reason(i) for p in paths for i in range(len(p.solution.status))]
-    data = {
-        **fields,
-        "status": ("member", status, {"long_name": "0 where the member was integrated to the end"}),
-        "reason": ("member", np.array(reasons, dtype=object), {"long_name": "why the member failed"}),
-        "steps": ("member", record[:, 0].astype(int), {"long_name": "accepted time steps"}),
-        "max_wall_mach": ("member", record[:, 2], {"units": "1", "long_name": "largest wall Mach number"}),
-    }
+    data["status"] = (member, out.status, {"long_name": "0 where the member was integrated to the end"})
+    data["reason"] = (member, out.reasons, {"long_name": "why the member failed"})
+    data["steps"] = (member, record[:, STEPS].astype(int), {"long_name": "accepted time steps"})
+    data["max_wall_mach"] = (member, record[:, MAX_MACH], {"units": "1", "long_name": "largest wall Mach number"})
     if model.system.gas:
-        hottest = medium.T_inf * from_kirchhoff(record[:, 3], conduction_slope(medium))
-        data["max_temperature"] = (
-            "member",
-            hottest,
-            {"units": "K", "long_name": "highest temperature near the centre"},
-        )
-    coordinates = {"time": ("time", t, {"units": "s", "long_name": "time"})} | {
-        p.name: ("member", theta[p.name], {"units": p.unit, "long_name": p.label}) for p in model.parameters
+        hottest = medium.T_inf * from_kirchhoff(record[:, MAX_THETA], conduction_slope(medium))
+        data["max_temperature"] = (member, hottest, {"units": "K", "long_name": "highest temperature near the centre"})
+    coordinates: dict[str, Any] = {"time": ("time", t, {"units": "s", "long_name": "time"})}
+    for p in model.parameters:
+        coordinates[p.name] = (member, theta[p.name], {"units": p.unit, "long_name": p.label})
+    constants = {
+        name: {"value": value, "unit": UNITS[name], "source": medium.sources.get(name, "")}
+        for name, value in medium.constants.items()
     }
-    attributes = {"law": chosen.name, "start": start, "gas": gas, "driving_read": driving_read, "radial": radial}
-    attributes |= {"vapour": vapour, "medium_heat": medium_heat}
+    attributes = {
+        "law": model.law.name,
+        "start": model.start,
+        "gas": model.gas,
+        "driving_read": model.reading,
+        "radial": model.radial,
+        "vapour": model.vapour,
+        "medium_heat": model.medium_heat,
+        "constants": json.dumps(constants, ensure_ascii=False),
+    }
     return xr.Dataset(data, coords=coordinates, attrs=attributes)
 
 
-def _members(model: BubbleModel, given: dict[str, npt.ArrayLike]) -> dict[str, npt.NDArray[np.float64]]:
+def _members(model: BubbleModel, given: dict[str, npt.ArrayLike]) -> dict[str, Array]:
     """Parameters as arrays of one length. Raises :class:`ConfigError`."""
     if model.start == "laser" and "R0" in given and "R_eq" not in given:
         given["R_eq"] = given.pop("R0")

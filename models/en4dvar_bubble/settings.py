@@ -11,7 +11,7 @@ from en4dvar.errors import ConfigError
 from en4dvar.hints import suggest
 from en4dvar.units import Quantity, parse_quantity
 from en4dvar_bubble.driving import Reading
-from en4dvar_bubble.driving.settings import DrivingSettings, Histotripsy, NoDriving, with_kind
+from en4dvar_bubble.driving.settings import DrivingSettings, Histotripsy, with_kind
 from en4dvar_bubble.laws import ConstitutiveLaw, get_law
 from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.medium import CONSTANT_SETS, UNITS, WATER_25C, Medium, saturated_vapour_pressure
@@ -114,13 +114,6 @@ class BubbleSettings(_Section):
         if isinstance(value, dict):
             default = {"kind": "none" if value.get("start") == "laser" else "histotripsy"}
             return {**value, "driving": with_kind(value.get("driving", default))}
-        return value
-
-    @field_validator("driving")
-    @classmethod
-    def _laser_is_not_driven(cls, value: DrivingSettings, info: ValidationInfo) -> DrivingSettings:
-        if info.data.get("start") == "laser" and not isinstance(value, NoDriving):
-            raise ValueError("the laser start takes no driving; leave it out or write driving: none")
         return value
 
     @field_validator("law")

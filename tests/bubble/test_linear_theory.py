@@ -96,7 +96,7 @@ def test_frequency_and_damping(name):
     expected = eigenvalue(medium=medium, **case)
     found = simulated_rate(medium=medium, expected=expected, **case)
     assert found.imag == pytest.approx(expected.imag, rel=1e-4)
-    assert found.real == pytest.approx(expected.real, rel=1e-3)
+    assert found.real == pytest.approx(expected.real, rel=1e-4)
 
 
 def test_every_mechanism_matters_here():

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
 import en4dvar_bubble
 from en4dvar.errors import ConfigError
+from en4dvar_bubble.medium import UNITS, WATER_25C
 
 GEL = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}
 TIMES = np.linspace(5e-6, 30e-6, 7)
@@ -18,6 +21,9 @@ def test_dataset_has_si_fields_with_units_and_the_parameters():
     assert {n: data[n].attrs["units"] for n in ("R", "Rdot", "p_b", "time", "G", "R0")} == {
         "R": "m", "Rdot": "m s-1", "p_b": "Pa", "time": "s", "G": "Pa", "R0": "m",
     }  # fmt: skip
+    constants = json.loads(data.attrs.pop("constants"))
+    assert constants["S"] == {"value": 0.072, "unit": "N/m", "source": WATER_25C.sources["S"]}
+    assert set(constants) == set(UNITS)
     assert data.attrs == {
         "law": "quadratic-kelvin-voigt", "start": "acoustic", "gas": "heat", "driving_read": "instantaneous",
         "radial": "keller-miksis", "vapour": "none", "medium_heat": "cold",
@@ -40,6 +46,10 @@ def test_velocity_is_the_derivative_of_the_radius():
         ({"parameters": {**GEL, "G": [1.0, 2.0], "mu": [1.0, 2.0, 3.0]}}, "lengths differ"),
         ({"parameters": {**GEL, "mu": -1.0}}, "mu must lie in"),
         ({"times": [2e-6, 1e-6]}, "increasing"),
+        ({"times": [[1e-6, 2e-6]]}, "one-dimensional"),
+        ({"times": 1e-6}, "one-dimensional"),
+        ({"workers": 0}, "at least 1, not 0"),
+        ({"gas": "polytropic", "vapour": "transport"}, "need gas: heat"),
         ({"law": "rubber"}, "unknown law 'rubber'"),
     ],
 )
