@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.signal import find_peaks
 
 from en4dvar.readers import Column, Format, read_series
 from en4dvar.state import Array
 from en4dvar_bubble.driving.base import Driving
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 _MOST_CELLS = 200_000
 _PROMINENCE = 0.02  # of the largest |p|: turning points that no time step may straddle
@@ -72,6 +74,9 @@ def tabulated(times: Array, pressure: Array, delay: float = 0.0, scale: float = 
         lead = span / inner
     if inner + 2 > _MOST_CELLS:
         raise ValueError(f"{inner + 2} cells for {len(t)} samples, more than {_MOST_CELLS}: resample the record evenly")
+    from scipy.interpolate import CubicSpline  # half a second at the start of every worker that needs neither
+    from scipy.signal import find_peaks
+
     peaks = np.concatenate([find_peaks(sign * p, prominence=_PROMINENCE * largest)[0] for sign in (1, -1)])
     shape = _Record(CubicSpline(t, p / largest), float(t[0]), float(t[-1]), float(lead))
     stops = (float(t[0]), *(float(t[i]) for i in peaks), float(t[-1]))
