@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar.errors import ConfigError
-from en4dvar_bubble import BubbleModel, get_law, simulate
+from en4dvar_bubble import REGISTRY, BubbleModel, NeoHookeanKelvinVoigt, get_law, simulate
 from en4dvar_bubble.laws import loading
 from en4dvar_bubble.settings import BubbleSettings
 
@@ -88,6 +88,13 @@ class TestFinding:
         assert "no_such_package" in str(found["broken"])
         with pytest.raises(ConfigError, match="did you mean 'installed'"):
             get_law("instaled")
+
+    def test_a_law_without_a_name_has_that_of_its_class_not_of_its_parent(self, tmp_path):
+        body = "class Mine(NeoHookeanKelvinVoigt):\n    pass\n"
+        assert get_law(write(tmp_path, body)).name == "Mine"
+        assert type("Local", (NeoHookeanKelvinVoigt,), {})().name == "Local"
+        assert not {"Mine", "Local"} & set(REGISTRY)
+        assert REGISTRY["neo-hookean-kelvin-voigt"] is NeoHookeanKelvinVoigt
 
     def test_an_edited_file_is_loaded_again(self, yeoh):
         first = get_law(f"{yeoh}:Yeoh")

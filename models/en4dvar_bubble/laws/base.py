@@ -46,7 +46,7 @@ Limits = tuple[tuple[type["ConstitutiveLaw"], Mapping[str, float]], ...]
 
 
 class ConstitutiveLaw:
-    """Base class of constitutive laws; a subclass with a ``name`` registers itself.
+    """Base class of constitutive laws; a subclass with a ``name`` of its own registers itself.
 
     The stress integral is J = 2 ∫_R^∞ (τ_rr − τ_θθ)/r dr = J_e(λ) − 4 μ̄(|V|) V + Σ s, with V = Ṙ/R, λ = R/R0.
 
@@ -72,7 +72,9 @@ class ConstitutiveLaw:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        if cls.name and not cls.__module__.startswith(FILE_MODULE):
+        own = cls.__dict__.get("name")
+        cls.name = own or cls.__name__
+        if own and not cls.__module__.startswith(FILE_MODULE):
             present = REGISTRY.get(cls.name, cls)
             if (present.__module__, present.__qualname__) != (cls.__module__, cls.__qualname__):
                 raise ConfigError(f"two laws are called {cls.name!r}: {present.__module__} and {cls.__module__}")

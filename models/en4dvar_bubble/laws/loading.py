@@ -85,7 +85,6 @@ def _from_file(path: Path, attribute: str) -> Any:
     found = _attribute(sys.modules[key], attribute, str(path))
     if isinstance(found, type) and issubclass(found, ConstitutiveLaw) and found.__module__ == key:
         found.reference = FileReference(str(path), attribute, digest)
-        found.name = found.name or found.__name__
     return found
 
 
