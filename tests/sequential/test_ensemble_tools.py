@@ -1,0 +1,154 @@
+"""Inflation, rotation, chunked update, localisation: what each must leave unchanged and what it must change."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from en4dvar.inflation import Inflation, relaxation
+from en4dvar.linalg import GRAM_LIMIT, Hessian, apply_weights, centre, rotate
+from en4dvar.localisation import Localisation, distances, gaspari_cohn
+from en4dvar.schemes import Evaluation, Weights, gauss_newton
+from en4dvar.schemes.ienks import IEnKS
+from en4dvar.sequential import SequentialSettings
+
+RNG = np.random.default_rng
+
+
+def test_multiplicative_inflation():
+    anomalies = centre(RNG(0).standard_normal((6, 4)))[1]
+    assert np.array_equal(Inflation(1.1).apply(anomalies, anomalies), 1.1 * anomalies)
+    assert Inflation().apply(anomalies, anomalies) is anomalies
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.3, 1.0])
+def test_relaxation_moves_the_spread_between_posterior_and_prior(alpha):
+    prior = RNG(0).standard_normal((6, 4))
+    posterior = 0.4 * centre(prior)[1] * np.array([1.0, 0.5, 0.2, 0.0])
+    relaxed = Inflation(rtps=alpha).apply(prior, posterior)
+    before, after = prior.std(axis=0, ddof=1), posterior.std(axis=0, ddof=1)
+    expected = (1 - alpha) * after + alpha * before
+    assert relaxed.std(axis=0, ddof=1)[:3] == pytest.approx(expected[:3], rel=1e-13)
+    assert np.array_equal(relaxed[:, 3], np.zeros(6))  # a variable without spread is given none
+    assert relaxation(before, before, alpha) == pytest.approx(np.ones(4))
+
+
+@pytest.mark.parametrize("arguments", [(0.0,), (-1.0,), (1.0, -0.1), (1.0, 1.1)])
+def test_inflation_refuses_nonsense(arguments):
+    with pytest.raises(ValueError, match="must"):
+        Inflation(*arguments)
+
+
+@pytest.mark.parametrize("reflections", [1, 2, 5])
+def test_rotation_keeps_mean_and_covariance_and_mixes_members(reflections):
+    anomalies = centre(RNG(0).standard_normal((9, 30)))[1]
+    turned = rotate(anomalies, RNG(1), reflections)
+    assert np.max(np.abs(turned.sum(axis=0))) < 1e-13
+    assert np.max(np.abs(turned.T @ turned - anomalies.T @ anomalies)) < 1e-12
+    assert np.linalg.norm(turned - anomalies) > 0.1 * np.linalg.norm(anomalies)
+
+
+def test_rotations_reach_every_direction():
+    """Repeated, they forget where they started: the mean of turned anomalies vanishes as 1/√(number)."""
+    anomalies, rng = centre(np.eye(8))[1], RNG(0)
+    total, current = np.zeros((8, 8)), anomalies
+    for _ in range(4000):
+        current = rotate(current, rng)
+        total += current
+    assert np.max(np.abs(total / 4000)) < 0.05 * np.max(np.abs(anomalies))
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 64, 10_000])
+def test_update_in_chunks(chunk):
+    ensemble, rows = 5 + RNG(0).standard_normal((6, 150)), RNG(1).standard_normal((6, 6))
+    mean, anomalies = centre(ensemble)
+    expected = mean + rows @ anomalies
+    assert apply_weights(ensemble, rows, chunk=chunk) == pytest.approx(expected, abs=1e-13)
+    assert apply_weights(ensemble, rows, out=ensemble, chunk=chunk) is ensemble
+    assert ensemble == pytest.approx(expected, abs=1e-13)
+    assert apply_weights(expected, rows[:2], chunk=chunk).shape == (2, 150)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 2.9, 3.1, 1e3])
+def test_both_decompositions_give_the_same_analysis(scale):
+    """Below GRAM_LIMIT eigenvectors of SᵀS, above it the SVD of S; both against plain linear algebra."""
+    s = scale * centre(RNG(0).standard_normal((10, 40)))[1].T
+    hessian, g = Hessian.of(s), RNG(1).standard_normal(10)
+    assert (np.sum(s**2) / 9 <= GRAM_LIMIT) == (scale < 1.5)
+    a = 9 * np.eye(10) + s.T @ s
+    # a textbook solve loses eps · cond(A), most of it at the largest scale
+    tolerance = 1e-13 * max(1.0, np.linalg.cond(a) / 100)
+    assert hessian.solve(g) == pytest.approx(np.linalg.solve(a, g), rel=tolerance, abs=tolerance)
+    t = hessian.transform
+    assert t @ t == pytest.approx(9 * np.linalg.inv(a), abs=tolerance)
+    singular = np.linalg.svd(s, compute_uv=False)
+    assert hessian.singular_values[:9] == pytest.approx(singular[:9], rel=1e-12)
+    assert hessian.singular_values[9] < 1e-6 * scale * 10
+
+
+def test_gaspari_cohn():
+    """Values of eq. 4.10 at whole and half radii, smoothness at the joints, positive definiteness on a circle."""
+    z = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 3.0, -0.5])
+    value = gaspari_cohn(2.5 * z, 2.5)
+    assert value == pytest.approx([1, 0.6848958333, 5 / 24, 0.0164930556, 0, 0, 0.6848958333], abs=1e-9)
+    h = 1e-5
+    for joint in (1.0, 2.0):
+        left, here, right = gaspari_cohn(joint + h * np.array([-1, 0, 1]), 1.0)
+        assert abs((right - here) - (here - left)) < 1e-8
+    positions = np.arange(40.0)
+    matrix = gaspari_cohn(distances(positions, positions, 40.0), 5.0)
+    assert np.linalg.eigvalsh(matrix).min() > -1e-12
+
+
+def test_distances_on_line_and_circle():
+    a, b = np.array([0.0, 9.0]), np.array([1.0, 8.0])
+    assert distances(a, b).tolist() == [[1, 8], [8, 1]]
+    assert distances(a, b, 10.0).tolist() == [[1, 2], [2, 1]]
+
+
+def evaluation(n_members=6, p=12):
+    spread = centre(RNG(0).standard_normal((n_members, p)))[1]
+    return Evaluation(RNG(1).standard_normal(p), spread.T)
+
+
+def test_without_taper_the_local_analysis_is_the_global_one():
+    ensemble, e = RNG(2).standard_normal((6, 12)), evaluation()
+    step = gauss_newton(Weights.prior(6), e)
+    expected = apply_weights(ensemble, step.direction + step.transform)
+    for size in (1, 5, 12):
+        blocks = [np.arange(i, min(i + size, 12)) for i in range(0, 12, size)]
+        local = Localisation(blocks, np.ones((len(blocks), 12)))
+        assert local.analysis(ensemble, e) == pytest.approx(expected, abs=1e-12)
+
+
+def test_local_analysis_sees_what_is_near():
+    positions = np.arange(12.0)
+    ensemble, e = RNG(2).standard_normal((6, 12)), evaluation()
+    local = Localisation.on_line(positions, positions, radius=1.5, period=12.0)
+    analysed = local.analysis(ensemble, e)
+    far = e.d.copy()
+    far[3:10] += 100.0  # 3 or more away from variable 0, around the circle
+    changed = local.analysis(ensemble, Evaluation(far, e.S))
+    assert np.array_equal(changed[:, 0], analysed[:, 0])
+    assert np.all(np.abs(changed[:, 1:11] - analysed[:, 1:11]).max(axis=0) > 1e-3)
+    # by hand for one variable: error variances divided by the taper
+    taper = gaspari_cohn(distances(positions[:1], positions, 12.0), 1.5)[0]
+    root = np.sqrt(taper)
+    step = gauss_newton(Weights.prior(6), Evaluation(root * e.d, root[:, None] * e.S))
+    by_hand = apply_weights(ensemble[:, :1], step.direction + step.transform)
+    assert analysed[:, :1] == pytest.approx(by_hand, abs=1e-12)
+
+
+def test_variables_without_position_or_observation_stay():
+    positions = np.array([0.0, 1.0, np.nan, 50.0])
+    local = Localisation.on_line(positions, np.array([0.0, 1.0]), radius=2.0, block_size=2)
+    assert [block.tolist() for block in local.blocks] == [[0, 1], [3]]
+    ensemble = RNG(2).standard_normal((6, 4))
+    analysed = local.analysis(ensemble, evaluation(p=2))
+    assert np.array_equal(analysed[:, 2:], ensemble[:, 2:])
+    assert not np.allclose(analysed[:, :2], ensemble[:, :2])
+
+
+def test_localisation_needs_a_filter():
+    with pytest.raises(ValueError, match="filter"):
+        SequentialSettings(IEnKS(1), localisation=Localisation([np.arange(2)], np.ones((1, 2))))
