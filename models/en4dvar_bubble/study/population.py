@@ -32,11 +32,11 @@ from en4dvar_bubble.study.gaussian import Factors
 class HyperPrior:
     """Standard deviation of ν and scale of τ in transformed coordinates, and the length of the chains."""
 
-    mean_std: float = 0.5
+    mean_std: float = 1.0
     spread: float = 0.5
     chains: int = 24
-    steps: int = 1500
-    burn_in: int = 500
+    steps: int = 1200
+    burn_in: int = 400
 
 
 @dataclass(frozen=True)

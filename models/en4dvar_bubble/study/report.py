@@ -1,0 +1,211 @@
+"""One self-contained page, the tables in three formats, the figures as PDF and PNG."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from en4dvar.errors import OutputError
+from en4dvar.files import write_text
+from en4dvar.report.style import COLUMN, DARK, LIGHT, css_variables, inline_svg, save_figure
+from en4dvar_bubble.study import tables
+from en4dvar_bubble.study.evidence import DECISIVE, probability, verdict
+from en4dvar_bubble.study.figures import all_figures
+from en4dvar_bubble.study.paper import LABELS, NAMES, QUANTITIES, ROUTES, Route
+from en4dvar_bubble.study.run import Study, per_set_csv
+
+ROUTE_KEYS: tuple[Route, ...] = ("sweep", "en4dvar")
+Block = dict[str, Any]
+
+
+def write_study(study: Study, directory: Path) -> Path:
+    """Write everything; returns the page. Raises :class:`OutputError`."""
+    figures_folder = directory / "figures"
+    try:
+        figures_folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{figures_folder}: cannot be created: {error.strerror or error}") from None
+    for number, route in enumerate(ROUTE_KEYS, 1):
+        rows = tables.table(study, route)
+        write_text(directory / f"table{number}.csv", tables.as_csv(study, rows, route))
+        write_text(directory / f"table{number}.md", tables.as_markdown(study, rows, route))
+        write_text(directory / f"table{number}.tex", tables.as_latex(study, rows, route))
+    write_text(directory / "sets.csv", per_set_csv(study))
+    write_text(directory / "study.yaml", study.plan.text)
+    drawn = []
+    for name, caption, figure in all_figures(study):
+        save_figure(figure, figures_folder, name)
+        wide = figure.get_size_inches()[0] > 1.5 * COLUMN
+        drawn.append((name, caption, Markup(inline_svg(figure, name, caption)), wide))
+    return write_text(directory / "study.html", _page(study, drawn))
+
+
+def _page(study: Study, drawn: list[tuple[str, str, Markup, bool]]) -> str:
+    environment = Environment(
+        loader=PackageLoader("en4dvar_bubble.study", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    plan = study.plan
+    sets = sum(len(next(iter(models.values())).problems) for models in study.fits.values())
+    differ = tables.disagreements(study)
+    spreads = tables.spread_notes(study)
+    return environment.get_template("page.html.j2").render(
+        title=f"Acoustic cavitation rheometry: {plan.name}" + (" (synthetic twin)" if plan.synthetic else ""),
+        synthetic=plan.synthetic,
+        introduction=f"{sets} data sets in {len(study.fits)} gels; neo-Hookean, quasi-static and general quadratic law "
+        "Kelvin–Voigt models; after Mancia et al. (2021), Acoustic Cavitation Rheometry.",
+        findings=findings(study),
+        tables=[_table(study, route) for route in ROUTE_KEYS],
+        differ="Means that differ by more than both standard deviations together:"
+        if differ
+        else "No mean differs from the printed one by more than both standard deviations together.",
+        disagreements=differ,
+        spreads="Standard deviations at least two times larger or smaller than printed: " + "; ".join(spreads) + ". "
+        "The spread over best fits depends on the ranges searched, which the paper does not state; the spread of "
+        "En4D-Var estimates on the standard deviation of the prior, which it does not state either."
+        if spreads
+        else "",
+        more=[b for b in (_dfs(study), _coverage(study), _population(study), _comparison(study)) if b["rows"]],
+        figures=drawn,
+        method=_method(study),
+        configuration=plan.text,
+        light=Markup(css_variables(LIGHT)),
+        dark=Markup(css_variables(DARK)),
+    )
+
+
+def _method(study: Study) -> str:
+    s, seconds = study.plan.sweep, study.seconds
+    members = next(iter(next(iter(study.fits.values())).values())).analyses[0].settings.members
+    return (
+        f"Sweep: {s.trajectories} trajectories of a Sobol design a model and gel, uniform in the transformed "
+        f"parameters within {s.width:g} prior standard deviations, then {s.rounds} rounds of {s.local} a set about the best fit; "
+        f"nearest neighbour in time on a grid of {s.step * 1e6:g} µs, time shift within ±{s.shift * 1e6:g} µs; weights "
+        f"are the NRMSE of the best fits ({seconds['sweep']:.0f} s). En4D-Var: {members} members a set "
+        f"({seconds['en4dvar']:.0f} s). Population and comparison: {seconds['population']:.0f} s."
+    )
+
+
+def findings(study: Study) -> list[str]:
+    """The paper's qualitative findings, in numbers of this study."""
+    told = []
+    for gel, models in study.fits.items():
+        for route in ROUTE_KEYS:
+            if {"nh", "qlkv"} <= set(models):
+                nh, general = (models[m].summary(route, "G")[0] for m in ("nh", "qlkv"))
+                mu = {m: models[m].summary(route, "mu")[0] for m in models}
+                viscosities = ", ".join(f"{LABELS[m]} {v:.3f}" for m, v in mu.items())
+                told.append(
+                    f"{gel}, {ROUTES[route]}: G of the neo-Hookean law is {nh / general:.1f} times that of the general "
+                    f"quadratic law; μ hardly depends on the model ({viscosities} Pa s)."
+                )
+    for route in ROUTE_KEYS:
+        scores = {
+            m: np.concatenate([f.nrmse(route) for models in study.fits.values() for n, f in models.items() if n == m])
+            for m in NAMES
+        }
+        words = ", ".join(
+            f"{LABELS[m]} {v.min():.3f} to {v.max():.3f}, mean {v.mean():.3f}" for m, v in scores.items() if len(v)
+        )
+        told.append(f"NRMSE, {ROUTES[route]}: {words}.")
+    return told
+
+
+def _table(study: Study, route: Route) -> Block:
+    heads = tables.columns(study)
+    return {
+        "title": tables.TITLES[route],
+        "legend": "; ".join(words for _, words in heads),
+        "heads": [f"{q.plain} ({q.unit})" for q in QUANTITIES],
+        "rows": [
+            {
+                "gel": row.gel,
+                "model": LABELS[row.model],
+                "cells": [[tables.text(cell, getattr(cell, a)) for a, _ in heads] for cell in row.cells],
+            }
+            for row in tables.table(study, route)
+        ],
+    }
+
+
+def _dfs(study: Study) -> Block:
+    rows = []
+    for gel, models in study.fits.items():
+        for model, fit in models.items():
+            mean = dict(zip(fit.prior.names, np.mean([a.dfs_per_parameter for a in fit.analyses], axis=0), strict=True))
+            shares = [f"{100 * mean[q.name]:.0f} %" if q.name in mean else "–" for q in QUANTITIES]
+            rows.append([gel, LABELS[model], *shares])
+    return {
+        "title": "What one data set tells",
+        "words": "DFS a parameter, 1 − posterior variance / prior variance, mean over the sets: 0 % means that the "
+        "posterior is the prior. Viscosity is measured; a parameter with a small share stays near its initial guess, "
+        "whatever the guess is.",
+        "heads": ["gel", "model", *(q.plain for q in QUANTITIES)],
+        "rows": rows,
+    }
+
+
+def _coverage(study: Study) -> Block:
+    rows = [
+        [gel, *(f"{100 * study.coverage(gel, 'qlkv', q.name):.0f} %" for q in QUANTITIES)]
+        for gel in study.fits
+        if study.truth and "qlkv" in study.fits[gel]
+    ]
+    return {
+        "title": "Coverage of the truth",
+        "words": "Share of the data sets whose central 90 % posterior interval (En4D-Var, general QLKV) holds the "
+        "truth.",
+        "heads": ["gel", *(q.plain for q in QUANTITIES)],
+        "rows": rows,
+    }
+
+
+def _population(study: Study) -> Block:
+    rows = []
+    for gel, found in study.populations.items():
+        fit = study.fits[gel]["qlkv"]
+        interval = found.interval()
+        for q in QUANTITIES:
+            j = found.names.index(q.name)
+            stacked, truth = fit.members(q.name) * q.factor, study.true_values(gel, q.name) * q.factor
+            mean, std = (np.median(values[:, j]) * q.factor for values in (found.mean, found.std))
+            low, high = interval[:, j] * q.factor
+            known = tables.plus_minus((truth.mean(), truth.std(ddof=1))) if len(truth) > 1 else "–"
+            cells = [f"{mean:.3g} [{low:.3g}, {high:.3g}]", f"{std:.2g}"]
+            rows.append(
+                [gel, f"{q.plain} ({q.unit})", *cells, tables.plus_minus((stacked.mean(), stacked.std())), known]
+            )
+    return {
+        "title": "Population of bubbles",
+        "words": "General QLKV. Stacking the ensembles, as the paper does, counts the prior once a data set and so "
+        "inherits it. The hierarchical step divides the prior out of every set and estimates mean and between-bubble spread "
+        "together; its interval is wide where the data determine only a combination of parameters (at the stretch of "
+        "these bubbles the elastic stress depends on little else than G α / R₀).",
+        "heads": ["gel", "parameter", "mean [95 %]", "spread", "stacked mean ± std", "truths mean ± std"],
+        "rows": rows,
+    }
+
+
+def _comparison(study: Study) -> Block:
+    rows = []
+    for gel, found in study.comparisons.items():
+        fit = study.fits[gel]["qlkv"]
+        rows += [
+            [gel, name, f"{value:+.1f}", f"{float(probability(value)):.2f}", verdict(value)]
+            for name, value in zip(fit.names, found.single, strict=True)
+        ]
+        for words, value in (("all sets, a gel each", found.independent), ("all sets, one gel", found.shared)):
+            rows.append([gel, words, f"{value:+.1f}", f"{float(probability(np.array(value))):.2f}", verdict(value)])
+    undecided = sum(c.undecidable for c in study.comparisons.values())
+    total = sum(len(c.single) for c in study.comparisons.values())
+    return {
+        "title": "Neo-Hookean or quadratic law",
+        "words": "Log-evidence of the general quadratic over the neo-Hookean law and its probability at equal prior "
+        f"odds. Undecidable (|Δ| < {DECISIVE:g}) by itself: {undecided} of {total} data sets. “One gel”: G, α and μ "
+        "common to all bubbles, R₀ and t_s of each its own.",
+        "heads": ["gel", "data set", "Δ log-evidence", "probability", "verdict"],
+        "rows": rows,
+    }

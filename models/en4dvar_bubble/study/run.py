@@ -1,0 +1,195 @@
+"""The study: both routes on every gel and model, then population and model comparison."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from en4dvar.assimilate import assimilate
+from en4dvar.build import build
+from en4dvar.diagnostics import nrmse
+from en4dvar.errors import DataError
+from en4dvar.executor import make_executor
+from en4dvar.prior import Prior
+from en4dvar.problem import Analysis, InverseProblem
+from en4dvar.state import Array
+from en4dvar_bubble.study.evidence import Comparison, compare_laws
+from en4dvar_bubble.study.gaussian import factors
+from en4dvar_bubble.study.paper import QUANTITIES, Model, Route
+from en4dvar_bubble.study.population import Population, estimate_population
+from en4dvar_bubble.study.settings import StudyPlan
+from en4dvar_bubble.study.sweep import SweepResult, run_sweep
+
+Tell = Callable[[str], None]
+SHARED = ("G", "alpha", "mu")  # properties of the gel; R0 and t_s belong to the bubble
+POPULATION = ("G", "alpha", "mu", "R0")
+_TRUTH_UNITS = {"G_kPa": ("G", 1e3), "alpha": ("alpha", 1.0), "mu_Pa_s": ("mu", 1.0), "R0_um": ("R0", 1e-6)}
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Both routes of one model on the S data sets of one gel."""
+
+    gel: str
+    model: Model
+    problems: tuple[InverseProblem, ...]
+    sweep: SweepResult
+    analyses: tuple[Analysis, ...]
+
+    @property
+    def prior(self) -> Prior:
+        return self.problems[0].prior
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(p.observations.name for p in self.problems)
+
+    def values(self, route: Route, name: str) -> Array:
+        """(S,) estimates of a parameter, SI: best fits of the sweep, or means of the posterior ensembles."""
+        if name in self.problems[0].fixed:
+            return np.full(len(self.problems), self.problems[0].fixed[name])
+        if route == "sweep":
+            return np.asarray(self.sweep.theta[:, [p.name for p in self.sweep.parameters].index(name)])
+        return np.array([np.nanmean(a.posterior[:, self.prior.names.index(name)]) for a in self.analyses])
+
+    def has(self, name: str) -> bool:
+        return name in self.prior.names or name in self.problems[0].fixed
+
+    def estimated(self, name: str) -> bool:
+        return name in self.prior.names
+
+    def nrmse(self, route: Route) -> Array:
+        """(S,) NRMSE of the best fit, or of the centre of the posterior."""
+        if route == "sweep":
+            return self.sweep.nrmse
+        return np.array([nrmse(a.observations.values, a.centre_predictions) for a in self.analyses])
+
+    def summary(self, route: Route, name: str) -> tuple[float, float]:
+        """NRMSE-weighted mean and standard deviation over the sets, SI."""
+        weights, values = self.nrmse(route), self.values(route, name)
+        mean = float(np.average(values, weights=weights))
+        return mean, float(np.sqrt(np.average((values - mean) ** 2, weights=weights)))
+
+    def members(self, name: str) -> Array:
+        """(S·N,) posterior members of all sets, SI; failed ones left out."""
+        j = self.prior.names.index(name)
+        stacked = np.concatenate([a.posterior[:, j] for a in self.analyses])
+        return stacked[np.isfinite(stacked)]
+
+    def prior_members(self, name: str) -> Array:
+        """(N,) members of the prior, SI."""
+        return np.asarray(self.analyses[0].prior[:, self.prior.names.index(name)])
+
+
+@dataclass(frozen=True)
+class Study:
+    """All that the report shows. ``truth``: data set → parameter → SI value, empty without a twin."""
+
+    plan: StudyPlan
+    fits: Mapping[str, Mapping[Model, Fit]]
+    populations: Mapping[str, Population]
+    comparisons: Mapping[str, Comparison]
+    truth: Mapping[str, Mapping[str, float]]
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    def true_values(self, gel: str, name: str) -> Array:
+        """(S,) true values of a gel's data sets, SI; empty where there is no truth."""
+        fit = next(iter(self.fits[gel].values()))
+        return np.array([self.truth[n][name] for n in fit.names if n in self.truth])
+
+    def coverage(self, gel: str, model: Model, name: str, level: float = 0.9) -> float:
+        """Share of the data sets whose central posterior interval holds the truth; NaN without a truth."""
+        fit, tail = self.fits[gel][model], (1 - level) / 2
+        j = fit.prior.names.index(name)
+        inside = [
+            low <= self.truth[a.name][name] <= high
+            for a in fit.analyses
+            if a.name in self.truth
+            for low, high in [np.nanquantile(a.posterior[:, j], (tail, 1 - tail))]
+        ]
+        return float(np.mean(inside)) if inside else float("nan")
+
+
+def run_study(plan: StudyPlan, workers: int = 1, tell: Tell | None = None) -> Study:
+    """Compute everything; the truth of a twin is read last and enters no estimate.
+
+    Raises
+    ------
+    DataError, ConfigError, TooFewMembersError: as the routes do.
+    """
+    say = tell or (lambda message: None)
+    seconds = {"sweep": 0.0, "en4dvar": 0.0, "population": 0.0}
+    fits: dict[str, dict[Model, Fit]] = {}
+    for gel, configs in plan.configs.items():
+        fits[gel] = {}
+        for model, config in configs.items():
+            problems = build(config)
+            start = time.perf_counter()
+            sweep = run_sweep(problems, plan.sweep, plan.seed, workers)
+            middle = time.perf_counter()
+            say(f"{gel} {model}: sweep of {sweep.trajectories} trajectories in {middle - start:.1f} s")
+            with make_executor(config.model, workers) as executor:
+                analyses = tuple(assimilate(p, config.assimilation, config.seed, executor) for p in problems)
+            end = time.perf_counter()
+            say(f"{gel} {model}: En4D-Var of {len(problems)} data sets in {end - middle:.1f} s")
+            seconds["sweep"] += middle - start
+            seconds["en4dvar"] += end - middle
+            fits[gel][model] = Fit(gel, model, problems, sweep, analyses)
+    start = time.perf_counter()
+    populations, comparisons = {}, {}
+    for gel, models in fits.items():
+        general = models.get("qlkv")
+        if general is not None and len(general.problems) >= 3:
+            likelihoods = factors(general.analyses, general.prior)
+            populations[gel] = estimate_population(likelihoods, general.prior, POPULATION, plan.seed)
+        if general is not None and "nh" in models:
+            comparisons[gel] = compare_laws(
+                factors(models["nh"].analyses, models["nh"].prior, [n for n in SHARED if models["nh"].estimated(n)]),
+                factors(general.analyses, general.prior, [n for n in SHARED if general.estimated(n)]),
+                np.array([a.log_evidence for a in models["nh"].analyses]),
+                np.array([a.log_evidence for a in general.analyses]),
+            )
+    seconds["population"] = time.perf_counter() - start
+    say(f"population and model comparison in {seconds['population']:.1f} s")
+    truth = read_truth(plan.truth) if plan.truth else {}
+    return Study(plan, fits, populations, comparisons, truth, seconds)
+
+
+def read_truth(path: Path) -> dict[str, dict[str, float]]:
+    """Data set → parameter → SI value, of a ``truth.csv`` of a synthetic campaign. Raises :class:`DataError`."""
+    try:
+        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+        rows = list(csv.DictReader(lines))
+        return {
+            row["dataset"]: {name: factor * float(row[column]) for column, (name, factor) in _TRUTH_UNITS.items()}
+            for row in rows
+        }
+    except (OSError, KeyError, ValueError) as error:
+        raise DataError(f"{path}: not the truth of a synthetic campaign of bubbles: {error!r}") from None
+
+
+def per_set_csv(study: Study) -> str:
+    """One line a gel, model, data set and parameter, in the units of the tables: both routes, truth, fit, DFS."""
+    head = "gel,model,dataset,parameter,unit,sweep,en4dvar_mean,en4dvar_std,q05,q50,q95,dfs,truth"
+    lines = [f"{head},nrmse_sweep,nrmse_en4dvar,log_evidence"]
+    for gel, models in study.fits.items():
+        for model, fit in models.items():
+            scores = {route: fit.nrmse(route) for route in ("sweep", "en4dvar")}
+            for q in QUANTITIES:
+                if not fit.estimated(q.name):
+                    continue
+                j, best = fit.prior.names.index(q.name), fit.values("sweep", q.name)
+                for i, a in enumerate(fit.analyses):
+                    x = q.factor * a.posterior[:, j]
+                    true = study.truth.get(a.name, {}).get(q.name, np.nan) * q.factor
+                    numbers = [best[i] * q.factor, np.nanmean(x), np.nanstd(x, ddof=1)]
+                    numbers += [*np.nanquantile(x, (0.05, 0.5, 0.95)), a.dfs_per_parameter[j], true]
+                    numbers += [scores["sweep"][i], scores["en4dvar"][i], a.log_evidence]
+                    values = ",".join(f"{v:.6g}" for v in numbers)
+                    lines.append(f"{gel},{model},{a.name},{q.name},{q.unit},{values}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,104 @@
+"""The study's YAML file: which configurations make it up, how large the sweep is, where a twin's truth is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from en4dvar.config import Config, load_config
+from en4dvar.config.document import Document, override, read_document
+from en4dvar.config.schema import Name, QuantityText, Section
+from en4dvar.config.validate import check
+from en4dvar.errors import ConfigError, Fault
+from en4dvar.units import UnitError, parse_quantity
+from en4dvar_bubble.study.paper import Model
+from en4dvar_bubble.study.sweep import SweepSettings
+
+MODELS: tuple[Model, ...] = ("nh", "qs", "qlkv")
+
+
+class Sweep(Section):
+    """Size of the sweep of each model and gel; see :class:`~en4dvar_bubble.study.sweep.SweepSettings`."""
+
+    trajectories: Annotated[int, Field(ge=2, le=10_000_000)] = SweepSettings.trajectories
+    shift: QuantityText = "0.8 us"
+    step: QuantityText = "0.025 us"
+    width: Annotated[float, Field(gt=0, le=10)] = SweepSettings.width
+    rounds: Annotated[int, Field(ge=0, le=50)] = SweepSettings.rounds
+    local: Annotated[int, Field(ge=1)] = SweepSettings.local
+
+    def built(self) -> SweepSettings:
+        """In seconds. Raises :class:`UnitError`."""
+        shift, step = parse_quantity(self.shift, "s"), parse_quantity(self.step, "s")
+        if shift < 0 or step <= 0:
+            raise UnitError("the shift must not be negative and the step must be positive")
+        return SweepSettings(self.trajectories, shift, step, self.width, rounds=self.rounds, local=self.local)
+
+
+class StudySchema(Section):
+    """The whole file. ``gels``: label → model (nh, qs, qlkv) → configuration file. ``data``: folder of the campaign."""
+
+    name: Name
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    synthetic: bool
+    truth: str | None = None
+    sweep: Sweep = Sweep()
+    gels: Annotated[dict[str, dict[str, str]], Field(min_length=1)]
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """A validated study; ``configs`` gel → model → configuration. ``truth`` is read for the report only."""
+
+    name: str
+    seed: int
+    synthetic: bool
+    truth: Path | None
+    sweep: SweepSettings
+    configs: dict[str, dict[Model, Config]]
+    text: str
+
+
+def load_study(path: str | Path, overrides: dict[str, Any] | None = None) -> StudyPlan:
+    """Read a study and every configuration it names; paths are relative to its folder. Raises :class:`ConfigError`."""
+    path = Path(path)
+    document = override(read_document(path), overrides or {})
+    faults: list[Fault] = []
+    top = check(StudySchema, document.data, (), document, faults)
+    if top is None:
+        raise ConfigError(faults)
+    sweep = SweepSettings()
+    try:
+        sweep = top.sweep.built()
+    except UnitError as error:
+        faults.append(document.fault(("sweep",), str(error)))
+    base = path.resolve().parent
+    configs = {gel: _configs(gel, files, base, document, faults) for gel, files in top.gels.items()}
+    if top.truth and not top.synthetic:
+        faults.append(document.fault(("truth",), "only a synthetic campaign has a truth"))
+    truth = base / top.truth if top.truth else None
+    if truth and not truth.is_file():
+        faults.append(document.fault(("truth",), f"{truth}: no such file"))
+    if faults:
+        raise ConfigError(faults)
+    return StudyPlan(top.name, top.seed, top.synthetic, truth, sweep, configs, document.text)
+
+
+def _configs(
+    gel: str, files: dict[str, str], base: Path, document: Document, faults: list[Fault]
+) -> dict[Model, Config]:
+    found: dict[Model, Config] = {}
+    for name in files:
+        if name not in MODELS:
+            faults.append(document.fault(("gels", gel, name), f"write one of {', '.join(MODELS)}", at_key=True))
+    for model in MODELS:
+        if model not in files:
+            continue
+        try:
+            found[model] = load_config(base / files[model])
+        except ConfigError as error:
+            faults += error.problems
+    return found

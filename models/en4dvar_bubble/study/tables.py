@@ -1,0 +1,178 @@
+"""Tables 1 and 2 beside the paper's printed values and a twin's truth, as CSV, Markdown and LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from en4dvar_bubble.study.paper import LABELS, QUANTITIES, ROUTES, TABLES, Model, Quantity, Route
+from en4dvar_bubble.study.run import Study
+
+Pair = tuple[float, float]
+TITLES: dict[Route, str] = {
+    "sweep": "Table 1. IMR sweep: NRMSE-weighted mean ± standard deviation of the best fits",
+    "en4dvar": "Table 2. En4D-Var: NRMSE-weighted mean ± standard deviation of the ensemble means",
+}
+SYNTHETIC = "synthetic twin, no measurement"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One quantity of one model: mean and standard deviation, None where there is none; ``fixed``: not estimated."""
+
+    quantity: Quantity
+    computed: Pair | None
+    printed: Pair | None
+    truth: Pair | None
+    fixed: bool = False
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table."""
+
+    gel: str
+    model: Model
+    cells: tuple[Cell, ...]
+
+
+def table(study: Study, route: Route) -> tuple[Row, ...]:
+    """The rows of table 1 (``sweep``) or 2 (``en4dvar``), in the units of the paper."""
+    rows = []
+    for gel, models in study.fits.items():
+        for model, fit in models.items():
+            printed = TABLES[route].get(gel, {}).get(model, {})
+            cells = []
+            for q in QUANTITIES:
+                pair = fit.summary(route, q.name) if fit.has(q.name) else None
+                true = study.true_values(gel, q.name) * q.factor
+                cells.append(
+                    Cell(
+                        q,
+                        (pair[0] * q.factor, pair[1] * q.factor) if pair else None,
+                        printed.get(q.name),
+                        (float(true.mean()), float(true.std(ddof=1))) if len(true) > 1 else None,
+                        fixed=fit.has(q.name) and not fit.estimated(q.name),
+                    )
+                )
+            rows.append(Row(gel, model, tuple(cells)))
+    return tuple(rows)
+
+
+def plus_minus(pair: Pair | None, sign: str = "±") -> str:
+    """``0.42 ± 0.06``: the standard deviation to two digits, the mean to as many places; a dash for None."""
+    if pair is None:
+        return "–"
+    mean, std = pair
+    if not (math.isfinite(std) and std > 0):
+        return f"{mean:.3g}"
+    places = max(0, 1 - math.floor(math.log10(std)))
+    return f"{mean:.{places}f} {sign} {std:.{places}f}"
+
+
+def text(cell: Cell, pair: Pair | None, sign: str = "±") -> str:
+    """A pair of a cell; a value that was held fixed has no standard deviation."""
+    return f"{pair[0]:.3g} (fixed)" if cell.fixed and pair and pair is cell.computed else plus_minus(pair, sign)
+
+
+def columns(study: Study) -> list[tuple[str, str]]:
+    """(attribute of a cell, heading) of what stands side by side."""
+    mine = f"this work ({SYNTHETIC})" if study.plan.synthetic else "this work"
+    found = [("printed", "paper"), ("computed", mine)]
+    return [*found, ("truth", "truth of the twin")] if study.truth else found
+
+
+def as_csv(study: Study, rows: Sequence[Row], route: Route) -> str:
+    """One line a gel, model and quantity, every digit kept; a comment says what is synthetic."""
+    out = io.StringIO()
+    if study.plan.synthetic:
+        out.write(
+            f"# {ROUTES[route]} on a SYNTHETIC twin of the paper's campaign; only the paper_ columns are printed\n"
+        )
+    writer = csv.writer(out, lineterminator="\n")
+    sources = ("paper", "computed", "truth")
+    writer.writerow(["gel", "model", "quantity", "unit", *(f"{s}_{m}" for s in sources for m in ("mean", "std"))])
+    for row in rows:
+        for cell in row.cells:
+            pairs = (cell.printed, cell.computed, cell.truth)
+            numbers = [f"{v:.6g}" if np.isfinite(v) else "" for p in pairs for v in (p or (np.nan, np.nan))]
+            writer.writerow([row.gel, LABELS[row.model], cell.quantity.name, cell.quantity.unit, *numbers])
+    return out.getvalue()
+
+
+def as_markdown(study: Study, rows: Sequence[Row], route: Route) -> str:
+    """A table a gel and model a line, with paper, computed and truth one below the other in a cell."""
+    heads = columns(study)
+    lines = [f"**{TITLES[route]}**", "", f"In each cell: {'; '.join(h for _, h in heads)}.", ""]
+    lines.append("| gel | model | " + " | ".join(f"{q.plain} ({q.unit})" for q in QUANTITIES) + " |")
+    lines.append("|---" * (2 + len(QUANTITIES)) + "|")
+    for row in rows:
+        cells = ["<br>".join(text(cell, getattr(cell, a)) for a, _ in heads) for cell in row.cells]
+        lines.append(f"| {row.gel} | {LABELS[row.model]} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def as_latex(study: Study, rows: Sequence[Row], route: Route) -> str:
+    """A ``tabular`` in a ``table*`` with booktabs-free rules, one line a source."""
+    heads = columns(study)
+    caption = TITLES[route].partition(". ")[2].replace("±", r"$\pm$")
+    note = (
+        " The computed values come from a synthetic twin campaign, not from measurements."
+        if study.plan.synthetic
+        else ""
+    )
+    units = {"10⁻²": r"$10^{-2}$", "µm": r"$\mu$m", "Pa s": r"Pa\,s"}
+    lines = [r"\begin{table*}", rf"\caption{{{caption}.{note}}}", r"\begin{tabular}{llllll}", r"\hline"]
+    names = " & ".join(f"{q.latex} ({units.get(q.unit, q.unit)})" for q in QUANTITIES)
+    lines += [rf"Model & Source & {names} \\", r"\hline"]
+    gel = ""
+    for row in rows:
+        if row.gel != gel:
+            gel = row.gel
+            lines += [rf"\multicolumn{{6}}{{l}}{{{gel.replace('%', chr(92) + '%')} gel}} \\", r"\hline"]
+        for i, (attribute, heading) in enumerate(heads):
+            cells = [text(cell, getattr(cell, attribute), r"$\pm$").replace("–", "--") for cell in row.cells]
+            lines.append(
+                rf"{LABELS[row.model] if i == 0 else ''} & {heading.partition(' (')[0]} & {' & '.join(cells)} \\"
+            )
+        lines.append(r"\hline")
+    return "\n".join([*lines, r"\end{tabular}", r"\end{table*}"]) + "\n"
+
+
+def disagreements(study: Study) -> list[str]:
+    """Where the computed mean differs from the printed one by more than both standard deviations together, and why."""
+    told = []
+    for route in ("sweep", "en4dvar"):
+        for row in table(study, route):
+            for cell in row.cells:
+                if cell.printed is None or cell.computed is None or cell.fixed:
+                    continue
+                gap = cell.computed[0] - cell.printed[0]
+                if abs(gap) > cell.printed[1] + cell.computed[1]:
+                    mine, paper = plus_minus(cell.computed), plus_minus(cell.printed)
+                    told.append(
+                        f"{ROUTES[route]}, {row.gel}, {LABELS[row.model]}: {cell.quantity.plain} is {mine} "
+                        f"{cell.quantity.unit} where the paper prints {paper}"
+                    )
+    return told
+
+
+def spread_notes(study: Study) -> list[str]:
+    """Where the standard deviation differs from the printed one by a factor of two or more."""
+    told = []
+    for route in ("sweep", "en4dvar"):
+        for row in table(study, route):
+            for cell in row.cells:
+                if cell.printed is None or cell.computed is None or cell.fixed:
+                    continue
+                ratio = cell.computed[1] / cell.printed[1]
+                if not 0.5 < ratio < 2:
+                    told.append(
+                        f"{ROUTES[route]}, {row.gel}, {LABELS[row.model]}, {cell.quantity.plain}: {ratio:.2g} times"
+                    )
+    return told
