@@ -107,6 +107,7 @@ def _overrides(data: str | None, settings: tuple[str, ...], **special: Any) -> d
 @click.option("--out", type=click.Path(path_type=Path), help="Run directory; default output.directory or runs/<name>.")
 @click.option("--force", is_flag=True, help="Replace an earlier run in the run directory, once this one is complete.")
 @click.option("--resume", is_flag=True, help="Continue the interrupted run in the run directory, to the same bits.")
+@click.option("--no-report", is_flag=True, help="Leave figures and page to 'en4dvar report'.")
 @click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
 @click.option("--scheduler", metavar="ADDRESS", help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786.")
 def run(
@@ -116,6 +117,7 @@ def run(
     out: Path | None,
     force: bool,
     resume: bool,
+    no_report: bool,
     workers: int | None,
     scheduler: str | None,
 ) -> None:
@@ -130,6 +132,7 @@ def run(
     """
     special = {
         "output.directory": str(out) if out else None,
+        "output.report": False if no_report else None,
         "execution.workers": workers,
         "execution.address": scheduler,
     }
@@ -162,7 +165,7 @@ def run(
         click.echo(f"warning: {warning}", err=True)
     if len(told) > MOST_TOLD:
         click.echo(f"warning: {len(told) - MOST_TOLD} more; see run.log", err=True)
-    if len(campaign):
+    if len(campaign) and not no_report:
         click.echo(f"report: {campaign.directory / 'report.html'}")
     if campaign.failures:
         reasons = [f"{o.name}: {o.failure}" for o in campaign.failures]

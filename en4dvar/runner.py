@@ -20,7 +20,7 @@ from en4dvar.progress import Progress, RunLog
 from en4dvar.provenance import provenance
 from en4dvar.report import summary_csv, write_report
 from en4dvar.rundir import Mode, RunDirectory
-from en4dvar.store import Result
+from en4dvar.store import Result, load_result
 from en4dvar.worklist import Dataset, Done, Worklist, datasets
 
 IDENTITY = f"{FOLDER}/run"
@@ -195,10 +195,10 @@ def _finish(work: Worklist) -> None:
     if good and len(work.sets) > 1:
         longest = max(work.ended[name].n_observations for name in good)
         save_campaign(directory.work / "posterior.nc", good, longest, work.attributes, failures)
-    if good:
+    if good and work.config.report:
         _report(directory)
     else:
-        write_text(directory.claim("summary.csv"), summary_csv((), failures))
+        write_text(directory.claim("summary.csv"), summary_csv(map(load_result, good.values()), failures))
 
 
 def _report(directory: RunDirectory) -> Path:

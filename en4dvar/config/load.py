@@ -37,6 +37,7 @@ class Config:
     assimilation: AssimilationSettings
     weights: Literal["sum", "mean"]
     execution: schema.Execution
+    report: bool
     directory: Path
     simulate_times: Array | None
     resolved: str
@@ -97,6 +98,7 @@ def resolve(document: Document, base: Path) -> Config:
         assimilation=AssimilationSettings(**options),
         weights=weights,
         execution=top.execution,
+        report=top.output.report,
         directory=top.output.directory or Path("runs") / top.name,
         simulate_times=times,
         resolved=_resolved(top, base, data, model_resolved, entries, assimilation),

@@ -124,9 +124,10 @@ class Execution(Section):
 
 
 class Output(Section):
-    """Run directory; default ``runs/<name>``, relative to the current directory."""
+    """Run directory; default ``runs/<name>``, relative to the current directory. ``report``: write figures and page."""
 
     directory: Path | None = None
+    report: bool = True
 
 
 class Times(Section):

@@ -10,6 +10,7 @@ reads while it runs. Dask repeats the calls of a worker that dies; a worker that
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
 import queue
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 CONNECT_TIMEOUT = 15.0  # s
 NO_WORKER_TIMEOUT = 60.0  # s without any worker before the run is given up
 POLL = 2.0  # s
+CLOSE_TIMEOUT = 10.0  # s; workers end by themselves when their scheduler is gone
 
 
 class DaskExecutor(Executor):
@@ -58,7 +60,7 @@ class DaskExecutor(Executor):
                     n_workers=workers or 1,
                     threads_per_worker=1,
                     memory_limit=0,  # a member that needs memory is not a reason to kill its worker
-                    dashboard_address=None,
+                    dashboard_address=":0",
                     silence_logs=logging.CRITICAL,
                 )
             self._client = distributed.Client(
@@ -149,10 +151,12 @@ class DaskExecutor(Executor):
     def close(self) -> None:
         client, cluster = self._client, self._cluster
         self._client = self._cluster = None
-        if client is not None:
-            client.close(timeout=POLL)
-        if cluster is not None:
-            cluster.close(timeout=POLL)
+        with contextlib.suppress(TimeoutError):
+            if client is not None:
+                client.close(timeout=CLOSE_TIMEOUT)
+        with contextlib.suppress(TimeoutError):
+            if cluster is not None:
+                cluster.close(timeout=CLOSE_TIMEOUT)
 
 
 def _on_worker(function: Callable[..., T], call: tuple[Any, ...]) -> T:

@@ -1,0 +1,61 @@
+"""Oscillators that disturb the process they run in, told how by environment variables so that workers hear it too."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+from toy_models import Oscillator
+
+
+class Slow(Oscillator):
+    """Takes ``EN4DVAR_TEST_PAUSE`` seconds more for each batch of members."""
+
+    def trajectories(self, x, times):
+        time.sleep(float(os.environ.get("EN4DVAR_TEST_PAUSE", "0.02")))
+        return super().trajectories(x, times)
+
+
+class DiesOnce(Slow):
+    """Kills its process at a data set of large amplitude, once: the file ``EN4DVAR_TEST_FLAG`` remembers."""
+
+    def trajectories(self, x, times):
+        flag = Path(os.environ["EN4DVAR_TEST_FLAG"])
+        if np.median(x[:, 0]) > 150e-6 and not flag.exists():
+            flag.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().trajectories(x, times)
+
+
+class DiesAlways(Oscillator):
+    """Kills its process at a data set of large amplitude."""
+
+    def trajectories(self, x, times):
+        if np.median(x[:, 0]) > 150e-6:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().trajectories(x, times)
+
+
+class Breaks(Oscillator):
+    """Loses every member at a data set of large amplitude."""
+
+    def step(self, x, t0, t1):
+        if t0 == 0.0 and x[0] > 150e-6:
+            raise ArithmeticError("too large")
+        return super().step(x, t0, t1)
+
+
+class Stops(Oscillator):
+    """Ctrl-C at call number ``stop_at`` of this process."""
+
+    calls = 0
+    stop_at = 0
+
+    def trajectories(self, x, times):
+        type(self).calls += 1
+        if type(self).calls == type(self).stop_at:
+            raise KeyboardInterrupt
+        return super().trajectories(x, times)

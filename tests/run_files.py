@@ -1,0 +1,93 @@
+"""Run directories of the toy oscillator, and equality of what they hold to the last bit."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from toy_config import csv_text, write_toy
+
+from en4dvar.config import Config, load_config
+
+TESTS = Path(__file__).parent
+
+
+def make_campaign(folder: Path, n: int = 4, model: str = "toy_models:Oscillator", large: int | None = None) -> Path:
+    """A configuration with ``n`` data files in ``folder/data``; number ``large`` has twice the amplitude."""
+    path = write_toy(
+        folder,
+        ("path: toy.csv", "path: data/*.csv"),
+        ("toy_models:Oscillator", model),
+    )
+    (folder / "data").mkdir()
+    for i in range(n):
+        text = csv_text(k=1.6 + 0.15 * i)
+        if i == large:
+            head, *rows = text.splitlines()[1:]
+            doubled = (f"{t},{2 * float(x):.6g}" for t, x in (row.split(",") for row in rows))
+            text = "\n".join([head, *doubled, ""])
+        (folder / "data" / f"set{i}.csv").write_text(text)
+    return path
+
+
+def configuration(path: Path, out: Path, **execution: object) -> Config:
+    """The configuration with ``execution`` settings and run directory ``out``; every iteration is kept."""
+    overrides = {"output.directory": str(out), "output.report": False, "execution.checkpoint_every": 0}
+    return load_config(path, overrides | {f"execution.{key}": value for key, value in execution.items()})
+
+
+def posterior_files(run: Path) -> dict[str, Path]:
+    return {p.relative_to(run).as_posix(): p for p in sorted(run.rglob("*.nc"))}
+
+
+def assert_same_results(a: Path, b: Path) -> None:
+    """Every value of every group of every netCDF file agrees bit for bit; attributes of the making may differ."""
+    left, right = posterior_files(a), posterior_files(b)
+    assert left, f"no result in {a}"
+    assert left.keys() == right.keys()
+    for name in left:
+        with xr.open_datatree(left[name]) as x, xr.open_datatree(right[name]) as y:
+            assert x.groups == y.groups
+            for group in x.groups:
+                one, two = x[group].to_dataset(inherit=False), y[group].to_dataset(inherit=False)
+                assert set(one.variables) == set(two.variables), (name, group)
+                for key in one.variables.keys() - {"data_source"}:
+                    u, v = one[key].values, two[key].values
+                    assert u.dtype == v.dtype
+                    assert u.tobytes() == v.tobytes() if u.dtype != object else np.array_equal(u, v), (name, group, key)
+                if group != "/":
+                    assert stated(one) == stated(two), (name, group)
+
+
+def stated(dataset: xr.Dataset) -> dict[str, str]:
+    """Attributes but the path of the data."""
+    return {str(k): str(v) for k, v in dataset.attrs.items() if k != "data_source"}
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "en4dvar.cli", *map(str, arguments)]
+
+
+def environment(**variables: object) -> dict[str, str]:
+    known = os.pathsep.join(p for p in (str(TESTS), os.environ.get("PYTHONPATH", "")) if p)
+    return {**os.environ, "PYTHONPATH": known, **{k: str(v) for k, v in variables.items()}}
+
+
+def run_cli(*arguments: object, **variables: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command(*arguments), capture_output=True, text=True, env=environment(**variables))
+
+
+def run_and_signal(number: signal.Signals, after: float, *arguments: object, **variables: object) -> tuple[int, str]:
+    """Run, send a signal after some seconds; exit code and standard error."""
+    process = subprocess.Popen(command(*arguments), stderr=subprocess.PIPE, text=True, env=environment(**variables))
+    try:
+        _, told = process.communicate(timeout=after)
+    except subprocess.TimeoutExpired:
+        process.send_signal(number)
+        _, told = process.communicate()
+    return process.returncode, told
