@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar import diagnostics as diag
+from en4dvar import mcmc
 from en4dvar.descent import Local, WeightSpace
 from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
@@ -18,6 +19,7 @@ from en4dvar.problem import Analysis, AssimilationSettings, InverseProblem, Iter
 from en4dvar.schemes import Step, Weights
 from en4dvar.schemes.esmda import ESMDA
 from en4dvar.start import choose_start
+from en4dvar.state import Array
 
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 
@@ -112,6 +114,7 @@ class _Run:
         end = self.assimilate_repeatedly(state, self.mda) if self.mda else self.iterate(state)
 
         posterior = space.control(end.weights.w + end.step.transform)
+        posterior, refinement, refine_warnings = self.refine(posterior)
         mode = space.control(end.weights.w)
         final = space.forecast(np.vstack([posterior, mode]), grid)
         after, last = final[:-1], final[-1:]
@@ -149,6 +152,7 @@ class _Run:
             forward_runs=space.forward_runs,
             seed=self.seed,
             settings=self.settings,
+            refinement=refinement,
             log_evidence=diag.log_evidence(
                 end.cost, end.step.hessian.singular_values, len(space.members), observations
             ),
@@ -157,6 +161,7 @@ class _Run:
                 *(() if end.converged else (f"not converged: {end.reason}",)),
                 *diag.loss_warning("prior forecast", prior_run.failures[:-1]),
                 *end.warnings,
+                *refine_warnings,
                 *diag.loss_warning("posterior forecast", after.failures),
                 *diag.fit_warnings(record.chi2_per_observation * used, used, record.dfs),
                 *diag.conflict_warnings(prior.names, mode, prior.mean, prior.std),
@@ -169,6 +174,20 @@ class _Run:
             return LoopState(Weights.prior(len(self.space.members)), self.space.forward_runs)
         w, warnings = choose_start(self.space, prior_run)
         return LoopState(Weights(w, self.space.scheme.init(len(w)).T), self.space.forward_runs, warnings)
+
+    def refine(self, posterior: Array) -> tuple[Array, dict[str, float], tuple[str, ...]]:
+        """The posterior ensemble (N, n), the summary of the chain that replaced it, and warnings."""
+        if self.settings.refine == "none":
+            return posterior, {}, ()
+        space = self.space
+
+        def log_density(x: Array) -> Array:
+            space.forward_runs += len(x)
+            return log_posterior(self.problem, x, space.executor)
+
+        chain = mcmc.sample(log_density, posterior, self.seed)
+        warnings = () if chain.converged else (chain.warning(),)
+        return chain.thin(len(posterior), self.settings.sampling == "exact"), chain.summary(), warnings
 
     def iterate(self, state: LoopState) -> _Outcome:
         settings, space = self.settings, self.space

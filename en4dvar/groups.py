@@ -181,6 +181,8 @@ def _sample_stats(a: Analysis) -> xr.Dataset:
         "converged": a.converged,
         "stop_reason": a.stop_reason,
         "forward_runs": a.forward_runs,
+        **a.shape,
+        **a.refinement,
     }
     reason = "reason of failure, empty where the member is alive"
     return xr.Dataset(

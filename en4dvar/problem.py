@@ -52,6 +52,7 @@ class AssimilationSettings:
     step_tolerance: float = 1e-3
     cost_tolerance: float = 1e-4
     min_active_fraction: float = 0.5
+    refine: Literal["none", "mcmc"] = "none"
     mda_coefficients: tuple[float, ...] = (4.0, 4.0, 4.0, 4.0)
     mda_form: Literal["perturbed", "square-root"] = "perturbed"
 
@@ -118,3 +119,5 @@ class Analysis:
     settings: AssimilationSettings
     warnings: tuple[str, ...] = ()
     log_evidence: float = float("nan")  # ln p(y), Laplace approximation
+    shape: Mapping[str, float] = field(default_factory=dict)  # how Gaussian the posterior is (diagnostics.gaussianity)
+    refinement: Mapping[str, float] = field(default_factory=dict)  # summary of the Markov chain, if any

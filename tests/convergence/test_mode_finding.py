@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from toys import Decay, Toy, Wave, make_problem
 
-from en4dvar.assimilate import assimilate, cost
+from en4dvar.assimilate import assimilate
 from en4dvar.descent import WeightSpace
 from en4dvar.executor import SerialExecutor
 from en4dvar.linalg import Hessian
@@ -106,20 +106,15 @@ def test_searches_side_by_side_find_what_each_finds_alone():
     assert len({m.step_length for m in together if m}) > 1
 
 
-def lowest(problem, points=401):
-    axes = [m + s * np.linspace(-4, 4, points) for m, s in zip(problem.prior.mean, problem.prior.std, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    return grid[::37], float(cost(problem, grid[::37]).min())
-
-
-def test_several_starts_find_the_lowest_of_many_minima():
-    settings = AssimilationSettings(members=24)
-    ends = {starts: [] for starts in (1, 3, 8)}
-    for seed in range(12):
-        problem = make_problem(Wave(), [1.5, 2.0], scale=0.8, seed=seed)
-        _, best = lowest(problem)
-        for starts, found in ends.items():
-            analysis = assimilate(problem, replace(settings, starts=starts), seed)
-            found.append(analysis.iterations[-1].cost < best + 0.1)
-    assert np.mean(ends[8]) == 1
-    assert np.mean(ends[3]) >= np.mean(ends[1])
+@pytest.mark.parametrize("seed", range(6))
+def test_three_starts_find_the_lowest_of_many_minima(seed):
+    """Prior so wide that b sin(3 b t) has many minima; twenty starts from another ensemble are the reference."""
+    problem = make_problem(Wave(), [1.5, 3.0], scale=2.5, seed=seed)
+    reference = assimilate(problem, AssimilationSettings(members=60, starts=20), 99).iterations[-1].cost
+    ends = {
+        starts: assimilate(problem, AssimilationSettings(members=24, starts=starts), seed).iterations[-1].cost
+        for starts in (1, 3)
+    }
+    assert ends[3] < reference + 0.01
+    if seed == 1:
+        assert ends[1] > reference + 1  # the member of lowest J lies in the wrong basin
