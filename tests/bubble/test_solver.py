@@ -12,7 +12,7 @@ import pytest
 
 import en4dvar_bubble.solver
 from en4dvar.forward import Failure
-from en4dvar_bubble import Accuracy, BubbleModel, simulate
+from en4dvar_bubble import Accuracy, BubbleModel, get_law, simulate
 from en4dvar_bubble.solver import integrate, lanes, rodas5p
 from en4dvar_bubble.solver.caching import _digest
 from en4dvar_bubble.solver.collocation import ball
@@ -189,3 +189,14 @@ class TestCache:
         code = "import en4dvar_bubble.solver.integrate as i; print(len(i.integrate.signatures))"
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         assert done.stdout.strip() == "0"
+
+
+class TestBounce:
+    @pytest.mark.parametrize("law", ["carreau", "cross"])
+    def test_shear_thinning_bubble_passes_its_bounce(self, law):
+        """The wall turns round in 1e-12 µs, below the spacing of doubles near t, and the viscosity has its knee there."""
+        t = np.linspace(5e-6, 80e-6, 40)
+        values = {k: float(v[0]) for k, v in get_law(law).example_values().items()}
+        data = simulate(law, {**values, "R0": [0.5e-6, 1e-6, 2e-6]}, t)
+        assert (data.status == 0).all()
+        assert float(data.max_wall_mach.max()) > 5
