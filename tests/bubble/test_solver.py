@@ -194,7 +194,7 @@ class TestCache:
 class TestBounce:
     @pytest.mark.parametrize("law", ["carreau", "cross"])
     def test_shear_thinning_bubble_passes_its_bounce(self, law):
-        """The wall turns round in 1e-12 µs, below the spacing of doubles near t, and the viscosity has its knee there."""
+        """The wall turns in 1e-12 µs, below the spacing of doubles near t, and the viscosity has its knee there."""
         t = np.linspace(5e-6, 80e-6, 40)
         values = {k: float(v[0]) for k, v in get_law(law).example_values().items()}
         data = simulate(law, {**values, "R0": [0.5e-6, 1e-6, 2e-6]}, t)

@@ -120,7 +120,7 @@ def _attempt(y, t, h, par, dims, world, extra, general, tol, w):
         store(y_new, i, new)
         size = maximum(absolute(old), absolute(new))
         if shear and i == fast_row:
-            # At a bounce V passes the knee of the viscosity in 1e-12 µs; on the scale √|V̇| of the bounce nothing happens.
+            # At a bounce V passes the viscosity's knee in 1e-12 µs; on the scale √|V̇| nothing happens.
             size = maximum(size, sqrt(absolute(new - old) * inverse_h))
         ratio = error / (size * tol[1, i] + tol[0, i])
         total = total + ratio * ratio
