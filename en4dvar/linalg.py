@@ -36,7 +36,7 @@ def apply_weights(ensemble: Array, rows: Array, out: Array | None = None, chunk:
     return out
 
 
-def rotate(anomalies: Array, rng: np.random.Generator, reflections: int = 2) -> Array:
+def rotate(anomalies: Array, rng: np.random.Generator, reflections: int = 4) -> Array:
     """Anomalies (N, n) under a random orthogonal map of the members that keeps mean and covariance.
 
     A product of Householder reflections with directions uniform on the unit sphere of 1⊥: a random walk on the group

@@ -1,0 +1,167 @@
+"""Twin experiments side by side with DAPPER: the same truths and observations, settings and inflation.
+
+    pip install en4dvar[benchmark]
+    python benchmarks/against_dapper.py [--cycles 1000] [--seeds 5]
+
+Prints analysis RMSE (after a burn-in of a tenth, averaged over seeds) and wall time of the assimilation for both, and
+their ratios. DAPPER is timed twice: as its examples run it (ten iterations a window, all statistics), and lean (its
+recommended ``wtol=1e-5``, errors only), which is also where its RMSE comes from. One thread each.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.update(OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1", MPLBACKEND="Agg")
+
+import argparse
+import copy
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from en4dvar.inflation import Inflation
+from en4dvar.prior import member_stream
+from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.ienks import IEnKS
+from en4dvar.sequential import SequentialSettings, Series, run_sequential
+from en4dvar_lorenz import Lorenz63, Lorenz96
+from en4dvar_lorenz.lorenz63 import Lorenz63Settings
+from en4dvar_lorenz.lorenz96 import Lorenz96Settings
+
+
+@dataclass(frozen=True)
+class System:
+    """``step``: of the integration; an observation of all variables every ``every`` steps."""
+
+    name: str
+    model: Any
+    step: float
+    every: int
+    error_std: float
+    initial_std: float
+
+
+# Sakov, Oliver & Bertino (2012), Table 1; Sakov & Oke (2008)
+L63 = System("L63", Lorenz63.from_settings(Lorenz63Settings()), 0.01, 25, 2**0.5, 2**0.5)
+L96 = System("L96", Lorenz96.from_settings(Lorenz96Settings()), 0.05, 1, 1.0, 0.001**0.5)
+# system, members, lag (0: ETKF), inflation
+CASES = [
+    (L63, 10, 0, 1.02),
+    (L63, 10, 1, 1.02),
+    (L63, 10, 4, 1.02),
+    (L96, 25, 0, 1.02),
+    (L96, 25, 1, 1.02),
+    (L96, 25, 4, 1.02),
+    (L96, 40, 0, 1.01),
+    (L96, 40, 1, 1.01),
+    (L96, 40, 4, 1.01),
+]
+
+
+def draw(system: System, cycles: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Truth at every step (K + 1, n), its observations (cycles, n) and the state all start around."""
+    mean = system.model.initial_state(system.model.defaults)
+    n = len(mean) - len(system.model.defaults)
+    stream = member_stream(seed, "truth")
+    start = mean.copy()
+    start[:n] += system.initial_std * stream.standard_normal(n)
+    (path,) = system.model.trajectories(start[None], system.step * np.arange(1, cycles * system.every + 1))
+    truth = np.vstack([start[:n], path.states[:, :n]])
+    seen = truth[system.every :: system.every]
+    return truth, seen + system.error_std * stream.standard_normal(seen.shape), mean
+
+
+def ours(
+    system: System,
+    members: int,
+    lag: int,
+    inflation: float,
+    truth: np.ndarray,
+    y: np.ndarray,
+    mean: np.ndarray,
+    seed: int,
+) -> tuple[np.ndarray, float]:
+    """Analysis RMSE of every cycle and the wall time."""
+    n = truth.shape[1]
+    ensemble = np.tile(mean, (members, 1))
+    ensemble[:, :n] += system.initial_std * member_stream(seed, "members").standard_normal((members, n))
+    times = system.step * system.every * np.arange(1, len(y) + 1)
+    series = Series(times, y, np.full(n, system.error_std))
+    settings = SequentialSettings(IEnKS(lag) if lag else ETKF(), Inflation(inflation), rotation=True)
+    began = time.perf_counter()
+    result = run_sequential(system.model, system.model.observables, ensemble, series, settings, seed)
+    took = time.perf_counter() - began
+    error = result.analysis.mean[:, :n] - truth[system.every :: system.every]
+    return np.sqrt(np.mean(error**2, axis=1)), took
+
+
+def theirs(
+    system: System, members: int, lag: int, inflation: float, truth: np.ndarray, y: np.ndarray, seed: int, lean: bool
+) -> tuple[np.ndarray, float]:
+    """The same by DAPPER."""
+    import dapper as dpr
+    import dapper.da_methods as methods
+    from dapper.tools import progressbar
+    from dapper.tools.seeding import set_seed
+
+    progressbar.disable_progbar = True
+    if system is L63:
+        from dapper.mods.Lorenz63.sakov2012 import HMM as original
+    else:
+        from dapper.mods.Lorenz96.sakov2008 import HMM as original
+    hmm = copy.deepcopy(original)
+    hmm.tseq.Ko = len(y) - 1
+    assert (hmm.tseq.dt, hmm.tseq.dko, hmm.tseq.K) == (system.step, system.every, len(truth) - 1)
+    dpr.rc.comps["error_only"] = lean
+    options = {"N": members, "infl": inflation, "rot": True}
+    if lag:
+        method = methods.iEnKS("Sqrt", Lag=lag, wtol=1e-5 if lean else 0, **options)
+    else:
+        method = methods.EnKF("Sqrt", **options)
+    set_seed(1 + seed)
+    began = time.perf_counter()
+    method.assimilate(hmm, truth, y, liveplots=False)
+    return np.array(method.stats.err.rms.a), time.perf_counter() - began
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cycles", type=int, default=1000)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--only", default="", help="cases whose name contains this, e.g. 'L96 N=25'")
+    arguments = parser.parse_args()
+    counted = slice(arguments.cycles // 10, None)
+    for system in (L63, L96):  # compile
+        ours(system, 4, 1, 1.0, *draw(system, 2, 0), 0)
+    head = ("case", "RMSE", "DAPPER", "ratio", "ms/cycle", "DAPPER", "lean", "times faster", "than lean")
+    print(("{:16s}" + "{:>12s}" * 8).format(*head))
+    for system, members, lag, inflation in CASES:
+        name = f"{system.name} N={members} " + (f"lag {lag}" if lag else "ETKF")
+        if arguments.only not in name:
+            continue
+        errors: dict[str, list[float]] = {"ours": [], "theirs": []}
+        wall = {"ours": 0.0, "default": 0.0, "lean": 0.0}
+        for seed in range(arguments.seeds):
+            truth, y, mean = draw(system, arguments.cycles, seed)
+            rmse, took = ours(system, members, lag, inflation, truth, y, mean, seed)
+            errors["ours"].append(float(rmse[counted].mean()))
+            wall["ours"] += took
+            rmse, took = theirs(system, members, lag, inflation, truth, y, seed, lean=True)
+            errors["theirs"].append(float(rmse[counted].mean()))
+            wall["lean"] += took
+            if seed == 0:  # its time does not depend on the seed
+                wall["default"] = arguments.seeds * theirs(system, members, lag, inflation, truth, y, seed, False)[1]
+        a, b = (float(np.mean(errors[who])) for who in ("ours", "theirs"))
+        each = {who: 1e3 * total / arguments.seeds / arguments.cycles for who, total in wall.items()}
+        numbers = (a, b, a / b, each["ours"], each["default"], each["lean"])
+        faster = (each["default"] / each["ours"], each["lean"] / each["ours"])
+        print(
+            f"{name:16s}" + "".join(f"{v:12.3f}" for v in numbers) + "".join(f"{v:12.1f}" for v in faster), flush=True
+        )
+
+
+if __name__ == "__main__":
+    main()
