@@ -299,6 +299,20 @@ def report(run_dir: Path) -> None:
 
 
 @main.command()
+@click.argument("run_dirs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN_DIR RUN_DIR...")
+def compare(run_dirs: tuple[Path, ...]) -> None:
+    """Compare models on the same data: evidence, model probabilities, fit, information.
+
+    \b
+    Example:
+      en4dvar compare runs/neo_hookean runs/quadratic
+    """
+    from en4dvar.compare import compare, comparison_table
+
+    click.echo(comparison_table(compare(run_dirs)))
+
+
+@main.command()
 def models() -> None:
     """List the models with their observables, parameters, units and settings.
 

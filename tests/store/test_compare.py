@@ -1,0 +1,89 @@
+"""Models side by side: probabilities from evidences, sums over data sets, and what may not be compared."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from toys import Linear, make_problem
+
+from en4dvar.assimilate import assimilate
+from en4dvar.cli import main
+from en4dvar.compare import ALL, compare, comparison_table, model_probabilities
+from en4dvar.errors import OutputError
+from en4dvar.prior import Prior, PriorTerm
+from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.store import Result, save
+
+
+def run_dir(path, names, seeds=(1,), std=0.1, wide=1.0):
+    """Results of linear models with the first ``names`` of a, b; the data are those of y = a alone."""
+    for seed in seeds:
+        problem = make_problem(Linear(("a",)), [1.0], seed=seed, std=std)
+        model = Linear(names)
+        observations = replace(problem.observations, name=f"set{seed}")
+        prior = Prior(tuple(PriorTerm.normal(p, 0.0, wide) for p in model.parameters))
+        analysis = assimilate(InverseProblem(model, problem.observable, observations, prior), AssimilationSettings(), 1)
+        place = path / "datasets" / f"set{seed}.nc" if len(seeds) > 1 else path / "posterior.nc"
+        place.parent.mkdir(parents=True, exist_ok=True)
+        save(Result.from_analysis(analysis, {"configuration": json.dumps({})}), place)
+    return path
+
+
+def exact_evidence(problem_seed, names, std=0.1, wide=1.0):
+    """ln N(y; 0, H B Hᵀ + R) of the linear model."""
+    problem = make_problem(Linear(("a",)), [1.0], seed=problem_seed, std=std)
+    y, t = problem.observations.values, problem.observations.times
+    model = Linear(names)
+    h = np.array([[model.curve(e, s) for e in np.eye(len(names))] for s in t])
+    cov = wide**2 * h @ h.T + std**2 * np.eye(len(y))
+    return float(-0.5 * (y @ np.linalg.solve(cov, y) + np.linalg.slogdet(2 * np.pi * cov)[1]))
+
+
+def test_probabilities_follow_the_exact_evidence_of_linear_models(tmp_path):
+    runs = [run_dir(tmp_path / "one", ("a",), (1, 2)), run_dir(tmp_path / "two", ("a", "b"), (1, 2))]
+    comparison = compare(runs)
+    assert comparison.datasets == ("set1", "set2", ALL)
+    exact = {s: [exact_evidence(s, names) for names in (("a",), ("a", "b"))] for s in (1, 2)}
+    exact_sum = np.sum([exact[1], exact[2]], axis=0)
+    for dataset, evidence in (("set1", exact[1]), ("set2", exact[2]), (ALL, exact_sum)):
+        scores = comparison.of(dataset)
+        assert [s.run for s in scores] == ["one", "two"]
+        assert [s.log_evidence for s in scores] == pytest.approx(list(evidence), abs=1e-6)
+        odds = np.exp(evidence[0] - evidence[1])
+        assert scores[0].probability == pytest.approx(odds / (1 + odds), abs=1e-6)
+        assert sum(s.probability for s in scores) == pytest.approx(1)
+        assert comparison.verdict(dataset).startswith("one is preferred")
+    assert comparison.of("set1")[0].dfs == pytest.approx(1, abs=0.01)
+    assert comparison.of("set1")[1].dfs == pytest.approx(2, abs=0.01)
+    # p_WAIC of a well informed linear parameter is near 1
+    assert comparison.of("set1")[0].effective_parameters == pytest.approx(1, abs=0.6)
+
+
+def test_equal_models_are_undecidable_on_the_command_line(tmp_path):
+    runs = [str(run_dir(tmp_path / name, ("a",), wide=wide)) for name, wide in (("first", 1.0), ("second", 1.1))]
+    done = CliRunner().invoke(main, ["compare", *runs])
+    assert done.exit_code == 0, done.output
+    assert "undecidable: first and second differ by 0." in done.output
+    assert done.output.splitlines()[0].split()[:3] == ["data", "set", "run"]
+    assert comparison_table(compare(runs)) in done.output
+
+
+def test_probabilities_do_not_overflow():
+    assert model_probabilities(np.array([-1e5, -1e5 + np.log(3), -2e5])) == pytest.approx([0.25, 0.75, 0])
+
+
+def test_what_does_not_compare_is_refused(tmp_path):
+    one = run_dir(tmp_path / "one", ("a",))
+    for other, message in (
+        (run_dir(tmp_path / "noise", ("a",), std=0.2), "used different observations of set1"),
+        (run_dir(tmp_path / "sets", ("a",), (1, 2)), "hold different data sets: set2"),
+        (one, "given twice"),
+    ):
+        with pytest.raises(OutputError, match=message):
+            compare([one, other])
+    with pytest.raises(OutputError, match="at least two"):
+        compare([one])
+    with pytest.raises(OutputError, match="no such file"):
+        compare([one, tmp_path / "nowhere"])
