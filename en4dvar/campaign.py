@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from en4dvar.errors import TooFewMembersError
-from en4dvar.store import Result, load_result
+from en4dvar.store import ParameterSummary, Result, load_result
 
 _RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")  # names of devices on Windows
 _LONGEST = 120  # bytes; file systems allow 255, and temporary names are longer
@@ -27,6 +27,7 @@ class DatasetOutcome:
     failure: str = ""
     exit_code: int = 0
     warnings: tuple[str, ...] = ()
+    summary: tuple[ParameterSummary, ...] = ()
 
 
 @dataclass(frozen=True)

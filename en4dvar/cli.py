@@ -157,7 +157,7 @@ def run(
             again = shlex.join([*(w for w in words if w not in ("--force", "--resume")), "--resume"])
             raise Failed(f"{interrupt}\nto continue: {again}", 130) from None
     if len(campaign) <= MOST_TOLD:
-        click.echo(results_table(campaign))
+        click.echo(results_table({o.name: o.summary for o in campaign.outcomes if not o.failure}))
     for notice in campaign.notices:
         click.echo(f"warning: {notice}", err=True)
     told = [f"{o.name}: {warning}" for o in campaign.outcomes for warning in o.warnings]

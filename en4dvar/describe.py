@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +13,7 @@ from en4dvar.state import Parameter
 from en4dvar.units import convert
 
 if TYPE_CHECKING:
-    from en4dvar.store import Result
+    from en4dvar.store import ParameterSummary
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:
@@ -42,13 +42,13 @@ def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
     return "\n\n".join(parts)
 
 
-def results_table(results: Iterable[Result]) -> str:
-    """Posterior mean, std and 5/50/95 % of every parameter and data set, in display units."""
+def results_table(summaries: Mapping[str, Iterable[ParameterSummary]]) -> str:
+    """Posterior mean, std and 5/50/95 % of every parameter (data set → its rows), in display units."""
     header = ("data set", "parameter", "unit", "mean", "std", "5 %", "50 %", "95 %")
     rows = [
-        (result.name, row.name, row.unit, *(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q50, row.q95)))
-        for result in results
-        for row in result.summary()
+        (name, row.name, row.unit, *(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q50, row.q95)))
+        for name, summary in summaries.items()
+        for row in summary
     ]
     return table([header, *rows])
 

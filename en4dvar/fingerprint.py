@@ -7,6 +7,7 @@ packages, sources of the framework and of the model, files that the model's sett
 from __future__ import annotations
 
 import difflib
+import functools
 import inspect
 import os
 import sys
@@ -63,6 +64,7 @@ def identity(resolved: str, model: ForwardModel, data: Mapping[str, Path]) -> Id
     return Identity(text, tuple((name, file_digest(path)) for name, path in data.items()))
 
 
+@functools.cache  # the code that runs is that of the first import
 def source_digest(module: str) -> str:
     """SHA-256 over the Python files of the package (or the file of the module) that holds ``module``."""
     top = sys.modules[module.partition(".")[0]]

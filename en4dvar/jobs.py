@@ -15,7 +15,7 @@ from en4dvar.executor import Executor
 from en4dvar.netcdf import to_bytes
 from en4dvar.problem import AssimilationSettings, InverseProblem, IterationRecord
 from en4dvar.progress import Progress, describe
-from en4dvar.store import Result
+from en4dvar.store import ParameterSummary, Result
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,14 @@ class Job:
 
 @dataclass(frozen=True)
 class Estimate:
-    """``content`` is the netCDF file; ``log`` what the iterations had to tell; ``last`` the last of them."""
+    """``content`` is the netCDF file; ``log`` what the iterations had to tell, ``last`` the last of them; ``ending``
+    how they ended."""
 
     content: bytes
     log: tuple[str, ...]
     last: IterationRecord
-    summary: str
+    ending: str
+    summary: tuple[ParameterSummary, ...]
     warnings: tuple[str, ...]
     n_observations: int
 
@@ -72,11 +74,13 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
         job.problem, job.settings, job.seed, executor, tell, job.resume, on_iteration=_checkpoints(job)
     )
     outcome = "converged" if analysis.converged else "not converged"
+    result = Result.from_analysis(analysis, job.attributes)
     return Estimate(
-        content=to_bytes(Result.from_analysis(analysis, job.attributes).tree),
+        content=to_bytes(result.tree),
         log=tuple(log),
         last=analysis.iterations[-1],
-        summary=f"{outcome}: {analysis.stop_reason}; {analysis.forward_runs} forward runs",
+        summary=result.summary(),
+        ending=f"{outcome}: {analysis.stop_reason}; {analysis.forward_runs} forward runs",
         warnings=analysis.warnings,
         n_observations=len(analysis.observations),
     )

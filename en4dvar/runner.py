@@ -20,7 +20,7 @@ from en4dvar.progress import Progress, RunLog
 from en4dvar.provenance import provenance
 from en4dvar.report import summary_csv, write_report
 from en4dvar.rundir import Mode, RunDirectory
-from en4dvar.store import Result, load_result
+from en4dvar.store import Result
 from en4dvar.worklist import Dataset, Done, Worklist, datasets
 
 IDENTITY = f"{FOLDER}/run"
@@ -198,7 +198,9 @@ def _finish(work: Worklist) -> None:
     if good and work.config.report:
         _report(directory)
     else:
-        write_text(directory.claim("summary.csv"), summary_csv(map(load_result, good.values()), failures))
+        write_text(
+            directory.claim("summary.csv"), summary_csv(((name, work.ended[name].summary) for name in good), failures)
+        )
 
 
 def _report(directory: RunDirectory) -> Path:

@@ -21,6 +21,7 @@ from en4dvar.fingerprint import Identity
 from en4dvar.jobs import Estimate, Job, estimate
 from en4dvar.progress import Progress, RunLog
 from en4dvar.rundir import RunDirectory
+from en4dvar.store import ParameterSummary
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Done:
     exit_code: int = 0
     warnings: tuple[str, ...] = ()
     n_observations: int = 0
+    summary: tuple[ParameterSummary, ...] = ()
 
 
 def datasets(files: Mapping[str, Path]) -> tuple[Dataset, ...]:
@@ -79,7 +81,12 @@ class Worklist:
         """What came of each data set, in order."""
         return tuple(
             DatasetOutcome(
-                d.name, None if r.failure else self.directory.path / d.file, r.failure, r.exit_code, r.warnings
+                d.name,
+                None if r.failure else self.directory.path / d.file,
+                r.failure,
+                r.exit_code,
+                r.warnings,
+                r.summary,
             )
             for d in self.sets
             if (r := self.ended.get(d.name)) is not None
@@ -190,10 +197,16 @@ class Worklist:
             self.log.write("\n".join(value.log))
             if self.progress is not None:
                 self.progress(d.name, value.last)
-        self.log.write(f"{d.name}: {value.summary}")
+        self.log.write(f"{d.name}: {value.ending}")
         self.log.write("\n".join(f"{d.name}: warning: {warning}" for warning in value.warnings))
         write_bytes(self.directory.work / d.file, value.content)
-        self._end(d, Done(digest(value.content), warnings=value.warnings, n_observations=value.n_observations))
+        record = Done(
+            digest(value.content),
+            warnings=value.warnings,
+            n_observations=value.n_observations,
+            summary=value.summary,
+        )
+        self._end(d, record)
 
     def _failed(self, d: Dataset, error: Exception) -> None:
         known = isinstance(error, En4dvarError)

@@ -18,7 +18,7 @@ from en4dvar.files import write_text
 from en4dvar.report.figures import all_figures
 from en4dvar.report.page import Section, make_section, render
 from en4dvar.report.style import save_figure
-from en4dvar.store import ParameterSummary, Result, load_result
+from en4dvar.store import ParameterSummary, load_result
 
 DETAILED = 24  # data sets with figures; a campaign's others are in summary.csv and datasets/
 
@@ -37,13 +37,13 @@ def write_report(run_dir: str | Path) -> Path:
     failures = failed_datasets(run_dir / "posterior.nc") if len(paths) > 1 or paths[0].parent != run_dir else {}
     warned: dict[Path, bool] = {}
 
-    def results() -> Iterator[Result]:
+    def summaries() -> Iterator[tuple[str, tuple[ParameterSummary, ...]]]:
         for path in paths:
             result = load_result(path)
             warned[path] = bool(result.warnings)
-            yield result
+            yield result.name, result.summary()
 
-    write_text(run_dir / "summary.csv", summary_csv(results(), failures))
+    write_text(run_dir / "summary.csv", summary_csv(summaries(), failures))
     folder = run_dir / "figures"
     try:
         folder.mkdir(exist_ok=True)
@@ -60,18 +60,18 @@ def write_report(run_dir: str | Path) -> Path:
     return write_text(run_dir / "report.html", render(sections, failures, len(paths) - len(sections)))
 
 
-def summary_csv(results: Iterable[Result], failures: Mapping[str, str]) -> str:
+def summary_csv(summaries: Iterable[tuple[str, Iterable[ParameterSummary]]], failures: Mapping[str, str]) -> str:
     """One line a data set and parameter, in display units, every digit kept; one line a data set that failed.
 
-    ``failures``: name of the data set → reason; column ``failure`` is empty elsewhere.
+    ``summaries``: (name of the data set, its rows); ``failures``: name of the data set → reason, column ``failure``.
     """
     columns = [f.name for f in fields(ParameterSummary) if f.name not in ("label", "symbol")]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["dataset", *columns, "failure"])
-    for result in results:
-        for row in result.summary():
-            writer.writerow([result.name, *(getattr(row, column) for column in columns), ""])
+    for name, summary in summaries:
+        for row in summary:
+            writer.writerow([name, *(getattr(row, column) for column in columns), ""])
     for name, reason in failures.items():
         writer.writerow([name, *("" for _ in columns), reason])
     return text.getvalue()
