@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
+from scipy.stats import halfnorm, multivariate_normal, norm
 
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.state import Parameter
 from en4dvar_bubble.study.gaussian import divide_out, log_pooled_evidence
-from en4dvar_bubble.study.population import HyperPrior, _Posterior, estimate_population
+from en4dvar_bubble.study.population import HyperPrior, _Posterior, estimate_population, population_log_evidence
 
 NAMES = ("a", "b", "c")
 MEAN, STD = np.array([1.0, -2.0, 0.3]), np.array([0.5, 1.5, 0.7])
+
+
+def normal_prior(names, means, stds):
+    bounds = (-np.inf, np.inf)
+    parameters = [Parameter(name, unit="1", transform="normal", bounds=bounds, label="", symbol="") for name in names]
+    return Prior(tuple(PriorTerm.normal(p, m, s) for p, m, s in zip(parameters, means, stds, strict=True)))
 
 
 def linear_problem(n_sets=6, k=4, seed=0, spread=0.0):
@@ -70,6 +76,28 @@ def test_marginal_density_of_the_spread_against_the_joint_gaussian():
     told = posterior(np.log(taus))[0]
     reference = np.array([exact(t) for t in taus])
     np.testing.assert_allclose(told - told[0], reference - reference[0], atol=1e-7)
+
+
+def test_population_evidence_against_quadrature():
+    """One coordinate: p(y | ν, τ) is a product of normals, integrated by quadrature over ν and τ."""
+    rng = np.random.default_rng(4)
+    n, s, noise = 12, 0.8, 0.5
+    y = 0.4 + 0.3 * rng.standard_normal(n) + noise * rng.standard_normal(n)
+    variance = 1 / (1 / s**2 + 1 / noise**2)
+    evidence = norm(0.0, np.hypot(s, noise)).logpdf(y)
+    found = divide_out(
+        ("a",), (variance * y / noise**2)[:, None], np.full((n, 1, 1), variance), evidence, np.zeros(1), np.array([s])
+    )
+    hyper = HyperPrior(mean_std=0.7, spread=0.4)
+    told = population_log_evidence(found, normal_prior(("a",), [0.0], [s]), ["a"], 1, hyper)
+    nu, tau = np.linspace(-3, 3, 1201)[:, None], np.linspace(1e-4, 3, 1500)[None, :]
+    density = (
+        sum(norm(nu, np.hypot(tau, noise)).logpdf(v) for v in y)
+        + norm(0, 0.7).logpdf(nu)
+        + halfnorm(scale=0.4).logpdf(tau)
+    )
+    exact = np.log(np.exp(density).sum() * (nu[1, 0] - nu[0, 0]) * (tau[0, 1] - tau[0, 0]))
+    assert told == pytest.approx(exact, abs=0.02)
 
 
 def test_population_is_recovered_and_the_prior_is_not():

@@ -18,11 +18,13 @@ class Comparison:
     """Log-evidence of the quadratic over the neo-Hookean law.
 
     ``single`` (S,) of each data set by itself. ``independent``: of all of them, every bubble in a gel of its own.
+    ``population``: mean and spread of the material parameters common (hierarchical step).
     ``shared``: of all of them in one gel, material parameters common and R0, t_s of each bubble's own.
     """
 
     single: Array
     independent: float
+    population: float
     shared: float
 
     @property
@@ -31,11 +33,13 @@ class Comparison:
         return int(np.sum(np.abs(self.single) < DECISIVE))
 
 
-def compare_laws(nh: Factors, quadratic: Factors, log_nh: Array, log_quadratic: Array) -> Comparison:
-    """From the likelihood factors of the shared coordinates and the log-evidences (S,) of both laws."""
+def compare_laws(nh: Factors, quadratic: Factors, log_nh: Array, log_quadratic: Array, population: float) -> Comparison:
+    """From the likelihood factors of the shared coordinates, the log-evidences (S,) of both laws, and the difference of
+    their hierarchical log-evidences.
+    """
     single = log_quadratic - log_nh
     shared = log_pooled_evidence(quadratic) - log_pooled_evidence(nh)
-    return Comparison(single, float(single.sum()), shared)
+    return Comparison(single, float(single.sum()), population, shared)
 
 
 def probability(difference: Array) -> Array:

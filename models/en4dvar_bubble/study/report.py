@@ -82,9 +82,9 @@ def _method(study: Study) -> str:
     members = next(iter(next(iter(study.fits.values())).values())).analyses[0].settings.members
     return (
         f"Sweep: {s.trajectories} trajectories of a Sobol design a model and gel, uniform in the transformed "
-        f"parameters within {s.width:g} prior standard deviations, then {s.rounds} rounds of {s.local} a set about the best fit; "
-        f"nearest neighbour in time on a grid of {s.step * 1e6:g} µs, time shift within ±{s.shift * 1e6:g} µs; weights "
-        f"are the NRMSE of the best fits ({seconds['sweep']:.0f} s). En4D-Var: {members} members a set "
+        f"parameters within {s.width:g} prior standard deviations, then {s.rounds} rounds of {s.local} a set about "
+        f"the best fit; nearest neighbour in time on a grid of {s.step * 1e6:g} µs, time shift within "
+        f"±{s.shift * 1e6:g} µs; weights are the NRMSE of the best fits ({seconds['sweep']:.0f} s). En4D-Var: {members} members a set "
         f"({seconds['en4dvar']:.0f} s). Population and comparison: {seconds['population']:.0f} s."
     )
 
@@ -181,9 +181,9 @@ def _population(study: Study) -> Block:
     return {
         "title": "Population of bubbles",
         "words": "General QLKV. Stacking the ensembles, as the paper does, counts the prior once a data set and so "
-        "inherits it. The hierarchical step divides the prior out of every set and estimates mean and between-bubble spread "
-        "together; its interval is wide where the data determine only a combination of parameters (at the stretch of "
-        "these bubbles the elastic stress depends on little else than G α / R₀).",
+        "inherits it. The hierarchical step divides the prior out of every set and estimates mean and between-bubble "
+        "spread together; its interval is wide where the data determine only a combination of parameters (at the "
+        "stretch of these bubbles the elastic stress depends on little else than G α / R₀).",
         "heads": ["gel", "parameter", "mean [95 %]", "spread", "stacked mean ± std", "truths mean ± std"],
         "rows": rows,
     }
@@ -197,7 +197,12 @@ def _comparison(study: Study) -> Block:
             [gel, name, f"{value:+.1f}", f"{float(probability(value)):.2f}", verdict(value)]
             for name, value in zip(fit.names, found.single, strict=True)
         ]
-        for words, value in (("all sets, a gel each", found.independent), ("all sets, one gel", found.shared)):
+        pooled = (
+            ("all sets, a gel each", found.independent),
+            ("all sets, one population", found.population),
+            ("all sets, one gel", found.shared),
+        )
+        for words, value in pooled:
             rows.append([gel, words, f"{value:+.1f}", f"{float(probability(np.array(value))):.2f}", verdict(value)])
     undecided = sum(c.undecidable for c in study.comparisons.values())
     total = sum(len(c.single) for c in study.comparisons.values())
@@ -205,7 +210,8 @@ def _comparison(study: Study) -> Block:
         "title": "Neo-Hookean or quadratic law",
         "words": "Log-evidence of the general quadratic over the neo-Hookean law and its probability at equal prior "
         f"odds. Undecidable (|Δ| < {DECISIVE:g}) by itself: {undecided} of {total} data sets. “One gel”: G, α and μ "
-        "common to all bubbles, R₀ and t_s of each its own.",
+        "common to all bubbles, R₀ and t_s of each its own; a law that needs different values from bubble to bubble "
+        "pays heavily. “One population”: they vary from bubble to bubble about a common mean with a common spread.",
         "heads": ["gel", "data set", "Δ log-evidence", "probability", "verdict"],
         "rows": rows,
     }

@@ -21,7 +21,7 @@ from en4dvar.state import Array
 from en4dvar_bubble.study.evidence import Comparison, compare_laws
 from en4dvar_bubble.study.gaussian import factors
 from en4dvar_bubble.study.paper import QUANTITIES, Model, Route
-from en4dvar_bubble.study.population import Population, estimate_population
+from en4dvar_bubble.study.population import Population, estimate_population, population_log_evidence
 from en4dvar_bubble.study.settings import StudyPlan
 from en4dvar_bubble.study.sweep import SweepResult, run_sweep
 
@@ -70,7 +70,9 @@ class Fit:
         return np.array([nrmse(a.observations.values, a.centre_predictions) for a in self.analyses])
 
     def summary(self, route: Route, name: str) -> tuple[float, float]:
-        """NRMSE-weighted mean and standard deviation over the sets, SI."""
+        """NRMSE-weighted mean and standard deviation over the sets, SI; a fixed value has none."""
+        if not self.estimated(name):
+            return self.problems[0].fixed[name], 0.0
         weights, values = self.nrmse(route), self.values(route, name)
         mean = float(np.average(values, weights=weights))
         return mean, float(np.sqrt(np.average((values - mean) ** 2, weights=weights)))
@@ -148,16 +150,25 @@ def run_study(plan: StudyPlan, workers: int = 1, tell: Tell | None = None) -> St
             likelihoods = factors(general.analyses, general.prior)
             populations[gel] = estimate_population(likelihoods, general.prior, POPULATION, plan.seed)
         if general is not None and "nh" in models:
-            comparisons[gel] = compare_laws(
-                factors(models["nh"].analyses, models["nh"].prior, [n for n in SHARED if models["nh"].estimated(n)]),
-                factors(general.analyses, general.prior, [n for n in SHARED if general.estimated(n)]),
-                np.array([a.log_evidence for a in models["nh"].analyses]),
-                np.array([a.log_evidence for a in general.analyses]),
-            )
+            comparisons[gel] = _compare(models["nh"], general, plan.seed)
     seconds["population"] = time.perf_counter() - start
     say(f"population and model comparison in {seconds['population']:.1f} s")
     truth = read_truth(plan.truth) if plan.truth else {}
     return Study(plan, fits, populations, comparisons, truth, seconds)
+
+
+def _compare(nh: Fit, general: Fit, seed: int) -> Comparison:
+    names = {fit.model: [name for name in SHARED if fit.estimated(name)] for fit in (nh, general)}
+    shared = {fit.model: factors(fit.analyses, fit.prior, names[fit.model]) for fit in (nh, general)}
+    single = {fit.model: np.array([a.log_evidence for a in fit.analyses]) for fit in (nh, general)}
+    pooled = {
+        fit.model: population_log_evidence(shared[fit.model], fit.prior, names[fit.model], seed)
+        if len(fit.problems) >= 3
+        else np.nan
+        for fit in (nh, general)
+    }
+    difference = pooled[general.model] - pooled[nh.model]
+    return compare_laws(shared["nh"], shared["qlkv"], single["nh"], single["qlkv"], float(difference))
 
 
 def read_truth(path: Path) -> dict[str, dict[str, float]]:

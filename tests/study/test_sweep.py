@@ -1,0 +1,160 @@
+"""The sweep: NRMSE as defined, the design, streaming, continuing, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from en4dvar.build import build
+from en4dvar.config import load_config
+from en4dvar.errors import ConfigError, DataError, OutputError
+from en4dvar.observations import Observations
+from en4dvar_bubble.commands_study import sweep as sweep_command
+from en4dvar_bubble.study.nearest import best_over_shifts, targets
+from en4dvar_bubble.study.sweep import SweepSettings, prepare_folder, run_sweep, sobol_box
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+SMALL = SweepSettings(trajectories=192, chunk=64, step=0.1e-6)
+
+
+def readings(times, values, name="a"):
+    ones = np.ones(len(times))
+    return Observations(np.asarray(times), np.asarray(values), ones, 0 * ones, ones, name=name)
+
+
+@pytest.fixture(scope="module")
+def problems():
+    return build(load_config(CONFIGS / "agarose_03_qlkv.yaml"))[:3]
+
+
+@pytest.fixture(scope="module")
+def whole(problems):
+    return run_sweep(problems, SMALL, seed=1)
+
+
+def test_nrmse_by_its_definition():
+    """Against the formula, written out: nearest grid instant of t + shift, every shift tried."""
+    rng = np.random.default_rng(0)
+    sets = [readings(np.sort(rng.uniform(5, 30, k)), rng.uniform(10, 100, k)) for k in (7, 12)]
+    aims = targets(sets, shift=0.8, step=0.05)
+    traces = 50 + 40 * np.sin(aims.grid / 5 + rng.uniform(0, 6, (4, 1)))
+    nrmse, shift = best_over_shifts(traces, aims)
+    assert aims.reach == 16
+    for b in range(4):
+        for s, o in enumerate(sets):
+            best = -np.inf
+            for k in range(-16, 17):
+                # the nearest grid instant of the reading, then the shift in whole steps
+                nearest = [int(np.argmin(np.abs(aims.grid - t))) + k for t in o.times]
+                error = np.linalg.norm(o.values - traces[b, nearest])
+                best = max(best, 1 - error / np.linalg.norm(o.values - o.values.mean()))
+            assert nrmse[b, s] == pytest.approx(best, abs=1e-12)
+            assert abs(shift[b, s]) <= 0.8 + 1e-12
+
+
+def test_a_trace_through_the_shifted_readings_is_a_perfect_fit():
+    o = readings(np.arange(5.0, 25.0, 1.5), 10 + np.arange(14.0) ** 2)
+    aims = targets([o], shift=0.8, step=0.1)
+    trace = np.interp(aims.grid - 0.5, o.times, o.values)  # told at t, taken at t + 0.5
+    nrmse, shift = best_over_shifts(trace[None], aims)
+    assert nrmse[0, 0] == pytest.approx(1, abs=1e-9)
+    assert shift[0, 0] == pytest.approx(0.5)
+
+
+def test_a_constant_at_the_mean_has_nrmse_zero_and_a_lost_trace_none():
+    o = readings(np.arange(5.0, 25.0, 1.5), 10 + np.arange(14.0) ** 2)
+    aims = targets([o], shift=0.0, step=0.1)
+    flat = np.full((2, len(aims.grid)), o.values.mean())
+    flat[1, 3] = np.nan
+    nrmse, _ = best_over_shifts(flat, aims)
+    assert nrmse[0, 0] == pytest.approx(0, abs=1e-12)
+    assert nrmse[1, 0] == -np.inf
+
+
+def test_sobol_box_grows_without_moving_and_fills_the_box():
+    centre, half = np.array([1.0, -3.0]), np.array([0.5, 2.0])
+    few, many = sobol_box(centre, half, 100, 7), sobol_box(centre, half, 1000, 7)
+    np.testing.assert_array_equal(few, many[:100])
+    assert np.all(np.abs(many - centre) <= half)
+    np.testing.assert_allclose(many.mean(axis=0), centre, atol=0.02)
+
+
+def test_bits_do_not_depend_on_workers_or_chunks(problems, whole):
+    other = run_sweep(problems, replace(SMALL, chunk=50), seed=1, workers=2)
+    np.testing.assert_array_equal(other.theta, whole.theta)
+    np.testing.assert_array_equal(other.nrmse, whole.nrmse)
+
+
+def test_an_interrupted_sweep_continues_with_the_missing_chunks(problems, whole, tmp_path):
+    class Stop(Exception):
+        pass
+
+    def interrupt(done, total):
+        if done >= 128:
+            raise Stop
+
+    with pytest.raises(Stop):
+        run_sweep(problems, SMALL, seed=1, folder=tmp_path, progress=interrupt)
+    kept = sorted(tmp_path.glob("*.npz"))
+    assert kept
+    stamps = {file: file.stat().st_mtime_ns for file in kept}
+    again = run_sweep(problems, SMALL, seed=1, folder=tmp_path)
+    np.testing.assert_array_equal(again.theta, whole.theta)
+    np.testing.assert_array_equal(again.shift, whole.shift)
+    assert all(file.stat().st_mtime_ns == stamp for file, stamp in stamps.items())
+    assert len(list(tmp_path.glob("*.npz"))) == 3
+
+
+def test_refinement_never_worsens_and_finds_better(problems, whole):
+    refined = run_sweep(problems, replace(SMALL, rounds=2, local=32), seed=1)
+    assert np.all(refined.nrmse >= whole.nrmse)
+    assert np.any(refined.nrmse > whole.nrmse)
+    assert refined.trajectories == 192 + 2 * 32 * 3
+
+
+def test_weighted_moments(whole):
+    w = whole.nrmse / whole.nrmse.sum()
+    mean = w @ whole.theta
+    np.testing.assert_allclose(whole.mean, mean)
+    np.testing.assert_allclose(whole.std, np.sqrt(w @ (whole.theta - mean) ** 2))
+
+
+def test_the_design_is_shared(problems):
+    other = replace(problems[1], fixed={"G": 1.0})
+    with pytest.raises(ConfigError, match="the design is shared"):
+        run_sweep([problems[0], other], SMALL, seed=1)
+
+
+def test_readings_before_the_start_are_refused(problems):
+    with pytest.raises(DataError, match="before the start"):
+        run_sweep(problems, replace(SMALL, shift=6e-6), seed=1)
+
+
+def test_folder_of_another_sweep(tmp_path):
+    prepare_folder(tmp_path, "a", "new")
+    (tmp_path / "design_00000.npz").write_bytes(b"")
+    with pytest.raises(OutputError, match="--resume"):
+        prepare_folder(tmp_path, "a", "new")
+    with pytest.raises(OutputError, match="another configuration"):
+        prepare_folder(tmp_path, "b", "resume")
+    assert prepare_folder(tmp_path, "a", "resume") == tmp_path
+    prepare_folder(tmp_path, "b", "force")
+    assert not list(tmp_path.glob("*.npz"))
+
+
+def test_command(tmp_path):
+    call = [str(CONFIGS / "quickstart.yaml"), "--trajectories", "128", "--out", str(tmp_path), "--step", "0.1 us"]
+    first = CliRunner().invoke(sweep_command, call)
+    assert first.exit_code == 0, first.output
+    assert "NRMSE" in first.output
+    table = (tmp_path / "sweep.csv").read_text().splitlines()
+    assert table[0] == "dataset,G (kPa),alpha,mu (Pa s),R0 (um),t_s (us),NRMSE"
+    assert len(table) == 2
+    assert isinstance(CliRunner().invoke(sweep_command, call).exception, OutputError)
+    assert CliRunner().invoke(sweep_command, [*call, "--resume"]).exit_code == 0
+    assert CliRunner().invoke(sweep_command, [*call, "--force", "--resume"]).exit_code == 2
+    assert CliRunner().invoke(sweep_command, [*call, "--shift", "1 kPa"]).exit_code == 2
