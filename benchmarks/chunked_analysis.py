@@ -65,10 +65,8 @@ def main() -> None:
     product = min(best(lambda: columns @ square), best(lambda: square @ ensemble))  # the better layout
     whole, in_place = best(lambda: analyse()), best(lambda: analyse(ensemble))
     print(f"n = {n}, N = {n_members}: one (n × N)(N × N) product {product:.3f} s")
-    print(f"analysis          {whole:.3f} s   {whole / product:.2f} × the product   peak {peaks[0]:.2f} × the ensemble")
-    print(
-        f"analysis in place {in_place:.3f} s   {in_place / product:.2f} × the product   peak {peaks[1]:.2f} × the ensemble"
-    )
+    for name, seconds, peak in (("analysis", whole, peaks[0]), ("analysis in place", in_place, peaks[1])):
+        print(f"{name:18s}{seconds:.3f} s   {seconds / product:.2f} × the product   peak {peak:.2f} × the ensemble")
 
 
 if __name__ == "__main__":

@@ -99,9 +99,9 @@ class Hessian:
         return float(self.right.shape[1] - 1)
 
     def solve(self, g: Array, damping: float = 0.0) -> Array:
-        """(A + damping (N−1) I)⁻¹ g for g (N,)."""
+        """(A + damping (N−1) I)⁻¹ g for g (N,), or for every row of g (M, N)."""
         base = self.prior_precision * (1 + damping)
-        coefficients = self.right @ g
+        coefficients = g @ self.right.T
         return np.asarray(g / base + (coefficients * (1 / (base + self.singular_values**2) - 1 / base)) @ self.right)
 
     def norm(self, delta: Array) -> float:

@@ -20,7 +20,8 @@ from typing import Literal
 
 import numpy as np
 
-from en4dvar.schemes import Evaluation, Weights, gauss_newton
+from en4dvar.linalg import Hessian
+from en4dvar.schemes import Evaluation, Weights
 from en4dvar.state import Array
 
 Form = Literal["perturbed", "square-root"]
@@ -57,13 +58,12 @@ class ESMDA:
         alpha: of this assimilation. perturbations: z (N, K'), standard normal; not read by ``square-root``.
         """
         root = np.sqrt(alpha)
-        damped = Evaluation(evaluation.d / root, evaluation.S / root)
-        step = gauss_newton(Weights.prior(len(weights.w)), damped)
-        centre = weights.w + step.direction @ weights.T
+        d, S = evaluation.d / root, evaluation.S / root
+        hessian = Hessian.of(S)
+        centre = weights.w + hessian.solve(d @ S) @ weights.T
         if self.form == "square-root":
-            return Weights(centre, step.transform @ weights.T)
+            return Weights(centre, hessian.transform @ weights.T)
         # anomalies of the members' innovations: −S_i of the predictions and the perturbations
         noise = perturbations - perturbations.mean(axis=0)
-        gradients = (noise - damped.S.T) @ damped.S
-        moves = np.stack([step.hessian.solve(g) for g in gradients])
+        moves = hessian.solve((noise - S.T) @ S)
         return Weights(centre, weights.T + moves @ weights.T)
