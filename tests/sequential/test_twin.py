@@ -1,0 +1,163 @@
+"""Twin experiments: their random numbers, their scores, and what the schemes reach on the field's test-beds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from en4dvar.config import load_twin
+from en4dvar.errors import En4dvarError
+from en4dvar.executor import ThreadsExecutor
+from en4dvar.inflation import Inflation
+from en4dvar.prior import Prior, PriorTerm
+from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.ienks import IEnKS
+from en4dvar.sequential import SequentialSettings
+from en4dvar.twin import TwinExperiment, conduct, initial_ensemble, observe_truth
+from en4dvar_lorenz import Lorenz63, Lorenz96
+from en4dvar_lorenz.lorenz63 import Lorenz63Settings
+from en4dvar_lorenz.lorenz96 import Lorenz96Settings
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+L63 = {"x": 2**0.5, "y": 2**0.5, "z": 2**0.5}
+
+
+def lorenz63(scheme, cycles, members=10, inflation=1.02, burn_in=50):
+    """Sakov, Oliver & Bertino (2012), Table 1."""
+    model = Lorenz63.from_settings(Lorenz63Settings())
+    settings = SequentialSettings(scheme, Inflation(inflation), rotation=True)
+    return TwinExperiment(model, settings, members, cycles, 0.25, L63, L63, burn_in, fixed=model.defaults)
+
+
+def lorenz96(scheme, cycles, members=25, inflation=1.02, burn_in=100):
+    """Sakov & Oke (2008)."""
+    model = Lorenz96.from_settings(Lorenz96Settings())
+    settings = SequentialSettings(scheme, Inflation(inflation), rotation=True)
+    spread = {"x": 0.001**0.5}
+    return TwinExperiment(model, settings, members, cycles, 0.05, {"x": 1.0}, spread, burn_in, fixed=model.defaults)
+
+
+def rmse(experiment, seed=1, kind="analysis"):
+    return conduct(experiment, seed).scores[kind].mean_rmse
+
+
+def test_the_same_seed_gives_the_same_bits_for_any_executor():
+    experiment = lorenz63(IEnKS(1), 20)
+    one, again, other = conduct(experiment, 1), conduct(experiment, 1, ThreadsExecutor(2)), conduct(experiment, 2)
+    assert np.array_equal(one.run.members, again.run.members)
+    assert np.array_equal(one.truth, again.truth)
+    assert not np.array_equal(one.truth, other.truth)
+
+
+def test_draws_stay_as_they_were():
+    """More members leave the first ones, more cycles the earlier truth and observations."""
+    small = lorenz96(ETKF(), 20, members=5)
+    large = replace(small, members=9, cycles=30)
+    assert np.array_equal(initial_ensemble(large, 3)[:5], initial_ensemble(small, 3))
+    (a, y), (b, z) = observe_truth(small, 3), observe_truth(large, 3)
+    assert np.array_equal(b[:20], a)
+    assert np.array_equal(z.values[:20], y.values)
+    assert np.std(z.values - b[:, :40]) == pytest.approx(1.0, abs=0.1)
+
+
+def test_what_is_observed():
+    experiment = replace(lorenz63(ETKF(), 400), error_std={"z": 0.5, "x": 0.1})
+    truth, series = observe_truth(experiment, 1)
+    assert [o.name for o in experiment.observables] == ["x", "z"]
+    assert series.std.tolist() == [0.1, 0.5]
+    assert np.std(series.values - truth[:, [0, 2]], axis=0) == pytest.approx([0.1, 0.5], rel=0.15)
+
+
+def test_scores_by_hand():
+    experiment = lorenz63(IEnKS(2), 12, burn_in=4)
+    result = conduct(experiment, 1)
+    error = result.run.analysis.mean[:, :3] - result.truth[:, :3]
+    by_hand = np.sqrt(np.sum(error**2, axis=1) / 3)
+    score = result.scores["analysis"]
+    assert score.rmse == pytest.approx(by_hand)
+    assert score.mean_rmse == pytest.approx(by_hand[4:].mean())
+    assert score.spread == pytest.approx(np.sqrt(np.sum(result.run.analysis.std[:, :3] ** 2, axis=1) / 3))
+    smoothed = result.scores["smoothed"]
+    assert np.isnan(smoothed.rmse).tolist() == [False] * 10 + [True] * 2
+    assert smoothed.mean_rmse == pytest.approx(smoothed.rmse[4:10].mean())
+    assert "smoothed" not in conduct(lorenz63(ETKF(), 6), 1).scores
+
+
+def test_truth_that_cannot_be_integrated():
+    experiment = replace(lorenz96(ETKF(), 5), initial_std={"x": 1e200})
+    with pytest.raises(En4dvarError, match="truth cannot be integrated: non-finite state"):
+        conduct(experiment, 1)
+
+
+def test_analysis_is_better_than_forecast_and_than_the_observations():
+    """Observation error 1.41 a variable; DAPPER's averages over long runs are 0.60 and 0.31."""
+    filtered, smoothed = (conduct(lorenz63(scheme, 300), 1).scores for scheme in (ETKF(), IEnKS(1)))
+    assert filtered["analysis"].mean_rmse < 0.75 < filtered["forecast"].mean_rmse
+    assert smoothed["analysis"].mean_rmse < 0.6 * filtered["analysis"].mean_rmse
+    assert smoothed["smoothed"].mean_rmse < smoothed["analysis"].mean_rmse
+    for scores in (filtered, smoothed):
+        assert 0.7 < scores["analysis"].mean_spread / scores["analysis"].mean_rmse < 1.6
+
+
+def test_parameter_is_estimated_with_the_state():
+    model = Lorenz96.from_settings(Lorenz96Settings())
+    term = PriorTerm.normal(model.parameters[0], 8.0, 0.5)
+    experiment = replace(lorenz96(ETKF(), 400, members=40, inflation=1.01), prior=Prior((term,)), fixed={})
+    result = conduct(experiment, 1)
+    truth, estimate = result.truth[0, 40], result.run.analysis.mean[-1, 40]
+    assert np.all(result.truth[:, 40] == truth)
+    assert abs(truth - 8.0) > 0.1
+    assert abs(estimate - truth) < 0.06
+    assert result.run.analysis.std[-1, 40] < 0.1 * result.run.forecast.std[0, 40]
+    assert result.scores["analysis"].mean_rmse < 0.25
+
+
+EXPECTED = {  # config: (cycles, burn-in, upper bound of the analysis RMSE, lower bound)
+    "linear_etkf": (200, 20, 0.08, 0.01),
+    "lorenz63_ienks": (300, 50, 0.40, 0.20),
+    "lorenz96_etkf": (300, 100, 0.21, 0.15),
+    "lorenz96_ienks": (300, 100, 0.20, 0.14),
+    "lorenz96_letkf": (250, 100, 0.26, 0.16),
+    "lorenz96_parameter": (300, 150, 0.24, 0.15),
+}
+
+
+def test_every_twin_configuration_is_run():
+    twins = {p.stem for p in CONFIGS.glob("*.yaml") if "\ntwin:" in p.read_text(encoding="utf-8")}
+    assert twins == set(EXPECTED)
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_shipped_configuration(name):
+    cycles, burn_in, upper, lower = EXPECTED[name]
+    config = load_twin(CONFIGS / f"{name}.yaml", {"twin.cycles": cycles, "twin.burn_in": burn_in})
+    assert lower < rmse(config.experiment, config.seed) < upper
+
+
+def test_few_members_need_localisation():
+    """Ten members, fewer than the unstable directions: without localisation the filter diverges."""
+    local = load_twin(CONFIGS / "lorenz96_letkf.yaml", {"twin.cycles": 150, "twin.burn_in": 50}).experiment
+    everywhere = replace(local, sequential=replace(local.sequential, localisation=None))
+    assert rmse(local) < 0.5 < 2.0 < rmse(everywhere)
+
+
+PUBLISHED = [  # DAPPER 1.7.1, its suggested settings: analysis RMSE in long runs
+    (lorenz63, ETKF(), {"members": 10}, 0.60),
+    (lorenz63, IEnKS(1), {"members": 10}, 0.31),
+    (lorenz96, ETKF(), {"members": 25}, 0.18),
+    (lorenz96, IEnKS(1), {"members": 25}, 0.181),
+    (lorenz96, IEnKS(4), {"members": 25}, 0.177),
+    (lorenz96, ETKF(), {"members": 40, "inflation": 1.01}, 0.18),
+    (lorenz96, IEnKS(1), {"members": 40, "inflation": 1.01}, 0.18),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("system", "scheme", "options", "published"), PUBLISHED)
+def test_published_rmse(system, scheme, options, published):
+    """Within 5 %, averaged over four seeds."""
+    experiment = system(scheme, 3000, burn_in=300, **options)
+    assert np.mean([rmse(experiment, seed) for seed in range(4)]) < 1.05 * published
