@@ -45,7 +45,7 @@ def sweep(
     from en4dvar.files import write_text
     from en4dvar.units import UnitError, parse_quantity
     from en4dvar_bubble.study.summary import sweep_csv, sweep_text
-    from en4dvar_bubble.study.sweep import SweepSettings, prepare_folder, run_sweep
+    from en4dvar_bubble.study.sweep import SweepSettings, prepare_folder, refinement_size, run_sweep
 
     if force and resume:
         raise click.UsageError("--force and --resume exclude each other")
@@ -62,7 +62,7 @@ def sweep(
     readings = b"".join(p.observations.times.tobytes() + p.observations.values.tobytes() for p in problems)
     key = hashlib.sha256(f"{loaded.resolved}{chosen}".encode() + readings).hexdigest()
     chunks = prepare_folder(folder / "chunks", key, "force" if force else "resume" if resume else "new")
-    with _bar(trajectories + refine * chosen.local * len(problems)) as progress:
+    with _bar(trajectories + refinement_size(chosen, len(problems))) as progress:
         result = run_sweep(problems, chosen, loaded.seed, workers or _cores(), chunks, progress)
     write_text(folder / "sweep.csv", sweep_csv(result))
     click.echo(sweep_text(result))

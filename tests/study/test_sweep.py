@@ -113,7 +113,7 @@ def test_refinement_never_worsens_and_finds_better(problems, whole):
     refined = run_sweep(problems, replace(SMALL, rounds=2, local=32), seed=1)
     assert np.all(refined.nrmse >= whole.nrmse)
     assert np.any(refined.nrmse > whole.nrmse)
-    assert refined.trajectories == 192 + 2 * 32 * 3
+    assert refined.trajectories == 192 + 3 * 32 * 3
 
 
 def test_weighted_moments(whole):

@@ -80,12 +80,15 @@ def _page(study: Study, drawn: list[tuple[str, str, Markup, bool]]) -> str:
 def _method(study: Study) -> str:
     s, seconds = study.plan.sweep, study.seconds
     members = next(iter(next(iter(study.fits.values())).values())).analyses[0].settings.members
+    sweep = (
+        f"{s.trajectories} trajectories of a Sobol design a model and gel, uniform in the transformed parameters within "
+        f"{s.width:g} prior standard deviations, then {s.rounds} rounds of refinement with {s.local} a set; nearest "
+        f"neighbour in time on a grid of {s.step * 1e6:g} µs, time shift within ±{s.shift * 1e6:g} µs; weights are the "
+        "NRMSE of the best fits"
+    )
     return (
-        f"Sweep: {s.trajectories} trajectories of a Sobol design a model and gel, uniform in the transformed "
-        f"parameters within {s.width:g} prior standard deviations, then {s.rounds} rounds of {s.local} a set about "
-        f"the best fit; nearest neighbour in time on a grid of {s.step * 1e6:g} µs, time shift within "
-        f"±{s.shift * 1e6:g} µs; weights are the NRMSE of the best fits ({seconds['sweep']:.0f} s). En4D-Var: {members} members a set "
-        f"({seconds['en4dvar']:.0f} s). Population and comparison: {seconds['population']:.0f} s."
+        f"Sweep ({seconds['sweep']:.0f} s): {sweep}. En4D-Var ({seconds['en4dvar']:.0f} s): {members} members a set. "
+        f"Population and comparison: {seconds['population']:.0f} s."
     )
 
 

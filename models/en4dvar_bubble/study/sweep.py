@@ -11,19 +11,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
 from en4dvar.errors import ConfigError, DataError, OutputError
 from en4dvar.files import atomic_path
+from en4dvar.prior import member_stream
 from en4dvar.problem import InverseProblem
 from en4dvar.state import TIME_SHIFT, Array, Parameter
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.study.nearest import Targets, best_over_shifts, targets
 
 BATCH = 128  # trajectories whose full solution is in memory at once, a thread
+T = TypeVar("T")
 Progress = Callable[[int, int], None]
 
 
@@ -31,8 +34,9 @@ Progress = Callable[[int, int], None]
 class SweepSettings:
     """``shift`` and ``step`` (s): the largest time shift and the step of the traces' time grid.
 
-    After the design come ``rounds`` of local refinement: ``local`` trajectories a set, uniform about its best fit so
-    far in a box that halves every round, first ``width``/4 prior standard deviations to each side.
+    After the design come ``rounds`` of local refinement of every set's best fit by differential evolution (Storn &
+    Price 1997, "best/1"): ``local`` trajectories a set, first in ±``width``/4 prior standard deviations about it. They
+    follow the narrow valleys of parameters that make up for each other.
     """
 
     trajectories: int = 50_000
@@ -41,7 +45,7 @@ class SweepSettings:
     width: float = 3.0
     chunk: int = 2048
     rounds: int = 0
-    local: int = 64
+    local: int = 32
 
 
 @dataclass(frozen=True)
@@ -103,29 +107,30 @@ def run_sweep(
     DataError: no trajectory fits a set.
     """
     sweep = _Sweep(problems, settings, workers, folder)
-    total = settings.trajectories + settings.rounds * settings.local * len(problems)
+    total = settings.trajectories + refinement_size(settings, len(problems))
     done, best = 0, None
-    for x, found in sweep.run(sobol_box(sweep.mean, settings.width * sweep.std, settings.trajectories, seed), "design"):
+    design = sobol_box(sweep.mean, settings.width * sweep.std, settings.trajectories, seed)
+    for x, found in sweep.run(design):
         best = found if best is None else best.merged(found)
         done += len(x)
         if progress is not None:
             progress(done, total)
     assert best is not None
-    for number in range(settings.rounds):
-        half = settings.width / 4 * 0.5**number * sweep.std
-        boxes = [
-            sobol_box(centre, half, settings.local, seed + 1000 * (number + 1) + s) for s, centre in enumerate(best.x)
-        ]
-        for x, found in sweep.run(np.vstack(boxes), f"round{number}"):
-            best = best.merged(found)
-            done += len(x)
-            if progress is not None:
-                progress(done, total)
+    for count, refined in sweep.refine(best, seed):
+        best = refined
+        done += count
+        if progress is not None:
+            progress(done, total)
     names = tuple(p.observations.name for p in problems)
     lost = [name for name, value in zip(names, best.nrmse, strict=True) if not math.isfinite(value)]
     if lost:
         raise DataError(f"no trajectory of the design could be integrated for {', '.join(lost)}")
     return SweepResult(names, sweep.parameters, sweep.physical(best.x), best.shift, best.nrmse, done)
+
+
+def refinement_size(settings: SweepSettings, n_sets: int) -> int:
+    """Trajectories of the local refinement."""
+    return (settings.rounds + 1) * settings.local * n_sets if settings.rounds else 0
 
 
 def sobol_box(centre: Array, half: Array, count: int, seed: int) -> Array:
@@ -165,17 +170,59 @@ class _Sweep:
     def physical(self, x: Array) -> Array:
         return np.stack([t.to_physical(x[:, j]) for j, t in enumerate(self.terms)], axis=1)
 
-    def run(self, design: Array, stage: str) -> Iterator[tuple[Array, Best]]:
+    def run(self, design: Array) -> Iterator[tuple[Array, Best]]:
         """Chunks of the design with the best fits among them, in order."""
         chunks = [design[i : i + self.settings.chunk] for i in range(0, len(design), self.settings.chunk)]
+        files = [self.folder / f"chunk_{i:05d}.npz" if self.folder else None for i in range(len(chunks))]
+        yield from zip(chunks, self._map(self._chunk, chunks, files), strict=True)
+
+    def refine(self, best: Best, seed: int) -> Iterator[tuple[int, Best]]:
+        """Trajectories run and the best fits after each round."""
+        settings, n_sets = self.settings, len(best.nrmse)
+        if not settings.rounds:
+            return
+        half = settings.width / 4 * self.std
+        x = np.stack([sobol_box(centre, half, settings.local, seed + 1 + s) for s, centre in enumerate(best.x)])
+        nrmse, shift = self._own(x)
+        stream = member_stream(seed, "sweep refinement")
+        for number in range(settings.rounds + 1):
+            if number:
+                trial = self._trials(x, best, stream)
+                new, moved = self._own(trial)
+                better = new > nrmse
+                x, nrmse, shift = (
+                    np.where(better[..., None], trial, x),
+                    np.where(better, new, nrmse),
+                    np.where(better, moved, shift),
+                )
+            top, sets = np.argmax(nrmse, axis=1), np.arange(n_sets)
+            best = best.merged(Best(x[sets, top], shift[sets, top], nrmse[sets, top]))
+            yield nrmse.size, best
+
+    def _trials(self, x: Array, best: Best, stream: np.random.Generator) -> Array:
+        """best + F (x_b − x_c) of each set, inside the range of the design."""
+        n_sets, count, _ = x.shape
+        pairs = np.argsort(stream.uniform(size=(n_sets, count, count)), axis=2)[..., :2]
+        b, c = (np.take_along_axis(x, pairs[..., k, None], axis=1) for k in (0, 1))
+        step = stream.uniform(0.4, 1.0, (n_sets, count, 1)) * (b - c)
+        reach = self.settings.width * self.std
+        return np.clip(best.x[:, None] + step, self.mean - reach, self.mean + reach)
+
+    def _own(self, x: Array) -> tuple[Array, Array]:
+        """NRMSE and shift (S, L) of coordinates (S, L, n), each against its own set."""
+        n_sets, count, n = x.shape
+        flat = x.reshape(-1, n)
+        parts = list(self._map(self._score, [flat[i : i + BATCH] for i in range(0, len(flat), BATCH)]))
+        nrmse, shift = (np.concatenate(p).reshape(n_sets, count, n_sets) for p in zip(*parts, strict=True))
+        sets = np.arange(n_sets)
+        return nrmse[sets, :, sets], shift[sets, :, sets]
+
+    def _map(self, function: Callable[..., T], *columns: Sequence[Any]) -> Iterator[T]:
         with ThreadPoolExecutor(self.workers) as pool:
             try:
-                yield from zip(chunks, pool.map(self._chunk, chunks, self._files(stage, len(chunks))), strict=True)
+                yield from pool.map(function, *columns)
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)
-
-    def _files(self, stage: str, count: int) -> list[Path | None]:
-        return [self.folder / f"{stage}_{i:05d}.npz" if self.folder else None for i in range(count)]
 
     def _chunk(self, x: Array, file: Path | None) -> Best:
         if file is not None and file.exists():
@@ -190,14 +237,17 @@ class _Sweep:
         return best
 
     def _fit(self, x: Array) -> Best:
+        nrmse, shift = self._score(x)
+        row, sets = np.argmax(nrmse, axis=0), np.arange(nrmse.shape[1])
+        return Best(x[row], shift[row, sets], nrmse[row, sets])
+
+    def _score(self, x: Array) -> tuple[Array, Array]:
+        """NRMSE and shift (B, S) of coordinates (B, n)."""
         theta = {p.name: column for p, column in zip(self.parameters, self.physical(x).T, strict=True)}
         theta |= {name: np.full(len(x), value) for name, value in self.fixed.items()}
         states = self.model.initial_states({p.name: theta[p.name] for p in self.model.parameters})
         path = self.model.integrate(states, np.broadcast_to(self.aims.grid, (len(x), len(self.aims.grid))))
-        traces = np.where(path.solution.status[:, None] == 0, path["R"], np.nan)
-        nrmse, shift = best_over_shifts(traces, self.aims)
-        row, sets = np.argmax(nrmse, axis=0), np.arange(nrmse.shape[1])
-        return Best(x[row], shift[row, sets], nrmse[row, sets])
+        return best_over_shifts(np.where(path.solution.status[:, None] == 0, path["R"], np.nan), self.aims)
 
 
 def prepare_folder(folder: Path, key: str, mode: str) -> Path:
@@ -223,8 +273,3 @@ def prepare_folder(folder: Path, key: str, mode: str) -> Path:
     except OSError as error:
         raise OutputError(f"{folder}: cannot be used: {error.strerror or error}") from None
     return folder
-
-
-def with_trajectories(settings: SweepSettings, count: int) -> SweepSettings:
-    """The same sweep with another number of trajectories."""
-    return replace(settings, trajectories=count)
