@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from en4dvar.config import Config as Config
+    from en4dvar.config import TwinConfig as TwinConfig
     from en4dvar.config import load_config as load_config
+    from en4dvar.config import load_twin as load_twin
     from en4dvar.errors import ConfigError as ConfigError
     from en4dvar.errors import DataError as DataError
     from en4dvar.errors import En4dvarError as En4dvarError
@@ -39,10 +41,11 @@ if TYPE_CHECKING:
     from en4dvar.state import StateLayout as StateLayout
     from en4dvar.store import Result as Result
     from en4dvar.store import load_result as load_result
+    from en4dvar.twin_run import run_twin as run_twin
     from en4dvar.units import Quantity as Quantity
 
 _HOME = {
-    "config": ("Config", "load_config"),
+    "config": ("Config", "TwinConfig", "load_config", "load_twin"),
     "errors": ("ConfigError", "DataError", "En4dvarError", "OutputError", "TooFewMembersError"),
     "forward": ("Failure", "ForwardModel", "Observable", "StateField", "Trajectory"),
     "observations": ("Observations",),
@@ -52,6 +55,7 @@ _HOME = {
     "simulation": ("simulate",),
     "state": ("Field", "Parameter", "StateLayout"),
     "store": ("Result", "load_result"),
+    "twin_run": ("run_twin",),
     "units": ("Quantity",),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
