@@ -11,13 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from en4dvar_bubble import BubbleModel
 
 from en4dvar.forecast import forecast
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.state import TIME_SHIFT, Array
+from en4dvar_bubble import BubbleModel
 
 MEDIANS = {"G": 500.0, "alpha": 0.03, "mu": 0.1, "R0": 0.5e-6}
 NARROW = {"G": 0.3, "alpha": 0.3, "mu": 0.3, "R0": 0.3}

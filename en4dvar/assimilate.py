@@ -120,6 +120,7 @@ class _Run:
         after, last = final[:-1], final[-1:]
         centre_rates = None if last.rates is None else last.rates[0]
         per_parameter = diag.dfs_per_parameter(space.members, posterior)
+        shape = {} if refinement else self.shape(posterior, mode, after)
         record = end.records[-1]
         used = int(np.sum(observations.weights > 0))
         prior = problem.prior
@@ -152,6 +153,7 @@ class _Run:
             forward_runs=space.forward_runs,
             seed=self.seed,
             settings=self.settings,
+            shape=shape,
             refinement=refinement,
             log_evidence=diag.log_evidence(
                 end.cost, end.step.hessian.singular_values, len(space.members), observations
@@ -165,6 +167,7 @@ class _Run:
                 *diag.loss_warning("posterior forecast", after.failures),
                 *diag.fit_warnings(record.chi2_per_observation * used, used, record.dfs),
                 *diag.conflict_warnings(prior.names, mode, prior.mean, prior.std),
+                *diag.shape_warnings(shape),
                 *diag.information_warnings(prior.names, per_parameter),
             ),
         )
@@ -174,6 +177,12 @@ class _Run:
             return LoopState(Weights.prior(len(self.space.members)), self.space.forward_runs)
         w, warnings = choose_start(self.space, prior_run)
         return LoopState(Weights(w, self.space.scheme.init(len(w)).T), self.space.forward_runs, warnings)
+
+    def shape(self, posterior: Array, mode: Array, run: Forecast) -> dict[str, float]:
+        """How Gaussian the posterior is, from the forecast of the posterior ensemble."""
+        z = (posterior - self.problem.prior.mean) / self.problem.prior.std
+        costs = 0.5 * np.sum(z**2, axis=1) + self.space.observation_cost(run)
+        return diag.gaussianity(posterior, mode, costs)
 
     def refine(self, posterior: Array) -> tuple[Array, dict[str, float], tuple[str, ...]]:
         """The posterior ensemble (N, n), the summary of the chain that replaced it, and warnings."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from en4dvar.observations import Observations
 from en4dvar.state import Array
 
 TAIL = 0.0005  # each tail of the central 99.9 % interval
+GAUSSIAN_ENOUGH = 0.35  # effective share of members below which the posterior is called non-Gaussian
 HARDLY_INFORMED = 0.1  # DFS of a parameter below which its posterior is said to be its prior
 
 
@@ -89,6 +90,41 @@ def conflict_warnings(names: Sequence[str], centre: Array, mean: Array, std: Arr
     worst = np.argsort(-np.abs(z))
     listed = ", ".join(f"{names[j]} by {z[j]:+.1f}" for j in worst if abs(z[j]) > 2) or f"{names[worst[0]]} most"
     return (f"prior and data conflict: the minimum lies far from the prior mean ({listed} prior standard deviations)",)
+
+
+def gaussianity(members: Array, mode: Array, costs: Array) -> dict[str, float]:
+    """How well the posterior ensemble, as a Gaussian, agrees with the posterior at its own members.
+
+    ``members`` (N, n) and their Gaussian's centre ``mode`` (n,), transformed; ``costs`` J (N,) of the members. With log
+    weights ½ z² − J, z the distance in the ensemble's covariance, the effective sample size of the weights relative to
+    N is 1 for a Gaussian posterior. The √N largest weights are cut to the smallest of them (Ionides 2008, J. Comput.
+    Graph. Stat. 17, 295), which keeps one member in a tail from deciding. NaN with fewer members alive than n + 2.
+    """
+    alive = np.isfinite(costs)
+    anomalies = members - mode
+    if int(alive.sum()) < members.shape[1] + 2:
+        return {"gaussian_fit": math.nan}
+    covariance = np.atleast_2d(np.cov(members.T))
+    squares = np.sum(anomalies * np.linalg.solve(covariance, anomalies.T).T, axis=1)
+    log_weights = np.where(alive, 0.5 * squares - costs, -np.inf)
+    cap = np.sort(log_weights)[-max(3, math.isqrt(len(members)))]
+    weights = np.exp(np.minimum(log_weights, cap) - cap)
+    return {"gaussian_fit": float(weights.sum() ** 2 / np.sum(weights**2) / len(members))}
+
+
+def is_non_gaussian(shape: Mapping[str, float]) -> bool:
+    """Whether :func:`gaussianity` says that mean and spread of the ensemble need not be those of the posterior."""
+    return shape.get("gaussian_fit", 1.0) < GAUSSIAN_ENOUGH
+
+
+def shape_warnings(shape: Mapping[str, float]) -> tuple[str, ...]:
+    """Words for a posterior that no Gaussian ensemble describes."""
+    if not is_non_gaussian(shape):
+        return ()
+    return (
+        f"the posterior is far from Gaussian (effective share of members {shape['gaussian_fit']:.2f}): mean and spread "
+        "of the ensemble may be off by more than they say; refine: mcmc samples it",
+    )
 
 
 def information_warnings(names: Sequence[str], per_parameter: Array) -> tuple[str, ...]:
