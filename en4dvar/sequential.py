@@ -22,6 +22,7 @@ from en4dvar.forward import Failure, ForwardModel, Observable, Trajectory
 from en4dvar.inflation import Inflation
 from en4dvar.linalg import apply_weights, centre, rotate
 from en4dvar.localisation import Localisation
+from en4dvar.prior import member_stream
 from en4dvar.schemes import Evaluation, Step, Weights
 from en4dvar.state import Array
 
@@ -183,7 +184,7 @@ class _Loop:
 
     def __post_init__(self) -> None:
         self.initial_members = len(self.ensemble)
-        self.rng = np.random.default_rng(self.seed)
+        self.rng = member_stream(self.seed, "rotation")
         self.times = np.concatenate([[0.0], self.series.times])
         cycles, size = len(self.series.times), self.ensemble.shape[1]
         self.before, self.after, self.smooth = (Moments.empty(cycles, size) for _ in range(3))
@@ -212,7 +213,7 @@ class _Loop:
             anomalies = rotate(anomalies, self.rng)
         self.ensemble = mean + self.settings.inflation.apply(self.ensemble, anomalies)
         next_start = max(self.start, newest + 1 - lag) if lag else newest
-        if self.start and lag and next_start > self.start:
+        if 0 < self.start < next_start:
             self.smooth.put(self.start - 1, self.ensemble)
         at = self.run(self.ensemble, sorted({next_start, newest}))
         self.after.put(k, at[-1])
@@ -239,7 +240,10 @@ class _Loop:
             if iteration == 1:  # here the scheme's spread is a multiple of I
                 self.before.put(k, states[-1], 1 / spread[0, 0])
             self.iterations[k] = iteration
-            evaluation = self.evaluate(k, weights, self.predict(states[-1], newest))
+            predicted = self.predict(states[-1], newest)
+            if not np.isfinite(predicted).all():
+                return None, ["" if row.all() else "non-finite prediction" for row in np.isfinite(predicted)]
+            evaluation = self.evaluate(k, weights, predicted)
             if self.settings.localisation is not None:
                 return self.settings.localisation.analysis(self.ensemble, evaluation), []
             step = scheme.step(weights, evaluation)

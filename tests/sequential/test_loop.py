@@ -90,6 +90,21 @@ def test_failures_may_be_values():
     assert len(result.members) == 9
 
 
+@pytest.mark.parametrize("scheme", [ETKF(), IEnKS(1)])
+def test_a_prediction_that_is_no_number_loses_its_member(scheme):
+    def gap(trajectory):
+        return np.where(trajectory["y"] > 0.7, np.nan, trajectory["y"])
+
+    start = members()
+    lost = start[:, 1] > 0.7
+    assert lost.sum() == 1
+    observed = (Forced.observables[0], Observable("gap", "1", gap))
+    blind = series(std=1e9)  # so that no other member is moved into the gap
+    result = run_sequential(Forced(), observed, start, blind, SequentialSettings(scheme))
+    assert result.failures == ("non-finite prediction",)
+    assert result.members[:, 1] == pytest.approx(start[~lost, 1], abs=1e-9)
+
+
 def test_count_of_forward_runs():
     model = Forced()
     filtered = run_sequential(model, model.observables, members(), series(), SequentialSettings(ETKF()))
