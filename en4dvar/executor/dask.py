@@ -78,6 +78,7 @@ class DaskExecutor(Executor):
         ended: queue.SimpleQueue[Future] = queue.SimpleQueue()
         pending: dict[Any, tuple[int, tuple[Any, ...], Future]] = {}
         following = enumerate(calls)
+        suspects: list[tuple[int, tuple[Any, ...]]] = []  # repeated when nothing else is under way
 
         def submit(i: int, call: tuple[Any, ...]) -> None:
             future = self._submit(function, call)
@@ -89,11 +90,16 @@ class DaskExecutor(Executor):
                 for i, call in itertools.islice(following, max(0, 2 * self.workers - len(pending))):
                     submit(i, call)
                 if not pending:
-                    return
+                    break
                 future = self._next(ended)
                 i, call, _ = pending.pop(future.key)
                 value = self._value(future)
-                yield i, self._alone(function, call) if isinstance(value, WorkerLostError) else value
+                if isinstance(value, WorkerLostError):
+                    suspects.append((i, call))
+                else:
+                    yield i, value
+            for i, call in suspects:
+                yield i, self._alone(function, call)
         finally:
             for _, _, future in pending.values():
                 future.release()
@@ -119,22 +125,22 @@ class DaskExecutor(Executor):
                     raise ExecutorError(f"dask scheduler {self._address or ''}: {reason}") from None
 
     def _value(self, future: Future) -> Any:
-        from distributed import KilledWorker
+        """What the call gave or raised. Waits where the value was lost with its worker and is computed again."""
+        from distributed import CancelledError, KilledWorker
 
-        if future.status not in ("finished", "error"):
-            raise self._lost()
-        error = future.exception() if future.status == "error" else None
-        if isinstance(error, KilledWorker):
-            return WorkerLostError("a worker process died")
-        if error is not None:
-            return error if isinstance(error, Exception) else RuntimeError(str(error))
         try:
             return future.result()
-        except Exception as lost:  # finished, but the value cannot be fetched
-            raise self._lost() from lost
+        except KilledWorker:
+            return WorkerLostError("a worker process died")
+        except CancelledError:
+            raise self._lost() from None
+        except Exception as error:
+            if future.status == "error":  # the call's own
+                return error
+            raise self._lost() from error
 
     def _alone(self, function: Callable[..., T], call: tuple[Any, ...]) -> T | Exception:
-        """Repeat a call that was under way when several workers died; calls around it may have been the reason."""
+        """Repeat a call under which several workers died; calls around it may have been the reason."""
         value: Any = None
         for _ in range(ATTEMPTS_ALONE):
             ended: queue.SimpleQueue[Future] = queue.SimpleQueue()

@@ -1,0 +1,138 @@
+"""Campaigns: what fails is named and ends nothing; one file for all; names that every file system takes."""
+
+import csv
+
+import arviz
+import numpy as np
+import pytest
+import xarray as xr
+from run_files import configuration, make_campaign, run_cli
+from toy_config import csv_text
+
+from en4dvar.campaign import Campaign, DatasetOutcome, file_names
+from en4dvar.campaign_file import GROUPS
+from en4dvar.errors import DataError, TooFewMembersError
+from en4dvar.runner import report, run_campaign
+from en4dvar.store import load_result
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory):
+    """Six data sets: three good ones of different length, one empty file, one that loses its ensemble, one not text."""
+    folder = tmp_path_factory.mktemp("campaign")
+    path = make_campaign(folder, 4, "execution_models:Breaks", large=2)
+    (folder / "data" / "set1.csv").write_text(csv_text(25, k=1.8))
+    (folder / "data" / "empty.csv").write_text("t_ms,x_um\n")
+    (folder / "data" / "image.csv").write_bytes(bytes(range(256)) * 4)
+    return run_campaign(configuration(path, folder / "run"))
+
+
+def test_failures_are_named_and_the_rest_is_estimated(campaign):
+    assert [o.name for o in campaign.outcomes] == ["empty", "image", "set0", "set1", "set2", "set3"]
+    assert [o.name for o in campaign.failures] == ["empty", "image", "set2"]
+    assert [o.exit_code for o in campaign.failures] == [DataError.exit_code] * 2 + [TooFewMembersError.exit_code]
+    assert "empty.csv: " in campaign.failures[0].failure
+    assert "ArithmeticError: too large" in campaign.failures[2].failure
+    assert campaign.exit_code == 1
+    assert [r.name for r in campaign] == ["set0", "set1", "set3"]
+    assert campaign["set3"].name == "set3"
+    with pytest.raises(KeyError):
+        campaign["empty"]
+    log = (campaign.directory / "run.log").read_text()
+    rows = list(csv.DictReader((campaign.directory / "summary.csv").read_text().splitlines()))
+    for outcome in campaign.failures:
+        assert f"{outcome.name}: failed: {outcome.failure.splitlines()[0]}" in log
+        assert [r["failure"] for r in rows if r["dataset"] == outcome.name] == [outcome.failure]
+    assert {r["dataset"]: r["name"] for r in rows if not r["failure"]} == dict.fromkeys(["set0", "set1", "set3"], "k")
+    assert sorted(p.name for p in (campaign.directory / "datasets").iterdir()) == ["set0.nc", "set1.nc", "set3.nc"]
+
+
+@pytest.mark.parametrize(
+    ("codes", "expected"), [((0, 0), 0), ((3, 0), 3), ((3, 3), 3), ((3, 2), 1), ((2, 0), 1), ((1, 1), 1)]
+)
+def test_exit_code(tmp_path, codes, expected):
+    outcomes = [DatasetOutcome(str(i), None, "reason" if code else "", code) for i, code in enumerate(codes)]
+    assert Campaign(tmp_path, tuple(outcomes)).exit_code == expected
+
+
+def test_one_file_for_all(campaign):
+    single = {r.name: r for r in campaign}
+    with xr.open_datatree(campaign.directory / "posterior.nc") as tree:
+        assert set(tree.children) == set(GROUPS)
+        for group in ("prior", "posterior"):
+            assert tree[group]["k"].dims == ("dataset", "chain", "draw")
+            assert tree[group]["dataset"].values.tolist() == list(single)
+        for name, result in single.items():
+            one = {g: tree[g].to_dataset().sel(dataset=name) for g in GROUPS}
+            for key in ("A", "k"):
+                np.testing.assert_array_equal(one["posterior"][key], result.posterior[key])
+                assert one["posterior"][key].attrs == result.posterior[key].attrs
+            n = len(result.observed_data["time"])
+            for group in ("observed_data", "prior_predictive", "log_likelihood"):
+                ours, theirs = one[group]["position"], result.dataset(group)["position"]
+                np.testing.assert_array_equal(ours[..., :n], theirs)
+                assert np.isnan(ours[..., n:]).all()
+            np.testing.assert_array_equal(one["observed_data"]["time"][:n], result.observed_data["time"])
+            np.testing.assert_array_equal(one["sample_stats"]["active"], result.sample_stats["active"])
+            assert one["sample_stats"]["nrmse"] == result.sample_stats.attrs["nrmse"]
+            assert one["sample_stats"]["dfs_total"] == result.sample_stats.attrs["dfs"]
+            np.testing.assert_array_equal(one["sample_stats"]["dfs"], result.sample_stats["dfs"])
+            assert str(one["sample_stats"]["stop_reason"].values) == result.sample_stats.attrs["stop_reason"]
+            assert one["constant_data"]["c"] == 0.02
+        assert {len(r.observed_data["time"]) for r in single.values()} == {25, 31}
+
+
+@pytest.mark.filterwarnings("ignore")  # whatever ArviZ and its dependencies deprecate
+def test_arviz_reads_every_group(campaign):
+    data = arviz.from_netcdf(str(campaign.directory / "posterior.nc"))
+    assert set(GROUPS) <= {str(g).strip("/") for g in (data.children if hasattr(data, "children") else data.groups())}
+    table = arviz.summary(data, var_names=["k"], kind="stats")
+    means = [float(r.posterior["k"].mean()) for r in campaign]
+    assert len(table) == 3
+    assert table["mean"].astype(float).to_numpy() == pytest.approx(means, rel=1e-2)
+
+
+def test_report_names_the_failures(campaign):
+    html = report(campaign.directory).read_text()
+    assert "3 data sets without a posterior" in html
+    assert "ArithmeticError: too large" in html
+    assert 'id="d2"' in html
+
+
+def test_names_of_files():
+    names = ["a b", "a/b", "A_B", "ü", "u\u0308", "con", "..", "x" * 300, "x" * 299 + "y", "ゲル 1", "a:b*?"]
+    files = file_names(names)
+    assert list(files) == names
+    folded = [f.casefold() for f in files.values()]
+    assert len(set(folded)) == len(names)
+    assert all(0 < len(f.encode()) < 140 and not set(f) & set(' /\\:*?"<>|\0') and f[0] != "." for f in files.values())
+    assert "con" not in folded
+
+
+def test_unicode_blanks_and_same_names(tmp_path):
+    path = make_campaign(tmp_path, 0)
+    folder = tmp_path / "data"
+    for place in ("run 1/ゲル 5 %", "run 2/ゲル 5 %", "x/run 1/ゲル 5 %"):
+        (folder / place).parent.mkdir(parents=True)
+        (folder / f"{place}.csv").write_text(csv_text())
+    path.write_text(path.read_text().replace("data/*.csv", "data/**/*.csv"))
+    campaign = run_campaign(configuration(path, tmp_path / "out put"))
+    assert [o.name for o in campaign.outcomes] == ["run 1_ゲル 5 %", "run 2_ゲル 5 %", "run 1_ゲル 5 %_2"]
+    assert [load_result(o.file).name for o in campaign.outcomes] == [o.name for o in campaign.outcomes]
+    assert campaign.exit_code == 0
+
+
+def test_command_line(tmp_path):
+    path = make_campaign(tmp_path, 2)
+    (tmp_path / "data" / "bad.csv").write_text("t_ms,x_um\n0,1\n")
+    done = run_cli("run", path, "--out", tmp_path / "run", "--data", tmp_path / "data", "--no-report")
+    assert done.returncode == 1
+    assert "1 of 3 data sets failed:\nbad: " in done.stderr
+    assert "Traceback" not in done.stderr
+    assert [line.split()[0] for line in done.stdout.splitlines()[1:]] == ["set0", "set0", "set1", "set1"]
+    for file in (tmp_path / "data").glob("set*"):
+        file.write_text("nothing")
+    done = run_cli("run", path, "--out", tmp_path / "none", "--data", tmp_path / "data")
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 3
+    assert not (tmp_path / "none").exists()

@@ -1,0 +1,152 @@
+"""One run at a time; an earlier result stays until the new one is complete, wherever the new one fails."""
+
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from run_files import assert_same_results, command, configuration, environment, make_campaign
+from toy_config import write_toy
+
+from en4dvar import rundir
+from en4dvar.errors import OutputError, TooFewMembersError
+from en4dvar.lock import LOCK, locked
+from en4dvar.rundir import NEXT, RunDirectory
+from en4dvar.runner import run, run_campaign
+
+
+def contents(folder):
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_second_run_is_refused_and_a_dead_one_is_not_in_the_way(tmp_path):
+    path, out = write_toy(tmp_path, ("toy_models:Oscillator", "execution_models:Slow")), tmp_path / "run"
+    words = command("run", path, "--out", out, "--no-report")
+    first = subprocess.Popen(words, env=environment(EN4DVAR_TEST_PAUSE=5), stderr=subprocess.PIPE, text=True)
+    try:
+        for _ in range(600):
+            if (out / "checkpoints" / "run").exists():
+                break
+            time.sleep(0.05)
+        for mode in ("new", "force", "resume", "report"):
+            with pytest.raises(OutputError, match=rf"in use by process {first.pid} on "), RunDirectory.open(out, mode):
+                pass
+    finally:
+        first.send_signal(signal.SIGKILL)
+        first.communicate()
+    assert (out / LOCK).exists()
+    assert run(configuration(path, out), resume=True).name == "toy"
+    assert not (out / LOCK).exists()
+
+
+def test_lock_goes_with_its_holder(tmp_path):
+    with locked(tmp_path):
+        script = f"from en4dvar.lock import locked\nwith locked(__import__('pathlib').Path({str(tmp_path)!r})): pass"
+        other = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+        assert "in use by process" in other.stderr
+    with locked(tmp_path):
+        pass
+
+
+@pytest.fixture
+def earlier(tmp_path):
+    path = make_campaign(tmp_path, 2, "execution_models:Breaks")
+    run_campaign(configuration(path, tmp_path / "run"))
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    return path, tmp_path / "run"
+
+
+def test_a_failed_replacement_leaves_the_earlier_result(earlier):
+    path, out = earlier
+    before = contents(out)
+    (path.parent / "data" / "set1.csv").unlink()
+    large = (path.parent / "data" / "set0.csv").read_text().replace("x_um", "x_um").splitlines()
+    large = [*large[:2], *(f"{t},{2 * float(x)}" for t, x in (row.split(",") for row in large[2:]))]
+    (path.parent / "data" / "set0.csv").write_text("\n".join(large))
+    with pytest.raises(TooFewMembersError):
+        run_campaign(configuration(path, out), force=True)
+    after = contents(out)
+    assert {k: v for k, v in after.items() if not k.startswith(NEXT)} == before
+    assert "failed: TooFewMembersError" in (out / NEXT / "run.log").read_text()
+
+
+def test_replacement(earlier):
+    path, out = earlier
+    (path.parent / "data" / "set1.csv").rename(path.parent / "data" / "other.csv")
+    run_campaign(configuration(path, out), force=True)
+    assert sorted(p.name for p in (out / "datasets").iterdir()) == ["other.nc", "set0.nc"]
+    assert (out / "notes.txt").read_text() == "mine"
+    assert not (out / NEXT).exists()
+    assert not (out / "checkpoints" / "set1.done").exists()
+
+
+def test_replacement_interrupted_anywhere_is_finished_later(earlier, monkeypatch):
+    path, out = earlier
+    kept = out.with_name("kept")
+    shutil.copytree(out, kept)
+    (path.parent / "data" / "set1.csv").rename(path.parent / "data" / "other.csv")
+    run_campaign(configuration(path, out), force=True)
+    expected = contents(out)
+    steps = 0
+    moved = rundir.Path.replace
+
+    def dies(self, target):
+        nonlocal steps
+        if (NEXT in self.parts and self.parent.name != NEXT) or self.name == "posterior.nc":
+            steps -= 1
+            if steps == 0:
+                raise KeyboardInterrupt
+        return moved(self, target)
+
+    interrupted = 0
+    for at in range(1, 30):
+        shutil.rmtree(out)
+        shutil.copytree(kept, out)
+        monkeypatch.setattr(rundir, "_replace_earlier_run", lambda path: None)
+        run_campaign(configuration(path, out), force=True)  # complete, but not yet in place
+        monkeypatch.undo()
+        steps = at
+        monkeypatch.setattr(rundir.Path, "replace", dies)
+        try:
+            with RunDirectory.open(out, "report"):
+                pass
+        except KeyboardInterrupt:
+            interrupted += 1
+        monkeypatch.undo()
+        with RunDirectory.open(out, "report"):
+            pass
+        assert contents(out).keys() == expected.keys() | {LOCK} - {LOCK}
+        assert not (out / NEXT).exists()
+        if steps > 0:
+            break
+    assert interrupted > 3
+
+
+def test_resume_continues_an_interrupted_replacement(earlier, monkeypatch):
+    path, out = earlier
+    quiet = out.with_name("quiet")
+    run_campaign(configuration(path, quiet))
+    before = contents(out)
+
+    def full(*_, **__):
+        raise OutputError("disk full")
+
+    monkeypatch.setattr("en4dvar.runner.save_campaign", full)
+    with pytest.raises(OutputError, match="disk full"):
+        run_campaign(configuration(path, out), force=True)
+    monkeypatch.undo()
+    assert {k: v for k, v in contents(out).items() if not k.startswith(NEXT)} == before
+    run_campaign(configuration(path, out), resume=True)
+    assert not (out / NEXT).exists()
+    assert_same_results(out, quiet)
+
+
+def test_resume_needs_a_run(tmp_path):
+    path = write_toy(tmp_path)
+    with pytest.raises(OutputError, match="no such run directory"):
+        run(configuration(path, tmp_path / "nowhere"), resume=True)
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(OutputError, match="holds no run"):
+        run(configuration(path, tmp_path / "mine"), resume=True)
