@@ -11,9 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from en4dvar_bubble.study.gaussian import factors
-from en4dvar_bubble.study.population import estimate_population
-from en4dvar_bubble.study.run import POPULATION
 
 from en4dvar.assimilate import assimilate
 from en4dvar.build import build
@@ -23,6 +20,9 @@ from en4dvar.config.synthetic import resolve_campaign
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.observations import Observations
 from en4dvar.synthetic import draw_campaign
+from en4dvar_bubble.study.gaussian import factors
+from en4dvar_bubble.study.population import estimate_population
+from en4dvar_bubble.study.run import POPULATION
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 

@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from en4dvar_bubble.study.evidence import DECISIVE, probability
 
 from en4dvar.assimilate import assimilate
 from en4dvar.build import build
@@ -21,6 +20,7 @@ from en4dvar.config import load_config
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.forecast import forecast
 from en4dvar.observations import Observations
+from en4dvar_bubble.study.evidence import DECISIVE, probability
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 STOP, MOST, FEWEST = 0.35, 60, 5

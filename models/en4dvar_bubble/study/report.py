@@ -81,10 +81,10 @@ def _method(study: Study) -> str:
     s, seconds = study.plan.sweep, study.seconds
     members = next(iter(next(iter(study.fits.values())).values())).analyses[0].settings.members
     sweep = (
-        f"{s.trajectories} trajectories of a Sobol design a model and gel, uniform in the transformed parameters within "
-        f"{s.width:g} prior standard deviations, then {s.rounds} rounds of refinement with {s.local} a set; nearest "
-        f"neighbour in time on a grid of {s.step * 1e6:g} µs, time shift within ±{s.shift * 1e6:g} µs; weights are the "
-        "NRMSE of the best fits"
+        f"{s.trajectories} trajectories of a Sobol design a model and gel, uniform in the transformed parameters "
+        f"within {s.width:g} prior standard deviations, then {s.rounds} rounds of refinement with {s.local} a set; "
+        f"nearest neighbour in time on a grid of {s.step * 1e6:g} µs, time shift within ±{s.shift * 1e6:g} µs; "
+        "weights are the NRMSE of the best fits"
     )
     return (
         f"Sweep ({seconds['sweep']:.0f} s): {sweep}. En4D-Var ({seconds['en4dvar']:.0f} s): {members} members a set. "

@@ -31,6 +31,8 @@ def sweep_text(result: SweepResult) -> str:
         unit = p.display_unit or p.unit
         values = [convert(float(v), p.unit, unit) for v in (mean, std)]
         shown = "" if unit == "1" else f" {unit}"
-        lines.append(f"  {p.label}: {p.name} = {values[0]:.4g} ± {values[1]:.2g}{shown}")
+        lines.append(
+            f"  {p.label}: {p.name} = {values[0]:.4g}{f' ± {values[1]:.2g}' if len(result.names) > 1 else ''}{shown}"
+        )
     fits = result.nrmse
     return "\n".join([*lines, f"  NRMSE {fits.min():.4f} to {fits.max():.4f}, mean {fits.mean():.4f}"])
