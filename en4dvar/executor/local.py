@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import Any
 
 from en4dvar.executor.base import ATTEMPTS_ALONE, Executor, T, WorkerLostError
@@ -119,6 +121,14 @@ class ProcessesExecutor(_PoolExecutor):
 
 
 def prepare_worker() -> None:
-    """Ctrl-C is the main process's business, and BLAS uses one thread."""
+    """Ctrl-C is the main process's business, BLAS uses one thread, and nobody works for a main process that is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     one_blas_thread_for_good()
+    threading.Thread(target=_end_with_parent, name="en4dvar-parent", daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
