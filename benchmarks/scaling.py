@@ -1,6 +1,6 @@
 """Scaling and bookkeeping of a campaign: python benchmarks/scaling.py [SETS]
 
-Synthetic acoustic data sets (quadratic law, truths within the 30 % priors, 1.4 µm noise, 15 points) are estimated by one
+Synthetic acoustic data sets (quadratic law, truths from the 30 % priors, 1.4 µm noise, 15 points) are estimated by one
 and by two workers, in threads and in processes; one worker's time is split into forecast (forward model), analysis with
 bookkeeping, and writing. Times are the best of REPEATS by the wall clock, in the profile processor time (but for the
 disk); start-up of the interpreter and compilation are not counted. Ratios mean something on an idle machine only.
