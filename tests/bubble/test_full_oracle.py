@@ -10,12 +10,12 @@ from reference_cases import ACCURATE, LASER, NEO_HOOKEAN
 from en4dvar_bubble import simulate
 
 TIMES = np.linspace(0, 60e-6, 601)  # collapse at 23 µs, maximum of the first rebound near 30 µs, second collapse
-GRIDS = {"coarse": (20, 60), "fine": (40, 120)}  # nodes in the gas, cells in the medium, of the oracle
+COARSE, FINE = (20, 60), (40, 120)  # nodes in the gas, cells in the medium, of the oracle
 
 
 def difference(grid, vapour, conducting):
     """Largest |ΔR|/R_max over collapse, rebound and second collapse."""
-    nodes, cells = GRIDS[grid]
+    nodes, cells = grid
     slow = Bubble(**LASER, vapour=vapour, conducting=conducting, nodes=nodes, cells=cells)
     fast = simulate(
         NEO_HOOKEAN,
@@ -32,19 +32,26 @@ def difference(grid, vapour, conducting):
 
 
 def test_vapour_transport_and_conducting_medium():
-    assert difference("fine", "transport", conducting=True) < 2e-3
+    assert difference(FINE, "transport", conducting=True) < 2e-3
 
 
 def test_conducting_medium_without_vapour():
-    assert difference("fine", "none", conducting=True) < 2e-3
+    assert difference(FINE, "none", conducting=True) < 2e-3
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("vapour", "conducting"),
-    [("none", False), ("none", True), ("frozen", True), ("transport", False), ("transport", True)],
+    ("vapour", "conducting", "coarse", "fine"),
+    [
+        ("none", False, COARSE, FINE),
+        ("none", True, COARSE, FINE),
+        ("frozen", True, COARSE, FINE),
+        # Held at T_inf the wall takes up nearly all vapour: the most violent collapse, where the oracle's ṗ needs most.
+        ("transport", False, (48, 0), (96, 0)),
+        ("transport", True, COARSE, FINE),
+    ],
 )
-def test_difference_is_the_oracles_truncation_error(vapour, conducting):
-    coarse, fine = (difference(grid, vapour, conducting) for grid in GRIDS)
-    assert fine < 2e-3
-    assert fine < coarse / 3
+def test_difference_is_the_oracles_truncation_error(vapour, conducting, coarse, fine):
+    error = difference(fine, vapour, conducting)
+    assert error < 2e-3
+    assert error < difference(coarse, vapour, conducting) / 3
