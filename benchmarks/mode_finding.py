@@ -22,9 +22,10 @@ from en4dvar.problem import AssimilationSettings, InverseProblem
 WAYS = {
     "prior mean": AssimilationSettings(start="prior-mean"),
     "best member": AssimilationSettings(starts=1),
-    "default (3 starts)": AssimilationSettings(),
+    "default (2 starts)": AssimilationSettings(),
+    "3 starts": AssimilationSettings(starts=3),
     "8 starts": AssimilationSettings(starts=8),
-    "3 starts, Levenberg-Marquardt": AssimilationSettings(step_control="levenberg-marquardt"),
+    "2 starts, Levenberg-Marquardt": AssimilationSettings(step_control="levenberg-marquardt"),
 }
 TOLERANCE = 0.1  # of J: closer ends are the same minimum
 

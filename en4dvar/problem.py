@@ -47,7 +47,7 @@ class AssimilationSettings:
     epsilon: float = 1e-3
     step_control: Literal["line-search", "levenberg-marquardt", "full"] = "line-search"
     start: Literal["best-member", "prior-mean"] = "best-member"
-    starts: int = 3
+    starts: int = 2
     max_iterations: int = 30
     step_tolerance: float = 1e-3
     cost_tolerance: float = 1e-4

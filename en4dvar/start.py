@@ -17,7 +17,7 @@ from en4dvar.schemes import Weights
 from en4dvar.state import Array
 
 ROUGH = 1e-2  # relative decrease of J at which a scout stops: it only has to tell basins apart
-SAME = 0.1  # posterior standard deviations between scouts that have met
+SAME = 1.0  # posterior standard deviations between scouts that have met
 
 
 def choose_start(space: WeightSpace, run: Forecast) -> tuple[Array, tuple[str, ...]]:
@@ -63,6 +63,8 @@ def lowest_basin(space: WeightSpace, starts: list[Array]) -> int:
             scout.cost = at.cost
         _stop_those_that_met(going, locals_)
         going, locals_ = _still_active(going, locals_)
+        if len(going) == 1 and going[0].cost <= min(scout.cost for scout in scouts):
+            break  # it can only go lower: the comparison is decided
         for scout, at, move in zip(going, locals_, space.search(locals_), strict=True):
             if move is None or at.step is None:
                 scout.active = False
