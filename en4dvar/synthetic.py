@@ -1,7 +1,8 @@
 """A synthetic campaign: truths drawn from distributions, observed as an experiment would observe them.
 
 Each data set has its own stream of random numbers, by (seed, its name): adding data sets leaves the others as they
-were. When a series ends is decided by its readings alone, never by the truth.
+were. When a series ends is decided by its readings alone, never by the truth. No reading is refused for its value, not
+even one that noise puts below zero: that would bias the noise, and with it whatever such readings tell.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ def _draw(plan: CampaignPlan, group: GroupPlan, number: int) -> SyntheticSet:
         values = exact + noise
         below = np.flatnonzero(values < plan.stop * np.maximum.accumulate(values))
         count = int(below[0]) + 1 if len(below) else plan.most
-        if count >= plan.fewest and np.all(values[:count] > 0):
+        if count >= plan.fewest:
             truth = {**theta, TIME_SHIFT.name: shift}
             return SyntheticSet(name, group.name, times[:count], values[:count], exact[:count], truth)
         reason = f"{count} usable readings"
