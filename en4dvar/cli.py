@@ -71,7 +71,7 @@ def _config_options(command: F) -> F:
         click.option(
             "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a value, e.g. assimilation.members=96."
         ),
-        click.option("--data", metavar="FILE", help="Data file (or glob) instead of data.path."),
+        click.option("--data", metavar="FILE", help="Data file, folder or pattern instead of data.path."),
         click.argument("config", type=click.Path()),
     ):
         command = decorate(command)
