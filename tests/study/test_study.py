@@ -153,7 +153,6 @@ def test_population_holds_the_truth_and_most_bubbles_are_undecidable(twin):
             assert low[j] < twin.true_values(gel, q.name).mean() < high[j], (gel, q.name)
         assert twin.comparisons[gel].undecidable >= 0.7 * len(twin.comparisons[gel].single)
         assert twin.comparisons[gel].independent > 3
-        assert twin.comparisons[gel].shared > 3
 
 
 @pytest.mark.slow

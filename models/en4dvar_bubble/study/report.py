@@ -206,7 +206,8 @@ def _comparison(study: Study) -> Block:
             ("all sets, one gel", found.shared),
         )
         for words, value in pooled:
-            rows.append([gel, words, f"{value:+.1f}", f"{float(probability(np.array(value))):.2f}", verdict(value)])
+            told = "no verdict: supposes a uniform gel" if words.endswith("one gel") else verdict(value)
+            rows.append([gel, words, f"{value:+.1f}", f"{float(probability(np.array(value))):.2f}", told])
     undecided = sum(c.undecidable for c in study.comparisons.values())
     total = sum(len(c.single) for c in study.comparisons.values())
     return {
