@@ -27,6 +27,7 @@ def sets():
 
 
 def test_shipped_files_are_what_the_configuration_draws(tmp_path):
+    """To 1 % of the noise: beside a collapse the radius shows the tolerance of the solver, whose bits may change."""
     out = tmp_path / "twin"
     result = CliRunner().invoke(main, ["simulate", str(CONFIGS / "agarose_twin.yaml"), "--out", str(out)])
     assert result.exit_code == 0, result.output
@@ -40,7 +41,7 @@ def test_shipped_files_are_what_the_configuration_draws(tmp_path):
         if file.name != "truth.csv":
             assert "SYNTHETIC" in file.read_text().splitlines()[0]
             np.testing.assert_allclose(
-                np.loadtxt(told[1:], delimiter=","), np.loadtxt(kept[1:], delimiter=","), atol=2e-3
+                np.loadtxt(told[1:], delimiter=","), np.loadtxt(kept[1:], delimiter=","), atol=1.2e-2
             )
 
 
