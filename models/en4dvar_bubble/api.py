@@ -18,7 +18,7 @@ from en4dvar_bubble.laws import ConstitutiveLaw, get_law
 from en4dvar_bubble.medium import UNITS, WATER_25C, Medium
 from en4dvar_bubble.model import BubbleModel, Gas, Heat, Start, Vapour
 from en4dvar_bubble.packing import conduction_slope, from_kirchhoff
-from en4dvar_bubble.solver.driver import ACCURACIES, Accuracy, AccuracyName, Radial
+from en4dvar_bubble.solver.driver import Accuracy, AccuracyName, Radial, preset
 from en4dvar_bubble.solver.integrate import MAX_MACH, MAX_THETA, RECORD, STEPS
 from en4dvar_bubble.solver.lanes import WIDTH
 
@@ -89,7 +89,7 @@ def simulate(
             radial=radial,
             vapour=vapour,
             medium_heat=medium_heat,
-            accuracy=ACCURACIES[accuracy] if isinstance(accuracy, str) else accuracy,
+            accuracy=preset(accuracy, start) if isinstance(accuracy, str) else accuracy,
         )
     except ValueError as error:
         raise ConfigError(str(error)) from error

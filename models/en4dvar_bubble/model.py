@@ -18,7 +18,7 @@ from en4dvar_bubble.medium import WATER_25C, Medium, saturated_vapour_pressure
 from en4dvar_bubble.packing import law_tables, mass_fraction, pack
 from en4dvar_bubble.paths import BubbleTrajectory, Paths
 from en4dvar_bubble.settings import BubbleSettings
-from en4dvar_bubble.solver.driver import ACCURACIES, Accuracy, Radial, Solution, System, solve
+from en4dvar_bubble.solver.driver import Accuracy, Radial, Solution, System, preset, solve
 
 Gas = Literal["heat", "polytropic", "isothermal", "adiabatic"]
 Start = Literal["acoustic", "laser"]
@@ -54,7 +54,7 @@ class BubbleModel(ForwardModel):
     driving: Driving = None  # type: ignore[assignment]  # chosen by the start
     reading: Reading = "instantaneous"
     medium: Medium = WATER_25C
-    accuracy: Accuracy = ACCURACIES["standard"]
+    accuracy: Accuracy = None  # type: ignore[assignment]  # ``standard`` for the start
     radial: Radial = "keller-miksis"
     vapour: Vapour = "none"
     medium_heat: Heat = "cold"
@@ -72,6 +72,8 @@ class BubbleModel(ForwardModel):
     def __post_init__(self) -> None:
         if self.driving is None:
             object.__setattr__(self, "driving", histotripsy() if self.start == "acoustic" else silence())
+        if self.accuracy is None:
+            object.__setattr__(self, "accuracy", preset("standard", self.start))
         if self.gas != "heat" and (self.vapour == "transport" or self.medium_heat != "cold"):
             raise ValueError("vapour transport and a conducting medium need gas: heat")
         if self.vapour != "none" and self.medium.p_v:

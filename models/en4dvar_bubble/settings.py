@@ -15,7 +15,7 @@ from en4dvar_bubble.driving.settings import DrivingSettings, Histotripsy, with_k
 from en4dvar_bubble.laws import ConstitutiveLaw, get_law
 from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.medium import CONSTANT_SETS, UNITS, WATER_25C, Medium, saturated_vapour_pressure
-from en4dvar_bubble.solver.driver import ACCURACIES, Accuracy, Radial
+from en4dvar_bubble.solver.driver import Accuracy, Radial, preset
 
 SetName = Literal["water-25C", "imr-v1", "imr-v2"]
 Positive = Field(gt=0)
@@ -147,11 +147,11 @@ class BubbleSettings(_Section):
 
     @property
     def solver_accuracy(self) -> Accuracy:
-        preset = ACCURACIES[self.accuracy]
+        base = preset(self.accuracy, self.start)
         return Accuracy(
-            nodes=preset.nodes if self.nodes is None else self.nodes,
-            rtol=preset.rtol if self.rtol is None else self.rtol,
-            medium_nodes=preset.medium_nodes if self.medium_nodes is None else self.medium_nodes,
+            nodes=base.nodes if self.nodes is None else self.nodes,
+            rtol=base.rtol if self.rtol is None else self.rtol,
+            medium_nodes=base.medium_nodes if self.medium_nodes is None else self.medium_nodes,
             step_limit=self.step_limit,
             time_limit=self.time_limit,
             mach_limit=self.mach_limit,

@@ -43,9 +43,10 @@ from en4dvar_bubble.solver.rows import (
 )
 
 
-@nb.njit
-def _gas(y, m, par, ops, work):
+@nb.njit(forceinline=True)
+def _gas(y, nodes, par, ops, work):
     """Pressure p, π̇, E and wall gradient; rows of ``work``: k (0…), θ (m…), τ' (2m…), ∇²τ (3m…)."""
+    m = len(nodes)
     V = load(y, m)
     u = load(y, m + 1)
     kappa = load(par, KAPPA)
@@ -82,15 +83,16 @@ def _gas(y, m, par, ops, work):
     return p, rate, E, wall
 
 
-@nb.njit
-def rhs(y, t, m, par, world, work, out):
+@nb.njit(forceinline=True)
+def rhs(y, t, nodes, par, world, work, out):
     """Write dy/dt (n, 8) to ``out``.
 
     ``ops`` holds the collocation operators: rows 0…m of d/dy (the last is the wall), m rows of the Laplacian, then
     radii (row 2m+1) and averaging weights (row 2m+2). ``work`` (4m+1, 8) is scratch.
     """
+    m = len(nodes)
     ops, elastic, elastic_span, drive, drive_span, reading = world
-    p, rate, E, _wall = _gas(y, m, par, ops, work)
+    p, rate, E, _wall = _gas(y, nodes, par, ops, work)
     V = load(y, m)
     u = load(y, m + 1)
     kappa = load(par, KAPPA)
@@ -127,14 +129,15 @@ def rhs(y, t, m, par, world, work, out):
     store(out, m + 1, V)
 
 
-@nb.njit
-def jacobian(y, t, m, par, world, work, out, jac, dt):
+@nb.njit(forceinline=True)
+def jacobian(y, t, nodes, par, world, work, out, jac, dt):
     """Write dy/dt to ``out`` (n, 8), ∂f/∂y to ``jac`` (n·n, 8; row i·n+j) and ∂f_V/∂t, the only nonzero one, to
     ``dt`` (1, 8).
     """
+    m = len(nodes)
     n = m + 2
     ops, elastic, elastic_span, drive, drive_span, reading = world
-    p, rate, E, wall = _gas(y, m, par, ops, work)
+    p, rate, E, wall = _gas(y, nodes, par, ops, work)
     V = load(y, m)
     u = load(y, m + 1)
     kappa = load(par, KAPPA)

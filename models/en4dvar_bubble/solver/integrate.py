@@ -13,7 +13,7 @@ from numba.core import types
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.equations import jacobian, rhs
 from en4dvar_bubble.solver.general import general_jacobian, general_rhs
-from en4dvar_bubble.solver.lanes import WIDTH, absolute, load, maximum, splat, sqrt, store
+from en4dvar_bubble.solver.lanes import WIDTH, absolute, exp, load, log, maximum, splat, sqrt, store
 from en4dvar_bubble.solver.rows import AMPLITUDE, INVERSE_C
 
 # Status of a member; the reasons users read are made by ``driver.reason``.
@@ -27,6 +27,7 @@ _GAMMA = rodas5p.GAMMA
 _STAGES = rodas5p.STAGES
 _SAFETY, _SHRINK, _GROW = 0.9, 0.15, 6.0
 _EXPONENT = 1.0 / rodas5p.ORDER
+_LEAST_ROOT = 1e-2**_EXPONENT
 # µs. A bounce may need steps below the spacing of doubles near t: the equations know no other time by then, and the
 # step limit bounds the work.
 _SHORTEST = 1e-18
@@ -35,12 +36,13 @@ _TURNS_PER_LOOK = 64  # attempted steps between looks at the clock
 _clock = types.ExternalFunction("time", types.int64(types.intp))  # time(NULL) of the C library, seconds
 
 
-@nb.njit
-def _factorise(a, n):
+@nb.njit(forceinline=True)
+def _factorise(a, size):
     """LU without pivoting, in place; the diagonal is replaced by its inverse. Rows i·n+j.
 
     The temperature block comes first and is diagonally dominant; V and u follow as its border.
     """
+    n = len(size)
     for k in range(n):
         pivot = 1.0 / load(a, k * n + k)
         store(a, k * n + k, pivot)
@@ -51,9 +53,10 @@ def _factorise(a, n):
                 store(a, i * n + j, load(a, i * n + j) - factor * load(a, k * n + j))
 
 
-@nb.njit
-def _solve(a, n, b, row):
+@nb.njit(forceinline=True)
+def _solve(a, size, b, row):
     """Solve in place for the right-hand side in rows ``row … row+n−1`` of ``b``."""
+    n = len(size)
     for i in range(1, n):
         total = load(b, row + i)
         for j in range(i):
@@ -66,21 +69,24 @@ def _solve(a, n, b, row):
         store(b, row + i, total * load(a, i * n + i))
 
 
-@nb.njit
-def _attempt(y, t, h, par, dims, world, extra, general, tol, w):
-    """One RODAS5P step of all lanes: stages to ``k``, the new state to ``y_new``, the error norm to ``norm``.
+@nb.njit(forceinline=True)
+def _attempt(y, t, h, par, dims, world, extra, nodes, size, tol, w):
+    """One RODAS5P step of all lanes: stages to ``k``, the new state to ``y_new``, to ``norm`` the error
+    norm, its fifth root and the wall Mach number.
 
-    ``general`` chooses the equations: the paper's with their analytic Jacobian, or those with every option.
+    ``nodes`` chooses the equations: None for those with every option; for the paper's, with their analytic Jacobian, a
+    zero per temperature node, and ``size`` a zero per unknown. Only their lengths count. That of a tuple belongs to its
+    type: the compiler knows it and unrolls; arrays serve any length.
     """
     work, f, jac, dt, k, stage, y_new, t_stage, norm = w
     mT, mY, mM, wall, q, _, shear = dims
     n = mT + mY + mM + wall + q + 2
     fast_row = n - 2  # V, the only row with an explicit time dependence
-    algebraic = mT + mY + mM if wall else -1
-    if general:
+    algebraic = mT + mY + mM if nodes is None and wall else -1
+    if nodes is None:
         general_jacobian(y, t, par, dims, world, extra, stage, f, y_new, jac, dt)
     else:
-        jacobian(y, t, mT, par, world, work, f, jac, dt)
+        jacobian(y, t, nodes, par, world, work, f, jac, dt)
     step = load(h, 0)
     inverse_h = 1.0 / step
     for i in range(n * n):
@@ -88,7 +94,7 @@ def _attempt(y, t, h, par, dims, world, extra, general, tol, w):
     for i in range(n):
         if i != algebraic:
             store(jac, i * n + i, load(jac, i * n + i) + inverse_h * (1.0 / _GAMMA))
-    _factorise(jac, n)
+    _factorise(jac, size)
     now = load(t, 0)
     slope_t = load(dt, 0) * step
     for s in range(_STAGES):
@@ -99,10 +105,10 @@ def _attempt(y, t, h, par, dims, world, extra, general, tol, w):
                     value = value + load(k, r * n + i) * _A[s, r]
                 store(stage, i, value)
             store(t_stage, 0, now + step * _ALPHA[s])
-            if general:
+            if nodes is None:
                 general_rhs(stage, t_stage, par, dims, world, extra, f)
             else:
-                rhs(stage, t_stage, mT, par, world, work, f)
+                rhs(stage, t_stage, nodes, par, world, work, f)
         for i in range(n):
             value = splat(0.0)
             if i != algebraic:
@@ -110,7 +116,7 @@ def _attempt(y, t, h, par, dims, world, extra, general, tol, w):
                     value = value + load(k, r * n + i) * _C[s, r]
             store(k, s * n + i, load(f, i) + value * inverse_h)
         store(k, s * n + fast_row, load(k, s * n + fast_row) + slope_t * _D[s])
-        _solve(jac, n, k, s * n)
+        _solve(jac, size, k, s * n)
     total = splat(0.0)
     last = (_STAGES - 1) * n
     for i in range(n):
@@ -124,10 +130,13 @@ def _attempt(y, t, h, par, dims, world, extra, general, tol, w):
             size = maximum(size, sqrt(absolute(new - old) * inverse_h))
         ratio = error / (size * tol[1, i] + tol[0, i])
         total = total + ratio * ratio
-    store(norm, 0, sqrt(total * (1.0 / n)))
+    error_norm = sqrt(total * (1.0 / n))
+    store(norm, 0, error_norm)
+    store(norm, 1, exp(log(maximum(error_norm, 1e-8)) * _EXPONENT))
+    store(norm, 2, absolute(load(y_new, n - 2)) * exp(load(y_new, n - 1)) * load(par, INVERSE_C))
 
 
-@nb.njit
+@nb.njit(forceinline=True)
 def _dense(y, y_new, k, n, coefficients):
     """Rows 3n of the dense-output polynomial (K1, K2, K3)."""
     for r in range(3):
@@ -139,22 +148,23 @@ def _dense(y, y_new, k, n, coefficients):
 
 
 @nb.njit
+def _rows(count):
+    """(count, WIDTH) uninitialised, on a 64-byte boundary: a row that straddles two cache lines costs twice."""
+    raw = np.empty((count + 1) * WIDTH)
+    first = (-(raw.ctypes.data // 8)) % WIDTH
+    return raw[first : first + count * WIDTH].reshape(count, WIDTH)
+
+
+@nb.njit
 def _workspace(m, n):
-    return (
-        np.empty((6 * m + 2, WIDTH)),
-        np.empty((n, WIDTH)),
-        np.empty((n * n, WIDTH)),
-        np.empty((1, WIDTH)),
-        np.empty((_STAGES * n, WIDTH)),
-        np.empty((n, WIDTH)),
-        np.empty((n, WIDTH)),
-        np.empty((1, WIDTH)),
-        np.empty((1, WIDTH)),
-    )
+    work, f, jac, dt, k = _rows(6 * m + 2), _rows(n), _rows(n * n), _rows(1), _rows(_STAGES * n)
+    return work, f, jac, dt, k, _rows(n), _rows(n), _rows(1), _rows(3)
 
 
 @nb.njit(cache=True, nogil=True)
-def integrate(initial, parameters, start, times, dims, world, extra, general, breaks, tol, limits, out, status, record):
+def integrate(
+    initial, parameters, start, times, dims, world, extra, nodes, size, breaks, tol, limits, out, status, record
+):
     """Integrate N members and write their states at the output times.
 
     initial (N, n), parameters (N, rows), start (N,) µs, times (N, K) increasing µs; ``dims``, ``world``, ``extra`` as
@@ -169,17 +179,14 @@ def integrate(initial, parameters, start, times, dims, world, extra, general, br
     n_parameters = parameters.shape[1]
     w = _workspace(m, n)
     k, y_new, norm = w[4], w[6], w[8]
-    y = np.zeros((n, WIDTH))
-    t = np.zeros((1, WIDTH))
-    h = np.full((1, WIDTH), limits[0])
-    par = np.zeros((n_parameters, WIDTH))
-    coefficients = np.empty((3 * n, WIDTH))
+    y, t, h, par, coefficients = _rows(n), _rows(1), _rows(1), _rows(n_parameters), _rows(3 * n)
+    y[:], t[:], h[:], par[:] = 0.0, 0.0, limits[0], 0.0
     member = np.full(WIDTH, -1, dtype=np.int64)
     observed = np.zeros(WIDTH, dtype=np.int64)
     next_break = np.zeros(WIDTH, dtype=np.int64)
     proposal = np.empty(WIDTH)  # the step before it was cut at a break
     old_h = np.empty(WIDTH)
-    old_norm = np.empty(WIDTH)
+    old_root = np.empty(WIDTH)
     rejected = np.zeros(WIDTH, dtype=np.bool_)
     waiting = 0
     running = 0
@@ -236,7 +243,7 @@ def integrate(initial, parameters, start, times, dims, world, extra, general, br
         if turn % _TURNS_PER_LOOK == 0:
             clock = _clock(0)
 
-        _attempt(y, t, h, par, dims, world, extra, general, tol, w)
+        _attempt(y, t, h, par, dims, world, extra, nodes, size, tol, w)
 
         have_dense = False
         for lane in range(WIDTH):
@@ -252,7 +259,8 @@ def integrate(initial, parameters, start, times, dims, world, extra, general, br
                 h[0, lane] = step * 0.1
             else:
                 e = max(e, 1e-8)
-                shrink = e**_EXPONENT / _SAFETY
+                root = norm[1, lane]
+                shrink = root / _SAFETY
                 if e > 1.0:
                     rejected[lane] = True
                     record[i, REJECTED] += 1
@@ -282,14 +290,14 @@ def integrate(initial, parameters, start, times, dims, world, extra, general, br
                     record[i, STEPS] += 1
                     record[i, END_TIME] = end
                     log_r = y[n - 1, lane]
-                    mach = abs(y[n - 2, lane]) * math.exp(log_r) * par[INVERSE_C, lane]
+                    mach = norm[2, lane]
                     record[i, MAX_MACH] = max(record[i, MAX_MACH], mach)
                     record[i, MIN_LOG_R] = min(record[i, MIN_LOG_R], log_r)
                     if m > 0:
                         record[i, MAX_THETA] = max(record[i, MAX_THETA], y[0, lane])
                     # Gustafsson's predictive controller: the trend of the error, not only its size, sets the next step.
                     if old_h[lane] > 0.0:
-                        trend = old_h[lane] / step * (e * e / old_norm[lane]) ** _EXPONENT / _SAFETY
+                        trend = old_h[lane] / step * root * root / old_root[lane] / _SAFETY
                         shrink = max(shrink, trend)
                     grown = step / min(max(shrink, 1.0 / _GROW), 1.0 / _SHRINK)
                     if rejected[lane]:
@@ -297,7 +305,7 @@ def integrate(initial, parameters, start, times, dims, world, extra, general, br
                     if cut and grown < proposal[lane] and e < 1.0:
                         grown = max(grown, min(proposal[lane], step * _GROW))
                     old_h[lane] = step
-                    old_norm[lane] = max(e, 1e-2)
+                    old_root[lane] = max(root, _LEAST_ROOT)
                     rejected[lane] = False
                     h[0, lane] = grown
                     if mach > mach_limit:

@@ -7,7 +7,7 @@ import numba as nb
 from en4dvar_bubble.solver.lanes import any_lane, floor, gather, maximum, minimum, select, splat
 
 
-@nb.njit
+@nb.njit(forceinline=True)
 def lookup(table, offset, origin, per_unit, intervals, x):
     """Value, first and second derivative of a piecewise quintic; beyond its ends the last interval is extended."""
     position = (x - origin) * per_unit
@@ -22,7 +22,7 @@ def lookup(table, offset, origin, per_unit, intervals, x):
     return value, first * per_unit, second * (per_unit * per_unit)
 
 
-@nb.njit
+@nb.njit(forceinline=True)
 def driving(t, drive, span, amplitude):
     """p_f, dp_f/dt, d²p_f/dt² at the lanes' times; zero outside the table's span (t_0, t_1, intervals per µs,
     count).
