@@ -50,7 +50,8 @@ def conduction_slope(medium: Medium) -> float:
 def law_tables(model: BubbleModel, values: Mapping[str, Array]) -> Tables:
     """The laws of N members as tables in the kernel's units."""
     law, rho = model.law, model.medium.rho
-    elastic = law.table(values) / rho
+    elastic = law.table(values)
+    elastic /= rho  # in place: the tables are the largest arrays of a forecast
     extra = {}
     if model.system.shear:
         extra["viscous"] = law.viscous_table(values) / rho * 1e6
