@@ -213,4 +213,4 @@ class BubbleModel(ForwardModel):
             states = np.take_along_axis(solution.states, back[:, :, None], axis=1)
             states[:, :, -2] *= np.where(times < 0, -1.0, 1.0)
             solution = Solution(states, solution.status, solution.record)
-        return Paths(self, x, times, solution, par, tables)
+        return Paths(self, x, times, solution, par)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from en4dvar.state import Array
+from en4dvar_bubble.laws.tabulate import new_table
 from en4dvar_bubble.medium import Medium, saturated_vapour_pressure
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.collocation import ball
@@ -47,11 +49,22 @@ def conduction_slope(medium: Medium) -> float:
     return medium.A * medium.T_inf / medium.K_inf
 
 
+_buffers = threading.local()
+
+
+def _buffer(n: int) -> Array:
+    """Room for the elastic tables of n members, one per thread and used again: fresh pages are dear."""
+    room: Array | None = getattr(_buffers, "elastic", None)
+    if room is None or len(room) < n:
+        room = _buffers.elastic = new_table(n)
+    return room[:n]
+
+
 def law_tables(model: BubbleModel, values: Mapping[str, Array]) -> Tables:
-    """The laws of N members as tables in the kernel's units."""
+    """The laws of N members as tables in the kernel's units; valid until the thread's next call."""
     law, rho = model.law, model.medium.rho
-    elastic = law.table(values)
-    elastic /= rho  # in place: the tables are the largest arrays of a forecast
+    n = len(next(iter(values.values()), ()))
+    elastic = law.table(values, 1 / rho, _buffer(n))
     extra = {}
     if model.system.shear:
         extra["viscous"] = law.viscous_table(values) / rho * 1e6

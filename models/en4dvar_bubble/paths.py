@@ -14,7 +14,7 @@ from en4dvar_bubble.medium import saturated_vapour_pressure
 from en4dvar_bubble.packing import conduction_slope, from_kirchhoff, mass_fraction
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.collocation import ball
-from en4dvar_bubble.solver.driver import Solution, Tables
+from en4dvar_bubble.solver.driver import Solution
 from en4dvar_bubble.tables import evaluate
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ class Paths:
     times: Array
     solution: Solution
     par: Array
-    tables: Tables
     _fields: dict[str, Array] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Array:
@@ -97,11 +96,11 @@ class Paths:
         system, rho = self.model.system, self.model.medium.rho
         V = self.solution.states[:, :, -2]
         log_stretch = self.solution.states[:, :, -1] - self.par[:, None, rows.LOG_R0]
-        stress = evaluate(self.tables.elastic, GRID.span, log_stretch)
+        values = self.model.law_values(self.initial)
+        stress = evaluate(self.model.law.table(values, 1 / rho), GRID.span, log_stretch)
         if system.memory:
             stress = stress + self.solution.states[:, :, system.first_memory : -2].sum(axis=2)
         if system.shear:
-            values = self.model.law_values(self.initial)
             nu = self.model.law.mean_viscosity(np.abs(V) * 1e6, values) / rho * 1e6
         else:
             nu = self.par[:, None, rows.VISCOSITY]

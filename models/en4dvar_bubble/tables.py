@@ -55,12 +55,18 @@ def _cell(out, a, da, dda, b, db, ddb):
     out[7] = 0.0
 
 
-@nb.njit(cache=True, nogil=True)
-def from_values(samples):
+def from_values(samples: Array) -> Array:
     """Coefficients (N, cells, 8) from samples (N, cells + 1 + 2·HALO) of the function."""
+    out = np.empty((len(samples), samples.shape[1] - 1 - 2 * HALO, 8))
+    fill(samples, 1.0, out)
+    return out
+
+
+@nb.njit(cache=True, nogil=True)
+def fill(samples, scale, out):
+    """Write ``scale`` times the coefficients of :func:`from_values` to ``out`` (N, cells, 8)."""
     n, total = samples.shape
     cells = total - 1 - 2 * HALO
-    out = np.empty((n, cells, 8))
     for i in range(n):
         row = samples[i]
         a = da = dda = 0.0
@@ -73,10 +79,10 @@ def from_values(samples):
                 right, left = row[at + r + 1], row[at - r - 1]
                 db += _FIRST[r] * (right - left)
                 ddb += _SECOND[r] * (right + left)
+            b, db, ddb = b * scale, db * scale, ddb * scale
             if j > 0:
                 _cell(out[i, j - 1], a, da, dda, b, db, ddb)
             a, da, dda = b, db, ddb
-    return out
 
 
 @nb.njit(cache=True, nogil=True)

@@ -20,7 +20,7 @@ from en4dvar.errors import ConfigError
 from en4dvar.state import Array, Parameter
 from en4dvar_bubble.laws.memory import MemoryTables, MemoryVariable
 from en4dvar_bubble.laws.parameters import MU
-from en4dvar_bubble.laws.tabulate import GRID, from_function, from_strain_energy
+from en4dvar_bubble.laws.tabulate import GRID, from_function, from_strain_energy, new_table
 from en4dvar_bubble.laws.viscous import VISCOUS_GRID, mean_viscosity
 from en4dvar_bubble.tables import evaluate, from_values
 
@@ -119,13 +119,17 @@ class ConstitutiveLaw:
         """Whether the viscosity is the method, not the parameter ``mu``."""
         return type(self).viscosity is not ConstitutiveLaw.viscosity
 
-    def table(self, values: Mapping[str, Array]) -> Array:
-        """J_e against ln λ for N members: (N, cells, 8) coefficients on :data:`GRID`, Pa. ``values``: name → (N,)."""
+    def table(self, values: Mapping[str, Array], scale: float = 1.0, out: Array | None = None) -> Array:
+        """``scale · J_e`` against ln λ for N members: (N, cells, 8) coefficients on :data:`GRID`, Pa.
+
+        ``values``: name → (N,). Written to ``out`` where given.
+        """
         p, n = _namespace(values)
+        out = new_table(n) if out is None else out
         with np.errstate(all="ignore"):  # a law may overflow at stretches that no member reaches
             if type(self).stress is not ConstitutiveLaw.stress:
-                return from_function(lambda stretch: self.stress(stretch, p), n)
-            return from_strain_energy(lambda stretch: self.strain_energy_rate(stretch, p), n)
+                return from_function(lambda stretch: self.stress(stretch, p), out, scale)
+            return from_strain_energy(lambda stretch: self.strain_energy_rate(stretch, p), out, scale)
 
     def viscous_table(self, values: Mapping[str, Array]) -> Array:
         """μ̄ (Pa s) against z = ln(|V| s), constant below the first node: (N, cells, 8) on :data:`VISCOUS_GRID`.
@@ -142,7 +146,7 @@ class ConstitutiveLaw:
         variables = self.memory(p)
 
         def table(source: Any) -> Array:
-            return from_function(source if callable(source) else lambda stretch: source, n)
+            return from_function(source if callable(source) else lambda stretch: source, new_table(n))
 
         with np.errstate(all="ignore"):
             shape = (n, len(variables), GRID.cells, 8)

@@ -45,8 +45,9 @@ class MemoryTables(NamedTuple):
 def linear_maxwell(viscosity: Array, relaxation_time: Array) -> tuple[MemoryVariable, ...]:
     r"""A dashpot and a linear spring in series: $\dot s = -s/\theta - 4(\mu_p/\theta)\dot R/R$.
 
-    The linear law of the rheometry codes (Warnez & Johnsen 2015; their variable is $Z_1 = R^3 (J_e + s)$). Exact for
-    small strain within a relaxation time.
+    Exact for small strain within a relaxation time. The rheometry codes differentiate at fixed r instead of with the
+    material, which adds $-3\dot R/R\,s$ (``convection=-3``); the two agree at small strain, and at large strain neither
+    is objective: prefer :func:`upper_convected_maxwell` there.
     """
     return (MemoryVariable(relaxation_time, stiffness=-4 * viscosity / relaxation_time),)
 

@@ -204,7 +204,7 @@ def _medium_operators(m: int) -> Array:
 
 
 def _lengths(system: System) -> tuple[Any, Any]:
-    """``nodes`` and ``size`` of :func:`integrate.integrate`: as tuples, whose length the compiler sees, for few nodes only.
+    """``nodes`` and ``size`` of :func:`integrate.integrate`: as tuples, whose length the compiler sees, for few nodes.
 
     Unrolling halves the time of a step and costs a compilation (some seconds, once) for every number of nodes.
     """
