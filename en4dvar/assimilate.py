@@ -10,16 +10,17 @@ import numpy as np
 from en4dvar import diagnostics as diag
 from en4dvar import mcmc
 from en4dvar.descent import Local, WeightSpace
-from en4dvar.errors import TooFewMembersError
+from en4dvar.errors import ConfigError, TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
-from en4dvar.forecast import Forecast, check_problem, cost, forecast, log_posterior
-from en4dvar.likelihood import error_std, log_likelihood
+from en4dvar.forecast import Forecast, check_problem, cost, forecast, has_noise_scale, log_posterior
+from en4dvar.likelihood import error_std, log_likelihood, robust_weights, whitened_residual
 from en4dvar.mda import assimilate_once
 from en4dvar.problem import Analysis, AssimilationSettings, InverseProblem, IterationRecord
 from en4dvar.schemes import Step, Weights
 from en4dvar.schemes.esmda import ESMDA
 from en4dvar.start import choose_start
 from en4dvar.state import Array
+from en4dvar.units import convert
 
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 
@@ -99,6 +100,8 @@ class _Run:
         self.problem, self.settings, self.seed = problem, settings, seed
         self.progress, self.on_iteration = progress, on_iteration
         self.mda = ESMDA(settings.mda_coefficients, settings.mda_form) if settings.scheme == "es-mda" else None
+        if self.mda and (has_noise_scale(problem) or problem.observations.huber is not None):
+            raise ConfigError("es-mda takes Gaussian errors of known std: neither sigma nor a robust cost; use en4dvar")
         if self.mda:  # step and J of its ensembles are regressed over them
             settings = replace(settings, linearisation="transform")
         self.space = WeightSpace(problem, settings, seed, executor)
@@ -118,7 +121,11 @@ class _Run:
         mode = space.control(end.weights.w)
         final = space.forecast(np.vstack([posterior, mode]), grid)
         after, last = final[:-1], final[-1:]
-        centre_rates = None if last.rates is None else last.rates[0]
+        at_centre = (
+            None if last.rates is None else last.rates[0],
+            None if last.noise_scale is None else last.noise_scale[0],
+        )
+        huber, huber_warnings = self.robust(last.predictions[0], *at_centre)
         per_parameter = diag.dfs_per_parameter(space.members, posterior)
         shape = {} if refinement else self.shape(posterior, mode, after)
         record = end.records[-1]
@@ -139,8 +146,8 @@ class _Run:
             prior_predictions=prior_run.predictions[:-1],
             posterior_predictions=after.predictions,
             centre_predictions=last.predictions[0],
-            error_std=error_std(observations, centre_rates),
-            log_likelihood=log_likelihood(observations, after.predictions, after.rates),
+            error_std=error_std(observations, *at_centre),
+            log_likelihood=log_likelihood(observations, after.predictions, after.rates, after.noise_scale),
             trajectory_times=grid,
             prior_trajectories=prior_run.path[:-1],
             posterior_trajectories=after.path,
@@ -154,6 +161,7 @@ class _Run:
             seed=self.seed,
             settings=self.settings,
             shape=shape,
+            huber_weight=huber,
             refinement=refinement,
             log_evidence=diag.log_evidence(
                 end.cost, end.step.hessian.singular_values, len(space.members), observations
@@ -166,6 +174,7 @@ class _Run:
                 *refine_warnings,
                 *diag.loss_warning("posterior forecast", after.failures),
                 *diag.fit_warnings(record.chi2_per_observation * used, used, record.dfs),
+                *huber_warnings,
                 *diag.conflict_warnings(prior.names, mode, prior.mean, prior.std),
                 *diag.shape_warnings(shape),
                 *diag.information_warnings(prior.names, per_parameter),
@@ -177,6 +186,17 @@ class _Run:
             return LoopState(Weights.prior(len(self.space.members)), self.space.forward_runs)
         w, warnings = choose_start(self.space, prior_run)
         return LoopState(Weights(w, self.space.scheme.init(len(w)).T), self.space.forward_runs, warnings)
+
+    def robust(
+        self, prediction: Array, rate: Array | None, scale: Array | None
+    ) -> tuple[Array | None, tuple[str, ...]]:
+        """Huber's weights (K,) at the centre and words for those below one; None with Gaussian errors."""
+        observations, model = self.problem.observations, self.problem.model
+        if observations.huber is None:
+            return None, ()
+        weights = robust_weights(observations, whitened_residual(observations, prediction, rate, scale))
+        times = convert(observations.times, model.time_unit, model.time_display_unit)
+        return weights, diag.robust_warnings(weights, times, model.time_display_unit, observations.huber)
 
     def shape(self, posterior: Array, mode: Array, run: Forecast) -> dict[str, float]:
         """How Gaussian the posterior is, from the forecast of the posterior ensemble."""
@@ -269,6 +289,7 @@ class _Run:
         space, w = self.space, at.weights.w
         ensemble = space.control(w + step.transform)
         rates = None if at.central.rates is None else at.central.rates[0]
+        scale = None if at.central.noise_scale is None else at.central.noise_scale[0]
         predictions = at.central.predictions[0]
         return IterationRecord(
             iteration=iteration,
@@ -277,7 +298,7 @@ class _Run:
             observation=at.observation,
             step_norm=step.norm,
             step_length=step_length,
-            chi2_per_observation=diag.chi2_per_observation(self.problem.observations, predictions, rates),
+            chi2_per_observation=diag.chi2_per_observation(self.problem.observations, predictions, rates, scale),
             dfs=diag.dfs(step.hessian.singular_values, len(w)),
             spread=diag.spread(ensemble, space.members),
             active=at.active,

@@ -9,6 +9,7 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.config import Config
 from en4dvar.config.data import DataPlan
@@ -18,7 +19,8 @@ from en4dvar.forecast import check_problem
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
-from en4dvar.readers import SUFFIXES, read_series
+from en4dvar.readers import SUFFIXES, read_covariance, read_series
+from en4dvar.state import Array
 from en4dvar.units import UnitError, convert
 from en4dvar.window import select
 
@@ -48,7 +50,7 @@ def inverse_plan(config: Config) -> DataPlan:
     """How the observations are read. Raises :class:`ConfigError` without data or without anything to estimate."""
     if config.data is None:
         raise ConfigError([Fault("required: where the observations are", "data", config.document.file)])
-    if not any(isinstance(entry, Uncertain) for entry in config.parameters):
+    if not config.initial_state and not any(isinstance(entry, Uncertain) for entry in config.parameters):
         raise ConfigError([config.document.fault(("parameters",), "no parameter has a prior; nothing to estimate")])
     return config.data
 
@@ -57,7 +59,9 @@ def build_one(config: Config, name: str, path: Path) -> InverseProblem:
     """The inverse problem of one of :func:`data_files`. Raises :class:`ConfigError`, :class:`DataError`."""
     observations = read_observations(inverse_plan(config), path, name, config.weights)
     terms, fixed = resolve_parameters(config, observations)
-    problem = InverseProblem(config.model, config.observable, observations, Prior(terms), fixed)
+    terms = (*terms, *(term for term, _ in config.initial_state))
+    perturbations = tuple(perturbation for _, perturbation in config.initial_state)
+    problem = InverseProblem(config.model, config.observable, observations, Prior(terms), fixed, perturbations)
     check_problem(problem)
     return problem
 
@@ -115,16 +119,43 @@ def read_observations(plan: DataPlan, path: Path, name: str, weights: str = "sum
     if times[0] < 0:
         raise DataError(f"{path}: the first observation used lies {-times[0]:g} before time zero; see data.time_zero")
     count = len(times)
+    std, correlation = _errors(plan, times, values, np.arange(len(series.times))[window])
     return Observations(
         times=times,
         values=values,
-        std=np.full(count, plan.std.absolute(float(values.max()))),
-        time_std=np.full(count, plan.time_std),
+        std=std,
+        time_std=np.full(count, plan.error.time_std),
         weights=np.full(count, 1.0 if weights == "sum" else 1.0 / count),
         name=name,
         source=str(path),
         scalars=series.scalars,
+        correlation=correlation,
+        huber=plan.error.huber,
     )
+
+
+def _errors(plan: DataPlan, times: Array, values: Array, samples: npt.NDArray[np.intp]) -> tuple[Array, Array | None]:
+    """std (K,) and correlation (K, K) or None; ``samples`` (K,) are the places of the observations in the series.
+
+    A covariance file holds one row an observation of the window, or one a usable sample of the whole series.
+    """
+    error = plan.error
+    if error.covariance is not None:
+        covariance = read_covariance(error.covariance)
+        if len(covariance) > samples[-1] and len(covariance) != len(times):
+            covariance = covariance[np.ix_(samples, samples)]
+        if len(covariance) != len(times):
+            raise DataError(f"{error.covariance.path}: {len(covariance)} rows, but {len(times)} observations")
+        std = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(std, std)
+        np.fill_diagonal(correlation, 1.0)
+        return std, correlation
+    if error.std is None:
+        raise ConfigError("data.error: neither a std nor a covariance")
+    std = np.full(len(times), error.std.absolute(float(values.max())))
+    if error.correlation_time is None:
+        return std, None
+    return std, np.exp(-np.abs(np.subtract.outer(times, times)) / error.correlation_time)
 
 
 def resolve_parameters(

@@ -23,7 +23,7 @@ GROUPS = (
     "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "constant_data", "sample_stats",
     "log_likelihood",
 )  # fmt: skip
-LEFT_OUT = {"path_time", "iteration"}
+LEFT_OUT = {"path_time", "iteration", "time_column"}
 FAILURES = "failed_datasets"  # root attribute: JSON of name → reason
 
 

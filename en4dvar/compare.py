@@ -142,7 +142,13 @@ def _same_data(a: Result, b: Result) -> bool:
     left, right = a.observed_data, b.observed_data
     if a.observable != b.observable or left.sizes["time"] != right.sizes["time"]:
         return False
-    names = ("time", a.observable, f"{a.observable}_reading_std", "time_std", "weights")
+    names = ["time", a.observable, f"{a.observable}_reading_std", "time_std", "weights"]
+    further = f"{a.observable}_correlation"
+    if (further in left) != (further in right) or left.attrs.get("huber_threshold") != right.attrs.get(
+        "huber_threshold"
+    ):
+        return False
+    names += [further] if further in left else []
     return all(np.allclose(left[n].values, right[n].values, rtol=1e-12, atol=0) for n in names)
 
 

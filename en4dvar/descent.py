@@ -16,7 +16,7 @@ import numpy as np
 from en4dvar import diagnostics as diag
 from en4dvar.executor import Executor
 from en4dvar.forecast import NO_TIMES, Forecast, forecast
-from en4dvar.likelihood import Linearisation, error_std, observation_cost, whiten
+from en4dvar.likelihood import Linearisation, observation_cost, precision_times, whiten
 from en4dvar.linalg import anomaly_basis, centre
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.schemes import Evaluation, Scheme, Step, Weights
@@ -70,7 +70,7 @@ class WeightSpace:
         return forecast(self.problem, x, self.executor, extra_times)
 
     def observation_cost(self, run: Forecast) -> Array:
-        return observation_cost(self.problem.observations, run.predictions, run.rates)
+        return observation_cost(self.problem.observations, run.predictions, run.rates, run.noise_scale)
 
     def try_out(self, w: Array) -> Trials:
         """J and predictions of central trajectories at weights (B, N)."""
@@ -121,25 +121,42 @@ class WeightSpace:
         if active < self.needed_members or not np.isfinite(total):
             return Local(weights, members, central, active, observation, total, None, None)
         reference, anomalies = self._linearisation(weights, members, central, reduced)
-        k = central.predictions.shape[1]
-        at = Linearisation(reference[:k], anomalies[:, :k])
-        if central.rates is not None:
-            at = Linearisation(reference[:k], anomalies[:, :k], reference[k:], anomalies[:, k:])
+        at = _split(central, reference, anomalies)
         observations = self.problem.observations
         step = self.scheme.step(weights, Evaluation(*whiten(observations, at)))
         tangent = None
         if self.settings.linearisation == "bundle":
-            scale = np.sqrt(observations.weights) / error_std(observations, at.rate)
-            tangent = Tangent(at.prediction, at.anomalies, scale)
+            tangent = Tangent(at.prediction, at.anomalies, precision_times(observations, at, at.anomalies))
         return Local(weights, members, central, active, observation, total, step, tangent)
 
     def _linearisation(
         self, weights: Weights, members: Forecast, central: Forecast, reduced: bool
     ) -> tuple[Array, Array]:
-        """Reference (Ky,) and anomalies per unit weight (N, Ky) of predictions and, with timing errors, rates."""
-        stacked, reference = (
-            np.hstack([f.predictions] if f.rates is None else [f.predictions, f.rates]) for f in (members, central)
-        )
+        """Reference (Ky,) and anomalies per unit weight (N, Ky) of all that :func:`_stack` puts side by side."""
+        stacked, reference = _stack(members), _stack(central)
         if reduced:
             return reference[0], self.basis @ ((stacked - reference[0]) / self._short)
         return self.scheme.linearise(weights, self.basis, stacked, reference[0], members.active)
+
+
+def _stack(run: Forecast) -> Array:
+    """Predictions, where there are timing errors rates, and where there is a noise scale ln σ: (B, Ky)."""
+    parts = [run.predictions]
+    if run.rates is not None:
+        parts.append(run.rates)
+    if run.noise_scale is not None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            parts.append(np.log(run.noise_scale)[:, None])
+    return np.hstack(parts)
+
+
+def _split(run: Forecast, reference: Array, anomalies: Array) -> Linearisation:
+    """The linearisation of what was stacked."""
+    k = run.predictions.shape[1]
+    rate = rate_anomalies = scale_anomalies = None
+    log_scale = None
+    if run.rates is not None:
+        rate, rate_anomalies = reference[k : 2 * k], anomalies[:, k : 2 * k]
+    if run.noise_scale is not None:
+        log_scale, scale_anomalies = float(reference[-1]), anomalies[:, -1]
+    return Linearisation(reference[:k], anomalies[:, :k], rate, rate_anomalies, log_scale, scale_anomalies)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from en4dvar.likelihood import error_std
+from en4dvar.likelihood import log_normalisation, whitened_residual
 from en4dvar.observations import Observations
 from en4dvar.state import Array
 
@@ -37,10 +37,12 @@ def spread(members: Array, prior: Array) -> float:
     return float(np.sqrt(np.mean(members.var(axis=0) / prior.var(axis=0))))
 
 
-def chi2_per_observation(observations: Observations, predictions: Array, rates: Array | None) -> float:
-    """Mean of (y − m)²/s² over the observations with β > 0, for predictions (K,)."""
-    z = (observations.values - predictions) / error_std(observations, rates)
-    return float(np.mean(z[observations.weights > 0] ** 2))
+def chi2_per_observation(
+    observations: Observations, predictions: Array, rates: Array | None, noise_scale: Array | None = None
+) -> float:
+    """(y − m)ᵀR⁻¹(y − m) per observation with β > 0, for predictions (K,); outliers count fully."""
+    v = whitened_residual(observations, predictions, rates, noise_scale)
+    return float(np.mean(v[observations.weights > 0] ** 2))
 
 
 def nrmse(values: Array, predictions: Array) -> float:
@@ -49,15 +51,14 @@ def nrmse(values: Array, predictions: Array) -> float:
 
 
 def log_evidence(cost: float, singular_values: Array, n_members: int, observations: Observations) -> float:
-    """Laplace approximation of ln p(y): −J_min − ½ ln det(A/(N−1)) − Σ β_k ln(std_k √2π).
+    """Laplace approximation of ln p(y): −J_min − ½ ln det(A/(N−1)) − Σ β_k ln(std_k √2π) (− ½ ln det C).
 
     Exact for linear F and H. ``cost`` is J at its minimum, ``singular_values`` are those of S there. With β ≠ 1 it is
     the evidence of the tempered likelihood. Source: MacKay (2003), Information Theory, Inference and Learning
     Algorithms, chapter 28.
     """
     log_det = float(np.sum(np.log1p(singular_values**2 / (n_members - 1))))
-    normalisation = np.sum(observations.weights * (np.log(observations.std) + 0.5 * math.log(2 * math.pi)))
-    return float(-cost - 0.5 * log_det - normalisation)
+    return float(-cost - 0.5 * log_det - log_normalisation(observations))
 
 
 def chi2_interval(degrees: float) -> tuple[float, float]:
@@ -124,6 +125,20 @@ def shape_warnings(shape: Mapping[str, float]) -> tuple[str, ...]:
     return (
         f"the posterior is far from Gaussian (effective share of members {shape['gaussian_fit']:.2f}): mean and spread "
         "of the ensemble may be off by more than they say; refine: mcmc samples it",
+    )
+
+
+def robust_warnings(weights: Array, times: Array, unit: str, threshold: float, most: int = 6) -> tuple[str, ...]:
+    """Words for the observations that a robust cost counts less; weights and times (K,), ``unit`` of the times."""
+    lighter = np.flatnonzero(weights < 1)
+    if not len(lighter):
+        return ()
+    worst = lighter[np.argsort(weights[lighter], kind="stable")]
+    listed = ", ".join(f"{times[k]:.4g} {unit} (weight {weights[k]:.2g})" for k in worst[:most])
+    more = f" and {len(worst) - most} more" if len(worst) > most else ""
+    return (
+        f"{len(worst)} of {len(weights)} observations lie beyond {threshold:g} standard deviations and were "
+        f"down-weighted (Huber): {listed}{more}",
     )
 
 

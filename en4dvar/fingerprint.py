@@ -57,7 +57,9 @@ def identity(resolved: str, model: ForwardModel, data: Mapping[str, Path]) -> Id
             software[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
+    errors = (content.get("data") or {}).get("error", {})
     sources = {"en4dvar": source_digest("en4dvar"), **_model_sources(model, content["model"])}
+    sources |= {str(path): file_digest(path) for path in _paths(errors)}
     text = yaml.safe_dump(
         {**settings, "software": software, "sources": sources}, sort_keys=False, allow_unicode=True, width=120
     )

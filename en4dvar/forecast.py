@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from en4dvar.executor import Executor, SerialExecutor, describe
 from en4dvar.forward import Failure, RateOperator, Trajectory
 from en4dvar.likelihood import needs_rate, observation_cost
 from en4dvar.problem import InverseProblem
-from en4dvar.state import TIME_SHIFT, Array, Parameter
+from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Array, Parameter
 
 NO_TIMES: Array = np.empty(0)
 SAME_INSTANT = 1e-9  # of the window: an extra time this close to an observation is read at the observation
@@ -23,13 +24,15 @@ class Forecast:
     """Predictions of B members; NaN rows where a member failed.
 
     ``predictions`` (B, K) at the observations, ``rates`` (B, K) of the observable or None where no observation has a
-    timing error, ``path`` (B, M) at the extra times, ``failures`` (B,) reasons, "" for members alive.
+    timing error, ``path`` (B, M) at the extra times, ``failures`` (B,) reasons, "" for members alive, ``noise_scale``
+    (B,) σ of each member or None where it is neither estimated nor fixed.
     """
 
     predictions: Array
     rates: Array | None
     path: Array
     failures: tuple[str, ...]
+    noise_scale: Array | None = None
 
     @property
     def active(self) -> Array:
@@ -42,6 +45,7 @@ class Forecast:
             None if self.rates is None else self.rates[members],
             self.path[members],
             self.failures[members],
+            None if self.noise_scale is None else self.noise_scale[members],
         )
 
 
@@ -68,7 +72,7 @@ def forecast(
     outcomes: dict[int, Trajectory | Failure] = {}
     if states:
         alive = list(states)
-        shifted = times + _time_shift(problem, physical)[alive, None]
+        shifted = times + _of_framework(problem, physical, TIME_SHIFT, 0.0)[alive, None]
         results = executor.trajectories(problem.model, np.stack(list(states.values())), shifted)
         outcomes = dict(zip(alive, results, strict=True))
 
@@ -94,7 +98,14 @@ def forecast(
         None if rates is None else rates[:, at_observations],
         observed[:, at_extra],
         tuple(failures),
+        _of_framework(problem, physical, NOISE_SCALE, 1.0) if has_noise_scale(problem) else None,
     )
+
+
+def has_noise_scale(problem: InverseProblem) -> bool:
+    """Whether ``sigma`` is given and scales the observation errors (rather than being the model's own)."""
+    own = {p.name for p in problem.model.parameters}
+    return NOISE_SCALE.name not in own and NOISE_SCALE.name in {*problem.prior.names, *problem.fixed}
 
 
 def cost(problem: InverseProblem, x: Array, executor: Executor | None = None) -> Array:
@@ -103,7 +114,7 @@ def cost(problem: InverseProblem, x: Array, executor: Executor | None = None) ->
     J = ½ Σ_j ((x_j − mean_j)/std_j)² + Σ_k β_k [½ (y_k − m_k)²/s_k² + ln(s_k/std_k)].
     """
     run = forecast(problem, x, executor)
-    observation = observation_cost(problem.observations, run.predictions, run.rates)
+    observation = observation_cost(problem.observations, run.predictions, run.rates, run.noise_scale)
     with np.errstate(over="ignore"):
         z = (x - problem.prior.mean) / problem.prior.std
         return np.where(run.active, 0.5 * np.sum(z * z, axis=-1) + observation, np.inf)
@@ -125,9 +136,12 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
     ConfigError: a parameter neither fixed nor estimated, both, or unknown to the model; a timing error on an
         observable without a rate.
     """
-    known = {p.name: p for p in (TIME_SHIFT, *problem.model.parameters)}
+    perturbed = [p.parameter for p in problem.perturbations]
+    known = {p.name: p for p in (TIME_SHIFT, NOISE_SCALE, *perturbed, *problem.model.parameters)}
     estimated, fixed = set(problem.prior.names), set(problem.fixed)
-    required = {p.name for p in problem.model.parameters} - {TIME_SHIFT.name}
+    if unknown := {p.field for p in problem.perturbations} - set(problem.model.layout.names):
+        raise ConfigError(f"initial_state: {', '.join(sorted(unknown))}: not a field of the model's state")
+    required = {p.name for p in (*perturbed, *problem.model.parameters)} - {TIME_SHIFT.name}
     for names, message in (
         (required - estimated - fixed, "neither fixed nor estimated"),
         (estimated & fixed, "both fixed and estimated"),
@@ -163,11 +177,12 @@ def _initial_states(problem: InverseProblem, physical: Array) -> tuple[dict[int,
         return {}, failures
     fixed = {name: np.full(len(physical), float(value)) for name, value in problem.fixed.items()}
     theta = {**fixed, **dict(zip(problem.prior.names, physical.T, strict=True))}
-    if all(p.name != TIME_SHIFT.name for p in problem.model.parameters):
-        theta.pop(TIME_SHIFT.name, None)
+    own = {p.name for p in problem.model.parameters}
+    of_model = {name: values for name, values in theta.items() if name in own}
 
     def build(members: list[int]) -> dict[int, Array]:
-        states = np.asarray(problem.model.initial_states({k: v[members] for k, v in theta.items()}), dtype=float)
+        states = np.asarray(problem.model.initial_states({k: v[members] for k, v in of_model.items()}), dtype=float)
+        states = _perturbed(problem, states, {k: v[members] for k, v in theta.items()})
         if states.shape != (len(members), problem.model.layout.size) or not np.all(np.isfinite(states)):
             raise ValueError("non-finite or misshapen initial state")
         return dict(zip(members, states, strict=True))
@@ -184,11 +199,22 @@ def _initial_states(problem: InverseProblem, physical: Array) -> tuple[dict[int,
     return states, failures
 
 
-def _time_shift(problem: InverseProblem, physical: Array) -> Array:
-    """t_s (B,) of each member."""
-    if TIME_SHIFT.name in problem.prior.names:
-        return np.asarray(physical[:, problem.prior.names.index(TIME_SHIFT.name)])
-    return np.full(len(physical), problem.fixed.get(TIME_SHIFT.name, 0.0))
+def _perturbed(problem: InverseProblem, states: Array, theta: Mapping[str, Array]) -> Array:
+    """Initial states (B, n_state) with the perturbations of the control vector."""
+    if not problem.perturbations or states.ndim != 2 or states.shape[1] != problem.model.layout.size:
+        return states
+    states = states.copy()
+    for perturbation in problem.perturbations:
+        where, value = problem.model.layout[perturbation.field], theta[perturbation.parameter.name][:, None]
+        states[:, where] = states[:, where] * value if perturbation.relative else states[:, where] + value
+    return states
+
+
+def _of_framework(problem: InverseProblem, physical: Array, parameter: Parameter, default: float) -> Array:
+    """Values (B,) of a parameter that the framework itself uses, t_s or σ."""
+    if parameter.name in problem.prior.names:
+        return np.asarray(physical[:, problem.prior.names.index(parameter.name)])
+    return np.full(len(physical), problem.fixed.get(parameter.name, default))
 
 
 def _observe(problem: InverseProblem, trajectory: Trajectory, rate_operator: RateOperator | None) -> Array:

@@ -137,6 +137,15 @@ def _predictive(a: Analysis, predictions: Array, paths: Array) -> xr.Dataset:
 def _observed(a: Analysis) -> xr.Dataset:
     name, obs = a.observable.name, a.observations
     scalars = {f"scalar_{key}": value for key, value in obs.scalars.items()}
+    if obs.huber is not None:
+        scalars["huber_threshold"] = obs.huber
+    further = {}
+    if obs.correlation is not None:
+        text = "correlation of the observation errors"
+        further[f"{name}_correlation"] = _variable(("time", "time_column"), obs.correlation, "1", text)
+    if a.huber_weight is not None:
+        text = "weight of the observation in the robust cost at its minimum"
+        further[f"{name}_huber_weight"] = _variable("time", a.huber_weight, "1", text)
     return xr.Dataset(
         {
             name: _observable(a, ("time",), obs.values, "observed"),
@@ -144,6 +153,7 @@ def _observed(a: Analysis) -> xr.Dataset:
             f"{name}_reading_std": _observable(a, ("time",), obs.std, "observation-error std of the reading alone"),
             "time_std": _time(a, "time", obs.time_std, "std of the observation times"),
             "weights": _variable("time", obs.weights, "1", "weight of the observation in the cost"),
+            **further,
         },
         {"time": _time(a, "time", obs.times, "observation time")},
         netcdf_attributes({"name": obs.name, "data_source": obs.source, **scalars}),

@@ -15,11 +15,26 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+class StatePerturbation:
+    """A part of the control vector that changes the initial state instead of the model's parameters.
+
+    ``field`` of the model's layout (every component of it) is multiplied by the value where ``relative``, else the
+    value is added to it.
+    """
+
+    parameter: Parameter
+    field: str
+    relative: bool = False
+
+
+@dataclass(frozen=True)
 class InverseProblem:
     """Everything that defines a posterior: F, H, y, R, the prior, and the values held fixed.
 
     The control vector holds ``prior.parameters`` in transformed space. A parameter named ``t_s`` shifts the observation
-    times: member i is observed at t_k + t_s,i. ``fixed`` are physical SI values of the model's other parameters.
+    times: member i is observed at t_k + t_s,i; one named ``sigma`` multiplies the std of every observation error, where
+    the model has no parameter of that name. ``perturbations`` act on the initial state. ``fixed`` are physical SI
+    values of the other parameters.
     """
 
     model: ForwardModel
@@ -27,6 +42,7 @@ class InverseProblem:
     observations: Observations
     prior: Prior
     fixed: Mapping[str, float] = field(default_factory=dict)
+    perturbations: tuple[StatePerturbation, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -120,4 +136,5 @@ class Analysis:
     warnings: tuple[str, ...] = ()
     log_evidence: float = float("nan")  # ln p(y), Laplace approximation
     shape: Mapping[str, float] = field(default_factory=dict)  # how Gaussian the posterior is (diagnostics.gaussianity)
+    huber_weight: Array | None = None  # (K,) weights of the robust cost at the centre, where there is one
     refinement: Mapping[str, float] = field(default_factory=dict)  # summary of the Markov chain, if any

@@ -44,6 +44,15 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Matrix:
+    """A square table of numbers without header in ``unit``, wanted in ``target``."""
+
+    path: Path
+    unit: str
+    target: str
+
+
+@dataclass(frozen=True)
 class Series:
     """One observable in time, in the model's units, times increasing; ``scalars`` as the file has them."""
 
@@ -74,6 +83,35 @@ def read_series(path: Path, time: Column | Step, value: Column, format: Format |
         raise DataError(f"{path}: {len(times)} times but {len(values)} values of {value.name!r}")
     first = int(np.argmax(np.nan_to_num(values) != 0)) if kind == "mat" else 0
     return _clean(times[first:], values[first:], value.name, path, scalars)
+
+
+def read_covariance(matrix: Matrix) -> Array:
+    """The covariance (K, K) of a CSV file: symmetric, positive variances. Raises :class:`DataError`."""
+    path = matrix.path
+    if not path.is_file():
+        raise DataError(f"{path}: is a directory" if path.is_dir() else no_such_file(path))
+    rows: list[list[float]] = []
+    delimiter = None
+    for number, line in _lines(path):
+        delimiter = _delimiter(line) if delimiter is None else delimiter
+        rows.append([_number(cell, str(i), path, number) for i, cell in enumerate(_cells(line, delimiter), 1)])
+        if len(rows[-1]) != len(rows[0]):
+            raise DataError(f"{path}:{number}: {len(rows[-1])} numbers, but {len(rows[0])} in the first row")
+    if not rows or len(rows) != len(rows[0]):
+        raise DataError(
+            f"{path}: a covariance is square, but this has {len(rows)} rows of {len(rows[0]) if rows else 0}"
+        )
+    values = np.array(rows)
+    if not np.all(np.isfinite(values)) or not np.all(np.diag(values) > 0):
+        raise DataError(f"{path}: the variances must be positive and every covariance finite")
+    scale = np.sqrt(np.outer(np.diag(values), np.diag(values)))
+    unequal = np.argwhere(np.abs(values - values.T) > 1e-9 * scale)
+    if len(unequal):
+        i, j = unequal[0]
+        raise DataError(
+            f"{path}: not symmetric: {values[i, j]:g} in row {i + 1}, column {j + 1}, {values[j, i]:g} across"
+        )
+    return np.asarray(convert(0.5 * (values + values.T), matrix.unit, matrix.target))
 
 
 def _clean(times: Array, values: Array, name: str, path: Path, scalars: Mapping[str, float]) -> Series:
@@ -107,15 +145,10 @@ def _step(step: Step, scalars: Mapping[str, float], path: Path) -> float:
 
 
 def _read_csv(path: Path, wanted: Sequence[str]) -> tuple[dict[str, Array], dict[str, float]]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise DataError(f"{path}: not a text file") from None
-    lines = [(n, s) for n, s in enumerate(text.splitlines(), 1) if s.strip() and not s.lstrip().startswith(COMMENT)]
+    lines = _lines(path)
     if not lines:
         raise DataError(f"{path}: the file holds no data")
-    delimiter = max((",", ";", "\t"), key=lines[0][1].count)
-    delimiter = delimiter if delimiter in lines[0][1] else ""
+    delimiter = _delimiter(lines[0][1])
     names = _cells(lines[0][1], delimiter)
     where = {name: _position(path, names, name) for name in wanted}
     columns: dict[str, list[float]] = {name: [] for name in wanted}
@@ -126,6 +159,21 @@ def _read_csv(path: Path, wanted: Sequence[str]) -> tuple[dict[str, Array], dict
         if any(cells[len(names) :]):
             raise DataError(f"{path}:{number}: {len(cells)} cells, but the header names {len(names)} columns")
     return {name: np.array(column, dtype=float) for name, column in columns.items()}, {}
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """Numbered lines that are neither blank nor comments."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: not a text file") from None
+    return [(n, s) for n, s in enumerate(text.splitlines(), 1) if s.strip() and not s.lstrip().startswith(COMMENT)]
+
+
+def _delimiter(line: str) -> str:
+    """What separates the cells; "" for blanks."""
+    delimiter = max((",", ";", "\t"), key=line.count)
+    return delimiter if delimiter in line else ""
 
 
 def _cells(line: str, delimiter: str) -> list[str]:

@@ -58,6 +58,17 @@ TIME_SHIFT = Parameter(
 )
 
 
+NOISE_SCALE = Parameter(
+    name="sigma",
+    unit="1",
+    transform="lognormal",
+    bounds=(0.0, np.inf),
+    label="noise scale",
+    symbol=r"$\sigma$",
+    source="multiplies the std of every observation error; a model's own parameter of this name goes before it",
+)
+
+
 @dataclass(frozen=True)
 class Field:
     """A named block of a state vector."""

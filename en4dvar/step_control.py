@@ -33,12 +33,12 @@ class Trials:
 class Tangent:
     """The observations' part of a tangent linearisation, for rules that look at curvature.
 
-    ``prediction`` (K,) at the centre, ``anomalies`` (N, K) of the predictions per unit weight, ``scale`` (K,) = √β/s.
+    ``prediction`` (K,) at the centre, ``anomalies`` Y (N, K) of the predictions per unit weight, ``weighted`` Y βR⁻¹.
     """
 
     prediction: Array
     anomalies: Array
-    scale: Array
+    weighted: Array
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def acceleration(step: Step, tangent: Tangent, lengths: Array, predictions: Arra
     shortest = runnable[np.argmin(lengths[runnable])]
     a = lengths[shortest]
     departure = predictions[shortest] - tangent.prediction - a * step.direction @ tangent.anomalies
-    bend = -step.hessian.solve(tangent.anomalies @ (tangent.scale**2 * departure * 2 / a**2))
+    bend = -step.hessian.solve(tangent.weighted @ (departure * 2 / a**2))
     longest = MOST_BENT * float(np.linalg.norm(step.direction))
     return np.asarray(bend * min(1.0, longest / (float(np.linalg.norm(bend)) or 1.0)))
 

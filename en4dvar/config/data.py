@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any, Literal, TypeVar
 
 from en4dvar.config import schema
 from en4dvar.config.document import Document
+from en4dvar.config.observation_error import ErrorPlan, Spread, parse_spread, read_error
 from en4dvar.config.validate import check
 from en4dvar.errors import Fault
 from en4dvar.forward import ForwardModel, Observable
@@ -18,32 +18,9 @@ from en4dvar.readers import Column, Format, Step
 from en4dvar.units import UnitError, convert, parse_quantity
 from en4dvar.window import Instant, parse_instant
 
+__all__ = ["DataPlan", "Spread", "parse_spread", "read_data"]
+
 T = TypeVar("T")
-_RELATIVE = re.compile(r"(.*%)\s+of\s+(?:the\s+)?maximum")
-
-
-@dataclass(frozen=True)
-class Spread:
-    """An observation-error std: ``value`` in the observable's unit, or a fraction of the observed maximum."""
-
-    value: float
-    relative: bool = False
-
-    def absolute(self, maximum: float) -> float:
-        return self.value * abs(maximum) if self.relative else self.value
-
-
-def parse_spread(text: str | float, unit: str) -> Spread:
-    """``"1.4 um"`` or ``"1 % of maximum"``. Raises :class:`UnitError`."""
-    word = str(text).strip()
-    relative = _RELATIVE.fullmatch(word)
-    if relative:
-        return Spread(parse_quantity(relative[1], "1"), relative=True)
-    try:
-        return Spread(parse_quantity(text, unit))
-    except UnitError as error:
-        hint = f"; write '{word} of maximum'" if word.endswith("%") else ""
-        raise UnitError(f"{error}{hint}") from None
 
 
 @dataclass(frozen=True)
@@ -60,8 +37,7 @@ class DataPlan:
     end: Instant
     prominence: float
     time_zero: Literal["file", "window"] | float
-    std: Spread
-    time_std: float
+    error: ErrorPlan
 
 
 def read_data(
@@ -86,20 +62,15 @@ def read_data(
     end = attempt(("window", "to"), lambda: parse_instant(raw.window.end, unit, symbols))
     prominence = attempt(("window", "prominence"), lambda: parse_quantity(raw.window.prominence, "1"))
     zero = attempt(("time_zero",), lambda: _time_zero(raw.time_zero, unit))
-    std = _spread(raw.error, observable, document, faults) if observable else None
-    time_std = attempt(("error", "time_std"), lambda: parse_quantity(raw.error.get("time_std", f"0 {unit}"), unit))
-    if time_std is not None and time_std < 0:
-        faults.append(
-            document.fault(("data", "error", "time_std"), f"must not be negative, not {raw.error['time_std']}")
-        )
+    error = read_error(raw.error, base, observable, model, document, faults) if observable else None
     if prominence is not None and not 0 < prominence < 1:
         faults.append(document.fault(("data", "window", "prominence"), "must lie between 0 and 100 %"))
-    if len(faults) > before or observable is None or time is None or value is None or std is None:
+    if len(faults) > before or observable is None or time is None or value is None or error is None:
         return None
-    if start is None or end is None or prominence is None or zero is None or time_std is None:
+    if start is None or end is None or prominence is None or zero is None:
         return None
     paths = (raw.path,) if isinstance(raw.path, str) else raw.path
-    return DataPlan(base, paths, raw.format, observable, time, value, start, end, prominence, zero, std, time_std)
+    return DataPlan(base, paths, raw.format, observable, time, value, start, end, prominence, zero, error)
 
 
 def _observable(
@@ -159,26 +130,3 @@ def _time_zero(value: str | float, unit: str) -> Literal["file", "window"] | flo
         return parse_quantity(value, unit)
     except UnitError as error:
         raise UnitError(f"write file, window or a time: {error}") from None
-
-
-def _spread(
-    raw: Mapping[str, str | float], observable: Observable, document: Document, faults: list[Fault]
-) -> Spread | None:
-    key = f"{observable.name}_std"
-    path = ("data", "error", key)
-    for other in raw:
-        if other not in (key, "time_std"):
-            message = f"unknown key {other!r}{suggest(other, [key, 'time_std'])}"
-            faults.append(document.fault(("data", "error", other), message, at_key=True))
-    if key not in raw:
-        faults.append(document.fault(path, "required: the standard deviation of the observation error"))
-        return None
-    try:
-        spread = parse_spread(raw[key], observable.unit)
-    except UnitError as error:
-        faults.append(document.fault(path, str(error)))
-        return None
-    if not spread.value > 0:
-        faults.append(document.fault(path, f"must be positive, not {raw[key]}"))
-        return None
-    return spread

@@ -13,6 +13,7 @@ import yaml
 from en4dvar.config import schema
 from en4dvar.config.data import DataPlan, read_data
 from en4dvar.config.document import Document, override, read_document
+from en4dvar.config.initial_state import Perturbed, read_initial_state
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, read_parameters
 from en4dvar.config.validate import check
@@ -41,6 +42,7 @@ class Config:
     directory: Path
     simulate_times: Array | None
     resolved: str
+    initial_state: tuple[Perturbed, ...] = ()
 
     @property
     def text(self) -> str:
@@ -81,6 +83,8 @@ def resolve(document: Document, base: Path) -> Config:
     model, model_resolved = found
     raw_parameters = document.data.get("parameters")
     entries = read_parameters(raw_parameters, model, document, faults) if isinstance(raw_parameters, dict) else ()
+    raw_state = document.data.get("initial_state")
+    perturbed = read_initial_state(raw_state, model, document, faults) if isinstance(raw_state, dict) else ()
     plan = read_data(data, base, model, document, faults) if data else None
     times = _grid(top.simulate.times, model.time_unit, document, faults) if top and top.simulate else None
     if faults or top is None or assimilation is None:
@@ -102,6 +106,7 @@ def resolve(document: Document, base: Path) -> Config:
         directory=top.output.directory or Path("runs") / top.name,
         simulate_times=times,
         resolved=_resolved(top, base, data, model_resolved, entries, assimilation),
+        initial_state=perturbed,
     )
 
 
@@ -151,4 +156,6 @@ def _resolved(
         absolute = [str(base / p) for p in paths]
         content["data"] = data.model_dump(mode="json", by_alias=True, exclude_none=True)
         content["data"]["path"] = absolute[0] if len(absolute) == 1 else absolute
+        if isinstance(covariance := content["data"]["error"].get("covariance"), dict):
+            covariance["path"] = str(base / Path(str(covariance["path"])).expanduser())
     return yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)

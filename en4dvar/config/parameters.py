@@ -14,7 +14,7 @@ from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel
 from en4dvar.hints import suggest
 from en4dvar.prior import PriorTerm
-from en4dvar.state import TIME_SHIFT, Parameter
+from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Parameter
 from en4dvar.units import UnitError, convert, parse_quantity
 
 _PERCENT = re.compile(r"([^%]*)%")
@@ -112,9 +112,10 @@ Entry = Fixed | Scalar | Uncertain
 def read_parameters(
     raw: Mapping[str, Any], model: ForwardModel, document: Document, faults: list[Fault]
 ) -> tuple[Entry, ...]:
-    """One entry for every parameter of the model, in its order, then t_s if given. Faults are appended."""
+    """One entry for every parameter of the model, in its order, then t_s and sigma if given. Faults are appended."""
     shift = replace(TIME_SHIFT, unit=model.time_unit, display_unit=model.time_display_unit)
-    known = {p.name: p for p in (*model.parameters, shift)}
+    known = {p.name: p for p in (shift, NOISE_SCALE, *model.parameters)}  # a model's own sigma goes before
+    known = {p.name: known[p.name] for p in (*model.parameters, shift, NOISE_SCALE)}
     defaults: Mapping[str, float] = getattr(model, "defaults", {})
     for name in raw:
         if name not in known:
@@ -128,7 +129,7 @@ def read_parameters(
             entries += [entry] if entry else []
         elif name in defaults:
             entries.append(Fixed(parameter, defaults[name]))
-        elif name != shift.name:
+        elif parameter not in (shift, NOISE_SCALE):
             faults.append(document.fault(("parameters", name), _missing(parameter)))
     return tuple(entries)
 

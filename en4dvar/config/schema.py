@@ -64,6 +64,15 @@ class Window(Section):
     prominence: QuantityText = "10 %"
 
 
+class CovarianceFile(Section):
+    """A CSV file of the full matrix R, without header; its unit (e.g. ``um^2``) is required, never guessed."""
+
+    path: Annotated[str, Field(min_length=1)]
+    unit: str
+
+    _unit = field_validator("unit")(_known_unit)
+
+
 class Data(Section):
     """Where the observations are, what they mean and how well they are known."""
 
@@ -72,7 +81,7 @@ class Data(Section):
     columns: dict[str, Any]
     window: Window = Window()
     time_zero: QuantityText = "file"
-    error: dict[str, QuantityText]
+    error: dict[str, QuantityText | dict[str, QuantityText]]
 
     @field_validator("path")
     @classmethod
@@ -93,6 +102,12 @@ class Prior(Section):
     logit_std: Annotated[float, Field(gt=0)] | None = None
     lower: QuantityText | None = None
     upper: QuantityText | None = None
+
+
+class InitialSpread(Section):
+    """Spread of the initial value of a state field: in its unit (added), or in ``%`` (a factor)."""
+
+    std: QuantityText
 
 
 class FromFile(Section):
@@ -184,6 +199,7 @@ class Schema(Section):
     data: dict[str, Any] | None = None
     model: dict[str, Any]
     parameters: dict[str, Any]
+    initial_state: dict[str, Any] | None = None
     assimilation: dict[str, Any] = {}
     execution: Execution = Execution()
     output: Output = Output()
