@@ -200,13 +200,18 @@ def _initial_states(problem: InverseProblem, physical: Array) -> tuple[dict[int,
 
 
 def _perturbed(problem: InverseProblem, states: Array, theta: Mapping[str, Array]) -> Array:
-    """Initial states (B, n_state) with the perturbations of the control vector."""
+    """Initial states (B, n_state) with the perturbations of the control vector; ValueError outside a field's bounds."""
     if not problem.perturbations or states.ndim != 2 or states.shape[1] != problem.model.layout.size:
         return states
     states = states.copy()
+    fields = {f.name: f for f in problem.model.layout}
     for perturbation in problem.perturbations:
         where, value = problem.model.layout[perturbation.field], theta[perturbation.parameter.name][:, None]
         states[:, where] = states[:, where] * value if perturbation.relative else states[:, where] + value
+        low, high = fields[perturbation.field].bounds
+        if not np.all((states[:, where] > low) & (states[:, where] < high)):
+            unit = fields[perturbation.field].unit
+            raise ValueError(f"perturbed initial {perturbation.field} outside ({low:g}, {high:g}) {unit}")
     return states
 
 

@@ -71,11 +71,12 @@ NOISE_SCALE = Parameter(
 
 @dataclass(frozen=True)
 class Field:
-    """A named block of a state vector."""
+    """A named block of a state vector; a perturbed initial state must lie strictly inside its ``bounds``."""
 
     name: str
     size: int = 1
     unit: str = "1"
+    bounds: tuple[float, float] = (-np.inf, np.inf)
 
 
 @dataclass(frozen=True)

@@ -127,14 +127,20 @@ class BubbleModel(ForwardModel):
         vapour), T_m of the medium, Z (memory variables) where the model has them; the parameters.
         """
         system = self.system
-        state = [Field("R", unit="m"), Field("Rdot", unit="m/s"), Field("p_b", unit="Pa"), Field("S", unit="Pa")]
+        positive = (0.0, np.inf)
+        state = [
+            Field("R", unit="m", bounds=positive),
+            Field("Rdot", unit="m/s"),
+            Field("p_b", unit="Pa", bounds=(self.medium.p_v, np.inf)),
+            Field("S", unit="Pa"),
+        ]
         blocks = (
-            ("T", system.gas + system.wall, "K"),
-            ("C", system.vapour, "1"),
-            ("T_m", system.medium, "K"),
-            ("Z", system.memory, "Pa"),
+            Field("T", system.gas + system.wall, "K", positive),
+            Field("C", system.vapour, "1", (0.0, 1.0)),
+            Field("T_m", system.medium, "K", positive),
+            Field("Z", system.memory, "Pa"),
         )
-        state += [Field(name, size, unit) for name, size, unit in blocks if size]
+        state += [block for block in blocks if block.size]
         return StateLayout((*state, *(Field(p.name, unit=p.unit) for p in self.parameters)))
 
     def initial_state(self, theta: Mapping[str, float]) -> Array:

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import multivariate_normal
 from toys import Decay, Linear, Wave, make_observations, make_problem
 
-from en4dvar.assimilate import assimilate, forecast
+from en4dvar.assimilate import assimilate, forecast, log_posterior
 from en4dvar.descent import WeightSpace
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.executor import SerialExecutor
@@ -85,6 +85,20 @@ def test_identity_correlation_is_no_correlation():
     assert a.posterior == pytest.approx(b.posterior, rel=1e-9)
     assert a.log_evidence == pytest.approx(b.log_evidence, rel=1e-9)
     assert a.log_likelihood == pytest.approx(b.log_likelihood, rel=1e-7)
+
+
+@pytest.mark.parametrize(("huber", "correlated"), [(None, False), (None, True), (0.5, False), (1.345, False)])
+def test_log_likelihood_and_cost_differ_by_a_constant(huber, correlated):
+    """What ``refine: mcmc`` samples, what the evidence integrates and what is stored are one density."""
+    correlation = exponential(np.linspace(0.2, 2.0, K), 0.4) if correlated else None
+    base = make_problem(Wave(), [1.0, 1.3], time_std=0.1)
+    problem = with_errors(base, correlation=correlation, huber=huber, sigma=0.5)
+    x = problem.prior.sample(8, 1)
+    run = forecast(problem, x)
+    y = problem.observations
+    total = log_likelihood(y, run.predictions, run.rates, run.noise_scale).sum(axis=1)
+    total += problem.prior.log_density(x) - problem.prior.log_density(problem.prior.mean)
+    assert total == pytest.approx(log_posterior(problem, x) - log_normalisation(y), abs=1e-8)
 
 
 @pytest.mark.parametrize("time_std", [0.0, 0.1])
@@ -208,6 +222,13 @@ def test_fixed_noise_scale_scales_the_errors():
     a, b = (assimilate(p, AssimilationSettings(members=12), 2) for p in (plain, scaled))
     assert a.posterior == pytest.approx(b.posterior, rel=1e-9)
     assert a.log_evidence == pytest.approx(b.log_evidence, rel=1e-9)
+
+
+def test_a_models_own_sigma_is_not_the_noise_scale():
+    problem = make_problem(Linear(("sigma",)), [1.0])
+    run = forecast(problem, problem.prior.sample(4, 1))
+    assert run.noise_scale is None
+    assert run.active.all()
 
 
 def outlier(problem, k=3, by=3.0):
