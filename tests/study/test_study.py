@@ -145,12 +145,8 @@ def test_90_percent_intervals_cover_the_twin(twin):
 
 
 @pytest.mark.slow
-def test_population_holds_the_truth_and_most_bubbles_are_undecidable(twin):
-    for gel, found in twin.populations.items():
-        low, high = found.interval()
-        for q in QUANTITIES:
-            j = found.names.index(q.name)
-            assert low[j] < twin.true_values(gel, q.name).mean() < high[j], (gel, q.name)
+def test_most_bubbles_are_undecidable(twin):
+    for gel in twin.populations:
         assert twin.comparisons[gel].undecidable >= 0.7 * len(twin.comparisons[gel].single)
         assert twin.comparisons[gel].independent > 3
 
