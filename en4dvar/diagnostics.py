@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from en4dvar.likelihood import log_normalisation, whitened_residual
+from en4dvar.likelihood import log_normalisation, robust_weights, whitened_residual
 from en4dvar.observations import Observations
 from en4dvar.state import Array
 
@@ -40,9 +40,13 @@ def spread(members: Array, prior: Array) -> float:
 def chi2_per_observation(
     observations: Observations, predictions: Array, rates: Array | None, noise_scale: Array | None = None
 ) -> float:
-    """(y − m)ᵀR⁻¹(y − m) per observation with β > 0, for predictions (K,); outliers count fully."""
+    """(y − m)ᵀR⁻¹(y − m) per observation with β > 0, for predictions (K,).
+
+    With a robust cost each square has its Huber weight, v ρ'(v), whose expectation under the density of ρ is 1 as well.
+    """
     v = whitened_residual(observations, predictions, rates, noise_scale)
-    return float(np.mean(v[observations.weights > 0] ** 2))
+    squares = v**2 if observations.huber is None else v**2 * robust_weights(observations, v)
+    return float(np.mean(squares[observations.weights > 0]))
 
 
 def nrmse(values: Array, predictions: Array) -> float:
