@@ -7,7 +7,7 @@ A model that can integrate many members at once overrides ``trajectories``, the 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -139,6 +139,13 @@ class ForwardModel(ABC):
         """
         own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
         return [self._march(x[i], own[i]) for i in range(len(x))]
+
+    def prepare(self, x: Array, times: Array) -> Callable[[], Sequence[Trajectory | Failure]]:
+        """:meth:`trajectories` in two parts: what needs the interpreter is done here, what releases it is returned.
+
+        A thread can then integrate one chunk while the next is prepared. This default prepares nothing.
+        """
+        return lambda: self.trajectories(x, times)
 
     def _march(self, x: Array, times: Array) -> Trajectory | Failure:
         states = np.empty((len(times), self.layout.size))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, Literal
@@ -18,7 +18,7 @@ from en4dvar_bubble.medium import WATER_25C, Medium, saturated_vapour_pressure
 from en4dvar_bubble.packing import law_tables, mass_fraction, pack
 from en4dvar_bubble.paths import BubbleTrajectory, Paths
 from en4dvar_bubble.settings import BubbleSettings
-from en4dvar_bubble.solver.driver import Accuracy, Radial, Solution, System, preset, solve
+from en4dvar_bubble.solver.driver import Accuracy, Radial, Solution, System, preset, ready
 
 Gas = Literal["heat", "polytropic", "isothermal", "adiabatic"]
 Start = Literal["acoustic", "laser"]
@@ -194,17 +194,28 @@ class BubbleModel(ForwardModel):
         return np.asarray(path.states[0, 0])
 
     def trajectories(self, x: Array, times: Array) -> Sequence[Trajectory | Failure]:
-        path = self.integrate(np.asarray(x, dtype=float), np.broadcast_to(times, (len(x), np.shape(times)[-1])))
-        solution = path.solution
-        return [
-            BubbleTrajectory(path, i)
-            if solution.status[i] == 0
-            else Failure(solution.reason(i), float(solution.record[i, 5]) * 1e-6)
-            for i in range(len(x))
-        ]
+        return self.prepare(x, times)()
+
+    def prepare(self, x: Array, times: Array) -> Callable[[], Sequence[Trajectory | Failure]]:
+        run = self._prepare(np.asarray(x, dtype=float), np.broadcast_to(times, (len(x), np.shape(times)[-1])), 0.0)
+
+        def finish() -> Sequence[Trajectory | Failure]:
+            path = run()
+            solution = path.solution
+            return [
+                BubbleTrajectory(path, i)
+                if solution.status[i] == 0
+                else Failure(solution.reason(i), float(solution.record[i, 5]) * 1e-6)
+                for i in range(len(x))
+            ]
+
+        return finish
 
     def integrate(self, x: Array, times: Array, t0: float = 0.0) -> Paths:
         """All members from their states ``x`` (N, n_state) at ``t0`` (s) to ``times`` (N, K) (s, increasing)."""
+        return self._prepare(x, times, t0)()
+
+    def _prepare(self, x: Array, times: Array, t0: float) -> Callable[[], Paths]:
         initial, par = pack(self, x)
         tables = law_tables(self, self.law_values(x))
         start = np.full(len(x), t0 * 1e6)
@@ -213,10 +224,15 @@ class BubbleModel(ForwardModel):
         order = np.argsort(np.abs(micro), axis=1, kind="stable") if mirror else None
         if order is not None:
             micro = np.take_along_axis(np.abs(micro), order, axis=1)
-        solution = solve(self.system, initial, par, tables, start, micro, self.driving, self.reading, self.accuracy)
-        if order is not None:
-            back = np.argsort(order, axis=1)
-            states = np.take_along_axis(solution.states, back[:, :, None], axis=1)
-            states[:, :, -2] *= np.where(times < 0, -1.0, 1.0)
-            solution = Solution(states, solution.status, solution.record)
-        return Paths(self, x, times, solution, par)
+        kernel = ready(self.system, initial, par, tables, start, micro, self.driving, self.reading, self.accuracy)
+
+        def run() -> Paths:
+            solution = kernel()
+            if order is not None:
+                back = np.argsort(order, axis=1)
+                states = np.take_along_axis(solution.states, back[:, :, None], axis=1)
+                states[:, :, -2] *= np.where(times < 0, -1.0, 1.0)
+                solution = Solution(states, solution.status, solution.record)
+            return Paths(self, x, times, solution, par)
+
+        return run

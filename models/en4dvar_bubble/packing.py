@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from en4dvar.state import Array
-from en4dvar_bubble.laws.tabulate import new_table
 from en4dvar_bubble.medium import Medium, saturated_vapour_pressure
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.collocation import ball
@@ -49,29 +47,18 @@ def conduction_slope(medium: Medium) -> float:
     return medium.A * medium.T_inf / medium.K_inf
 
 
-_buffers = threading.local()
-
-
-def _buffer(n: int) -> Array:
-    """Room for the elastic tables of n members, one per thread and used again: fresh pages are dear."""
-    room: Array | None = getattr(_buffers, "elastic", None)
-    if room is None or len(room) < n:
-        room = _buffers.elastic = new_table(n)
-    return room[:n]
-
-
 def law_tables(model: BubbleModel, values: Mapping[str, Array]) -> Tables:
-    """The laws of N members as tables in the kernel's units; valid until the thread's next call."""
+    """The laws of N members as tables in the kernel's units."""
     law, rho = model.law, model.medium.rho
-    n = len(next(iter(values.values()), ()))
-    elastic = law.table(values, 1 / rho, _buffer(n))
+    samples = law.samples(values)
+    elastic = {"elastic": law.table(values) / rho} if samples is None else {"samples": samples / rho}
     extra = {}
     if model.system.shear:
         extra["viscous"] = law.viscous_table(values) / rho * 1e6
     if model.system.memory:
         memory = law.memory_tables(values)
         extra["memory"] = np.stack([memory.stiffness, memory.equilibrium], axis=2) / rho
-    return Tables(elastic, **extra)
+    return Tables(**elastic, **extra)
 
 
 def pack(model: BubbleModel, x: Array) -> tuple[Array, Array]:

@@ -97,7 +97,7 @@ class Paths:
         V = self.solution.states[:, :, -2]
         log_stretch = self.solution.states[:, :, -1] - self.par[:, None, rows.LOG_R0]
         values = self.model.law_values(self.initial)
-        stress = evaluate(self.model.law.table(values, 1 / rho), GRID.span, log_stretch)
+        stress = evaluate(self.model.law.table(values) / rho, GRID.span, log_stretch)
         if system.memory:
             stress = stress + self.solution.states[:, :, system.first_memory : -2].sum(axis=2)
         if system.shear:

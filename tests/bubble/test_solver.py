@@ -179,7 +179,7 @@ class TestFailures:
 class TestCache:
     def test_compiled_kernels_are_stamped_with_all_their_sources(self, tmp_path):
         folder = Path(en4dvar_bubble.solver.__file__).parent
-        assert integrate.integrate._cache._cache_file._source_stamp == _digest(folder)
+        assert integrate.integrate._cache._cache_file._source_stamp == _digest(folder, folder.parent / "tables.py")
         (tmp_path / "a.py").write_text("x = 1")
         before = _digest(tmp_path)
         (tmp_path / "a.py").write_text("x = 2")

@@ -20,7 +20,7 @@ from en4dvar.errors import ConfigError
 from en4dvar.state import Array, Parameter
 from en4dvar_bubble.laws.memory import MemoryTables, MemoryVariable
 from en4dvar_bubble.laws.parameters import MU
-from en4dvar_bubble.laws.tabulate import GRID, from_function, from_strain_energy, new_table
+from en4dvar_bubble.laws.tabulate import GRID, from_function, from_strain_energy, sample
 from en4dvar_bubble.laws.viscous import VISCOUS_GRID, mean_viscosity
 from en4dvar_bubble.tables import evaluate, from_values
 
@@ -119,17 +119,22 @@ class ConstitutiveLaw:
         """Whether the viscosity is the method, not the parameter ``mu``."""
         return type(self).viscosity is not ConstitutiveLaw.viscosity
 
-    def table(self, values: Mapping[str, Array], scale: float = 1.0, out: Array | None = None) -> Array:
-        """``scale · J_e`` against ln λ for N members: (N, cells, 8) coefficients on :data:`GRID`, Pa.
-
-        ``values``: name → (N,). Written to ``out`` where given.
-        """
+    def samples(self, values: Mapping[str, Array]) -> Array | None:
+        """J_e in Pa of N members at the nodes of the grid and its halo, (N, K); None where the law is W′(λ)."""
+        if type(self).stress is ConstitutiveLaw.stress:
+            return None
         p, n = _namespace(values)
-        out = new_table(n) if out is None else out
         with np.errstate(all="ignore"):  # a law may overflow at stretches that no member reaches
-            if type(self).stress is not ConstitutiveLaw.stress:
-                return from_function(lambda stretch: self.stress(stretch, p), out, scale)
-            return from_strain_energy(lambda stretch: self.strain_energy_rate(stretch, p), out, scale)
+            return sample(lambda stretch: self.stress(stretch, p), n)
+
+    def table(self, values: Mapping[str, Array]) -> Array:
+        """J_e against ln λ for N members: (N, cells, 8) coefficients on :data:`GRID`, Pa. ``values``: name → (N,)."""
+        samples = self.samples(values)
+        if samples is not None:
+            return from_values(samples)
+        p, n = _namespace(values)
+        with np.errstate(all="ignore"):
+            return from_strain_energy(lambda stretch: self.strain_energy_rate(stretch, p), n)
 
     def viscous_table(self, values: Mapping[str, Array]) -> Array:
         """μ̄ (Pa s) against z = ln(|V| s), constant below the first node: (N, cells, 8) on :data:`VISCOUS_GRID`.
@@ -146,7 +151,7 @@ class ConstitutiveLaw:
         variables = self.memory(p)
 
         def table(source: Any) -> Array:
-            return from_function(source if callable(source) else lambda stretch: source, new_table(n))
+            return from_function(source if callable(source) else lambda stretch: source, n)
 
         with np.errstate(all="ignore"):
             shape = (n, len(variables), GRID.cells, 8)

@@ -17,4 +17,5 @@ class NeoHookeanKelvinVoigt(ConstitutiveLaw):
     parameters: ClassVar[tuple[Parameter, ...]] = (G, MU)
 
     def stress(self, stretch: Array, p: Any) -> Array:
-        return -0.5 * p.G * (5 - 4 / stretch - stretch**-4.0)
+        inverse = 1 / stretch
+        return (-0.5 * p.G) * (5 - 4 * inverse - inverse**2 * inverse**2)

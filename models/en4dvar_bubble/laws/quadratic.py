@@ -22,6 +22,8 @@ class QuadraticKelvinVoigt(ConstitutiveLaw):
     limits: ClassVar[Limits] = ((NeoHookeanKelvinVoigt, {"alpha": 0.0}),)
 
     def stress(self, stretch: Array, p: Any) -> Array:
-        neo_hookean = 5 - 4 / stretch - stretch**-4.0
-        stiffening = 27 / 40 + stretch**-8.0 / 8 + stretch**-5.0 / 5 + stretch**-2.0 - 2 * stretch
-        return p.G * ((3 * p.alpha - 1) / 2 * neo_hookean + 2 * p.alpha * stiffening)
+        inverse = 1 / stretch
+        fourth = inverse**2 * inverse**2
+        neo_hookean = 5 - 4 * inverse - fourth
+        stiffening = 27 / 40 + fourth * (fourth / 8 + inverse / 5) + inverse**2 - 2 * stretch
+        return (p.G * (1.5 * p.alpha - 0.5)) * neo_hookean + (2 * p.G * p.alpha) * stiffening

@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 
 from en4dvar.state import Array
-from en4dvar_bubble.tables import HALO, Grid, _cell, fill, from_slopes
+from en4dvar_bubble.tables import HALO, Grid, _cell, from_slopes, from_values
 
 GRID = Grid(origin=-5.0, step=1 / 32, cells=496)
 STRETCH = np.exp(GRID.nodes)
@@ -24,26 +24,23 @@ _UNSTRETCHED = int(np.flatnonzero(_FINE_LOG == 0.0)[0])
 _ACROSS = np.array([0.8, -0.4, 4 / 35, -1 / 70])
 
 
-def new_table(n: int) -> Array:
-    """Uninitialised (N, cells, 8)."""
-    return np.empty((n, GRID.cells, 8))
+def sample(function: Callable[[Array], Array], n: int) -> Array:
+    """``function``, stretch (K,) → broadcastable to (N, K), at the nodes of the grid and its halo."""
+    return np.ascontiguousarray(np.broadcast_to(function(STRETCH), (n, len(STRETCH))), dtype=float)
 
 
-def from_function(function: Callable[[Array], Array], out: Array, scale: float = 1.0) -> Array:
-    """Write the table of ``scale · function``, stretch (K,) → broadcastable to (N, K), to ``out`` (N, cells, 8)."""
-    samples = np.broadcast_to(function(STRETCH), (len(out), len(STRETCH)))
-    fill(np.ascontiguousarray(samples, dtype=float), scale, out)
-    return out
+def from_function(function: Callable[[Array], Array], n: int) -> Array:
+    """Table (N, cells, 8) of ``function``: stretch (K,) → broadcastable to (N, K)."""
+    return from_values(sample(function, n))
 
 
-def from_strain_energy(rate: Callable[[Array], Array], out: Array, scale: float = 1.0) -> Array:
-    """Write to ``out`` (N, cells, 8) ``scale · J_e`` from W′: dJ_e/d ln λ = −λ W′(λ)/(λ³ − 1), J_e(1) = 0."""
+def from_strain_energy(rate: Callable[[Array], Array], n: int) -> Array:
+    """Table (N, cells, 8) of `` · J_e`` from W′: dJ_e/d ln λ = −λ W′(λ)/(λ³ − 1), J_e(1) = 0."""
     fine = -_FINE_STRETCH * rate(_FINE_STRETCH) / np.expm1(3 * _FINE_LOG)
-    slopes = np.array(np.broadcast_to(fine, (len(out), len(_FINE_STRETCH))))
+    slopes = np.array(np.broadcast_to(fine, (n, len(_FINE_STRETCH))))
     near = [slopes[:, _UNSTRETCHED + k] + slopes[:, _UNSTRETCHED - k] for k in (1, 2, 3, 4)]
     slopes[:, _UNSTRETCHED] = sum(w * s for w, s in zip(_ACROSS, near, strict=True))
-    table = _coarsen(from_slopes(slopes, _FINE.step, _UNSTRETCHED - HALO), _REFINE, GRID.cells)
-    return np.multiply(table, scale, out=out)
+    return np.asarray(_coarsen(from_slopes(slopes, _FINE.step, _UNSTRETCHED - HALO), _REFINE, GRID.cells))
 
 
 @nb.njit(cache=True, nogil=True)

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 
-def _digest(folder: Path) -> str:
-    content = b"".join(path.read_bytes() for path in sorted(folder.glob("*.py")))
+def _digest(folder: Path, *more: Path) -> str:
+    content = b"".join(path.read_bytes() for path in (*sorted(folder.glob("*.py")), *more))
     return sha256(content).hexdigest()
 
 
-def stamp_with_sources(dispatcher: Any, folder: Path) -> None:
+def stamp_with_sources(dispatcher: Any, folder: Path, *more: Path) -> None:
     """Replace the cache stamp of ``dispatcher`` (compiled with ``cache=True``) by the content of all modules in
-    ``folder``.
+    ``folder`` and ``more``.
     """
-    dispatcher._cache._cache_file._source_stamp = _digest(folder)
+    dispatcher._cache._cache_file._source_stamp = _digest(folder, *more)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -10,13 +11,14 @@ from typing import Any, Literal
 import numpy as np
 
 from en4dvar.state import Array
+from en4dvar_bubble import tables as tables_module
 from en4dvar_bubble.driving import Driving, Reading
 from en4dvar_bubble.laws.base import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import integrate, rows
 from en4dvar_bubble.solver.caching import stamp_with_sources
 from en4dvar_bubble.solver.collocation import ball, exterior
 
-stamp_with_sources(integrate.integrate, Path(__file__).parent)
+stamp_with_sources(integrate.integrate, Path(__file__).parent, Path(tables_module.__file__))
 
 AccuracyName = Literal["fast", "standard", "reference"]
 Radial = Literal["rayleigh-plesset", "keller-miksis", "keller-miksis-enthalpy", "gilmore"]
@@ -132,16 +134,21 @@ class System:
         return tol
 
 
-_NO_TABLE = np.zeros((1, 1, 8))
+_NO_TABLE = np.zeros((0, GRID.cells, 8))
+_NO_SAMPLES = np.zeros((0, len(GRID.nodes)))
 
 
 @dataclass(frozen=True)
 class Tables:
-    """What the laws of N members contribute, over the density: ``elastic`` (N, cells, 8) of J_e, ``viscous`` (N, cells,
-    8) of ν (µm²/µs), ``memory`` (N, q, 2, cells, 8) of stiffness and equilibrium.
+    """What the laws of N members contribute, over the density.
+
+    J_e either as ``samples`` (N, nodes with halo), tabulated when a member's turn comes, or as finished tables
+    ``elastic`` (N, cells, 8); ``viscous`` (N, cells, 8) of ν (µm²/µs); ``memory`` (N, q, 2, cells, 8) of stiffness and
+    equilibrium.
     """
 
-    elastic: Array
+    samples: Array = field(default_factory=lambda: _NO_SAMPLES)
+    elastic: Array = field(default_factory=lambda: _NO_TABLE)
     viscous: Array = field(default_factory=lambda: _NO_TABLE)
     memory: Array = field(default_factory=lambda: _NO_TABLE)
 
@@ -215,7 +222,7 @@ def _lengths(system: System) -> tuple[Any, Any]:
     return np.zeros(system.gas), np.zeros(system.size)
 
 
-def solve(
+def ready(
     system: System,
     initial: Array,
     parameters: Array,
@@ -225,8 +232,8 @@ def solve(
     driving: Driving,
     reading: Reading,
     accuracy: Accuracy,
-) -> Solution:
-    """Integrate N members.
+) -> Callable[[], Solution]:
+    """Everything set for the compiled integration of N members; the returned call runs it, without the interpreter.
 
     initial (N, n) and parameters (N, rows) in the kernel's units; start (N,) and times (N, K) in µs, times increasing.
     Members never influence each other: the bits do not depend on how they are batched.
@@ -239,18 +246,18 @@ def solve(
     inside = (span[1] - span[0]) / _STEPS_IN_DRIVING
     member = np.arange(n_members, dtype=float)
     parameters = parameters.copy()
-    parameters[:, rows.TABLE] = member * (GRID.cells * 8)
     parameters[:, rows.VISCOUS_TABLE] = member * (VISCOUS_GRID.cells * 8)
     for j in range(system.memory):
         offset = (member * system.memory + j) * (2 * GRID.cells * 8)
         parameters[:, rows.MEMORY + rows.PER_MEMORY * j + 2] = offset
-    integrate.integrate(
+    arguments = (
         np.ascontiguousarray(initial),
         parameters,
         np.ascontiguousarray(start),
         np.ascontiguousarray(times),
         system.dims,
-        (_gas_operators(system.gas), tables.elastic, GRID.span, driving.table, span, READINGS[reading]),
+        (tables.samples, tables.elastic),
+        (_gas_operators(system.gas), GRID.span, driving.table, span, READINGS[reading]),
         (_medium_operators(system.medium), tables.viscous, VISCOUS_GRID.span, tables.memory.reshape(-1, 1, 8)),
         *_lengths(system),
         driving.breaks,
@@ -260,4 +267,9 @@ def solve(
         status,
         record,
     )
-    return Solution(out, status, record)
+
+    def run() -> Solution:
+        integrate.integrate(*arguments)
+        return Solution(out, status, record)
+
+    return run

@@ -14,7 +14,8 @@ from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.equations import jacobian, rhs
 from en4dvar_bubble.solver.general import general_jacobian, general_rhs
 from en4dvar_bubble.solver.lanes import WIDTH, absolute, exp, load, log, maximum, splat, sqrt, store
-from en4dvar_bubble.solver.rows import AMPLITUDE, INVERSE_C
+from en4dvar_bubble.solver.rows import AMPLITUDE, INVERSE_C, TABLE
+from en4dvar_bubble.tables import fill
 
 # Status of a member; the reasons users read are made by ``driver.reason``.
 OK, STEP_LIMIT, NON_FINITE, STEP_UNDERFLOW, MACH_LIMIT, TIME_LIMIT = 0, 1, 2, 3, 4, 5
@@ -163,19 +164,25 @@ def _workspace(m, n):
 
 @nb.njit(cache=True, nogil=True)
 def integrate(
-    initial, parameters, start, times, dims, world, extra, nodes, size, breaks, tol, limits, out, status, record
+    initial, parameters, start, times, dims, law, world, extra, nodes, size, breaks, tol, limits, out, status, record
 ):
     """Integrate N members and write their states at the output times.
 
-    initial (N, n), parameters (N, rows), start (N,) µs, times (N, K) increasing µs; ``dims``, ``world``, ``extra`` as
-    for :func:`general.general_rhs`; ``tol`` (2, n) absolute and relative tolerances; ``breaks`` increasing instants the
-    steps must not straddle; ``limits`` = (first step, longest step inside the driving, step limit, Mach limit, seconds
-    per member). Outputs: out (N, K, n) with NaN where not reached, status (N,), record (N, RECORD).
+    initial (N, n), parameters (N, rows), start (N,) µs, times (N, K) increasing µs; ``dims``, ``world`` (without the
+    elastic tables) and ``extra`` as for :func:`general.general_rhs`; ``law`` = (samples (N, nodes) of J_e, tabulated
+    when a member's turn comes, or (0, nodes); finished tables (N, cells, 8)); ``nodes`` and ``size`` as for
+    :func:`_attempt`; ``tol`` (2, n) absolute and relative tolerances; ``breaks`` increasing instants the steps must not
+    straddle; ``limits`` = (first step, longest step inside the driving, step limit, Mach limit, seconds per member).
+    Outputs: out (N, K, n) with NaN where not reached, status (N,), record (N, RECORD).
     """
     n_members, n = initial.shape
     n_times = times.shape[1]
     m = dims[0]
-    dspan = world[4]
+    samples, finished = law
+    ops, espan, drive, dspan, reading = world
+    cells = int(espan[3])
+    elastic = np.zeros((WIDTH, cells, 8))  # of the members in the lanes: small enough for the cache
+    system = (ops, elastic, espan, drive, dspan, reading)
     n_parameters = parameters.shape[1]
     w = _workspace(m, n)
     k, y_new, norm = w[4], w[6], w[8]
@@ -221,6 +228,11 @@ def integrate(
                     y[j, lane] = initial[i, j]
                 for j in range(n_parameters):
                     par[j, lane] = parameters[i, j]
+                par[TABLE, lane] = lane * cells * 8
+                if samples.shape[0] > 0:
+                    fill(samples[i : i + 1], 1.0, elastic[lane : lane + 1])
+                else:
+                    elastic[lane] = finished[i]
                 t[0, lane] = start[i]
                 h[0, lane] = first_step
                 old_h[lane] = -1.0
@@ -243,7 +255,7 @@ def integrate(
         if turn % _TURNS_PER_LOOK == 0:
             clock = _clock(0)
 
-        _attempt(y, t, h, par, dims, world, extra, nodes, size, tol, w)
+        _attempt(y, t, h, par, dims, system, extra, nodes, size, tol, w)
 
         have_dense = False
         for lane in range(WIDTH):
