@@ -197,7 +197,7 @@ class BubbleModel(ForwardModel):
         return self.prepare(x, times)()
 
     def prepare(self, x: Array, times: Array) -> Callable[[], Sequence[Trajectory | Failure]]:
-        run = self._prepare(np.asarray(x, dtype=float), np.broadcast_to(times, (len(x), np.shape(times)[-1])), 0.0)
+        run = self.prepared(np.asarray(x, dtype=float), np.broadcast_to(times, (len(x), np.shape(times)[-1])), 0.0)
 
         def finish() -> Sequence[Trajectory | Failure]:
             path = run()
@@ -213,9 +213,10 @@ class BubbleModel(ForwardModel):
 
     def integrate(self, x: Array, times: Array, t0: float = 0.0) -> Paths:
         """All members from their states ``x`` (N, n_state) at ``t0`` (s) to ``times`` (N, K) (s, increasing)."""
-        return self._prepare(x, times, t0)()
+        return self.prepared(x, times, t0)()
 
-    def _prepare(self, x: Array, times: Array, t0: float) -> Callable[[], Paths]:
+    def prepared(self, x: Array, times: Array, t0: float = 0.0) -> Callable[[], Paths]:
+        """:meth:`integrate` with all that needs the interpreter done; the returned call releases it."""
         initial, par = pack(self, x)
         tables = law_tables(self, self.law_values(x))
         start = np.full(len(x), t0 * 1e6)
