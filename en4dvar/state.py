@@ -1,4 +1,4 @@
-"""Names and arrays: parameters, the layout of a state vector, an ensemble of control vectors."""
+"""Names and arrays: parameters, the layout of a state vector."""
 
 from __future__ import annotations
 
@@ -125,31 +125,3 @@ class StateLayout:
         """Views of the fields of ``x`` (…, n_state); blocks of size one lose their last axis."""
         sizes = {f.name: f.size for f in self.fields}
         return {n: x[..., s.start] if sizes[n] == 1 else x[..., s] for n, s in self.slices.items()}
-
-
-@dataclass(frozen=True)
-class Ensemble:
-    """Members as rows of ``values`` (N, n); ``names`` labels the n columns."""
-
-    values: Array
-    names: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        if self.values.ndim != 2 or self.values.shape[1] != len(self.names):
-            raise ValueError(f"ensemble of shape {self.values.shape} does not match {len(self.names)} names")
-
-    @property
-    def n_members(self) -> int:
-        return int(self.values.shape[0])
-
-    @property
-    def mean(self) -> Array:
-        return np.asarray(self.values.mean(axis=0))
-
-    @property
-    def anomalies(self) -> Array:
-        """Unscaled anomalies (N, n): members minus their mean."""
-        return self.values - self.mean
-
-    def column(self, name: str) -> Array:
-        return self.values[:, self.names.index(name)]

@@ -230,7 +230,7 @@ def integrate(
                     par[j, lane] = parameters[i, j]
                 par[TABLE, lane] = lane * cells * 8
                 if samples.shape[0] > 0:
-                    fill(samples[i : i + 1], 1.0, elastic[lane : lane + 1])
+                    fill(samples[i : i + 1], elastic[lane : lane + 1])
                 else:
                     elastic[lane] = finished[i]
                 t[0, lane] = start[i]
