@@ -1,0 +1,108 @@
+"""``en4dvar run``."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from en4dvar.commands.common import Failed, command_line, command_words, config_options, load_any
+
+if TYPE_CHECKING:
+    from en4dvar.campaign import Campaign
+    from en4dvar.config import TwinConfig
+
+MOST_TOLD = 30  # data sets, warnings and failures on the terminal; all of them are in the run directory
+
+
+@click.command()
+@config_options
+@click.option("--out", type=click.Path(path_type=Path), help="Run directory; default output.directory or runs/<name>.")
+@click.option("--force", is_flag=True, help="Replace an earlier run in the run directory, once this one is complete.")
+@click.option("--resume", is_flag=True, help="Continue the interrupted run in the run directory, to the same bits.")
+@click.option("--no-report", is_flag=True, help="Leave figures and page to 'en4dvar report'.")
+@click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
+@click.option("--scheduler", metavar="ADDRESS", help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786.")
+def run(
+    config: str,
+    data: str | None,
+    settings: tuple[str, ...],
+    out: Path | None,
+    force: bool,
+    resume: bool,
+    no_report: bool,
+    workers: int | None,
+    scheduler: str | None,
+) -> None:
+    """Estimate the parameters; write posterior and report to the run directory.
+
+    Several data files (a list, a pattern or a folder) are a campaign; one that cannot be used does not end it.
+    A configuration with a 'twin:' section is a twin experiment: RMSE and spread against its truth.
+
+    \b
+    Example:
+      en4dvar run configs/quickstart.yaml --out runs/first --set assimilation.members=96
+    """
+    special = {
+        "output.directory": str(out) if out else None,
+        "output.report": False if no_report else None,
+        "execution.workers": workers,
+        "execution.address": scheduler,
+    }
+    loaded = load_any(config, data, settings, **special)
+    from en4dvar.config import TwinConfig
+
+    if isinstance(loaded, TwinConfig):
+        if resume or scheduler:
+            raise click.UsageError("a twin experiment takes neither --resume nor --scheduler")
+        _run_twin(loaded, force)
+        return
+    from en4dvar.build import data_files, inverse_plan
+    from en4dvar.progress import terminal_progress
+    from en4dvar.runner import execute
+
+    words = command_words()
+    with terminal_progress(len(data_files(inverse_plan(loaded)))) as progress:
+        try:
+            campaign = execute(loaded, force=force, resume=resume, progress=progress, command=shlex.join(words))
+        except KeyboardInterrupt as interrupt:
+            again = shlex.join([*(w for w in words if w not in ("--force", "--resume")), "--resume"])
+            raise Failed(f"{interrupt}\nto continue: {again}", 130) from None
+    _tell(campaign, with_report=not no_report)
+
+
+def _tell(campaign: Campaign, with_report: bool) -> None:
+    """The posterior on standard output, warnings on standard error. Raises :class:`Failed` where a data set has."""
+    from en4dvar.describe import results_table
+
+    if len(campaign) <= MOST_TOLD:
+        click.echo(results_table({o.name: o.summary for o in campaign.outcomes if not o.failure}))
+    for notice in campaign.notices:
+        click.echo(f"warning: {notice}", err=True)
+    told = [f"{o.name}: {warning}" for o in campaign.outcomes for warning in o.warnings]
+    for warning in told[:MOST_TOLD]:
+        click.echo(f"warning: {warning}", err=True)
+    if len(told) > MOST_TOLD:
+        click.echo(f"warning: {len(told) - MOST_TOLD} more; see run.log", err=True)
+    if len(campaign) and with_report:
+        click.echo(f"report: {campaign.directory / 'report.html'}")
+    if campaign.failures:
+        reasons = [f"{o.name}: {o.failure}" for o in campaign.failures]
+        head = f"{len(reasons)} of {len(campaign.outcomes)} data sets failed:"
+        more = [f"and {len(reasons) - MOST_TOLD} more; see summary.csv"] if len(reasons) > MOST_TOLD else []
+        raise Failed("\n".join([head, *reasons[:MOST_TOLD], *more]), campaign.exit_code)
+
+
+def _run_twin(config: TwinConfig, force: bool) -> None:
+    from en4dvar.progress import cycle_progress
+    from en4dvar.twin_run import run_twin, scores_table
+
+    with cycle_progress(config.experiment.cycles) as on_cycle:
+        result = run_twin(config, force=force, on_cycle=on_cycle, command=command_line())
+    click.echo(scores_table(result))
+    if result.run.failures:
+        lost = f"{len(result.run.failures)} of {config.experiment.members} members lost"
+        click.echo(f"warning: {config.name}: {lost}, the last: {result.run.failures[-1]}", err=True)
+    click.echo(f"result: {config.directory / 'twin.nc'}")
