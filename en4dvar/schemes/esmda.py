@@ -64,6 +64,7 @@ class ESMDA:
         if self.form == "square-root":
             return Weights(centre, hessian.transform @ weights.T)
         # anomalies of the members' innovations: −S_i of the predictions and the perturbations
-        noise = perturbations - perturbations.mean(axis=0)
-        moves = hessian.solve((noise - S.T) @ S)
-        return Weights(centre, weights.T + moves @ weights.T)
+        innovations = perturbations - perturbations.mean(axis=0) - S.T
+        if len(S) < S.shape[1]:  # the cheaper order of the same product
+            return Weights(centre, weights.T + innovations @ (hessian.solve(S) @ weights.T))
+        return Weights(centre, weights.T + hessian.solve(innovations @ S) @ weights.T)
