@@ -25,34 +25,45 @@ class Group(Section):
     """Data sets of one kind: how many, and what their parameters are drawn from."""
 
     datasets: Annotated[int, Field(ge=1, le=999)]
+    """How many data sets."""
     parameters: dict[str, Any]
+    """What their truths are drawn from: a prior (drawn for each) or a quantity (common to all)."""
 
 
 class Campaign(Section):
-    """How the truths are observed. Pairs are the ends of uniform distributions.
-
-    Readings start at ``first``, are ``spacing`` apart and end with the first one below ``stop`` times the largest so
-    far. ``noise`` is the std of the observable. ``time_shift`` t_s: a reading told at t was taken at t + t_s.
-    """
+    """How the truths are observed. Pairs are the ends of uniform distributions."""
 
     directory: Annotated[str, Field(min_length=1)]
+    """Folder of the data files, relative to the configuration's."""
     first: tuple[QuantityText, QuantityText]
+    """Instant of the first reading."""
     spacing: tuple[QuantityText, QuantityText]
+    """Time between two readings."""
     stop: Annotated[float, Field(gt=0, lt=1)]
+    """Readings end with the first one below this times the largest so far."""
     most: Annotated[int, Field(ge=3, le=100_000)] = 60
+    """Largest number of readings."""
     fewest: Annotated[int, Field(ge=3)] = 5
+    """Data sets with fewer readings are drawn again."""
     noise: QuantityText
+    """Std of the error of a reading, in the observable's unit."""
     time_shift: tuple[QuantityText, QuantityText] = (0, 0)
+    """t_s: a reading told at t was taken at t + t_s."""
     groups: Annotated[dict[schema.Name, Group], Field(min_length=1)]
+    """Data sets of one kind, by name."""
 
 
 class CampaignSchema(Section):
     """The whole file; ``model`` is as for an estimation."""
 
     name: schema.Name
+    """Name of the campaign."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Seed of truths and readings."""
     model: dict[str, Any]
+    """The forward model: its ``name`` (see ``en4dvar models``) and its settings."""
     campaign: dict[str, Any]
+    """How truths are drawn and observed."""
 
 
 @dataclass(frozen=True)

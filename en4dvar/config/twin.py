@@ -31,13 +31,18 @@ from en4dvar.units import UnitError, parse_quantity
 
 
 class Twin(Section):
-    """How the truth is made and observed. ``error``: ``<observable>_std``; ``initial_std``: by field of the state."""
+    """How the truth is made and observed."""
 
     cycles: Annotated[int, Field(ge=1)]
+    """Number of analyses."""
     burn_in: Annotated[int, Field(ge=0)] = 0
+    """Cycles at the beginning that no score counts."""
     interval: QuantityText
+    """Time between two observations, in the model's unit of time."""
     error: Annotated[dict[str, QuantityText], Field(min_length=1)]
+    """Std of the observation errors, by observable: ``<observable>_std``."""
     initial_std: Annotated[dict[str, QuantityText], Field(min_length=1)]
+    """Std of the initial ensemble, by field of the state."""
 
     @model_validator(mode="after")
     def _something_counts(self) -> Twin:
@@ -50,24 +55,38 @@ class Local(Section):
     """Gaspari–Cohn taper over the indices of the observed field; it vanishes from ``2 radius`` on."""
 
     radius: Annotated[float, Field(gt=0)]
+    """Radius of the taper, in indices: an observation has no influence from twice this distance on."""
     periodic: bool = False
+    """The field is a circle: the last index is next to the first."""
     block_size: Annotated[int, Field(ge=1)] = 1
+    """Neighbouring indices that share one analysis."""
 
 
 class Sequential(Section):
-    """The scheme and what it does to the ensemble; ``lag`` to ``tolerance`` are the smoother's (see IEnKS)."""
+    """The scheme and what it does to the ensemble."""
 
     scheme: Literal["etkf", "ienks"]
+    """etkf (filter) or ienks (sliding-window smoother)."""
     members: Annotated[int, Field(ge=3)]
+    """Ensemble size N."""
     lag: Annotated[int, Field(ge=0)] = IEnKS.lag
+    """Length of the smoother's window in cycles; 0 is a filter."""
     linearisation: Literal["transform", "bundle"] = IEnKS.linearisation
+    """Regression over the ensemble (transform), or tangent from runs close to the iterate (bundle)."""
     epsilon: Annotated[float, Field(gt=0, le=1)] = IEnKS.epsilon
+    """Size of the bundle: factor on the anomalies."""
     max_iterations: Annotated[int, Field(ge=1)] = IEnKS.max_iterations
+    """Iteration limit in each cycle."""
     tolerance: Annotated[float, Field(gt=0)] = IEnKS.tolerance
+    """Iterations end where the step is shorter than this, in posterior standard deviations."""
     inflation: Annotated[float, Field(gt=0)] = 1.0
+    """Factor on the anomalies after each analysis; 1 is none."""
     rtps: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Relaxation to the prior spread, 0 (none) to 1."""
     rotation: bool = False
+    """Rotate the ensemble at random after each analysis, mean and covariance kept."""
     localisation: Local | None = None
+    """Gaspari–Cohn taper over the indices of the observed field (etkf only)."""
 
     @model_validator(mode="after")
     def _belongs_together(self) -> Sequential:
@@ -89,19 +108,28 @@ class Workers(Section):
     """Where members are integrated; never changes the numbers. A cycle is short: one worker is the default."""
 
     workers: Annotated[int, Field(ge=1)] = 1
+    """Parallel workers."""
 
 
 class TwinSchema(Section):
     """The whole file; ``model`` and ``parameters`` are as for an estimation and validated by themselves."""
 
     name: schema.Name
+    """Name of the run; its results go to runs/<name>."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Seed of truth, observations and ensemble."""
     model: dict[str, Any]
+    """The forward model: its ``name`` (see ``en4dvar models``) and its settings."""
     parameters: dict[str, Any] = Field(default_factory=dict)
+    """Parameters to estimate (a prior) or to change from the model's default (a quantity)."""
     twin: dict[str, Any]
+    """How the truth is made and observed."""
     assimilation: dict[str, Any]
+    """The scheme and what it does to the ensemble."""
     execution: Workers = Workers()
+    """Where members are integrated; never changes the numbers."""
     output: schema.Output = schema.Output()
+    """Where results go."""
 
 
 @dataclass(frozen=True)

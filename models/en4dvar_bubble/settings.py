@@ -25,32 +25,52 @@ _GIVEN = "given in the configuration"
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 class ConstantsSettings(_Section):
-    """A named set of constants, any of them replaced; ``sources`` says where replaced values come from."""
+    """A named set of constants, any of them replaced."""
 
     set: SetName = "water-25C"
+    """The set that fills what is not given."""
     rho: Annotated[float, Quantity(UNITS["rho"]), Positive] = WATER_25C.rho
+    """Density of the medium."""
     c: Annotated[float, Quantity(UNITS["c"]), Positive] = WATER_25C.c
+    """Speed of sound in the medium."""
     p_inf: Annotated[float, Quantity(UNITS["p_inf"]), Positive] = WATER_25C.p_inf
+    """Far-field pressure."""
     S: Annotated[float, Quantity(UNITS["S"]), NonNegative] = WATER_25C.S
+    """Surface tension."""
     T_inf: Annotated[float, Quantity(UNITS["T_inf"]), Positive] = WATER_25C.T_inf
+    """Far-field temperature."""
     kappa: Annotated[float, Field(gt=1)] = WATER_25C.kappa
+    """Ratio of specific heats of the gas."""
     A: Annotated[float, Quantity(UNITS["A"]), NonNegative] = WATER_25C.A
+    """Conductivity of the gas, K(T) = A T + B."""
     B: Annotated[float, Quantity(UNITS["B"]), NonNegative] = WATER_25C.B
+    """Conductivity of the gas, K(T) = A T + B."""
     tait_B: Annotated[float, Quantity(UNITS["tait_B"]), Positive] = WATER_25C.tait_B
+    """Tait equation of the medium: pressure B (enthalpy form and Gilmore)."""
     tait_n: Annotated[float, Field(gt=1)] = WATER_25C.tait_n
+    """Tait equation of the medium: exponent n (enthalpy form and Gilmore)."""
     K_m: Annotated[float, Quantity(UNITS["K_m"]), Positive] = WATER_25C.K_m
+    """Thermal conductivity of the medium (medium_heat: conducting)."""
     c_m: Annotated[float, Quantity(UNITS["c_m"]), Positive] = WATER_25C.c_m
+    """Specific heat of the medium (medium_heat: conducting)."""
     A_v: Annotated[float, Quantity(UNITS["A_v"]), NonNegative] = WATER_25C.A_v
+    """Conductivity of the vapour, K(T) = A_v T + B_v (vapour: transport)."""
     B_v: Annotated[float, Quantity(UNITS["B_v"]), NonNegative] = WATER_25C.B_v
+    """Conductivity of the vapour, K(T) = A_v T + B_v (vapour: transport)."""
     D_v: Annotated[float, Quantity(UNITS["D_v"]), Positive] = WATER_25C.D_v
+    """Diffusivity of vapour in the gas (vapour: transport)."""
     L_v: Annotated[float, Quantity(UNITS["L_v"]), Positive] = WATER_25C.L_v
+    """Latent heat of evaporation (vapour: transport)."""
     M_g: Annotated[float, Quantity(UNITS["M_g"]), Positive] = WATER_25C.M_g
+    """Molar mass of the gas (vapour: transport)."""
     M_v: Annotated[float, Quantity(UNITS["M_v"]), Positive] = WATER_25C.M_v
+    """Molar mass of the vapour (vapour: transport)."""
     sources: dict[str, str] = Field(default_factory=lambda: dict(WATER_25C.sources))
+    """Where replaced values come from, by constant; recorded with the result."""
 
     @model_validator(mode="before")
     @classmethod
@@ -90,22 +110,39 @@ class BubbleSettings(_Section):
     """What the forward model is; every default is recorded in the resolved configuration."""
 
     law: str = "quadratic-kelvin-voigt"
+    """Constitutive law: a name of ``en4dvar laws``, or a class in a file: ./my_law.py:MyLaw."""
     radial: Radial = "keller-miksis"
+    """Radial dynamics: how the compressibility of the medium enters."""
     gas: Literal["heat", "polytropic", "isothermal", "adiabatic"] = "heat"
+    """Gas in the bubble: energy equation (heat), or a polytropic law."""
     vapour: Literal["none", "frozen", "transport"] = "none"
+    """Vapour: none, that of time zero as if it were gas, or diffusion with evaporation at the wall."""
     medium_heat: Literal["cold", "conducting"] = "cold"
+    """Wall at the far-field temperature, or heat conduction in the medium."""
     start: Literal["acoustic", "laser"] = "acoustic"
+    """acoustic: at rest at R0, then driven; laser: released from R_max with the gas of R_eq."""
     driving: DrivingSettings = Histotripsy()
+    """Pressure far away; default: the histotripsy pulse (acoustic start) or none (laser start)."""
     driving_read: Reading = "instantaneous"
+    """When p_f is evaluated: at t, at t + R/c without its derivative (retarded), or both (as-printed)."""
     vapour_pressure: float | Literal["saturated"] = 0.0
+    """Constant vapour pressure in the bubble: a pressure, or saturated at the far-field temperature."""
     constants: ConstantsSettings = ConstantsSettings()
+    """Constants of medium and gas: the name of a set, or a section that replaces some of them."""
     accuracy: Literal["fast", "standard", "reference"] = "standard"
+    """Nodes and tolerance together; errors of each in docs/solver.md."""
     nodes: Annotated[int, Field(ge=1, le=128)] | None = None
+    """Collocation nodes in the gas; default: those of ``accuracy``."""
     medium_nodes: Annotated[int, Field(ge=4, le=128)] | None = None
+    """Nodes in the conducting medium; default: those of ``accuracy``."""
     rtol: Annotated[float, Field(ge=1e-11, le=1e-2)] | None = None
+    """Relative tolerance of a time step; default: that of ``accuracy``."""
     step_limit: Annotated[int, Field(ge=100)] = Accuracy.step_limit
+    """A member that needs more time steps has failed."""
     time_limit: Annotated[float, Quantity("s"), Field(gt=0)] = Accuracy.time_limit
+    """A member that computes for longer has failed."""
     mach_limit: Annotated[float, Field(gt=0)] = Accuracy.mach_limit
+    """A member whose wall is faster, relative to the speed of sound, has failed."""
 
     @model_validator(mode="before")
     @classmethod

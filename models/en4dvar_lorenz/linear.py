@@ -17,10 +17,11 @@ from en4dvar_lorenz.autonomous import Autonomous, dimensionless
 
 
 class LinearSettings(BaseModel):
-    """``oscillators``: how many; at time zero all have z = 1."""
+    """Size of the linear model."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
     oscillators: Annotated[int, Setting(ge=1)] = 4
+    """Number of oscillators; at time zero all have z = 1."""
 
 
 def oscillate(start: np.ndarray, times: np.ndarray, longest: float) -> np.ndarray:

@@ -21,11 +21,13 @@ SOURCE = "Lorenz (1963)"
 
 
 class Lorenz63Settings(BaseModel):
-    """``initial``: the state at time zero. ``step``: longest step of the integration."""
+    """Start and integration of Lorenz-63."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
     initial: tuple[float, float, float] = (1.509, -1.531, 25.46)
+    """State at time zero."""
     step: Annotated[float, Setting(gt=0)] = 0.01
+    """Longest integration step."""
 
 
 @njit

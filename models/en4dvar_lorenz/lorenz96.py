@@ -19,11 +19,13 @@ from en4dvar_lorenz.rk4 import rk4
 
 
 class Lorenz96Settings(BaseModel):
-    """``size``: number of variables; at time zero the first is 1, the others 0. ``step``: longest integration step."""
+    """Size and integration of Lorenz-96."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
     size: Annotated[int, Setting(ge=4)] = 40
+    """Number of variables; at time zero the first is 1, the others are 0."""
     step: Annotated[float, Setting(gt=0)] = 0.05
+    """Longest integration step."""
 
 
 @njit

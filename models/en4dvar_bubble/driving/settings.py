@@ -21,7 +21,7 @@ Width = Annotated[Time, Field(gt=0)]
 
 
 class _Kind(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
     def build(self) -> Driving:
         """The driving. Raises ValueError or :class:`En4dvarError`."""
@@ -42,6 +42,7 @@ class NoDriving(_Kind):
     """No driving."""
 
     kind: Literal["none"] = "none"
+    """No driving."""
 
     def build(self) -> Driving:
         return pulses.silence()
@@ -51,26 +52,39 @@ class Histotripsy(_Kind):
     """The rarefactional half cycle of a histotripsy pulse."""
 
     kind: Literal["histotripsy"] = "histotripsy"
+    """p_A [(1 + cos ω(t−δ))/2]^n for |t−δ| ≤ π/ω."""
     amplitude: Pressure = -24e6
+    """p_A; negative for rarefaction."""
     frequency: Frequency = 1e6
+    """ω/2π."""
     exponent: Annotated[float, Field(ge=1)] = 3.7
+    """n."""
     delay: Time = 5e-6
+    """δ: the instant of the peak."""
 
     def build(self) -> Driving:
         return pulses.histotripsy(self.amplitude, self.frequency, self.exponent, self.delay)
 
 
 class Sine(_Kind):
-    """A sine burst, with or without an envelope; ``phase`` in radians."""
+    """A sine burst, with or without an envelope."""
 
     kind: Literal["sine"] = "sine"
+    """A sine burst."""
     amplitude: Pressure
+    """Pressure amplitude."""
     frequency: Frequency
+    """Frequency."""
     cycles: Annotated[float, Field(gt=0, le=1000)]
+    """Length of the burst in periods."""
     delay: Delay = 0.0
+    """When the burst begins."""
     phase: float = 0.0
+    """Phase at its beginning, in radians."""
     envelope: pulses.Envelope = "none"
+    """Window that the burst is multiplied by; without one the burst must begin and end at zero."""
     taper: Annotated[float, Field(ge=0.01, le=1)] = 0.5
+    """Share of the burst that the two tapers of the Tukey window take."""
 
     def build(self) -> Driving:
         return pulses.sine_burst(
@@ -82,9 +96,13 @@ class Gaussian(_Kind):
     """A Gaussian pulse centred at ``delay`` with standard deviation ``width``."""
 
     kind: Literal["gaussian"] = "gaussian"
+    """A Gaussian pulse."""
     amplitude: Pressure
+    """Peak pressure."""
     delay: Delay
+    """The instant of the peak."""
     width: Width
+    """Standard deviation of the pulse in time."""
 
     def build(self) -> Driving:
         return pulses.gaussian(self.amplitude, self.delay, self.width)
@@ -94,19 +112,26 @@ class Step(_Kind):
     """A step that lasts, or an impulse that ends after ``duration``."""
 
     kind: Literal["step"] = "step"
+    """A step or an impulse."""
     amplitude: Pressure
+    """Pressure after the step."""
     duration: Width
+    """How long the pressure lasts."""
     delay: Delay = 0.0
+    """When it begins."""
     rise: Width = 20e-9
+    """Rise time."""
 
     def build(self) -> Driving:
         return pulses.step(self.amplitude, self.duration, self.delay, self.rise)
 
 
 class _Column(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
     name: Annotated[str, Field(min_length=1)]
+    """Header of the column (CSV) or name of the field (.mat)."""
     unit: str
+    """Unit of the numbers in the file; required, never guessed."""
 
 
 class TimeOfRecord(_Column):
@@ -132,20 +157,28 @@ class PressureOfRecord(_Column):
 class Columns(BaseModel):
     """Which columns of the file hold time and pressure, and their units."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
     time: TimeOfRecord
+    """Column of times."""
     pressure: PressureOfRecord
+    """Column of pressures."""
 
 
 class Tabulated(_Kind):
-    """A measured p(t) from a CSV or ``.mat`` file, shifted by ``delay`` and multiplied by ``scale``."""
+    """A measured p(t) from a CSV or ``.mat`` file."""
 
     kind: Literal["tabulated"] = "tabulated"
+    """A measured p(t)."""
     file: str
+    """CSV or .mat file, relative to the configuration's folder."""
     columns: Columns
+    """Which columns hold time and pressure, and their units."""
     format: Literal["csv", "mat"] | None = None
+    """Format of the file; default: by its suffix."""
     delay: Time = 0.0
+    """Added to the times of the record."""
     scale: Annotated[float, Field()] = 1.0
+    """Factor on the pressures."""
 
     @field_validator("file")
     @classmethod

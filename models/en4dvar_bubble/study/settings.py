@@ -24,11 +24,17 @@ class Sweep(Section):
     """Size of the sweep of each model and gel; see :class:`~en4dvar_bubble.study.sweep.SweepSettings`."""
 
     trajectories: Annotated[int, Field(ge=2, le=10_000_000)] = SweepSettings.trajectories
+    """Size of the design."""
     shift: QuantityText = "0.8 us"
+    """Largest time shift."""
     step: QuantityText = "0.025 us"
+    """Step of the time grid and of the shifts."""
     width: Annotated[float, Field(gt=0, le=10)] = SweepSettings.width
+    """Range searched, in prior standard deviations."""
     rounds: Annotated[int, Field(ge=0, le=50)] = SweepSettings.rounds
+    """Rounds of local refinement."""
     local: Annotated[int, Field(ge=1)] = SweepSettings.local
+    """Trajectories a data set in each round of refinement."""
 
     def built(self) -> SweepSettings:
         """In seconds. Raises :class:`UnitError`."""
@@ -39,14 +45,20 @@ class Sweep(Section):
 
 
 class StudySchema(Section):
-    """The whole file. ``gels``: label → model (nh, qs, qlkv) → configuration file. ``data``: folder of the campaign."""
+    """The whole file of ``en4dvar study``."""
 
     name: Name
+    """Name of the study; its results go to runs/<name>."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Seed of the sweeps."""
     synthetic: bool
+    """Whether the data are a synthetic twin; every page says so."""
     truth: str | None = None
+    """CSV file of the twin's true parameters, read for the report only; relative to this file's folder."""
     sweep: Sweep = Sweep()
+    """Size of the sweep of each model and gel."""
     gels: Annotated[dict[str, dict[str, str]], Field(min_length=1)]
+    """Label of the gel → model (nh, qs, qlkv) → configuration file, relative to this file's folder."""
 
 
 @dataclass(frozen=True)
