@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from en4dvar.commands.common import Failed
-from en4dvar.commands.listings import models
+from en4dvar.commands.listings import models, schema
 from en4dvar.commands.results import compare, report
 from en4dvar.commands.run import run
 from en4dvar.commands.simulate import simulate
@@ -51,7 +51,7 @@ def main() -> None:
     """
 
 
-for command in (compare, models, report, run, simulate, validate):
+for command in (compare, models, report, run, schema, simulate, validate):
     main.add_command(command)
 
 if __name__ == "__main__":

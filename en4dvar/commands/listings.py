@@ -1,6 +1,8 @@
-"""Commands that tell what there is: ``en4dvar models``."""
+"""Commands that tell what there is: ``en4dvar models`` and ``en4dvar schema``."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import click
 
@@ -16,3 +18,23 @@ def models() -> None:
     from en4dvar.listing import model_listing
 
     click.echo(model_listing())
+
+
+@click.command()
+@click.option("--out", type=click.Path(path_type=Path), help="JSON file to write; default standard output.")
+def schema(out: Path | None) -> None:
+    """Print the JSON schema of configuration files: completion and checks in an editor.
+
+    Name it in the first line of a configuration:  # yaml-language-server: $schema=en4dvar.schema.json
+
+    \b
+    Example:
+      en4dvar schema --out en4dvar.schema.json
+    """
+    from en4dvar.config.json_schema import schema_text
+    from en4dvar.files import write_text
+
+    if out is None:
+        click.echo(schema_text(), nl=False)
+    else:
+        click.echo(f"schema: {write_text(out, schema_text())}")

@@ -45,6 +45,12 @@ class Column(Section):
 class TimeColumn(Section):
     """Observation times: a column, or a constant step (a scalar of the file, or a quantity such as ``0.63 us``)."""
 
+    model_config = ConfigDict(
+        json_schema_extra={
+            "dependentRequired": {"name": ["unit"]},
+            "oneOf": [{"required": ["name"]}, {"required": ["step"]}],
+        }
+    )
     name: str | None = None
     """Column of times; give this or ``step``."""
     step: QuantityText | None = None

@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_serializer, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    WithJsonSchema,
+    field_serializer,
+    field_validator,
+    model_validator,
+)
 
 from en4dvar.errors import ConfigError
 from en4dvar.hints import suggest
+from en4dvar.state import Parameter
 from en4dvar.units import Quantity, parse_quantity
 from en4dvar_bubble.driving import Reading
 from en4dvar_bubble.driving.settings import DrivingSettings, Histotripsy, with_kind
-from en4dvar_bubble.laws import ConstitutiveLaw, get_law
+from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, get_law
 from en4dvar_bubble.laws.loading import qualified
+from en4dvar_bubble.laws.parameters import R0, R_EQ, R_MAX
 from en4dvar_bubble.medium import CONSTANT_SETS, UNITS, WATER_25C, Medium, saturated_vapour_pressure
 from en4dvar_bubble.solver.driver import Accuracy, Radial, preset
 
@@ -22,6 +33,7 @@ Positive = Field(gt=0)
 NonNegative = Field(ge=0)
 
 _GIVEN = "given in the configuration"
+_VAPOUR_PRESSURE = {"anyOf": [{"const": "saturated"}, {"const": 0}, {"type": "string", "pattern": r"^\s*[\d.]"}]}
 
 
 class _Section(BaseModel):
@@ -71,6 +83,11 @@ class ConstantsSettings(_Section):
     """Molar mass of the vapour (vapour: transport)."""
     sources: dict[str, str] = Field(default_factory=lambda: dict(WATER_25C.sources))
     """Where replaced values come from, by constant; recorded with the result."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
+        names = list(get_args(SetName))
+        return {"anyOf": [{"enum": names, "description": "Name of a set of constants."}, handler(core_schema)]}
 
     @model_validator(mode="before")
     @classmethod
@@ -125,7 +142,7 @@ class BubbleSettings(_Section):
     """Pressure far away; default: the histotripsy pulse (acoustic start) or none (laser start)."""
     driving_read: Reading = "instantaneous"
     """When p_f is evaluated: at t, at t + R/c without its derivative (retarded), or both (as-printed)."""
-    vapour_pressure: float | Literal["saturated"] = 0.0
+    vapour_pressure: Annotated[float | Literal["saturated"], WithJsonSchema(_VAPOUR_PRESSURE)] = 0.0
     """Constant vapour pressure in the bubble: a pressure, or saturated at the far-field temperature."""
     constants: ConstantsSettings = ConstantsSettings()
     """Constants of medium and gas: the name of a set, or a section that replaces some of them."""
@@ -170,6 +187,12 @@ class BubbleSettings(_Section):
     @field_serializer("vapour_pressure", when_used="json")
     def _write_vapour(self, value: float | str) -> str:
         return value if isinstance(value, str) else f"{value!r} Pa"
+
+    @classmethod
+    def possible_parameters(cls) -> tuple[Parameter, ...]:
+        """The parameters of every built-in law and start, for editors; a configuration has those of its own."""
+        of_laws = [p for law in REGISTRY.values() for p in law.parameters]
+        return tuple({p.name: p for p in (*of_laws, R0, R_EQ, R_MAX)}.values())
 
     @property
     def constitutive_law(self) -> ConstitutiveLaw:

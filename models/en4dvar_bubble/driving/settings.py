@@ -193,9 +193,21 @@ class Tabulated(_Kind):
         )
 
 
+class _AsWritten:
+    """The JSON schema of what :func:`with_kind` accepts."""
+
+    def __get_pydantic_json_schema__(self, core_schema: Any, handler: Any) -> dict[str, Any]:
+        kinds = [
+            kind if Histotripsy.__name__ in kind["$ref"] else {"allOf": [kind], "required": ["kind"]}
+            for kind in handler(core_schema)["oneOf"]
+        ]
+        return {"anyOf": [{"const": "none", "description": "No driving."}, *kinds]}
+
+
 DrivingSettings = Annotated[
     NoDriving | Histotripsy | Sine | Gaussian | Step | Tabulated,
     Field(discriminator="kind"),
+    _AsWritten(),
 ]
 
 
