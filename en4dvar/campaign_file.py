@@ -8,7 +8,10 @@ observations and the iterations stay in ``datasets/``.
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,12 +21,14 @@ import numpy as np
 
 from en4dvar.errors import OutputError
 from en4dvar.files import atomic_path
+from en4dvar.seal import check_seal, seal_file
 
 GROUPS = (
     "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "constant_data", "sample_stats",
     "log_likelihood",
 )  # fmt: skip
 LEFT_OUT = {"path_time", "iteration", "time_column"}
+_LITTLE = 1 << 16  # bytes left on a disk that is full
 FAILURES = "failed_datasets"  # root attribute: JSON of name → reason
 
 
@@ -46,8 +51,20 @@ def save_campaign(
     ------
     OutputError: the file cannot be written.
     """
-    with atomic_path(path) as partial, netCDF4.Dataset(partial, "w", format="NETCDF4") as target:
-        target.setncatts({**attributes, FAILURES: json.dumps(failures, ensure_ascii=False)})
+    with atomic_path(path) as partial:
+        try:
+            _write(partial, sources, n_observations, {**attributes, FAILURES: json.dumps(failures, ensure_ascii=False)})
+        except RuntimeError as error:  # the library's own; of the operating system's reason it only tells "HDF error"
+            free = shutil.disk_usage(partial.parent).free
+            reason = os.strerror(errno.ENOSPC) if free < _LITTLE else str(error)
+            raise OutputError(f"{path}: cannot be written: {reason}") from None
+        seal_file(partial)
+    return path
+
+
+def _write(path: Path, sources: Mapping[str, Path], n_observations: int, attributes: Mapping[str, Any]) -> None:
+    with netCDF4.Dataset(path, "w", format="NETCDF4") as target:
+        target.setncatts(attributes)
         for i, (name, file) in enumerate(sources.items()):
             with netCDF4.Dataset(file) as source:
                 source.set_auto_maskandscale(False)
@@ -56,13 +73,13 @@ def save_campaign(
                 for group in GROUPS:
                     target[group]["dataset"][i] = name
                     _copy(target[group], source[group], i)
-    return path
 
 
 def failed_datasets(path: Path) -> dict[str, str]:
     """Name of the data set without a posterior → reason, from a campaign's file; empty where there is no such file."""
     if not path.is_file():
         return {}
+    check_seal(path)
     try:
         with netCDF4.Dataset(path) as file:
             return {str(k): str(v) for k, v in json.loads(getattr(file, FAILURES, "{}")).items()}

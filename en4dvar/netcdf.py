@@ -15,12 +15,14 @@ import netCDF4
 import numpy as np
 import xarray as xr
 
+from en4dvar.seal import sealed
+
 _LOCK = threading.Lock()  # the netCDF library is not safe to use from several threads
 _INITIAL_SIZE = 1 << 19  # bytes; grows as needed
 
 
 def to_bytes(tree: xr.DataTree) -> bytes:
-    """The file of a tree whose variables are floats, integers, truth values or text."""
+    """The file of a tree whose variables are floats, integers, truth values or text; its last line seals it."""
     with _LOCK:
         file = netCDF4.Dataset("in-memory.nc", "w", format="NETCDF4", memory=_INITIAL_SIZE)
         try:
@@ -30,7 +32,7 @@ def to_bytes(tree: xr.DataTree) -> bytes:
         except BaseException:
             file.close()
             raise
-        return bytes(file.close())
+        return sealed(bytes(file.close()))
 
 
 def _define(file: netCDF4.Dataset, node: xr.DataTree) -> Iterator[tuple[Any, Any]]:

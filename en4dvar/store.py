@@ -15,6 +15,7 @@ from en4dvar.files import write_bytes
 from en4dvar.groups import build_tree
 from en4dvar.netcdf import to_bytes
 from en4dvar.problem import Analysis
+from en4dvar.seal import check_seal
 from en4dvar.state import Array
 from en4dvar.units import convert
 
@@ -165,10 +166,14 @@ def save(result: Result, path: str | Path) -> Path:
 
 
 def load_result(path: str | Path) -> Result:
-    """Read a file of :func:`save` into memory and close it. Raises :class:`OutputError` if it is not one."""
+    """Read a file of :func:`save` into memory and close it.
+
+    Raises
+    ------
+    OutputError: it is not one, of another version, cut short or altered (see :mod:`en4dvar.seal`).
+    """
     path = Path(path)
-    if not path.is_file():
-        raise OutputError(f"{path}: no such file")
+    check_seal(path)
     try:
         with xr.open_datatree(path, engine="netcdf4", decode_timedelta=False) as tree:
             # a plain copy: the file can be replaced (or deleted) while the result is in use

@@ -12,6 +12,7 @@ import xarray as xr
 
 from en4dvar.errors import OutputError
 from en4dvar.provenance import git_commit, provenance
+from en4dvar.seal import sealed
 from en4dvar.store import Result, load_result, save
 
 FAILED = 3
@@ -216,14 +217,18 @@ def test_unreadable_file_is_one_clear_error(tmp_path, content):
     path = tmp_path / "posterior.nc"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(OutputError, match=r"no such file|not a readable netCDF file"):
+    with pytest.raises(OutputError, match=r"no such file|not a complete result of en4dvar"):
         load_result(path)
 
 
 def test_foreign_netcdf_is_refused(tmp_path):
-    xr.Dataset({"x": ("t", [1.0])}).to_netcdf(tmp_path / "x.nc")
+    path = tmp_path / "x.nc"
+    xr.Dataset({"x": ("t", [1.0])}).to_netcdf(path)
+    with pytest.raises(OutputError, match="not a complete result of en4dvar"):
+        load_result(path)
+    path.write_bytes(sealed(path.read_bytes()))
     with pytest.raises(OutputError, match="not a result of en4dvar: no group prior"):
-        load_result(tmp_path / "x.nc")
+        load_result(path)
 
 
 def test_untracked_file_has_no_commit(tmp_path):

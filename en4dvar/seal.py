@@ -1,0 +1,65 @@
+"""The last line of a result file: format, version and SHA-256 of everything before it.
+
+HDF5 has no checksum of its own: of files with one flipped bit most are read without a word, and some send its library
+into an endless loop. The line stands behind the end of the HDF5 file, where every reader of netCDF ignores it; it is
+checked before the library gets to see the file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+from en4dvar.errors import OutputError
+
+FORMAT = "en4dvar-result"
+VERSION = "1"
+_LENGTH = len(f"\n{FORMAT} {VERSION} sha256 {'0' * 64}\n")
+
+
+def sealed(content: bytes) -> bytes:
+    """``content`` with its last line."""
+    return content + _line(hashlib.sha256(content).hexdigest())
+
+
+def seal_file(path: Path) -> None:
+    """Add the last line to a file that is written piece by piece. Raises :class:`OSError`."""
+    with path.open("r+b") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        file.seek(0, os.SEEK_END)
+        file.write(_line(digest))
+
+
+def check_seal(path: Path) -> None:
+    """Read the whole file once and compare.
+
+    Raises
+    ------
+    OutputError: the file cannot be read, is not one of ours, is of another version, cut short or altered.
+    """
+    found = hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            left = max(os.fstat(file.fileno()).st_size - _LENGTH, 0)
+            while left and (block := file.read(min(left, 1 << 20))):
+                found.update(block)
+                left -= len(block)
+            line = file.read()
+    except FileNotFoundError:
+        raise OutputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    words = line.decode("ascii", "replace").split()
+    if words[:1] != [FORMAT] or len(words) != 4:
+        raise OutputError(
+            f"{path}: not a complete result of en4dvar: it is cut short, was altered, or comes from an older version"
+        )
+    if words[1] != VERSION:
+        raise OutputError(f"{path}: result format {words[1]}; this version of en4dvar reads {VERSION}")
+    if line != _line(found.hexdigest()):
+        raise OutputError(f"{path}: damaged or altered since it was written (its checksum does not match)")
+
+
+def _line(digest: str) -> bytes:
+    return f"\n{FORMAT} {VERSION} sha256 {digest}\n".encode("ascii")
