@@ -91,6 +91,18 @@ class Observable:
             object.__setattr__(self, key, getattr(self, key) or value)
 
 
+@dataclass(frozen=True)
+class Shared:
+    """A batch that is ready to be integrated by any number of threads.
+
+    Threads that call ``work``, which releases the interpreter, share the members among themselves; when all calls have
+    returned, ``results`` gives the N trajectories or failures. Who did what makes no difference to them.
+    """
+
+    work: Callable[[], object]
+    results: Callable[[], Sequence[Trajectory | Failure]]
+
+
 class ForwardModel(ABC):
     """F. Subclasses set ``parameters``, ``layout`` and ``observables`` (the first is the default).
 
@@ -140,12 +152,9 @@ class ForwardModel(ABC):
         own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
         return [self._march(x[i], own[i]) for i in range(len(x))]
 
-    def prepare(self, x: Array, times: Array) -> Callable[[], Sequence[Trajectory | Failure]]:
-        """:meth:`trajectories` in two parts: what needs the interpreter is done here, what releases it is returned.
-
-        A thread can then integrate one chunk while the next is prepared. This default prepares nothing.
-        """
-        return lambda: self.trajectories(x, times)
+    def share(self, x: Array, times: Array) -> Shared | None:
+        """:meth:`trajectories` as work that threads share, where the model can; None in this default."""
+        return None
 
     def _march(self, x: Array, times: Array) -> Trajectory | Failure:
         states = np.empty((len(times), self.layout.size))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 
 import numpy as np
 
@@ -22,23 +21,6 @@ def cut(n_members: int, batch: int, workers: int) -> list[slice]:
     batches = -(-n_members // batch)
     edges = [min(n_members, batch * -(-batches * i // min(workers, batches))) for i in range(min(workers, batches) + 1)]
     return [slice(a, b) for a, b in itertools.pairwise(edges)]
-
-
-def prepare_chunk(model: ForwardModel, x: Array, times: Array) -> Callable[[], list[Outcome]]:
-    """:func:`run_chunk` with the model's own preparation done at once."""
-    try:
-        run = model.prepare(x, times)
-    except Exception:  # told by run_chunk, member by member
-        return lambda: run_chunk(model, x, times)
-
-    def finish() -> list[Outcome]:
-        try:
-            outcomes = list(run())
-        except Exception:
-            outcomes = []
-        return outcomes if len(outcomes) == len(x) else run_chunk(model, x, times)
-
-    return finish
 
 
 def run_chunk(model: ForwardModel, x: Array, times: Array) -> list[Outcome]:

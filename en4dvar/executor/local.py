@@ -13,7 +13,7 @@ from typing import Any
 
 from en4dvar.executor.base import ATTEMPTS_ALONE, Executor, T, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
-from en4dvar.executor.chunks import Outcome, prepare_chunk
+from en4dvar.executor.chunks import Outcome
 from en4dvar.forward import ForwardModel
 from en4dvar.state import Array
 
@@ -108,14 +108,23 @@ class ThreadsExecutor(_PoolExecutor):
     def _start(self) -> ThreadPoolExecutor:
         return ThreadPoolExecutor(self.workers, thread_name_prefix="en4dvar")
 
-    def _chunks(self, model: ForwardModel, x: Array, times: Array, chunks: list[slice]) -> list[Outcome]:
-        """Chunks are prepared in the calling thread, which integrates the first of them itself.
+    def trajectories(self, model: ForwardModel, x: Array, times: Array) -> list[Outcome]:
+        """As of any executor; a model that can share a batch among threads is prepared once, in the calling thread.
 
         A forecast takes 1 ms: threads that contend for the interpreter, and one more to wake, would be a third of it.
         """
-        others = [self._submit(prepare_chunk(model, x[part], times[part]), ()) for part in chunks[1:]]
-        results = prepare_chunk(model, x[chunks[0]], times[chunks[0]])()
-        return [*results, *(outcome for other in others for outcome in other.result())]
+        try:
+            shared = model.share(x, times)
+            if shared is None:
+                return super().trajectories(model, x, times)
+            helpers = [self._submit(shared.work, ()) for _ in range(min(self.workers, -(-len(x) // model.batch)) - 1)]
+            shared.work()
+            for helper in helpers:
+                helper.result()
+            results = list(shared.results())
+        except Exception:  # told member by member
+            results = []
+        return results if len(results) == len(x) else super().trajectories(model, x, times)
 
 
 class ProcessesExecutor(_PoolExecutor):

@@ -9,13 +9,13 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from en4dvar.forward import Failure, ForwardModel, Observable, StateField, Trajectory
+from en4dvar.forward import Failure, ForwardModel, Observable, Shared, StateField, Trajectory
 from en4dvar.state import Array, Field, Parameter, StateLayout
 from en4dvar_bubble.driving import Driving, Reading, histotripsy, silence
 from en4dvar_bubble.laws import ConstitutiveLaw, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.parameters import R0, R_EQ, R_MAX
 from en4dvar_bubble.medium import WATER_25C, Medium, saturated_vapour_pressure
-from en4dvar_bubble.packing import law_tables, mass_fraction, pack
+from en4dvar_bubble.packing import constants, law_tables, mass_fraction, pack
 from en4dvar_bubble.paths import BubbleTrajectory, Paths
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.solver.driver import Accuracy, Radial, Solution, System, preset, ready
@@ -107,6 +107,11 @@ class BubbleModel(ForwardModel):
             shear=self.law.shear_dependent,
         )
 
+    @cached_property
+    def constants(self) -> Array:
+        """What all members have in common among the parameters of the compiled solver."""
+        return constants(self)
+
     @property
     def exponent(self) -> float:
         """Polytropic exponent (used without the energy equation)."""
@@ -194,29 +199,30 @@ class BubbleModel(ForwardModel):
         return np.asarray(path.states[0, 0])
 
     def trajectories(self, x: Array, times: Array) -> Sequence[Trajectory | Failure]:
-        return self.prepare(x, times)()
+        shared = self.share(x, times)
+        shared.work()
+        return shared.results()
 
-    def prepare(self, x: Array, times: Array) -> Callable[[], Sequence[Trajectory | Failure]]:
-        run = self.prepared(np.asarray(x, dtype=float), np.broadcast_to(times, (len(x), np.shape(times)[-1])), 0.0)
+    def share(self, x: Array, times: Array) -> Shared:
+        work, finish = self.prepared(np.asarray(x, dtype=float), np.broadcast_to(times, (len(x), np.shape(times)[-1])))
 
-        def finish() -> Sequence[Trajectory | Failure]:
-            path = run()
-            solution = path.solution
+        def results() -> Sequence[Trajectory | Failure]:
+            paths = finish()
             return [
-                BubbleTrajectory(path, i)
-                if solution.status[i] == 0
-                else Failure(solution.reason(i), float(solution.record[i, 5]) * 1e-6)
-                for i in range(len(x))
+                paths.failure(i) if status else BubbleTrajectory(paths, i)
+                for i, status in enumerate(paths.solution.status.tolist())
             ]
 
-        return finish
+        return Shared(work, results)
 
     def integrate(self, x: Array, times: Array, t0: float = 0.0) -> Paths:
         """All members from their states ``x`` (N, n_state) at ``t0`` (s) to ``times`` (N, K) (s, increasing)."""
-        return self.prepared(x, times, t0)()
+        work, finish = self.prepared(x, times, t0)
+        work()
+        return finish()
 
-    def prepared(self, x: Array, times: Array, t0: float = 0.0) -> Callable[[], Paths]:
-        """:meth:`integrate` with all that needs the interpreter done; the returned call releases it."""
+    def prepared(self, x: Array, times: Array, t0: float = 0.0) -> tuple[Callable[[], object], Callable[[], Paths]]:
+        """:meth:`integrate` in two: the work, without the interpreter, which threads can share, and its result."""
         initial, par = pack(self, x)
         tables = law_tables(self, self.law_values(x))
         start = np.full(len(x), t0 * 1e6)
@@ -225,10 +231,10 @@ class BubbleModel(ForwardModel):
         order = np.argsort(np.abs(micro), axis=1, kind="stable") if mirror else None
         if order is not None:
             micro = np.take_along_axis(np.abs(micro), order, axis=1)
-        kernel = ready(self.system, initial, par, tables, start, micro, self.driving, self.reading, self.accuracy)
+        work, solved = ready(self.system, initial, par, tables, start, micro, self.driving, self.reading, self.accuracy)
 
-        def run() -> Paths:
-            solution = kernel()
+        def finish() -> Paths:
+            solution = solved
             if order is not None:
                 back = np.argsort(order, axis=1)
                 states = np.take_along_axis(solution.states, back[:, :, None], axis=1)
@@ -236,4 +242,4 @@ class BubbleModel(ForwardModel):
                 solution = Solution(states, solution.status, solution.record)
             return Paths(self, x, times, solution, par)
 
-        return run
+        return work, finish

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,15 +51,18 @@ def conduction_slope(medium: Medium) -> float:
 def law_tables(model: BubbleModel, values: Mapping[str, Array]) -> Tables:
     """The laws of N members as tables in the kernel's units."""
     law, rho = model.law, model.medium.rho
+    tables = Tables()
     samples = law.samples(values)
-    elastic = {"elastic": law.table(values) / rho} if samples is None else {"samples": samples / rho}
-    extra = {}
+    if samples is None:
+        tables = replace(tables, elastic=law.table(values) / rho)
+    else:
+        tables = replace(tables, samples=samples, factor=1 / rho)
     if model.system.shear:
-        extra["viscous"] = law.viscous_table(values) / rho * 1e6
+        tables = replace(tables, viscous=law.viscous_table(values) / rho * 1e6)
     if model.system.memory:
         memory = law.memory_tables(values)
-        extra["memory"] = np.stack([memory.stiffness, memory.equilibrium], axis=2) / rho
-    return Tables(**elastic, **extra)
+        tables = replace(tables, memory=np.stack([memory.stiffness, memory.equilibrium], axis=2) / rho)
+    return tables
 
 
 def pack(model: BubbleModel, x: Array) -> tuple[Array, Array]:
@@ -70,7 +74,7 @@ def pack(model: BubbleModel, x: Array) -> tuple[Array, Array]:
     initial = np.zeros((len(x), system.size))
     initial[:, -2] = column["Rdot"] / column["R"] * 1e-6
     initial[:, -1] = log_R
-    par = np.zeros((len(x), rows.PARAMETERS + rows.PER_MEMORY * system.memory))
+    par = np.tile(model.constants, (len(x), 1))
     gas = (column["p_b"] - medium.p_v) / medium.rho
     if system.gas:
         m = system.gas
@@ -98,24 +102,32 @@ def pack(model: BubbleModel, x: Array) -> tuple[Array, Array]:
             at = rows.MEMORY + rows.PER_MEMORY * j
             par[:, at], par[:, at + 1] = memory.relaxation_time[:, j] * 1e6, memory.convection[j]
 
-    par[:, rows.VAPOUR] = medium.p_v / medium.rho
-    par[:, rows.AMBIENT] = medium.p_inf / medium.rho
-    par[:, rows.SURFACE] = 2 * medium.S / medium.rho * 1e6
-    par[:, rows.VISCOSITY] = column["mu"] / medium.rho * 1e6 if "mu" in column and not system.shear else 0.0
-    par[:, rows.INVERSE_C] = 0.0 if system.radial == "rayleigh-plesset" else 1 / medium.c
-    par[:, rows.CONDUCTION] = medium.K_inf * medium.T_inf / medium.rho * 1e6
-    par[:, rows.KAPPA] = medium.kappa if system.gas else model.exponent
-    par[:, rows.SLOPE] = slope
     par[:, rows.LOG_R0] = np.log(column[model.stress_free_radius] * 1e6)
-    par[:, rows.AMPLITUDE] = model.driving.amplitude / medium.rho
-    par[:, rows.TAIT_B] = medium.tait_B / medium.rho
-    par[:, rows.TAIT_N] = medium.tait_n
-    par[:, rows.DIFFUSION] = medium.D_v * 1e6
-    par[:, rows.SATURATION] = _SATURATION / medium.rho
-    par[:, rows.SATURATION_T] = _SATURATION_T / medium.T_inf
-    R_v = GAS_CONSTANT / medium.M_v
-    par[:, rows.LATENT] = medium.L_v / (R_v * medium.T_inf) * medium.D_v * medium.rho / (medium.K_inf * medium.T_inf)
-    par[:, rows.MEDIUM_K] = medium.K_m / medium.K_inf
-    par[:, rows.MEDIUM_D] = medium.K_m / (medium.rho * medium.c_m) * 1e6
-    par[:, rows.HEATING] = 12 / (medium.c_m * medium.T_inf)
+    if "mu" in column and not system.shear:
+        par[:, rows.VISCOSITY] = column["mu"] / medium.rho * 1e6
     return initial, par
+
+
+def constants(model: BubbleModel) -> Array:
+    """The parameter rows of the solver that are the same for every member, (rows,); zeros elsewhere."""
+    medium, system = model.medium, model.system
+    row = np.zeros(rows.PARAMETERS + rows.PER_MEMORY * system.memory)
+    row[rows.VAPOUR] = medium.p_v / medium.rho
+    row[rows.AMBIENT] = medium.p_inf / medium.rho
+    row[rows.SURFACE] = 2 * medium.S / medium.rho * 1e6
+    row[rows.INVERSE_C] = 0.0 if system.radial == "rayleigh-plesset" else 1 / medium.c
+    row[rows.CONDUCTION] = medium.K_inf * medium.T_inf / medium.rho * 1e6
+    row[rows.KAPPA] = medium.kappa if system.gas else model.exponent
+    row[rows.SLOPE] = conduction_slope(medium)
+    row[rows.AMPLITUDE] = model.driving.amplitude / medium.rho
+    row[rows.TAIT_B] = medium.tait_B / medium.rho
+    row[rows.TAIT_N] = medium.tait_n
+    row[rows.DIFFUSION] = medium.D_v * 1e6
+    row[rows.SATURATION] = _SATURATION / medium.rho
+    row[rows.SATURATION_T] = _SATURATION_T / medium.T_inf
+    R_v = GAS_CONSTANT / medium.M_v
+    row[rows.LATENT] = medium.L_v / (R_v * medium.T_inf) * medium.D_v * medium.rho / (medium.K_inf * medium.T_inf)
+    row[rows.MEDIUM_K] = medium.K_m / medium.K_inf
+    row[rows.MEDIUM_D] = medium.K_m / (medium.rho * medium.c_m) * 1e6
+    row[rows.HEATING] = 12 / (medium.c_m * medium.T_inf)
+    return row

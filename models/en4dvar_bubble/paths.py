@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from en4dvar.forward import Trajectory
-from en4dvar.state import Array
+from en4dvar.forward import Failure, Trajectory
+from en4dvar.state import Array, StateLayout
 from en4dvar_bubble.laws.base import GRID
 from en4dvar_bubble.medium import saturated_vapour_pressure
 from en4dvar_bubble.packing import conduction_slope, from_kirchhoff, mass_fraction
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.collocation import ball
 from en4dvar_bubble.solver.driver import Solution
+from en4dvar_bubble.solver.integrate import END_TIME
 from en4dvar_bubble.tables import evaluate
 
 if TYPE_CHECKING:
@@ -38,6 +39,10 @@ class Paths:
             compute: Any = getattr(self, f"_{name}", None)
             self._fields[name] = self._constant(name) if compute is None else compute()
         return self._fields[name]
+
+    def failure(self, member: int) -> Failure:
+        """Why and when (s) a member's integration ended early."""
+        return Failure(self.solution.reason(member), float(self.solution.record[member, END_TIME]) * 1e-6)
 
     @property
     def states(self) -> Array:
@@ -114,13 +119,18 @@ class BubbleTrajectory(Trajectory):
     _member: int
 
     def __init__(self, paths: Paths, member: int):
-        object.__setattr__(self, "_paths", paths)
-        object.__setattr__(self, "_member", member)
-        object.__setattr__(self, "times", paths.times[member])
-        object.__setattr__(self, "layout", paths.model.layout)
+        self.__dict__.update(_paths=paths, _member=member)  # the dataclass is frozen
+
+    @property
+    def times(self) -> Array:
+        return np.asarray(self._paths.times[self._member])
+
+    @property
+    def layout(self) -> StateLayout:
+        return self._paths.model.layout
 
     def __getitem__(self, name: str) -> Array:
-        return np.asarray(self._paths[name][self._member])
+        return cast(Array, self._paths[name][self._member])
 
     @property
     def states(self) -> Array:

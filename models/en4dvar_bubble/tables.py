@@ -58,13 +58,13 @@ def _cell(out, a, da, dda, b, db, ddb):
 def from_values(samples: Array) -> Array:
     """Coefficients (N, cells, 8) from samples (N, cells + 1 + 2·HALO) of the function."""
     out = np.empty((len(samples), samples.shape[1] - 1 - 2 * HALO, 8))
-    fill(samples, out)
+    fill(samples, 1.0, out)
     return out
 
 
 @nb.njit(cache=True, nogil=True)
-def fill(samples, out):
-    """Write the coefficients of :func:`from_values` to ``out`` (N, cells, 8)."""
+def fill(samples, factor, out):
+    """Write the coefficients of :func:`from_values`, of ``factor`` times the samples, to ``out`` (N, cells, 8)."""
     n, total = samples.shape
     cells = total - 1 - 2 * HALO
     for i in range(n):
@@ -72,13 +72,13 @@ def fill(samples, out):
         a = da = dda = 0.0
         for j in range(cells + 1):
             at = j + HALO
-            b = row[at]
+            b = factor * row[at]
             db = 0.0
             ddb = _SECOND_CENTRE * b
             for r in range(HALO):
                 right, left = row[at + r + 1], row[at - r - 1]
-                db += _FIRST[r] * (right - left)
-                ddb += _SECOND[r] * (right + left)
+                db += factor * _FIRST[r] * (right - left)
+                ddb += factor * _SECOND[r] * (right + left)
             if j > 0:
                 _cell(out[i, j - 1], a, da, dda, b, db, ddb)
             a, da, dda = b, db, ddb

@@ -69,7 +69,12 @@ class Driving:
         table[:, :6] = samples @ _TO_COEFFICIENTS.T
         return table
 
-    @property
+    @cached_property
+    def span(self) -> Array:
+        """(begin, end, cells per µs, cells) of the table."""
+        return self.grid.span
+
+    @cached_property
     def breaks(self) -> Array:
         """Instants (µs, increasing) at which a time step must end: the stops and both ends; none when silent."""
         if self.silent:

@@ -20,7 +20,7 @@ from en4dvar.errors import ConfigError
 from en4dvar.state import Array, Parameter
 from en4dvar_bubble.laws.memory import MemoryTables, MemoryVariable
 from en4dvar_bubble.laws.parameters import MU
-from en4dvar_bubble.laws.tabulate import GRID, from_function, from_strain_energy, sample
+from en4dvar_bubble.laws.tabulate import GRID, STRETCH, from_function, from_strain_energy
 from en4dvar_bubble.laws.viscous import VISCOUS_GRID, mean_viscosity
 from en4dvar_bubble.tables import evaluate, from_values
 
@@ -29,6 +29,7 @@ __all__ = ["GRID", "REGISTRY", "VISCOUS_GRID", "ConstitutiveLaw", "Liquid", "Mem
 REGISTRY: dict[str, type[ConstitutiveLaw]] = {}
 FILE_MODULE = "_en4dvar_bubble_law_"
 """Module names of laws loaded from a file; such laws are not registered."""
+_TOGETHER = 48  # members sampled at once: their temporary arrays fit in the cache
 _EXAMPLE_BY_NAME = {"G": 5e3, "alpha": 0.03, "mu": 0.1}
 _EXAMPLE_BY_UNIT = {"Pa": 5e3, "Pa s": 0.1, "s": 1e-6, "1": 0.5}
 
@@ -123,9 +124,14 @@ class ConstitutiveLaw:
         """J_e in Pa of N members at the nodes of the grid and its halo, (N, K); None where the law is W′(λ)."""
         if type(self).stress is ConstitutiveLaw.stress:
             return None
-        p, n = _namespace(values)
+        n = len(next(iter(values.values())))
+        samples = np.empty((n, len(GRID.nodes)))
         with np.errstate(all="ignore"):  # a law may overflow at stretches that no member reaches
-            return sample(lambda stretch: self.stress(stretch, p), n)
+            for first in range(0, n, _TOGETHER):
+                some = slice(first, first + _TOGETHER)
+                p, _ = _namespace({name: value[some] for name, value in values.items()})
+                samples[some] = self.stress(STRETCH, p)
+        return samples
 
     def table(self, values: Mapping[str, Array]) -> Array:
         """J_e against ln λ for N members: (N, cells, 8) coefficients on :data:`GRID`, Pa. ``values``: name → (N,)."""

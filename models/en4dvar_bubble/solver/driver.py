@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -96,12 +96,12 @@ class System:
         """1 where the wall temperature is an unknown."""
         return int(self.medium > 0)
 
-    @property
+    @cached_property
     def general(self) -> bool:
         """Whether the general equations are needed."""
         return bool(self.vapour or self.medium or self.memory or self.shear or RADIALS[self.radial] != rows.PRESSURE)
 
-    @property
+    @cached_property
     def size(self) -> int:
         return self.gas + self.vapour + self.medium + self.wall + self.memory + 2
 
@@ -134,6 +134,7 @@ class System:
         return tol
 
 
+_ELASTIC_SPAN, _VISCOUS_SPAN = GRID.span, VISCOUS_GRID.span
 _NO_TABLE = np.zeros((0, GRID.cells, 8))
 _NO_SAMPLES = np.zeros((0, len(GRID.nodes)))
 
@@ -142,12 +143,13 @@ _NO_SAMPLES = np.zeros((0, len(GRID.nodes)))
 class Tables:
     """What the laws of N members contribute, over the density.
 
-    J_e either as ``samples`` (N, nodes with halo), tabulated when a member's turn comes, or as finished tables
-    ``elastic`` (N, cells, 8); ``viscous`` (N, cells, 8) of ν (µm²/µs); ``memory`` (N, q, 2, cells, 8) of stiffness and
-    equilibrium.
+    J_e either as ``samples`` (N, nodes with halo) times ``factor``, tabulated when a member's turn comes, or as
+    finished tables ``elastic`` (N, cells, 8); ``viscous`` (N, cells, 8) of ν (µm²/µs); ``memory`` (N, q, 2, cells, 8)
+    of stiffness and equilibrium.
     """
 
     samples: Array = field(default_factory=lambda: _NO_SAMPLES)
+    factor: float = 1.0
     elastic: Array = field(default_factory=lambda: _NO_TABLE)
     viscous: Array = field(default_factory=lambda: _NO_TABLE)
     memory: Array = field(default_factory=lambda: _NO_TABLE)
@@ -232,8 +234,12 @@ def ready(
     driving: Driving,
     reading: Reading,
     accuracy: Accuracy,
-) -> Callable[[], Solution]:
-    """Everything set for the compiled integration of N members; the returned call runs it, without the interpreter.
+) -> tuple[Callable[[], object], Solution]:
+    """Everything set for the compiled integration of N members; a call that does it without the interpreter,
+    and the solution that it fills.
+
+    Threads that make the call at once share the members, those that ring longest first, so that the lanes run dry
+    together; each returns when no member is left to begin, and all are done when all have returned.
 
     initial (N, n) and parameters (N, rows) in the kernel's units; start (N,) and times (N, K) in µs, times increasing.
     Members never influence each other: the bits do not depend on how they are batched.
@@ -242,34 +248,32 @@ def ready(
     out = np.empty((n_members, times.shape[1], system.size))
     status = np.zeros(n_members, dtype=np.int64)
     record = np.zeros((n_members, integrate.RECORD))
-    span = driving.grid.span
+    span = driving.span
     inside = (span[1] - span[0]) / _STEPS_IN_DRIVING
-    member = np.arange(n_members, dtype=float)
-    parameters = parameters.copy()
-    parameters[:, rows.VISCOUS_TABLE] = member * (VISCOUS_GRID.cells * 8)
-    for j in range(system.memory):
-        offset = (member * system.memory + j) * (2 * GRID.cells * 8)
-        parameters[:, rows.MEMORY + rows.PER_MEMORY * j + 2] = offset
+    if system.general:
+        parameters = parameters.copy()
+        member = np.arange(n_members, dtype=float)
+        parameters[:, rows.VISCOUS_TABLE] = member * (VISCOUS_GRID.cells * 8)
+        for j in range(system.memory):
+            offset = (member * system.memory + j) * (2 * GRID.cells * 8)
+            parameters[:, rows.MEMORY + rows.PER_MEMORY * j + 2] = offset
+    order = np.argsort(parameters[:, rows.VISCOSITY], kind="stable")
     arguments = (
+        (np.zeros(1, dtype=np.int64), order),
         np.ascontiguousarray(initial),
         parameters,
         np.ascontiguousarray(start),
         np.ascontiguousarray(times),
         system.dims,
-        (tables.samples, tables.elastic),
-        (_gas_operators(system.gas), GRID.span, driving.table, span, READINGS[reading]),
-        (_medium_operators(system.medium), tables.viscous, VISCOUS_GRID.span, tables.memory.reshape(-1, 1, 8)),
+        (tables.samples, tables.factor, tables.elastic),
+        (_gas_operators(system.gas), _ELASTIC_SPAN, driving.table, span, READINGS[reading]),
+        (_medium_operators(system.medium), tables.viscous, _VISCOUS_SPAN, tables.memory.reshape(-1, 1, 8)),
         *_lengths(system),
         driving.breaks,
         system.tolerances(accuracy.rtol),
-        np.array([_FIRST_STEP, inside, float(accuracy.step_limit), accuracy.mach_limit, accuracy.time_limit]),
+        np.array([_FIRST_STEP, inside, accuracy.step_limit, accuracy.mach_limit, accuracy.time_limit]),
         out,
         status,
         record,
     )
-
-    def run() -> Solution:
-        integrate.integrate(*arguments)
-        return Solution(out, status, record)
-
-    return run
+    return partial(integrate.integrate, *arguments), Solution(out, status, record)

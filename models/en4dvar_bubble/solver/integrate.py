@@ -13,7 +13,7 @@ from numba.core import types
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.equations import jacobian, rhs
 from en4dvar_bubble.solver.general import general_jacobian, general_rhs
-from en4dvar_bubble.solver.lanes import WIDTH, absolute, exp, load, log, maximum, splat, sqrt, store
+from en4dvar_bubble.solver.lanes import WIDTH, absolute, exp, load, log, maximum, splat, sqrt, store, take
 from en4dvar_bubble.solver.rows import AMPLITUDE, INVERSE_C, TABLE
 from en4dvar_bubble.tables import fill
 
@@ -164,21 +164,25 @@ def _workspace(m, n):
 
 @nb.njit(cache=True, nogil=True)
 def integrate(
-    initial, parameters, start, times, dims, law, world, extra, nodes, size, breaks, tol, limits, out, status, record
-):
+    queue, initial, parameters, start, times, dims, law, world, extra, nodes, size, breaks, tol, limits, out, status,
+    record,
+):  # fmt: skip
     """Integrate N members and write their states at the output times.
 
+    ``queue`` = (counter (1,), order (N,)): members are taken in this order; threads that call with the same arrays at
+    once share the members, and which of them integrates one makes no difference to it.
     initial (N, n), parameters (N, rows), start (N,) µs, times (N, K) increasing µs; ``dims``, ``world`` (without the
     elastic tables) and ``extra`` as for :func:`general.general_rhs`; ``law`` = (samples (N, nodes) of J_e, tabulated
-    when a member's turn comes, or (0, nodes); finished tables (N, cells, 8)); ``nodes`` and ``size`` as for
-    :func:`_attempt`; ``tol`` (2, n) absolute and relative tolerances; ``breaks`` increasing instants the steps must not
-    straddle; ``limits`` = (first step, longest step inside the driving, step limit, Mach limit, seconds per member).
-    Outputs: out (N, K, n) with NaN where not reached, status (N,), record (N, RECORD).
+    when a member's turn comes, or (0, nodes); their factor; finished tables (N, cells, 8)); ``nodes`` and ``size`` as
+    for :func:`_attempt`; ``tol`` (2, n) absolute and relative tolerances; ``breaks`` increasing instants the steps must
+    not straddle; ``limits`` = (first step, longest step inside the driving, step limit, Mach limit, seconds per
+    member). Outputs: out (N, K, n) with NaN where not reached, status (N,), record (N, RECORD).
     """
     n_members, n = initial.shape
     n_times = times.shape[1]
     m = dims[0]
-    samples, finished = law
+    samples, factor, finished = law
+    counter, order = queue
     ops, espan, drive, dspan, reading = world
     cells = int(espan[3])
     elastic = np.zeros((WIDTH, cells, 8))  # of the members in the lanes: small enough for the cache
@@ -195,18 +199,21 @@ def integrate(
     old_h = np.empty(WIDTH)
     old_root = np.empty(WIDTH)
     rejected = np.zeros(WIDTH, dtype=np.bool_)
-    waiting = 0
+    waiting = True
     running = 0
     first_step, inside_step, step_limit, mach_limit, seconds = limits
     began = np.zeros(WIDTH, dtype=np.int64)
     clock = _clock(0)
-    turn = 0
+    attempts = 0
 
     while True:
         for lane in range(WIDTH):  # refill
-            while member[lane] < 0 and waiting < n_members:
-                i = waiting
-                waiting += 1
+            while member[lane] < 0 and waiting:
+                turn = take(counter)
+                waiting = turn < n_members
+                if not waiting:
+                    break
+                i = order[turn]
                 record[i, :] = 0.0
                 record[i, MIN_LOG_R] = initial[i, n - 1]
                 done = 0
@@ -230,7 +237,7 @@ def integrate(
                     par[j, lane] = parameters[i, j]
                 par[TABLE, lane] = lane * cells * 8
                 if samples.shape[0] > 0:
-                    fill(samples[i : i + 1], elastic[lane : lane + 1])
+                    fill(samples[i : i + 1], factor, elastic[lane : lane + 1])
                 else:
                     elastic[lane] = finished[i]
                 t[0, lane] = start[i]
@@ -251,8 +258,8 @@ def integrate(
                     h[0, lane] = breaks[next_break[lane]] - now
         if running == 0:
             break
-        turn += 1
-        if turn % _TURNS_PER_LOOK == 0:
+        attempts += 1
+        if attempts % _TURNS_PER_LOOK == 0:
             clock = _clock(0)
 
         _attempt(y, t, h, par, dims, system, extra, nodes, size, tol, w)

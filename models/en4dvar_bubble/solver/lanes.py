@@ -174,6 +174,17 @@ def any_lane(typingctx, condition):
     return types.boolean(mask), codegen
 
 
+@intrinsic
+def take(typingctx, counter):
+    """The number in ``counter[0]``, one more for whoever asks next; no two threads ever get the same."""
+
+    def codegen(context, builder, sig, args):
+        array = context.make_array(sig.args[0])(context, builder, args[0])
+        return builder.atomic_rmw("add", array.data, ir.Constant(_I64, 1), "monotonic")
+
+    return types.int64(counter), codegen
+
+
 def _unary(name: str) -> Any:
     @intrinsic
     def function(typingctx, x):
