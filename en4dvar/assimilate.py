@@ -13,6 +13,8 @@ from en4dvar.descent import Local, WeightSpace
 from en4dvar.errors import ConfigError, TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.forecast import Forecast, check_problem, cost, forecast, has_noise_scale, log_posterior
+from en4dvar.honesty import Caution, Ending, caution, examine
+from en4dvar.honesty.checks import down_weighted
 from en4dvar.likelihood import error_std, log_likelihood, robust_weights, whitened_residual
 from en4dvar.mda import assimilate_once
 from en4dvar.problem import Analysis, AssimilationSettings, InverseProblem, IterationRecord
@@ -64,7 +66,7 @@ class LoopState:
 
     weights: Weights
     forward_runs: int
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Caution, ...] = ()
     records: tuple[IterationRecord, ...] = ()
     worst_loss: tuple[str, ...] = ()
     stop_reason: str = ""
@@ -81,7 +83,7 @@ class _Outcome:
     converged: bool
     reason: str
     records: tuple[IterationRecord, ...]
-    warnings: tuple[str, ...]
+    worst_loss: tuple[str, ...]
 
 
 class _Run:
@@ -128,7 +130,8 @@ class _Run:
         )
         huber, huber_warnings = self.robust(last.predictions[0], *at_centre)
         per_parameter = diag.dfs_per_parameter(space.members, posterior)
-        shape = {} if refinement else self.shape(posterior, mode, after)
+        costs = self.costs(posterior, after)
+        shape = {} if refinement else diag.gaussianity(posterior, mode, costs)
         record = end.records[-1]
         used = int(np.sum(observations.weights > 0))
         prior = problem.prior
@@ -167,18 +170,30 @@ class _Run:
             log_evidence=diag.log_evidence(
                 end.cost, end.step.hessian.singular_values, len(space.members), observations
             ),
-            warnings=(
-                *state.warnings,
-                *(() if end.converged else (f"not converged: {end.reason}",)),
-                *diag.loss_warning("prior forecast", prior_run.failures[:-1]),
-                *end.warnings,
-                *refine_warnings,
-                *diag.loss_warning("posterior forecast", after.failures),
-                *diag.fit_warnings(record.chi2_per_observation * used, used, record.dfs),
-                *huber_warnings,
-                *diag.conflict_warnings(prior.names, mode, prior.mean, prior.std),
-                *diag.shape_warnings(shape),
-                *diag.information_warnings(prior.names, per_parameter),
+            limits=problem.model.validity,
+            extremes=after.extremes,
+            cautions=examine(
+                Ending(
+                    prior=prior,
+                    members=space.members,
+                    posterior=posterior,
+                    mode=mode,
+                    costs=costs,
+                    cost=float(self.costs(mode[None], last)[0]),
+                    converged=end.converged,
+                    stop_reason=end.reason,
+                    chi2=record.chi2_per_observation * used,
+                    n_weighted=used,
+                    dfs=record.dfs,
+                    dfs_per_parameter=per_parameter,
+                    prior_failures=prior_run.failures[:-1],
+                    worst_loss=end.worst_loss,
+                    posterior_failures=after.failures,
+                    shape=shape,
+                    limits=problem.model.validity,
+                    extremes=after.extremes,
+                    found=(*state.warnings, *refine_warnings, *huber_warnings),
+                )
             ),
         )
 
@@ -207,22 +222,21 @@ class _Run:
 
     def robust(
         self, prediction: Array, rate: Array | None, scale: Array | None
-    ) -> tuple[Array | None, tuple[str, ...]]:
+    ) -> tuple[Array | None, tuple[Caution, ...]]:
         """Huber's weights (K,) at the centre and words for those below one; None with Gaussian errors."""
         observations, model = self.problem.observations, self.problem.model
         if observations.huber is None:
             return None, ()
         weights = robust_weights(observations, whitened_residual(observations, prediction, rate, scale))
         times = convert(observations.times, model.time_unit, model.time_display_unit)
-        return weights, diag.robust_warnings(weights, times, model.time_display_unit, observations.huber)
+        return weights, down_weighted(weights, times, model.time_display_unit, observations.huber)
 
-    def shape(self, posterior: Array, mode: Array, run: Forecast) -> dict[str, float]:
-        """How Gaussian the posterior is, from the forecast of the posterior ensemble."""
-        z = (posterior - self.problem.prior.mean) / self.problem.prior.std
-        costs = 0.5 * np.sum(z**2, axis=1) + self.space.observation_cost(run)
-        return diag.gaussianity(posterior, mode, costs)
+    def costs(self, members: Array, run: Forecast) -> Array:
+        """J (N,) of members (N, n), from their forecast and the prior's own mean and covariance."""
+        z = (members - self.problem.prior.mean) / self.problem.prior.std
+        return np.asarray(0.5 * np.sum(z**2, axis=1) + self.space.observation_cost(run))
 
-    def refine(self, posterior: Array) -> tuple[Array, dict[str, float], tuple[str, ...]]:
+    def refine(self, posterior: Array) -> tuple[Array, dict[str, float], tuple[Caution, ...]]:
         """The posterior ensemble (N, n), the summary of the chain that replaced it, and warnings."""
         if self.settings.refine == "none":
             return posterior, {}, ()
@@ -233,7 +247,7 @@ class _Run:
             return log_posterior(self.problem, x, space.executor)
 
         chain = mcmc.sample(log_density, posterior, self.seed)
-        warnings = () if chain.converged else (chain.warning(),)
+        warnings = () if chain.converged else (caution("chain-not-converged", chain.warning()),)
         return chain.thin(len(posterior), self.settings.sampling == "exact"), chain.summary(), warnings
 
     def iterate(self, state: LoopState) -> _Outcome:
@@ -264,8 +278,7 @@ class _Run:
             if self.progress is not None:
                 self.progress(self.problem.observations.name, records[-1])
             if stop:
-                warnings = diag.loss_warning("iterations", worst_loss)
-                return _Outcome(weights, step, total, converged, stop, tuple(records), warnings)
+                return _Outcome(weights, step, total, converged, stop, tuple(records), worst_loss)
             if move is None:  # a regression over a narrower ensemble may still show the way down
                 weights = contracted
                 continue
@@ -290,8 +303,7 @@ class _Run:
             if self.progress is not None:
                 self.progress(self.problem.observations.name, records[-1])
             if done:
-                warnings = diag.loss_warning("iterations", worst_loss)
-                return _Outcome(weights, step, at.cost, True, f"{count} assimilations", tuple(records), warnings)
+                return _Outcome(weights, step, at.cost, True, f"{count} assimilations", tuple(records), worst_loss)
             weights = assimilate_once(space, at, scheme, len(records) - 1, self.seed)
 
     def same_members(self, a: Weights, b: Weights) -> bool:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from en4dvar.errors import TooFewMembersError
+from en4dvar.honesty import Caution
 from en4dvar.store import ParameterSummary, Result, load_result
 
 _RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")  # names of devices on Windows
@@ -26,7 +27,7 @@ class DatasetOutcome:
     file: Path | None
     failure: str = ""
     exit_code: int = 0
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Caution, ...] = ()
     summary: tuple[ParameterSummary, ...] = ()
 
 

@@ -72,31 +72,6 @@ def chi2_interval(degrees: float) -> tuple[float, float]:
     return float(2 * gammaincinv(degrees / 2, TAIL)), float(2 * gammaincinv(degrees / 2, 1 - TAIL))
 
 
-def fit_warnings(chi2: float, n_observations: int, total_dfs: float) -> tuple[str, ...]:
-    """Words for a residual χ² (the sum over the observations) that R does not explain.
-
-    At the minimum its expectation is K − DFS, not K (Talagrand 1999): the fit has absorbed DFS of the noise.
-    """
-    degrees = max(1.0, n_observations - total_dfs)
-    low, high = chi2_interval(degrees)
-    fit = f"χ² of the residuals is {chi2:.3g} where about {degrees:.3g} is expected"
-    if chi2 > high:
-        return (f"{fit}: the model does not explain the data within the stated observation error",)
-    if chi2 < low:
-        return (f"{fit}: the stated observation error is larger than the scatter of the data",)
-    return ()
-
-
-def conflict_warnings(names: Sequence[str], centre: Array, mean: Array, std: Array) -> tuple[str, ...]:
-    """Words for a posterior mode far from the prior: 2 J_b beyond the 99.95 % point of χ²_n. All (n,), transformed."""
-    z = (centre - mean) / std
-    if float(z @ z) <= chi2_interval(len(z))[1]:
-        return ()
-    worst = np.argsort(-np.abs(z))
-    listed = ", ".join(f"{names[j]} by {z[j]:+.1f}" for j in worst if abs(z[j]) > 2) or f"{names[worst[0]]} most"
-    return (f"prior and data conflict: the minimum lies far from the prior mean ({listed} prior standard deviations)",)
-
-
 def gaussianity(members: Array, mode: Array, costs: Array) -> dict[str, float]:
     """How well the posterior ensemble, as a Gaussian, agrees with the posterior at its own members.
 
@@ -130,35 +105,6 @@ def shape_warnings(shape: Mapping[str, float]) -> tuple[str, ...]:
         f"the posterior is far from Gaussian (effective share of members {shape['gaussian_fit']:.2f}): mean and spread "
         "of the ensemble may be off by more than they say; refine: mcmc samples it",
     )
-
-
-def robust_warnings(weights: Array, times: Array, unit: str, threshold: float, most: int = 6) -> tuple[str, ...]:
-    """Words for the observations that a robust cost counts less; weights and times (K,), ``unit`` of the times."""
-    lighter = np.flatnonzero(weights < 1)
-    if not len(lighter):
-        return ()
-    worst = lighter[np.argsort(weights[lighter], kind="stable")]
-    listed = ", ".join(f"{times[k]:.4g} {unit} (weight {weights[k]:.2g})" for k in worst[:most])
-    more = f" and {len(worst) - most} more" if len(worst) > most else ""
-    return (
-        f"{len(worst)} of {len(weights)} observations lie beyond {threshold:g} standard deviations and were "
-        f"down-weighted (Huber): {listed}{more}",
-    )
-
-
-def information_warnings(names: Sequence[str], per_parameter: Array) -> tuple[str, ...]:
-    """Words for parameters the data hardly constrain."""
-    return tuple(
-        f"{name} is hardly informed by the data (DFS {value:.2f}): its posterior is close to its prior"
-        for name, value in zip(names, per_parameter, strict=True)
-        if value < HARDLY_INFORMED
-    )
-
-
-def loss_warning(stage: str, failures: Sequence[str]) -> tuple[str, ...]:
-    """Words for members lost in a forecast; ``failures`` (N,) are reasons, "" for members alive."""
-    lost = sum(1 for reason in failures if reason)
-    return (f"{lost} of {len(failures)} members failed in the {stage}: {common_reasons(failures)}",) if lost else ()
 
 
 def common_reasons(failures: Sequence[str], most: int = 3) -> str:

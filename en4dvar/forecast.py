@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,8 @@ class Forecast:
 
     ``predictions`` (B, K) at the observations, ``rates`` (B, K) of the observable or None where no observation has a
     timing error, ``path`` (B, M) at the extra times, ``failures`` (B,) reasons, "" for members alive, ``noise_scale``
-    (B,) σ of each member or None where it is neither estimated nor fixed.
+    (B,) σ of each member or None where it is neither estimated nor fixed, ``extremes`` (B, V) what the members reached
+    of the model's V limits of validity (empty without extra times).
     """
 
     predictions: Array
@@ -33,6 +34,7 @@ class Forecast:
     path: Array
     failures: tuple[str, ...]
     noise_scale: Array | None = None
+    extremes: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
     def active(self) -> Array:
@@ -46,6 +48,7 @@ class Forecast:
             self.path[members],
             self.failures[members],
             None if self.noise_scale is None else self.noise_scale[members],
+            self.extremes[members],
         )
 
 
@@ -78,12 +81,15 @@ def forecast(
 
     observed = np.full((n_members, len(times)), np.nan)
     rates = None if rate_operator is None else np.full((n_members, len(times)), np.nan)
+    limits = problem.model.validity if extra_times.size else ()
+    extremes = np.full((n_members, len(limits)), np.nan)
     for i, outcome in outcomes.items():
         if isinstance(outcome, Failure):
             failures[i] = outcome.reason
             continue
         try:
             row = _observe(problem, outcome, rate_operator)
+            extremes[i] = [outcome.largest(limit.name) for limit in limits]
         except Exception as error:  # H belongs to the user as well
             failures[i] = describe(error)
             continue
@@ -99,6 +105,7 @@ def forecast(
         observed[:, at_extra],
         tuple(failures),
         _of_framework(problem, physical, NOISE_SCALE, 1.0) if has_noise_scale(problem) else None,
+        extremes,
     )
 
 

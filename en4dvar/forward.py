@@ -28,6 +28,13 @@ class Trajectory:
         """The field ``name`` along the path: (K,) or (K, size)."""
         return self.layout.unpack(self.states)[name]
 
+    def largest(self, name: str) -> float:
+        """What a quantity of the model's ``validity`` reached along the path; by default |field of that name|.
+
+        A model whose quantity peaks between the stored instants overrides this.
+        """
+        return float(np.max(np.abs(self[name])))
+
 
 @dataclass(frozen=True)
 class Failure:
@@ -35,6 +42,24 @@ class Failure:
 
     reason: str
     time: float = float("nan")
+
+
+@dataclass(frozen=True)
+class ValidityLimit:
+    """A quantity that must stay below ``value`` along a path for the model's own assumptions to hold.
+
+    The model computes on beyond it; a result says where its members went (see :mod:`en4dvar.honesty`). ``label`` is in
+    words, e.g. "Mach number of the wall"; ``source`` says where the limit comes from.
+    """
+
+    name: str
+    value: float
+    unit: str = "1"
+    label: str = ""
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "label", self.label or self.name)
 
 
 @runtime_checkable
@@ -109,7 +134,8 @@ class ForwardModel(ABC):
     ``time_unit`` / ``time_display_unit`` label the time axis of observations. ``batch`` is the number of members the
     fast path likes to get at once (executors cut chunks at multiples of it); ``compiled`` says that ``trajectories``
     releases the interpreter lock, so that threads serve it. ``autonomous`` says that F depends on elapsed time alone:
-    sequential schemes may start ``trajectories`` at any instant, where otherwise they repeat ``step``.
+    sequential schemes may start ``trajectories`` at any instant, where otherwise they repeat ``step``. ``validity``
+    names quantities and the limits beyond which the equations do not hold.
 
     To be usable from YAML a model class also has ``Settings`` (a pydantic model of its ``model:`` section) and
     ``from_settings``.
@@ -123,6 +149,7 @@ class ForwardModel(ABC):
     batch: ClassVar[int] = 1
     compiled: ClassVar[bool] = False
     autonomous: ClassVar[bool] = False
+    validity: tuple[ValidityLimit, ...] = ()
 
     @abstractmethod
     def initial_state(self, theta: Mapping[str, float]) -> Array:

@@ -50,7 +50,7 @@ def build_tree(analysis: Analysis, attributes: Mapping[str, Any]) -> xr.DataTree
         "data_source": analysis.observations.source,
         "seed": analysis.seed,
         "assimilation_settings": json.dumps(asdict(analysis.settings)),
-        "warnings": "\n".join(" ".join(w.split()) for w in analysis.warnings),
+        "warnings": "\n".join(c.line for c in analysis.cautions),
     }
     groups["/"] = xr.Dataset(attrs=netcdf_attributes({**root, **attributes}))
     return xr.DataTree.from_dict(groups)
@@ -191,8 +191,20 @@ def _sample_stats(a: Analysis) -> xr.Dataset:
         "converged": a.converged,
         "stop_reason": a.stop_reason,
         "forward_runs": a.forward_runs,
+        "warning_codes": " ".join(dict.fromkeys(c.code for c in a.cautions)),
         **a.shape,
         **a.refinement,
+    }
+    reached = {
+        limit.name: _variable(
+            MEMBER,
+            a.extremes[None, :, i],
+            limit.unit,
+            limit.label,
+            limit=limit.value,
+            source=limit.source,
+        )
+        for i, limit in enumerate(a.limits)
     }
     reason = "reason of failure, empty where the member is alive"
     return xr.Dataset(
@@ -208,6 +220,7 @@ def _sample_stats(a: Analysis) -> xr.Dataset:
             ),
             "dfs": _variable("parameter", a.dfs_per_parameter, "1", "degrees of freedom for signal of the parameter"),
             f"{name}_centre": _observable(a, ("time",), a.centre_predictions, "prediction at the minimum of J"),
+            **reached,
         },
         {
             **_member_coords(len(active)),

@@ -12,6 +12,7 @@ from typing import Any
 from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.checkpoint import write_checkpoint
 from en4dvar.executor import Executor
+from en4dvar.honesty import Caution
 from en4dvar.netcdf import to_bytes
 from en4dvar.problem import AssimilationSettings, InverseProblem, IterationRecord
 from en4dvar.progress import Progress, describe
@@ -48,7 +49,7 @@ class Estimate:
     last: IterationRecord
     ending: str
     summary: tuple[ParameterSummary, ...]
-    warnings: tuple[str, ...]
+    warnings: tuple[Caution, ...]
     n_observations: int
 
 
@@ -81,7 +82,7 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
         last=analysis.iterations[-1],
         summary=result.summary(),
         ending=f"{outcome}: {analysis.stop_reason}; {analysis.forward_runs} forward runs",
-        warnings=analysis.warnings,
+        warnings=analysis.cautions,
         n_observations=len(analysis.observations),
     )
 

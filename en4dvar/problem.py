@@ -6,11 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
-from en4dvar.forward import ForwardModel, Observable
+import numpy as np
+
+from en4dvar.forward import ForwardModel, Observable, ValidityLimit
 from en4dvar.observations import Observations
 from en4dvar.state import Array, Parameter
 
 if TYPE_CHECKING:
+    from en4dvar.honesty import Caution
     from en4dvar.prior import Prior
 
 
@@ -133,8 +136,15 @@ class Analysis:
     forward_runs: int
     seed: int
     settings: AssimilationSettings
-    warnings: tuple[str, ...] = ()
+    cautions: tuple[Caution, ...] = ()  # why not to trust the posterior, the worst first
     log_evidence: float = float("nan")  # ln p(y), Laplace approximation
     shape: Mapping[str, float] = field(default_factory=dict)  # how Gaussian the posterior is (diagnostics.gaussianity)
     huber_weight: Array | None = None  # (K,) weights of the robust cost at the centre, where there is one
     refinement: Mapping[str, float] = field(default_factory=dict)  # summary of the Markov chain, if any
+    limits: tuple[ValidityLimit, ...] = ()  # V of the model
+    extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) reached by the posterior members
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The words of the cautions."""
+        return tuple(c.words for c in self.cautions)

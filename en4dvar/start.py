@@ -13,6 +13,7 @@ import numpy as np
 from en4dvar import diagnostics as diag
 from en4dvar.descent import Local, WeightSpace
 from en4dvar.forecast import Forecast
+from en4dvar.honesty import Caution, caution
 from en4dvar.schemes import Weights
 from en4dvar.state import Array
 
@@ -20,7 +21,7 @@ ROUGH = 1e-2  # relative decrease of J at which a scout stops: it only has to te
 SAME = 1.0  # posterior standard deviations between scouts that have met
 
 
-def choose_start(space: WeightSpace, run: Forecast) -> tuple[Array, tuple[str, ...]]:
+def choose_start(space: WeightSpace, run: Forecast) -> tuple[Array, tuple[Caution, ...]]:
     """Weights (N,) to start from and warnings. ``run`` is the forecast of the prior members and, last, of their mean.
 
     ``start: best-member`` compares descents from the ``starts`` members of lowest J, where a linearisation takes so
@@ -30,11 +31,12 @@ def choose_start(space: WeightSpace, run: Forecast) -> tuple[Array, tuple[str, .
     # e_i moved to the minimum-norm weights of the same member, so that J_b is ½‖x − x̄0‖² in the prior covariance
     candidates = np.vstack([space.basis @ space.basis.T, np.zeros(n_members)])
     costs = diag.background_cost(candidates) + space.observation_cost(run)
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Caution, ...] = ()
     if space.settings.start == "prior-mean":
         if np.isfinite(costs[-1]):
             return candidates[-1], ()
-        warnings = (f"the prior mean cannot be run ({run.failures[-1]}); started from the best prior member",)
+        words = f"the prior mean cannot be run ({run.failures[-1]}); started from the best prior member"
+        warnings = (caution("start-moved", words),)
     best = np.argsort(costs, kind="stable")
     affordable = n_members // (space.basis.shape[1] + 1) if space.economical else 1
     chosen = [candidates[i] for i in best[: min(space.settings.starts, affordable)] if np.isfinite(costs[i])]

@@ -13,6 +13,7 @@ import xarray as xr
 from en4dvar.errors import OutputError
 from en4dvar.files import write_bytes
 from en4dvar.groups import build_tree
+from en4dvar.honesty import Caution
 from en4dvar.netcdf import to_bytes
 from en4dvar.problem import Analysis
 from en4dvar.seal import check_seal
@@ -100,9 +101,14 @@ class Result:
         return str(next(iter(self.dataset("log_likelihood").data_vars)))
 
     @property
+    def cautions(self) -> tuple[Caution, ...]:
+        """Why not to trust the posterior, or read it with care: code, severity, words, advice; the worst first."""
+        return tuple(map(Caution.parse, str(self.tree.attrs["warnings"]).splitlines()))
+
+    @property
     def warnings(self) -> tuple[str, ...]:
-        """What the assimilation found worth a warning."""
-        return tuple(str(self.tree.attrs["warnings"]).splitlines())
+        """The words of the cautions."""
+        return tuple(c.words for c in self.cautions)
 
     def dataset(self, group: str) -> xr.Dataset:
         """A group of the file, e.g. ``"prior_predictive"``."""

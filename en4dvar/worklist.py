@@ -18,6 +18,7 @@ from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, ThreadsExecutor
 from en4dvar.files import write_bytes
 from en4dvar.fingerprint import Identity
+from en4dvar.honesty import Caution
 from en4dvar.jobs import Estimate, Job, estimate
 from en4dvar.progress import Progress, RunLog
 from en4dvar.rundir import RunDirectory
@@ -42,7 +43,7 @@ class Done:
     sha256: str
     failure: str = ""
     exit_code: int = 0
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Caution, ...] = ()
     n_observations: int = 0
     summary: tuple[ParameterSummary, ...] = ()
 
@@ -198,7 +199,7 @@ class Worklist:
             if self.progress is not None:
                 self.progress(d.name, value.last)
         self.log.write(f"{d.name}: {value.ending}")
-        self.log.write("\n".join(f"{d.name}: warning: {warning}" for warning in value.warnings))
+        self.log.write("\n".join(f"{d.name}: {warning.severity}: {warning}" for warning in value.warnings))
         write_bytes(self.directory.work / d.file, value.content)
         record = Done(
             digest(value.content),

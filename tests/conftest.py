@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from en4dvar.forward import Observable, StateField
+from en4dvar.honesty import caution
 from en4dvar.observations import Observations
 from en4dvar.problem import Analysis, AssimilationSettings, IterationRecord
 from en4dvar.state import TIME_SHIFT, Array, Parameter
@@ -100,7 +101,7 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
         forward_runs=6 * n_members,
         seed=11,
         settings=AssimilationSettings(members=n_members),
-        warnings=("1 of 24 members lost: collapse too violent",),
+        cautions=(caution("members-lost", "1 of 24 members failed in the posterior forecast: collapse too violent"),),
     )
     return replace(analysis, **changes)
 

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from en4dvar.forward import Failure, ForwardModel, Observable, Shared, StateField, Trajectory
+from en4dvar.forward import Failure, ForwardModel, Observable, Shared, StateField, Trajectory, ValidityLimit
 from en4dvar.state import Array, Field, Parameter, StateLayout
 from en4dvar_bubble.driving import Driving, Reading, histotripsy, silence
 from en4dvar_bubble.laws import ConstitutiveLaw, QuadraticKelvinVoigt
@@ -24,6 +24,14 @@ Gas = Literal["heat", "polytropic", "isothermal", "adiabatic"]
 Start = Literal["acoustic", "laser"]
 Vapour = Literal["none", "frozen", "transport"]
 Heat = Literal["cold", "conducting"]
+
+FIRST_ORDER = "an expansion to first order in the Mach number: Prosperetti & Lezzi (1986), J. Fluid Mech. 168, 457"
+MACH_LIMITS: Mapping[Radial, tuple[float, str]] = {
+    "rayleigh-plesset": (0.3, "an incompressible liquid; 0.3 is the usual limit"),
+    "keller-miksis": (1.0, FIRST_ORDER),
+    "keller-miksis-enthalpy": (1.0, FIRST_ORDER),
+    "gilmore": (2.2, "agrees with the full equations up to there: Hickling & Plesset (1964), Phys. Fluids 7, 7"),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +119,12 @@ class BubbleModel(ForwardModel):
     def constants(self) -> Array:
         """What all members have in common among the parameters of the compiled solver."""
         return constants(self)
+
+    @property
+    def validity(self) -> tuple[ValidityLimit, ...]:  # type: ignore[override]
+        """The largest Mach number of the wall that the radial equation can bear, and where that is said."""
+        value, source = MACH_LIMITS[self.radial]
+        return (ValidityLimit("wall_mach", value, label="Mach number of the bubble wall", source=source),)
 
     @property
     def exponent(self) -> float:

@@ -15,7 +15,7 @@ from en4dvar_bubble.packing import conduction_slope, from_kirchhoff, mass_fracti
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.collocation import ball
 from en4dvar_bubble.solver.driver import Solution
-from en4dvar_bubble.solver.integrate import END_TIME
+from en4dvar_bubble.solver.integrate import END_TIME, MAX_MACH
 from en4dvar_bubble.tables import evaluate
 
 if TYPE_CHECKING:
@@ -131,6 +131,15 @@ class BubbleTrajectory(Trajectory):
 
     def __getitem__(self, name: str) -> Array:
         return cast(Array, self._paths[name][self._member])
+
+    def largest(self, name: str) -> float:
+        """Of the wall Mach number: over all steps of the solver; with Rayleigh–Plesset over the stored instants."""
+        if name != "wall_mach":
+            return super().largest(name)
+        model = self._paths.model
+        if model.radial == "rayleigh-plesset":  # its equations know no speed of sound
+            return float(np.max(np.abs(self["Rdot"]))) / model.medium.c
+        return float(self._paths.solution.record[self._member, MAX_MACH])
 
     @property
     def states(self) -> Array:

@@ -68,7 +68,7 @@ def test_fewer_survivors_than_parameters_is_an_error():
 def test_prior_mean_that_fails_falls_back_to_the_best_member():
     problem = make_problem(Fragile(-0.9, names=NAMES), TRUTH)
     analysis = assimilate(problem, settings("bundle", max_iterations=20), 4)
-    assert analysis.warnings[0] == "the prior mean cannot be run (too stiff); started from the best prior member"
+    assert "the prior mean cannot be run (too stiff); started from the best prior member" in analysis.warnings
     assert analysis.converged
 
 
