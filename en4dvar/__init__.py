@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from en4dvar.batch import Batch as Batch
     from en4dvar.config import Config as Config
     from en4dvar.config import TwinConfig as TwinConfig
     from en4dvar.config import load_config as load_config
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from en4dvar.units import Quantity as Quantity
 
 _HOME = {
+    "batch": ("Batch",),
     "config": ("Config", "TwinConfig", "load_config", "load_twin"),
     "errors": ("ConfigError", "DataError", "En4dvarError", "OutputError", "TooFewMembersError"),
     "forward": ("Failure", "ForwardModel", "Observable", "StateField", "Trajectory"),

@@ -37,20 +37,6 @@ def apply_weights(ensemble: Array, rows: Array, out: Array | None = None, chunk:
     return out
 
 
-def rotate(anomalies: Array, rng: np.random.Generator, reflections: int = 4) -> Array:
-    """Anomalies (N, n) under a random orthogonal map of the members that keeps mean and covariance.
-
-    A product of Householder reflections with directions uniform on the unit sphere of 1⊥: a random walk on the group
-    of such maps whose stationary law is Haar's, at O(N n) where drawing from Haar's law itself costs O(N³).
-    Why rotate: Sakov & Oke (2008), Mon. Wea. Rev. 136, 1042.
-    """
-    directions = rng.standard_normal((reflections, len(anomalies)))
-    directions -= directions.mean(axis=1, keepdims=True)
-    for v in directions:
-        anomalies = anomalies - np.multiply.outer(2 / (v @ v) * v, v @ anomalies)
-    return anomalies
-
-
 def anomaly_basis(anomalies: Array) -> Array:
     """Orthonormal columns U (N, r) that span the column space of the anomalies X (N, n), r = rank X ≤ min(n, N − 1).
 

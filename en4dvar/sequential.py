@@ -11,19 +11,22 @@ those of one ensemble; its reason is kept.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
+from en4dvar.batch import Batch
 from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.forward import Failure, ForwardModel, Observable, Trajectory
 from en4dvar.inflation import Inflation
-from en4dvar.linalg import apply_weights, centre, rotate
+from en4dvar.linalg import centre
 from en4dvar.localisation import Localisation
-from en4dvar.prior import member_stream
+from en4dvar.moments import Moments, MomentsRecorder
+from en4dvar.rotation import Rotations, rotate
 from en4dvar.schemes import Evaluation, Step, Weights
+from en4dvar.series import Series
 from en4dvar.state import Array
 
 NO_INFLATION = Inflation()
@@ -45,32 +48,10 @@ class SequentialScheme(Protocol):
 
 
 @dataclass(frozen=True)
-class Series:
-    """Observations ``values`` (K, p) at increasing ``times`` (K,) > 0 with independent errors ``std`` (p,) or (K, p).
-
-    Raises
-    ------
-    ValueError: shapes that do not fit, times that do not increase from zero, std that is not positive.
-    """
-
-    times: Array
-    values: Array
-    std: Array
-
-    def __post_init__(self) -> None:
-        if self.values.ndim != 2 or self.times.shape != self.values.shape[:1]:
-            raise ValueError(f"values {self.values.shape} do not match times {self.times.shape}")
-        if self.std.shape not in (self.values.shape, self.values.shape[1:]):
-            raise ValueError(f"std {self.std.shape} does not match values {self.values.shape}")
-        if not (np.all(np.diff(self.times, prepend=0.0) > 0) and np.all(self.std > 0)):
-            raise ValueError("times must increase from zero and std must be positive")
-
-
-@dataclass(frozen=True)
 class SequentialSettings:
     """How the loop treats the ensemble of ``scheme``; ``localisation`` only with a filter (lag 0).
 
-    ``rotation``: every analysis is turned by a random mean-preserving rotation (:func:`~en4dvar.linalg.rotate`).
+    ``rotation``: every analysis is turned by a random mean-preserving rotation (:mod:`en4dvar.rotation`).
     """
 
     scheme: SequentialScheme
@@ -85,20 +66,22 @@ class SequentialSettings:
 
 
 @dataclass(frozen=True)
-class Moments:
-    """Ensemble mean and standard deviation (K, n_state) at the observation times; NaN where there is none."""
+class SequentialState:
+    """All that the rest of a run depends on, besides its arguments, and what it has found so far.
 
-    mean: Array
-    std: Array
+    ``cycle`` is the next one; ``ensemble`` (N', n_state) stands at ``start`` (0: time zero, k: observation time k).
+    Random numbers are drawn by cycle, so that no generator has a state. Rows of the arrays are the cycles done.
+    """
 
-    @classmethod
-    def empty(cls, cycles: int, size: int) -> Moments:
-        return cls(np.full((cycles, size), np.nan), np.full((cycles, size), np.nan))
-
-    def put(self, cycle: int, ensemble: Array, scale: float = 1.0) -> None:
-        mean, anomalies = centre(ensemble)
-        self.mean[cycle] = mean
-        self.std[cycle] = scale * np.sqrt(np.einsum("ij,ij->j", anomalies, anomalies) / (len(ensemble) - 1))
+    cycle: int
+    start: int
+    ensemble: Array
+    forecast: Moments
+    analysis: Moments
+    smoothed: Moments
+    iterations: Array
+    forward_runs: int
+    failures: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -127,18 +110,33 @@ def run_sequential(
     seed: int = 0,
     executor: Executor | None = None,
     on_cycle: Callable[[int], None] | None = None,
+    resume: SequentialState | None = None,
+    keep: Callable[[Callable[[], SequentialState]], None] | None = None,
 ) -> SequentialResult:
     """Assimilate ``series`` into ``members`` (N, n_state), the ensemble at time zero.
 
     The operators of ``observables`` act at each instant by itself; their outputs side by side are the p predictions.
-    ``seed`` drives the rotations. Raises :class:`TooFewMembersError`.
+
+    Parameters
+    ----------
+    seed: of the rotations. on_cycle: called with the number of each cycle, from 0.
+    resume: where an earlier call with the same arguments was interrupted; the result has the same bits as without.
+    keep: called after each cycle with a function that gives the state to resume from.
+
+    Raises
+    ------
+    TooFewMembersError: the ensemble is lost. ValueError: localisation with correlated errors.
     """
+    if settings.localisation is not None and series.correlation is not None:
+        raise ValueError("localisation needs observations with independent errors")
     with one_blas_thread():
-        loop = _Loop(model, tuple(observables), members, series, settings, seed, executor or SerialExecutor())
-        for cycle in range(len(series.times)):
+        loop = _Loop(model, tuple(observables), members, series, settings, seed, executor or SerialExecutor(), resume)
+        for cycle in range(resume.cycle if resume else 0, len(series.times)):
             loop.cycle(cycle)
             if on_cycle is not None:
                 on_cycle(cycle)
+            if keep is not None:
+                keep(loop.state)
         return loop.result()
 
 
@@ -158,59 +156,79 @@ class _Started(ForwardModel):
 
 def propagate(
     model: ForwardModel, states: Array, start: float, times: Array, executor: Executor
-) -> list[Trajectory | Failure]:
-    """Members (N, n_state) from ``start`` to ``times`` (later than ``start``), in order."""
+) -> tuple[Array, list[str]]:
+    """Members (N, n_state) from ``start`` to later ``times`` (K,): (N, K, n_state) and no reasons, or reasons (N,)."""
     mover = model if model.autonomous or start == 0 else _Started(model, start)
-    return executor.trajectories(mover, states, times - start)
+    outcomes = executor.trajectories(mover, states, times - start)
+    if isinstance(outcomes, Batch) and outcomes.whole:
+        return outcomes.states, []
+    failed = [outcome.reason if isinstance(outcome, Failure) else "" for outcome in outcomes]
+    if any(failed):
+        return np.empty(0), failed
+    return np.array([outcome.states for outcome in outcomes if isinstance(outcome, Trajectory)]), []
 
 
 def predictions(observables: Sequence[Observable], trajectory: Trajectory) -> Array:
     """(K, p): outputs (K,) or (K, q) of the operators along a trajectory, side by side."""
-    return np.column_stack([observable.operator(trajectory) for observable in observables])
+    outputs = [observable.operator(trajectory) for observable in observables]
+    return outputs[0] if len(outputs) == 1 and outputs[0].ndim == 2 else np.column_stack(outputs)
 
 
-@dataclass
 class _Loop:
-    model: ForwardModel
-    observables: tuple[Observable, ...]
-    ensemble: Array  # (N, n) at the start of the window
-    series: Series
-    settings: SequentialSettings
-    seed: int
-    executor: Executor
-    start: int = 0  # of the window: 0 is time zero, k the k-th observation time
-    forward_runs: int = 0
-    failures: list[str] = field(default_factory=list)
+    """The ensemble (N, n) at the start of the window and what has been recorded."""
 
-    def __post_init__(self) -> None:
-        self.initial_members = len(self.ensemble)
-        self.rng = member_stream(self.seed, "rotation")
-        self.times = np.concatenate([[0.0], self.series.times])
-        cycles, size = len(self.series.times), self.ensemble.shape[1]
-        self.before, self.after, self.smooth = (Moments.empty(cycles, size) for _ in range(3))
+    def __init__(
+        self,
+        model: ForwardModel,
+        observables: tuple[Observable, ...],
+        members: Array,
+        series: Series,
+        settings: SequentialSettings,
+        seed: int,
+        executor: Executor,
+        resume: SequentialState | None,
+    ):
+        self.model, self.observables, self.executor = model, observables, executor
+        self.series, self.settings, self.scheme = series, settings, settings.scheme
+        self.initial_members, size = members.shape
+        self.rotations = Rotations(seed, self.initial_members) if settings.rotation else None
+        self.times = np.concatenate([[0.0], series.times])
+        cycles = len(series.times)
         self.iterations = np.zeros(cycles)
+        self.ensemble, self.start, self.forward_runs = members, 0, 0  # start: k is the k-th observation time
+        self.failures: list[str] = []
+        earlier: tuple[Moments | None, ...] = (None, None, None)
+        if resume is not None:
+            self.ensemble, self.start, self.forward_runs = resume.ensemble, resume.start, resume.forward_runs
+            self.failures = list(resume.failures)
+            self.iterations[: resume.cycle] = resume.iterations
+            earlier = resume.forecast, resume.analysis, resume.smoothed
+        self.before, self.after, self.smooth = (MomentsRecorder(cycles, size, moments) for moments in earlier)
+        self.cycles_done = resume.cycle if resume else 0
+
+    def state(self) -> SequentialState:
+        done = self.cycles_done
+        before, after, smooth = (recorder.moments().until(done) for recorder in (self.before, self.after, self.smooth))
+        return SequentialState(
+            done, self.start, self.ensemble, before, after, smooth, self.iterations[:done].copy(),
+            self.forward_runs, tuple(self.failures),
+        )  # fmt: skip
 
     def result(self) -> SequentialResult:
+        before, after, smooth = (recorder.moments() for recorder in (self.before, self.after, self.smooth))
         return SequentialResult(
-            self.before,
-            self.after,
-            self.smooth,
-            self.iterations,
-            self.ensemble,
-            tuple(self.failures),
-            self.forward_runs,
+            before, after, smooth, self.iterations, self.ensemble, tuple(self.failures), self.forward_runs
         )
 
     def cycle(self, k: int) -> None:
         """Assimilate observation k (index k + 1 of ``times``) and move the window to its next start."""
-        newest, lag = k + 1, self.settings.scheme.lag
+        newest, lag = k + 1, self.scheme.lag
         if lag == 0:
             (self.ensemble,) = self.run(self.ensemble, [newest])
             self.start = newest
-        posterior = self.window(k)
-        mean, anomalies = centre(posterior)
-        if self.settings.rotation:
-            anomalies = rotate(anomalies, self.rng)
+        mean, anomalies = self.window(k)
+        if self.rotations is not None:
+            anomalies = rotate(anomalies, self.rotations.of_cycle(k, len(anomalies)))
         self.ensemble = mean + self.settings.inflation.apply(self.ensemble, anomalies)
         next_start = max(self.start, newest + 1 - lag) if lag else newest
         if 0 < self.start < next_start:
@@ -218,9 +236,10 @@ class _Loop:
         at = self.run(self.ensemble, sorted({next_start, newest}))
         self.after.put(k, at[-1])
         self.ensemble, self.start = at[0], next_start
+        self.cycles_done = newest
 
-    def window(self, k: int) -> Array:
-        """The posterior ensemble at the start of the window; members lost on the way are dropped from the prior."""
+    def window(self, k: int) -> tuple[Array, Array]:
+        """Mean and anomalies of the posterior at the start of the window; members lost are dropped from the prior."""
         while True:
             posterior, failed = self.iterate(k)
             if posterior is not None:
@@ -228,14 +247,14 @@ class _Loop:
             self.drop(failed)
             self.ensemble = self.ensemble[[not reason for reason in failed]]
 
-    def iterate(self, k: int) -> tuple[Array | None, list[str]]:
-        scheme, newest, n_members = self.settings.scheme, k + 1, len(self.ensemble)
+    def iterate(self, k: int) -> tuple[tuple[Array, Array] | None, list[str]]:
+        scheme, newest = self.scheme, k + 1
         mean, anomalies = centre(self.ensemble)
-        weights = scheme.init(n_members)
+        weights = scheme.init(len(anomalies))
         for iteration in range(1, scheme.max_iterations + 1):
             spread = scheme.spread(weights)
             states, failed = self.forecast(mean + (weights.w + spread) @ anomalies, [newest])
-            if any(failed):
+            if failed:
                 return None, failed
             if iteration == 1:  # here the scheme's spread is a multiple of I
                 self.before.put(k, states[-1], 1 / spread[0, 0])
@@ -243,19 +262,14 @@ class _Loop:
             predicted = self.predict(states[-1], newest)
             if not np.isfinite(predicted).all():
                 return None, ["" if row.all() else "non-finite prediction" for row in np.isfinite(predicted)]
-            evaluation = self.evaluate(k, weights, predicted)
+            evaluation = Evaluation(*self.series.whiten(k, *scheme.linearise(weights, predicted)))
             if self.settings.localisation is not None:
-                return self.settings.localisation.analysis(self.ensemble, evaluation), []
+                return centre(self.settings.localisation.analysis(self.ensemble, evaluation)), []
             step = scheme.step(weights, evaluation)
             weights = Weights(weights.w + step.direction, step.transform)
             if step.norm <= scheme.tolerance:
                 break
-        return apply_weights(self.ensemble, weights.rows), []
-
-    def evaluate(self, k: int, weights: Weights, predictions: Array) -> Evaluation:
-        std = self.series.std if self.series.std.ndim == 1 else self.series.std[k]
-        reference, spread = self.settings.scheme.linearise(weights, predictions)
-        return Evaluation((self.series.values[k] - reference) / std, (spread / std).T)
+        return (mean + weights.w @ anomalies, weights.T @ anomalies), []
 
     def predict(self, states: Array, index: int) -> Array:
         """Predictions (N, p): H acts at one instant, so members stand where it expects times."""
@@ -264,17 +278,15 @@ class _Loop:
         )
 
     def forecast(self, states: Array, indices: Sequence[int]) -> tuple[list[Array], list[str]]:
-        """Members at the start of the window → ensembles (N, n) at times of ``indices``, and reasons (N,)."""
+        """Members at the start of the window → ensembles (N, n) at times of ``indices``, or reasons (N,)."""
         ahead = [i for i in indices if i > self.start]
         if not ahead:
             return [states] * len(indices), []
         self.forward_runs += len(states)
-        outcomes = propagate(self.model, states, self.times[self.start], self.times[ahead], self.executor)
-        failed = [o.reason if isinstance(o, Failure) else "" for o in outcomes]
-        if any(failed):
+        paths, failed = propagate(self.model, states, self.times[self.start], self.times[ahead], self.executor)
+        if failed:
             return [], failed
-        paths = np.array([o.states for o in outcomes if isinstance(o, Trajectory)])
-        return [states] * (len(indices) - len(ahead)) + [paths[:, j] for j in range(len(ahead))], failed
+        return [states] * (len(indices) - len(ahead)) + [paths[:, j] for j in range(len(ahead))], []
 
     def run(self, states: Array, indices: Sequence[int]) -> list[Array]:
         """As :meth:`forecast`, again with the survivors where members are lost."""

@@ -123,5 +123,9 @@ class StateLayout:
 
     def unpack(self, x: Array) -> dict[str, Array]:
         """Views of the fields of ``x`` (…, n_state); blocks of size one lose their last axis."""
-        sizes = {f.name: f.size for f in self.fields}
-        return {n: x[..., s.start] if sizes[n] == 1 else x[..., s] for n, s in self.slices.items()}
+        return {name: self.part(x, name) for name in self.slices}
+
+    def part(self, x: Array, name: str) -> Array:
+        """View of one field of ``x`` (…, n_state), as in :meth:`unpack`."""
+        where = self.slices[name]
+        return x[..., where.start] if where.stop - where.start == 1 else x[..., where]

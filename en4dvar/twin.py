@@ -19,8 +19,10 @@ import numpy as np
 from en4dvar.errors import En4dvarError
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.forward import Failure, ForwardModel, Observable
+from en4dvar.moments import Moments
 from en4dvar.prior import Prior, member_stream
-from en4dvar.sequential import Moments, SequentialResult, SequentialSettings, Series, predictions, run_sequential
+from en4dvar.sequential import SequentialResult, SequentialSettings, predictions, run_sequential
+from en4dvar.series import Series
 from en4dvar.state import Array
 
 

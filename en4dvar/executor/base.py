@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -43,7 +43,7 @@ class Executor(ABC):
         ExecutorError: the workers cannot be reached.
         """
 
-    def trajectories(self, model: ForwardModel, x: Array, times: Array) -> list[Outcome]:
+    def trajectories(self, model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
         """Initial states (B, n_state) and times (K,) or (B, K) → B trajectories or failures, in the order of members.
 
         Members are cut into chunks at multiples of ``model.batch``, so that every compiled batch holds the same

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
+from en4dvar.batch import Batch
 from en4dvar.forward import Failure, ForwardModel, Trajectory
 from en4dvar.state import Array
 
@@ -23,11 +25,11 @@ def cut(n_members: int, batch: int, workers: int) -> list[slice]:
     return [slice(a, b) for a, b in itertools.pairwise(edges)]
 
 
-def run_chunk(model: ForwardModel, x: Array, times: Array) -> list[Outcome]:
+def run_chunk(model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
     """Run a chunk; where the model raises, run its batches one by one, so that only a raising batch is lost."""
     times = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
     try:
-        outcomes = list(model.trajectories(x, times))
+        outcomes = _kept(model.trajectories(x, times))
         reason = f"the model returned {len(outcomes)} trajectories for {len(x)} members"
     except Exception as error:  # a model may fail in any way; the reason is kept
         outcomes, reason = [], describe(error)
@@ -37,6 +39,10 @@ def run_chunk(model: ForwardModel, x: Array, times: Array) -> list[Outcome]:
         return [Failure(reason)] * len(x)
     parts = [slice(i, i + model.batch) for i in range(0, len(x), model.batch)]
     return [outcome for part in parts for outcome in run_chunk(model, x[part], times[part])]
+
+
+def _kept(outcomes: Sequence[Outcome]) -> Sequence[Outcome]:
+    return outcomes if isinstance(outcomes, Batch) else list(outcomes)
 
 
 def describe(error: BaseException) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context, parent_process
@@ -13,7 +13,7 @@ from typing import Any
 
 from en4dvar.executor.base import ATTEMPTS_ALONE, Executor, T, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
-from en4dvar.executor.chunks import Outcome
+from en4dvar.executor.chunks import Outcome, run_chunk
 from en4dvar.forward import ForwardModel
 from en4dvar.state import Array
 
@@ -30,6 +30,10 @@ class SerialExecutor(Executor):
             except Exception as error:
                 value = error
             yield i, value
+
+    def trajectories(self, model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
+        """As they come from the model: nothing is cut, nothing is collected."""
+        return run_chunk(model, x, times)
 
     def close(self) -> None:
         """Nothing to release."""
@@ -108,7 +112,7 @@ class ThreadsExecutor(_PoolExecutor):
     def _start(self) -> ThreadPoolExecutor:
         return ThreadPoolExecutor(self.workers, thread_name_prefix="en4dvar")
 
-    def trajectories(self, model: ForwardModel, x: Array, times: Array) -> list[Outcome]:
+    def trajectories(self, model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
         """As of any executor; a model that can share a batch among threads is prepared once, in the calling thread.
 
         A forecast takes 1 ms: threads that contend for the interpreter, and one more to wake, would be a third of it.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from en4dvar import Field, ForwardModel, Observable, Parameter, StateField, StateLayout, Trajectory
+from en4dvar import Batch, Field, ForwardModel, Observable, Parameter, StateField, StateLayout
 
 Integrate = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 
@@ -34,18 +34,10 @@ class Autonomous(ForwardModel):
     def step(self, x: np.ndarray, t0: float, t1: float) -> np.ndarray:
         return np.asarray(self.integrate(x[None], np.array([[t1 - t0]]), self.longest_step)[0, 0])
 
-    def trajectories(self, x: np.ndarray, times: np.ndarray) -> list[Any]:
-        own = np.ascontiguousarray(np.broadcast_to(times, (len(x), np.shape(times)[-1])))
-        paths = self.integrate(np.ascontiguousarray(x), own, self.longest_step)
-        if np.isfinite(paths).all():
-            return [Trajectory(t, states, self.layout) for t, states in zip(own, paths, strict=True)]
-        return [self._outcome(t, states) for t, states in zip(own, paths, strict=True)]
-
-    def _outcome(self, times: np.ndarray, states: np.ndarray) -> Any:
-        from en4dvar import Failure
-
-        bad = np.flatnonzero(~np.isfinite(states).all(axis=1))
-        return Failure("non-finite state", float(times[bad[0]])) if len(bad) else Trajectory(times, states, self.layout)
+    def trajectories(self, x: np.ndarray, times: np.ndarray) -> Batch:
+        own = np.empty((len(x), np.shape(times)[-1]))
+        own[:] = times
+        return Batch(own, self.integrate(np.ascontiguousarray(x), own, self.longest_step), self.layout)
 
 
 def dimensionless(name: str, label: str, symbol: str, source: str) -> Parameter:

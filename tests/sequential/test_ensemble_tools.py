@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from en4dvar.inflation import Inflation, relaxation
-from en4dvar.linalg import GRAM_LIMIT, Hessian, apply_weights, centre, rotate
+from en4dvar.linalg import GRAM_LIMIT, Hessian, apply_weights, centre
 from en4dvar.localisation import Localisation, distances, gaspari_cohn
+from en4dvar.moments import BLOCK, MomentsRecorder
+from en4dvar.rotation import Rotations, reflections, rotate
 from en4dvar.schemes import Evaluation, Weights, gauss_newton
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.sequential import SequentialSettings
@@ -39,23 +41,59 @@ def test_inflation_refuses_nonsense(arguments):
         Inflation(*arguments)
 
 
-@pytest.mark.parametrize("reflections", [1, 2, 5])
-def test_rotation_keeps_mean_and_covariance_and_mixes_members(reflections):
+@pytest.mark.parametrize("number", [1, 2, 5])
+def test_rotation_keeps_mean_and_covariance_and_mixes_members(number):
     anomalies = centre(RNG(0).standard_normal((9, 30)))[1]
-    turned = rotate(anomalies, RNG(1), reflections)
+    directions = RNG(1).standard_normal((number, 9))
+    turned = rotate(anomalies, reflections(directions))
     assert np.max(np.abs(turned.sum(axis=0))) < 1e-13
     assert np.max(np.abs(turned.T @ turned - anomalies.T @ anomalies)) < 1e-12
     assert np.linalg.norm(turned - anomalies) > 0.1 * np.linalg.norm(anomalies)
+    one_by_one = anomalies
+    for v in directions - directions.mean(axis=1, keepdims=True):
+        one_by_one = one_by_one - np.outer(2 * v / (v @ v), v @ one_by_one)
+    assert turned == pytest.approx(one_by_one, abs=1e-13)
 
 
 def test_rotations_reach_every_direction():
     """Repeated, they forget where they started: the mean of turned anomalies vanishes as 1/√(number)."""
-    anomalies, rng = centre(np.eye(8))[1], RNG(0)
+    anomalies, rotations = centre(np.eye(8))[1], Rotations(0, 8)
     total, current = np.zeros((8, 8)), anomalies
-    for _ in range(4000):
-        current = rotate(current, rng)
+    for cycle in range(4000):
+        current = rotate(current, rotations.of_cycle(cycle, 8))
         total += current
     assert np.max(np.abs(total / 4000)) < 0.05 * np.max(np.abs(anomalies))
+
+
+def test_a_cycle_has_its_own_rotation():
+    """Whatever was drawn before; a lost member takes its own random numbers away and no others."""
+    onward, anew = Rotations(3, 8), Rotations(3, 8)
+    for cycle in range(130):
+        factors = onward.of_cycle(cycle, 8)
+    assert all(np.array_equal(a, b) for a, b in zip(factors, anew.of_cycle(129, 8), strict=True))
+    assert not np.array_equal(factors[0], onward.of_cycle(128, 8)[0])
+    fewer, whole = anew.of_cycle(129, 7)[1], factors[1]
+    assert np.diff(fewer) == pytest.approx(np.diff(whole)[:, :6], abs=1e-14)  # up to their mean
+
+
+@pytest.mark.parametrize("shape", [(5, 1), (6, 3), (40, 41), (9, 200)])
+def test_moments_do_not_depend_on_the_blocks_they_are_taken_in(shape):
+    ensembles = RNG(0).standard_normal((2 * BLOCK + 3, *shape))
+    onward = MomentsRecorder(len(ensembles), shape[1])
+    for cycle, ensemble in enumerate(ensembles):
+        onward.put(cycle, ensemble, 2.0)
+    whole = onward.moments()
+    assert whole.mean == pytest.approx(ensembles.mean(axis=1), abs=1e-14)
+    assert whole.std == pytest.approx(2 * ensembles.std(axis=1, ddof=1), rel=1e-13)
+    single = MomentsRecorder(len(ensembles), shape[1])
+    for cycle, ensemble in enumerate(ensembles[:9]):
+        single.put(cycle, ensemble, 2.0)
+        assert np.array_equal(single.moments().std[: cycle + 1], whole.std[: cycle + 1])
+    resumed = MomentsRecorder(len(ensembles), shape[1], single.moments().until(9))
+    for cycle in range(9, len(ensembles)):
+        resumed.put(cycle, ensembles[cycle], 2.0)
+    for a, b in ((resumed.moments().mean, whole.mean), (resumed.moments().std, whole.std)):
+        assert np.array_equal(a, b)
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 64, 10_000])

@@ -1,0 +1,73 @@
+"""Ensemble moments along a sequential run, taken of many cycles at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from en4dvar.state import Array
+
+BLOCK = 64  # ensembles kept until their moments are taken, at most
+BLOCK_SIZE = 2_000_000  # numbers in them, at most
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Ensemble mean and standard deviation (K, n_state) at the observation times; NaN where there is none."""
+
+    mean: Array
+    std: Array
+
+    @classmethod
+    def empty(cls, cycles: int, size: int) -> Moments:
+        return cls(np.full((cycles, size), np.nan), np.full((cycles, size), np.nan))
+
+    def until(self, cycle: int) -> Moments:
+        """Copy of the rows before ``cycle``."""
+        return Moments(self.mean[:cycle].copy(), self.std[:cycle].copy())
+
+
+class MomentsRecorder:
+    """Collects ensembles (N, n) and takes their moments in blocks: on small states the calls cost more than the sums.
+
+    The moments of a cycle do not depend on which cycles share its block.
+    """
+
+    def __init__(self, cycles: int, size: int, before: Moments | None = None):
+        self._moments = Moments.empty(cycles, size)
+        if before is not None:
+            self._moments.mean[: len(before.mean)] = before.mean
+            self._moments.std[: len(before.std)] = before.std
+        self._cycles: list[int] = []
+        self._scales: list[float] = []
+        self._ensembles = np.empty((0, 0, size))
+
+    def put(self, cycle: int, ensemble: Array, scale: float = 1.0) -> None:
+        """Record an ensemble; its standard deviation is multiplied by ``scale``."""
+        if ensemble.shape != self._ensembles.shape[1:] or len(self._cycles) == len(self._ensembles):
+            self._flush()
+            block = max(1, min(BLOCK, BLOCK_SIZE // ensemble.size))
+            if (block, *ensemble.shape) != self._ensembles.shape:
+                self._ensembles = np.empty((block, *ensemble.shape))
+        self._ensembles[len(self._cycles)] = ensemble
+        self._cycles.append(cycle)
+        self._scales.append(scale)
+
+    def moments(self) -> Moments:
+        """Of everything recorded so far."""
+        self._flush()
+        return self._moments
+
+    def _flush(self) -> None:
+        if not self._cycles:
+            return
+        ensembles = self._ensembles[: len(self._cycles)]
+        n_members = ensembles.shape[1]
+        mean = np.add.reduce(ensembles, axis=1) / n_members
+        anomalies = ensembles - mean[:, None]
+        variance = np.einsum("kij,kij->kj", anomalies, anomalies) / (n_members - 1)
+        self._moments.mean[self._cycles] = mean
+        self._moments.std[self._cycles] = np.array(self._scales)[:, None] * np.sqrt(variance)
+        self._cycles.clear()
+        self._scales.clear()
