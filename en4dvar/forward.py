@@ -26,7 +26,7 @@ class Trajectory:
 
     def __getitem__(self, name: str) -> Array:
         """The field ``name`` along the path: (K,) or (K, size)."""
-        return self.layout.unpack(self.states)[name]
+        return self.layout.part(self.states, name)
 
     def largest(self, name: str) -> float:
         """What a quantity of the model's ``validity`` reached along the path; by default |field of that name|.
