@@ -1,0 +1,33 @@
+"""Formulas become MathML while the site is built: browsers draw it themselves, without script, font or network."""
+
+from __future__ import annotations
+
+import logging
+import re
+from html import unescape
+from typing import Any
+
+from latex2mathml.converter import convert
+
+log = logging.getLogger("mkdocs.hooks.formulas")
+_TIGHT = re.compile(r"<mo([^>]*)>(/|&#x0002F;|\||&#x0007C;|&#x02223;)</mo>")
+_FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.S)
+
+
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """Replace what ``pymdownx.arithmatex`` marked; a formula not understood is a warning, so a strict build fails."""
+
+    def mathml(match: re.Match[str]) -> str:
+        tag, bracket, source = match.groups()
+        tex = unescape(source).strip()
+        try:
+            made = convert(tex, display="block" if bracket == "[" else "inline")
+        except Exception as error:  # the library raises a dozen classes of its own, and IndexError
+            log.warning("%s: formula %r: %r", page.file.src_path, tex, error)
+            return match.group()
+        if "\\" in re.sub(r'alttext="[^"]*"', "", made):  # a command it does not know is copied as it is
+            log.warning("%s: formula %r has a command that is not understood", page.file.src_path, tex)
+        made = _TIGHT.sub(r'<mo\1 lspace="0" rspace="0">\2</mo>', made)  # browsers set these apart like a plus
+        return f'<{tag} class="formula">{made}</{tag}>'
+
+    return _FORMULA.sub(mathml, html)

@@ -1,0 +1,61 @@
+"""The page on result files against a result file: every group, variable and attribute of a run is on it."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from doc_pages import ROOT, blocks
+
+from en4dvar.store import Result, save
+
+PAGE = ROOT / "docs" / "reference_netcdf.md"
+
+
+@pytest.fixture(scope="module")
+def result(analysis):
+    """A result whose parameters and observable have the names that stand for all on the page, where they can."""
+    return Result.from_analysis(analysis, {})
+
+
+def named(result, text):
+    """A name of the file as the page writes it: G stands for every parameter, radius for the observable."""
+    stem, _, rest = str(text).partition("_")
+    if text in result.posterior or str(text).removesuffix("_centre") in result.posterior:
+        return "G_centre" if str(text).endswith("_centre") else "G"
+    return f"radius_{rest}" if rest and stem == result.observable else "radius" if stem == result.observable else text
+
+
+def test_every_variable_and_attribute_is_on_the_page(result):
+    words = set(re.findall(r"`/?([\w]+)`", PAGE.read_text(encoding="utf-8")))
+    coordinates = {"chain", "draw", "time", "path_time", "iteration", "parameter", "time_column"}
+    for node in result.tree.subtree:
+        group = node.path.strip("/")
+        assert not group or group in words, group
+        if group == "constant_data":
+            continue
+        missing = {named(result, v) for v in node.dataset.variables} - words - coordinates
+        assert missing == set(), f"{group}: {sorted(missing)}"
+    assert set(result.sample_stats.attrs) - words == set()
+
+
+def test_the_page_names_nothing_that_is_not_there(result):
+    rows = re.findall(r"^\| (`/[^|]*)?\| ([^|]+)\| ([^|]*)\|", PAGE.read_text(encoding="utf-8"), re.M)
+    sometimes = {"radius_correlation", "radius_huber_weight", "R_eq"}
+    groups: list[str] = []
+    for head, names, dims in rows:
+        groups = re.findall(r"`/(\w+)`", head) or groups
+        for group in groups:
+            there = {named(result, v): set(map(str, d.dims)) for v, d in result.dataset(group).variables.items()}
+            for name in set(re.findall(r"`(\w+)`", names)) - sometimes:
+                assert name in there, f"{group}: {name}"
+                if name != "G_centre":
+                    assert there[name] <= set(re.findall(r"\w+", dims)), f"{group}: {name} has {there[name]}"
+
+
+def test_the_example_reads_a_file(result, tmp_path, monkeypatch):
+    (example,) = (b for b in blocks(PAGE) if b.language == "python")
+    (tmp_path / "runs" / "quickstart").mkdir(parents=True)
+    save(result, tmp_path / "runs" / "quickstart" / "posterior.nc")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example.body, str(PAGE), "exec"), {})
