@@ -95,6 +95,7 @@ class StateField:
         return trajectory[self.name]
 
     def rate(self, trajectory: Trajectory) -> Array:
+        """Time derivative of the observable (K,). Raises NotImplementedError where the model has none."""
         if self.rate_of is None:
             raise NotImplementedError(f"the model does not provide d({self.name})/dt")
         return trajectory[self.rate_of]
@@ -180,7 +181,7 @@ class ForwardModel(ABC):
         return [self._march(x[i], own[i]) for i in range(len(x))]
 
     def share(self, x: Array, times: Array) -> Shared | None:
-        """:meth:`trajectories` as work that threads share, where the model can; None in this default."""
+        """:meth:`trajectories` of states (N, n_state) as work that threads share, where the model can; else None."""
         return None
 
     def _march(self, x: Array, times: Array) -> Trajectory | Failure:

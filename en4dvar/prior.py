@@ -135,10 +135,12 @@ class Prior:
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
+        """What is estimated, in the order of the control vector."""
         return tuple(term.parameter for term in self.terms)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
+        """Names of the parameters, in the order of the control vector."""
         return tuple(p.name for p in self.parameters)
 
     @cached_property

@@ -97,15 +97,18 @@ class StateLayout:
 
     @cached_property
     def slices(self) -> dict[str, slice]:
+        """Name → where the field is in a state vector."""
         edges = np.cumsum([0, *(f.size for f in self.fields)])
         return {f.name: slice(int(a), int(b)) for f, a, b in zip(self.fields, edges[:-1], edges[1:], strict=True)}
 
     @property
     def size(self) -> int:
+        """Length of a state vector, n_state."""
         return sum(f.size for f in self.fields)
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the fields, in order."""
         return tuple(f.name for f in self.fields)
 
     def __getitem__(self, name: str) -> slice:

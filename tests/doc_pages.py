@@ -94,6 +94,11 @@ def command_lines(page: Path) -> Iterator[tuple[int, str]]:
                 yield number, command
 
 
+def command_words(command: str) -> list[str]:
+    """A command as words, without what the shell does with its output."""
+    return shlex.split(re.split(r"\s[|>]\s|\s{2,}#", command.replace("\\\n", " "))[0])
+
+
 class Session:
     """A folder in which the blocks of one page are run."""
 

@@ -89,6 +89,7 @@ class BubbleModel(ForwardModel):
 
     @classmethod
     def from_settings(cls, settings: BubbleSettings) -> BubbleModel:
+        """The model of a ``model:`` section."""
         return cls(
             law=settings.constitutive_law,
             gas=settings.gas,
@@ -117,7 +118,7 @@ class BubbleModel(ForwardModel):
 
     @cached_property
     def constants(self) -> Array:
-        """What all members have in common among the parameters of the compiled solver."""
+        """What all members have in common among the parameters of the compiled solver, (rows,)."""
         return constants(self)
 
     @property
@@ -138,6 +139,7 @@ class BubbleModel(ForwardModel):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
+        """Those of the law, then R0, or R_eq and R_max for the laser start."""
         return (*self.law.parameters, *((R0,) if self.start == "acoustic" else (R_EQ, R_MAX)))
 
     @cached_property
@@ -236,7 +238,9 @@ class BubbleModel(ForwardModel):
         return finish()
 
     def prepared(self, x: Array, times: Array, t0: float = 0.0) -> tuple[Callable[[], object], Callable[[], Paths]]:
-        """:meth:`integrate` in two: the work, without the interpreter, which threads can share, and its result."""
+        """:meth:`integrate` of states (N, n_state) in two: the work, without the interpreter, which threads can share,
+        and its result.
+        """
         initial, par = pack(self, x)
         tables = law_tables(self, self.law_values(x))
         start = np.full(len(x), t0 * 1e6)

@@ -84,6 +84,6 @@ class Driving:
         return np.array([first, *(t for t in inside if first < t < last), last])
 
     def pressure(self, t: Array) -> Array:
-        """p_f at times t (s), Pa."""
+        """p_f in Pa at times (K,) in s, of any shape."""
         t = np.asarray(t, dtype=float)
         return np.where((t >= self.begin) & (t <= self.end), self.amplitude * self.shape(t), 0.0)

@@ -91,15 +91,15 @@ class ConstitutiveLaw:
         return reload_law, (reference,), self.__dict__ or None
 
     def stress(self, stretch: Array, p: Any) -> Array:
-        """J_e(λ) in Pa: the elastic part of the stress integral."""
+        """J_e(λ) (N, K) in Pa at stretches (K,): the elastic part of the stress integral; ``p.G`` is (N, 1)."""
         raise NotImplementedError
 
     def strain_energy_rate(self, stretch: Array, p: Any) -> Array:
-        """W′(λ) in Pa: derivative of the strain energy density in equibiaxial stretch."""
+        """W′(λ) (N, K) in Pa at stretches (K,): derivative of the strain energy density in equibiaxial stretch."""
         raise NotImplementedError
 
     def viscosity(self, shear_rate: Array, p: Any) -> Array:
-        """μ(γ̇) in Pa s of a generalised Newtonian liquid; ``shear_rate`` in 1/s. Replaces the dashpot ``mu``."""
+        """μ(γ̇) (N, K) in Pa s at shear rates (K,) in 1/s: a generalised Newtonian liquid, instead of the dashpot."""
         raise NotImplementedError
 
     def memory(self, p: Any) -> tuple[MemoryVariable, ...]:
@@ -152,7 +152,7 @@ class ConstitutiveLaw:
             return np.asarray(from_values(mean_viscosity(lambda rate: self.viscosity(rate, p), n)))
 
     def memory_tables(self, values: Mapping[str, Array]) -> MemoryTables:
-        """θ, k and the tables of a and b for N members and M memory variables (M = 0 for most laws)."""
+        """θ, k and the tables of a and b for values name → (N,) and M memory variables (M = 0 for most laws)."""
         p, n = _namespace(values)
         variables = self.memory(p)
 

@@ -1,0 +1,113 @@
+"""Every public object says what it is: a docstring of its own, shapes of arrays, errors, units of constants."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import textwrap
+from collections.abc import Iterator
+from typing import Any
+
+import click
+import pytest
+from doc_pages import command_words
+
+import en4dvar
+import en4dvar_bubble
+from en4dvar.cli import main
+
+SHAPE = re.compile(r"\([\w…'′]{1,7},(?: ?[\w…'′·+]{1,9},?)*\)|any shape")  # (K,), (N, n), (…, K)
+ERRORS = {"ConfigError", "DataError", "OutputError", "TooFewMembersError", "En4dvarError", "UnitError", "ValueError"}
+
+
+def public() -> Iterator[tuple[str, Any]]:
+    """Qualified name → object: the public names of both packages and the public members that their classes define."""
+    for package in (en4dvar, en4dvar_bubble):
+        names = getattr(package, "__all__", None) or [n for n in dir(package) if not n.startswith("_")]
+        for name in names:
+            value = getattr(package, name)
+            yield f"{package.__name__}.{name}", value
+            if inspect.isclass(value):
+                for key, member in vars(value).items():
+                    made = inspect.unwrap(getattr(member, "func", getattr(member, "fget", member)) or member)
+                    made = getattr(made, "__func__", made)
+                    if not key.startswith("_") and inspect.isfunction(made):
+                        yield f"{package.__name__}.{name}.{key}", made
+
+
+OBJECTS = {name: value for name, value in public() if callable(value)}
+FUNCTIONS = {name: value for name, value in OBJECTS.items() if inspect.isfunction(value)}
+
+
+def told(name: str) -> str:
+    """The docstring of an object; that of a method with what its class says."""
+    own = inspect.getdoc(OBJECTS[name]) or ""
+    owner = name.rpartition(".")[0]
+    return own if owner not in OBJECTS else f"{own}\n{inspect.getdoc(OBJECTS[owner])}"
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_it_has_a_docstring_of_its_own(name):
+    value = OBJECTS[name]
+    text = value.__doc__ or ""
+    if inspect.isfunction(value) and not text:  # a method that does what its parent says
+        text = inspect.getdoc(value) or _inherited(name)
+    assert len(text.split()) >= 2, name
+    if inspect.isclass(value):
+        assert not text.startswith(f"{value.__name__}("), f"{name}: the generated docstring of a dataclass"
+
+
+def _inherited(name: str) -> str:
+    owner, _, key = name.rpartition(".")
+    kinds = OBJECTS[owner].__mro__[1:] if owner in OBJECTS else ()
+    return next((doc for kind in kinds if (doc := getattr(getattr(kind, key, None), "__doc__", None))), "")
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_arrays_have_shapes(name):
+    annotations = {k: str(v) for k, v in FUNCTIONS[name].__annotations__.items()}
+    if any(re.search(r"\b(?:Array|NDArray|ndarray)\b", text) for text in annotations.values()):
+        text = f"{told(name)}\n{_inherited(name)}"
+        assert SHAPE.search(text), f"{name} takes or gives arrays of unknown shape: {annotations}"
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_errors_are_announced(name):
+    tree = ast.parse(textwrap.dedent(inspect.getsource(FUNCTIONS[name])))
+    raised = {
+        node.exc.func.id
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and isinstance(node.exc.func, ast.Name)
+    }
+    missing = {error for error in raised & ERRORS if error not in told(name) + _inherited(name)}
+    assert missing == set(), f"{name} does not say that it raises {', '.join(sorted(missing))}"
+
+
+def test_parameters_of_every_law_and_constant_have_unit_and_source():
+    for law in en4dvar_bubble.REGISTRY.values():
+        for parameter in law.parameters:
+            assert parameter.unit, (law, parameter.name)
+            assert parameter.label, (law, parameter.name)
+            assert parameter.source, (law, parameter.name)
+    medium = en4dvar_bubble.WATER_25C
+    assert set(medium.constants) == set(medium.sources)
+
+
+CONTEXT = click.Context(main, info_name="en4dvar")
+
+
+@pytest.mark.parametrize("name", ["", *main.list_commands(CONTEXT)])
+def test_every_help_has_an_example_that_parses(name):
+    command = main.get_command(CONTEXT, name) if name else main
+    assert command is not None
+    command = command.entry.load() if hasattr(command, "entry") else command
+    text = command.help or ""
+    assert re.search(r"Examples?:", text), f"en4dvar {name} --help shows no example"
+    examples = re.findall(r"^ *(en4dvar \S.*)", text.partition("Example")[2].replace("\\\n", " "), re.M)
+    assert examples
+    for example in examples:
+        words = command_words(example)
+        found = main.get_command(CONTEXT, words[1])
+        assert found is not None, example
+        found.make_context(words[1], words[2:], parent=CONTEXT)

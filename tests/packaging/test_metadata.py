@@ -1,0 +1,43 @@
+"""What the packaging declares agrees with itself, with the README and with .ci/run."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from importlib.metadata import version
+from pathlib import Path
+
+import en4dvar
+
+ROOT = Path(__file__).resolve().parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+CI = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_version_is_that_of_the_installation():
+    assert en4dvar.__version__ == version("en4dvar")
+    assert re.match(r"\d+\.\d+", en4dvar.__version__)
+    assert "version" in PROJECT["project"]["dynamic"]
+
+
+def test_python_versions_agree():
+    declared = re.findall(r"Python :: (3\.\d+)", "\n".join(PROJECT["project"]["classifiers"]))
+    lowest = min(declared, key=lambda v: int(v.partition(".")[2]))
+    assert PROJECT["project"]["requires-python"] == f">={lowest}"
+    assert PROJECT["tool"]["mypy"]["python_version"] == lowest
+
+
+def test_ci_runs_the_test_command_of_the_readme():
+    (command,) = re.findall(r"\.venv/bin/pip install -q -e '\.\[dev\]' && \.venv/bin/(pytest .*)", README)
+    assert command in CI
+    assert re.search(r"install [^\n]*-e '\.\[dev\]'", CI)
+
+
+def test_the_extras_that_the_errors_and_pages_name_exist():
+    extras = set(PROJECT["project"]["optional-dependencies"])
+    files = [README, *(p.read_text(encoding="utf-8") for p in [*ROOT.glob("docs/*.md"), *ROOT.glob("en4dvar/**/*.py")])]
+    groups = [group for text in files for group in re.findall(r"en4dvar\[([\w,]+)\]", text)]
+    named = {extra for group in groups for extra in group.split(",")}
+    assert named
+    assert named <= extras
