@@ -200,8 +200,19 @@ class _Run:
     def start(self, prior_run: Forecast) -> LoopState:
         if self.mda:
             return LoopState(Weights.prior(len(self.space.members)), self.space.forward_runs)
-        w, warnings = choose_start(self.space, prior_run)
-        return LoopState(Weights(w, self.space.scheme.init(len(w)).T), self.space.forward_runs, warnings)
+        start, weights = choose_start(self.space, prior_run), self.space.scheme.init(len(self.space.members))
+        records: list[IterationRecord] = []
+        worst_loss: tuple[str, ...] = ()
+        for at, move in start.path:
+            step = self.require_step(at, f"forecast of iteration {len(records) + 1}")
+            worst_loss = max(worst_loss, at.members.failures, key=lambda failures: sum(map(bool, failures)))
+            records.append(self.record(len(records), at, step, move.step_length))
+            weights = Weights(move.w, step.transform)
+            if self.progress is not None:
+                self.progress(self.problem.observations.name, records[-1])
+        return LoopState(
+            Weights(start.w, weights.T), self.space.forward_runs, start.warnings, tuple(records), worst_loss
+        )
 
     def mean_beyond_mode(self, posterior: Array, step: Step) -> Array:
         """What the estimate of ln σ adds to the mode (n,) for the posterior mean; zero without a noise scale.

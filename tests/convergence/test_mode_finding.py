@@ -118,3 +118,28 @@ def test_three_starts_find_the_lowest_of_many_minima(seed):
     assert ends[3] < reference + 0.01
     if seed == 1:
         assert ends[1] > reference + 1  # the member of lowest J lies in the wrong basin
+
+
+class Remembering(Decay):
+    """Keeps the parameters of every run."""
+
+    def trajectories(self, x, times):
+        self.runs = [*getattr(self, "runs", []), *(tuple(row[2:]) for row in x)]
+        return super().trajectories(x, times)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_lowest_descent_is_gone_once(seed):
+    """Its moves are the first iterations; a run from the same member alone records the same, bit for bit."""
+    problem = make_problem(Remembering(), [1.5, 1.2], seed=seed)
+    seen = []
+    two = assimilate(problem, AssimilationSettings(members=12), seed, progress=lambda _, record: seen.append(record))
+    runs = np.array(problem.model.runs)
+    assert [record.iteration for record in seen] == list(range(len(two.iterations)))
+    for record in two.iterations[1:-1]:  # once as a trial, once with the members about it
+        assert np.sum(np.all(np.isclose(runs, record.centre, rtol=1e-12), axis=1)) == 2
+    one = assimilate(problem, AssimilationSettings(members=12, starts=1), seed)
+    if two.iterations[0].cost > one.iterations[0].cost:
+        return  # another member than that of lowest J had the lower minimum
+    assert all(np.array_equal(a.members, b.members) for a, b in zip(two.iterations, one.iterations, strict=True))
+    assert two.forward_runs > one.forward_runs
