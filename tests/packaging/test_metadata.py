@@ -41,3 +41,24 @@ def test_the_extras_that_the_errors_and_pages_name_exist():
     named = {extra for group in groups for extra in group.split(",")}
     assert named
     assert named <= extras
+
+
+def test_the_lock_file_is_of_these_requirements():
+    """``uv lock`` was run after the last change of a requirement."""
+    lock = tomllib.loads((ROOT / "uv.lock").read_text(encoding="utf-8"))
+    assert lock["requires-python"] == PROJECT["project"]["requires-python"]
+    (own,) = (p for p in lock["package"] if p["name"] == "en4dvar")
+    locked = {
+        (r["name"], r.get("specifier", ""), tuple(sorted(r.get("extras", ()))), r.get("marker", ""))
+        for r in own["metadata"]["requires-dist"]
+    }
+    wanted = {(*_parsed(text), "") for text in PROJECT["project"]["dependencies"]}
+    for extra, texts in PROJECT["project"]["optional-dependencies"].items():
+        wanted |= {(*_parsed(text), f"extra == '{extra}'") for text in texts}
+    assert locked == wanted
+
+
+def _parsed(text: str) -> tuple[str, str, tuple[str, ...]]:
+    """Name, specifier and extras of a requirement, as the lock file writes them."""
+    name, extras, specifier = re.fullmatch(r"([\w.-]+)(?:\[([\w,-]+)\])?\s*(.*)", text).groups()
+    return name.lower().replace("_", "-"), specifier, tuple(sorted(extras.split(","))) if extras else ()
