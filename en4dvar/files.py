@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from en4dvar.errors import OutputError
@@ -32,7 +32,7 @@ def atomic_path(path: str | Path, durable: bool = True) -> Iterator[Path]:
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
-        if partial.exists():
+        with suppress(OSError):
             partial.unlink()
 
 

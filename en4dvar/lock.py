@@ -6,14 +6,17 @@ import errno
 import os
 import socket
 import sys
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
 from en4dvar.errors import OutputError
 
 LOCK = ".en4dvar-lock"
+PATIENCE = 3.0  # s for the lock of a dead process to go
+_OTHER = "another process"
 _UNSUPPORTED = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)  # some network file systems
 
 
@@ -32,12 +35,15 @@ def locked(directory: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        (directory / LOCK).unlink(missing_ok=True)
+        with suppress(OSError):  # the directory may have been removed, and made again by another run
+            if os.path.samestat(os.fstat(file.fileno()), (directory / LOCK).stat()):
+                (directory / LOCK).unlink()
         file.close()
 
 
 def _acquire(directory: Path) -> IO[str]:
     path = directory / LOCK
+    patience = time.monotonic() + PATIENCE
     while True:
         try:
             file = path.open("a+", encoding="utf-8")
@@ -48,8 +54,11 @@ def _acquire(directory: Path) -> IO[str]:
         except OSError as error:
             if error.errno not in _UNSUPPORTED:
                 file.seek(0)
-                owner = file.read().strip() or "another process"
+                owner = file.read().strip() or _OTHER
                 file.close()
+                if _is_dead(owner) and time.monotonic() < patience:
+                    time.sleep(0.02)
+                    continue
                 raise OutputError(
                     f"{directory}: in use by {owner}; wait for it to end, or give another --out"
                 ) from None
@@ -63,6 +72,25 @@ def _acquire(directory: Path) -> IO[str]:
     file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
     file.flush()
     return file
+
+
+def _is_dead(owner: str) -> bool:
+    """Whether the process that wrote its name into the lock has ended.
+
+    Its lock then outlives it for a moment only, in a process that it was about to start.
+    """
+    if owner == _OTHER:  # not written yet
+        return True
+    number, _, host = owner.removeprefix("process ").partition(" on ")
+    if host != socket.gethostname() or not number.isdigit() or sys.platform == "win32":
+        return False
+    try:
+        os.kill(int(number), 0)
+    except ProcessLookupError:
+        return True
+    except OSError:
+        pass
+    return False
 
 
 if sys.platform == "win32":

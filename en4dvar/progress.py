@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -25,18 +25,25 @@ def describe(name: str, record: IterationRecord) -> str:
 
 
 class RunLog:
-    """``run.log``: time and message, written line by line so that a killed run leaves what it knew."""
+    """``run.log``: time and message, written line by line so that a killed run leaves what it knew.
+
+    Raises :class:`OutputError` where it cannot be opened or, while the run is at work, written.
+    """
 
     def __init__(self, path: Path, append: bool = False):
         try:
             self._file = path.open("a" if append else "w", encoding="utf-8", buffering=1)
         except OSError as error:
             raise OutputError(f"{path}: cannot be written: {error.strerror}") from None
+        self._path = path
 
     def write(self, message: str) -> None:
         """Append every line of ``message`` with the time of day."""
         now = datetime.now().astimezone().isoformat(timespec="milliseconds")
-        self._file.writelines(f"{now} {line}\n" for line in message.splitlines())
+        try:
+            self._file.writelines(f"{now} {line}\n" for line in message.splitlines())
+        except OSError as error:
+            raise OutputError(f"{self._path}: cannot be written: {error.strerror}") from None
 
     def __enter__(self) -> Self:
         return self
@@ -44,9 +51,11 @@ class RunLog:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if value is not None:
-            self.write(f"failed: {type(value).__name__}: {value}")
-        self._file.close()
+        with suppress(OutputError, OSError):  # on a full disk: the reason that ended the run is told all the same
+            if value is not None:
+                self.write(f"failed: {type(value).__name__}: {value}")
+        with suppress(OSError):
+            self._file.close()
 
 
 @contextmanager

@@ -22,6 +22,7 @@ from en4dvar.lock import LOCK, locked
 LISTING = ".en4dvar-files"
 NEXT = ".en4dvar-next"
 COMPLETE = ".en4dvar-complete"
+OLD = ".en4dvar-old"
 FIXED = ("config.yaml", "config.resolved.yaml", "posterior.nc", "twin.nc", "run.log", "report.html", "summary.csv")
 FOLDERS = ("datasets", "figures", "checkpoints")
 _PARTIAL = re.compile(r"\..+\.\d+\.tmp")  # of en4dvar.files, left by a process that was killed
@@ -85,6 +86,13 @@ class RunDirectory:
         """The files of folder ``name`` now."""
         return frozenset(p for p in (self.work / name).glob("*") if p.is_file())
 
+    def remove(self, name: str) -> None:
+        """Remove a file if it is there. Raises :class:`OutputError`."""
+        try:
+            (self.work / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(f"{self.work / name}: cannot be removed: {error.strerror}") from None
+
     def files(self) -> tuple[str, ...]:
         """Relative names of the files that a run wrote."""
         return _listed(self.work)
@@ -104,16 +112,19 @@ class RunDirectory:
 def _prepare(path: Path, mode: Mode) -> Path:
     """The folder to write to. Raises :class:`OutputError`."""
     following = path / NEXT
+    _remove_folder(path / OLD)
     if (following / COMPLETE).exists():
         _replace_earlier_run(path)
+    if not (following / LISTING).exists():  # of a run that ended before it began
+        _remove_folder(following)
     listed = set(_listed(path))
     if mode in ("resume", "report"):
-        work = following if mode == "resume" and following.is_dir() else path
+        work = following if mode == "resume" and (following / LISTING).exists() else path
         if not (work / LISTING).exists():
             raise OutputError(f"{path}: holds no run")
         _remove_partial(work)
         return work
-    others = [p for p in path.iterdir() if p.name != LOCK]
+    others = [p for p in path.iterdir() if p.name != LOCK and not _PARTIAL.fullmatch(p.name)]
     if mode == "new" and others:
         raise OutputError(
             f"{path}: not empty; give --resume to continue its run, --force to replace it, or another --out"
@@ -121,8 +132,8 @@ def _prepare(path: Path, mode: Mode) -> Path:
     foreign = [name for name in FIXED if (path / name).exists() and name not in listed]
     if foreign:
         raise OutputError(f"{path}: {foreign[0]} was not written by a run and would be replaced; move it away")
-    if following.is_dir():  # of a run that was given up
-        shutil.rmtree(following)
+    _remove_folder(following)  # of a run that was given up
+    _remove_partial(path)
     work = path
     if any((path / name).exists() for name in listed):
         work = following
@@ -141,7 +152,13 @@ def _replace_earlier_run(path: Path) -> None:
             (path / name).parent.mkdir(parents=True, exist_ok=True)
             (following / name).replace(path / name)
     write_text(path / LISTING, "".join(f"{name}\n" for name in names))
-    shutil.rmtree(following)
+    following.rename(path / OLD)  # at once: half of this folder would look like an interrupted run
+    _remove_folder(path / OLD)
+
+
+def _remove_folder(folder: Path) -> None:
+    if folder.is_dir():
+        shutil.rmtree(folder)
 
 
 def _remove(path: Path, names: Iterable[str]) -> None:

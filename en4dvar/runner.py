@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -108,19 +109,19 @@ def execute(
                 config, identity(config.resolved, config.model, files), datasets(files), directory, log, attributes,
                 progress,
             )  # fmt: skip
+            prepared = False
             try:
                 _prepare(work, resume)
+                prepared = True
                 work.work(executor)
                 _finish(work)
-            except (KeyboardInterrupt, ExecutorError) as error:
+                log.write("done")
+            except (KeyboardInterrupt, ExecutorError, OutputError) as error:
+                if isinstance(error, OutputError) and not prepared:
+                    raise
                 work.stop.set()
                 executor.kill()
-                kept = f"{len(work.ended)} of {len(work.sets)} data sets are done and kept in {directory.path}"
-                log.write(f"interrupted; {kept}")
-                if isinstance(error, ExecutorError):
-                    raise ExecutorError(f"{error}; {kept}; give --resume to continue") from error
-                raise Interrupted(f"interrupted; {kept}") from None
-            log.write("done")
+                raise _interrupted(work, error) from error
         directory.publish()
         return Campaign(directory.path, work.outcomes(), tuple(work.notices))
 
@@ -164,7 +165,7 @@ def _prepare(work: Worklist, resume: bool) -> None:
                 "give --force to estimate everything again, or another --out"
             )
         for d in failed.values():  # tried again, on what the data file holds now
-            (directory.work / d.done).unlink()
+            directory.remove(d.done)
     directory.claim(
         "run.log", "config.yaml", "config.resolved.yaml", "posterior.nc", IDENTITY,
         *(name for d in work.sets for name in (d.file, d.iteration, d.done)),
@@ -175,6 +176,21 @@ def _prepare(work: Worklist, resume: bool) -> None:
     if earlier is not None:
         work.recall()
         work.log.write(f"resumed: {len(work.ended)} of {len(work.sets)} data sets are done")
+
+
+def _interrupted(work: Worklist, error: BaseException) -> BaseException:
+    """The error as the user should see it: with what was kept, and what to do."""
+    path = work.directory.path
+    kept = f"{len(work.ended)} of {len(work.sets)} data sets are done and kept in {path}"
+    if gone := not work.directory.work.is_dir():
+        kept = f"the run directory {path} was removed or renamed while the run was at work"
+    with suppress(OutputError):
+        work.log.write(f"interrupted; {kept}")
+    if isinstance(error, KeyboardInterrupt):
+        return Interrupted(f"interrupted; {kept}")
+    advice = "" if gone else "; give --resume to continue"
+    kind = ExecutorError if isinstance(error, ExecutorError) else OutputError
+    return kind(f"{error}; {kept}{advice}")
 
 
 def _has_failed(work: Worklist, d: Dataset, earlier: Identity) -> bool:

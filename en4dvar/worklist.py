@@ -221,5 +221,5 @@ class Worklist:
 
     def _end(self, d: Dataset, record: Done) -> None:
         write_checkpoint(self.directory.work / d.done, self.identity.of_dataset(d.name), record)
-        (self.directory.work / d.iteration).unlink(missing_ok=True)
+        self.directory.remove(d.iteration)
         self.ended[d.name] = record
