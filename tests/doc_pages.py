@@ -123,7 +123,10 @@ class Session:
                 assert not shown or matches(shown, printed), f"{command} printed\n{printed}\nnot\n{shown}"
 
     def call(self, command: str) -> str:
-        """Standard output of a command; it must succeed."""
+        """Standard output of a command; it must succeed. An exported variable stays for those that follow."""
+        if exported := re.match(r"export (\w+)=(\S+)", command):
+            self.environment[exported[1]] = exported[2]
+            return ""
         done = subprocess.run(
             ["bash", "-c", f"set -o pipefail; {command}"],
             cwd=self.folder,
