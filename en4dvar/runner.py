@@ -96,7 +96,9 @@ def execute(
     with (
         one_blas_thread(),
         terminate_as_interrupt(),
-        choose_executor(config.model, execution.executor, execution.workers, execution.address) as executor,
+        choose_executor(
+            config.model, execution.executor, execution.workers, execution.address, execution.limits
+        ) as executor,
         RunDirectory.open(config.directory, mode) as directory,
     ):
         attributes = {
@@ -215,7 +217,8 @@ def _finish(work: Worklist) -> None:
         _report(directory)
     else:
         write_text(
-            directory.claim("summary.csv"), summary_csv(((name, work.ended[name].summary) for name in good), failures)
+            directory.claim("summary.csv"),
+            summary_csv(((name, work.ended[name].summary, work.ended[name].warnings) for name in good), failures),
         )
 
 

@@ -8,8 +8,9 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
+from en4dvar.executor.limits import Limits, parse_bytes
 from en4dvar.problem import AssimilationSettings
-from en4dvar.units import parse_unit
+from en4dvar.units import Quantity, parse_unit
 
 QuantityText = str | int | float
 Name = Annotated[str, Field(pattern=r"^[\w.][\w.+ -]*$", max_length=100)]
@@ -29,6 +30,11 @@ class Section(BaseModel):
 def _known_unit(unit: str) -> str:
     parse_unit(unit)
     return unit
+
+
+def _size(text: str) -> str:
+    parse_bytes(text)
+    return text
 
 
 class Column(Section):
@@ -168,6 +174,26 @@ class Execution(Section):
     """Address of a running dask scheduler, e.g. tcp://10.0.0.1:8786."""
     checkpoint_every: Annotated[float, Field(ge=0)] = 0.2
     """Seconds between two checkpoints of a data set; an iteration that follows sooner is not written, 0 writes all."""
+
+    time_limit: Annotated[float, Quantity("s"), Field(gt=0)] | None = None
+    """Longest that one batch of members (one member, unless the model batches) may take, e.g. 60 s; past it they have
+    failed. Needs executor processes (then the default) or dask."""
+    memory_limit: Annotated[str, AfterValidator(_size)] | None = None
+    """Most that a worker process may allocate, e.g. 4 GB; members that need more have failed. Linux; needs executor
+    processes (then the default) or dask."""
+
+    @property
+    def limits(self) -> Limits:
+        """What a worker process may take."""
+        return Limits(self.time_limit, None if self.memory_limit is None else parse_bytes(self.memory_limit))
+
+    @model_validator(mode="after")
+    def _limits_are_of_processes(self) -> Execution:
+        if self.limits and self.executor in ("serial", "threads"):
+            raise ValueError(
+                f"a time or memory limit can end a process only; write executor: processes, not {self.executor}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _address_is_of_dask(self) -> Execution:

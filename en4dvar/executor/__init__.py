@@ -6,16 +6,19 @@ from typing import Literal
 from en4dvar.executor.base import Executor, ExecutorError, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread
 from en4dvar.executor.chunks import Outcome, cut, describe, run_chunk
+from en4dvar.executor.limits import NO_LIMITS, Limits, TimeLimitError
 from en4dvar.executor.local import ProcessesExecutor, SerialExecutor, ThreadsExecutor
 from en4dvar.forward import ForwardModel
 
 __all__ = [
     "Executor",
     "ExecutorError",
+    "Limits",
     "Outcome",
     "ProcessesExecutor",
     "SerialExecutor",
     "ThreadsExecutor",
+    "TimeLimitError",
     "WorkerLostError",
     "choose_executor",
     "cut",
@@ -38,13 +41,18 @@ def choose_executor(
     kind: Literal["serial", "threads", "processes", "dask"] | None = None,
     workers: int | None = None,
     address: str | None = None,
+    limits: Limits = NO_LIMITS,
 ) -> Executor:
     """As asked for; by default threads on every core for compiled models, else this process alone.
+
+    With ``limits`` the default are processes, the only workers of this machine that can be held to them.
 
     Raises
     ------
     ExecutorError: the dask cluster at ``address`` cannot be reached, or dask is not installed.
     """
+    if limits and kind is None and address is None:
+        kind = "processes"
     if kind == "serial":
         return SerialExecutor()
     if workers is None and address is None:
@@ -53,8 +61,8 @@ def choose_executor(
     if kind == "dask" or address is not None:
         from en4dvar.executor.dask import DaskExecutor
 
-        return DaskExecutor(workers, address)
+        return DaskExecutor(workers, address, limits)
     workers = workers or 1
     if kind is None:
         return make_executor(model, workers)
-    return ThreadsExecutor(workers) if kind == "threads" else ProcessesExecutor(workers)
+    return ThreadsExecutor(workers) if kind == "threads" else ProcessesExecutor(workers, limits)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from en4dvar.batch import Batch
+from en4dvar.executor.limits import TimeLimitError, has_time_limit, time_limit
 from en4dvar.forward import Failure, ForwardModel, Trajectory
 from en4dvar.state import Array
 
@@ -26,17 +27,27 @@ def cut(n_members: int, batch: int, workers: int) -> list[slice]:
 
 
 def run_chunk(model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
-    """Run a chunk; where the model raises, run its batches one by one, so that only a raising batch is lost."""
+    """Run a chunk; where the model raises, run its batches one by one, so that only a raising batch is lost.
+
+    Where batches are timed (see :mod:`en4dvar.executor.limits`) they are run one by one from the start.
+    """
     times = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+    if has_time_limit() and len(x) > model.batch:
+        return _by_batch(model, x, times)
     try:
-        outcomes = _kept(model.trajectories(x, times))
+        with time_limit():
+            outcomes = _kept(model.trajectories(x, times))
         reason = f"the model returned {len(outcomes)} trajectories for {len(x)} members"
-    except Exception as error:  # a model may fail in any way; the reason is kept
+    except (Exception, TimeLimitError) as error:  # a model may fail in any way; the reason is kept
         outcomes, reason = [], describe(error)
     if len(outcomes) == len(x):
         return outcomes
     if len(x) <= model.batch:
         return [Failure(reason)] * len(x)
+    return _by_batch(model, x, times)
+
+
+def _by_batch(model: ForwardModel, x: Array, times: Array) -> list[Outcome]:
     parts = [slice(i, i + model.batch) for i in range(0, len(x), model.batch)]
     return [outcome for part in parts for outcome in run_chunk(model, x[part], times[part])]
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from en4dvar.executor.base import ATTEMPTS_ALONE, Executor, ExecutorError, T, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
+from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster
@@ -38,18 +39,19 @@ class DaskExecutor(Executor):
     workers: processes of the local cluster; with an ``address``, how many calls to keep under way (default: one for
         each thread of the cluster).
     address: of a running scheduler, e.g. ``tcp://10.0.0.1:8786``; by default a cluster is started on this machine.
+    limits: of a worker process, which a nanny (dask's default) starts again where they end it.
 
     Raises
     ------
     ExecutorError: dask is not installed, the scheduler cannot be reached, or it has no worker.
     """
 
-    def __init__(self, workers: int | None = None, address: str | None = None):
+    def __init__(self, workers: int | None = None, address: str | None = None, limits: Limits = NO_LIMITS):
         try:
             import distributed
         except ImportError:
             raise ExecutorError("the dask executor needs the extra: pip install 'en4dvar[distributed]'") from None
-        self._address = address
+        self._address, self._limits = address, limits
         self._cluster: LocalCluster | None = None
         self._client: Client | None = None
         for name in ("distributed.client", "distributed.comm", "distributed.core", "distributed.batched"):
@@ -107,7 +109,7 @@ class DaskExecutor(Executor):
     def _submit(self, function: Callable[..., T], call: tuple[Any, ...]) -> Future:
         if self._client is None or self._client.status != "running":
             raise self._lost()
-        return self._client.submit(_on_worker, function, call, pure=False)
+        return self._client.submit(_on_worker, self._limits, function, call, pure=False)
 
     def _next(self, ended: queue.SimpleQueue[Future]) -> Future:
         """The next future that ends. Raises :class:`ExecutorError` where the cluster is gone."""
@@ -131,7 +133,7 @@ class DaskExecutor(Executor):
         try:
             return future.result()
         except KilledWorker:
-            return WorkerLostError("a worker process died")
+            return WorkerLostError(self._limits.death)
         except CancelledError:
             raise self._lost() from None
         except Exception as error:
@@ -165,6 +167,7 @@ class DaskExecutor(Executor):
                 cluster.close(timeout=CLOSE_TIMEOUT)
 
 
-def _on_worker(function: Callable[..., T], call: tuple[Any, ...]) -> T:
+def _on_worker(limits: Limits, function: Callable[..., T], call: tuple[Any, ...]) -> T:
     one_blas_thread_for_good()
+    apply_limits(limits)
     return function(*call)

@@ -14,6 +14,7 @@ from typing import Any
 from en4dvar.executor.base import ATTEMPTS_ALONE, Executor, T, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
 from en4dvar.executor.chunks import Outcome, run_chunk
+from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
 from en4dvar.forward import ForwardModel
 from en4dvar.state import Array
 
@@ -41,6 +42,8 @@ class SerialExecutor(Executor):
 
 class _PoolExecutor(Executor):
     """The pool is started at first use and lives until :meth:`close`."""
+
+    limits: Limits = NO_LIMITS
 
     def __init__(self, workers: int):
         if workers < 1:
@@ -98,7 +101,7 @@ class _PoolExecutor(Executor):
             except Exception as error:
                 return error
         self.close()
-        return WorkerLostError("a worker process died")
+        return WorkerLostError(self.limits.death)
 
     def close(self) -> None:
         if self._pool is not None:
@@ -132,10 +135,16 @@ class ThreadsExecutor(_PoolExecutor):
 
 
 class ProcessesExecutor(_PoolExecutor):
-    """Fresh (spawned) processes; the model must be picklable and importable."""
+    """Fresh (spawned) processes, within ``limits``; the model must be picklable and importable."""
+
+    def __init__(self, workers: int, limits: Limits = NO_LIMITS):
+        super().__init__(workers)
+        self.limits = limits
 
     def _start(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(self.workers, mp_context=get_context("spawn"), initializer=prepare_worker)
+        return ProcessPoolExecutor(
+            self.workers, mp_context=get_context("spawn"), initializer=prepare_worker, initargs=(self.limits,)
+        )
 
     def kill(self) -> None:
         if isinstance(self._pool, ProcessPoolExecutor):
@@ -145,10 +154,11 @@ class ProcessesExecutor(_PoolExecutor):
         self.close()
 
 
-def prepare_worker() -> None:
+def prepare_worker(limits: Limits = NO_LIMITS) -> None:
     """Ctrl-C is the main process's business, BLAS uses one thread, and nobody works for a main process that is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     one_blas_thread_for_good()
+    apply_limits(limits)
     threading.Thread(target=_end_with_parent, name="en4dvar-parent", daemon=True).start()
 
 
