@@ -28,6 +28,8 @@ UNITS: Mapping[str, str] = MappingProxyType(
         "A_v": "W/(m K^2)",
         "B_v": "W/(m K)",
         "D_v": "m^2/s",
+        "D_p": "1",
+        "D_T": "1",
         "L_v": "J/kg",
         "M_g": "kg/mol",
         "M_v": "kg/mol",
@@ -51,6 +53,8 @@ _WATER_SOURCES: Mapping[str, str] = {
     "A_v": "IMRv2 src/forward_solver/default_case.m, commit 788a54d (ATv)",
     "B_v": "IMRv2 src/forward_solver/default_case.m, commit 788a54d (BTv)",
     "D_v": "IMRv2 src/forward_solver/default_case.m, commit 788a54d (D0)",
+    "D_p": "IMRv2 src/forward_solver/default_case.m, commit 788a54d: a constant diffusivity",
+    "D_T": "IMRv2 src/forward_solver/default_case.m, commit 788a54d: a constant diffusivity",
     "L_v": "IMRv2 src/forward_solver/default_case.m, commit 788a54d (L_heat)",
     "M_g": "molar mass of dry air",
     "M_v": "molar mass of water",
@@ -67,7 +71,8 @@ class Medium:
 
     For the enthalpy form and Gilmore's equation: Tait's (p + tait_B)/(p_inf + tait_B) = (ρ/rho)^tait_n. For a
     conducting medium: conductivity K_m, specific heat c_m. For vapour transport: the vapour's conductivity
-    A_v T + B_v, diffusivity D_v in the gas, latent heat L_v, molar masses M_g of the gas and M_v of the vapour.
+    A_v T + B_v, diffusivity D_v (p_inf/p)^D_p (T/T_inf)^D_T in the gas (0 and 0: the constant of the rheometry codes;
+    1 and 1.75: Fuller, Schettler & Giddings 1966), latent heat L_v, molar masses M_g of the gas and M_v of the vapour.
 
     ``sources`` says where each constant comes from.
     """
@@ -88,6 +93,8 @@ class Medium:
     A_v: float = 3.30e-5
     B_v: float = 1.742e-2
     D_v: float = 24.2e-6
+    D_p: float = 0.0
+    D_T: float = 0.0
     L_v: float = 2264.76e3
     M_g: float = 28.966e-3
     M_v: float = 18.01528e-3

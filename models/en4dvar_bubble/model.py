@@ -15,7 +15,7 @@ from en4dvar_bubble.driving import Driving, Reading, histotripsy, silence
 from en4dvar_bubble.laws import ConstitutiveLaw, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.parameters import R0, R_EQ, R_MAX
 from en4dvar_bubble.medium import WATER_25C, Medium, saturated_vapour_pressure
-from en4dvar_bubble.packing import constants, law_tables, mass_fraction, pack
+from en4dvar_bubble.packing import constants, hottest_wall, law_tables, mass_fraction, pack
 from en4dvar_bubble.paths import BubbleTrajectory, Paths
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.solver.driver import Accuracy, Radial, Solution, System, preset, ready
@@ -86,6 +86,12 @@ class BubbleModel(ForwardModel):
             raise ValueError("vapour transport and a conducting medium need gas: heat")
         if self.vapour != "none" and self.medium.p_v:
             raise ValueError(f"vapour: {self.vapour} and a constant vapour_pressure exclude each other")
+        if self.vapour == "transport" and self.start == "acoustic" and self.medium.D_p == 0:
+            raise ValueError(
+                "a driven bubble grows until it is nearly all vapour, for which a diffusivity that does not depend on "
+                "the pressure has no solution that a grid can hold: vapour: transport with start: acoustic needs D_p, "
+                "e.g. constants: {D_p: 1, D_T: 1.75} (kinetic theory)"
+            )
 
     @classmethod
     def from_settings(cls, settings: BubbleSettings) -> BubbleModel:
@@ -249,7 +255,18 @@ class BubbleModel(ForwardModel):
         order = np.argsort(np.abs(micro), axis=1, kind="stable") if mirror else None
         if order is not None:
             micro = np.take_along_axis(np.abs(micro), order, axis=1)
-        work, solved = ready(self.system, initial, par, tables, start, micro, self.driving, self.reading, self.accuracy)
+        work, solved = ready(
+            self.system,
+            initial,
+            par,
+            tables,
+            start,
+            micro,
+            self.driving,
+            self.reading,
+            self.accuracy,
+            hottest_wall(self),
+        )
 
         def finish() -> Paths:
             solution = solved

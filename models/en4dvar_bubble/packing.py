@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 GAS_CONSTANT = 8.314462618
 """J/(mol K), CODATA 2018."""
+CRITICAL_TEMPERATURE = 647.096
+"""K, of water (IAPWS-95)."""
 _SATURATION = saturated_vapour_pressure(np.inf)
 _SATURATION_T = -298.15 * float(np.log(saturated_vapour_pressure(298.15) / _SATURATION))
 
@@ -85,9 +87,9 @@ def pack(model: BubbleModel, x: Array) -> tuple[Array, Array]:
         at_wall = ball(m).weights[m] / wall
         outside = np.zeros(len(x))
         if system.vapour:
-            chi = mole_fraction(x[:, layout["C"]], medium)
-            initial[:, m : 2 * m] = chi
-            share = share * (1 - chi)
+            gas_fraction = 1 - mole_fraction(x[:, layout["C"]], medium)
+            initial[:, m : 2 * m] = gas_fraction
+            share = share * gas_fraction
             outside = saturated_vapour_pressure(wall * medium.T_inf) / medium.rho * at_wall
         par[:, rows.LOG_GAS] = np.log(gas * (share.sum(axis=1) + at_wall) - outside) + 3 * log_R
         if system.wall:
@@ -108,6 +110,13 @@ def pack(model: BubbleModel, x: Array) -> tuple[Array, Array]:
     return initial, par
 
 
+def hottest_wall(model: BubbleModel) -> float:
+    """τ of a wall at the critical temperature of water, above which no vapour is in equilibrium with it; else inf."""
+    if not (model.system.vapour and model.system.wall):
+        return float(np.inf)
+    return float(kirchhoff(np.array(CRITICAL_TEMPERATURE / model.medium.T_inf), conduction_slope(model.medium)))
+
+
 def constants(model: BubbleModel) -> Array:
     """The parameter rows of the solver that are the same for every member, (rows,); zeros elsewhere."""
     medium, system = model.medium, model.system
@@ -123,6 +132,8 @@ def constants(model: BubbleModel) -> Array:
     row[rows.TAIT_B] = medium.tait_B / medium.rho
     row[rows.TAIT_N] = medium.tait_n
     row[rows.DIFFUSION] = medium.D_v * 1e6
+    row[rows.DIFFUSION_P] = medium.D_p
+    row[rows.DIFFUSION_T] = medium.D_T
     row[rows.SATURATION] = _SATURATION / medium.rho
     row[rows.SATURATION_T] = _SATURATION_T / medium.T_inf
     R_v = GAS_CONSTANT / medium.M_v

@@ -68,7 +68,7 @@ class Paths:
 
     def _chi(self) -> Array:
         system = self.model.system
-        return self.solution.states[:, :, system.first_vapour : system.first_medium]
+        return 1 - self.solution.states[:, :, system.first_vapour : system.first_medium]
 
     def _C(self) -> Array:
         return mass_fraction(self["chi"], self.model.medium)

@@ -74,7 +74,11 @@ class ConstantsSettings(_Section):
     B_v: Annotated[float, Quantity(UNITS["B_v"]), NonNegative] = WATER_25C.B_v
     """Conductivity of the vapour, K(T) = A_v T + B_v (vapour: transport)."""
     D_v: Annotated[float, Quantity(UNITS["D_v"]), Positive] = WATER_25C.D_v
-    """Diffusivity of vapour in the gas (vapour: transport)."""
+    """Diffusivity of vapour in the gas at p_inf and T_inf (vapour: transport)."""
+    D_p: Annotated[float, Field(ge=0, le=2)] = WATER_25C.D_p
+    """Diffusivity ∝ (p_inf/p)^D_p: 0 constant, as in the rheometry codes; 1 kinetic theory (vapour: transport)."""
+    D_T: Annotated[float, Field(ge=0, le=3)] = WATER_25C.D_T
+    """Diffusivity ∝ (T/T_inf)^D_T: 0 constant, as in the rheometry codes; 1.75 kinetic theory (vapour: transport)."""
     L_v: Annotated[float, Quantity(UNITS["L_v"]), Positive] = WATER_25C.L_v
     """Latent heat of evaporation (vapour: transport)."""
     M_g: Annotated[float, Quantity(UNITS["M_g"]), Positive] = WATER_25C.M_g

@@ -12,8 +12,8 @@ collocation). The wall temperature is solved for inside the right-hand side. sci
     ṗ = 3/R [(κ−1) K T' − κ p Ṙ + κ p (R_v/R_mix) D C'/(1−C)]_R
     K_m T_m' = K T' + L ρ D C'/(1−C)  at the wall,   ρ_m c_m ∂T_m/∂t = K_m ∂/∂η(r⁴ ∂T_m/∂η) + 12 μ R⁴Ṙ²/r⁶
 
-(Estrada et al. 2018; Prosperetti 1991). ``Constants.spurious_wall_temperature`` puts the public code's error into the
-evaporation term of ṗ: divided by T_w/T_∞.
+(Estrada et al. 2018; Prosperetti 1991), D = D_0 (p_∞/p)^D_p (T/T_∞)^D_T. ``Constants.spurious_wall_temperature`` puts
+the public code's error into the evaporation term of ṗ: divided by T_w/T_∞.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ class Constants:
     K_m: float = 0.55
     c_m: float = 4181.0
     D: float = 24.2e-6
+    D_p: float = 0.0
+    D_T: float = 0.0
     L: float = 2264.76e3
     M_g: float = 28.966e-3
     M_v: float = 18.01528e-3
@@ -80,6 +82,10 @@ class Bubble:
         x = p_sat(T) / p
         return x * self.Rg / (x * self.Rg + (1 - x) * self.Rv)
 
+    def diffusivity(self, T, p):
+        k = self.k
+        return k.D * (k.p_inf / p) ** k.D_p * (T / k.T_inf) ** k.D_T
+
     def wall_temperature(self, R, p, T, C, T_m):
         """The T_w at which the heat fluxes balance (Newton with a differenced slope)."""
         k = self.k
@@ -92,7 +98,7 @@ class Bubble:
             if self.transport:
                 Cw = self.saturated(w, p)
                 rho = p / ((Cw * self.Rv + (1 - Cw) * self.Rg) * w)
-                inward += k.L * rho * k.D / (1 - Cw) * (self.D1[0, 0] * Cw + vapour) / R
+                inward += k.L * rho * self.diffusivity(w, p) / (1 - Cw) * (self.D1[0, 0] * Cw + vapour) / R
             return inward - k.K_m * R**2 * (weights[0] * w + weights[1] * T_m[0] + weights[2] * T_m[1])
 
         w = T_m[0]
@@ -120,19 +126,21 @@ class Bubble:
             C[0] = self.saturated(T[0], p)
             Rmix = C * self.Rv + (1 - C) * self.Rg
             dC = D1 @ C / R
-            evaporation = k.kappa * p * self.Rv / Rmix[0] * k.D / (1 - C[0]) * dC[0]
+            D = self.diffusivity(T, p)
+            evaporation = k.kappa * p * self.Rv / Rmix[0] * D[0] / (1 - C[0]) * dC[0]
             drive += evaporation / (T[0] / k.T_inf if k.spurious_wall_temperature else 1.0)
         p_dot = 3 / R * drive
         v = (heat - y * R * p_dot / 3) / (k.kappa * p)
         energy = p_dot + K * (self.L @ T) / R**2 + k.A * dT**2
         rates = [np.zeros(0)] * 2
         if self.transport:
-            v = v + k.D * (self.Rv - self.Rg) / Rmix * dC
+            v = v + D * (self.Rv - self.Rg) / Rmix * dC
             rho = p / (Rmix * T)
             enthalpy = k.kappa / (k.kappa - 1) * (self.Rv - self.Rg)
-            energy = energy + rho * k.D * enthalpy * dC * dT
+            energy = energy + rho * D * enthalpy * dC * dT
             d_ln_rho = -(self.Rv - self.Rg) / Rmix * dC - dT / T
-            C_dot = k.D * (self.L @ C / R**2 + d_ln_rho * dC) - (v - y * V) * dC
+            d_ln_D = k.D_T * dT / T
+            C_dot = D * (self.L @ C / R**2 + (d_ln_rho + d_ln_D) * dC) - (v - y * V) * dC
             rates[1] = C_dot[1:]
         T_dot = (k.kappa - 1) / k.kappa * T / p * energy - (v - y * V) * dT
         rates[0] = T_dot[1:]

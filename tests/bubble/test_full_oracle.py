@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from oracle_full import Bubble
+from oracle_full import Bubble, Constants
 from reference_cases import ACCURATE, LASER, NEO_HOOKEAN
 
 from en4dvar_bubble import simulate
+from en4dvar_bubble.medium import WATER_25C
 
 TIMES = np.linspace(0, 60e-6, 601)  # collapse at 23 µs, maximum of the first rebound near 30 µs, second collapse
 COARSE, FINE = (20, 60), (40, 120)  # nodes in the gas, cells in the medium, of the oracle
 
 
-def difference(grid, vapour, conducting):
+def difference(grid, vapour, conducting, **diffusivity):
     """Largest |ΔR|/R_max over collapse, rebound and second collapse."""
     nodes, cells = grid
-    slow = Bubble(**LASER, vapour=vapour, conducting=conducting, nodes=nodes, cells=cells)
+    slow = Bubble(
+        **LASER, vapour=vapour, conducting=conducting, nodes=nodes, cells=cells, constants=Constants(**diffusivity)
+    )
     fast = simulate(
         NEO_HOOKEAN,
         LASER,
@@ -25,6 +30,7 @@ def difference(grid, vapour, conducting):
         vapour=vapour,
         medium_heat="conducting" if conducting else "cold",
         accuracy=ACCURATE,
+        medium=replace(WATER_25C, **diffusivity),
     )
     R = slow.solve(TIMES)
     assert R[:400].min() < 0.2 * LASER["R_max"]  # there was a collapse to compare
@@ -33,6 +39,11 @@ def difference(grid, vapour, conducting):
 
 def test_vapour_transport_and_conducting_medium():
     assert difference(FINE, "transport", conducting=True) < 2e-3
+
+
+@pytest.mark.slow
+def test_diffusivity_of_kinetic_theory():
+    assert difference(FINE, "transport", conducting=True, D_p=1.0, D_T=1.75) < 2e-3
 
 
 def test_conducting_medium_without_vapour():

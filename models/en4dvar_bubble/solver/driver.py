@@ -42,6 +42,7 @@ UNROLLED = (0, 4, 8)
 _FIRST_STEP = 1e-3  # µs
 _STEPS_IN_DRIVING = 32
 _SLOWEST_RATE = 0.01  # 1/µs: errors of V = Ṙ/R below rtol times this are not seen (they accumulate over about 100 µs)
+_LEAST_GAS = 1e-6  # mole fraction of gas below which its error is judged on this scale
 _STRESS_SCALE = 10.0  # µm²/µs², about 0.1 bar: errors of a memory variable below rtol times this are not seen
 
 
@@ -128,6 +129,7 @@ class System:
     def tolerances(self, rtol: float) -> Array:
         """(2, n) absolute and relative tolerances; ln R has an absolute one, which is a relative one of R."""
         tol = np.full((2, self.size), rtol)
+        tol[0, self.first_vapour : self.first_medium] = rtol * _LEAST_GAS
         tol[0, self.first_memory : -2] = rtol * _STRESS_SCALE
         tol[0, -2] = rtol * _SLOWEST_RATE
         tol[1, -1] = 0.0
@@ -186,6 +188,8 @@ def reason(status: int, record: Array) -> str:
             return f"step size underflow {when}"
         case integrate.MACH_LIMIT:
             return f"model validity: wall Mach {record[integrate.MAX_MACH]:.3g} {when}"
+        case integrate.WALL_LIMIT:
+            return f"model validity: wall above the critical temperature of water {when}"
         case integrate.TIME_LIMIT:
             return f"time limit reached {when}"
     raise ValueError(f"unknown status {status}")
@@ -234,6 +238,7 @@ def ready(
     driving: Driving,
     reading: Reading,
     accuracy: Accuracy,
+    hottest_wall: float = np.inf,
 ) -> tuple[Callable[[], object], Solution]:
     """Everything set for the compiled integration of N members; a call that does it without the interpreter,
     and the solution that it fills.
@@ -241,6 +246,7 @@ def ready(
     Threads that make the call at once share the members, those that ring longest first, so that the lanes run dry
     together; each returns when no member is left to begin, and all are done when all have returned.
 
+    ``hottest_wall``: τ of the wall above which there is no equilibrium with its vapour.
     initial (N, n) and parameters (N, rows) in the kernel's units; start (N,) and times (N, K) in µs, times increasing.
     Members never influence each other: the bits do not depend on how they are batched.
     """
@@ -271,7 +277,7 @@ def ready(
         *_lengths(system),
         driving.breaks,
         system.tolerances(accuracy.rtol),
-        np.array([_FIRST_STEP, inside, accuracy.step_limit, accuracy.mach_limit, accuracy.time_limit]),
+        np.array([_FIRST_STEP, inside, accuracy.step_limit, accuracy.mach_limit, accuracy.time_limit, hottest_wall]),
         out,
         status,
         record,

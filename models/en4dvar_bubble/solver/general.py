@@ -1,17 +1,19 @@
 """The bubble with every option: vapour, conducting medium, memory, shear thinning, enthalpy and Gilmore equations.
 
-State rows: Kirchhoff temperatures τ of the gas (mT), mole fractions of vapour (mY), temperatures θ_m − 1 of the
-medium (mM), the wall's τ_w where the medium conducts (an algebraic unknown: RODAS5P integrates the index-1 system as
-it stands), memory variables (q), V, u. Notation and units as in :mod:`equations`. The Jacobian is by one-sided
-differences.
+State rows: Kirchhoff temperatures τ of the gas (mT), mole fractions Y = 1 − χ of the non-condensible gas (mY),
+temperatures θ_m − 1 of the medium (mM), the wall's τ_w where the medium conducts (an algebraic unknown: RODAS5P
+integrates the index-1 system as it stands), memory variables (q), V, u. Notation and units as in :mod:`equations`. The
+Jacobian is by one-sided differences.
 
 Gas and vapour. Both have the same κ, hence the same molar heat capacity, and with the molar-average velocity u* the
 energy equation is that of a pure gas (diffusion carries no net enthalpy):
     u*/R = (κ−1)/κ E τ' − y π̇/(3κ),     τ̇ = −(u*/R − yV) τ' + (κ−1)/κ kθ (π̇ + E ∇²τ)
-    χ̇ = −(u*/R − yV) χ' + D/R² (∇²χ − θ'χ'/θ)          (mole fraction χ; Fick's law, ρ D uniform in composition)
-    π̇ = 3(κ−1) E τ'_w − 3κ V + 3κ D/R² χ'_w/(1−χ_w),   χ_w = p_sat(T_w)/p
-which is Prosperetti's ṗ_b with vapour transport, R_v/R_mix · dC/(1−C) being dχ/(1−χ). The non-condensible gas has the
-density p(1−χ)/(R_a T), linear in p at the wall too, so p follows from its mass as in :mod:`equations`.
+    Ẏ = −(u*/R − yV) Y' + D/R² (∇²Y + (b−1) θ'Y'/θ),   D = D_v (p_∞/p)^a θ^b      (Fick's law)
+    π̇ = 3(κ−1) E τ'_w − 3κ V − 3κ D_w/R² Y'_w/Y_w,     Y_w = 1 − p_sat(T_w)/p
+which is Prosperetti's ṗ_b with vapour transport, R_v/R_mix · dC/(1−C) being −dY/Y. The non-condensible gas has the
+density p Y/(R_a T), linear in p at the wall too, so p follows from its mass as in :mod:`equations`.
+A driven bubble becomes nearly all vapour (Y about 1e-6), hence Y and not χ as the unknown. Its growth has a solution
+that a grid can hold only with a = 1, as kinetic theory has it: at constant D, Y_w would be of order exp(−Ṙ R/D).
 
 Medium (x = r/R ≥ 1, on a rational Chebyshev grid):  θ̇_m = V(x − x⁻²) θ_m' + D_m/R² ∇²θ_m + 12 ν V² x⁻⁶/(c_p T_∞)
 Wall: K_m θ_m' = K_∞ τ'_w + latent heat of the evaporating flux.
@@ -63,27 +65,32 @@ def _gas_and_medium(y, par, dims, ops, medium, V, u, out):
     if mY:
         saturation = load(par, rows.SATURATION) * exp(-(load(par, rows.SATURATION_T) / theta_w))
     at_wall = weights[mT] / theta_w
-    inside = at_wall
+    interior = zero
     for i in range(mT):
         tau = load(y, i)
         k = sqrt(maximum(a * tau * 2.0 + 1.0, 1e-12))
         share = weights[i] / (tau * 2.0 / (k + 1.0) + 1.0)
         if mY:
-            share = share * (1.0 - load(y, oY + i))
-        inside = inside + share
-    p = (exp(load(par, rows.LOG_GAS) - u * 3.0) + saturation * at_wall) / inside
+            share = share * load(y, oY + i)
+        interior = interior + share
+    content = exp(load(par, rows.LOG_GAS) - u * 3.0)
+    p = (content + saturation * at_wall) / (interior + at_wall)
     per_area = exp(u * (-2.0))
     E = load(par, rows.CONDUCTION) / p * per_area
     slope_w = _derivative(y, 0, mT, tau_w, ops, mT)
     rate = (kappa - 1.0) * E * slope_w * 3.0 - kappa * V * 3.0
-    chi_w = zero
+    gas_w = zero
     flux = zero
     diffusion = zero
+    power = load(par, rows.DIFFUSION_T)
     if mY:
-        chi_w = saturation / p
-        diffusion = load(par, rows.DIFFUSION) * per_area
-        flux = _derivative(y, oY, mY, chi_w, ops, mT) / (1.0 - chi_w)
-        rate = rate + kappa * diffusion * flux * 3.0
+        # 1 − p_sat/p without the cancellation where the bubble is nearly all vapour
+        gas_w = (content - saturation * interior) / (content + saturation * at_wall)
+        dilution = exp(load(par, rows.DIFFUSION_P) * log(load(par, rows.AMBIENT) / p))
+        diffusion = load(par, rows.DIFFUSION) * per_area * dilution
+        at_T = exp(power * log(theta_w))
+        flux = -(_derivative(y, oY, mY, gas_w, ops, mT) / gas_w) * dilution * at_T
+        rate = rate + kappa * load(par, rows.DIFFUSION) * per_area * flux * 3.0
     for i in range(mT):
         tau = load(y, i)
         k = sqrt(maximum(a * tau * 2.0 + 1.0, 1e-12))
@@ -93,9 +100,10 @@ def _gas_and_medium(y, par, dims, ops, medium, V, u, out):
         drift = k1 * E * slope - (rate / (kappa * 3.0) + V) * ops[2 * mT + 1, i]
         store(out, i, k1 * k * theta * (rate + E * bend) - drift * slope)
         if mY:
-            slope_y = _derivative(y, oY, mY, chi_w, ops, i)
-            bend_y = _derivative(y, oY, mY, chi_w, ops, mT + 1 + i)
-            store(out, oY + i, diffusion * (bend_y - slope / (k * theta) * slope_y) - drift * slope_y)
+            slope_y = _derivative(y, oY, mY, gas_w, ops, i)
+            bend_y = _derivative(y, oY, mY, gas_w, ops, mT + 1 + i)
+            spread_y = diffusion * exp(power * log(maximum(theta, 1e-12)))
+            store(out, oY + i, spread_y * (bend_y + (power - 1.0) * slope / (k * theta) * slope_y) - drift * slope_y)
     if wall:
         hot = theta_w - 1.0
         spread = load(par, rows.MEDIUM_D) * per_area
@@ -199,7 +207,7 @@ def general_jacobian(y, t, par, dims, world, extra, shifted, out, changed, jac, 
         store(shifted, i, load(y, i))
     for j in range(n):
         value = load(y, j)
-        floor_j = 0.01 if j == n - 2 else 1.0
+        floor_j = 0.01 if j == n - 2 else 1e-6 if mT <= j < mT + mY else 1.0
         delta = _DELTA * maximum(absolute(value), floor_j)
         store(shifted, j, value + delta)
         delta = load(shifted, j) - value

@@ -18,7 +18,7 @@ from en4dvar_bubble.solver.rows import AMPLITUDE, INVERSE_C, TABLE
 from en4dvar_bubble.tables import fill
 
 # Status of a member; the reasons users read are made by ``driver.reason``.
-OK, STEP_LIMIT, NON_FINITE, STEP_UNDERFLOW, MACH_LIMIT, TIME_LIMIT = 0, 1, 2, 3, 4, 5
+OK, STEP_LIMIT, NON_FINITE, STEP_UNDERFLOW, MACH_LIMIT, TIME_LIMIT, WALL_LIMIT = 0, 1, 2, 3, 4, 5, 6
 # Columns of the per-member record.
 STEPS, REJECTED, MAX_MACH, MAX_THETA, MIN_LOG_R, END_TIME = 0, 1, 2, 3, 4, 5
 RECORD = 6
@@ -176,7 +176,8 @@ def integrate(
     when a member's turn comes, or (0, nodes); their factor; finished tables (N, cells, 8)); ``nodes`` and ``size`` as
     for :func:`_attempt`; ``tol`` (2, n) absolute and relative tolerances; ``breaks`` increasing instants the steps must
     not straddle; ``limits`` = (first step, longest step inside the driving, step limit, Mach limit, seconds per
-    member). Outputs: out (N, K, n) with NaN where not reached, status (N,), record (N, RECORD).
+    member, τ of the wall above which a breakdown is put down to it). Outputs: out (N, K, n) with NaN where not reached,
+    status (N,), record (N, RECORD).
     """
     n_members, n = initial.shape
     n_times = times.shape[1]
@@ -201,7 +202,7 @@ def integrate(
     rejected = np.zeros(WIDTH, dtype=np.bool_)
     waiting = True
     running = 0
-    first_step, inside_step, step_limit, mach_limit, seconds = limits
+    first_step, inside_step, step_limit, mach_limit, seconds, hottest_wall = limits
     began = np.zeros(WIDTH, dtype=np.int64)
     clock = _clock(0)
     attempts = 0
@@ -335,6 +336,8 @@ def integrate(
                 failure = TIME_LIMIT
             if h[0, lane] < _SHORTEST:
                 failure = STEP_UNDERFLOW if math.isfinite(norm[0, lane]) else NON_FINITE
+                if dims[3] > 0 and y[dims[0] + dims[1] + dims[2], lane] > hottest_wall:
+                    failure = WALL_LIMIT
             if failure != OK or observed[lane] == n_times:
                 status[i] = failure
                 member[lane] = -1

@@ -25,7 +25,9 @@ MEDIUM_K = 18  # K_m/K_∞
 MEDIUM_D = 19  # thermal diffusivity of the medium, µm²/µs
 HEATING = 20  # 12/(c_p T_∞) of the medium, of ν V²
 VISCOUS_TABLE = 21  # offset of the member's table of ν against ln(|V| in 1/s)
-PARAMETERS = 22
+DIFFUSION_P = 22  # exponents of D ∝ (p_∞/p)^… θ^…
+DIFFUSION_T = 23
+PARAMETERS = 24
 # Three further rows for each memory variable: relaxation time (µs), convection, offset of its two tables.
 MEMORY = PARAMETERS
 PER_MEMORY = 3
