@@ -1,121 +1,137 @@
 """Is the posterior calibrated? Synthetic acoustic experiments with truths drawn from the prior, in one command.
 
-    python benchmarks/calibration.py                       cases a, b and c, 500 experiments (hours)
-    python benchmarks/calibration.py --case a --n 100      30 % priors, En4D-Var alone
+    python benchmarks/calibration.py a                 30 % priors, En4D-Var alone; 20 of them against a Markov chain
+    python benchmarks/calibration.py b                 wide priors, ``refine: mcmc``
+    python benchmarks/calibration.py b --minutes 4     a piece of it: records are kept and the next call goes on
 
-Case a: 30 % priors, En4D-Var; 20 of them against a Markov chain. Case b: wide priors, ``refine: mcmc``. Case c: wide
-priors without refinement: does the diagnostic flag the runs that differ from a chain? For a and b: rank histograms
-of every parameter uniform (chi-squared, p > 0.01), central 50 and 90 % intervals cover within binomial error, standard
-deviation of the z-scores in [0.9, 1.1].
+Over ``--n`` experiments: rank histograms of every parameter uniform (chi-squared, p > 0.01), central 50 and 90 %
+intervals cover within binomial error (p > 0.01), standard deviation of the z-scores in [0.9, 1.1]. The records of b are
+also those of case c (benchmarks/gaussianity.py).
 """
 
 from __future__ import annotations
 
 import argparse
-import time
+from pathlib import Path
 
 import numpy as np
 from acoustic_twin import NARROW, WIDE, make_twin, prior
+from records import Record, fill
 from scipy.stats import binomtest, chisquare
 
 from en4dvar import mcmc
 from en4dvar.assimilate import assimilate
-from en4dvar.diagnostics import is_non_gaussian
+from en4dvar.errors import En4dvarError
 from en4dvar.forecast import log_posterior
-from en4dvar.prior import Prior
-from en4dvar.problem import Analysis, AssimilationSettings, InverseProblem
-from en4dvar.state import Array
+from en4dvar.problem import AssimilationSettings
 
 BINS = 7  # of 49 ranks
-OFF = (0.5, 0.3)  # mean by posterior standard deviations, std by a fraction: what case c must flag
+CHAINS = 20  # runs of case a that are compared with a chain
+CLOSE = (0.3, 0.15)  # mean by standard deviations of the chain, std by a fraction
+LEVEL = 0.01  # of every test
 
 
-def against_chain(problem: InverseProblem, analysis: Analysis, seed: int) -> tuple[Array, Array]:
-    """(Shift of the mean in std of the chain, std relative to the chain's), each (n,)."""
-    x = problem.prior.from_physical(analysis.posterior)
-    chain = mcmc.sample(lambda z: log_posterior(problem, z), x, 10_000 + seed)
-    std = chain.flat.std(axis=0)
-    return (x.mean(axis=0) - chain.flat.mean(axis=0)) / std, x.std(axis=0, ddof=1) / std
+def narrow(key: str) -> Record:
+    """En4D-Var under 30 % priors and, for the first experiments, a chain."""
+    return experiment(int(key), NARROW, AssimilationSettings(), chain=int(key) < CHAINS)
+
+
+def wide(key: str) -> Record:
+    """Wide priors with refinement."""
+    return experiment(int(key), WIDE, AssimilationSettings(refine="mcmc"))
+
+
+def experiment(seed: int, widths: dict[str, float], settings: AssimilationSettings, chain: bool = False) -> Record:
+    """Ranks, moments (n,) of the posterior ensemble in transformed space, the truth, and what a chain says."""
+    of = prior(widths)
+    twin = make_twin(seed, of)
+    try:
+        analysis = assimilate(twin.problem, settings, seed)
+    except En4dvarError as error:  # counted: no run may fail
+        return {"failure": str(error)}
+    x = of.from_physical(analysis.posterior)
+    record = {
+        "truth": twin.truth,
+        "mean": x.mean(axis=0),
+        "std": x.std(axis=0, ddof=1),
+        "rank": np.sum(x < twin.truth, axis=0),
+        "converged": analysis.converged,
+        **analysis.refinement,
+    }
+    if chain:
+        sampled = mcmc.sample(lambda z: log_posterior(twin.problem, z), x, 10_000 + seed)
+        record |= {
+            "chain_mean": sampled.flat.mean(axis=0),
+            "chain_std": sampled.flat.std(axis=0),
+            "chain_converged": sampled.converged,
+        }
+    return record
 
 
 def verdict(passed: bool) -> str:
     return "ok" if passed else "MISSED"
 
 
-def calibrated(of: Prior, settings: AssimilationSettings, n: int, time_std: float, chains: int) -> None:
-    """Print ranks, coverage and z-scores of ``n`` experiments; compare the first ``chains`` with a chain."""
-    ranks, scores, levels, differences, failed = [], [], [], [], 0
-    for seed in range(n):
-        twin = make_twin(seed, of, time_std=time_std)
-        try:
-            analysis = assimilate(twin.problem, settings, seed)
-        except Exception as error:  # counted: no run may fail
-            failed += 1
-            print(f"  experiment {seed} failed: {error}")
-            continue
-        x = of.from_physical(analysis.posterior)
-        mean, std = x.mean(axis=0), x.std(axis=0, ddof=1)
-        ranks.append(np.sum(x < twin.truth, axis=0))
-        scores.append((twin.truth - mean) / std)
-        # distance from the median in ranks: half of a central interval
-        levels.append(np.abs((np.sum(x < twin.truth, axis=0) + 0.5) / (len(x) + 1) - 0.5) * 2)
-        if seed < chains:
-            differences.append(against_chain(twin.problem, analysis, seed))
-    print(f"failed runs: {failed} of {n} {verdict(failed == 0)}")
-    z, level, rank = np.array(scores), np.array(levels), np.array(ranks)
-    for j, name in enumerate(of.names):
-        counts = np.histogram(rank[:, j], bins=BINS, range=(-0.5, 48.5))[0]
-        p, spread = chisquare(counts).pvalue, z[:, j].std(ddof=1)
-        line = f"{name:6} rank p {p:.3f} {verdict(p > 0.01)}; z std {spread:.3f} {verdict(0.9 <= spread <= 1.1)}"
-        for target in (0.5, 0.9):
-            inside = int(np.sum(level[:, j] < target))
-            fits = binomtest(inside, len(level), target).pvalue > 0.01
-            line += f"; {target:.0%} covers {inside / len(level):.1%} {verdict(fits)}"
-        print(line)
-    if differences:
-        shift, ratio = (np.abs(np.array(d)).max(axis=1) for d in ([s for s, _ in differences], _off(differences)))
-        print(
-            f"against a chain, {len(shift)} runs: mean off by {shift.max():.2f} std {verdict(shift.max() < 0.3)}, ",
-            end="",
-        )
-        print(f"std off by {ratio.max():.0%} {verdict(ratio.max() < 0.15)}")
+def table(records: list[Record], names: tuple[str, ...]) -> None:
+    """Print ranks, z-scores and coverage of every parameter."""
+    good = [record for record in records if "failure" not in record]
+    print(f"{len(records)} experiments, failed runs: {len(records) - len(good)} {verdict(len(good) == len(records))}")
+    for record in records:
+        if "failure" in record:
+            print(f"  experiment {record['key']}: {record['failure']}")
+    truth, mean, std, rank = (np.array([r[key] for r in good]) for key in ("truth", "mean", "std", "rank"))
+    z, members = (truth - mean) / std, 48
+    # distance from the median in ranks: half of a central interval
+    level = np.abs((rank + 0.5) / (members + 1) - 0.5) * 2
+    print("| parameter | rank histogram p | std of z | mean of z | 50 % interval | 90 % interval | |")
+    print("|---|---|---|---|---|---|---|")
+    for j, name in enumerate(names):
+        p = chisquare(np.histogram(rank[:, j], bins=BINS, range=(-0.5, members + 0.5))[0]).pvalue
+        spread = z[:, j].std(ddof=1)
+        inside = [int(np.sum(level[:, j] < target)) for target in (0.5, 0.9)]
+        passed = p > LEVEL and 0.9 <= spread <= 1.1
+        passed &= all(binomtest(i, len(z), t).pvalue > LEVEL for i, t in zip(inside, (0.5, 0.9), strict=True))
+        cells = [f"{p:.3f}", f"{spread:.3f}", f"{z[:, j].mean():+.3f}", *(f"{i / len(z):.1%}" for i in inside)]
+        print(f"| {name} | {' | '.join(cells)} | {verdict(passed)} |")
 
 
-def _off(differences: list[tuple[Array, Array]]) -> list[Array]:
-    return [ratio - 1 for _, ratio in differences]
+def against_chain(records: list[Record]) -> None:
+    """Print the largest differences from the chains."""
+    pairs = [r for r in records if "chain_mean" in r]
+    if not pairs:
+        return
+    mean, std, m, s = (np.array([r[k] for r in pairs]) for k in ("mean", "std", "chain_mean", "chain_std"))
+    shift = np.max(np.abs(mean - m) / s, axis=1)
+    ratio = np.max(np.abs(std / s - 1), axis=1)
+    print(f"against a chain, {len(pairs)} runs ({sum(r['chain_converged'] for r in pairs)} chains converged): ", end="")
+    print(f"mean off by at most {shift.max():.2f} std {verdict(shift.max() < CLOSE[0])}, ", end="")
+    print(f"std by at most {ratio.max():.0%} {verdict(ratio.max() < CLOSE[1])}")
 
 
-def flagged(of: Prior, n: int, time_std: float) -> None:
-    """Print how well the non-Gaussianity diagnostic tells runs that differ from a chain."""
-    off, flags = [], []
-    for seed in range(n):
-        problem = make_twin(seed, of, time_std=time_std).problem
-        analysis = assimilate(problem, AssimilationSettings(), seed)
-        shift, ratio = against_chain(problem, analysis, seed)
-        off.append(bool(np.max(np.abs(shift)) > OFF[0] or np.max(np.abs(ratio - 1)) > OFF[1]))
-        flags.append(is_non_gaussian(analysis.shape))
-    wrong, warned = np.array(off), np.array(flags)
-    print(f"runs off: {wrong.sum()} of {n}; flagged of them: {(warned & wrong).sum()}; ", end="")
-    print(f"false alarms: {(warned & ~wrong).sum()} of {(~wrong).sum()}")
+def chains(records: list[Record]) -> None:
+    """Print what the refinement cost and whether it converged."""
+    refined = [r for r in records if "mcmc_steps" in r]
+    if refined:
+        steps, size = (np.array([r[k] for r in refined]) for k in ("mcmc_steps", "mcmc_effective_sample_size"))
+        print(f"chains converged: {sum(bool(r['mcmc_converged']) for r in refined)} of {len(refined)}; ", end="")
+        print(f"steps: median {np.median(steps):.0f}, most {steps.max()}; least effective sample size {size.min():.0f}")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--case", choices=("a", "b", "c", "all"), default="all")
-    parser.add_argument("--n", type=int, default=500, help="experiments of cases a and b; case c takes a fifth")
-    parser.add_argument("--chains", type=int, default=20, help="runs of case a to compare with a chain")
-    parser.add_argument("--time-std", type=float, default=0.0, help="timing error, s")
+    parser.add_argument("case", choices=("a", "b"))
+    parser.add_argument("--start", type=int, default=0, help="first experiment (its seed)")
+    parser.add_argument("--n", type=int, default=500, help="number of experiments")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="start no experiment after so long")
+    parser.add_argument("--records", type=Path, default=Path("runs/calibration"), help="folder of the records")
     options = parser.parse_args()
-    for case in "abc" if options.case == "all" else options.case:
-        began = time.perf_counter()
-        print(f"case {case}")
-        if case == "a":
-            calibrated(prior(NARROW), AssimilationSettings(), options.n, options.time_std, options.chains)
-        elif case == "b":
-            calibrated(prior(WIDE), AssimilationSettings(refine="mcmc"), options.n, options.time_std, 0)
-        else:
-            flagged(prior(WIDE), max(1, options.n // 5), options.time_std)
-        print(f"{time.perf_counter() - began:.0f} s\n", flush=True)
+    keys = [str(seed) for seed in range(options.start, options.start + options.n)]
+    run, widths = (narrow, NARROW) if options.case == "a" else (wide, WIDE)
+    found = list(fill(options.records / f"{options.case}.jsonl", keys, run, options.minutes).values())
+    print(f"case {options.case}: seeds {options.start} to {options.start + options.n - 1}, {len(found)} done")
+    table(found, prior(widths).names)
+    against_chain(found)
+    chains(found)
 
 
 if __name__ == "__main__":
