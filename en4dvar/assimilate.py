@@ -124,6 +124,7 @@ class _Run:
         mode = space.control(end.weights.w)
         final = space.forecast(np.vstack([posterior, mode]), grid)
         after, last = final[:-1], final[-1:]
+        self.require_members(after.failures, "posterior forecast")
         at_centre = (
             None if last.rates is None else last.rates[0],
             None if last.noise_scale is None else last.noise_scale[0],
@@ -182,6 +183,7 @@ class _Run:
                     cost=float(self.costs(mode[None], last)[0]),
                     converged=end.converged,
                     stop_reason=end.reason,
+                    step_norm=record.step_norm,
                     chi2=record.chi2_per_observation * used,
                     n_weighted=used,
                     dfs=record.dfs,

@@ -196,7 +196,7 @@ def _sample_stats(a: Analysis) -> xr.Dataset:
         **a.refinement,
     }
     reached = {
-        limit.name: _variable(
+        f"{limit.name}_reached": _variable(
             MEMBER,
             a.extremes[None, :, i],
             limit.unit,

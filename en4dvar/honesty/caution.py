@@ -31,7 +31,7 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
     "at-bound": ("caution", "widen the bound if physics allows it; else quote a limit, not mean ± std"),
     "non-gaussian": ("caution", "set assimilation.refine: mcmc, which samples the posterior as it is"),
     "overstated-error": ("caution", "state the observation error as it is (or estimate sigma); intervals are too wide"),
-    "start-moved": ("note", "nothing, where the iterations converged"),
+    "start-moved": ("note", "no action is needed where the iterations converged"),
     "down-weighted": ("note", "look at these observations; they count less than the others"),
     "not-informed": ("note", "do not quote it as measured: fix it, or add data that depend on it"),
 }

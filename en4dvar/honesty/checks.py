@@ -105,7 +105,7 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
 def validity(limits: Sequence[ValidityLimit], extremes: Array) -> tuple[Caution, ...]:
     """Posterior members (N, V) whose path leaves what the model's equations assume."""
     found = []
-    for limit, reached in zip(limits, extremes.T, strict=True) if len(extremes) else ():
+    for limit, reached in zip(limits, extremes.T, strict=True) if extremes.size else ():
         beyond = reached > limit.value
         if np.mean(beyond) > BEYOND:
             unit = "" if limit.unit == "1" else f" {limit.unit}"

@@ -17,6 +17,7 @@ from en4dvar.prior import Prior
 from en4dvar.state import Array
 
 COLLAPSED = 1 / 9  # of the mean of 2 (J − J_min) per parameter: a spread below a third of what J allows
+SHORT_STEP = 0.5  # posterior standard deviations
 NO_SPREAD = 1e-8  # of the prior's: members that agree to rounding
 
 
@@ -24,11 +25,11 @@ NO_SPREAD = 1e-8  # of the prior's: members that agree to rounding
 class Ending:
     """What the checks look at. N members, n parameters; ensembles are in transformed space.
 
-    ``costs`` (N,) are J of the posterior members, +inf where one failed, ``cost`` is J at the ``mode`` (n,); ``chi2``
-    is the sum of squared standardised residuals of ``n_weighted`` observations. ``failures`` are the reasons, ""
-    for a member alive, in the prior forecast, in the iteration that lost most, and in the posterior forecast.
-    ``extremes`` (N, V) are what the posterior members reached of the model's ``limits``. ``found`` are warnings met
-    on the way.
+    ``costs`` (N,) are J of the posterior members, +inf where one failed, ``cost`` is J at the ``mode`` (n,).
+    ``step_norm`` is the length of the next step in posterior standard deviations, had there been one. ``chi2`` is the
+    sum of squared standardised residuals of ``n_weighted`` observations. ``failures`` are the reasons, "" for a member
+    alive, in the prior forecast, in the iteration that lost most, and in the posterior forecast. ``extremes`` (N, V)
+    are what the posterior members reached of the model's ``limits``. ``found`` are warnings met on the way.
     """
 
     prior: Prior
@@ -39,6 +40,7 @@ class Ending:
     cost: float
     converged: bool
     stop_reason: str
+    step_norm: float
     chi2: float
     n_weighted: int
     dfs: float
@@ -62,7 +64,7 @@ def examine(end: Ending) -> tuple[Caution, ...]:
     return worst_first(
         (
             *end.found,
-            *(() if end.converged else (caution("not-converged", f"not converged: {end.stop_reason}"),)),
+            *unfinished(end),
             *checks.rank(end.prior, end.members, end.posterior[end.alive]),
             *collapse(end),
             *loss("prior forecast", end.prior_failures, end.prior, end.members),
@@ -71,11 +73,25 @@ def examine(end: Ending) -> tuple[Caution, ...]:
             *checks.fit(end.chi2, end.n_weighted, end.dfs),
             *checks.conflict(end.prior, end.mode),
             *checks.at_bound(end.prior, end.members, end.posterior, end.posterior_failures),
-            *checks.validity(end.limits, end.extremes[end.alive]),
+            *(checks.validity(end.limits, end.extremes[end.alive]) if end.limits else ()),
             *(caution("non-gaussian", words) for words in shape_warnings(end.shape)),
             *checks.information(end.prior.names, end.dfs_per_parameter),
         )
     )
+
+
+def unfinished(end: Ending) -> tuple[Caution, ...]:
+    """Iterations that stopped before their own criterion; a note where the next step would have been short.
+
+    A gradient regressed over the ensemble need not vanish where J is smallest, so that variant often ends like this.
+    """
+    if end.converged:
+        return ()
+    words = f"not converged: {end.stop_reason}"
+    if not end.step_norm <= SHORT_STEP:
+        return (caution("not-converged", words),)
+    words = f"{words}; the next step would be {end.step_norm:.2g} posterior standard deviations, which is little"
+    return (caution("not-converged", words, "note"),)
 
 
 def collapse(end: Ending) -> tuple[Caution, ...]:

@@ -52,13 +52,12 @@ def where_lost(prior: Prior, members: Array, lost: Mask) -> str:
             continue
         mirrored = values if score > 0 else -values
         edge, rest = float(np.min(mirrored[lost])), mirrored[~lost]
-        clean = edge > float(rest.max())
-        if not clean:  # most of the lost lie beyond this quantile
+        if edge <= float(rest.max()):  # not all on one side: most of the lost lie beyond this quantile
             edge = float(np.quantile(mirrored[lost], 0.1))
-        side = "above" if score > 0 else "below"
-        within = int(np.sum(rest > edge))
-        also = "" if clean else f" (as do {within} of the {n_alive} others)"
-        sides.append((abs(score), f"{_name(prior, j)} {side} {_shown(prior, j, edge if score > 0 else -edge)}{also}"))
+        beyond = int(np.sum(rest > edge))
+        others = f"as {beyond} of" if beyond else "none of"
+        side, at = ("above", edge) if score > 0 else ("below", -edge)
+        sides.append((abs(score), f"{prior.names[j]} {side} {_shown(prior, j, at)} ({others} the {n_alive} others)"))
     if not sides:
         return "they are spread over the whole ensemble"
     named = [text for _, text in sorted(sides, key=lambda side: -side[0])[:MOST_NAMED]]
@@ -70,7 +69,7 @@ def _one_by_one(prior: Prior, members: Array) -> str:
     for row in members:
         z = (row - prior.mean) / prior.std
         far = [j for j in np.argsort(-np.abs(z)) if abs(z[j]) > FAR][:MOST_NAMED]
-        places = ", ".join(f"{_name(prior, j)} = {_shown(prior, j, row[j])} ({z[j]:+.1f} prior std)" for j in far)
+        places = ", ".join(f"{prior.names[j]} = {_shown(prior, j, row[j])} ({z[j]:+.1f} prior std)" for j in far)
         told.append(f"at {places}" if places else "near the centre of the prior")
     return f"lost {' and '.join(dict.fromkeys(told))}"
 
@@ -82,10 +81,6 @@ def _rank_score(values: Array, lost: Mask) -> float:
     n, m = int(lost.sum()), int((~lost).sum())
     expected, variance = n * (n + m + 1) / 2, n * m * (n + m + 1) / 12
     return float((ranks[lost].sum() - expected) / math.sqrt(variance))
-
-
-def _name(prior: Prior, j: int) -> str:
-    return prior.names[j]
 
 
 def _shown(prior: Prior, j: int, x: float) -> str:

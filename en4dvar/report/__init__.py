@@ -15,11 +15,13 @@ from pathlib import Path
 from en4dvar.campaign_file import failed_datasets
 from en4dvar.errors import OutputError
 from en4dvar.files import write_text
+from en4dvar.honesty import Caution
 from en4dvar.report.figures import all_figures
 from en4dvar.report.page import Section, make_section, render
 from en4dvar.report.style import save_figure
 from en4dvar.store import ParameterSummary, load_result
 
+Summarised = tuple[str, Iterable[ParameterSummary], Iterable[Caution]]
 DETAILED = 24  # data sets with figures; a campaign's others are in summary.csv and datasets/
 
 
@@ -37,11 +39,11 @@ def write_report(run_dir: str | Path) -> Path:
     failures = failed_datasets(run_dir / "posterior.nc") if len(paths) > 1 or paths[0].parent != run_dir else {}
     warned: dict[Path, bool] = {}
 
-    def summaries() -> Iterator[tuple[str, tuple[ParameterSummary, ...]]]:
+    def summaries() -> Iterator[Summarised]:
         for path in paths:
             result = load_result(path)
             warned[path] = bool(result.warnings)
-            yield result.name, result.summary()
+            yield result.name, result.summary(), result.cautions
 
     write_text(run_dir / "summary.csv", summary_csv(summaries(), failures))
     folder = run_dir / "figures"
@@ -60,20 +62,22 @@ def write_report(run_dir: str | Path) -> Path:
     return write_text(run_dir / "report.html", render(sections, failures, len(paths) - len(sections)))
 
 
-def summary_csv(summaries: Iterable[tuple[str, Iterable[ParameterSummary]]], failures: Mapping[str, str]) -> str:
+def summary_csv(summaries: Iterable[Summarised], failures: Mapping[str, str]) -> str:
     """One line a data set and parameter, in display units, every digit kept; one line a data set that failed.
 
-    ``summaries``: (name of the data set, its rows); ``failures``: name of the data set → reason, column ``failure``.
+    ``summaries``: (name of the data set, its rows, its warnings: column ``warnings`` holds their codes);
+    ``failures``: name of the data set → reason, column ``failure``.
     """
     columns = [f.name for f in fields(ParameterSummary) if f.name not in ("label", "symbol")]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["dataset", *columns, "failure"])
-    for name, summary in summaries:
+    writer.writerow(["dataset", *columns, "failure", "warnings"])
+    for name, summary, cautions in summaries:
+        codes = " ".join(dict.fromkeys(c.code for c in cautions))
         for row in summary:
-            writer.writerow([name, *(getattr(row, column) for column in columns), ""])
+            writer.writerow([name, *(getattr(row, column) for column in columns), "", codes])
     for name, reason in failures.items():
-        writer.writerow([name, *("" for _ in columns), reason])
+        writer.writerow([name, *("" for _ in columns), reason, ""])
     return text.getvalue()
 
 

@@ -1,0 +1,33 @@
+"""The bubble says how far its radial equation was stretched: the wall Mach number, also between the observations."""
+
+import numpy as np
+import pytest
+
+from en4dvar.honesty.checks import validity
+from en4dvar_bubble import BubbleModel
+
+
+def largest_mach(end, radial="keller-miksis"):
+    model = BubbleModel(radial=radial)
+    theta = {"G": 500.0, "alpha": 0.03, "mu": 0.1, "R0": 0.5e-6}
+    x = model.initial_states({name: np.array([value]) for name, value in theta.items()})
+    (path,) = model.trajectories(x, np.linspace(5e-6, end, 12))
+    return model, path, path.largest("wall_mach")
+
+
+def test_collapse_exceeds_it_and_the_growth_before_does_not():
+    model, _, growth = largest_mach(25e-6)
+    _, path, collapse = largest_mach(40e-6)
+    assert growth < 0.2
+    assert collapse > 3
+    assert np.max(np.abs(path["Rdot"])) / model.medium.c < 0.5 * collapse  # its peak is between the observations
+    assert validity(model.validity, np.full((4, 1), growth)) == ()
+    (found,) = validity(model.validity, np.full((4, 1), collapse))
+    assert "Mach number of the bubble wall reaches" in found.words
+
+
+def test_an_incompressible_liquid_has_a_lower_limit():
+    model, path, reached = largest_mach(25e-6, "rayleigh-plesset")
+    assert reached == pytest.approx(np.max(np.abs(path["Rdot"])) / model.medium.c, rel=1e-12)
+    assert model.validity[0].value < BubbleModel().validity[0].value < BubbleModel(radial="gilmore").validity[0].value
+    assert path.largest("R") == pytest.approx(path["R"].max(), rel=1e-12)

@@ -1,0 +1,111 @@
+"""Problems built to end badly, one for each warning, and problems that end well."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from toys import Decay, Fragile, Toy, Vectorised, Wave, make_problem
+
+from en4dvar.assimilate import assimilate
+from en4dvar.forward import ValidityLimit
+from en4dvar.prior import PriorTerm
+from en4dvar.problem import Analysis, AssimilationSettings, InverseProblem
+from en4dvar.state import Parameter
+
+TWO = ("a", "b")
+
+
+class Violent(Vectorised):
+    """Says of itself that it does not hold where |y| exceeds 0.9 m."""
+
+    validity = (ValidityLimit("y", 0.9, "m", "largest excursion", "a test"),)
+
+
+class Product(Toy):
+    """y = a b: the data know the product alone, so the posterior is a bent ridge."""
+
+    def curve(self, theta, t):
+        a, b = theta
+        return float(a * b)
+
+    def rate(self, theta, t):
+        return 0.0
+
+
+def run(problem: InverseProblem, **settings: object) -> Analysis:
+    return assimilate(problem, AssimilationSettings(**settings), 1)  # type: ignore[arg-type]
+
+
+def linear(truth: tuple[float, ...] = (1.0, 0.5), **options: object) -> InverseProblem:
+    return make_problem(Vectorised(TWO), truth, **options)
+
+
+def bounded(truth: float, term: Callable[[Parameter], PriorTerm], bounds: tuple[float, float]) -> InverseProblem:
+    model = Vectorised(TWO)
+    a = Parameter("a", "m", bounds=bounds)
+    return make_problem(model, (truth, 0.5), prior=(term(a), PriorTerm.normal(model.parameters[1], 0.5, 1.0)))
+
+
+def many(n: int, **options: object) -> InverseProblem:
+    return make_problem(Vectorised(tuple(f"p{i}" for i in range(n))), (1.0,) * n, k=3 * n, std=0.01, **options)
+
+
+def outlier() -> InverseProblem:
+    problem = linear()
+    values = problem.observations.values.copy()
+    values[3] += 0.8
+    return replace(problem, observations=replace(problem.observations, values=values, huber=1.5))
+
+
+def chain_not_converged() -> Analysis:
+    return run(linear(), refine="mcmc", members=12)
+
+
+PROVOKED: dict[str, Callable[[], Analysis]] = {
+    "not-converged": lambda: run(
+        make_problem(Wave(), [1.5, 1.2], scale=0.4), members=16, max_iterations=1, start="prior-mean"
+    ),
+    "ensemble-collapse": lambda: run(many(40), members=4, sampling="random", scheme="es-mda"),
+    "rank-deficient": lambda: run(many(8), members=6, sampling="random"),
+    "misfit": lambda: run(replace_std(linear(scale=100.0), 0.01)),
+    "overstated-error": lambda: run(replace_std(linear(scale=100.0), 10.0)),
+    "prior-conflict": lambda: run(linear(scale=0.02, std=0.001)),
+    "model-validity": lambda: run(make_problem(Violent(TWO), (1.0, 0.5))),
+    "members-lost": lambda: run(
+        make_problem(Fragile(0.2, names=TWO), (-1.0, 0.5)), members=40, min_active_fraction=0.2
+    ),
+    "at-bound": lambda: run(bounded(1.6, lambda a: PriorTerm.logit(a, (0.0, 1.0), 0.5, 1.5), (0.0, 1.0))),
+    "non-gaussian": lambda: run(make_problem(Product(TWO), (1.0, 1.0), std=0.1)),
+    "start-moved": lambda: run(
+        make_problem(Fragile(-0.9, names=TWO), (-1.0, 0.5)), start="prior-mean", min_active_fraction=0.2
+    ),
+    "down-weighted": lambda: run(outlier()),
+    "not-informed": lambda: run(linear(scale=0.01, std=0.5)),
+}
+
+
+def replace_std(problem: InverseProblem, std: float) -> InverseProblem:
+    problem.observations.std[:] = std
+    return problem
+
+
+def well_specified(model: Toy, terms: tuple[PriorTerm, ...], std: float, count: int, seed: int) -> list[InverseProblem]:
+    """Experiments whose truth is drawn from the prior and whose noise is as stated."""
+    prior = make_problem(model, (1.0,) * len(terms), prior=terms).prior
+    truths = prior.to_physical(prior.sample(count, seed, "random"))
+    return [make_problem(model, truth, prior=terms, seed=seed + 1 + i, std=std, k=9) for i, truth in enumerate(truths)]
+
+
+def linear_experiments(count: int, seed: int) -> list[InverseProblem]:
+    model = Vectorised(("a", "b", "c"))
+    terms = tuple(PriorTerm.normal(p, 0.5, 1.0) for p in model.parameters)
+    return well_specified(model, terms, 0.3, count, seed)
+
+
+def decay_experiments(count: int, seed: int) -> list[InverseProblem]:
+    model = Decay()
+    a, b = model.parameters
+    return well_specified(
+        model, (PriorTerm.lognormal(a, 1.2, 0.3), PriorTerm.lognormal(b, 1.0, 0.3)), 0.05, count, seed
+    )
