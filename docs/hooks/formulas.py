@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import unicodedata
 from html import unescape
 from typing import Any
 
@@ -12,6 +13,22 @@ from latex2mathml.converter import convert
 log = logging.getLogger("mkdocs.hooks.formulas")
 _TIGHT = re.compile(r"<mo([^>]*)>(/|&#x0002F;|\||&#x0007C;|&#x02223;)</mo>")
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.S)
+
+
+_FUNCTION = re.compile(r"(<mi>(?:ln|log|exp|cos|sin|det)</mi>)(?=<m(?:i|n|frac|sqrt|sub|sup)>)")
+_STYLED = re.compile(r'<(m[in]) mathvariant="(script|double-struck|bold)">(\w)</\1>')
+_STYLES = {"script": "SCRIPT CAPITAL", "double-struck": "DOUBLE-STRUCK CAPITAL", "bold": "MATHEMATICAL BOLD"}
+
+
+def _styled(match: re.Match[str]) -> str:
+    """A letter of its own in place of a style, which browsers no longer read."""
+    tag, style, letter = match.groups()
+    kind = "DIGIT" if letter.isdigit() else "CAPITAL" if style == "bold" else ""
+    try:
+        made = unicodedata.lookup(" ".join(filter(None, [_STYLES[style], kind, unicodedata.name(letter).split()[-1]])))
+    except KeyError:
+        return match.group()
+    return f'<{tag} mathvariant="normal">{made}</{tag}>'
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
@@ -27,6 +44,8 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
             return match.group()
         if "\\" in re.sub(r'alttext="[^"]*"', "", made):  # a command it does not know is copied as it is
             log.warning("%s: formula %r has a command that is not understood", page.file.src_path, tex)
+        made = _STYLED.sub(_styled, made)
+        made = _FUNCTION.sub(r'\1<mspace width="0.17em"/>', made)
         made = _TIGHT.sub(r'<mo\1 lspace="0" rspace="0">\2</mo>', made)  # browsers set these apart like a plus
         return f'<{tag} class="formula">{made}</{tag}>'
 

@@ -1,0 +1,81 @@
+"""The site as a reader gets it: built strictly, complete, and in need of no network (extra ``docs``)."""
+
+from __future__ import annotations
+
+import html
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from doc_pages import ROOT
+
+import en4dvar
+import en4dvar_bubble
+from en4dvar.config import schema
+from en4dvar_bubble.settings import BubbleSettings
+
+pytest.importorskip("mkdocs", reason="the extra docs is not installed")
+pytest.importorskip("latex2mathml", reason="the extra docs is not installed")
+pytestmark = pytest.mark.slow
+TAG = r"<(?:script|img|iframe|source|link(?! rel=.canonical)) [^>]*"
+REMOTE = re.compile(TAG + r"(?:src|href)=[\"']?(https?://[^\"' >]+)")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+def test_every_page_is_there_and_can_be_found(site):
+    home = (site / "index.html").read_text(encoding="utf-8")
+    generated = {"reference_yaml", "reference_cli", "reference_api"}
+    for name in {p.stem for p in (ROOT / "docs").glob("*.md")} | generated:
+        assert (site / f"{name}.html").is_file()
+        assert f'href="{name}.html"' in home or name == "index", f"{name} is not in the navigation"
+
+
+def test_nothing_is_loaded_from_elsewhere(site):
+    for page in site.rglob("*.html"):
+        assert REMOTE.findall(page.read_text(encoding="utf-8")) == [], page.name
+    for sheet in site.rglob("*.css"):
+        assert re.findall(r"url\([\"']?https?:", sheet.read_text(encoding="utf-8")) == [], sheet.name
+
+
+def test_formulas_are_drawn_by_the_browser(site):
+    total = 0
+    for page in site.glob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        assert "arithmatex" not in text, f"{page.name} holds a formula that was not converted"
+        formulas = re.findall(r"<math .*?</math>", text, re.S)
+        assert not [f for f in formulas if "\\" in html.unescape(f)]
+        total += len(formulas)
+    assert total > 100
+
+
+def test_the_reference_is_complete(site):
+    keys = (site / "reference_yaml.html").read_text(encoding="utf-8")
+    for section, prefix in ((schema.Schema, ""), (schema.Data, "data."), (schema.Assimilation, "assimilation.")):
+        for name in section.model_fields:
+            assert f">{prefix}{name}<" in keys, name
+    for name in BubbleSettings.model_fields:
+        assert f">{name}<" in keys, name
+    python = (site / "reference_api.html").read_text(encoding="utf-8")
+    for name in [*(n for n in dir(en4dvar) if not n.startswith("_")), *en4dvar_bubble.__all__]:
+        assert re.search(rf'id="en4dvar[\w.]*\.{name}"', python), name
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium")
+def test_the_search_works_from_a_file(site):
+    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=20000", "--dump-dom"]
+    page = f"{(site / 'index.html').as_uri()}?q=Kirchhoff"
+    shown = subprocess.run([*command, page], capture_output=True, text=True, timeout=120).stdout
+    assert re.search(r"md-search-result__meta\">\s*\d+ matching", shown)
