@@ -1,0 +1,126 @@
+"""A forward model that fails in every way it can: the members are lost with their reason, the run is not."""
+
+import re
+
+import numpy as np
+import pytest
+from faulty_models import STIFF, LosesAt
+from run_files import configuration
+from toy_config import write_toy
+
+from en4dvar.errors import ConfigError, TooFewMembersError
+from en4dvar.executor.limits import parse_bytes
+from en4dvar.runner import run
+
+LIMITS = {
+    "hangs": {"workers": 2, "time_limit": "0.3 s"},
+    "hangs_in_compiled_code": {"workers": 2, "time_limit": "0.3 s"},
+    "allocates": {"workers": 2, "memory_limit": "300 MB"},
+}
+REASONS = {
+    "raises": "ArithmeticError: no such oscillation",
+    "not_a_number": "non-finite state",
+    "wrong_shape": "step returned shape (3,), expected (4,)",
+    "hangs": "TimeLimitError: not done after 0.3 s",
+    "hangs_in_compiled_code": "a worker process died, or was ended at its time limit of 0.3 s",
+    "allocates": "MemoryError: ",
+}
+
+
+@pytest.fixture(scope="module")
+def raising(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("raising")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("EN4DVAR_TEST_FAULT", "raises")
+        return run(configuration(faulty(folder), folder / "run", executor="serial"))
+
+
+def faulty(folder):
+    return write_toy(folder, ("toy_models:Oscillator", "faulty_models:Faulty"))
+
+
+def fault(name, *marks):
+    rows = {"not_a_number": "model-nan", "wrong_shape": "model-shape", "allocates": "model-memory"}
+    row = rows.get(name, "model-hangs" if name.startswith("hangs") else "model-raises")
+    return pytest.param(name, marks=[pytest.mark.fault(row), *marks])
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        fault("raises"),
+        fault("not_a_number"),
+        fault("wrong_shape"),
+        fault("hangs"),
+        fault("hangs_in_compiled_code", pytest.mark.slow, pytest.mark.long),
+        fault("allocates"),
+    ],
+)
+def test_only_the_faulty_members_are_lost(raising, tmp_path, monkeypatch, name):
+    """Whatever a member does, the others are as they are where it raises an exception, and it is told why."""
+    monkeypatch.setenv("EN4DVAR_TEST_FAULT", name)
+    result = run(configuration(faulty(tmp_path), tmp_path / "run", **LIMITS.get(name, {"executor": "serial"})))
+    reasons = result.sample_stats["prior_failure_reason"].values.ravel()
+    stiff = result.prior["k"].values.ravel() > STIFF
+    assert 0 < stiff.sum() < 4
+    assert all(reason.startswith(REASONS[name]) for reason in reasons[stiff]), reasons
+    assert not any(reasons[~stiff])
+    assert result.sample_stats["active"].all()
+    for key in ("A", "k"):
+        assert np.array_equal(result.posterior[key], raising.posterior[key])
+
+
+def test_a_limit_needs_a_process_to_end(tmp_path):
+    path = faulty(tmp_path)
+    with pytest.raises(ConfigError, match="can end a process only; write executor: processes, not threads"):
+        configuration(path, tmp_path / "run", executor="threads", time_limit="1 s")
+    with pytest.raises(ConfigError, match=r"'2 pints' is not a size of memory; write e\.g\. 2 GB"):
+        configuration(path, tmp_path / "run", memory_limit="2 pints")
+    config = configuration(path, tmp_path / "run", memory_limit="2 GB", time_limit="1 min")
+    assert (config.execution.limits.seconds, config.execution.limits.memory) == (60.0, 2 * 10**9)
+    assert parse_bytes("1.5 GiB") == 3 << 29
+
+
+def losing(tmp_path, at, share):
+    """Every iteration forecasts the whole ensemble (transform variant)."""
+    LosesAt.at, LosesAt.share, LosesAt.calls = at, share, 0
+    path = write_toy(
+        tmp_path,
+        ("toy_models:Oscillator", "faulty_models:LosesAt"),
+        ("members: 8", "linearisation: transform\n  members: 8"),
+    )
+    return run(configuration(path, tmp_path / f"run{at}_{share}", executor="serial"))
+
+
+@pytest.fixture(scope="module")
+def forecasts(tmp_path_factory):
+    """Number of forecasts of the ensemble in an undisturbed run."""
+    losing(tmp_path_factory.mktemp("count"), 0, 1.0)
+    return LosesAt.calls
+
+
+STAGES = {0.0: "prior forecast", 0.5: r"forecast of iteration \d", 1.0: "posterior forecast"}
+
+
+@pytest.mark.parametrize("where", STAGES, ids=["first", "middle", "last"])
+@pytest.mark.fault("all-lost")
+def test_all_members_lost(tmp_path, forecasts, where):
+    with pytest.raises(TooFewMembersError) as lost:
+        losing(tmp_path, 1 + round(where * (forecasts - 1)), 1.0)
+    assert re.fullmatch(
+        rf"toy: 8 of 8 members failed in the {STAGES[where]}; at least 4 must survive. "
+        r"Most frequent reasons: lost on purpose \(8×\)",
+        str(lost.value),
+    )
+    assert lost.value.exit_code == 3
+
+
+@pytest.mark.parametrize("where", STAGES, ids=["first", "middle", "last"])
+@pytest.mark.fault("half-lost")
+def test_half_of_the_members_lost(tmp_path, forecasts, where):
+    result = losing(tmp_path, 1 + round(where * (forecasts - 1)), 0.5)
+    stage = "iterations" if where == 0.5 else STAGES[where]
+    assert any(w.startswith(f"4 of 8 members failed in the {stage}: lost on purpose (4×)") for w in result.warnings)
+    active = result.sample_stats["active"].values.ravel()
+    assert active.sum() == (4 if where == 1.0 else 8)
+    assert result.posterior["k"].values.ravel()[active].mean() == pytest.approx(2.0, rel=0.01)  # of the data
