@@ -15,6 +15,7 @@ from en4dvar.config import Config
 from en4dvar.config.data import DataPlan
 from en4dvar.config.parameters import Fixed, Uncertain, located
 from en4dvar.errors import ConfigError, DataError, Fault
+from en4dvar.files import readable
 from en4dvar.forecast import check_problem
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
@@ -101,7 +102,7 @@ def _unique_names(paths: list[Path]) -> list[str]:
         name = path.stem if stems[path.stem] == 1 else f"{path.parent.name}_{path.stem}"
         same = itertools.chain([name], (f"{name}_{i}" for i in itertools.count(2)))
         names[next(n for n in same if n not in names)] = None
-    return list(names)
+    return list(map(readable, names))
 
 
 def read_observations(plan: DataPlan, path: Path, name: str, weights: str = "sum") -> Observations:
@@ -127,7 +128,7 @@ def read_observations(plan: DataPlan, path: Path, name: str, weights: str = "sum
         time_std=np.full(count, plan.error.time_std),
         weights=np.full(count, 1.0 if weights == "sum" else 1.0 / count),
         name=name,
-        source=str(path),
+        source=readable(path),
         scalars=series.scalars,
         correlation=correlation,
         huber=plan.error.huber,

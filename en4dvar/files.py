@@ -50,6 +50,11 @@ def write_bytes(path: str | Path, content: bytes) -> Path:
     return Path(path)
 
 
+def readable(text: object) -> str:
+    r"""Text that can be written as UTF-8; bytes of a file's name that are not are shown as ``\udcfc``."""
+    return str(text).encode("utf-8", "backslashreplace").decode("utf-8")
+
+
 def _fsync(path: Path) -> None:
     handle = os.open(path, os.O_RDONLY)
     try:

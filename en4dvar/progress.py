@@ -32,7 +32,7 @@ class RunLog:
 
     def __init__(self, path: Path, append: bool = False):
         try:
-            self._file = path.open("a" if append else "w", encoding="utf-8", buffering=1)
+            self._file = path.open("a" if append else "w", encoding="utf-8", errors="backslashreplace", buffering=1)
         except OSError as error:
             raise OutputError(f"{path}: cannot be written: {error.strerror}") from None
         self._path = path

@@ -16,7 +16,7 @@ from en4dvar.checkpoint import FOLDER, CheckpointError, digest, file_digest, rea
 from en4dvar.config import Config
 from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, ThreadsExecutor
-from en4dvar.files import write_bytes
+from en4dvar.files import readable, write_bytes
 from en4dvar.fingerprint import Identity
 from en4dvar.honesty import Caution
 from en4dvar.jobs import Estimate, Job, estimate
@@ -211,7 +211,7 @@ class Worklist:
 
     def _failed(self, d: Dataset, error: Exception) -> None:
         known = isinstance(error, En4dvarError)
-        reason = str(error) if known else f"{type(error).__name__}: {error}"
+        reason = readable(error if known else f"{type(error).__name__}: {error}")
         self.log.write(f"{d.name}: failed: {reason}")
         if not known:
             self.log.write("".join(traceback.format_exception(error)))
