@@ -112,3 +112,11 @@ class Hessian:
         root = np.sqrt(1 + self.singular_values**2 / self.prior_precision)
         shrink = 1 / (self.prior_precision * root * (1 + root))
         return np.asarray(np.eye(self.rows.shape[1]) - (self.rows.T * shrink) @ self.rows)
+
+    @property
+    def inverse_transform(self) -> Array:
+        """T⁻¹ (N, N)."""
+        # √(1+x) − 1 = x / (1 + √(1+x))
+        root = np.sqrt(1 + self.singular_values**2 / self.prior_precision)
+        stretch = 1 / (self.prior_precision * (1 + root))
+        return np.asarray(np.eye(self.rows.shape[1]) + (self.rows.T * stretch) @ self.rows)

@@ -25,7 +25,7 @@ from en4dvar.linalg import centre
 from en4dvar.localisation import Localisation
 from en4dvar.moments import Moments, MomentsRecorder
 from en4dvar.rotation import Rotations, rotate
-from en4dvar.schemes import Evaluation, Step, Weights
+from en4dvar.schemes import Evaluation, FullStep, Weights
 from en4dvar.series import Series
 from en4dvar.state import Array
 
@@ -44,7 +44,7 @@ class SequentialScheme(Protocol):
     def init(self, n_members: int) -> Weights: ...
     def spread(self, weights: Weights) -> Array: ...
     def linearise(self, weights: Weights, predictions: Array) -> tuple[Array, Array]: ...
-    def step(self, weights: Weights, evaluation: Evaluation) -> Step: ...
+    def step(self, weights: Weights, evaluation: Evaluation) -> FullStep: ...
 
 
 @dataclass(frozen=True)
@@ -253,11 +253,15 @@ class _Loop:
         weights = scheme.init(len(anomalies))
         for iteration in range(1, scheme.max_iterations + 1):
             spread = scheme.spread(weights)
-            states, failed = self.forecast(mean + (weights.w + spread) @ anomalies, [newest])
+            if iteration == 1:  # here w = 0 and the scheme's spread is a multiple of I
+                width = float(spread[0, 0])
+                states, failed = self.forecast(self.ensemble if width == 1 else mean + width * anomalies, [newest])
+            else:
+                states, failed = self.forecast(mean + (weights.w + spread) @ anomalies, [newest])
             if failed:
                 return None, failed
-            if iteration == 1:  # here the scheme's spread is a multiple of I
-                self.before.put(k, states[-1], 1 / spread[0, 0])
+            if iteration == 1:
+                self.before.put(k, states[-1], 1 / width)
             self.iterations[k] = iteration
             predicted = self.predict(states[-1], newest)
             if not np.isfinite(predicted).all():
@@ -266,7 +270,7 @@ class _Loop:
             if self.settings.localisation is not None:
                 return centre(self.settings.localisation.analysis(self.ensemble, evaluation)), []
             step = scheme.step(weights, evaluation)
-            weights = Weights(weights.w + step.direction, step.transform)
+            weights = step.weights
             if step.norm <= scheme.tolerance:
                 break
         return (mean + weights.w @ anomalies, weights.T @ anomalies), []

@@ -7,12 +7,14 @@ linearisation in weight space, and turns the whitened linearisation into a direc
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from en4dvar.linalg import Hessian
+from en4dvar.near_prior import NearPrior
 from en4dvar.state import Array
 
 
@@ -22,11 +24,13 @@ class Weights:
 
     w: Array
     T: Array
+    inverse: Array | None = None  # T⁻¹, where it was at hand
 
     @classmethod
     def prior(cls, n_members: int) -> Weights:
         """w = 0, T = I."""
-        return cls(np.zeros(n_members), np.eye(n_members))
+        identity = np.eye(n_members)
+        return cls(np.zeros(n_members), identity, identity)
 
     @property
     def rows(self) -> Array:
@@ -70,6 +74,24 @@ def gauss_newton(weights: Weights, evaluation: Evaluation) -> Step:
     hessian = Hessian.of(evaluation.S)
     gradient = hessian.prior_precision * weights.w - evaluation.S.T @ evaluation.d
     return Step(gradient, hessian, -hessian.solve(gradient), hessian.transform)
+
+
+@dataclass(frozen=True)
+class FullStep:
+    """Weights after an undamped step, T that of the point it starts from, and its length as :attr:`Step.norm`."""
+
+    weights: Weights
+    norm: float
+
+
+def full_step(weights: Weights, evaluation: Evaluation, inverse: bool = False) -> FullStep:
+    """:func:`gauss_newton` where nothing but the next weights is asked for, T⁻¹ or not, by the cheapest root of A."""
+    hessian = NearPrior.of(evaluation.S)
+    gradient = hessian.prior_precision * weights.w - evaluation.d @ evaluation.S
+    ascent = hessian.solve(gradient)
+    norm = math.sqrt(max(0.0, float(gradient @ ascent)))
+    after = hessian.inverse_transform if inverse else None
+    return FullStep(Weights(weights.w - ascent, hessian.transform, after), norm)
 
 
 class Scheme(Protocol):

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from en4dvar.linalg import centre
-from en4dvar.schemes import Evaluation, Step, Weights, gauss_newton
+from en4dvar.schemes import Evaluation, FullStep, Weights, full_step
 from en4dvar.state import Array
 
 
@@ -38,6 +38,6 @@ class ETKF:
         """Mean (K',) and anomalies (N, K') of the members' predictions (N, K')."""
         return centre(predictions)
 
-    def step(self, weights: Weights, evaluation: Evaluation) -> Step:
-        """Increment and symmetric transform."""
-        return gauss_newton(weights, evaluation)
+    def step(self, weights: Weights, evaluation: Evaluation) -> FullStep:
+        """Weights of the analysis, with the symmetric transform."""
+        return full_step(weights, evaluation)

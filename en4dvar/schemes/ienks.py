@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 
 from en4dvar.linalg import centre
-from en4dvar.schemes import Evaluation, Step, Weights, gauss_newton
+from en4dvar.schemes import Evaluation, FullStep, Weights, full_step
 from en4dvar.state import Array
 
 
@@ -51,8 +51,10 @@ class IEnKS:
         mean, anomalies = centre(predictions)
         if self.linearisation == "bundle":
             return mean, anomalies / self.epsilon
-        return mean, np.asarray(np.linalg.solve(weights.T, anomalies))
+        if weights.inverse is None:
+            return mean, np.asarray(np.linalg.solve(weights.T, anomalies))
+        return mean, np.asarray(weights.inverse @ anomalies)
 
-    def step(self, weights: Weights, evaluation: Evaluation) -> Step:
-        """Gauss–Newton step and symmetric transform."""
-        return gauss_newton(weights, evaluation)
+    def step(self, weights: Weights, evaluation: Evaluation) -> FullStep:
+        """Weights after a Gauss–Newton step, with the symmetric transform."""
+        return full_step(weights, evaluation, inverse=self.linearisation == "transform")

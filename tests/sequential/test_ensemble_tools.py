@@ -9,6 +9,7 @@ from en4dvar.inflation import Inflation, relaxation
 from en4dvar.linalg import GRAM_LIMIT, Hessian, apply_weights, centre
 from en4dvar.localisation import Localisation, distances, gaspari_cohn
 from en4dvar.moments import BLOCK, MomentsRecorder
+from en4dvar.near_prior import NearPrior
 from en4dvar.rotation import Rotations, reflections, rotate
 from en4dvar.schemes import Evaluation, Weights, gauss_newton
 from en4dvar.schemes.ienks import IEnKS
@@ -119,9 +120,24 @@ def test_both_decompositions_give_the_same_analysis(scale):
     assert hessian.solve(g) == pytest.approx(np.linalg.solve(a, g), rel=tolerance, abs=tolerance)
     t = hessian.transform
     assert t @ t == pytest.approx(9 * np.linalg.inv(a), abs=tolerance)
+    assert t @ hessian.inverse_transform == pytest.approx(np.eye(10), abs=1e-11 if scale > 100 else 1e-13)
     singular = np.linalg.svd(s, compute_uv=False)
     assert hessian.singular_values[:9] == pytest.approx(singular[:9], rel=1e-12)
     assert hessian.singular_values[9] < 1e-6 * scale * 10
+
+
+@pytest.mark.parametrize("shape", [(16, 40), (40, 25), (40, 40)])
+@pytest.mark.parametrize("norm", [0.0, 1e-3, 0.2, 0.26, 0.9, 1.999, 2.001, 50.0])
+def test_root_near_the_prior_is_that_of_the_decomposition(shape, norm):
+    """‖SᵀS‖/(N − 1) up to 2 takes the series, beyond it the eigenvectors; both to rounding."""
+    s = centre(RNG(0).standard_normal(shape).T)[1].T
+    s *= np.sqrt(norm * (shape[1] - 1) / np.linalg.norm(s.T @ s))
+    near, exact, g = NearPrior.of(s), Hessian.of(s), RNG(1).standard_normal(shape[1])
+    assert isinstance(near, NearPrior) == (norm < 2)
+    assert near.transform == pytest.approx(exact.transform, abs=1e-14)
+    assert near.inverse_transform == pytest.approx(exact.inverse_transform, abs=1e-13 * max(1, norm))
+    assert near.solve(g) == pytest.approx(exact.solve(g), rel=1e-13, abs=1e-15)
+    assert near.transform @ np.ones(shape[1]) == pytest.approx(np.ones(shape[1]), abs=1e-13)
 
 
 def test_gaspari_cohn():

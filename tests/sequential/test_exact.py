@@ -189,8 +189,7 @@ def test_iterations_end_at_a_minimum_of_the_cost():
     scheme, weights = IEnKS(1, "bundle", epsilon=1e-5), Weights.prior(5)
     for _ in range(30):
         reference, spread = scheme.linearise(weights, predict(weights.w + scheme.spread(weights)))
-        step = scheme.step(weights, Evaluation((value - reference) / np.sqrt(2), spread.T / np.sqrt(2)))
-        weights = Weights(weights.w + step.direction, step.transform)
+        weights = scheme.step(weights, Evaluation((value - reference) / np.sqrt(2), spread.T / np.sqrt(2))).weights
     h = 1e-5
     gradient = [(cost(weights.w + h * e) - cost(weights.w - h * e)) / (2 * h) for e in np.eye(5)]
     start_gradient = [(cost(h * e) - cost(-h * e)) / (2 * h) for e in np.eye(5)]
