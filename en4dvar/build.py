@@ -6,6 +6,7 @@ import glob
 import itertools
 import os
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -74,9 +75,14 @@ def data_files(plan: DataPlan) -> dict[str, Path]:
     ------
     DataError: no file matches a pattern, or a file is named twice.
     """
+    return find_files(plan.base, plan.paths)
+
+
+def find_files(base: Path, texts: Sequence[str]) -> dict[str, Path]:
+    """:func:`data_files` of paths, folders and patterns relative to ``base``. Raises :class:`DataError`."""
     paths: list[Path] = []
-    for text in plan.paths:
-        path = plan.base / Path(text).expanduser()
+    for text in texts:
+        path = base / Path(text).expanduser()
         if glob.has_magic(text) and not path.exists():
             found = sorted(Path(p) for p in glob.glob(str(path), recursive=True))
             if not found:

@@ -64,11 +64,7 @@ class Series:
 
 def read_series(path: Path, time: Column | Step, value: Column, format: Format | None = None) -> Series:
     """Read one data set. ``format`` defaults to the one of the suffix. Raises :class:`DataError`."""
-    if not path.is_file():
-        raise DataError(f"{path}: is a directory" if path.is_dir() else no_such_file(path))
-    kind = format or SUFFIXES.get(path.suffix.lower())
-    if kind is None:
-        raise DataError(f"{path}: the format cannot be told from the suffix {path.suffix!r}; write format: csv or mat")
+    kind = _kind(path, format)
     wanted = [c.name for c in (value, time if isinstance(time, Column) else None) if c is not None]
     try:
         columns, scalars = _read_csv(path, wanted) if kind == "csv" else _read_mat(path, wanted)
@@ -83,6 +79,46 @@ def read_series(path: Path, time: Column | Step, value: Column, format: Format |
         raise DataError(f"{path}: {len(times)} times but {len(values)} values of {value.name!r}")
     first = int(np.argmax(np.nan_to_num(values) != 0)) if kind == "mat" else 0
     return _clean(times[first:], values[first:], value.name, path, scalars)
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a data file holds: columns (or vectors) with numbers, as written, and scalars; no units applied."""
+
+    columns: Mapping[str, Array]
+    scalars: Mapping[str, float] = field(default_factory=dict)
+
+
+def read_contents(path: Path, format: Format | None = None) -> Contents:
+    """Every column that holds numbers. Raises :class:`DataError`."""
+    kind = _kind(path, format)
+    try:
+        return _mat_contents(path) if kind == "mat" else _csv_contents(path)
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror or error}") from None
+
+
+def _mat_contents(path: Path) -> Contents:
+    vectors, scalars = _mat_vectors(path)
+    return Contents({k: np.asarray(v, dtype=float).ravel() for k, v in vectors.items() if v.size > 1}, scalars)
+
+
+def _csv_contents(path: Path) -> Contents:
+    lines = _lines(path)
+    if not lines:
+        raise DataError(f"{path}: the file holds no data")
+    delimiter = _delimiter(lines[0][1])
+    names = _cells(lines[0][1], delimiter)
+    if all(_is_number(n) for n in names):
+        raise DataError(f"{path}: the first line must name the columns, but it holds numbers")
+    rows = [_cells(line, delimiter) for _, line in lines[1:]]
+    columns: dict[str, Array] = {}
+    for i, name in enumerate(names):
+        cells = [row[i] if i < len(row) else "" for row in rows]
+        numbers = [c if c.lower() not in BLANK else "nan" for c in cells]
+        if numbers and all(_is_number(n) for n in numbers):
+            columns[name] = np.array([float(n) for n in numbers])
+    return Contents(columns)
 
 
 def read_covariance(matrix: Matrix) -> Array:
@@ -112,6 +148,16 @@ def read_covariance(matrix: Matrix) -> Array:
             f"{path}: not symmetric: {values[i, j]:g} in row {i + 1}, column {j + 1}, {values[j, i]:g} across"
         )
     return np.asarray(convert(0.5 * (values + values.T), matrix.unit, matrix.target))
+
+
+def _kind(path: Path, format: Format | None) -> Format:
+    """The format of a file that is there. Raises :class:`DataError`."""
+    if not path.is_file():
+        raise DataError(f"{path}: is a directory" if path.is_dir() else no_such_file(path))
+    kind = format or SUFFIXES.get(path.suffix.lower())
+    if kind is None:
+        raise DataError(f"{path}: the format cannot be told from the suffix {path.suffix!r}; write format: csv or mat")
+    return kind
 
 
 def _clean(times: Array, values: Array, name: str, path: Path, scalars: Mapping[str, float]) -> Series:
@@ -209,6 +255,12 @@ def _number(cell: str, name: str, path: Path, line: int) -> float:
 
 
 def _read_mat(path: Path, wanted: Sequence[str]) -> tuple[dict[str, Array], dict[str, float]]:
+    vectors, scalars = _mat_vectors(path, wanted)
+    return {name: np.asarray(vectors[name], dtype=float).ravel() for name in wanted}, scalars
+
+
+def _mat_vectors(path: Path, wanted: Sequence[str] = ()) -> tuple[dict[str, Any], dict[str, float]]:
+    """Real vectors of a ``.mat`` file, those ``wanted`` among them, and its finite scalars."""
     from scipy.io import loadmat
 
     try:
@@ -224,8 +276,7 @@ def _read_mat(path: Path, wanted: Sequence[str]) -> tuple[dict[str, Array], dict
         if name not in vectors:
             fault = "is not a row or column of real numbers" if name in content else "is not in the file"
             raise DataError(f"{path}: field {name!r} {fault}; the vectors are: {', '.join(sorted(vectors)) or 'none'}")
-    scalars = {k: float(v.flat[0]) for k, v in vectors.items() if v.size == 1 and np.isfinite(v.flat[0])}
-    return {name: np.asarray(vectors[name], dtype=float).ravel() for name in wanted}, scalars
+    return vectors, {k: float(v.flat[0]) for k, v in vectors.items() if v.size == 1 and np.isfinite(v.flat[0])}
 
 
 def _is_vector(value: Any) -> bool:

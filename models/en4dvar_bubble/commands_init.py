@@ -1,0 +1,244 @@
+"""``en4dvar init``: a first configuration for radius histories. Heavy imports stay inside the command."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+if TYPE_CHECKING:
+    from en4dvar.state import Array
+    from en4dvar_bubble.starter.page import Source
+    from en4dvar_bubble.starter.proposal import Proposal
+
+_TIME = re.compile(r"(?i)t|time|t[ _(\[].*|time[ _(\[].*")
+_RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
+
+
+@click.command()
+@click.option("--data", metavar="PATH", help="CSV or .mat file, a folder or a pattern; without it, an empty starter.")
+@click.option("--example", type=click.Choice(["quickstart"]), help="An example and its synthetic data instead.")
+@click.option("--time-unit", metavar="UNIT", help="Unit of the times in the file, e.g. us.")
+@click.option("--radius-unit", metavar="UNIT", help="Unit of the radii in the file, e.g. um.")
+@click.option("--time-column", metavar="NAME", help="Column of times, where its name does not tell.")
+@click.option("--radius-column", metavar="NAME", help="Column of radii, where its name does not tell.")
+@click.option("--time-step", metavar="TIME", help="Constant time step instead of a column, e.g. '3.7 us'.")
+@click.option("--start", type=click.Choice(["acoustic", "laser"]), help="Start of the bubble; default: what it shows.")
+@click.option("--law", metavar="LAW", help="Constitutive law, see 'en4dvar laws'.")
+@click.option("--out", type=click.Path(path_type=Path), help="YAML file to write; default <name of the data>.yaml.")
+@click.option("--force", is_flag=True, help="Replace that file.")
+def init(
+    data: str | None,
+    example: str | None,
+    time_unit: str | None,
+    radius_unit: str | None,
+    time_column: str | None,
+    radius_column: str | None,
+    time_step: str | None,
+    start: Literal["acoustic", "laser"] | None,
+    law: str | None,
+    out: Path | None,
+    force: bool,
+) -> None:
+    """Write a commented starter configuration for bubble radius data, proposed from what they show.
+
+    Units are asked for on a terminal, else given; they are never guessed.
+
+    \b
+    Example:
+      en4dvar init --data bubble.csv --time-unit us --radius-unit um
+    """
+    from en4dvar.errors import OutputError
+    from en4dvar.files import write_text
+    from en4dvar_bubble.starter.page import SCHEMA_FILE, Source, yaml_text
+    from en4dvar_bubble.starter.proposal import propose, starter
+
+    if example is not None:
+        if data is not None or out is not None:
+            raise click.UsageError("--example comes with its own data and file names")
+        _write_example(example, force)
+        return
+    name = _name(data)
+    target = out or Path(f"{name}.yaml")
+    if target.exists() and not force:
+        raise OutputError(f"{target}: exists; give --force to replace it, or another --out")
+    if not target.absolute().parent.is_dir():
+        raise OutputError(f"{target}: the folder {target.parent} does not exist")
+    if data is None:
+        source = Source("bubble.csv", ("t_us", "us"), None, ("R_um", "um"))
+        proposal = starter(start or "acoustic", law)
+    else:
+        asked = _Asked(time_unit, radius_unit, time_column, radius_column, time_step)
+        source, histories = _read(data, asked, target)
+        proposal = propose(histories, start, law)
+    words = ["en4dvar", *sys.argv[1:]]
+    text = yaml_text(name, source, proposal, shlex.join(words))
+    if data is not None:
+        _check(text, target)
+    write_text(target, text)
+    from en4dvar.config.json_schema import schema_text
+
+    write_text(target.parent / SCHEMA_FILE, schema_text())
+    _tell(target, proposal, example_only=data is None)
+
+
+def _write_example(name: str, force: bool) -> None:
+    from en4dvar_bubble.examples import write_example
+
+    file = write_example(name, Path(), force)
+    click.echo(f"configuration: {file}, its data are synthetic")
+    click.echo(f"next: en4dvar validate {file}, then en4dvar run {file}")
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What the options say about the columns."""
+
+    time_unit: str | None
+    radius_unit: str | None
+    time_column: str | None
+    radius_column: str | None
+    time_step: str | None
+
+
+def _read(data: str, asked: _Asked, target: Path) -> tuple[Source, dict[str, tuple[Array, Array]]]:
+    """How the data are read, and the histories in SI."""
+    from en4dvar.build import find_files
+    from en4dvar.readers import Column, Step, read_contents, read_series
+    from en4dvar.units import convert, parse_quantity
+    from en4dvar_bubble.starter.page import Source
+
+    files = find_files(Path.cwd(), [data])
+    first = next(iter(files.values()))
+    contents = read_contents(first)
+    shown = {name: f"{len(v)} values, {_range(v)}" for name, v in contents.columns.items()}
+    click.echo(f"{first}: {'; '.join(f'{name} ({words})' for name, words in shown.items())}", err=True)
+    time, radius, missing = _columns(asked, shown)
+    time_unit, radius_unit = asked.time_unit, asked.radius_unit
+    if _interactive():
+        time, radius = time or _ask_column("times", shown), radius or _ask_column("radii", shown)
+        missing = []
+        if asked.time_step is None:
+            time_unit = time_unit or _ask_unit(time, shown, "s", "us, ms or s")
+        radius_unit = radius_unit or _ask_unit(radius, shown, "m", "um, mm or m")
+    _require(missing, time_unit, radius_unit, asked, first, shown)
+    convert(1.0, str(radius_unit), "m")
+    column: Column | Step
+    if asked.time_step is not None:
+        column = Step(value=parse_quantity(asked.time_step, "s"))
+        named = None
+    else:
+        convert(1.0, str(time_unit), "s")
+        column = Column(str(time), str(time_unit), "s")
+        named = (str(time), str(time_unit))
+    value = Column(str(radius), str(radius_unit), "m")
+    series = {name: read_series(file, column, value) for name, file in files.items()}
+    source = Source(_path_in(target, data), named, asked.time_step, (str(radius), str(radius_unit)))
+    return source, {name: (s.times, s.values) for name, s in series.items()}
+
+
+def _path_in(target: Path, data: str) -> str:
+    """``data`` as the file ``target`` says it: relative to its folder where both share more than the root."""
+    path, folder = Path(data).expanduser().absolute(), target.absolute().parent
+    near = path.parts[:2] == folder.parts[:2] and len(folder.parts) > 1
+    return Path(os.path.relpath(path, folder)).as_posix() if near else path.as_posix()
+
+
+def _columns(asked: _Asked, shown: Mapping[str, str]) -> tuple[str | None, str | None, list[str]]:
+    """Columns of times and radii by option, else by name where one name alone fits; options that are missing."""
+    time, radius = asked.time_column, asked.radius_column
+    if time is None and asked.time_step is None:
+        time = _only(_TIME, shown)
+    radius = radius or _only(_RADIUS, shown)
+    missing = ["--time-column NAME"] * (time is None and asked.time_step is None)
+    missing += ["--radius-column NAME"] * (radius is None)
+    return time, radius, missing
+
+
+def _only(pattern: re.Pattern[str], names: Mapping[str, str]) -> str | None:
+    fitting = [name for name in names if pattern.fullmatch(name)]
+    return fitting[0] if len(fitting) == 1 else None
+
+
+def _require(
+    missing: Sequence[str],
+    time_unit: str | None,
+    radius_unit: str | None,
+    asked: _Asked,
+    path: Path,
+    shown: Mapping[str, str],
+) -> None:
+    """Raise one error that names every option to add."""
+    needed = list(missing)
+    needed += ["--time-unit UNIT (e.g. us)"] * (time_unit is None and asked.time_step is None)
+    needed += ["--radius-unit UNIT (e.g. um)"] * (radius_unit is None)
+    if needed:
+        from en4dvar.errors import ConfigError
+
+        columns = ", ".join(shown) or "none"
+        raise ConfigError(f"{path}: columns with numbers: {columns}; units are never guessed: add {', '.join(needed)}")
+
+
+def _interactive() -> bool:
+    return sys.stdin.isatty() and sys.stderr.isatty()
+
+
+def _ask_column(what: str, shown: Mapping[str, str]) -> str:
+    return str(click.prompt(f"Column of {what}", type=click.Choice(list(shown)), err=True))
+
+
+def _ask_unit(column: str | None, shown: Mapping[str, str], dimension: str, examples: str) -> str:
+    from en4dvar.units import UnitError, convert
+
+    while True:
+        unit = str(click.prompt(f"Unit of {column} ({shown.get(str(column), '')}), e.g. {examples}", err=True))
+        try:
+            convert(1.0, unit, dimension)
+        except UnitError as error:
+            click.echo(str(error), err=True)
+        else:
+            return unit
+
+
+def _range(values: Any) -> str:
+    import numpy as np
+
+    finite = values[np.isfinite(values)]
+    return f"{finite.min():g} to {finite.max():g}" if len(finite) else "none of them finite"
+
+
+def _name(data: str | None) -> str:
+    """Name of the run and of the file: that of the data, with letters, digits, dots and dashes."""
+    if data is None:
+        return "bubble"
+    path = Path(data).expanduser().absolute()
+    stem = path.parent.name if any(sign in path.name for sign in "*?[") else path.name if path.is_dir() else path.stem
+    return re.sub(r"[^\w.+-]", "_", stem).lstrip(".-+") or "bubble"
+
+
+def _check(text: str, target: Path) -> None:
+    """What is written loads, and its data can be used; raises what is wrong before anything is written."""
+    from en4dvar.build import build
+    from en4dvar.config import resolve
+    from en4dvar.config.document import parse_document
+
+    build(resolve(parse_document(text, str(target)), target.absolute().parent))
+
+
+def _tell(target: Path, proposal: Proposal, example_only: bool) -> None:
+    for line in proposal.seen:
+        click.echo(line)
+    for warning in proposal.warnings:
+        click.echo(f"warning: {warning}", err=True)
+    file = shlex.quote(str(target))
+    click.echo(f"configuration: {target}")
+    if example_only:
+        click.echo("every value in it is an example; with --data FILE it is proposed from your data")
+    click.echo(f"next: en4dvar validate {file} --plot, then en4dvar run {file}")

@@ -1,0 +1,92 @@
+"""First guesses of G and μ from two numbers of a history, by the forward model itself.
+
+Acoustic start: R_max and the collapse time (the driving is known, so both follow from G and μ). Laser start: the
+collapse time and the rebound's height over R_max (R_max is where the model starts). The model is run on a grid of G and
+μ, every other parameter at the centre of its prior; each node is weighted by exp(−½ Σ (ln feature − ln observed)²/s²)
+and the guess is the weighted geometric mean. Collapse times of model and data are taken in the same way
+(:func:`~en4dvar_bubble.starter.look.lobe`).
+
+A guess is an order of magnitude to centre a wide prior on: it has seen the data that the prior is then confronted with.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from en4dvar.errors import DataError
+from en4dvar.forward import Trajectory
+from en4dvar.state import Array
+from en4dvar_bubble.model import BubbleModel
+from en4dvar_bubble.starter.look import lobe, second_maximum
+
+GRID: Mapping[str, Array] = {"G": np.geomspace(50.0, 2e5, 25), "mu": np.geomspace(3e-3, 1.0, 18)}  # Pa, Pa s
+TOLERANCE = {"R_max": 0.05, "t_c": 0.05, "rebound": 0.15}  # s, of the logarithm
+FAR = 3.0  # in units of s: no node reproduces the observed numbers
+POINTS = 400
+
+
+@dataclass(frozen=True)
+class Guess:
+    """``values`` SI by name; ``log_std`` how far the nodes that fit are spread (std of ln); ``misfit`` of the best
+    node in units of s. Empty where the law has neither ``G`` nor ``mu`` or no node could be run."""
+
+    values: Mapping[str, float]
+    log_std: Mapping[str, float]
+    misfit: float
+
+    @property
+    def far(self) -> bool:
+        """Whether no node comes close to what was observed."""
+        return self.misfit > FAR
+
+
+def first_guess(model: BubbleModel, fixed: Mapping[str, float], observed: Mapping[str, float]) -> Guess:
+    """Guesses of those of G and μ that the law has.
+
+    Parameters
+    ----------
+    fixed: SI values of every other parameter of the model.
+    observed: ``t_c`` (s) and, where known, ``R_max`` (m; acoustic) or ``rebound`` (laser); NaN is unknown.
+    """
+    names = [name for name in GRID if any(p.name == name for p in model.parameters)]
+    if not names:
+        return Guess({}, {}, 0.0)
+    nodes = np.array(list(itertools.product(*(GRID[name] for name in names))))
+    theta = {name: np.full(len(nodes), value) for name, value in fixed.items()}
+    theta |= {name: nodes[:, i] for i, name in enumerate(names)}
+    reach = (4.0 if model.start == "laser" else 5.0) * observed["t_c"]
+    times = np.linspace(0.0, reach + max(0.0, getattr(model.driving, "end", 0.0)), POINTS)
+    paths = model.trajectories(model.initial_states(theta), times)
+    keys = [
+        k for k in ("R_max" if model.start == "acoustic" else "rebound", "t_c") if np.isfinite(observed.get(k, np.nan))
+    ]
+    misfit = np.full(len(nodes), np.inf)
+    for i, path in enumerate(paths):
+        if isinstance(path, Trajectory):
+            seen = _features(times, path["R"])
+            terms = [np.log(seen[k] / observed[k]) / TOLERANCE[k] for k in keys]
+            misfit[i] = float(np.sum(np.square(terms))) if np.all(np.isfinite(terms)) else np.inf
+    if not np.any(np.isfinite(misfit)):
+        return Guess({}, {}, float("inf"))
+    weights = np.exp(-0.5 * (misfit - misfit.min()))
+    weights /= weights.sum()
+    logs = np.log(nodes)
+    mean = weights @ logs
+    spread = np.sqrt(weights @ (logs - mean) ** 2)
+    return Guess(
+        {name: float(np.exp(m)) for name, m in zip(names, mean, strict=True)},
+        {name: float(s) for name, s in zip(names, spread, strict=True)},
+        float(np.sqrt(misfit.min())),
+    )
+
+
+def _features(times: Array, radius: Array) -> dict[str, float]:
+    try:
+        found = lobe(times, radius)
+    except DataError:
+        return {"R_max": np.nan, "t_c": np.nan, "rebound": np.nan}
+    return {"R_max": found.R_max, "t_c": found.t_c, "rebound": second_maximum(radius)}

@@ -1,0 +1,87 @@
+"""A proposal as the text of a YAML file."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from en4dvar_bubble.starter.proposal import Entry, Proposal
+
+SCHEMA_FILE = "en4dvar.schema.json"
+_PLAIN = re.compile(r"[A-Za-z_./][\w ./*-]*[\w./*]|[A-Za-z_]")
+_WORDS = ("true", "false", "null", "yes", "no", "on", "off")
+
+
+@dataclass(frozen=True)
+class Source:
+    """How the data are read: ``path`` as the file says it, the column (or constant step) of times, that of radii."""
+
+    path: str
+    time: tuple[str, str] | None
+    time_step: str | None
+    radius: tuple[str, str]
+
+    @property
+    def time_entry(self) -> str:
+        """The ``time`` column as YAML."""
+        if self.time is None:
+            return f"{{step: {quoted(self.time_step or '')}}}"
+        return f"{{name: {quoted(self.time[0])}, unit: {quoted(self.time[1])}}}"
+
+    @property
+    def radius_entry(self) -> str:
+        """The ``radius`` column as YAML."""
+        return f"{{name: {quoted(self.radius[0])}, unit: {quoted(self.radius[1])}}}"
+
+
+def quoted(text: str) -> str:
+    """``text`` as a YAML scalar that is read as text, also inside braces."""
+    plain = _PLAIN.fullmatch(text) and text.lower() not in _WORDS
+    return text if plain else json.dumps(text, ensure_ascii=False)
+
+
+def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> str:
+    """The whole configuration with comments."""
+    head = [
+        f"# yaml-language-server: $schema={SCHEMA_FILE}",
+        f"# Proposed by: {command}",
+        *(f"# Seen: {line}" for line in proposal.seen),
+        *(f"# MIND: {line}" for line in proposal.warnings),
+        "# Every value is a proposal; what was guessed from the data says so. Read, change, then:",
+        "#   en4dvar validate THIS_FILE --plot        what would be estimated, and the prior over the data",
+        "#   en4dvar run THIS_FILE",
+        f"name: {quoted(name)}",
+        "seed: 1 # the same seed gives the same bits",
+        "data:",
+        f"  path: {quoted(source.path)}",
+        "  columns:",
+        f"    time: {source.time_entry}",
+        f"    radius: {source.radius_entry}",
+    ]
+    tail = [
+        "# Estimate the noise as well: uncomment this line.",
+        "# sigma: {prior: lognormal, median: 1, log_std: 0.5}",
+    ]
+    lines = [
+        *head,
+        *_section(proposal.data),
+        "model:",
+        *_section(proposal.model),
+        "parameters: # a prior is estimated, a quantity such as 'mu: 0.1 Pa s' is fixed",
+        *_section(proposal.parameters),
+        *(f"  {line}" for line in tail),
+        "assimilation:",
+        "  members: 48",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _section(entries: Sequence[Entry]) -> list[str]:
+    bare = [f"  {entry.key}: {entry.value}".rstrip() for entry in entries]
+    width = max(len(line) for line in bare if len(line) < 72)
+    return [
+        f"{line.ljust(width)} # {entry.comment}" if entry.comment else line
+        for line, entry in zip(bare, entries, strict=True)
+    ]

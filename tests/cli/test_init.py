@@ -1,0 +1,258 @@
+"""``en4dvar init``: from data alone to a configuration that validates and runs; units are never guessed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from jsonschema import Draft202012Validator
+from scipy.integrate import solve_ivp
+
+from en4dvar.build import build
+from en4dvar.cli import main
+from en4dvar.config import Config, load_config, resolve
+from en4dvar.config.document import parse_document, read_document
+from en4dvar.errors import DataError
+from en4dvar.store import load_result
+from en4dvar_bubble import commands_init
+from en4dvar_bubble.laws import REGISTRY
+from en4dvar_bubble.starter.look import RAYLEIGH, lobe, look, noise
+from en4dvar_bubble.starter.page import Source, quoted, yaml_text
+from en4dvar_bubble.starter.proposal import starter
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIGS = ROOT / "configs"
+MEASURED = ROOT.parent / "shared" / "data"
+UNITS = ("--time-unit", "us", "--radius-unit", "um")
+TRUTH = {
+    "acoustic": {"G": 420.0, "alpha": 0.029, "mu": 0.086, "R0": 0.43e-6, "t_s": 0.25e-6},
+    "laser": {"G": 2500.0, "mu": 0.09, "R_eq": 22e-6, "R_max": 195e-6, "t_s": 0.0},
+}
+
+
+@pytest.fixture(autouse=True)
+def _in_its_own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def call(*arguments: str | Path, **options: str) -> Result:
+    return CliRunner().invoke(main, [str(a) for a in arguments], **options)  # type: ignore[arg-type]
+
+
+def simulate(start: str, times: str, noise_std: str, path: Path, seed: int = 1) -> Path:
+    """Synthetic data at TRUTH, by ``en4dvar simulate`` from a configuration without data."""
+    units = {"G": "Pa", "alpha": "", "mu": "Pa s", "R0": "m", "R_eq": "m", "R_max": "m", "t_s": "s"}
+    values = [f"  {name}: {value} {units[name]}".rstrip() for name, value in TRUTH[start].items()]
+    law = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}[start]
+    gas = {"acoustic": "heat", "laser": "polytropic, vapour_pressure: saturated"}[start]
+    model = f"model: {{name: bubble, law: {law}, start: {start}, gas: {gas}}}"
+    config = path.with_suffix(".truth.yaml")
+    config.write_text("\n".join(["name: truth", model, "parameters:", *values, ""]), encoding="utf-8")
+    done = call(
+        "simulate", config, "--times", times, "--noise", noise_std, "--seed", str(seed), "--out", path, "--force"
+    )
+    assert done.exit_code == 0, done.output
+    return path
+
+
+def proposed(path: Path) -> Config:
+    config = load_config(path)
+    build(config)  # and its data can be read
+    return config
+
+
+@pytest.mark.parametrize(
+    ("start", "times", "noise_std"),
+    [
+        ("acoustic", "5.6 us:30.1 us:1.4 us", "1.4 um"),  # multi-flash imaging: some 18 frames
+        ("acoustic", "0 us:60 us:0.5 us", "1.4 um"),  # from the nucleus through rebounds
+        ("laser", "0 us:70 us:0.63 us", "2 um"),  # high-speed film from R_max on, the bubble not yet at rest
+    ],
+)
+def test_synthetic_data_to_a_run(tmp_path: Path, start: str, times: str, noise_std: str) -> None:
+    data = simulate(start, times, noise_std, tmp_path / "bubble.csv")
+    done = call("init", "--data", data, "--time-unit", "us", "--radius-unit", "um")
+    assert done.exit_code == 0, done.output
+    text = Path("bubble.yaml").read_text(encoding="utf-8")
+    config = proposed(Path("bubble.yaml"))
+    assert config.document.data["model"]["start"] == start
+    (problem,) = build(config)
+    std = float(np.median(problem.observations.std))
+    assert std == pytest.approx(float(noise_std.split()[0]) * 1e-6, rel=0.35)
+    for term in problem.prior.terms:  # the truth is no surprise to the prior
+        truth = TRUTH[start][term.parameter.name]
+        transformed = np.log(truth) if term.transform == "lognormal" else truth
+        assert abs(transformed - term.mean) < 3 * term.std, term.parameter.name
+    assert text.startswith("# yaml-language-server: $schema=en4dvar.schema.json\n")
+    schema = json.loads(Path("en4dvar.schema.json").read_text(encoding="utf-8"))
+    assert list(Draft202012Validator(schema).iter_errors(read_document(Path("bubble.yaml")).data)) == []
+    assert call("validate", "bubble.yaml").exit_code == 0
+    run = call("run", "bubble.yaml", "--no-report")
+    assert run.exit_code == 0, run.output
+    result = load_result(Path("runs") / "bubble" / "posterior.nc")
+    assert result.sample_stats.attrs["converged"] == 1
+    assert result.sample_stats.attrs["nrmse"] > 0.9
+    rows = {row.name: row for row in result.summary()}
+    assert rows["mu"].unit == "Pa s"
+    assert abs(rows["mu"].mean - TRUTH[start]["mu"]) < 4 * rows["mu"].std
+
+
+def test_the_collapse_time_is_rayleigh_s() -> None:
+    """In a liquid without viscosity, gas and surface tension the lobe is Rayleigh's, integrated here."""
+    rho, p, radius = 998.0, 101325.0, 200e-6
+
+    def rhs(_: float, y: np.ndarray) -> list[float]:
+        return [y[1], (-p / rho - 1.5 * y[1] ** 2) / y[0]]
+
+    times = np.linspace(0, 0.9 * RAYLEIGH * radius * np.sqrt(rho / p), 12)
+    path = solve_ivp(rhs, (0, times[-1]), [radius, 0.0], t_eval=times, rtol=1e-10, atol=1e-14)
+    found = lobe(times, path.y[0])
+    assert found.R_max == pytest.approx(radius, rel=0.01)
+    assert found.t_c == pytest.approx(RAYLEIGH * radius * np.sqrt(rho / p), rel=0.02)
+
+
+def test_the_noise_is_what_was_added() -> None:
+    times = np.linspace(-0.9, 0.9, 25)
+    exact = 100e-6 * (1 - times**2) ** 0.4
+    stream = np.random.default_rng(0)
+    found = [noise(times, exact + 1e-6 * stream.standard_normal(25)) for _ in range(200)]
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(1e-6, rel=0.05)
+    assert np.isnan(noise(times[::8], exact[::8]))
+
+
+def test_what_is_no_bubble_is_told() -> None:
+    with pytest.raises(DataError, match="fewer than four samples"):
+        look(np.arange(10.0), np.arange(10.0))
+
+
+def write(path: Path, header: str = "t_us,R_um", scale: float = 1.0) -> Path:
+    """A film of a released bubble: Rayleigh's collapse, rebound, rest."""
+    times = np.arange(60) * 0.7
+    rebound = 60 * np.sqrt(np.clip(1 - ((times - 27) / 8) ** 2, 0, 1))
+    radius = np.where(times < 18.2, 195 * np.clip(1 - (times / 18.5) ** 2, 0, 1) ** 0.4, np.maximum(rebound, 22))
+    path.write_text("\n".join([header, *(f"{t:g},{scale * r:g}" for t, r in zip(times, radius, strict=True)), ""]))
+    return path
+
+
+def test_without_units_and_terminal_one_error_says_what_to_add(tmp_path: Path) -> None:
+    done = call("init", "--data", write(tmp_path / "b.csv"))
+    assert done.exit_code == 2
+    fault = done.stderr.splitlines()[-1]
+    assert "columns with numbers: t_us, R_um; units are never guessed" in fault
+    assert "add --time-unit UNIT (e.g. us), --radius-unit UNIT (e.g. um)" in fault
+    done = call("init", "--data", write(tmp_path / "b.csv", "a,b"), "--time-unit", "us")
+    needed = "add --time-column NAME, --radius-column NAME, --radius-unit UNIT (e.g. um)"
+    assert needed in done.stderr
+    assert not list(tmp_path.glob("*.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--time-unit", "us", "--radius-unit", "Pa"), "unit 'Pa' cannot be converted to 'm'"),
+        (("--time-unit", "usec", "--radius-unit", "um"), "did you mean 'us'"),
+        ((*UNITS, "--radius-column", "x"), "no column 'x'; the columns are: t_us, R_um"),
+        ((*UNITS, "--law", "newtonain"), "did you mean 'newtonian'"),
+        ((*UNITS, "--out", "nowhere/b.yaml"), "nowhere/b.yaml: the folder nowhere does not exist"),
+    ],
+)
+def test_wrong_options(tmp_path: Path, options: tuple[str, ...], message: str) -> None:
+    done = call("init", "--data", write(tmp_path / "b.csv"), *options)
+    assert done.exit_code == 2, done.output
+    assert message in done.stderr
+    assert not list(tmp_path.glob("*.yaml"))
+
+
+def test_on_a_terminal_it_asks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commands_init, "_interactive", lambda: True)
+    done = call("init", "--data", write(tmp_path / "b.csv", "when,size"), input="when\nsize\nus\nPa\num\n")
+    assert done.exit_code == 0, done.output
+    assert "unit 'Pa' cannot be converted to 'm'" in done.stderr  # asked again
+    columns = proposed(Path("b.yaml")).document.data["data"]["columns"]
+    assert columns == {"time": {"name": "when", "unit": "us"}, "radius": {"name": "size", "unit": "um"}}
+
+
+def test_nothing_is_replaced_without_force(tmp_path: Path) -> None:
+    write(tmp_path / "b.csv")
+    assert call("init", "--data", "b.csv", *UNITS).exit_code == 0
+    Path("b.yaml").write_text("mine")
+    done = call("init", "--data", "b.csv", *UNITS)
+    assert (done.exit_code, done.stderr) == (2, "b.yaml: exists; give --force to replace it, or another --out\n")
+    assert Path("b.yaml").read_text() == "mine"
+    assert call("init", "--data", "b.csv", *UNITS, "--force").exit_code == 0
+    assert proposed(Path("b.yaml")).document.data["data"]["path"] == "b.csv"
+
+
+def test_a_constant_step_instead_of_times(tmp_path: Path) -> None:
+    done = call("init", "--data", write(tmp_path / "b.csv"), "--time-step", "0.7 us", "--radius-unit", "um")
+    assert done.exit_code == 0, done.output
+    assert proposed(Path("b.yaml")).document.data["data"]["columns"]["time"] == {"step": "0.7 us"}
+
+
+def test_a_folder_is_a_campaign_and_its_odd_file_is_named(tmp_path: Path) -> None:
+    folder = tmp_path / "gel one"
+    folder.mkdir()
+    for n in (1, 2):
+        write(folder / f"b{n}.csv", scale=1 + n / 20)
+    done = call("init", "--data", folder, *UNITS)
+    assert done.exit_code == 0, done.output
+    assert len(build(proposed(Path("gel_one.yaml")))) == 2
+    simulate("acoustic", "0 us:40 us:0.5 us", "1 um", folder / "other.csv")
+    text = (folder / "other.csv").read_text().replace("t_us,radius_um", "t_us,R_um")
+    (folder / "other.csv").write_text(text)
+    (folder / "other.truth.yaml").unlink()
+    done = call("init", "--data", folder, *UNITS, "--force")
+    assert done.exit_code == 2
+    assert "suggest different starts (acoustic: other; laser: b1, b2); say --start" in done.stderr
+    (folder / "other.csv").write_text("a,b\n1,2\n")
+    assert "other.csv: no column" in call("init", "--data", folder, *UNITS, "--force").stderr
+
+
+def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
+    done = call("init", "--data", write(tmp_path / "b.csv"), "--time-unit", "ms", "--radius-unit", "um")
+    assert done.exit_code == 0, done.output
+    assert "are the units of both columns right?" in done.stderr
+    assert "# MIND: the collapse takes" in Path("b.yaml").read_text()
+
+
+@pytest.mark.parametrize("start", ["acoustic", "laser"])
+@pytest.mark.parametrize("law", sorted(REGISTRY))
+def test_every_law_has_a_starter_that_validates(tmp_path: Path, start: str, law: str) -> None:
+    source = Source("b.csv", ("t", "us"), None, ("R", "um"))
+    text = yaml_text("a", source, starter(start, law), "test")  # type: ignore[arg-type]
+    config = resolve(parse_document(text, "a.yaml"), tmp_path)
+    assert {e.parameter.name for e in config.parameters} == {*(p.name for p in config.model.parameters), "t_s"}
+
+
+def test_without_data_a_starter_is_written() -> None:
+    done = call("init", "--start", "laser")
+    assert done.exit_code == 0, done.output
+    assert load_config("bubble.yaml").document.data["model"]["start"] == "laser"
+    assert "bubble.csv: no such file" in call("validate", "bubble.yaml").stderr
+
+
+def test_names_are_quoted_where_yaml_needs_it() -> None:
+    for text in ("R (um)", "1", "no", "a: b", "#", "t,s", "Größe", "R_um", "a b"):
+        assert parse_document(f"x: {{name: {quoted(text)}, unit: m}}").data == {"x": {"name": text, "unit": "m"}}
+
+
+@pytest.mark.parametrize(
+    ("file", "radius_unit", "G", "rest"),
+    [("A_E2_002.mat", "um", 1.9e3, 21.8e-6), ("PA1_exp2_RofTdata_0.mat", "m", 40e3, 63e-6)],
+)
+def test_measured_films(file: str, radius_unit: str, G: float, rest: float) -> None:
+    """G of a least-squares fit, R_eq of the file: within what the proposed prior expects."""
+    path = MEASURED / file
+    if not path.exists():
+        pytest.skip(f"measured data not present: {path}")
+    done = call("init", "--data", path, "--time-unit", "s", "--radius-unit", radius_unit)
+    assert done.exit_code == 0, done.output
+    config = proposed(Path(f"{path.stem}.yaml"))
+    assert config.document.data["model"]["start"] == "laser"
+    (problem,) = build(config)
+    terms = {term.parameter.name: term for term in problem.prior.terms}
+    for name, value in {"G": G, "R_eq": rest}.items():
+        assert abs(np.log(value) - terms[name].mean) < 2 * terms[name].std, name
