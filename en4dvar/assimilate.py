@@ -78,6 +78,7 @@ class _Outcome:
     """Where the iterations ended."""
 
     weights: Weights
+    transform: Array
     step: Step
     cost: float
     converged: bool
@@ -118,7 +119,7 @@ class _Run:
         space.forward_runs = state.forward_runs
         end = self.assimilate_repeatedly(state, self.mda) if self.mda else self.iterate(state)
 
-        posterior = space.control(end.weights.w + end.step.transform)
+        posterior = space.control(end.weights.w + end.transform)
         posterior = posterior + self.mean_beyond_mode(posterior, end.step)
         posterior, refinement, refine_warnings = self.refine(posterior)
         mode = space.control(end.weights.w)
@@ -208,7 +209,7 @@ class _Run:
         for at, move in start.path:
             step = self.require_step(at, f"forecast of iteration {len(records) + 1}")
             worst_loss = max(worst_loss, at.members.failures, key=lambda failures: sum(map(bool, failures)))
-            records.append(self.record(len(records), at, step, move.step_length))
+            records.append(self.record(len(records), at, step, step.transform, move.step_length))
             weights = Weights(move.w, step.transform)
             if self.progress is not None:
                 self.progress(self.problem.observations.name, records[-1])
@@ -287,11 +288,11 @@ class _Run:
                     if move is None and self.same_members(contracted, weights):
                         stop = "no decrease possible along the step"
                         converged = step.predicted_decrease <= self.small(total)
-            records.append(self.record(len(records), at, step, move.step_length if move else 0.0))
+            records.append(self.record(len(records), at, step, step.transform, move.step_length if move else 0.0))
             if self.progress is not None:
                 self.progress(self.problem.observations.name, records[-1])
             if stop:
-                return _Outcome(weights, step, total, converged, stop, tuple(records), worst_loss)
+                return _Outcome(weights, step.transform, step, total, converged, stop, tuple(records), worst_loss)
             if move is None:  # a regression over a narrower ensemble may still show the way down
                 weights = contracted
                 continue
@@ -309,14 +310,14 @@ class _Run:
                 self.on_iteration(LoopState(weights, space.forward_runs, state.warnings, tuple(records), worst_loss))
             (at,) = space.linearise([weights])
             step = self.require_step(at, f"forecast of iteration {len(records) + 1}")
-            step = replace(step, transform=weights.T)
             worst_loss = max(worst_loss, at.members.failures, key=lambda failures: sum(map(bool, failures)))
             done = len(records) == count
-            records.append(self.record(len(records), at, step, 0.0 if done else 1.0))
+            records.append(self.record(len(records), at, step, weights.T, 0.0 if done else 1.0))
             if self.progress is not None:
                 self.progress(self.problem.observations.name, records[-1])
             if done:
-                return _Outcome(weights, step, at.cost, True, f"{count} assimilations", tuple(records), worst_loss)
+                ending = f"{count} assimilations"
+                return _Outcome(weights, weights.T, step, at.cost, True, ending, tuple(records), worst_loss)
             weights = assimilate_once(space, at, scheme, len(records) - 1, self.seed)
 
     def same_members(self, a: Weights, b: Weights) -> bool:
@@ -328,9 +329,9 @@ class _Run:
         """A decrease of J that counts as none; below J = 1 it is absolute, for there J has no more to tell."""
         return self.settings.cost_tolerance * max(total, 1.0)
 
-    def record(self, iteration: int, at: Local, step: Step, step_length: float) -> IterationRecord:
+    def record(self, iteration: int, at: Local, step: Step, transform: Array, step_length: float) -> IterationRecord:
         space, w = self.space, at.weights.w
-        ensemble = space.control(w + step.transform)
+        ensemble = space.control(w + transform)
         rates = None if at.central.rates is None else at.central.rates[0]
         scale = None if at.central.noise_scale is None else at.central.noise_scale[0]
         predictions = at.central.predictions[0]

@@ -14,6 +14,7 @@ from en4dvar.state import Array, StateLayout
 class Batch(Sequence[Trajectory | Failure]):
     """N trajectories or failures: ``states`` (N, K, n_state) at ``times`` (N, K).
 
+    ``batch[i]`` is member i, ``batch["x"]`` a field along all paths, (N, K) or (N, K, size).
     A member is a :class:`Failure` from the first instant on at which its state is not finite. Where members are many
     and steps are short, as in sequential assimilation, a batch spares the making of N objects.
     """
@@ -29,10 +30,18 @@ class Batch(Sequence[Trajectory | Failure]):
     def __getitem__(self, index: int) -> Trajectory | Failure: ...
     @overload
     def __getitem__(self, index: slice) -> list[Trajectory | Failure]: ...
-    def __getitem__(self, index: int | slice) -> Trajectory | Failure | list[Trajectory | Failure]:
+    @overload
+    def __getitem__(self, index: str) -> Array: ...
+    def __getitem__(self, index: int | slice | str) -> Trajectory | Failure | list[Trajectory | Failure] | Array:
+        if isinstance(index, str):
+            return self.layout.part(self.states, index)
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         times, states = self.times[index], self.states[index]
         if not self.whole and not (finite := np.isfinite(states).all(axis=-1)).all():
             return Failure("non-finite state", float(times[np.argmin(finite)]))
         return Trajectory(times, states, self.layout)
+
+    def largest(self, name: str) -> Array:
+        """(N,) what a quantity of the model's ``validity`` reached, see :meth:`~en4dvar.forward.Trajectory.largest`."""
+        return np.array([path.largest(name) if isinstance(path, Trajectory) else np.nan for path in self])

@@ -123,7 +123,7 @@ class WeightSpace:
         reference, anomalies = self._linearisation(weights, members, central, reduced)
         at = _split(central, reference, anomalies)
         observations = self.problem.observations
-        step = self.scheme.step(weights, Evaluation(*whiten(observations, at)))
+        step = self.scheme.step(weights, Evaluation(*whiten(observations, at), self.basis))
         tangent = None
         if self.settings.linearisation == "bundle":
             tangent = Tangent(at.prediction, at.anomalies, precision_times(observations, at, at.anomalies))

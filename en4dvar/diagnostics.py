@@ -19,7 +19,7 @@ HARDLY_INFORMED = 0.1  # DFS of a parameter below which its posterior is said to
 
 def background_cost(w: Array) -> Array:
     """J_b = (N−1)/2 ‖w‖² of weights (…, N)."""
-    return np.asarray(0.5 * (w.shape[-1] - 1) * np.sum(w * w, axis=-1))
+    return np.asarray(0.5 * (w.shape[-1] - 1) * (w * w).sum(axis=-1))
 
 
 def dfs(singular_values: Array, n_members: int) -> float:

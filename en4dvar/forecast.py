@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.errors import ConfigError
-from en4dvar.executor import Executor, SerialExecutor, describe
-from en4dvar.forward import Failure, RateOperator, Trajectory
-from en4dvar.likelihood import needs_rate, observation_cost
+from en4dvar.executor import Executor, SerialExecutor
+from en4dvar.forward import RateOperator
+from en4dvar.likelihood import observation_cost
+from en4dvar.members import Indices, Reading, initial_states, out_of_bounds
 from en4dvar.problem import InverseProblem
 from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Array, Parameter
 
@@ -65,44 +64,23 @@ def forecast(
     ------
     ConfigError: a timing error on an observable without a rate.
     """
-    executor = executor or SerialExecutor()
-    observations = problem.observations
-    rate_operator = _rate_operator(problem)
-    times, at_observations, at_extra = _union(observations.times, extra_times)
-    n_members = len(x)
+    reading = _reading(problem, limits=len(extra_times) > 0)
+    times, at_observations, at_extra = _union(problem.observations.times, extra_times)
     physical = problem.prior.to_physical(x)
-    states, failures = _initial_states(problem, physical)
-    outcomes: dict[int, Trajectory | Failure] = {}
-    if states:
-        alive = list(states)
+    failures = out_of_bounds(problem.prior, physical)
+    alive, states = initial_states(problem, physical, failures)
+    observed = np.full((len(reading.quantities), len(x), len(times)), np.nan)
+    extremes = np.full((len(x), len(reading.largest)), np.nan)
+    if len(alive):
         shifted = times + _of_framework(problem, physical, TIME_SHIFT, 0.0)[alive, None]
-        results = executor.trajectories(problem.model, np.stack(list(states.values())), shifted)
-        outcomes = dict(zip(alive, results, strict=True))
-
-    observed = np.full((n_members, len(times)), np.nan)
-    rates = None if rate_operator is None else np.full((n_members, len(times)), np.nan)
-    limits = problem.model.validity if extra_times.size else ()
-    extremes = np.full((n_members, len(limits)), np.nan)
-    for i, outcome in outcomes.items():
-        if isinstance(outcome, Failure):
-            failures[i] = outcome.reason
-            continue
-        try:
-            row = _observe(problem, outcome, rate_operator)
-            extremes[i] = [outcome.largest(limit.name) for limit in limits]
-        except Exception as error:  # H belongs to the user as well
-            failures[i] = describe(error)
-            continue
-        if row.shape[1:] != times.shape or not np.all(np.isfinite(row)):
-            failures[i] = "non-finite prediction" if row.shape[1:] == times.shape else "misshapen prediction"
-            continue
-        observed[i] = row[0]
-        if rates is not None:
-            rates[i] = row[1]
+        outcomes = (executor or SerialExecutor()).trajectories(problem.model, states, shifted)
+        observed[:, alive], extremes[alive], reasons = reading.observe(outcomes, len(times))
+        for i, reason in zip(alive, reasons, strict=True):
+            failures[i] = reason
     return Forecast(
-        observed[:, at_observations],
-        None if rates is None else rates[:, at_observations],
-        observed[:, at_extra],
+        observed[0][:, at_observations],
+        observed[1][:, at_observations] if len(observed) > 1 else None,
+        observed[0][:, at_extra],
         tuple(failures),
         _of_framework(problem, physical, NOISE_SCALE, 1.0) if has_noise_scale(problem) else None,
         extremes,
@@ -156,70 +134,22 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
     ):
         if names:
             raise ConfigError(f"{', '.join(sorted(names))}: {message}")
-    _rate_operator(problem)
+    _reading(problem, limits=False)
     return tuple(known[name] for name in problem.fixed)
 
 
-def _rate_operator(problem: InverseProblem) -> RateOperator | None:
-    """What gives the rate of the observable, or None where no observation has a timing error."""
-    if not needs_rate(problem.observations):
-        return None
+def _reading(problem: InverseProblem, limits: bool) -> Reading:
+    """H; its rate where an observation has a timing error; the model's limits of validity where asked for."""
     operator = problem.observable.operator
+    largest = tuple(limit.name for limit in problem.model.validity) if limits else ()
+    batched = getattr(operator, "batched", False)
+    if not problem.observations.timed:
+        return Reading((operator,), largest, batched)
     if not isinstance(operator, RateOperator):
         raise ConfigError(
             f"a timing error needs the rate of {problem.observable.name}, which the model does not provide"
         )
-    return operator
-
-
-def _initial_states(problem: InverseProblem, physical: Array) -> tuple[dict[int, Array], list[str]]:
-    """States (n_state,) of the members that have one, by member, and the reasons (B,) of the others."""
-    failures = [""] * len(physical)
-    for parameter, values in zip(problem.prior.parameters, physical.T, strict=True):
-        low, high = parameter.bounds
-        for i in np.flatnonzero(~((values >= low) & (values <= high) & np.isfinite(values))):
-            failures[i] = failures[i] or f"{parameter.name} outside [{low:g}, {high:g}] {parameter.unit}"
-    alive = [i for i, reason in enumerate(failures) if not reason]
-    if not alive:
-        return {}, failures
-    fixed = {name: np.full(len(physical), float(value)) for name, value in problem.fixed.items()}
-    theta = {**fixed, **dict(zip(problem.prior.names, physical.T, strict=True))}
-    own = {p.name for p in problem.model.parameters}
-    of_model = {name: values for name, values in theta.items() if name in own}
-
-    def build(members: list[int]) -> dict[int, Array]:
-        states = np.asarray(problem.model.initial_states({k: v[members] for k, v in of_model.items()}), dtype=float)
-        states = _perturbed(problem, states, {k: v[members] for k, v in theta.items()})
-        if states.shape != (len(members), problem.model.layout.size) or not np.all(np.isfinite(states)):
-            raise ValueError("non-finite or misshapen initial state")
-        return dict(zip(members, states, strict=True))
-
-    states: dict[int, Array] = {}
-    try:
-        return build(alive), failures
-    except Exception:  # some member has no state: find out which, one by one
-        for member in alive:
-            try:
-                states |= build([member])
-            except Exception as error:  # a model may refuse parameters in any way; the reason is kept
-                failures[member] = describe(error)
-    return states, failures
-
-
-def _perturbed(problem: InverseProblem, states: Array, theta: Mapping[str, Array]) -> Array:
-    """Initial states (B, n_state) with the perturbations of the control vector; ValueError outside a field's bounds."""
-    if not problem.perturbations or states.ndim != 2 or states.shape[1] != problem.model.layout.size:
-        return states
-    states = states.copy()
-    fields = {f.name: f for f in problem.model.layout}
-    for perturbation in problem.perturbations:
-        where, value = problem.model.layout[perturbation.field], theta[perturbation.parameter.name][:, None]
-        states[:, where] = states[:, where] * value if perturbation.relative else states[:, where] + value
-        low, high = fields[perturbation.field].bounds
-        if not np.all((states[:, where] > low) & (states[:, where] < high)):
-            unit = fields[perturbation.field].unit
-            raise ValueError(f"perturbed initial {perturbation.field} outside ({low:g}, {high:g}) {unit}")
-    return states
+    return Reading((operator, operator.rate), largest, batched)
 
 
 def _of_framework(problem: InverseProblem, physical: Array, parameter: Parameter, default: float) -> Array:
@@ -229,16 +159,10 @@ def _of_framework(problem: InverseProblem, physical: Array, parameter: Parameter
     return np.full(len(physical), problem.fixed.get(parameter.name, default))
 
 
-def _observe(problem: InverseProblem, trajectory: Trajectory, rate_operator: RateOperator | None) -> Array:
-    """Predictions and, where needed, rates, (1 or 2, K)."""
-    rows = [np.asarray(problem.observable.operator(trajectory), dtype=float)]
-    if rate_operator is not None:
-        rows.append(np.asarray(rate_operator.rate(trajectory), dtype=float))
-    return np.stack(rows)
-
-
-def _union(times: Array, extra: Array) -> tuple[Array, npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+def _union(times: Array, extra: Array) -> tuple[Array, Indices | slice, Indices | slice]:
     """Increasing union of the times and where the observations and the extra times stand in it."""
+    if not len(extra):
+        return times, slice(None), slice(0, 0)
     nearest = times[np.abs(extra[:, None] - times).argmin(axis=1)]
     extra = np.where(np.abs(extra - nearest) <= SAME_INSTANT * (times[-1] - times[0]), nearest, extra)
     union: Array = np.unique(np.concatenate([times, extra]))

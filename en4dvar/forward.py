@@ -64,7 +64,11 @@ class ValidityLimit:
 
 @runtime_checkable
 class ObservationOperator(Protocol):
-    """H: maps a trajectory to predictions (Ny,), one per observation time."""
+    """H: maps a trajectory to predictions (Ny,), one per observation time.
+
+    One with an attribute ``batched = True`` gives, by the same expression, (N, Ny) for a :class:`~en4dvar.batch.Batch`,
+    whose fields have members as their first axis.
+    """
 
     def __call__(self, trajectory: Trajectory) -> Array: ...
 
@@ -90,6 +94,7 @@ class StateField:
 
     name: str
     rate_of: str | None = None
+    batched: ClassVar[bool] = True
 
     def __call__(self, trajectory: Trajectory) -> Array:
         return trajectory[self.name]

@@ -29,11 +29,6 @@ from en4dvar.observations import Observations
 from en4dvar.state import Array
 
 
-def needs_rate(observations: Observations) -> bool:
-    """Whether any observation carries a timing error."""
-    return bool(np.any(observations.time_std > 0))
-
-
 def error_std(observations: Observations, rates: Array | None, noise_scale: Array | None = None) -> Array:
     """Total observation-error std s (…, K) for rates (…, K) of the observable and noise scales σ (…,).
 
@@ -62,11 +57,11 @@ def observation_cost(
     observations: Observations, predictions: Array, rates: Array | None, noise_scale: Array | None = None
 ) -> Array:
     """J_o (…,) of predictions (…, K); +inf where a prediction is not finite."""
-    s = error_std(observations, rates, noise_scale)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        v = whitened_residual(observations, predictions, rates, noise_scale)
-        terms = _loss(observations, v) + np.log(s / observations.std)
-        total = np.sum(observations.weights * terms, axis=-1)
+        terms = _loss(observations, whitened_residual(observations, predictions, rates, noise_scale))
+        if rates is not None or noise_scale is not None:
+            terms = terms + np.log(error_std(observations, rates, noise_scale) / observations.std)
+        total = (observations.weights * terms).sum(axis=-1)
     return np.where(np.isfinite(total), total, np.inf)
 
 

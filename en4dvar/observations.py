@@ -86,6 +86,11 @@ class Observations:
             raise DataError(f"{where}: the covariance of the observation errors is not positive definite") from None
 
     @cached_property
+    def timed(self) -> bool:
+        """Whether any observation carries a timing error."""
+        return bool(np.any(self.time_std > 0))
+
+    @cached_property
     def whitening(self) -> Array:
         """L⁻¹ (K, K), lower triangular, with C = L Lᵀ; the identity for independent errors."""
         if self.correlation is None:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -144,6 +144,11 @@ class Prior:
         return tuple(p.name for p in self.parameters)
 
     @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest physical values (n,) that the parameters allow."""
+        return np.array([p.bounds[0] for p in self.parameters]), np.array([p.bounds[1] for p in self.parameters])
+
+    @cached_property
     def mean(self) -> Array:
         """(n,) in transformed space."""
         return np.array([term.mean for term in self.terms])
@@ -155,7 +160,21 @@ class Prior:
 
     def to_physical(self, x: Array) -> Array:
         """Physical values (…, n) of control vectors ``x`` (…, n)."""
-        return np.stack([term.to_physical(x[..., j]) for j, term in enumerate(self.terms)], axis=-1)
+        theta = np.array(x, dtype=float)
+        for columns, term in self._columns:
+            theta[..., columns] = term.to_physical(theta[..., columns])
+        return theta
+
+    @cached_property
+    def _columns(self) -> tuple[tuple[slice, PriorTerm], ...]:
+        """Neighbouring parameters that one call transforms, with the first of their terms; ``normal`` needs none."""
+        groups: list[tuple[slice, PriorTerm]] = []
+        for j, term in enumerate(self.terms):
+            if groups and groups[-1][0].stop == j and term.transform == "lognormal" == groups[-1][1].transform:
+                groups[-1] = slice(groups[-1][0].start, j + 1), groups[-1][1]
+            elif term.transform != "normal":
+                groups.append((slice(j, j + 1), term))
+        return tuple(groups)
 
     def from_physical(self, theta: Array) -> Array:
         """Control vectors (…, n) of physical values ``theta`` (…, n). Raises ValueError outside a transform's range."""
@@ -188,9 +207,15 @@ class Prior:
         return self.mean + self.std * z
 
 
+@lru_cache(maxsize=256)
 def standard_normal(seed: int, name: str, n_members: int) -> Array:
-    """One N(0, 1) number per member (N,), each from the stream of its own (seed, name, member)."""
-    return np.array([member_stream(seed, name, member).standard_normal() for member in range(n_members)])
+    """One N(0, 1) number per member (N,), each from the stream of its own (seed, name, member); read-only.
+
+    Kept, because the data sets of a campaign share them.
+    """
+    draws = np.array([member_stream(seed, name, member).standard_normal() for member in range(n_members)])
+    draws.flags.writeable = False
+    return draws
 
 
 def member_stream(seed: int, name: str, member: int = 0) -> np.random.Generator:

@@ -101,12 +101,12 @@ class StateLayout:
         edges = np.cumsum([0, *(f.size for f in self.fields)])
         return {f.name: slice(int(a), int(b)) for f, a, b in zip(self.fields, edges[:-1], edges[1:], strict=True)}
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Length of a state vector, n_state."""
         return sum(f.size for f in self.fields)
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the fields, in order."""
         return tuple(f.name for f in self.fields)

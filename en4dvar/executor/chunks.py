@@ -36,7 +36,7 @@ def run_chunk(model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
         return _by_batch(model, x, times)
     try:
         with time_limit():
-            outcomes = _kept(model.trajectories(x, times))
+            outcomes = kept(model.trajectories(x, times))
         reason = f"the model returned {len(outcomes)} trajectories for {len(x)} members"
     except (Exception, TimeLimitError) as error:  # a model may fail in any way; the reason is kept
         outcomes, reason = [], describe(error)
@@ -52,7 +52,8 @@ def _by_batch(model: ForwardModel, x: Array, times: Array) -> list[Outcome]:
     return [outcome for part in parts for outcome in run_chunk(model, x[part], times[part])]
 
 
-def _kept(outcomes: Sequence[Outcome]) -> Sequence[Outcome]:
+def kept(outcomes: Sequence[Outcome]) -> Sequence[Outcome]:
+    """A batch as it is, anything else as a list."""
     return outcomes if isinstance(outcomes, Batch) else list(outcomes)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from en4dvar.executor.base import ATTEMPTS_ALONE, Executor, T, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
-from en4dvar.executor.chunks import Outcome, run_chunk
+from en4dvar.executor.chunks import Outcome, kept, run_chunk
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
 from en4dvar.forward import ForwardModel
 from en4dvar.state import Array
@@ -128,7 +128,7 @@ class ThreadsExecutor(_PoolExecutor):
             shared.work()
             for helper in helpers:
                 helper.result()
-            results = list(shared.results())
+            results = kept(shared.results())
         except Exception:  # told member by member
             results = []
         return results if len(results) == len(x) else super().trajectories(model, x, times)

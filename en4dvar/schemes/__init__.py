@@ -40,23 +40,31 @@ class Weights:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What a forecast says about the centre: whitened innovation ``d`` (K',) and whitened anomalies ``S`` (K', N)."""
+    """What a forecast says about the centre: whitened innovation ``d`` (K',) and whitened anomalies ``S`` (K', N).
+
+    ``basis`` (N, r): orthonormal columns that hold the rows of S, where it is known that there are such.
+    """
 
     d: Array
     S: Array
+    basis: Array | None = None
 
 
 @dataclass(frozen=True)
 class Step:
     """An undamped step in weight space and the posterior transform at the point it starts from.
 
-    ``gradient`` g (N,) of J, ``hessian`` A, ``direction`` −A⁻¹g (N,), ``transform`` T = √(N−1) A^{-1/2} (N, N).
+    ``gradient`` g (N,) of J, ``hessian`` A, ``direction`` −A⁻¹g (N,).
     """
 
     gradient: Array
     hessian: Hessian
     direction: Array
-    transform: Array
+
+    @property
+    def transform(self) -> Array:
+        """T = √(N−1) A^{-1/2} (N, N)."""
+        return self.hessian.transform
 
     @property
     def norm(self) -> float:
@@ -71,9 +79,9 @@ class Step:
 
 def gauss_newton(weights: Weights, evaluation: Evaluation) -> Step:
     """The analysis that all schemes share: g = (N−1) w − Sᵀd, A = (N−1) I + SᵀS, δw = −A⁻¹g, T = √(N−1) A^{-1/2}."""
-    hessian = Hessian.of(evaluation.S)
+    hessian = Hessian.of(evaluation.S, evaluation.basis)
     gradient = hessian.prior_precision * weights.w - evaluation.S.T @ evaluation.d
-    return Step(gradient, hessian, -hessian.solve(gradient), hessian.transform)
+    return Step(gradient, hessian, -hessian.solve(gradient))
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from en4dvar_bubble.laws import ConstitutiveLaw, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.parameters import R0, R_EQ, R_MAX
 from en4dvar_bubble.medium import WATER_25C, Medium, saturated_vapour_pressure
 from en4dvar_bubble.packing import constants, hottest_wall, law_tables, mass_fraction, pack
-from en4dvar_bubble.paths import BubbleTrajectory, Paths
+from en4dvar_bubble.paths import Paths
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.solver.driver import Accuracy, Radial, Solution, System, preset, ready
 
@@ -226,16 +226,8 @@ class BubbleModel(ForwardModel):
         return shared.results()
 
     def share(self, x: Array, times: Array) -> Shared:
-        work, finish = self.prepared(np.asarray(x, dtype=float), np.broadcast_to(times, (len(x), np.shape(times)[-1])))
-
-        def results() -> Sequence[Trajectory | Failure]:
-            paths = finish()
-            return [
-                paths.failure(i) if status else BubbleTrajectory(paths, i)
-                for i, status in enumerate(paths.solution.status.tolist())
-            ]
-
-        return Shared(work, results)
+        times = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+        return Shared(*self.prepared(np.asarray(x, dtype=float), times))
 
     def integrate(self, x: Array, times: Array, t0: float = 0.0) -> Paths:
         """All members from their states ``x`` (N, n_state) at ``t0`` (s) to ``times`` (N, K) (s, increasing)."""

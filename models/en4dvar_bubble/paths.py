@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from en4dvar.batch import Batch
 from en4dvar.forward import Failure, Trajectory
 from en4dvar.state import Array, StateLayout
 from en4dvar_bubble.laws.base import GRID
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Paths:
-    """A batch of integrated members: ``initial`` states (N, n_state), ``times`` (N, K) in s, the raw solution."""
+class Paths(Batch):
+    """Integrated members: ``initial`` states (N, n_state), ``times`` (N, K) in s, the raw solution."""
 
     model: BubbleModel
     initial: Array
@@ -33,8 +34,24 @@ class Paths:
     par: Array
     _fields: dict[str, Array] = field(default_factory=dict)
 
-    def __getitem__(self, name: str) -> Array:
-        """A field of the state along the paths, (N, K) or (N, K, size), SI."""
+    @property
+    def whole(self) -> bool:  # type: ignore[override]
+        """Whether no member failed."""
+        return not self.solution.status.any()
+
+    @property
+    def layout(self) -> StateLayout:  # type: ignore[override]
+        return self.model.layout
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __getitem__(self, name: Any) -> Any:
+        """A field of the state along the paths, (N, K) or (N, K, size), SI; a member by its number."""
+        if isinstance(name, slice):
+            return [self[i] for i in range(*name.indices(len(self)))]
+        if not isinstance(name, str):
+            return self.failure(name) if self.solution.status[name] else BubbleTrajectory(self, name)
         if name not in self._fields:
             compute: Any = getattr(self, f"_{name}", None)
             self._fields[name] = self._constant(name) if compute is None else compute()
@@ -44,8 +61,16 @@ class Paths:
         """Why and when (s) a member's integration ended early."""
         return Failure(self.solution.reason(member), float(self.solution.record[member, END_TIME]) * 1e-6)
 
+    def largest(self, name: str) -> Array:
+        """(N,) wall Mach numbers over all steps of the solver; with Rayleigh–Plesset over the stored instants."""
+        if name != "wall_mach":
+            return np.abs(self[name]).max(axis=1)
+        if self.model.radial == "rayleigh-plesset":  # its equations know no speed of sound
+            return np.asarray(np.abs(self["Rdot"]).max(axis=1) / self.model.medium.c)
+        return self.solution.record[:, MAX_MACH]
+
     @property
-    def states(self) -> Array:
+    def states(self) -> Array:  # type: ignore[override]
         """Full state vectors (N, K, n_state) in the model's layout."""
         blocks = [self[f.name].reshape(*self.times.shape, -1) for f in self.model.layout]
         return np.concatenate(blocks, axis=2)
@@ -133,13 +158,8 @@ class BubbleTrajectory(Trajectory):
         return cast(Array, self._paths[name][self._member])
 
     def largest(self, name: str) -> float:
-        """Of the wall Mach number: over all steps of the solver; with Rayleigh–Plesset over the stored instants."""
-        if name != "wall_mach":
-            return super().largest(name)
-        model = self._paths.model
-        if model.radial == "rayleigh-plesset":  # its equations know no speed of sound
-            return float(np.max(np.abs(self["Rdot"]))) / model.medium.c
-        return float(self._paths.solution.record[self._member, MAX_MACH])
+        """See :meth:`Paths.largest`."""
+        return float(self._paths.largest(name)[self._member])
 
     @property
     def states(self) -> Array:

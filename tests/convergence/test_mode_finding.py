@@ -71,7 +71,7 @@ def test_acceleration_is_exact_for_a_parabola():
     scale = rng.uniform(0.5, 2, 6)
     hessian = Hessian.of((y * scale).T)
     gradient = rng.standard_normal(4)
-    step = Step(gradient, hessian, -hessian.solve(gradient), hessian.transform)
+    step = Step(gradient, hessian, -hessian.solve(gradient))
     lengths = np.array([1.0, 0.5, 0.25, 0.125])
     predictions = lengths[:, None] * (step.direction @ y) + 0.5 * lengths[:, None] ** 2 * q
     predictions[-1] = np.nan  # the shortest cannot be run: the next one serves
@@ -94,7 +94,7 @@ def test_searches_side_by_side_find_what_each_finds_alone():
     for _ in range(5):
         w, s = rng.standard_normal(3), rng.standard_normal((3, 3))
         hessian, gradient = Hessian.of(s), 4 * (w - 1) ** 3
-        step = Step(gradient, hessian, -20 * hessian.solve(gradient), hessian.transform)
+        step = Step(gradient, hessian, -20 * hessian.solve(gradient))
         points.append(Point(w, float(try_out(w[None]).costs[0]), step, Tangent(np.sin(w), np.eye(3), np.eye(3))))
     together = run_searches([line_search(p) for p in points], try_out)
     alone = [run_searches([line_search(p)], try_out)[0] for p in points]
