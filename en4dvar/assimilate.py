@@ -61,7 +61,8 @@ def assimilate(
 class LoopState:
     """All that the rest of the iterations depends on, besides the problem, the settings and the seed.
 
-    ``worst_loss`` (N,) reasons of failure in the iteration that lost most members, or empty.
+    ``worst_loss`` (N,) reasons of failure in the iteration that lost most members, or empty. ``refinement`` is there
+    once the iterations are done and the Markov chain is under way.
     """
 
     weights: Weights
@@ -71,6 +72,15 @@ class LoopState:
     worst_loss: tuple[str, ...] = ()
     stop_reason: str = ""
     converged: bool = False
+    refinement: Refinement | None = None
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """A Markov chain under way, and the forward runs up to there."""
+
+    chain: mcmc.ChainState
+    forward_runs: int
 
 
 @dataclass(frozen=True)
@@ -121,7 +131,7 @@ class _Run:
 
         posterior = space.control(end.weights.w + end.transform)
         posterior = posterior + self.mean_beyond_mode(posterior, end.step)
-        posterior, refinement, refine_warnings = self.refine(posterior)
+        posterior, refinement, refine_warnings = self.refine(posterior, state.refinement)
         mode = space.control(end.weights.w)
         final = space.forecast(np.vstack([posterior, mode]), grid)
         after, last = final[:-1], final[-1:]
@@ -250,8 +260,13 @@ class _Run:
         z = (members - self.problem.prior.mean) / self.problem.prior.std
         return np.asarray(0.5 * np.sum(z**2, axis=1) + self.space.observation_cost(run))
 
-    def refine(self, posterior: Array) -> tuple[Array, dict[str, float], tuple[Caution, ...]]:
-        """The posterior ensemble (N, n), the summary of the chain that replaced it, and warnings."""
+    def refine(
+        self, posterior: Array, earlier: Refinement | None
+    ) -> tuple[Array, dict[str, float], tuple[Caution, ...]]:
+        """The posterior ensemble (N, n), the summary of the chain that replaced it, and warnings.
+
+        ``earlier`` is where the chain was interrupted.
+        """
         if self.settings.refine == "none":
             return posterior, {}, ()
         space = self.space
@@ -260,7 +275,14 @@ class _Run:
             space.forward_runs += len(x)
             return log_posterior(self.problem, x, space.executor)
 
-        chain = mcmc.sample(log_density, posterior, self.seed)
+        def keep(chain: mcmc.ChainState) -> None:
+            if self.on_iteration is not None:
+                self.on_iteration(replace(self.latest, refinement=Refinement(chain, space.forward_runs)))
+
+        if earlier is not None:
+            space.forward_runs = earlier.forward_runs
+        resume = earlier.chain if earlier else None
+        chain = mcmc.sample(log_density, posterior, self.seed, resume=resume, keep=keep)
         warnings = () if chain.converged else (caution("chain-not-converged", chain.warning()),)
         return chain.thin(len(posterior), self.settings.sampling == "exact"), chain.summary(), warnings
 
@@ -270,9 +292,11 @@ class _Run:
         stop, converged = state.stop_reason, state.converged
         while True:
             if self.on_iteration is not None:
-                self.on_iteration(
-                    LoopState(weights, space.forward_runs, state.warnings, tuple(records), worst_loss, stop, converged)
-                )
+                self.latest = replace(
+                    state, weights=weights, forward_runs=space.forward_runs, records=tuple(records),
+                    worst_loss=worst_loss, stop_reason=stop, converged=converged,
+                )  # fmt: skip
+                self.on_iteration(self.latest)
             (at,) = space.linearise([weights])
             step, total = self.require_step(at, f"forecast of iteration {len(records) + 1}"), at.cost
             worst_loss = max(worst_loss, at.members.failures, key=lambda failures: sum(map(bool, failures)))
@@ -307,7 +331,11 @@ class _Run:
         weights, records, worst_loss = state.weights, list(state.records), state.worst_loss
         while True:
             if self.on_iteration is not None:
-                self.on_iteration(LoopState(weights, space.forward_runs, state.warnings, tuple(records), worst_loss))
+                self.latest = replace(
+                    state, weights=weights, forward_runs=space.forward_runs, records=tuple(records),
+                    worst_loss=worst_loss,
+                )  # fmt: skip
+                self.on_iteration(self.latest)
             (at,) = space.linearise([weights])
             step = self.require_step(at, f"forecast of iteration {len(records) + 1}")
             worst_loss = max(worst_loss, at.members.failures, key=lambda failures: sum(map(bool, failures)))

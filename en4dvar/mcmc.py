@@ -85,6 +85,20 @@ class Chain:
         }
 
 
+@dataclass(frozen=True)
+class ChainState:
+    """All that the rest of a chain depends on: positions (steps, walkers, n) and log densities (steps, walkers) so far,
+    steps accepted (walkers,), and the state of numpy's ``RandomState`` (its key, position and stored normal draw)."""
+
+    samples: Array
+    log_density: Array
+    accepted: Array
+    random_key: Array
+    random_position: int
+    random_has_normal: int
+    random_normal: float
+
+
 def sample(
     log_density: Callable[[Array], Array],
     ensemble: Array,
@@ -93,6 +107,8 @@ def sample(
     walkers: int = 48,
     max_steps: int = 4000,
     target: float = 1000.0,
+    resume: ChainState | None = None,
+    keep: Callable[[ChainState], None] | None = None,
 ) -> Chain:
     """Sample a density from the neighbourhood of an ensemble.
 
@@ -102,14 +118,89 @@ def sample(
     ensemble: (N, n) the Gaussian approximation; walkers start from its members, slightly scattered.
     seed: of the walkers; the same seed gives the same bits.
     walkers: at least 2 (n + 1), even. max_steps: at most. target: effective sample size to reach in each direction.
+    resume: where an earlier call with the same arguments was interrupted; the chain has the same bits as without.
+    keep: called with the state of the chain at each look at convergence.
 
     Raises
     ------
     ConfigError: emcee is not installed. En4dvarError: the density vanishes at (nearly) every member.
     """
     emcee = _emcee()
-    n_members, n = ensemble.shape
+    n = ensemble.shape[1]
     walkers = max(walkers, 2 * (n + 1)) + max(walkers, 2 * (n + 1)) % 2
+    if resume is None:
+        state, chain = _start(emcee, log_density, ensemble, seed, walkers), _Blocks(walkers, n)
+    else:
+        state, chain = _state_of(emcee, resume), _Blocks.of(resume)
+    moves = [(emcee.moves.DEMove(), DE_SHARE), (emcee.moves.StretchMove(), 1 - DE_SHARE)]
+    sampler = emcee.EnsembleSampler(walkers, n, log_density, vectorize=True, moves=moves)
+    steps, converged = chain.steps, False
+    while True:
+        if steps:
+            samples = chain.samples[int(BURN_IN * steps) :]
+            r_hat, effective = split_r_hat(samples), effective_sample_size(samples)
+            converged = bool(np.all(r_hat < MAX_R_HAT) and np.all(effective >= target))
+            if converged or steps >= max_steps:
+                break
+        block = min(max_steps - steps, max(BLOCK, steps // 4))
+        sampler.reset()
+        state = sampler.run_mcmc(state, block, skip_initial_state_check=True)
+        chain.add(sampler.get_chain(), sampler.get_log_prob(), sampler.backend.accepted)
+        steps += block
+        if keep is not None:
+            keep(chain.state(state.random_state))
+    flat = samples.reshape(-1, n)
+    spread = flat.std(axis=0)
+    return Chain(
+        samples=samples,
+        log_density=chain.log_density[int(BURN_IN * steps) :],
+        r_hat=r_hat,
+        effective=effective,
+        acceptance=float(np.mean(chain.accepted / steps)),
+        steps=steps,
+        converged=converged,
+        moved=(flat.mean(axis=0) - ensemble.mean(axis=0)) / spread,
+        widened=spread / ensemble.std(axis=0, ddof=1),
+    )
+
+
+@dataclass
+class _Blocks:
+    """The chain as it grows, block by block."""
+
+    walkers: int
+    size: int
+
+    def __post_init__(self) -> None:
+        self.samples = np.empty((0, self.walkers, self.size))
+        self.log_density = np.empty((0, self.walkers))
+        self.accepted = np.zeros(self.walkers)
+
+    @classmethod
+    def of(cls, state: ChainState) -> _Blocks:
+        chain = cls(*state.samples.shape[1:])
+        chain.add(state.samples, state.log_density, state.accepted)
+        return chain
+
+    @property
+    def steps(self) -> int:
+        return len(self.samples)
+
+    def add(self, samples: Array, log_density: Array, accepted: Array) -> None:
+        self.samples = np.concatenate([self.samples, samples])
+        self.log_density = np.concatenate([self.log_density, log_density])
+        self.accepted = self.accepted + accepted
+
+    def state(self, random: Any) -> ChainState:
+        _, key, position, has_normal, normal = random
+        return ChainState(
+            self.samples, self.log_density, self.accepted, key, int(position), int(has_normal), float(normal)
+        )
+
+
+def _start(emcee: Any, log_density: Callable[[Array], Array], ensemble: Array, seed: int, walkers: int) -> Any:
+    """The walkers' first positions and the state of the random numbers. Raises :class:`En4dvarError`."""
+    n_members, n = ensemble.shape
     random = np.random.Generator(np.random.Philox(key=seed))
     start = ensemble[np.arange(walkers) % n_members]
     start = start + SCATTER * ensemble.std(axis=0) * random.standard_normal(start.shape)
@@ -120,30 +211,13 @@ def sample(
     for i in np.flatnonzero(~np.isfinite(density)):  # one that cannot be run starts beside one that can
         twin = alive[i % len(alive)]
         start[i] = start[twin] + 1e-3 * (start[twin] - ensemble.mean(axis=0))
-    moves = [(emcee.moves.DEMove(), DE_SHARE), (emcee.moves.StretchMove(), 1 - DE_SHARE)]
-    sampler = emcee.EnsembleSampler(walkers, n, log_density, vectorize=True, moves=moves)
-    state: Any = emcee.State(start, random_state=np.random.RandomState(int(random.integers(2**32))).get_state())
-    steps, converged = 0, False
-    while steps < max_steps and not converged:
-        block = min(max_steps - steps, max(BLOCK, steps // 4))
-        state = sampler.run_mcmc(state, block, skip_initial_state_check=True)
-        steps += block
-        samples = sampler.get_chain(discard=int(BURN_IN * steps))
-        r_hat, effective = split_r_hat(samples), effective_sample_size(samples)
-        converged = bool(np.all(r_hat < MAX_R_HAT) and np.all(effective >= target))
-    flat = samples.reshape(-1, n)
-    spread = flat.std(axis=0)
-    return Chain(
-        samples=samples,
-        log_density=sampler.get_log_prob(discard=int(BURN_IN * steps)),
-        r_hat=r_hat,
-        effective=effective,
-        acceptance=float(np.mean(sampler.acceptance_fraction)),
-        steps=steps,
-        converged=converged,
-        moved=(flat.mean(axis=0) - ensemble.mean(axis=0)) / spread,
-        widened=spread / ensemble.std(axis=0, ddof=1),
-    )
+    return emcee.State(start, random_state=np.random.RandomState(int(random.integers(2**32))).get_state())
+
+
+def _state_of(emcee: Any, chain: ChainState) -> Any:
+    """Where the walkers stand at the end of a chain."""
+    random = ("MT19937", chain.random_key, chain.random_position, chain.random_has_normal, chain.random_normal)
+    return emcee.State(chain.samples[-1], log_prob=chain.log_density[-1], random_state=random)
 
 
 def split_r_hat(samples: Array) -> Array:
