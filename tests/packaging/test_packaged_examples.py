@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 from en4dvar.build import build
+from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar.errors import OutputError
 from en4dvar_bubble.examples import EXAMPLES, write_example
@@ -32,3 +34,15 @@ def test_nothing_is_replaced_unasked(tmp_path):
     assert (tmp_path / "quickstart.yaml").read_text() == "mine"
     write_example("quickstart", tmp_path, force=True)
     assert (tmp_path / "quickstart.yaml").read_text() != "mine"
+
+
+def test_from_the_command_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(main, ["init", "--example", "quickstart"])
+    assert done.exit_code == 0, done.output
+    assert "quickstart.yaml" in done.output
+    assert (tmp_path / "data" / "agarose_synthetic.csv").is_file()
+    for again in (["init", "--example", "quickstart"], ["init", "--example", "quickstart", "--data", "x.csv"]):
+        refused = CliRunner().invoke(main, again)
+        assert refused.exit_code == 2
+        assert "Traceback" not in refused.output

@@ -52,11 +52,11 @@ def test_the_wheel_holds_the_packages_and_what_lies_beside_them(built):
     tops = {name.partition("/")[0] for name in names}
     info = {top for top in tops if top.endswith(".dist-info")}
     assert tops - info == {"en4dvar", "en4dvar_bubble", "en4dvar_lorenz"}
-    for name in ("en4dvar/py.typed", "en4dvar_bubble/py.typed"):
-        assert name in names
-    sources = {p.relative_to(ROOT).as_posix() for p in (ROOT / "en4dvar").rglob("*.py")}
-    sources |= {p.relative_to(ROOT / "models").as_posix() for p in (ROOT / "models").rglob("*.py")}
-    assert sources <= set(names)
+    made = (".pyc", ".nbi", ".nbc")
+    for package, root in (("en4dvar", ROOT), ("en4dvar_*", ROOT / "models")):
+        here = {p.relative_to(root).as_posix() for p in root.glob(f"{package}/**/*") if p.is_file()}
+        assert {name for name in here if not name.endswith(made) and "egg-info" not in name} - set(names) == set()
+    assert {"en4dvar/py.typed", "en4dvar_bubble/py.typed"} <= set(names)
     assert metadata["Requires-Python"] == ">=3.11"
     assert metadata["License-Expression"] == "BSD-3-Clause"
     assert {"distributed", "mcmc", "docs", "dev"} <= set(metadata.get_all("Provides-Extra") or ())
