@@ -14,6 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from en4dvar.batch import Batch as Batch
+    from en4dvar.checks import Preview as Preview
+    from en4dvar.checks import preview as preview
+    from en4dvar.checks import validate as validate
     from en4dvar.config import Config as Config
     from en4dvar.config import TwinConfig as TwinConfig
     from en4dvar.config import load_config as load_config
@@ -47,6 +50,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "batch": ("Batch",),
+    "checks": ("Preview", "preview", "validate"),
     "config": ("Config", "TwinConfig", "load_config", "load_twin"),
     "errors": ("ConfigError", "DataError", "En4dvarError", "OutputError", "TooFewMembersError"),
     "forward": ("Failure", "ForwardModel", "Observable", "StateField", "Trajectory"),

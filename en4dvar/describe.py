@@ -13,6 +13,7 @@ from en4dvar.state import Parameter
 from en4dvar.units import convert
 
 if TYPE_CHECKING:
+    from en4dvar.checks import Preview
     from en4dvar.store import ParameterSummary
 
 
@@ -40,6 +41,23 @@ def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
             parts.append(table([("fixed", "value", "unit"), *fixed]))
     parts.append(f"run directory: {config.directory}")
     return "\n\n".join(parts)
+
+
+def cost_summary(config: Config, one: Preview, count: int) -> str:
+    """What an estimate costs: forward runs of a data set and of all ``count``, and the time on one thread."""
+    total = one.runs * count
+    runs = f"about {one.runs} forward runs" + (f" a data set, {total} in all" if count > 1 else "")
+    chain = "; the Markov chain comes on top" if config.assimilation.refine == "mcmc" else ""
+    took = f"{_seconds(one.seconds)} each: {_seconds(total * one.seconds)} on one thread"
+    return f"cost: {runs}, {took}, plus some seconds for files and report{chain}"
+
+
+def _seconds(value: float) -> str:
+    """A duration as people say it, to two digits."""
+    for limit, unit, size in ((1e-3, "us", 1e-6), (1.0, "ms", 1e-3), (120.0, "s", 1.0), (7200.0, "min", 60.0)):
+        if value < limit:
+            return f"{float(f'{value / size:.2g}'):g} {unit}"
+    return f"{value / 3600:.2g} h"
 
 
 def results_table(summaries: Mapping[str, Iterable[ParameterSummary]]) -> str:

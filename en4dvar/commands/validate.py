@@ -2,29 +2,85 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 import click
 
-from en4dvar.commands.common import config_options, load_any
+from en4dvar.commands.common import config_options, overrides
+
+if TYPE_CHECKING:
+    from en4dvar.checks import Preview
+    from en4dvar.config import Config
+    from en4dvar.problem import InverseProblem
 
 
 @click.command()
 @config_options
-def validate(config: str, data: str | None, settings: tuple[str, ...]) -> None:
-    """Check a configuration and its data without running; tell what would be estimated.
+@click.option("--plot", is_flag=True, help="Draw the prior predictive over the data (PNG and PDF).")
+def validate(config: str, data: str | None, settings: tuple[str, ...], plot: bool) -> None:
+    """Check a configuration and its data; tell what would be estimated and what it costs.
+
+    Every fault is told at once, with file, line and column. The cost comes from running prior members for a moment.
 
     \b
     Example:
-      en4dvar validate configs/quickstart.yaml
+      en4dvar validate configs/quickstart.yaml --plot
     """
-    loaded = load_any(config, data, settings)
+    from en4dvar.checks import validate as check
     from en4dvar.config import TwinConfig
 
+    loaded = check(config, overrides(data, settings))
     if isinstance(loaded, TwinConfig):
         from en4dvar.twin_run import twin_summary
 
+        if plot:
+            raise click.UsageError("a twin experiment has no data to plot the prior over")
         click.echo(twin_summary(loaded))
         return
     from en4dvar.build import build
-    from en4dvar.describe import problem_summary
+    from en4dvar.checks import preview
+    from en4dvar.describe import cost_summary, problem_summary
 
-    click.echo(problem_summary(loaded, build(loaded)))
+    problems = build(loaded)
+    click.echo(problem_summary(loaded, problems))
+    chosen = problems[: _panels()] if plot else problems[:1]
+    previews = [preview(problem, loaded.assimilation, loaded.seed, whole=plot) for problem in chosen]
+    click.echo(cost_summary(loaded, previews[0], len(problems)))
+    for one in previews:
+        _warn(one)
+    if plot:
+        click.echo(f"prior predictive: {_draw(loaded, previews, problems)}")
+
+
+def _panels() -> int:
+    from en4dvar.report.predictive import PANELS
+
+    return PANELS
+
+
+def _warn(one: Preview) -> None:
+    """What the prior ensemble shows that a run would stumble over."""
+    name, reasons = one.problem.observations.name, [reason for reason in one.run.failures if reason]
+    if reasons:
+        lost = f"{len(reasons)} of {len(one.run.failures)} prior members cannot be run"
+        click.echo(f"warning: {name}: {lost}, e.g.: {reasons[0]}", err=True)
+    if one.outside > 0.1:
+        share = f"{100 * one.outside:.0f} % of the observations lie outside everything the prior expects"
+        click.echo(f"warning: {name}: {share}; check units, clock and window (--plot shows them)", err=True)
+
+
+def _draw(config: Config, previews: Sequence[Preview], problems: Sequence[InverseProblem]) -> str:
+    from en4dvar.errors import OutputError
+    from en4dvar.report.predictive import prior_predictive
+    from en4dvar.report.style import save_figure
+
+    folder, name = config.directory.parent, f"{config.directory.name}_prior"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be created: {error.strerror}") from None
+    save_figure(prior_predictive(previews), folder, name)
+    left = f" ({len(previews)} of {len(problems)} data sets)" if len(previews) < len(problems) else ""
+    return f"{Path(folder) / name}.png and .pdf{left}"

@@ -1,6 +1,7 @@
 """Start-up: help and the package itself import nothing heavy; the public names are all there."""
 
 import inspect
+import re
 import subprocess
 import sys
 import types
@@ -37,7 +38,7 @@ def test_public_names() -> None:
         value = getattr(en4dvar, name)
         assert not isinstance(value, types.ModuleType)
         assert value.__module__.startswith("en4dvar.")
-    assert en4dvar.__version__.count(".") == 2
+    assert re.match(r"\d+\.\d+\.\d+", en4dvar.__version__)
 
 
 def test_every_command_has_help_with_an_example() -> None:

@@ -1,0 +1,74 @@
+"""The prior predictive over the data: what the priors expect before any assimilation (``en4dvar validate --plot``)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from en4dvar.checks import Preview
+from en4dvar.report.style import COLUMN, LIGHT, styled
+from en4dvar.report.text import with_unit
+from en4dvar.state import Array
+from en4dvar.units import convert
+
+PANELS = 6
+COLUMNS = 2
+
+
+@styled
+def prior_predictive(previews: Sequence[Preview]) -> Figure:
+    """Data ± std over the prior ensemble's paths (bands hold 50 and 90 % of the members), one panel a data set.
+
+    In display units; at most :data:`PANELS` data sets are drawn.
+    """
+    shown = previews[:PANELS]
+    columns = min(COLUMNS, len(shown))
+    rows = -(-len(shown) // columns)
+    figure = Figure(figsize=(COLUMN * columns, 6.5 / 2.54 * rows), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax in grid[len(shown) :]:
+        ax.remove()
+    for ax, one in zip(grid, shown, strict=False):
+        _panel(ax, one, titled=len(shown) > 1)
+    handles, labels = grid[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=4)
+    return figure
+
+
+def _panel(ax: Axes, one: Preview, titled: bool) -> None:
+    problem, y, observable = one.problem, one.problem.observations, one.problem.observable
+    model = problem.model
+
+    def clock(values: Array) -> Array:
+        return convert(values, model.time_unit, model.time_display_unit)
+
+    def shown(values: Array) -> Array:
+        return convert(values, observable.unit, observable.display_unit)
+
+    paths = shown(one.run.path[one.run.active])
+    time = clock(one.grid)
+    if len(paths) > 1:
+        for (low, high), alpha, label in (((0.05, 0.95), 0.3, "prior 90 %"), ((0.25, 0.75), 0.45, "50 %")):
+            edges = np.quantile(paths, (low, high), axis=0)
+            ax.fill_between(time, *edges, color=LIGHT["prior"], alpha=alpha, lw=0, label=label)
+        ax.plot(time, np.median(paths, axis=0), color=LIGHT["prior"], lw=0.9, label="median")
+    data, std = shown(y.values), shown(y.std)
+    size = 2.2 if len(y) <= 150 else 1.2
+    ink = LIGHT["ink"]
+    ax.errorbar(clock(y.times), data, std, fmt="o", ms=size, lw=0.6, color=ink, label="data ± std", zorder=4)
+    label = (
+        observable.label if observable.label == observable.symbol else f"{observable.label} {_math(observable.symbol)}"
+    )
+    ax.set(xlabel=with_unit("time", model.time_display_unit), ylabel=with_unit(label, observable.display_unit))
+    top = max(float(data.max()), float(np.quantile(paths, 0.95)) if len(paths) else 0.0)
+    low = min(float(data.min()), float(np.quantile(paths, 0.05)) if len(paths) else 0.0)
+    ax.set_ylim(low - 0.05 * (top - low), top + 0.08 * (top - low))
+    if titled:
+        ax.set_title(y.name)
+
+
+def _math(symbol: str) -> str:
+    return symbol if "$" in symbol or len(symbol) > 1 else f"${symbol}$"

@@ -1,0 +1,128 @@
+"""``en4dvar validate``: every fault of file and data at once, in place; what a run costs; the prior over the data."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from toy_config import csv_text, write_toy
+
+import en4dvar
+from en4dvar.build import build
+from en4dvar.checks import preview, validate
+from en4dvar.cli import main
+from en4dvar.config import load_config
+from en4dvar.report.predictive import prior_predictive
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def call(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def test_every_fault_is_told_at_once_and_in_place(tmp_path: Path) -> None:
+    path = write_toy(
+        tmp_path, ("seed: 3", "sede: 3"), ("members: 8", "members: one"), ("toy.csv", "toi.csv"), ("log_std", "logstd")
+    )
+    done = call("validate", path)
+    assert done.exit_code == 2
+    found = [line.removeprefix(f"{path}:").split(": ", 2)[:2] for line in done.stderr.splitlines()]
+    assert found == [
+        ["2:1", "sede"],
+        ["4:9", "data.path"],
+        ["14:40", "parameters.k.logstd"],
+        ["17:12", "assimilation.members"],
+    ]
+    assert "toi.csv: no such file; the folder holds toy.csv" in done.stderr
+    assert done.stdout == ""
+
+
+def test_faults_of_several_data_files(tmp_path: Path) -> None:
+    path = write_toy(tmp_path, ("toy.csv", "'*.csv'"))
+    (tmp_path / "odd.csv").write_text("a,b\n1,2\n")
+    (tmp_path / "short.csv").write_text("t_ms,x_um\n0,1\n")
+    done = call("validate", path)
+    assert done.exit_code == 2
+    assert [line.startswith(f"{path}:4:9: data.path: {tmp_path}") for line in done.stderr.splitlines()] == [True, True]
+    assert "odd.csv: no column 'x_um'" in done.stderr
+    assert "short.csv: 1 usable observations" in done.stderr
+    with pytest.raises(en4dvar.ConfigError) as caught:
+        en4dvar.validate(path, {"seed": -1})
+    assert len(caught.value.problems) == 3
+    assert en4dvar.validate(path, {"data.path": "toy.csv"}).name == "toy"
+
+
+def test_a_prior_that_does_not_suit_the_data(tmp_path: Path) -> None:
+    path = write_toy(tmp_path, ("A: {prior: normal, mean: maximum, std: 1 %}", "A: {from_file: A, unit: um}"))
+    done = call("validate", path)
+    assert done.exit_code == 2
+    assert done.stderr.startswith(f"{path}:13:6: parameters.A: ")
+    assert "no scalar 'A'" in done.stderr
+
+
+def test_the_cost_is_that_of_a_run(tmp_path: Path) -> None:
+    """Typical numbers of runs: within a factor of two of what these runs took."""
+    for path in (write_toy(tmp_path), ROOT / "configs" / "quickstart.yaml"):
+        done = call("validate", path)
+        assert done.exit_code == 0, done.output
+        told = re.search(r"^cost: about (\d+) forward runs, ([\d.]+) (us|ms) each: ", done.stdout, re.MULTILINE)
+        assert told
+        options = {"output.directory": str(tmp_path / "run"), "output.report": False}
+        took = en4dvar.run(path, overrides=options, force=True).sample_stats.attrs["forward_runs"]
+        assert 0.5 < int(told[1]) / took < 2
+        assert float(told[2]) > 0
+    two = tmp_path / "two.csv"
+    two.write_text(csv_text(k=1.9))
+    done = call("validate", write_toy(tmp_path), "--data", tmp_path / "t*.csv")
+    assert re.search(r"cost: about (\d+) forward runs a data set, (\d+) in all", done.stdout)
+
+
+def test_the_plot_is_written_where_the_run_will_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = call("validate", write_toy(tmp_path), "--plot")
+    assert done.exit_code == 0, done.output
+    assert done.stdout.rstrip().endswith("prior predictive: runs/toy_prior.png and .pdf")
+    assert Path("runs/toy_prior.png").read_bytes().startswith(b"\x89PNG")
+    assert Path("runs/toy_prior.pdf").read_bytes().startswith(b"%PDF")
+    assert call("run", "toy.yaml", "--no-report").exit_code == 0  # the run directory is still free
+
+
+def test_what_the_figure_shows(tmp_path: Path) -> None:
+    config = load_config(write_toy(tmp_path))
+    (problem,) = build(config)
+    one = preview(problem, config.assimilation, config.seed)
+    assert one.run.path.shape == (8, 200)
+    (ax,) = prior_predictive([one]).axes
+    assert ax.get_ylabel() == "position $x$ (µm)"
+    band = ax.collections[0].get_paths()[0].vertices[:, 1]
+    assert band.max() == pytest.approx(1e6 * np.quantile(one.run.path, 0.95, axis=0).max(), rel=1e-9)
+    assert len(prior_predictive([one] * 9).axes) == 6
+
+
+def test_a_prior_far_from_the_data_and_lost_members_are_told(tmp_path: Path) -> None:
+    done = call("validate", write_toy(tmp_path, ("3 N/m, log_std: 0.3", "300 N/m, log_std: 0.03")))
+    assert done.exit_code == 0
+    assert re.search(r"warning: toy: \d+ % of the observations lie outside everything", done.stderr)
+    done = call("validate", write_toy(tmp_path, ("toy_models:Oscillator", "toy_models:Fragile")))
+    assert "warning: toy: 8 of 8 prior members cannot be run, e.g.: ArithmeticError: no step succeeds" in done.stderr
+    assert "lie outside" in done.stderr
+
+
+def test_a_slow_model_is_not_run_in_full_unasked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = load_config(write_toy(tmp_path))
+    (problem,) = build(config)
+    monkeypatch.setattr("en4dvar.checks.LONGEST", 0.0)
+    monkeypatch.setattr("en4dvar.checks.ENOUGH", 0.0)
+    assert len(preview(problem, config.assimilation, 3).run.failures) == 1
+    assert len(preview(problem, config.assimilation, 3, whole=True).run.failures) == 8
+
+
+def test_a_twin_experiment_has_nothing_to_plot() -> None:
+    twin = ROOT / "configs" / "linear_etkf.yaml"
+    assert call("validate", twin).exit_code == 0
+    assert call("validate", twin, "--plot").exit_code == 2
+    assert isinstance(validate(twin), en4dvar.TwinConfig)
