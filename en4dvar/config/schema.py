@@ -260,6 +260,7 @@ _WORDS = {
     "cost_tolerance": "Converged where J falls by less than this, relative to J (absolute below J = 1).",
     "min_active_fraction": "Fewer surviving members than this share of the ensemble end the run (exit code 3).",
     "refine": "mcmc: replace the posterior ensemble by draws of a Markov chain (extra 'mcmc').",
+    "emulator": "A few hundred more runs to tell how Gaussian the posterior is: auto (compiled models), on, or off.",
     "mda_coefficients": "Inflation of R in each assimilation of es-mda, scaled so that the inverses sum to one.",
     "mda_form": "Analysis of es-mda: perturbed observations, or a square root.",
     "weights": "sum: every observation counts (the Bayesian posterior); mean: β = 1/K, as in the published code.",
