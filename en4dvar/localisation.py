@@ -21,8 +21,8 @@ from en4dvar.state import Array
 def gaspari_cohn(distance: Array, radius: float) -> Array:
     """The compactly supported fifth-order correlation: 1 at distance 0, 5/24 at ``radius``, 0 from 2 ``radius`` on.
 
-    >>> gaspari_cohn(np.array([0.0, 1.0, 2.0]), 1.0).tolist() == [1.0, 1 - 5 / 3 + 5 / 8 + 1 / 2 - 1 / 4, 0.0]
-    True
+    >>> gaspari_cohn(np.array([0.0, 1.0, 2.0]), 1.0).round(4).tolist()
+    [1.0, 0.2083, 0.0]
     """
     z = np.abs(np.asarray(distance, dtype=float)) / radius
     near = 1 + z * z * (-5 / 3 + z * (5 / 8 + z * (1 / 2 - z / 4)))

@@ -12,6 +12,7 @@ from griffe import Extension, Object
 
 _SECTION = re.compile(r"^(Parameters|Raises|Returns|Attributes|Notes|Sources)\n-{3,}$", re.M)
 _ITEM = re.compile(r"^(?=[\w*]+(?:, [\w*]+)*: )", re.M)
+_EXAMPLE = re.compile(r"^>>> .*(?:\n(?!\n).+)*", re.M)  # up to an empty line
 _ROLE = re.compile(r":(?:func|class|meth|mod|data|attr|exc):`[~.]*([^`<]+)`")
 
 
@@ -29,7 +30,7 @@ def markdown(text: str) -> str:
     >>> markdown("Do it.\\n\\nRaises\\n------\\nValueError: never.\\nOSError: see\\n    :func:`a.b`.")
     'Do it.\\n\\n**Raises**\\n\\n- `ValueError`: never.\\n- `OSError`: see\\n    `a.b`.\\n'
     """
-    text = _ROLE.sub(r"`\1`", text)
+    text = _EXAMPLE.sub(r"```pycon\n\g<0>\n```", _ROLE.sub(r"`\1`", text))
     head, *rest = _SECTION.split(text)
     parts = [head.rstrip()]
     for title, body in zip(rest[::2], rest[1::2], strict=True):

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import ast
+import doctest
+import importlib
 import inspect
 import re
 import textwrap
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import click
@@ -111,3 +114,19 @@ def test_every_help_has_an_example_that_parses(name):
         found = main.get_command(CONTEXT, words[1])
         assert found is not None, example
         found.make_context(words[1], words[2:], parent=CONTEXT)
+
+
+ROOT = Path(__file__).resolve().parents[2]
+WITH_EXAMPLES = [
+    path.relative_to(root).with_suffix("").as_posix().replace("/", ".")
+    for root in (ROOT, ROOT / "models")
+    for path in sorted(root.glob("en4dvar*/**/*.py"))
+    if ">>> " in path.read_text(encoding="utf-8")
+]
+
+
+@pytest.mark.parametrize("module", WITH_EXAMPLES)
+def test_examples_in_docstrings_run(module):
+    result = doctest.testmod(importlib.import_module(module))
+    assert result.attempted
+    assert result.failed == 0
