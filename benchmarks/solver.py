@@ -20,6 +20,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scalar_bubble import Array, Integrator, Problem, constants, cvode, lsoda, run
@@ -45,8 +46,8 @@ def members(n: int) -> dict[str, Array]:
 
 def forecast(model: BubbleModel, x: Array, executor: Executor | None = None) -> Array:
     """R (N, K) in m through the framework's executor, as an assimilation sees it."""
-    paths = (executor or SerialExecutor()).trajectories(model, x, TIMES)
-    return np.array([path["R"] for path in paths])
+    paths: Any = (executor or SerialExecutor()).trajectories(model, x, TIMES)
+    return np.asarray(model.observables[0].operator(paths))
 
 
 def median_time(call: Callable[[], object], repeats: int) -> float:

@@ -36,7 +36,6 @@ class Limits:
     def __bool__(self) -> bool:
         return self.seconds is not None or self.memory is not None
 
-
     @property
     def death(self) -> str:
         """What is known where a worker process is gone."""

@@ -53,12 +53,8 @@ def conduction_slope(medium: Medium) -> float:
 def law_tables(model: BubbleModel, values: Mapping[str, Array]) -> Tables:
     """The laws of N members as tables in the kernel's units."""
     law, rho = model.law, model.medium.rho
-    tables = Tables()
     samples = law.samples(values)
-    if samples is None:
-        tables = replace(tables, elastic=law.table(values) / rho)
-    else:
-        tables = replace(tables, samples=samples, factor=1 / rho)
+    tables = Tables(elastic=law.table(values) / rho) if samples is None else Tables(samples=samples, factor=1 / rho)
     if model.system.shear:
         tables = replace(tables, viscous=law.viscous_table(values) / rho * 1e6)
     if model.system.memory:
@@ -76,7 +72,8 @@ def pack(model: BubbleModel, x: Array) -> tuple[Array, Array]:
     initial = np.zeros((len(x), system.size))
     initial[:, -2] = column["Rdot"] / column["R"] * 1e-6
     initial[:, -1] = log_R
-    par = np.tile(model.constants, (len(x), 1))
+    par = np.empty((len(x), len(model.constants)))
+    par[:] = model.constants
     gas = (column["p_b"] - medium.p_v) / medium.rho
     if system.gas:
         m = system.gas

@@ -116,7 +116,9 @@ def test_colours_follow_the_scheme(html):
 def test_strings_of_data_and_configuration_are_escaped(write_run, analysis):
     evil = "<script>alert(1)</script>"
     parameters = (replace(analysis.parameters[0], label=evil), *analysis.parameters[1:])
-    bad = replace(analysis, name=evil, cautions=(Caution(evil, "serious", evil, evil),), stop_reason=evil, parameters=parameters)
+    bad = replace(
+        analysis, name=evil, cautions=(Caution(evil, "serious", evil, evil),), stop_reason=evil, parameters=parameters
+    )
     html = write_report(write_run(bad, config=f"name: '{evil}'\n")).read_text(encoding="utf-8")
     assert evil not in html
     assert html.count("&lt;script&gt;alert(1)") >= 5

@@ -129,7 +129,7 @@ class ConstitutiveLaw:
         with np.errstate(all="ignore"):  # a law may overflow at stretches that no member reaches
             for first in range(0, n, _TOGETHER):
                 some = slice(first, first + _TOGETHER)
-                p, _ = _namespace({name: value[some] for name, value in values.items()})
+                p, _ = _namespace(values if n <= _TOGETHER else {name: v[some] for name, v in values.items()})
                 samples[some] = self.stress(STRETCH, p)
         return samples
 
