@@ -1,9 +1,10 @@
 """Checkpoints: what an interrupted run needs to continue to the same bits.
 
 ``checkpoints/run.yaml`` says what was computed (resolved configuration, sources, data); ``<data set>.iteration`` holds
-the state of the loop (weights, transform, records with the members alive) at the start of the latest iteration, and
-``<data set>.done`` that and how the data set ended. The prior ensemble is drawn again from the seed, whose streams are
-counter-based, so no state of a random generator is lost.
+the state of the loop (weights, transform, records with the members alive) at the start of the latest iteration and,
+under ``refine: mcmc``, the chain so far with the state of its random numbers; ``<data set>.done`` that and how the data
+set ended. ``twin.cycle`` holds the same of a twin experiment. Prior ensembles, perturbations and rotations are drawn
+again from the seed: their streams are counter-based and have no state.
 
 Every file starts with one line: format, version, kind, fingerprint of the run and the data set, and the SHA-256 of the
 rest. A file that was cut short, altered, or written by another run is named and not used.
@@ -12,6 +13,8 @@ rest. A file that was cut short, altered, or written by another run is named and
 from __future__ import annotations
 
 import hashlib
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
@@ -29,8 +32,8 @@ class CheckpointError(OutputError):
     """A checkpoint that cannot be used, and why; the message starts with its path."""
 
 
-def write_checkpoint(path: Path, fingerprint: str, content: object, durable: bool = True) -> None:
-    """Write a dataclass; it appears complete or not at all. ``durable``: also after a loss of power.
+def write_checkpoint(path: Path, fingerprint: str, content: object) -> None:
+    """Write a dataclass; it appears complete or not at all, also after a loss of power.
 
     Raises
     ------
@@ -38,8 +41,35 @@ def write_checkpoint(path: Path, fingerprint: str, content: object, durable: boo
     """
     payload = encode(content)
     head = " ".join((FORMAT, VERSION, type(content).__name__, fingerprint, digest(payload)))
-    with atomic_path(path, durable) as partial:
+    with atomic_path(path) as partial:
         partial.write_bytes(f"{head}\n".encode("ascii") + payload)
+
+
+class Keeper:
+    """Keeps the latest state of a computation in a file, flushed to the disk: neither a kill nor a loss of power takes
+    more than what was done since.
+
+    A state is written at most every ``every`` seconds, and so seldom that writing takes a twentieth of the time; with
+    ``every`` 0 each one is.
+    """
+
+    SHARE = 0.05
+
+    def __init__(self, path: Path, fingerprint: str, every: float):
+        self.path, self.fingerprint, self.every = path, fingerprint, every
+        self._next = time.monotonic() + every
+
+    def keep(self, state: Callable[[], object]) -> None:
+        """Write what ``state`` gives where the time has come. Raises :class:`OutputError`."""
+        if time.monotonic() >= self._next:
+            self.write(state())
+
+    def write(self, state: object) -> None:
+        """Write a state at once. Raises :class:`OutputError`."""
+        began = time.monotonic()
+        write_checkpoint(self.path, self.fingerprint, state)
+        now = time.monotonic()
+        self._next = now + (max(self.every, (now - began) / self.SHARE) if self.every else 0.0)
 
 
 def read_checkpoint(path: Path, fingerprint: str, kind: type[D]) -> D | None:

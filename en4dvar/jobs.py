@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from en4dvar.assimilate import LoopState, assimilate
-from en4dvar.checkpoint import write_checkpoint
+from en4dvar.checkpoint import Keeper
 from en4dvar.executor import Executor
 from en4dvar.honesty import Caution
 from en4dvar.netcdf import to_bytes
@@ -89,16 +88,12 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
 
 def _checkpoints(job: Job) -> Callable[[LoopState], None]:
     path = job.checkpoint if job.checkpoint is not None and job.checkpoint.parent.is_dir() else None
-    written = time.monotonic()
+    keeper = None if path is None else Keeper(path, job.fingerprint, job.checkpoint_every)
 
     def keep(state: LoopState) -> None:
-        nonlocal written
         if job.stop is not None and job.stop.is_set():
             raise StoppedError
-        if path is not None and time.monotonic() - written >= job.checkpoint_every:
-            # Not flushed: the file is complete whenever the process is killed, and where the power goes instead,
-            # its checksum tells.
-            write_checkpoint(path, job.fingerprint, state, durable=False)
-            written = time.monotonic()
+        if keeper is not None:
+            keeper.keep(lambda: state)
 
     return keep
