@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from en4dvar.errors import OutputError
 from en4dvar.problem import IterationRecord
 
 Progress = Callable[[str, IterationRecord], None]
+TYPICAL_ITERATIONS = 8.0
+LONGEST_NAME = 24  # of a data set in the live line
+WIDE = 110  # columns of a terminal that has room for a bar
 
 
 def describe(name: str, record: IterationRecord) -> str:
@@ -58,9 +63,65 @@ class RunLog:
             self._file.close()
 
 
+class LiveProgress:
+    """One line on a terminal: the data set at work with its last iteration, data sets done, time gone and left.
+
+    Where data sets run side by side, each is told when it ends.
+    """
+
+    def __init__(self, bar: Any, total: int):
+        self._bar, self._total = bar, total
+        self._task = bar.add_task("prior forecast", total=total, left="")
+        self._began = time.monotonic()
+        self._before: int | None = None  # data sets that an earlier run had done
+        self._done = 0
+        self._open: dict[str, int] = {}  # data set → its last iteration
+        self._lengths: list[int] = []  # iterations of the data sets that have ended
+
+    def __call__(self, name: str, record: IterationRecord) -> None:
+        self._open[name] = record.iteration
+        self._show(_short(name, record))
+
+    def ended(self, count: int) -> None:
+        """``count`` data sets are done now."""
+        if self._before is None:
+            self._before = count
+        if count > self._done:
+            self._lengths += self._open.values()
+            self._open.clear()
+        self._done = count
+        self._show("files and report" if count == self._total else None)
+
+    def _show(self, description: str | None) -> None:
+        fields = {"completed": self._done, "left": self._left()}
+        self._bar.update(self._task, **fields, **({"description": description} if description else {}))
+
+    def _left(self) -> str:
+        gone = time.monotonic() - self._began
+        before = self._before or 0
+        return time_left(gone, self._done - before, self._total - before, list(self._open.values()), self._lengths)
+
+
+def time_left(gone: float, done: int, total: int, iterations: Sequence[int], lengths: Sequence[int]) -> str:
+    """``"about 12 s left"``, or nothing where that cannot be told yet.
+
+    ``gone`` seconds were spent on ``done`` of ``total`` data sets and on those at work, which have got to
+    ``iterations``. A data set is taken to need as many as the mean of those that ended (``lengths``), else eight.
+    """
+    expected = sum(lengths) / len(lengths) if lengths else TYPICAL_ITERATIONS
+    work = done + sum(min(0.9, i / max(expected, 1.0)) for i in iterations)
+    if gone < 1.0 or work <= 0 or done >= total:
+        return ""
+    seconds = gone * (total - work) / work
+    for limit, size, unit in ((100.0, 1.0, "s"), (6000.0, 60.0, "min"), (math.inf, 3600.0, "h")):
+        if seconds < limit:
+            return f"about {max(1, round(seconds / size))} {unit} left"
+    return ""
+
+
 @contextmanager
-def terminal_progress(n_datasets: int) -> Iterator[Progress | None]:
-    """A live line on the terminal (standard error), or None where there is no terminal."""
+def terminal_progress(n_datasets: int) -> Iterator[LiveProgress | None]:
+    """A live line on the terminal (standard error), or None where there is no terminal. NO_COLOR is respected."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
@@ -69,23 +130,17 @@ def terminal_progress(n_datasets: int) -> Iterator[Progress | None]:
     if not console.is_terminal:
         yield None
         return
+    wide = [BarColumn(20)] if console.width >= WIDE else []
     columns = (
         SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(20),
+        TextColumn("{task.description}", markup=False),
+        *wide,
         MofNCompleteColumn(),
         TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"),
     )
     with Bar(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("prior forecast", total=n_datasets)
-        seen: list[str] = []
-
-        def show(name: str, record: IterationRecord) -> None:
-            if name not in seen:
-                seen.append(name)
-            bar.update(task, completed=len(seen) - 1, description=_short(name, record))
-
-        yield show
+        yield LiveProgress(bar, n_datasets)
 
 
 @contextmanager
@@ -104,4 +159,8 @@ def cycle_progress(cycles: int) -> Iterator[Callable[[int], None] | None]:
 
 
 def _short(name: str, record: IterationRecord) -> str:
-    return f"{name}: iteration {record.iteration}, J {record.cost:.5g}, {record.active} members"
+    known = name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
+    return (
+        f"{known} iteration {record.iteration}: J {record.cost:.4g}, χ²/K {record.chi2_per_observation:.3g}, "
+        f"step {record.step_length:.2g}"
+    )

@@ -20,7 +20,7 @@ from en4dvar.files import readable, write_bytes
 from en4dvar.fingerprint import Identity
 from en4dvar.honesty import Caution
 from en4dvar.jobs import Estimate, Job, estimate
-from en4dvar.progress import Progress, RunLog
+from en4dvar.progress import LiveProgress, Progress, RunLog
 from en4dvar.rundir import RunDirectory
 from en4dvar.store import ParameterSummary
 
@@ -123,6 +123,7 @@ class Worklist:
         OutputError: results cannot be written. ExecutorError: the workers are gone. Where the run has one data set
         only, also what its estimate raises.
         """
+        self._count()
         todo = [d for d in self.sets if d.name not in self.ended]
         side_by_side = len(todo) > 1 and len(todo) >= executor.workers > 1
         for d, value in self._side_by_side(todo, executor) if side_by_side else self._in_turn(todo, executor):
@@ -223,3 +224,8 @@ class Worklist:
         write_checkpoint(self.directory.work / d.done, self.identity.of_dataset(d.name), record)
         self.directory.remove(d.iteration)
         self.ended[d.name] = record
+        self._count()
+
+    def _count(self) -> None:
+        if isinstance(self.progress, LiveProgress):
+            self.progress.ended(len(self.ended))

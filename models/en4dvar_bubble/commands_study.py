@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +65,14 @@ def sweep(
     key = hashlib.sha256(f"{loaded.resolved}{chosen}".encode() + readings).hexdigest()
     chunks = prepare_folder(folder / "chunks", key, "force" if force else "resume" if resume else "new")
     with _bar(trajectories + refinement_size(chosen, len(problems))) as progress:
-        result = run_sweep(problems, chosen, loaded.seed, workers or _cores(), chunks, progress)
+        try:
+            result = run_sweep(problems, chosen, loaded.seed, workers or _cores(), chunks, progress)
+        except KeyboardInterrupt:
+            words = [word for word in sys.argv[1:] if word not in ("--force", "--resume")]
+            again = shlex.join(["en4dvar", *words, "--resume"])
+            raise KeyboardInterrupt(
+                f"interrupted; finished chunks are kept in {chunks}\nto continue: {again}"
+            ) from None
     write_text(folder / "sweep.csv", sweep_csv(result))
     click.echo(sweep_text(result))
     click.echo(f"best fits: {folder / 'sweep.csv'}")

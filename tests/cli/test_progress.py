@@ -1,16 +1,17 @@
 """Progress: a live line on terminals only; a log that says why a run failed."""
 
+import re
 from pathlib import Path
 
 import pytest
 
 from en4dvar.errors import OutputError
 from en4dvar.problem import Analysis
-from en4dvar.progress import RunLog, describe, terminal_progress
+from en4dvar.progress import RunLog, describe, terminal_progress, time_left
 
 
 def test_terminal_only(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, analysis: Analysis) -> None:
-    for name in ("FORCE_COLOR", "TTY_COMPATIBLE"):
+    for name in ("FORCE_COLOR", "TTY_COMPATIBLE", "NO_COLOR"):
         monkeypatch.delenv(name, raising=False)
     with terminal_progress(1) as progress:
         assert progress is None
@@ -19,10 +20,57 @@ def test_terminal_only(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.M
     monkeypatch.setenv("COLUMNS", "120")
     with terminal_progress(2) as progress:
         assert progress is not None
-        progress("gel", analysis.iterations[-1])
+        progress("gel", last := analysis.iterations[-1])
     out, err = capsys.readouterr()
     assert out == ""
-    assert "gel: iteration 5, J " in err
+    assert f"gel iteration 5: J {last.cost:.4g}, χ²/K {last.chi2_per_observation:.3g}, step 0" in err
+    assert "0/2" in err
+    assert "\x1b[3" in err  # colours
+
+
+def test_no_color(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, analysis: Analysis) -> None:
+    for name, value in {"FORCE_COLOR": "1", "NO_COLOR": "1", "COLUMNS": "120"}.items():
+        monkeypatch.setenv(name, value)
+    with terminal_progress(1) as progress:
+        assert progress is not None
+        progress("gel", analysis.iterations[-1])
+        progress.ended(1)
+    err = capsys.readouterr().err
+    assert "files and report" in err
+    assert not re.search(r"\x1b\[[0-9;]*(3|4|9)\d*m", err)
+
+
+def test_data_sets_are_counted_as_they_end(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, analysis: Analysis
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "90")
+    with terminal_progress(3) as progress:
+        assert progress is not None
+        progress.ended(1)  # by an earlier run
+        progress("a very long name of a data set", analysis.iterations[3])
+        progress.ended(2)
+        assert "a very long name of a d… iteration 3" in progress._bar.tasks[0].description
+        assert progress._bar.tasks[0].completed == 2
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("gone", "done", "total", "iterations", "lengths", "told"),
+    [
+        (0.5, 1, 2, [], [5], ""),  # too early to tell
+        (9.0, 0, 3, [], [], ""),  # nothing done yet
+        (10.0, 1, 3, [], [6], "about 20 s left"),
+        (10.0, 0, 1, [4], [], "about 10 s left"),  # half of eight iterations
+        (10.0, 1, 3, [3], [6], "about 10 s left"),
+        (10.0, 0, 1, [30], [], "about 1 s left"),  # longer than expected: nearly done
+        (600.0, 1, 4, [], [6], "about 30 min left"),
+        (6000.0, 1, 9, [], [6], "about 13 h left"),
+        (10.0, 2, 2, [], [6, 6], ""),
+    ],
+)
+def test_time_left(gone: float, done: int, total: int, iterations: list[int], lengths: list[int], told: str) -> None:
+    assert time_left(gone, done, total, iterations, lengths) == told
 
 
 def test_log(tmp_path: Path, analysis: Analysis) -> None:

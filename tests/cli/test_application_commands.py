@@ -1,0 +1,41 @@
+"""The commands that the shipped applications add: help with an example, an interrupt that says how to go on."""
+
+import inspect
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from en4dvar.cli import main
+from en4dvar.plugin_commands import GROUP
+
+CONFIG = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
+
+
+def test_every_command_has_help_with_an_example() -> None:
+    entries = {entry.name: entry for entry in entry_points(group=GROUP)}
+    assert {"init", "laws", "study", "sweep"} <= set(entries)
+    for name, entry in entries.items():
+        text = inspect.cleandoc(entry.load().help or "")
+        assert "Example:\n" in text, name
+        assert f"en4dvar {name} " in text, name
+        shown = CliRunner().invoke(main, [name, "--help"])
+        assert (shown.exit_code, "Example:" in shown.output) == (0, True), name
+
+
+def test_an_interrupted_sweep_says_how_to_continue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("en4dvar_bubble.study.sweep.run_sweep", interrupt)
+    call = ["sweep", str(CONFIG), "--trajectories", "64", "--out", str(tmp_path / "sweep"), "--force"]
+    monkeypatch.setattr("sys.argv", ["en4dvar", *call])
+    done = CliRunner().invoke(main, call)
+    assert done.exit_code == 130
+    assert done.stderr.splitlines() == [
+        f"interrupted; finished chunks are kept in {tmp_path / 'sweep' / 'chunks'}",
+        f"to continue: en4dvar {' '.join(call[:-1])} --resume",
+    ]
+    monkeypatch.undo()
+    assert CliRunner().invoke(main, [*call[:-1], "--resume"]).exit_code == 0
