@@ -8,15 +8,15 @@ computes it again.
 from __future__ import annotations
 
 import json
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import xarray as xr
 
 from en4dvar.diagnostics import nrmse
+from en4dvar.netcdf import Group, Variable
 from en4dvar.problem import Analysis
 from en4dvar.state import Array, Parameter
 
@@ -28,8 +28,8 @@ REFERENCES = (
 MEMBER = ("chain", "draw")
 
 
-def build_tree(analysis: Analysis, attributes: Mapping[str, Any]) -> xr.DataTree:
-    """All groups of ``analysis``; ``attributes`` are added to the root attributes and win over the defaults."""
+def build_groups(analysis: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]:
+    """All groups of ``analysis`` by path; ``attributes`` are added to the root's and win over the defaults."""
     groups = {
         "/prior": _parameters(analysis, analysis.prior),
         "/posterior": _parameters(analysis, analysis.posterior),
@@ -52,8 +52,7 @@ def build_tree(analysis: Analysis, attributes: Mapping[str, Any]) -> xr.DataTree
         "assimilation_settings": json.dumps(asdict(analysis.settings)),
         "warnings": "\n".join(c.line for c in analysis.cautions),
     }
-    groups["/"] = xr.Dataset(attrs=netcdf_attributes({**root, **attributes}))
-    return xr.DataTree.from_dict(groups)
+    return {"/": Group(attrs=netcdf_attributes({**root, **attributes})), **groups}
 
 
 def netcdf_attributes(attributes: Mapping[Any, Any]) -> dict[str, Any]:
@@ -74,11 +73,16 @@ def active_members(failures: Sequence[str]) -> npt.NDArray[np.bool_]:
     return np.array([reason == "" for reason in failures], dtype=bool)
 
 
-def _variable(dims: str | tuple[str, ...], values: Any, units: str, long_name: str, **attrs: Any) -> xr.Variable:
-    return xr.Variable(dims, values, netcdf_attributes({"units": units, "long_name": long_name, **attrs}))
+def _variable(
+    dims: str | tuple[str, ...], values: Any, units: str, long_name: str, *, fill: bool = True, **attrs: Any
+) -> Variable:
+    dims = (dims,) if isinstance(dims, str) else dims
+    attributes = netcdf_attributes({"units": units, "long_name": long_name, **attrs})
+    return Variable(dims, np.asarray(values), attributes, fill)
 
 
-def _describe(p: Parameter) -> dict[str, Any]:
+def about(p: Parameter) -> dict[str, Any]:
+    """What a variable of the parameter says of itself."""
     return {
         "units": p.unit,
         "long_name": p.label,
@@ -88,40 +92,37 @@ def _describe(p: Parameter) -> dict[str, Any]:
     }
 
 
-def _member_coords(n_members: int) -> dict[Hashable, Any]:
+def _member_coords(n_members: int) -> dict[str, Variable]:
     return {
         "chain": _coordinate("chain", np.zeros(1, dtype=np.int64), "1", "chain"),
         "draw": _coordinate("draw", np.arange(n_members), "1", "ensemble member"),
     }
 
 
-def _coordinate(dim: str, values: Any, units: str, long_name: str, **attrs: Any) -> xr.Variable:
-    variable = _variable(dim, values, units, long_name, **attrs)
-    variable.encoding["_FillValue"] = None  # CF: a coordinate has no missing values
-    return variable
+def _coordinate(dim: str, values: Any, units: str, long_name: str, **attrs: Any) -> Variable:
+    return _variable(dim, values, units, long_name, fill=False, **attrs)  # CF: a coordinate has no missing values
 
 
-def _time(a: Analysis, dim: str, values: Array, long_name: str) -> xr.Variable:
+def _time(a: Analysis, dim: str, values: Array, long_name: str) -> Variable:
     return _coordinate(dim, values, a.time_unit, long_name, display_units=a.time_display_unit, axis="T")
 
 
-def _parameters(a: Analysis, members: Array) -> xr.Dataset:
+def _parameters(a: Analysis, members: Array) -> Group:
     """(N, n) physical values → one variable (chain, draw) a parameter."""
     variables = {
-        p.name: xr.Variable(MEMBER, members[None, :, i], netcdf_attributes(_describe(p)))
-        for i, p in enumerate(a.parameters)
+        p.name: Variable(MEMBER, members[None, :, i], netcdf_attributes(about(p))) for i, p in enumerate(a.parameters)
     }
-    return xr.Dataset(variables, _member_coords(len(members)))
+    return Group(variables, _member_coords(len(members)))
 
 
-def _observable(a: Analysis, dims: tuple[str, ...], values: Array, what: str) -> xr.Variable:
+def _observable(a: Analysis, dims: tuple[str, ...], values: Array, what: str) -> Variable:
     o = a.observable
     return _variable(dims, values, o.unit, f"{o.label}, {what}", display_units=o.display_unit, symbol=o.symbol)
 
 
-def _predictive(a: Analysis, predictions: Array, paths: Array) -> xr.Dataset:
+def _predictive(a: Analysis, predictions: Array, paths: Array) -> Group:
     name = a.observable.name
-    return xr.Dataset(
+    return Group(
         {
             name: _observable(a, (*MEMBER, "time"), predictions[None], "noise-free prediction at the observations"),
             f"{name}_path": _observable(a, (*MEMBER, "path_time"), paths[None], "noise-free prediction along the path"),
@@ -134,7 +135,7 @@ def _predictive(a: Analysis, predictions: Array, paths: Array) -> xr.Dataset:
     )
 
 
-def _observed(a: Analysis) -> xr.Dataset:
+def _observed(a: Analysis) -> Group:
     name, obs = a.observable.name, a.observations
     scalars = {f"scalar_{key}": value for key, value in obs.scalars.items()}
     if obs.huber is not None:
@@ -146,7 +147,7 @@ def _observed(a: Analysis) -> xr.Dataset:
     if a.huber_weight is not None:
         text = "weight of the observation in the robust cost at its minimum"
         further[f"{name}_huber_weight"] = _variable("time", a.huber_weight, "1", text)
-    return xr.Dataset(
+    return Group(
         {
             name: _observable(a, ("time",), obs.values, "observed"),
             f"{name}_std": _observable(a, ("time",), a.error_std, "observation-error std, timing error included"),
@@ -160,18 +161,18 @@ def _observed(a: Analysis) -> xr.Dataset:
     )
 
 
-def _constants(a: Analysis) -> xr.Dataset:
-    known = {p.name: _describe(p) for p in a.fixed_parameters}
+def _constants(a: Analysis) -> Group:
+    known = {p.name: about(p) for p in a.fixed_parameters}
     unknown = {"units": "1", "long_name": "fixed value"}
-    return xr.Dataset(
+    return Group(
         {
-            name: xr.Variable((), value, netcdf_attributes(known.get(name, {**unknown, "symbol": name})))
+            name: Variable((), np.asarray(value), netcdf_attributes(known.get(name, {**unknown, "symbol": name})))
             for name, value in a.fixed.items()
         }
     )
 
 
-def _sample_stats(a: Analysis) -> xr.Dataset:
+def _sample_stats(a: Analysis) -> Group:
     """Which members live and why not, the centre (minimum of J), DFS, and the scalars that judge the fit."""
     name, y = a.observable.name, a.observations.values
     active = active_members(a.posterior_failures)
@@ -207,7 +208,7 @@ def _sample_stats(a: Analysis) -> xr.Dataset:
         for i, limit in enumerate(a.limits)
     }
     reason = "reason of failure, empty where the member is alive"
-    return xr.Dataset(
+    return Group(
         {
             "active": _variable(MEMBER, active[None], "1", "member survived the posterior forecast"),
             "failure_reason": _variable(MEMBER, _text(a.posterior_failures)[None], "1", reason),
@@ -235,9 +236,9 @@ def _text(strings: Sequence[str]) -> npt.NDArray[np.object_]:
     return np.array(strings, dtype=object)
 
 
-def _log_likelihood(a: Analysis) -> xr.Dataset:
+def _log_likelihood(a: Analysis) -> Group:
     label = f"{a.observable.label}, log-likelihood of each observation"
-    return xr.Dataset(
+    return Group(
         {a.observable.name: _variable((*MEMBER, "time"), a.log_likelihood[None], "1", label)},
         {
             **_member_coords(len(a.log_likelihood)),
@@ -259,7 +260,7 @@ ITERATION_SCALARS = {
 }
 
 
-def _iterations(a: Analysis) -> xr.Dataset:
+def _iterations(a: Analysis) -> Group:
     """Diagnostics (iteration,), the ensemble each iterate describes (iteration, draw) and its centre (iteration,)."""
     records = a.iterations
     variables = {
@@ -269,10 +270,10 @@ def _iterations(a: Analysis) -> xr.Dataset:
     members = np.stack([r.members for r in records])
     centres = np.stack([r.centre for r in records])
     for i, p in enumerate(a.parameters):
-        about = netcdf_attributes(_describe(p))
-        variables[p.name] = xr.Variable(("iteration", "draw"), members[:, :, i], about)
-        variables[f"{p.name}_centre"] = xr.Variable(
-            "iteration", centres[:, i], {**about, "long_name": f"{p.label}, centre"}
+        attrs = netcdf_attributes(about(p))
+        variables[p.name] = Variable(("iteration", "draw"), members[:, :, i], attrs)
+        variables[f"{p.name}_centre"] = Variable(
+            ("iteration",), centres[:, i], {**attrs, "long_name": f"{p.label}, centre"}
         )
     index = _coordinate("iteration", np.array([r.iteration for r in records]), "1", "iteration")
-    return xr.Dataset(variables, {"iteration": index, "draw": _member_coords(members.shape[1])["draw"]})
+    return Group(variables, {"iteration": index, "draw": _member_coords(members.shape[1])["draw"]})

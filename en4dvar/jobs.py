@@ -11,11 +11,12 @@ from typing import Any
 from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.checkpoint import Keeper
 from en4dvar.executor import Executor
+from en4dvar.groups import build_groups
 from en4dvar.honesty import Caution
 from en4dvar.netcdf import to_bytes
 from en4dvar.problem import AssimilationSettings, InverseProblem, IterationRecord
 from en4dvar.progress import Progress, describe
-from en4dvar.store import ParameterSummary, Result
+from en4dvar.store import ParameterSummary, summarise
 
 
 @dataclass(frozen=True)
@@ -74,12 +75,11 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
         job.problem, job.settings, job.seed, executor, tell, job.resume, on_iteration=_checkpoints(job)
     )
     outcome = "converged" if analysis.converged else "not converged"
-    result = Result.from_analysis(analysis, job.attributes)
     return Estimate(
-        content=to_bytes(result.tree),
+        content=to_bytes(build_groups(analysis, job.attributes)),
         log=tuple(log),
         last=analysis.iterations[-1],
-        summary=result.summary(),
+        summary=summarise(analysis),
         ending=f"{outcome}: {analysis.stop_reason}; {analysis.forward_runs} forward runs",
         warnings=analysis.cautions,
         n_observations=len(analysis.observations),
