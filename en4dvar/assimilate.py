@@ -20,6 +20,7 @@ from en4dvar.mda import assimilate_once
 from en4dvar.problem import Analysis, AssimilationSettings, InverseProblem, IterationRecord
 from en4dvar.schemes import Step, Weights
 from en4dvar.schemes.esmda import ESMDA
+from en4dvar.shape import examine_shape, guide
 from en4dvar.start import choose_start
 from en4dvar.state import NOISE_SCALE, Array
 from en4dvar.units import convert
@@ -143,7 +144,7 @@ class _Run:
         huber, huber_warnings = self.robust(last.predictions[0], *at_centre)
         per_parameter = diag.dfs_per_parameter(space.members, posterior)
         costs = self.costs(posterior, after)
-        shape = {} if refinement else diag.gaussianity(posterior, mode, costs)
+        shape = {} if refinement else examine_shape(space, posterior, mode, costs, self.seed)
         record = end.records[-1]
         used = int(np.sum(observations.weights > 0))
         prior = problem.prior
@@ -279,10 +280,12 @@ class _Run:
             if self.on_iteration is not None:
                 self.on_iteration(replace(self.latest, refinement=Refinement(chain, space.forward_runs)))
 
+        guiding = guide(space, posterior, self.seed)  # made again after an interruption, from the same runs
+        emulated = None if guiding is None else guiding[0].cost
         if earlier is not None:
             space.forward_runs = earlier.forward_runs
         resume = earlier.chain if earlier else None
-        chain = mcmc.sample(log_density, posterior, self.seed, resume=resume, keep=keep)
+        chain = mcmc.sample(log_density, posterior, self.seed, resume=resume, keep=keep, emulated=emulated)
         warnings = () if chain.converged else (caution("chain-not-converged", chain.warning()),)
         return chain.thin(len(posterior), self.settings.sampling == "exact"), chain.summary(), warnings
 

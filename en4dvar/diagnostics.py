@@ -13,7 +13,9 @@ from en4dvar.observations import Observations
 from en4dvar.state import Array
 
 TAIL = 0.0005  # each tail of the central 99.9 % interval
-GAUSSIAN_ENOUGH = 0.35  # effective share of members below which the posterior is called non-Gaussian
+MEAN_OFF, SPREAD_OFF = 0.5, 0.3  # in posterior standard deviations, as a fraction: beyond, a posterior is non-Gaussian
+EMULATED_ENOUGH = 0.2  # effective share of its runs below which an emulator is not believed
+GAUSSIAN_ENOUGH = 0.35  # the same of the members: the criterion where there is no emulator to believe
 HARDLY_INFORMED = 0.1  # DFS of a parameter below which its posterior is said to be its prior
 
 
@@ -72,13 +74,23 @@ def chi2_interval(degrees: float) -> tuple[float, float]:
     return float(2 * gammaincinv(degrees / 2, TAIL)), float(2 * gammaincinv(degrees / 2, 1 - TAIL))
 
 
+def effective_share(log_weights: Array) -> float:
+    """Effective sample size of importance weights relative to their number: 1 where all are equal.
+
+    ``log_weights`` (B,) up to a constant, −inf for none. The √B largest are cut to the smallest of them (Ionides 2008,
+    J. Comput. Graph. Stat. 17, 295), which keeps one draw in a tail from deciding.
+    """
+    cap = np.sort(log_weights)[-max(3, math.isqrt(len(log_weights)))]
+    weights = np.exp(np.minimum(log_weights, cap) - cap)
+    return float(weights.sum() ** 2 / np.sum(weights**2) / len(weights))
+
+
 def gaussianity(members: Array, mode: Array, costs: Array) -> dict[str, float]:
     """How well the posterior ensemble, as a Gaussian, agrees with the posterior at its own members.
 
     ``members`` (N, n) and their Gaussian's centre ``mode`` (n,), transformed; ``costs`` J (N,) of the members. With log
-    weights ½ z² − J, z the distance in the ensemble's covariance, the effective sample size of the weights relative to
-    N is 1 for a Gaussian posterior. The √N largest weights are cut to the smallest of them (Ionides 2008, J. Comput.
-    Graph. Stat. 17, 295), which keeps one member in a tail from deciding. NaN with fewer members alive than n + 2.
+    weights ½ z² − J, z the distance in the ensemble's covariance, the :func:`effective_share` of the weights is 1 for a
+    Gaussian posterior. NaN with fewer members alive than n + 2.
     """
     alive = np.isfinite(costs)
     anomalies = members - mode
@@ -86,14 +98,14 @@ def gaussianity(members: Array, mode: Array, costs: Array) -> dict[str, float]:
         return {"gaussian_fit": math.nan}
     covariance = np.atleast_2d(np.cov(members.T))
     squares = np.sum(anomalies * np.linalg.solve(covariance, anomalies.T).T, axis=1)
-    log_weights = np.where(alive, 0.5 * squares - costs, -np.inf)
-    cap = np.sort(log_weights)[-max(3, math.isqrt(len(members)))]
-    weights = np.exp(np.minimum(log_weights, cap) - cap)
-    return {"gaussian_fit": float(weights.sum() ** 2 / np.sum(weights**2) / len(members))}
+    return {"gaussian_fit": effective_share(np.where(alive, 0.5 * squares - costs, -np.inf))}
 
 
 def is_non_gaussian(shape: Mapping[str, float]) -> bool:
-    """Whether :func:`gaussianity` says that mean and spread of the ensemble need not be those of the posterior."""
+    """Whether mean or spread of the ensemble are not the posterior's, from :func:`~en4dvar.shape.examine_shape`."""
+    if shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH:
+        off = abs(shape["spread_ratio"] - 1)
+        return shape["mean_shift"] > MEAN_OFF or off > SPREAD_OFF
     return shape.get("gaussian_fit", 1.0) < GAUSSIAN_ENOUGH
 
 
@@ -101,6 +113,12 @@ def shape_warnings(shape: Mapping[str, float]) -> tuple[str, ...]:
     """Words for a posterior that no Gaussian ensemble describes."""
     if not is_non_gaussian(shape):
         return ()
+    if shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH:
+        return (
+            "the posterior is far from Gaussian: the ensemble's mean is off by about "
+            f"{shape['mean_shift']:.1f} posterior standard deviations and its spread by a factor of about "
+            f"{shape['spread_ratio']:.2g} in the parameter where they are worst; refine: mcmc samples it",
+        )
     return (
         f"the posterior is far from Gaussian (effective share of members {shape['gaussian_fit']:.2f}): mean and spread "
         "of the ensemble may be off by more than they say; refine: mcmc samples it",

@@ -106,7 +106,7 @@ def test_refinement_reaches_the_posterior_that_no_gaussian_fits():
 
 
 def test_refinement_has_the_same_bits_for_any_workers(monkeypatch):
-    monkeypatch.setattr(mcmc.sample, "__kwdefaults__", {**mcmc.sample.__kwdefaults__, "max_steps": 60})
+    monkeypatch.setattr(mcmc.sample, "__kwdefaults__", {**mcmc.sample.__kwdefaults__, "max_steps": 20})
     problem, settings = make_problem(Decay(compiled=True), [1.5, 1.2]), AssimilationSettings(members=12, refine="mcmc")
     one = assimilate(problem, settings, 1)
     with ThreadsExecutor(2) as executor:

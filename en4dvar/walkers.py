@@ -1,0 +1,45 @@
+"""Moves of an ensemble of walkers about others that stand still, on a density that is cheap to evaluate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from en4dvar.state import Array
+
+STRETCHES = 0.3  # share of the moves, the others are differential evolution
+LEAPS = 0.1  # share of the latter of length 1, which takes walkers from one mode to another
+JITTER = 1e-5  # of the spread
+
+
+def advance(
+    cost: Callable[[Array], Array], x: Array, costs: Array, others: Array, random: Any, moves: int
+) -> tuple[Array, Array]:
+    """Walkers (W, n) of cost (W,) after so many Metropolis moves on exp(−cost), and their costs.
+
+    Every move is reversible with respect to exp(−cost) given ``others`` (W', n), and so are they together.
+    ``random`` is numpy's Generator or RandomState. Sources: ter Braak (2006), Stat.
+    Comput. 16, 239; Goodman & Weare (2010), Commun. Appl. Math. Comput. Sci. 5, 65.
+    """
+    count, n = x.shape
+    x, costs = x.copy(), costs.copy()
+    spread = others.std(axis=0)
+    uniform = random.random((moves, 6, count))
+    jitter = JITTER * spread * random.standard_normal((moves, count, n))
+    first = (uniform[:, 0] * len(others)).astype(int)
+    second = (first + 1 + (uniform[:, 1] * (len(others) - 1)).astype(int)) % len(others)
+    length = np.where(uniform[:, 2] < LEAPS, 1.0, 2.38 / np.sqrt(2 * n))[..., None]
+    stretched = uniform[:, 3] < STRETCHES
+    stretch = 0.5 * (1 + uniform[:, 4]) ** 2  # density ∝ 1/√s on [½, 2]
+    threshold = np.log1p(-uniform[:, 5]) - np.where(stretched, (n - 1) * np.log(stretch), 0.0)
+    for move in range(moves):
+        anchor = others[first[move]]
+        evolved = x + length[move] * (anchor - others[second[move]]) + jitter[move]
+        drawn = anchor + stretch[move][:, None] * (x - anchor)
+        proposed = np.where(stretched[move][:, None], drawn, evolved)
+        new = cost(proposed)
+        accepted = threshold[move] < costs - new
+        x[accepted], costs[accepted] = proposed[accepted], new[accepted]
+    return x, costs
