@@ -1,8 +1,8 @@
 """Does the result say when a posterior is not the Gaussian that its ensemble describes? (case c of the calibration)
 
-    python benchmarks/gaussianity.py --set wide --n 500                 the runs of ``calibration.py b``, before refinement
-    python benchmarks/gaussianity.py --set mixed --n 20                 20 experiments of each of the designs below
-    python benchmarks/gaussianity.py --set mixed --start 100 --n 20     others, for validation
+    python benchmarks/gaussianity.py --set wide --n 500               runs of ``calibration.py b``, before refinement
+    python benchmarks/gaussianity.py --set mixed --n 20               20 experiments of each of the designs below
+    python benchmarks/gaussianity.py --set mixed --start 100 --n 20   others, for validation
 
 A run is off where the mean of a parameter lies more than 0.5 standard deviations of a long Markov chain from the
 chain's, or its standard deviation differs by more than 30 %. The flag (``sample_stats.non_gaussian``) is of the same
