@@ -27,7 +27,8 @@ GROUPS = (
     "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "constant_data", "sample_stats",
     "log_likelihood",
 )  # fmt: skip
-LEFT_OUT = {"path_time", "iteration", "time_column"}
+LEFT_OUT = {"path_time", "iteration"}
+RENAMED = {"time": "observation", "time_column": "observation_column"}  # padded to the longest data set
 _LITTLE = 1 << 16  # bytes left on a disk that is full
 FAILURES = "failed_datasets"  # root attribute: JSON of name → reason
 
@@ -94,7 +95,7 @@ def _define(target: netCDF4.Dataset, first: netCDF4.Dataset, n_datasets: int, n_
         group.createDimension("dataset", n_datasets)
         dims = {d for variable in _kept(source) for d in variable.dimensions}
         for d in sorted(dims):
-            group.createDimension(_renamed(d), n_observations if d == "time" else len(source.dimensions[d]))
+            group.createDimension(_renamed(d), n_observations if d in RENAMED else len(source.dimensions[d]))
         names = group.createVariable("dataset", str, ("dataset",))
         names.setncatts({"units": "1", "long_name": "data set"})
         for variable in _kept(source):
@@ -139,7 +140,7 @@ def _kept(group: netCDF4.Group) -> Sequence[netCDF4.Variable]:
 
 
 def _renamed(dimension: str) -> str:
-    return "observation" if dimension == "time" else dimension
+    return RENAMED.get(dimension, dimension)
 
 
 def _free(group: netCDF4.Group, key: str) -> str:

@@ -82,6 +82,24 @@ def test_one_file_for_all(campaign):
         assert {len(r.observed_data["time"]) for r in single.values()} == {25, 31}
 
 
+def test_correlated_errors_are_kept_beside_one_another(tmp_path):
+    path = make_campaign(tmp_path, 2)
+    (tmp_path / "data" / "set1.csv").write_text(csv_text(25))
+    path.write_text(path.read_text().replace("position_std: 2 um", "position_std: 2 um, correlation_time: 20 ms"))
+    done = run_campaign(configuration(path, tmp_path / "run"))
+    with xr.open_datatree(done.directory / "posterior.nc") as tree:
+        together = tree["observed_data"]["position_correlation"]
+        assert together.dims == ("dataset", "observation", "observation_column")
+        assert together.shape == (2, 31, 31)
+        for result in done:
+            n = len(result.observed_data["time"])
+            ours = together.sel(dataset=result.name).values
+            np.testing.assert_array_equal(ours[:n, :n], result.observed_data["position_correlation"])
+            assert np.isnan(ours[n:]).all()
+            assert np.isnan(ours[:, n:]).all()
+    assert {len(result.observed_data["time"]) for result in done} == {25, 31}
+
+
 @pytest.mark.filterwarnings("ignore")  # whatever ArviZ and its dependencies deprecate
 def test_arviz_reads_every_group(campaign):
     data = arviz.from_netcdf(str(campaign.directory / "posterior.nc"))
