@@ -29,7 +29,7 @@ from en4dvar.walkers import advance
 DEGREES = (3, 2)  # tried in this order
 RUNS_PER_TERM = 4
 FEWEST_RUNS, MOST_RUNS = 96, 512  # of one fit
-RIDGE = 1e-6  # relative: decides where the runs leave a coefficient open
+RIDGE = 1e-9  # relative: decides where the runs leave a coefficient open
 WALKERS = 120
 SCATTERED, SETTLED = 8, 20  # rounds of the walkers before the second fit, after it
 PER_ROUND = 5  # moves of each half in a round
