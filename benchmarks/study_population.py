@@ -1,10 +1,14 @@
 """Repeated twin campaigns: how often the population's 95 % interval holds the true mean (slow; run by hand).
 
-python benchmarks/study_population.py 03 20
+    python benchmarks/study_population.py 03 20 [first]     # gel, campaigns, number of the first
+
+Adds a line a campaign and parameter to models/en4dvar_bubble/study/measured/population.csv, which the study's report
+shows; campaigns found there are left out, so a run that was stopped continues.
 """
 
 from __future__ import annotations
 
+import csv
 import sys
 import time
 from dataclasses import replace
@@ -20,40 +24,63 @@ from en4dvar.config.synthetic import resolve_campaign
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.observations import Observations
 from en4dvar.synthetic import draw_campaign
-from en4dvar_bubble.study.gaussian import factors
+from en4dvar_bubble.study.measured import FOLDER, POPULATION_HEAD
 from en4dvar_bubble.study.population import estimate_population
 from en4dvar_bubble.study.run import POPULATION
+from en4dvar_bubble.study.set_runs import SetRuns
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+GELS = {"03": "0.3 %", "10": "1 %"}
+FIRST_SEED = 100
 
 
-def repeat(key: str, campaigns: int, first_seed: int = 100) -> np.ndarray:
-    """(campaigns, 4) bool: the interval holds the mean of the distribution the truths were drawn from."""
+def campaign(key: str, seed: int) -> list[list[object]]:
+    """Rows of the file for one campaign; ``true`` is the mean of the lognormal that the truths were drawn from."""
     plan = resolve_campaign(read_document(CONFIGS / "agarose_twin.yaml"), CONFIGS)
     (group,) = (g for g in plan.groups if g.name == f"agarose_{key}")
     config = load_config(CONFIGS / f"agarose_{key}_qlkv.yaml")
     base = build(config)[0]
-    by_name = {t.parameter.name: t for t in group.terms}
-    true = np.array([np.exp(by_name[n].mean + by_name[n].std ** 2 / 2) for n in POPULATION])
-    held = []
+    sets = draw_campaign(replace(plan, seed=seed, groups=(group,)))
+    problems = []
+    for s in sets:
+        ones = np.ones(len(s.times))
+        observed = Observations(s.times, s.values, plan.noise * ones, 0 * ones, ones, name=s.name)
+        problems.append(replace(base, observations=observed))
     with ThreadsExecutor(2) as executor:
-        for seed in range(first_seed, first_seed + campaigns):
-            start, analyses = time.perf_counter(), []
-            for s in draw_campaign(replace(plan, seed=seed, groups=(group,))):
-                ones = np.ones(len(s.times))
-                observed = Observations(s.times, s.values, plan.noise * ones, 0 * ones, ones, name=s.name)
-                problem = replace(base, observations=observed)
-                analyses.append(assimilate(problem, config.assimilation, config.seed, executor))
-            found = estimate_population(factors(analyses, base.prior), base.prior, POPULATION, seed)
-            low, high = found.interval()
-            held.append((low < true) & (true < high))
-            told = ", ".join(
-                f"{n} {a / t:.2f}–{b / t:.2f}" for n, a, b, t in zip(POPULATION, low, high, true, strict=True)
-            )
-            print(f"{seed}: interval / truth: {told} ({time.perf_counter() - start:.1f} s)", flush=True)
-    return np.array(held)
+        analyses = [assimilate(p, config.assimilation, config.seed, executor) for p in problems]
+    start = np.stack([base.prior.from_physical(a.posterior) for a in analyses])
+    found = estimate_population(SetRuns(problems, 2), start, base.prior, POPULATION, seed)
+    low, high = found.interval()
+    terms = {t.parameter.name: t for t in group.terms}
+    rows: list[list[object]] = []
+    for j, name in enumerate(POPULATION):
+        term = terms[name]
+        true, drawn = np.exp(term.mean + term.std**2 / 2), np.mean([s.truth[name] for s in sets])
+        stacked = np.mean(np.concatenate([a.posterior[:, base.prior.names.index(name)] for a in analyses]))
+        numbers = [low[j], np.median(found.mean[:, j]), high[j], true, drawn, stacked]
+        judged = [found.r_hat.max(), found.effective.min(), *found.weighed]
+        rows.append([GELS[key], seed, name, *(f"{v:.6g}" for v in numbers), *(f"{v:.4g}" for v in judged)])
+    return rows
+
+
+def main() -> None:
+    key, count = sys.argv[1], int(sys.argv[2])
+    first = FIRST_SEED + (int(sys.argv[3]) if len(sys.argv) > 3 else 0)
+    file = FOLDER / "population.csv"
+    kept = list(csv.reader(file.read_text(encoding="utf-8").splitlines())) if file.exists() else [POPULATION_HEAD]
+    done = {(row[0], row[1]) for row in kept[1:]}
+    for seed in range(first, first + count):
+        if (GELS[key], str(seed)) in done:
+            continue
+        start = time.perf_counter()
+        rows = campaign(key, seed)
+        with file.open("a", encoding="utf-8", newline="") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerows([*([] if file.stat().st_size else [POPULATION_HEAD]), *rows])
+        told = ", ".join(f"{r[2]} {float(r[3]) / float(r[6]):.2f}–{float(r[5]) / float(r[6]):.2f}" for r in rows)
+        judged = f"R-hat {rows[0][9]}, effective {rows[0][10]}, weights {rows[0][11]} and {rows[0][12]}"
+        print(f"{seed}: interval / truth: {told}; {judged} ({time.perf_counter() - start:.1f} s)", flush=True)
 
 
 if __name__ == "__main__":
-    inside = repeat(sys.argv[1], int(sys.argv[2]))
-    print(dict(zip(POPULATION, inside.sum(axis=0).tolist(), strict=True)), "of", len(inside))
+    main()

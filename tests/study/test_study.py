@@ -37,7 +37,8 @@ def small(tmp_path_factory):
     text = (CONFIGS / "agarose_study.yaml").read_text()
     (folder / "study.yaml").write_text(text.replace("data/agarose_twin", str(CONFIGS / "data" / "agarose_twin")))
     call = [str(folder / "study.yaml"), "--set", "sweep.trajectories=128", "--set", "sweep.rounds=1"]
-    call += ["--set", "sweep.step=0.1 us", "--out", str(folder / "out")]
+    call += ["--set", "sweep.step=0.1 us", "--out", str(folder / "out"), "--set", "population.rounds=60"]
+    call += ["--set", "population.blocks=1", "--set", "population.draws=200", "--set", "population.exact=50"]
     result = CliRunner().invoke(study_command, call)
     assert result.exit_code == 0, (result.output, result.exception)
     return folder / "out", result.output, call

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.state import Array
-from en4dvar_bubble.study.gaussian import Factors, log_pooled_evidence
+from en4dvar_bubble.study.one_gel import OneGel
 
 DECISIVE = 3.0  # |Δ log-evidence|: odds of 20 to 1
+MISFIT = 2.0  # χ² per reading above which a model is not one of those to choose from
 
 
 @dataclass(frozen=True)
@@ -18,14 +19,16 @@ class Comparison:
     """Log-evidence of the quadratic over the neo-Hookean law.
 
     ``single`` (S,) of each data set by itself. ``independent``: of all of them, every bubble in a gel of its own.
-    ``population``: mean and spread of the material parameters common (hierarchical step).
-    ``shared``: of all of them in one gel, material parameters common and R0, t_s of each bubble's own.
+    ``population``: parameters of all bubbles about a common mean with a common spread. ``shared``: of all of them in
+    one gel, material parameters common and R0, t_s of each bubble's own. ``chi2`` of one gel per reading,
+    (neo-Hookean, quadratic): far from one where no single gel explains the readings.
     """
 
     single: Array
     independent: float
     population: float
     shared: float
+    chi2: tuple[float, float]
 
     @property
     def undecidable(self) -> int:
@@ -33,13 +36,11 @@ class Comparison:
         return int(np.sum(np.abs(self.single) < DECISIVE))
 
 
-def compare_laws(nh: Factors, quadratic: Factors, log_nh: Array, log_quadratic: Array, population: float) -> Comparison:
-    """From the likelihood factors of the shared coordinates, the log-evidences (S,) of both laws, and the difference of
-    their hierarchical log-evidences.
-    """
-    single = log_quadratic - log_nh
-    shared = log_pooled_evidence(quadratic) - log_pooled_evidence(nh)
-    return Comparison(single, float(single.sum()), population, shared)
+def compare_laws(single: Array, population: float, nh: OneGel, quadratic: OneGel) -> Comparison:
+    """From the differences (S,) of the sets' log-evidences, that of the populations, and both fits of one gel."""
+    shared = quadratic.log_evidence - nh.log_evidence
+    chi2 = (nh.chi2_per_reading, quadratic.chi2_per_reading)
+    return Comparison(single, float(single.sum()), population, shared, chi2)
 
 
 def probability(difference: Array) -> Array:

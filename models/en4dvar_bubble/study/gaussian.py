@@ -10,13 +10,10 @@ with Z_i the evidence. A direction the data say nothing about has Λ = 0; roundi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.prior import Prior
-from en4dvar.problem import Analysis
 from en4dvar.state import Array
 
 
@@ -33,24 +30,6 @@ class Factors:
     constant: Array
     prior_mean: Array
     prior_std: Array
-
-
-def factors(analyses: Sequence[Analysis], prior: Prior, keep: Sequence[str] | None = None) -> Factors:
-    """Likelihood factors of analyses made with ``prior``; ``keep`` integrates all other coordinates over their prior.
-
-    Members that failed are left out.
-    """
-    where = [prior.names.index(name) for name in keep or prior.names]
-    mean = np.empty((len(analyses), len(where)))
-    covariance = np.empty((len(analyses), len(where), len(where)))
-    for i, analysis in enumerate(analyses):
-        alive = np.array([not reason for reason in analysis.posterior_failures])
-        x = prior.from_physical(analysis.posterior[alive])[:, where]
-        mean[i] = x.mean(axis=0)
-        covariance[i] = np.cov(x, rowvar=False).reshape(len(where), len(where))
-    evidence = np.array([a.log_evidence for a in analyses])
-    names = tuple(prior.names[j] for j in where)
-    return divide_out(names, mean, covariance, evidence, prior.mean[where], prior.std[where])
 
 
 def divide_out(
@@ -75,13 +54,3 @@ def divide_out(
     linear_x = linear / prior_std + shift
     constant_x = constant - (linear / prior_std) @ prior_mean - 0.5 * shift @ prior_mean
     return Factors(names, precision_x, linear_x, constant_x, prior_mean, prior_std)
-
-
-def log_pooled_evidence(shared: Factors) -> float:
-    """ln ∫ p(x) Π_i L_i(x) dx: all sets share the coordinates, whose prior is the one divided out."""
-    prior_precision = np.diag(shared.prior_std**-2.0)
-    A = prior_precision + shared.precision.sum(axis=0)
-    b = prior_precision @ shared.prior_mean + shared.linear.sum(axis=0)
-    log_prior = -np.sum(np.log(shared.prior_std)) - 0.5 * np.sum((shared.prior_mean / shared.prior_std) ** 2)
-    log_integral = 0.5 * b @ np.linalg.solve(A, b) - 0.5 * np.linalg.slogdet(A)[1]
-    return float(shared.constant.sum() + log_prior + log_integral)

@@ -13,9 +13,10 @@ from en4dvar.errors import OutputError
 from en4dvar.files import write_text
 from en4dvar.report.style import COLUMN, DARK, LIGHT, css_variables, inline_svg, save_figure
 from en4dvar_bubble.study import tables
-from en4dvar_bubble.study.evidence import DECISIVE, probability, verdict
+from en4dvar_bubble.study.evidence import DECISIVE, MISFIT, probability, verdict
 from en4dvar_bubble.study.figures import all_figures
 from en4dvar_bubble.study.paper import LABELS, NAMES, QUANTITIES, ROUTES, Route
+from en4dvar_bubble.study.population import HyperPrior
 from en4dvar_bubble.study.run import Study, per_set_csv
 
 ROUTE_KEYS: tuple[Route, ...] = ("sweep", "en4dvar")
@@ -181,12 +182,21 @@ def _population(study: Study) -> Block:
             rows.append(
                 [gel, f"{q.plain} ({q.unit})", *cells, tables.plus_minus((stacked.mean(), stacked.std())), known]
             )
+    judged = [
+        f"{gel}: R-hat {f.r_hat.max():.3f}, effective draws {f.size:.0f}"
+        + ("" if f.converged else ", NOT CONVERGED: do not use")
+        for gel, f in study.populations.items()
+    ]
+    hyper = HyperPrior()
     return {
         "title": "Population of bubbles",
         "words": "General QLKV. Stacking the ensembles, as the paper does, counts the prior once a data set and so "
-        "inherits it. The hierarchical step divides the prior out of every set and estimates mean and between-bubble "
-        "spread together; its interval is wide where the data determine only a combination of parameters (at the "
-        "stretch of these bubbles the elastic stress depends on little else than G α / R₀).",
+        "inherits it. Here every set's likelihood enters as it is (forward runs, no Gaussian), and mean and "
+        "between-bubble spread are estimated together. The logarithms' mean is a priori within "
+        f"{hyper.mean_std:g} (one standard deviation) of the initial guess, their spread half-normal of scale "
+        f"{hyper.spread:g}. The interval is wide where the data determine only a combination of parameters (at the "
+        "stretch of these bubbles the elastic stress depends on little else than G α / R₀): there it is mostly this "
+        f"hyperprior. {'; '.join(judged)}.",
         "heads": ["gel", "parameter", "mean [95 %]", "spread", "stacked mean ± std", "truths mean ± std"],
         "rows": rows,
     }
@@ -200,13 +210,13 @@ def _comparison(study: Study) -> Block:
             [gel, name, f"{value:+.1f}", f"{float(probability(value)):.2f}", verdict(value)]
             for name, value in zip(fit.names, found.single, strict=True)
         ]
+        misfit = f"no verdict: no single gel fits (χ² per reading {found.chi2[0]:.1f} and {found.chi2[1]:.1f})"
         pooled = (
-            ("all sets, a gel each", found.independent),
-            ("all sets, one population", found.population),
-            ("all sets, one gel", found.shared),
+            ("all sets, a gel each", found.independent, verdict(found.independent)),
+            ("all sets, one population", found.population, verdict(found.population)),
+            ("all sets, one gel", found.shared, misfit if min(found.chi2) > MISFIT else verdict(found.shared)),
         )
-        for words, value in pooled:
-            told = "no verdict: supposes a uniform gel" if words.endswith("one gel") else verdict(value)
+        for words, value, told in pooled:
             rows.append([gel, words, f"{value:+.1f}", f"{float(probability(np.array(value))):.2f}", told])
     undecided = sum(c.undecidable for c in study.comparisons.values())
     total = sum(len(c.single) for c in study.comparisons.values())
@@ -214,8 +224,8 @@ def _comparison(study: Study) -> Block:
         "title": "Neo-Hookean or quadratic law",
         "words": "Log-evidence of the general quadratic over the neo-Hookean law and its probability at equal prior "
         f"odds. Undecidable (|Δ| < {DECISIVE:g}) by itself: {undecided} of {total} data sets. “One gel”: G, α and μ "
-        "common to all bubbles, R₀ and t_s of each its own; a law that needs different values from bubble to bubble "
-        "pays heavily. “One population”: they vary from bubble to bubble about a common mean with a common spread.",
+        "common to all bubbles, R₀ and t_s of each its own. “One population”: they (and R₀) vary from bubble to "
+        "bubble about a common mean with a common spread; the number to quote.",
         "heads": ["gel", "data set", "Δ log-evidence", "probability", "verdict"],
         "rows": rows,
     }

@@ -19,9 +19,10 @@ from en4dvar.prior import Prior
 from en4dvar.problem import Analysis, InverseProblem
 from en4dvar.state import Array
 from en4dvar_bubble.study.evidence import Comparison, compare_laws
-from en4dvar_bubble.study.gaussian import factors
+from en4dvar_bubble.study.one_gel import OneGel, fit_one_gel
 from en4dvar_bubble.study.paper import QUANTITIES, Model, Route
-from en4dvar_bubble.study.population import Population, estimate_population, population_log_evidence
+from en4dvar_bubble.study.population import Population, estimate_population
+from en4dvar_bubble.study.set_runs import SetRuns
 from en4dvar_bubble.study.settings import StudyPlan
 from en4dvar_bubble.study.sweep import SweepResult, run_sweep
 
@@ -145,30 +146,47 @@ def run_study(plan: StudyPlan, workers: int = 1, tell: Tell | None = None) -> St
     start = time.perf_counter()
     populations, comparisons = {}, {}
     for gel, models in fits.items():
-        general = models.get("qlkv")
-        if general is not None and len(general.problems) >= 3:
-            likelihoods = factors(general.analyses, general.prior)
-            populations[gel] = estimate_population(likelihoods, general.prior, POPULATION, plan.seed)
-        if general is not None and "nh" in models:
-            comparisons[gel] = _compare(models["nh"], general, plan.seed)
+        found: dict[Model, Population | None]
+        found = {m: _population(fit, plan, workers) for m, fit in models.items() if m in ("nh", "qlkv")}
+        if (general := found.get("qlkv")) is not None:
+            populations[gel] = general
+        if len(found) == 2:
+            comparisons[gel] = _compare(models, found, workers)
     seconds["population"] = time.perf_counter() - start
     say(f"population and model comparison in {seconds['population']:.1f} s")
     truth = read_truth(plan.truth) if plan.truth else {}
     return Study(plan, fits, populations, comparisons, truth, seconds)
 
 
-def _compare(nh: Fit, general: Fit, seed: int) -> Comparison:
-    names = {fit.model: [name for name in SHARED if fit.estimated(name)] for fit in (nh, general)}
-    shared = {fit.model: factors(fit.analyses, fit.prior, names[fit.model]) for fit in (nh, general)}
-    single = {fit.model: np.array([a.log_evidence for a in fit.analyses]) for fit in (nh, general)}
-    pooled = {
-        fit.model: population_log_evidence(shared[fit.model], fit.prior, names[fit.model], seed)
-        if len(fit.problems) >= 3
-        else np.nan
-        for fit in (nh, general)
-    }
-    difference = pooled[general.model] - pooled[nh.model]
-    return compare_laws(shared["nh"], shared["qlkv"], single["nh"], single["qlkv"], float(difference))
+def _start(fit: Fit) -> Array:
+    """(S, N, n) posterior members in transformed space; one that failed is replaced by the centre."""
+    members = [np.where(np.isfinite(a.posterior), a.posterior, a.centre) for a in fit.analyses]
+    return np.stack([fit.prior.from_physical(m) for m in members])
+
+
+def _population(fit: Fit, plan: StudyPlan, workers: int) -> Population | None:
+    """None with fewer than 3 data sets."""
+    if len(fit.problems) < 3:
+        return None
+    names = [name for name in POPULATION if fit.estimated(name)]
+    return estimate_population(
+        SetRuns(fit.problems, workers), _start(fit), fit.prior, names, plan.seed, effort=plan.population
+    )
+
+
+def _compare(models: Mapping[Model, Fit], populations: Mapping[Model, Population | None], workers: int) -> Comparison:
+    single = {m: np.array([a.log_evidence for a in models[m].analyses]) for m in populations}
+    pooled = {m: np.nan if found is None else found.log_evidence for m, found in populations.items()}
+    gels = {m: _one_gel(models[m], workers) for m in populations}
+    return compare_laws(single["qlkv"] - single["nh"], pooled["qlkv"] - pooled["nh"], gels["nh"], gels["qlkv"])
+
+
+def _one_gel(fit: Fit, workers: int) -> OneGel:
+    names = [name for name in SHARED if fit.estimated(name)]
+    members = _start(fit)
+    centres = members.mean(axis=1)
+    starts = np.stack([centres, (centres + fit.prior.mean) / 2])
+    return fit_one_gel(SetRuns(fit.problems, workers), starts, fit.prior, names)
 
 
 def read_truth(path: Path) -> dict[str, dict[str, float]]:

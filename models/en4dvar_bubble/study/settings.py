@@ -15,6 +15,7 @@ from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.units import UnitError, parse_quantity
 from en4dvar_bubble.study.paper import Model
+from en4dvar_bubble.study.population import Effort
 from en4dvar_bubble.study.sweep import SweepSettings
 
 MODELS: tuple[Model, ...] = ("nh", "qs", "qlkv")
@@ -44,6 +45,20 @@ class Sweep(Section):
         return SweepSettings(self.trajectories, shift, step, self.width, rounds=self.rounds, local=self.local)
 
 
+class PopulationSection(Section):
+    """How much the population estimate computes; see :mod:`~en4dvar_bubble.study.population`."""
+
+    rounds: Annotated[int, Field(ge=30)] = Effort.rounds
+    components: Annotated[int, Field(ge=1, le=100)] = Effort.components
+    blocks: Annotated[int, Field(ge=1)] = Effort.blocks
+    draws: Annotated[int, Field(ge=100)] = Effort.draws
+    exact: Annotated[int, Field(ge=50)] = Effort.exact
+
+    def built(self) -> Effort:
+        """The rest as by default."""
+        return Effort(**self.model_dump())
+
+
 class StudySchema(Section):
     """The whole file of ``en4dvar study``."""
 
@@ -56,6 +71,7 @@ class StudySchema(Section):
     truth: str | None = None
     """CSV file of the twin's true parameters, read for the report only; relative to this file's folder."""
     sweep: Sweep = Sweep()
+    population: PopulationSection = PopulationSection()
     """Size of the sweep of each model and gel."""
     gels: Annotated[dict[str, dict[str, str]], Field(min_length=1)]
     """Label of the gel → model (nh, qs, qlkv) → configuration file, relative to this file's folder."""
@@ -70,6 +86,7 @@ class StudyPlan:
     synthetic: bool
     truth: Path | None
     sweep: SweepSettings
+    population: Effort
     configs: dict[str, dict[Model, Config]]
     text: str
 
@@ -96,7 +113,7 @@ def load_study(path: str | Path, overrides: dict[str, Any] | None = None) -> Stu
         faults.append(document.fault(("truth",), f"{truth}: no such file"))
     if faults:
         raise ConfigError(faults)
-    return StudyPlan(top.name, top.seed, top.synthetic, truth, sweep, configs, document.text)
+    return StudyPlan(top.name, top.seed, top.synthetic, truth, sweep, top.population.built(), configs, document.text)
 
 
 def _configs(

@@ -1,0 +1,165 @@
+r"""Likelihoods of data sets as mixtures of Gaussians, and what they say about a population.
+
+The draws of an interim posterior L_i(x) N(x; m_0, C_0) are described by a mixture Σ_m a_m N(c_m, Σ_m) (expectation
+maximisation); the interim prior is divided out of every component (:mod:`~en4dvar_bubble.study.gaussian`), so that
+
+    L_i(x) ∝ Σ_m exp(k_m + η_mᵀx − ½ xᵀΛ_m x),
+    ∫ L_i(x) N(x; ν, D) dx = Σ_m exp(k_m + ½ bᵀA⁻¹b − ½ νᵀD⁻¹ν) |I + DΛ_m|^{-1/2},  A = Λ_m + D⁻¹, b = η_m + D⁻¹ν,
+
+and x given ν, D is drawn exactly: a component, then N(A⁻¹b, A⁻¹).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from en4dvar.state import Array
+from en4dvar_bubble.study.gaussian import divide_out
+
+
+@dataclass(frozen=True)
+class Mixtures:
+    """Of S sets, M components, n coordinates: ``precision`` (S, M, n, n), ``linear`` (S, M, n), ``constant`` (S, M)."""
+
+    precision: Array
+    linear: Array
+    constant: Array
+
+    def log_density(self, x: Array) -> Array:
+        """ln of the mixtures (B, S) at coordinates (B, S, n)."""
+        squares = np.einsum("bsi,smij,bsj->bsm", x, self.precision, x, optimize=True)
+        exponent = self.constant + np.einsum("smi,bsi->bsm", self.linear, x) - 0.5 * squares
+        top = exponent.max(axis=2, keepdims=True)
+        return np.asarray(top[..., 0] + np.log(np.exp(exponent - top).sum(axis=2)))
+
+    def log_marginal(self, mean: Array, variance: Array) -> Array:
+        """(B,) sum over the sets of ln ∫ L_i(x) N(x; mean, diag variance) dx, for ``mean`` and ``variance`` (B, n)."""
+        out = np.empty(len(mean))
+        _log_marginals(self.precision, self.linear, self.constant, mean, variance, out)
+        return out
+
+    def draw(self, rng: np.random.Generator, mean: Array, variance: Array, count: int) -> Array:
+        """(B, count, S, n) draws of x_i given populations (B, n)."""
+        n_sets, _, n = self.linear.shape
+        pick = rng.uniform(size=(len(mean), count, n_sets))
+        normal = rng.standard_normal((len(mean), count, n_sets, n))
+        out = np.empty_like(normal)
+        _draws(self.precision, self.linear, self.constant, mean, variance, pick, normal, out)
+        return out
+
+
+def fit_mixtures(
+    draws: Array, prior_mean: Array, prior_std: Array, rng: np.random.Generator, components: int = 12, rounds: int = 60
+) -> Mixtures:
+    """From draws (S, D, n) of posteriors under the independent prior N(prior_mean, prior_std²), up to constants."""
+    n_sets, _, n = draws.shape
+    parts = (np.empty((n_sets, components, n, n)), np.empty((n_sets, components, n)), np.empty((n_sets, components)))
+    for s in range(n_sets):
+        share, centre, covariance = _expectation_maximisation(draws[s], rng, components, rounds)
+        found = divide_out(("",) * n, centre, covariance, np.log(share), prior_mean, prior_std)
+        for target, values in zip(parts, (found.precision, found.linear, found.constant), strict=True):
+            target[s] = values
+    return Mixtures(*parts)
+
+
+def _expectation_maximisation(
+    x: Array, rng: np.random.Generator, components: int, rounds: int
+) -> tuple[Array, Array, Array]:
+    """Shares (M,), means (M, n) and covariances (M, n, n) of a mixture for points (D, n)."""
+    count, n = x.shape
+    middle, root = x.mean(axis=0), np.linalg.cholesky(np.cov(x, rowvar=False))
+    z = np.linalg.solve(root, (x - middle).T).T
+    centre = z[[int(rng.integers(count))]]
+    for _ in range(components - 1):  # k-means++ (Arthur & Vassilvitskii 2007)
+        distance = np.min(np.sum((z[:, None] - centre) ** 2, axis=2), axis=1)
+        centre = np.vstack([centre, z[rng.choice(count, p=distance / distance.sum())]])
+    covariance = np.tile(0.3 * np.eye(n), (components, 1, 1))
+    share = np.full(components, 1 / components)
+    for _ in range(rounds):
+        lower = np.linalg.cholesky(covariance)
+        scaled = np.linalg.solve(lower, (z - centre[:, None]).transpose(0, 2, 1))
+        log = np.log(share) - np.log(np.einsum("mii->mi", lower)).sum(axis=1)
+        log = (log[:, None] - 0.5 * np.sum(scaled**2, axis=1)).T
+        log -= log.max(axis=1, keepdims=True)
+        of_part = np.exp(log)
+        of_part /= of_part.sum(axis=1, keepdims=True)
+        size = of_part.sum(axis=0) + 1e-9 * count
+        share = size / size.sum()
+        centre = (of_part.T @ z) / size[:, None]
+        apart = z - centre[:, None]
+        covariance = np.einsum("dm,mdi,mdj->mij", of_part, apart, apart, optimize=True) / size[:, None, None]
+        covariance += 1e-4 * np.eye(n)
+    return share, middle + centre @ root.T, root @ covariance @ root.T
+
+
+@numba.njit(cache=True, nogil=True)
+def _condition(precision, linear, mean, variance, middle, root):  # type: ignore[no-untyped-def]
+    """A⁻¹b and the lower root of A; returns ½ bᵀA⁻¹b − ½ ln|DA| − ½ νᵀD⁻¹ν."""
+    n = mean.size
+    value = 0.0
+    for i in range(n):
+        for j in range(i + 1):
+            total = precision[i, j]
+            if i == j:
+                total += 1.0 / variance[i]
+            for k in range(j):
+                total -= root[i, k] * root[j, k]
+            if i == j:
+                root[i, i] = np.sqrt(total)
+                value -= np.log(root[i, i]) + 0.5 * np.log(variance[i])
+            else:
+                root[i, j] = total / root[j, j]
+        total = linear[i] + mean[i] / variance[i]
+        for k in range(i):
+            total -= root[i, k] * middle[k]
+        middle[i] = total / root[i, i]
+        value += 0.5 * middle[i] ** 2 - 0.5 * mean[i] ** 2 / variance[i]
+    _back(root, middle)
+    return value
+
+
+@numba.njit(cache=True, nogil=True)
+def _back(root, z):  # type: ignore[no-untyped-def]
+    """z ← root⁻ᵀ z."""
+    n = z.size
+    for i in range(n - 1, -1, -1):
+        total = z[i]
+        for k in range(i + 1, n):
+            total -= root[k, i] * z[k]
+        z[i] = total / root[i, i]
+
+
+@numba.njit(cache=True, nogil=True)
+def _log_marginals(precision, linear, constant, mean, variance, out):  # type: ignore[no-untyped-def]
+    n_sets, n_parts, n = linear.shape
+    middle, root, logs = np.empty(n), np.zeros((n, n)), np.empty(n_parts)
+    for b in range(mean.shape[0]):
+        out[b] = 0.0
+        for s in range(n_sets):
+            for m in range(n_parts):
+                logs[m] = constant[s, m] + _condition(precision[s, m], linear[s, m], mean[b], variance[b], middle, root)
+            top = logs.max()
+            out[b] += top + np.log(np.sum(np.exp(logs - top)))
+
+
+@numba.njit(cache=True, nogil=True)
+def _draws(precision, linear, constant, mean, variance, pick, normal, out):  # type: ignore[no-untyped-def]
+    n_sets, n_parts, n = linear.shape
+    middle, root = np.empty((n_parts, n)), np.zeros((n_parts, n, n))
+    logs, z = np.empty(n_parts), np.empty(n)
+    for b in range(mean.shape[0]):
+        for s in range(n_sets):
+            for m in range(n_parts):
+                logs[m] = constant[s, m] + _condition(
+                    precision[s, m], linear[s, m], mean[b], variance[b], middle[m], root[m]
+                )
+            share = np.cumsum(np.exp(logs - logs.max()))
+            share /= share[-1]
+            for c in range(pick.shape[1]):
+                m = min(np.searchsorted(share, pick[b, c, s]), n_parts - 1)
+                z[:] = normal[b, c, s]
+                _back(root[m], z)
+                out[b, c, s] = middle[m] + z
