@@ -1,13 +1,14 @@
-"""Models of the same data side by side: evidence, posterior model probabilities, fit, information.
+"""Runs side by side: posteriors of any, and for models of the same data evidence and posterior model probabilities.
 
 Probabilities start from equal ones and follow the Laplace evidence of each run, p(M|y) ∝ p(y|M). Over several data
 sets, each with parameters of its own, log-evidences add. A difference below one is called undecidable: "not worth
-more than a bare mention" (Kass & Raftery 1995, J. Am. Stat. Assoc. 90, 773).
+more than a bare mention" (Kass & Raftery 1995, J. Am. Stat. Assoc. 90, 773). Evidences of different data (two gels)
+do not compare: there the posteriors are shown, and no probabilities.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from en4dvar.errors import OutputError
 from en4dvar.state import Array
-from en4dvar.store import Result, load_result
+from en4dvar.store import ParameterSummary, Result, load_result
 
 UNDECIDABLE = 1.0  # difference of log-evidence
 ALL = "all data sets"
@@ -23,11 +24,12 @@ ALL = "all data sets"
 
 @dataclass(frozen=True)
 class ModelScore:
-    """One model on one data set (or, summed, on all): what the table of ``en4dvar compare`` shows.
+    """One run on one data set (or, summed, on all): what the table of ``en4dvar compare`` shows.
 
     ``effective_parameters`` is p_WAIC, the sum over the observations of the posterior variance of their
     log-likelihood (Gelman, Hwang & Vehtari 2014, Stat. Comput. 24, 997); ``dfs`` is its linear counterpart.
-    ``difference`` is the log-evidence minus that of the best model.
+    ``difference`` is the log-evidence minus that of the best model; NaN, as ``probability``, where the runs used
+    different data.
     """
 
     run: str
@@ -42,10 +44,33 @@ class ModelScore:
 
 
 @dataclass(frozen=True)
+class Estimate:
+    """A parameter's posterior in one run for one data set; ``members`` (N',) alive, in the unit of ``summary``."""
+
+    run: str
+    dataset: str
+    summary: ParameterSummary
+    members: Array
+
+
+@dataclass(frozen=True)
 class Comparison:
-    """Scores of every data set in turn, runs in the order given; with several data sets the sums come last."""
+    """Scores and estimates of every data set in turn, runs in the order given; with several data sets the sums of the
+    scores come last. ``incomparable`` says why evidences do not compare; empty where they do.
+    """
 
     scores: tuple[ModelScore, ...]
+    estimates: tuple[Estimate, ...] = ()
+    incomparable: str = ""
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(score.run for score in self.scores))
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters of all runs, in order of appearance."""
+        return tuple(dict.fromkeys(estimate.summary.name for estimate in self.estimates))
 
     def of(self, dataset: str) -> tuple[ModelScore, ...]:
         return tuple(score for score in self.scores if score.dataset == dataset)
@@ -55,41 +80,61 @@ class Comparison:
         return tuple(dict.fromkeys(score.dataset for score in self.scores))
 
     def verdict(self, dataset: str) -> str:
-        """The preferred model in words, or that the data do not decide."""
+        """The preferred model in words, or that the data do not decide, or that evidences do not compare."""
+        if self.incomparable:
+            return f"not compared: {self.incomparable}"
         best, second = sorted(self.of(dataset), key=lambda score: -score.log_evidence)[:2]
         if -second.difference < UNDECIDABLE:
             return f"undecidable: {best.run} and {second.run} differ by {-second.difference:.2f} in log-evidence"
         return f"{best.run} is preferred: log-evidence {-second.difference:.2f} above {second.run}"
 
 
-def compare(runs: Sequence[str | Path]) -> Comparison:
-    """Compare run directories that used the same data.
+def compare_runs(runs: Sequence[str | Path]) -> Comparison:
+    """Compare run directories: laws on the same data, or gels.
 
     Raises
     ------
-    OutputError: fewer than two runs, a directory without results, or runs whose observations differ.
+    OutputError: fewer than two runs, a run given twice, or a directory without results.
     """
     if len(runs) < 2:
         raise OutputError("compare needs at least two run directories")
     names = _labels([Path(run) for run in runs])
     results = {name: _results(Path(run)) for name, run in zip(names, runs, strict=True)}
+    reason = _difference(results)
+    estimates = tuple(
+        Estimate(name, dataset, row, result.members("posterior", row.name))
+        for dataset in dict.fromkeys(d for held in results.values() for d in held)
+        for name in names
+        if (result := results[name].get(dataset)) is not None
+        for row in result.summary()
+    )
+    if reason:
+        scores = [_score(name, dataset, result) for name in names for dataset, result in results[name].items()]
+        return Comparison(tuple(scores), estimates, reason)
+    scores = []
     first = results[names[0]]
-    for name in names[1:]:
-        if set(results[name]) != set(first):
-            odd = sorted(set(results[name]) ^ set(first))
-            raise OutputError(f"{name} and {names[0]} hold different data sets: {', '.join(odd)}")
-        for dataset, result in results[name].items():
-            if not _same_data(result, first[dataset]):
-                raise OutputError(
-                    f"{name} and {names[0]} used different observations of {dataset}; evidences of different data, "
-                    "errors or weights do not compare"
-                )
-    scores: list[ModelScore] = []
     for dataset in first:
         scores += _ranked([_score(name, dataset, results[name][dataset]) for name in names])
     if len(first) > 1:
         scores += _ranked([_total(name, [s for s in scores if s.run == name]) for name in names])
-    return Comparison(tuple(scores))
+    return Comparison(tuple(scores), estimates)
+
+
+def _difference(results: Mapping[str, Mapping[str, Result]]) -> str:
+    """Why the evidences of the runs do not compare; empty where all of them used the same data."""
+    first, *others = results
+    for name in others:
+        if set(results[name]) != set(results[first]):
+            odd = sorted(set(results[name]) ^ set(results[first]))
+            more = f" and {len(odd) - 3} more" if len(odd) > 3 else ""
+            return f"{name} and {first} hold different data sets: {', '.join(odd[:3])}{more}"
+        for dataset, result in results[name].items():
+            if not _same_data(result, results[first][dataset]):
+                return (
+                    f"{name} and {first} used different observations of {dataset}; evidences of different data, errors "
+                    "or weights do not compare"
+                )
+    return ""
 
 
 def model_probabilities(log_evidence: Array) -> Array:
@@ -108,8 +153,8 @@ def comparison_table(comparison: Comparison) -> str:
             s.dataset,
             s.run,
             f"{s.log_evidence:.2f}",
-            f"{s.difference:.2f}",
-            f"{s.probability:.3f}",
+            f"{s.difference:.2f}" if np.isfinite(s.difference) else "–",
+            f"{s.probability:.3f}" if np.isfinite(s.probability) else "–",
             f"{s.chi2_per_observation:.3g}",
             f"{s.dfs:.2f}",
             f"{s.effective_parameters:.2f}",
@@ -117,9 +162,28 @@ def comparison_table(comparison: Comparison) -> str:
         )
         for s in comparison.scores
     ]
-    return "\n".join(
-        [table([header, *rows]), "", *(f"{name}: {comparison.verdict(name)}" for name in comparison.datasets)]
-    )
+    verdicts = [f"{name}: {comparison.verdict(name)}" for name in comparison.datasets]
+    if comparison.incomparable:
+        verdicts = [comparison.verdict("")]
+    return "\n".join([table([header, *rows]), "", *verdicts])
+
+
+def estimates_table(comparison: Comparison) -> str:
+    """Posterior mean, std and 5–95 % of every parameter, runs below each other, in display units."""
+    from en4dvar.describe import table
+
+    header = ("parameter", "unit", "data set", "run", "mean", "std", "5 %", "95 %")
+    rows = [
+        (e.summary.name, e.summary.unit, e.dataset, e.run, *(f"{v:.4g}" for v in _shown(e.summary)))
+        for name in comparison.parameters
+        for e in comparison.estimates
+        if e.summary.name == name
+    ]
+    return table([header, *rows])
+
+
+def _shown(row: ParameterSummary) -> tuple[float, ...]:
+    return row.mean, row.std, row.q05, row.q95
 
 
 def _labels(runs: Sequence[Path]) -> list[str]:
@@ -160,8 +224,8 @@ def _score(run: str, dataset: str, result: Result) -> ModelScore:
         run,
         dataset,
         float(stats["log_evidence"]),
-        0.0,
-        0.0,
+        float("nan"),
+        float("nan"),
         float(stats["chi2_per_observation"]),
         float(stats["dfs"]),
         float(np.sum(np.var(likelihood[alive], axis=0, ddof=1))),

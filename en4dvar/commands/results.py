@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import os
+import re
 from pathlib import Path
 
 import click
 
+MOST_ROWS = 60  # of estimates on the terminal
+LONGEST = 120  # name of the folder of a comparison
+
 
 @click.command()
 @click.argument("run_dir", type=click.Path(path_type=Path))
-def report(run_dir: Path) -> None:
+@click.option("--dataset", "datasets", multiple=True, metavar="NAME", help="A page and figures for this data set, too.")
+def report(run_dir: Path, datasets: tuple[str, ...]) -> None:
     """Write the report and figures of a finished run again, from its netCDF files.
+
+    In a campaign of many data sets only those with the gravest warnings have a page of their own; --dataset (any
+    number of times) adds one, with its figures as PDF and PNG.
 
     \b
     Example:
@@ -18,18 +27,32 @@ def report(run_dir: Path) -> None:
     """
     from en4dvar.runner import report as write_report
 
-    click.echo(f"report: {write_report(run_dir)}")
+    click.echo(f"report: {write_report(run_dir, datasets)}")
 
 
 @click.command()
 @click.argument("run_dirs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN_DIR RUN_DIR...")
-def compare(run_dirs: tuple[Path, ...]) -> None:
-    """Compare models on the same data: evidence, model probabilities, fit, information.
+@click.option("--out", type=click.Path(path_type=Path), help="Folder of figure and page; default compare_... beside.")
+@click.option("--no-report", is_flag=True, help="Print the tables only.")
+def compare(run_dirs: tuple[Path, ...], out: Path | None, no_report: bool) -> None:
+    """Compare runs: posteriors over each other; on the same data also evidence and model probabilities.
+
+    The runs may be laws on the same data or different gels. Writes compare.html, a figure (PNG, PDF) and CSV tables.
 
     \b
     Example:
       en4dvar compare runs/neo_hookean runs/quadratic
     """
-    from en4dvar.compare import compare, comparison_table
+    from en4dvar.compare import compare_runs, comparison_table, estimates_table
 
-    click.echo(comparison_table(compare(run_dirs)))
+    comparison = compare_runs(run_dirs)
+    if len(comparison.estimates) <= MOST_ROWS:
+        click.echo(f"{estimates_table(comparison)}\n")
+    click.echo(comparison_table(comparison))
+    if not no_report:
+        from en4dvar.report.overlay import write_comparison
+
+        names = "_".join(re.sub(r"[^\w.+-]", "_", name) for name in comparison.runs)
+        folder = out or run_dirs[0].absolute().parent / f"compare_{names}"[:LONGEST]
+        page = write_comparison(comparison, folder)
+        click.echo(f"report: {page if out else os.path.relpath(page)}")

@@ -1,5 +1,6 @@
 """Models side by side: probabilities from evidences, sums over data sets, and what may not be compared."""
 
+import csv
 import json
 from dataclasses import replace
 
@@ -10,10 +11,11 @@ from toys import Linear, make_problem
 
 from en4dvar.assimilate import assimilate
 from en4dvar.cli import main
-from en4dvar.compare import ALL, compare, comparison_table, model_probabilities
+from en4dvar.compare import ALL, compare_runs, comparison_table, model_probabilities
 from en4dvar.errors import OutputError
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.report.overlay import overlay
 from en4dvar.store import Result, save
 
 
@@ -43,7 +45,7 @@ def exact_evidence(problem_seed, names, std=0.1, wide=1.0):
 
 def test_probabilities_follow_the_exact_evidence_of_linear_models(tmp_path):
     runs = [run_dir(tmp_path / "one", ("a",), (1, 2)), run_dir(tmp_path / "two", ("a", "b"), (1, 2))]
-    comparison = compare(runs)
+    comparison = compare_runs(runs)
     assert comparison.datasets == ("set1", "set2", ALL)
     exact = {s: [exact_evidence(s, names) for names in (("a",), ("a", "b"))] for s in (1, 2)}
     exact_sum = np.sum([exact[1], exact[2]], axis=0)
@@ -66,24 +68,71 @@ def test_equal_models_are_undecidable_on_the_command_line(tmp_path):
     done = CliRunner().invoke(main, ["compare", *runs])
     assert done.exit_code == 0, done.output
     assert "undecidable: first and second differ by 0." in done.output
-    assert done.output.splitlines()[0].split()[:3] == ["data", "set", "run"]
-    assert comparison_table(compare(runs)) in done.output
+    assert done.output.splitlines()[0].split()[:3] == ["parameter", "unit", "data"]
+    assert comparison_table(compare_runs(runs)) in done.output
 
 
 def test_probabilities_do_not_overflow():
     assert model_probabilities(np.array([-1e5, -1e5 + np.log(3), -2e5])) == pytest.approx([0.25, 0.75, 0])
 
 
-def test_what_does_not_compare_is_refused(tmp_path):
+def test_evidences_of_different_data_are_not_compared(tmp_path):
     one = run_dir(tmp_path / "one", ("a",))
     for other, message in (
-        (run_dir(tmp_path / "noise", ("a",), std=0.2), "used different observations of set1"),
-        (run_dir(tmp_path / "sets", ("a",), (1, 2)), "hold different data sets: set2"),
-        (one, "given twice"),
+        (run_dir(tmp_path / "noise", ("a",), std=0.2), "noise and one used different observations of set1"),
+        (run_dir(tmp_path / "sets", ("a",), (1, 2)), "sets and one hold different data sets: set2"),
+    ):
+        comparison = compare_runs([one, other])
+        assert message in comparison.incomparable
+        assert comparison.verdict("set1") == f"not compared: {comparison.incomparable}"
+        assert all(np.isnan(score.probability) and np.isnan(score.difference) for score in comparison.scores)
+        assert {e.run for e in comparison.estimates} == {"one", other.name}
+        done = CliRunner().invoke(main, ["compare", str(one), str(other)])
+        assert done.exit_code == 0, done.output
+        assert f"not compared: {message}" in done.output
+
+
+def test_what_cannot_be_compared_is_refused(tmp_path):
+    one = run_dir(tmp_path / "one", ("a",))
+    for runs, message in (
+        ([one, one], "given twice"),
+        ([one], "at least two"),
+        ([one, tmp_path / "nowhere"], "no such file"),
     ):
         with pytest.raises(OutputError, match=message):
-            compare([one, other])
-    with pytest.raises(OutputError, match="at least two"):
-        compare([one])
-    with pytest.raises(OutputError, match="no such file"):
-        compare([one, tmp_path / "nowhere"])
+            compare_runs(runs)
+
+
+def test_page_figure_and_tables(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    runs = [run_dir(tmp_path / name, names, (1, 2)) for name, names in (("one", ("a",)), ("two", ("a", "b")))]
+    done = CliRunner().invoke(main, ["compare", *map(str, runs)])
+    assert done.exit_code == 0, done.output
+    assert done.output.splitlines()[-1] == "report: compare_one_two/compare.html"
+    out = tmp_path / "compare_one_two"
+    assert {p.name for p in out.iterdir()} == {
+        "compare.html", "posteriors.png", "posteriors.pdf", "estimates.csv", "evidence.csv",
+    }  # fmt: skip
+    comparison = compare_runs(runs)
+    page = (out / "compare.html").read_text(encoding="utf-8")
+    assert comparison.verdict(ALL) in page
+    assert page.count("<tr>") == 2 + len(comparison.estimates) + len(comparison.scores)
+    assert "http" not in page.replace("http-equiv", "")
+    with (out / "estimates.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [(r["run"], r["dataset"], r["name"]) for r in rows] == [
+        ("one", "set1", "a"), ("two", "set1", "a"), ("one", "set2", "a"), ("two", "set2", "a"),
+        ("two", "set1", "b"), ("two", "set2", "b"),
+    ]  # fmt: skip
+    for row, estimate in zip(rows, (e for n in "ab" for e in comparison.estimates if e.summary.name == n), strict=True):
+        assert float(row["mean"]) == pytest.approx(estimate.members.mean(), rel=1e-12)
+    with (out / "evidence.csv").open(encoding="utf-8") as file:
+        assert [float(r["log_evidence"]) for r in csv.DictReader(file)] == [s.log_evidence for s in comparison.scores]
+    figure = overlay(comparison)
+    assert [ax.get_xlabel() for ax in figure.axes] == ["a (m)", "b (m)"]
+    assert [t.get_text() for t in figure.legends[0].get_texts()] == ["one", "two"]
+    bars = figure.axes[0].lines[0].get_xdata()
+    pooled = np.concatenate([e.members for e in comparison.estimates if (e.run, e.summary.name) == ("one", "a")])
+    assert list(bars) == pytest.approx(list(np.quantile(pooled, (0.05, 0.95))))
+    again = CliRunner().invoke(main, ["compare", *map(str, runs), "--out", str(out), "--no-report"])
+    assert "report" not in again.output
