@@ -32,6 +32,7 @@ from en4dvar_bubble.study.emulator import Emulators, draw_interim, fit_emulators
 from en4dvar_bubble.study.mixture import Mixtures, fit_mixtures
 from en4dvar_bubble.study.set_runs import Runs, log_likelihood
 
+SPREADS = (1e-3, 10.0)  # of τ; smaller ones are indistinguishable, and lost to rounding in the marginals
 MAX_R_HAT = 1.1  # Gelman et al. (2013), Bayesian Data Analysis, § 11.5
 
 
@@ -231,7 +232,10 @@ class _Target:
         p = len(self.where)
         hyper = -0.5 * np.sum(((h[:, :p] - self.start) / self.hyper.mean_std) ** 2, axis=1)
         hyper += np.sum(h[:, p:] - 0.5 * np.exp(2 * h[:, p:]) / self.hyper.spread**2, axis=1)
-        return np.asarray(self.mixtures.log_marginal(*self.population(h)) + hyper + self.constant)
+        inside = np.all((h[:, p:] > math.log(SPREADS[0])) & (h[:, p:] < math.log(SPREADS[1])), axis=1)
+        total = np.full(len(h), -np.inf)
+        total[inside] = self.mixtures.log_marginal(*self.population(h[inside])) + hyper[inside] + self.constant
+        return np.where(np.isnan(total), -np.inf, total)
 
 
 def _sample(target: _Target, stream: np.random.Generator, effort: Effort) -> Array:
