@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -128,10 +128,13 @@ def execute(
         return Campaign(directory.path, work.outcomes(), tuple(work.notices))
 
 
-def report(path: str | Path) -> Path:
-    """Write (again) the report of a run from its netCDF. Raises :class:`OutputError`."""
+def report(path: str | Path, datasets: Sequence[str] = ()) -> Path:
+    """Write (again) the report of a run from its netCDF; ``datasets`` of a campaign get a page in any case.
+
+    Raises :class:`OutputError`.
+    """
     with RunDirectory.open(path, "report") as directory:
-        return _report(directory)
+        return _report(directory, datasets)
 
 
 def _require_one_usable(config: Config, files: Mapping[str, Path]) -> None:
@@ -222,13 +225,14 @@ def _finish(work: Worklist) -> None:
         )
 
 
-def _report(directory: RunDirectory) -> Path:
+def _report(directory: RunDirectory, datasets: Sequence[str] = ()) -> Path:
     directory.claim("report.html", "summary.csv")
-    before = directory.listing("figures")
+    before = {folder: directory.listing(folder) for folder in ("figures", "pages")}
     try:
-        return write_report(directory.work)
+        return write_report(directory.work, datasets)
     finally:
-        directory.claim_folder("figures", before)
+        for folder, files in before.items():
+            directory.claim_folder(folder, files)
 
 
 def _loaded(config: Config | str | Path, overrides: Mapping[str, Any] | None) -> Config:

@@ -1,65 +1,57 @@
-"""A run directory's netCDF → figures (PDF and PNG), ``summary.csv`` and one self-contained ``report.html``.
+"""A run directory's netCDF → figures (PDF and PNG), ``summary.csv`` and self-contained HTML pages.
 
-Nothing is recomputed: whatever is shown was stored by the run.
+Nothing is recomputed: whatever is shown was stored by the run. One data set is one page, ``report.html``. A campaign's
+``report.html`` is its table, with a page for each data set beside it in ``pages/``; of more than :data:`PAGES` sets
+the worst warned of get theirs at once and the others when they are asked for by name.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
+from urllib.parse import quote
 
 from en4dvar.campaign_file import failed_datasets
 from en4dvar.errors import OutputError
 from en4dvar.files import write_text
+from en4dvar.hints import suggest
 from en4dvar.honesty import Caution
 from en4dvar.report.figures import all_figures
-from en4dvar.report.page import Section, make_section, render
+from en4dvar.report.overview import Entry, overview_figures, render_overview
+from en4dvar.report.page import make_section, render_set
 from en4dvar.report.style import save_figure
-from en4dvar.store import ParameterSummary, load_result
+from en4dvar.store import ParameterSummary, Result, load_result
 
 Summarised = tuple[str, Iterable[ParameterSummary], Iterable[Caution]]
-DETAILED = 24  # data sets with figures; a campaign's others are in summary.csv and datasets/
+PAGES = 40  # data sets of a campaign with a page from the start
+COPIES = 12  # data sets of a campaign up to which figures are also kept as PDF and PNG
 
 
-def write_report(run_dir: str | Path) -> Path:
+def write_report(run_dir: str | Path, datasets: Sequence[str] = ()) -> Path:
     """Write the report of a run and return the path of ``report.html``.
 
-    Reads ``datasets/*.nc`` where the run has several data sets, else ``posterior.nc``. Of more than :data:`DETAILED`
-    data sets those with warnings are shown first. Raises :class:`~en4dvar.errors.OutputError` where there is nothing
-    to read or the directory cannot be written.
+    Reads ``datasets/*.nc`` where the run has several data sets, else ``posterior.nc``. ``datasets`` are names of data
+    sets of a campaign: their pages, with figures as PDF and PNG, are written and the overview links to them.
+
+    Raises
+    ------
+    OutputError: there is nothing to read, a name is unknown, or the directory cannot be written.
     """
     run_dir = Path(run_dir)
-    paths = sorted((run_dir / "datasets").glob("*.nc")) or [run_dir / "posterior.nc"]
     if not run_dir.is_dir():
         raise OutputError(f"{run_dir}: no such run directory")
-    failures = failed_datasets(run_dir / "posterior.nc") if len(paths) > 1 or paths[0].parent != run_dir else {}
-    warned: dict[Path, bool] = {}
-
-    def summaries() -> Iterator[Summarised]:
-        for path in paths:
-            result = load_result(path)
-            warned[path] = bool(result.warnings)
-            yield result.name, result.summary(), result.cautions
-
-    write_text(run_dir / "summary.csv", summary_csv(summaries(), failures))
-    folder = run_dir / "figures"
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be created: {error.strerror}") from None
-    sections: list[Section] = []
-    for path in sorted(sorted(paths, key=lambda p: not warned[p])[:DETAILED]):
-        result = load_result(path)
-        prefix = f"{_slug(path.stem)}_" if len(paths) > 1 else ""
-        figures = list(all_figures(result))
-        for name, _, figure in figures:
-            save_figure(figure, folder, f"{prefix}{name}")
-        sections.append(make_section(result, f"d{len(sections)}", figures))
-    return write_text(run_dir / "report.html", render(sections, failures, len(paths) - len(sections)))
+    paths = sorted((run_dir / "datasets").glob("*.nc"))
+    if not paths:
+        result = load_result(run_dir / "posterior.nc")
+        write_text(run_dir / "summary.csv", summary_csv([(result.name, result.summary(), result.cautions)], {}))
+        return _write_set(run_dir / "report.html", result, copies="")
+    entries = [Entry.of(load_result(path), path.stem) for path in paths]
+    failures = failed_datasets(run_dir / "posterior.nc")
+    write_text(run_dir / "summary.csv", summary_csv(((e.name, e.summary, e.cautions) for e in entries), failures))
+    return _write_campaign(run_dir, entries, failures, _asked(run_dir, entries, datasets))
 
 
 def summary_csv(summaries: Iterable[Summarised], failures: Mapping[str, str]) -> str:
@@ -81,5 +73,49 @@ def summary_csv(summaries: Iterable[Summarised], failures: Mapping[str, str]) ->
     return text.getvalue()
 
 
-def _slug(name: str) -> str:
-    return re.sub(r"[^\w.-]+", "_", name)
+def _asked(run_dir: Path, entries: Sequence[Entry], names: Sequence[str]) -> frozenset[str]:
+    """Stems of the data sets asked for."""
+    stems = {entry.name: entry.stem for entry in entries}
+    for name in names:
+        if name not in stems:
+            raise OutputError(f"{run_dir}: no data set {name!r}{suggest(name, stems)}")
+    return frozenset(stems[name] for name in names)
+
+
+def _write_campaign(
+    run_dir: Path, entries: Sequence[Entry], failures: Mapping[str, str], asked: frozenset[str]
+) -> Path:
+    folder = _folder(run_dir / "pages")
+    first = {e.stem for e in sorted(entries, key=lambda e: -e.gravity)[:PAGES]}
+    paged = [e for e in entries if e.stem in asked | first or (folder / f"{e.stem}.html").is_file()]
+    for before, entry, after in zip([None, *paged[:-1]], paged, [*paged[1:], None], strict=True):
+        neighbours = (("← ", before), ("→ ", after))
+        trail = [("All data sets", "../report.html")]
+        trail += [(f"{arrow}{e.name}", quote(f"{e.stem}.html")) for arrow, e in neighbours if e is not None]
+        result = load_result(run_dir / "datasets" / f"{entry.stem}.nc")
+        copies = f"{entry.stem}_" if len(entries) <= COPIES or entry.stem in asked else None
+        _write_set(folder / f"{entry.stem}.html", result, copies, trail)
+    figures = overview_figures(entries)
+    _folder(run_dir / "figures")
+    for name, _, figure in figures:
+        save_figure(figure, run_dir / "figures", name)
+    pages = {e.stem: quote(f"pages/{e.stem}.html") for e in paged}
+    return write_text(run_dir / "report.html", render_overview(entries, pages, failures, figures))
+
+
+def _write_set(path: Path, result: Result, copies: str | None, trail: Sequence[tuple[str, str]] = ()) -> Path:
+    """The page of one data set; ``copies``: prefix of its figures as PDF and PNG in ``figures/``, None for none."""
+    figures = list(all_figures(result))
+    if copies is not None:
+        folder = _folder((path.parent if path.name == "report.html" else path.parent.parent) / "figures")
+        for name, _, figure in figures:
+            save_figure(figure, folder, f"{copies}{name}")
+    return write_text(path, render_set(make_section(result, "d0", figures), trail, copies is not None))
+
+
+def _folder(folder: Path) -> Path:
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be created: {error.strerror}") from None
+    return folder

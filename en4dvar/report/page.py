@@ -1,20 +1,20 @@
-"""What the report page says: results turned into rows, sentences and figures for the template."""
+"""What the page of one data set says: a result turned into rows, sentences and figures for the template."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from en4dvar.diagnostics import chi2_interval
 from en4dvar.groups import ITERATION_SCALARS
-from en4dvar.report.style import DARK, LIGHT, css_variables, inline_svg
+from en4dvar.report.html import render
+from en4dvar.report.style import inline_svg
 from en4dvar.report.text import (
     DFS_WORDS,
     number_like,
@@ -162,23 +162,9 @@ def make_section(result: Result, anchor: str, figures: Sequence[tuple[str, str, 
     return Section(anchor, result, [draw(*figure) for figure in figures])
 
 
-def render(sections: Sequence[Section], failures: Mapping[str, str], left_out: int) -> str:
-    """The page as one HTML text. Everything that comes from data or configuration is escaped.
+def render_set(section: Section, trail: Sequence[tuple[str, str]] = (), copies: bool = True) -> str:
+    """The page of one data set as HTML text.
 
-    ``failures``: name of a data set without a posterior → reason; ``left_out``: data sets that have no section.
+    ``trail``: links (words, address) above it; ``copies``: whether its figures are also kept as PDF and PNG.
     """
-    environment = Environment(
-        loader=PackageLoader("en4dvar.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("template.html.j2").render(
-        title=sections[0].name if len(sections) == 1 else f"{len(sections) + left_out} data sets",
-        sections=sections,
-        failures=failures,
-        left_out=left_out,
-        light=Markup(css_variables(LIGHT)),
-        dark=Markup(css_variables(DARK)),
-    )
+    return render("set.html.j2", title=section.name, s=section, trail=trail, copies=copies)

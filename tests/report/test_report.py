@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import base64
 import csv
+import hashlib
 import re
 from dataclasses import replace
+from html import unescape
 from html.parser import HTMLParser
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from en4dvar import report
 from en4dvar.errors import OutputError
 from en4dvar.honesty import Caution
 from en4dvar.provenance import provenance
 from en4dvar.report import write_report
+from en4dvar.report.overview import Entry, overview_figures, render_overview
 from en4dvar.report.page import judge_chi2
 from en4dvar.store import Result, save
 
@@ -52,11 +58,12 @@ def html(reported):
 
 
 class Page(HTMLParser):
-    """Collects what can go wrong in a page: unbalanced tags, repeated or dangling identifiers, addresses."""
+    """Collects what can go wrong in a page: unbalanced tags, repeated or dangling identifiers; and its addresses."""
 
     def __init__(self, html):
         super().__init__()
         self.open, self.ids, self.targets, self.faults, self.tags, self.text = [], [], [], [], [], []
+        self.links = []
         self.feed(html)
 
     def handle_starttag(self, tag, attrs):
@@ -67,7 +74,7 @@ class Page(HTMLParser):
             if key in ("href", "src") and value.startswith("#"):
                 self.targets.append(value[1:])
             elif key in ("href", "src") and not value.startswith("data:"):
-                self.faults.append(f"address {value}")
+                self.links.append(value)
             self.targets += re.findall(r"url\(#([^)]+)\)", value or "")
         if tag not in VOID:
             self.open.append(tag)
@@ -88,6 +95,7 @@ class Page(HTMLParser):
 def test_page_is_well_formed_and_self_contained(html):
     page = Page(html)
     assert page.faults == []
+    assert page.links == []
     assert page.open == []
     assert len(page.ids) == len(set(page.ids))
     assert set(page.targets) <= set(page.ids)
@@ -154,15 +162,64 @@ def test_summary_table(reported, analysis):
     assert float(rows["R0"]["dfs"]) == pytest.approx(analysis.dfs_per_parameter[2], rel=1e-12)
 
 
-def test_campaign_has_a_section_a_data_set(write_run, make_analysis):
-    for name in ("one", "two"):
-        run_dir = write_run(replace(make_analysis(), name=name), file=f"datasets/{name}.nc")
-    page = Page(write_report(run_dir).read_text(encoding="utf-8"))
+@pytest.fixture
+def campaign_dir(write_run, make_analysis):
+    """Three data sets, one with a name that must be escaped and quoted."""
+    for name, file in (("one", "one"), ("two", "two"), ("<script>alert('é')</script>", "é 100%")):
+        run_dir = write_run(replace(make_analysis(), name=name), file=f"datasets/{file}.nc")
+    return run_dir
+
+
+def test_campaign_is_a_table_with_a_page_for_each_data_set(campaign_dir):
+    html = write_report(campaign_dir).read_text(encoding="utf-8")
+    page = Page(html)
     assert page.faults == []
     assert len(page.ids) == len(set(page.ids))
-    assert page.tags.count("section") == 2
-    assert (run_dir / "figures" / "two_history.png").is_file()
-    assert (run_dir / "summary.csv").read_text(encoding="utf-8").count("\n") == 9
+    assert page.tags.count("script") == 1  # the one that sorts
+    assert "<script>alert" not in html
+    addresses = {"pages/one.html": "one", "pages/two.html": "two", "pages/%C3%A9%20100%25.html": "alert('é')"}
+    assert set(page.links) == set(addresses)
+    for address, name in addresses.items():
+        own = Page((campaign_dir / unquote(address)).read_text(encoding="utf-8"))
+        assert own.faults == []
+        assert name in "".join(own.text)
+        assert "../report.html" in own.links
+        assert all((campaign_dir / "pages" / unquote(link)).is_file() for link in own.links)
+    assert (campaign_dir / "figures" / "two_history.png").is_file()
+    assert (campaign_dir / "figures" / "estimates.pdf").is_file()
+    assert (campaign_dir / "summary.csv").read_text(encoding="utf-8").count("\n") == 13
+
+
+def test_the_script_that_runs_is_the_one_the_policy_names(campaign_dir):
+    html = write_report(campaign_dir).read_text(encoding="utf-8")
+    (script,) = re.findall(r"<script>(.*?)</script>", html, flags=re.S)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', html)
+    assert unescape(policy).startswith("default-src 'none';")
+    assert f"script-src 'sha256-{digest}'" in unescape(policy)
+
+
+def test_large_campaign_gets_pages_on_demand(campaign_dir, monkeypatch):
+    monkeypatch.setattr(report, "PAGES", 1)
+    monkeypatch.setattr(report, "COPIES", 0)
+    html = write_report(campaign_dir).read_text(encoding="utf-8")
+    assert [p.stem for p in (campaign_dir / "pages").iterdir()] == ["one"]
+    assert "2 data sets have no page of their own" in html
+    assert [p.name for p in (campaign_dir / "figures").iterdir()] == ["estimates.pdf", "estimates.png"]
+    html = write_report(campaign_dir, ["two"]).read_text(encoding="utf-8")
+    assert "1 data sets have no page of their own" in html
+    assert set(Page(html).links) == {"pages/one.html", "pages/two.html"}
+    assert (campaign_dir / "figures" / "two_pairs.pdf").is_file()
+    with pytest.raises(OutputError, match="no data set 'tow'; did you mean 'two'"):
+        write_report(campaign_dir, ["tow"])
+
+
+def test_overview_of_many_data_sets_stays_small(analysis):
+    one = Entry.of(Result.from_analysis(analysis, provenance("name: test\n")), "set")
+    entries = [replace(one, name=f"set {i:04d}", stem=f"set_{i:04d}") for i in range(2000)]
+    html = render_overview(entries, {}, {}, overview_figures(entries))
+    assert len(html.encode()) < 3e6
+    assert html.count("<tr>") == 2001
 
 
 @pytest.mark.parametrize("survivors", [0, 1])

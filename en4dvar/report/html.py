@@ -1,0 +1,49 @@
+"""HTML pages from templates: one style, one script, no address outside the file; everything given is escaped."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from en4dvar.report.style import DARK, LIGHT, css_variables
+
+
+def render(template: str, *, sortable: bool = False, **content: Any) -> str:
+    """The page of a template as text. ``sortable``: with the script that sorts tables.
+
+    A content security policy forbids the page every address and every script but that one: what escaping might miss
+    would still not run.
+    """
+    script = _text("table.js") if sortable else ""
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
+    return _environment().get_template(template).render(policy=policy, style=_style(), script=Markup(script), **content)
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
+        loader=PackageLoader("en4dvar.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+@cache
+def _style() -> Markup:
+    light, dark = css_variables(LIGHT), css_variables(DARK)
+    palette = f":root {{ {light} }}\n@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"
+    return Markup(palette + _text("style.css"))
+
+
+@cache
+def _text(name: str) -> str:
+    return files("en4dvar.report").joinpath(name).read_text(encoding="utf-8")
