@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from threading import Lock
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -18,7 +19,7 @@ from en4dvar_bubble.medium import WATER_25C, Medium, saturated_vapour_pressure
 from en4dvar_bubble.packing import constants, hottest_wall, law_tables, mass_fraction, pack
 from en4dvar_bubble.paths import Paths
 from en4dvar_bubble.settings import BubbleSettings
-from en4dvar_bubble.solver.driver import Accuracy, Radial, Solution, System, preset, ready
+from en4dvar_bubble.solver.driver import Accuracy, Queue, Radial, Solution, System, preset, ready
 
 Gas = Literal["heat", "polytropic", "isothermal", "adiabatic"]
 Start = Literal["acoustic", "laser"]
@@ -240,25 +241,22 @@ class BubbleModel(ForwardModel):
         and its result.
         """
         initial, par = pack(self, x)
-        tables = law_tables(self, self.law_values(x))
+        queue = Queue.longest_first(par)
+        tables, complete = law_tables(self, self.law_values(x), queue)
         start = np.full(len(x), t0 * 1e6)
         micro = times * 1e6
         mirror = self.start == "laser" and t0 == 0.0 and bool(np.any(times < 0))
         order = np.argsort(np.abs(micro), axis=1, kind="stable") if mirror else None
         if order is not None:
             micro = np.take_along_axis(np.abs(micro), order, axis=1)
-        work, solved = ready(
-            self.system,
-            initial,
-            par,
-            tables,
-            start,
-            micro,
-            self.driving,
-            self.reading,
-            self.accuracy,
-            hottest_wall(self),
-        )
+        options = (self.driving, self.reading, self.accuracy, hottest_wall(self))
+        kernel, solved = ready(self.system, initial, par, tables, start, micro, queue, *options)
+        once = Lock()
+
+        def work() -> None:
+            if once.acquire(blocking=False):
+                complete()
+            kernel()
 
         def finish() -> Paths:
             solution = solved

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,8 @@ from en4dvar.state import Array
 from en4dvar_bubble.medium import Medium, saturated_vapour_pressure
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.collocation import ball
-from en4dvar_bubble.solver.driver import Tables
+from en4dvar_bubble.solver.driver import Queue, Tables
+from en4dvar_bubble.solver.lanes import WIDTH
 
 if TYPE_CHECKING:
     from en4dvar_bubble.model import BubbleModel
@@ -50,17 +51,38 @@ def conduction_slope(medium: Medium) -> float:
     return medium.A * medium.T_inf / medium.K_inf
 
 
-def law_tables(model: BubbleModel, values: Mapping[str, Array]) -> Tables:
-    """The laws of N members as tables in the kernel's units."""
+def law_tables(model: BubbleModel, values: Mapping[str, Array], queue: Queue) -> tuple[Tables, Callable[[], None]]:
+    """The laws of N members as tables in the kernel's units, and a call that completes them.
+
+    The laws of the first members in the queue are sampled at once; they can be integrated while the call samples the
+    others, which it then makes available.
+    """
     law, rho = model.law, model.medium.rho
-    samples = law.samples(values)
-    tables = Tables(elastic=law.table(values) / rho) if samples is None else Tables(samples=samples, factor=1 / rho)
+    n_members = len(queue.order)
+    first, others = queue.order[:WIDTH], queue.order[WIDTH:]
+    some = law.samples({name: value[first] for name, value in values.items()})
+    if some is None:
+        tables = Tables(elastic=law.table(values) / rho)
+    else:
+        samples = np.empty((n_members, some.shape[1]))
+        samples[first] = some
+        queue.available[0] = len(first)
+        tables = Tables(samples=samples, factor=1 / rho)
+
+    def complete() -> None:
+        try:
+            if queue.available[0] < n_members:
+                rest = law.samples({name: value[others] for name, value in values.items()})
+                tables.samples[others] = np.nan if rest is None else rest
+        finally:  # threads may be waiting
+            queue.available[0] = n_members
+
     if model.system.shear:
         tables = replace(tables, viscous=law.viscous_table(values) / rho * 1e6)
     if model.system.memory:
         memory = law.memory_tables(values)
         tables = replace(tables, memory=np.stack([memory.stiffness, memory.equilibrium], axis=2) / rho)
-    return tables
+    return tables, complete
 
 
 def pack(model: BubbleModel, x: Array) -> tuple[Array, Array]:

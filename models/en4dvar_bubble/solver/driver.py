@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.state import Array
 from en4dvar_bubble import tables as tables_module
@@ -158,6 +159,21 @@ class Tables:
 
 
 @dataclass(frozen=True)
+class Queue:
+    """The order (N,) in which members are taken, how many of them are ``available`` (1,) yet, how many are taken."""
+
+    order: npt.NDArray[np.intp]
+    available: npt.NDArray[np.int64]
+    counter: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, dtype=np.int64))
+
+    @classmethod
+    def longest_first(cls, parameters: Array) -> Queue:
+        """Least damped, hence longest ringing, first, so that the lanes run dry together; all are available."""
+        order = np.argsort(parameters[:, rows.VISCOSITY], kind="stable")
+        return cls(order, np.full(1, len(order), dtype=np.int64))
+
+
+@dataclass(frozen=True)
 class Solution:
     """Raw solver output. ``states`` (N, K, n) in the rows of :class:`System`, NaN where a member did not get.
 
@@ -235,6 +251,7 @@ def ready(
     tables: Tables,
     start: Array,
     times: Array,
+    queue: Queue,
     driving: Driving,
     reading: Reading,
     accuracy: Accuracy,
@@ -243,8 +260,8 @@ def ready(
     """Everything set for the compiled integration of N members; a call that does it without the interpreter,
     and the solution that it fills.
 
-    Threads that make the call at once share the members, those that ring longest first, so that the lanes run dry
-    together; each returns when no member is left to begin, and all are done when all have returned.
+    Threads that make the call at once share the members; each returns when no member is left to begin, and all are done
+    when all have returned.
 
     ``hottest_wall``: τ of the wall above which there is no equilibrium with its vapour.
     initial (N, n) and parameters (N, rows) in the kernel's units; start (N,) and times (N, K) in µs, times increasing.
@@ -263,9 +280,8 @@ def ready(
         for j in range(system.memory):
             offset = (member * system.memory + j) * (2 * GRID.cells * 8)
             parameters[:, rows.MEMORY + rows.PER_MEMORY * j + 2] = offset
-    order = np.argsort(parameters[:, rows.VISCOSITY], kind="stable")
     arguments = (
-        (np.zeros(1, dtype=np.int64), order),
+        (queue.counter, queue.available, queue.order),
         np.ascontiguousarray(initial),
         parameters,
         np.ascontiguousarray(start),

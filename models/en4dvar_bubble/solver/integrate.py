@@ -13,7 +13,7 @@ from numba.core import types
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.equations import jacobian, rhs
 from en4dvar_bubble.solver.general import general_jacobian, general_rhs
-from en4dvar_bubble.solver.lanes import WIDTH, absolute, exp, load, log, maximum, splat, sqrt, store, take
+from en4dvar_bubble.solver.lanes import WIDTH, absolute, exp, load, log, maximum, peek, splat, sqrt, store, take
 from en4dvar_bubble.solver.rows import AMPLITUDE, INVERSE_C, TABLE
 from en4dvar_bubble.tables import fill
 
@@ -169,8 +169,9 @@ def integrate(
 ):  # fmt: skip
     """Integrate N members and write their states at the output times.
 
-    ``queue`` = (counter (1,), order (N,)): members are taken in this order; threads that call with the same arrays at
-    once share the members, and which of them integrates one makes no difference to it.
+    ``queue`` = (counter (1,), available (1,), order (N,)): members are taken in this order; one that is not available
+    yet is waited for; threads that call with the same arrays at once share the members, and which of them integrates one
+    makes no difference to it.
     initial (N, n), parameters (N, rows), start (N,) µs, times (N, K) increasing µs; ``dims``, ``world`` (without the
     elastic tables) and ``extra`` as for :func:`general.general_rhs`; ``law`` = (samples (N, nodes) of J_e, tabulated
     when a member's turn comes, or (0, nodes); their factor; finished tables (N, cells, 8)); ``nodes`` and ``size`` as
@@ -183,7 +184,7 @@ def integrate(
     n_times = times.shape[1]
     m = dims[0]
     samples, factor, finished = law
-    counter, order = queue
+    counter, available, order = queue
     ops, espan, drive, dspan, reading = world
     cells = int(espan[3])
     elastic = np.zeros((WIDTH, cells, 8))  # of the members in the lanes: small enough for the cache
@@ -214,6 +215,8 @@ def integrate(
                 waiting = turn < n_members
                 if not waiting:
                     break
+                while peek(available) <= turn:
+                    pass
                 i = order[turn]
                 record[i, :] = 0.0
                 record[i, MIN_LOG_R] = initial[i, n - 1]

@@ -185,6 +185,17 @@ def take(typingctx, counter):
     return types.int64(counter), codegen
 
 
+@intrinsic
+def peek(typingctx, counter):
+    """The number in ``counter[0]``, read anew at every call: another thread may be raising it."""
+
+    def codegen(context, builder, sig, args):
+        array = context.make_array(sig.args[0])(context, builder, args[0])
+        return builder.load_atomic(array.data, "acquire", 8)
+
+    return types.int64(counter), codegen
+
+
 def _unary(name: str) -> Any:
     @intrinsic
     def function(typingctx, x):
