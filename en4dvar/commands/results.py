@@ -56,3 +56,37 @@ def compare(run_dirs: tuple[Path, ...], out: Path | None, no_report: bool) -> No
         folder = out or run_dirs[0].absolute().parent / f"compare_{names}"[:LONGEST]
         page = write_comparison(comparison, folder)
         click.echo(f"report: {page if out else os.path.relpath(page)}")
+
+
+@click.command()
+@click.argument("run_dir", type=click.Path(path_type=Path))
+@click.option(
+    "--csv", "kind", flag_value="csv", default="csv", help="Summary: a line a data set and parameter (default)."
+)
+@click.option("--members", "kind", flag_value="members", help="CSV of the posterior members.")
+@click.option("--latex", "kind", flag_value="latex", help="Table for a paper: mean ± std (package booktabs).")
+@click.option("--netcdf", "kind", flag_value="netcdf", help="Say where posterior.nc is: it needs no export.")
+@click.option("--out", type=click.Path(path_type=Path), help="File to write; default standard output.")
+@click.option("--force", is_flag=True, help="Replace that file.")
+def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
+    """Write a table of a run as CSV or LaTeX, in display units.
+
+    \b
+    Example:
+      en4dvar export runs/quickstart --latex --out table.tex
+    """
+    from en4dvar.errors import OutputError
+    from en4dvar.export import export_table, posterior_file
+    from en4dvar.files import write_text
+
+    if kind == "netcdf":
+        path = posterior_file(run_dir)
+        click.echo(f"{path} follows the ArviZ schema as it is: arviz.from_netcdf({str(path)!r}); nothing to export")
+        return
+    text = export_table(run_dir, kind)  # type: ignore[arg-type]
+    if out is None:
+        click.echo(text, nl=False)
+        return
+    if out.exists() and not force:
+        raise OutputError(f"{out}: exists; give --force to replace it")
+    click.echo(f"table: {write_text(out, text)}")

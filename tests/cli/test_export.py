@@ -1,0 +1,115 @@
+"""``en4dvar export``: tables that a spreadsheet and LaTeX read; netCDF is ArviZ-ready as it is."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from en4dvar.cli import main
+from en4dvar.export import escaped, export_table, latex_unit
+from en4dvar.problem import Analysis
+from en4dvar.store import Result as Posterior
+from en4dvar.store import load_result, save
+
+
+def call(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, ["export", *(str(a) for a in arguments)])
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory: pytest.TempPathFactory, analysis: Analysis) -> Path:
+    folder = tmp_path_factory.mktemp("one")
+    save(Posterior.from_analysis(analysis, {}), folder / "posterior.nc")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory, make_analysis: Callable[..., Analysis]) -> Path:
+    folder = tmp_path_factory.mktemp("two")
+    (folder / "datasets").mkdir()
+    for name in ("a_1", "b&2"):
+        save(Posterior.from_analysis(make_analysis(name=name), {}), folder / "datasets" / f"{name[0]}.nc")
+    return folder
+
+
+def test_summary_as_csv_keeps_every_digit(one: Path) -> None:
+    done = call(one)
+    assert done.exit_code == 0, done.output
+    assert call(one, "--csv").output == done.output
+    rows = list(csv.DictReader(done.output.splitlines()))
+    for row, summary in zip(rows, load_result(one / "posterior.nc").summary(), strict=True):
+        assert (row["dataset"], row["name"], row["unit"]) == ("A_E2_synthetic", summary.name, summary.unit)
+        assert [float(row[k]) for k in ("mean", "std", "q05", "q95")] == [
+            summary.mean, summary.std, summary.q05, summary.q95,
+        ]  # fmt: skip
+
+
+def test_members_without_those_that_were_lost(one: Path, two: Path) -> None:
+    rows = list(csv.DictReader(call(one, "--members").output.splitlines()))
+    assert list(rows[0]) == ["dataset", "member", "G (kPa)", "mu (Pa s)", "R0 (um)", "t_s (us)"]
+    assert [int(row["member"]) for row in rows] == [i for i in range(24) if i != 3]
+    result = load_result(one / "posterior.nc")
+    stored = 1e-3 * result.posterior["G"].values[0]
+    assert [float(row["G (kPa)"]) for row in rows] == pytest.approx(list(stored[np.isfinite(stored)]), rel=1e-12)
+    assert len(export_table(two, "members").splitlines()) == 1 + 2 * 23
+
+
+def numbers(cell: str) -> list[float]:
+    return [float(text) for text in re.findall(r"-?\d+\.?\d*", cell)]
+
+
+def test_latex_of_one_data_set(one: Path) -> None:
+    lines = call(one, "--latex").output.splitlines()
+    assert lines[1:4] == [
+        r"\begin{tabular}{llrrr}",
+        r"  \toprule",
+        r"  parameter & unit & prior & posterior & 5--95\,\% \\",
+    ]
+    assert lines[-2:] == [r"  \bottomrule", r"\end{tabular}"]
+    summaries = load_result(one / "posterior.nc").summary()
+    for line, summary, head in zip(
+        lines[5:-2], summaries, (r"$G$ & kPa", r"$\mu$ & Pa\,s", r"$R_0$ & $\mu$m", r"$t_s$ & $\mu$s"), strict=True
+    ):
+        assert line.startswith(f"  {head} & $")
+        assert line.endswith(r" \\")
+        cells = line.removesuffix(r" \\").split(" & ")
+        assert len(cells) == 5
+        mean, std = numbers(cells[3])
+        assert mean == pytest.approx(summary.mean, abs=0.06 * summary.std)
+        assert std == pytest.approx(summary.std, rel=0.05)
+
+
+def test_latex_of_a_campaign(two: Path) -> None:
+    lines = call(two, "--latex").output.splitlines()
+    assert lines[3] == r"  data set & $G$ (kPa) & $\mu$ (Pa\,s) & $R_0$ ($\mu$m) & $t_s$ ($\mu$s) \\"
+    assert [line.split(" & ")[0] for line in lines[5:-2]] == [r"  a\_1", r"  b\&2"]
+    assert {line.count(" & ") for line in lines[3:-2] if "rule" not in line} == {4}
+
+
+def test_what_latex_would_not_print_is_escaped() -> None:
+    assert escaped(r"50 % of_{a}\b") == r"50 \% of\_\{a\}\textbackslash{}b"
+    assert latex_unit("J/m^2") == r"J/m$^{2}$"
+
+
+def test_netcdf_is_there_already(one: Path) -> None:
+    before = sorted(one.iterdir())
+    done = call(one, "--netcdf", "--out", one / "x.nc")
+    assert done.exit_code == 0
+    assert f"{one / 'posterior.nc'} follows the ArviZ schema as it is" in done.output
+    assert sorted(one.iterdir()) == before
+
+
+def test_files_and_faults(one: Path, tmp_path: Path) -> None:
+    out = tmp_path / "table.tex"
+    assert call(one, "--latex", "--out", out).output == f"table: {out}\n"
+    assert out.read_text(encoding="utf-8") == export_table(one, "latex")
+    assert (call(one, "--latex", "--out", out).exit_code, call(one, "--out", out, "--force").exit_code) == (2, 0)
+    for flag in ("--csv", "--netcdf"):
+        done = call(tmp_path / "nowhere", flag)
+        assert (done.exit_code, done.stderr.count("holds no posterior.nc")) == (2, 1)
