@@ -170,7 +170,7 @@ def integrate(
     """Integrate N members and write their states at the output times.
 
     ``queue`` = (counter (1,), available (1,), order (N,)): members are taken in this order; one that is not available
-    yet is waited for; threads that call with the same arrays at once share the members, and which of them integrates one
+    yet is waited for. Threads that call with the same arrays at once share the members; which of them integrates one
     makes no difference to it.
     initial (N, n), parameters (N, rows), start (N,) µs, times (N, K) increasing µs; ``dims``, ``world`` (without the
     elastic tables) and ``extra`` as for :func:`general.general_rhs`; ``law`` = (samples (N, nodes) of J_e, tabulated
