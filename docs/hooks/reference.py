@@ -18,6 +18,7 @@ def on_files(files: Files, config: Any, **_: Any) -> Files:
     pages = {
         "reference_yaml.md": yaml_page(),
         "reference_cli.md": command_page(),
+        "reference_warnings.md": warnings_page(),
         "reference_api.md": python_page(),
     }
     for name, text in pages.items():
@@ -196,6 +197,30 @@ def _loaded(command: click.Command) -> click.Command:
     """A command of an application package is imported only when it is asked for."""
     entry = getattr(command, "entry", None)
     return command if entry is None else entry.load()
+
+
+# --- warnings, from their catalogue
+
+
+def warnings_page() -> str:
+    """Every code a result can warn with."""
+    from en4dvar.honesty.caution import CATALOGUE, SEVERITIES
+
+    meaning = {
+        "serious": "do not trust the posterior before this is settled",
+        "caution": "read it with care",
+        "note": "worth knowing",
+    }
+    parts = [
+        "# Warnings",
+        "Generated. A result says what should keep you from trusting it: in the report, in `run.log`, "
+        "on the terminal and in `posterior.nc` (`warnings`, `warning_codes`), each with a code that does not change. "
+        "What is behind them: [What a posterior means](trusting_a_posterior.md#when-not-to-trust-it).",
+    ]
+    for severity in SEVERITIES:
+        rows = [[f"`{code}`", _prose(advice)] for code, (kind, advice) in CATALOGUE.items() if kind == severity]
+        parts += [f"## {severity.capitalize()}: {meaning[severity]}", _rows(["code", "what to do"], rows)]
+    return "\n\n".join(parts) + "\n"
 
 
 # --- Python, from the public names

@@ -37,7 +37,7 @@ def site(tmp_path_factory) -> Path:
 
 def test_every_page_is_there_and_can_be_found(site):
     home = (site / "index.html").read_text(encoding="utf-8")
-    generated = {"reference_yaml", "reference_cli", "reference_api"}
+    generated = {"reference_yaml", "reference_cli", "reference_api", "reference_warnings"}
     for name in {p.stem for p in (ROOT / "docs").glob("*.md")} | generated:
         assert (site / f"{name}.html").is_file()
         assert f'href="{name}.html"' in home or name == "index", f"{name} is not in the navigation"
