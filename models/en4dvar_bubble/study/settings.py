@@ -49,10 +49,15 @@ class PopulationSection(Section):
     """How much the population estimate computes; see :mod:`~en4dvar_bubble.study.population`."""
 
     rounds: Annotated[int, Field(ge=30)] = Effort.rounds
+    """Rounds of the walkers over each data set, from which its emulator is learnt."""
     components: Annotated[int, Field(ge=1, le=100)] = Effort.components
+    """Gaussians in the mixture that stands for a data set's posterior."""
     blocks: Annotated[int, Field(ge=1)] = Effort.blocks
+    """Blocks of the chain of means and spreads, at most; it ends when it has mixed."""
     draws: Annotated[int, Field(ge=100)] = Effort.draws
+    """Draws of the chain that receive importance weights."""
     exact: Annotated[int, Field(ge=50)] = Effort.exact
+    """Of them, those weighed by forward runs instead of emulators."""
 
     def built(self) -> Effort:
         """The rest as by default."""
@@ -71,8 +76,9 @@ class StudySchema(Section):
     truth: str | None = None
     """CSV file of the twin's true parameters, read for the report only; relative to this file's folder."""
     sweep: Sweep = Sweep()
-    population: PopulationSection = PopulationSection()
     """Size of the sweep of each model and gel."""
+    population: PopulationSection = PopulationSection()
+    """How much the population estimate computes."""
     gels: Annotated[dict[str, dict[str, str]], Field(min_length=1)]
     """Label of the gel → model (nh, qs, qlkv) → configuration file, relative to this file's folder."""
 
