@@ -19,6 +19,7 @@ from doc_pages import command_words
 import en4dvar
 import en4dvar_bubble
 from en4dvar.cli import main
+from en4dvar.config.json_schema import json_schema
 
 SHAPE = re.compile(r"\([\w…'′]{1,7},(?: ?[\w…'′·+]{1,9},?)*\)|any shape")  # (K,), (N, n), (…, K)
 ERRORS = {"ConfigError", "DataError", "OutputError", "TooFewMembersError", "En4dvarError", "UnitError", "ValueError"}
@@ -130,3 +131,26 @@ def test_examples_in_docstrings_run(module):
     result = doctest.testmod(importlib.import_module(module))
     assert result.attempted
     assert result.failed == 0
+
+
+def _undescribed(node: Any, path: str) -> Iterator[str]:
+    """Keys of a JSON schema, at any depth, that no description explains."""
+    if isinstance(node, dict):
+        for key, value in node.get("properties", {}).items():
+            if not value.get("description"):
+                yield f"{path}.{key}"
+        for key, value in node.items():
+            if key == "properties":
+                for name, child in value.items():
+                    yield from _undescribed(child, f"{path}.{name}")
+            elif key not in ("if", "then"):
+                yield from _undescribed(value, path)
+    elif isinstance(node, list):
+        for child in node:
+            yield from _undescribed(child, path)
+
+
+def test_every_yaml_key_has_a_description():
+    definitions = json_schema()["$defs"]
+    assert [key for name, node in definitions.items() for key in _undescribed(node, name)] == []
+    assert list(_undescribed({"anyOf": [{"properties": {"a": {}}}]}, "x")) == ["x.a"]
