@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import doctest
 import html
+import logging
 import os
 import re
 import shutil
 import subprocess
 import sys
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 from doc_pages import ROOT
@@ -79,3 +83,36 @@ def test_the_search_works_from_a_file(site):
     page = f"{(site / 'index.html').as_uri()}?q=Kirchhoff"
     shown = subprocess.run([*command, page], capture_output=True, text=True, timeout=120).stdout
     assert re.search(r"md-search-result__meta\">\s*\d+ matching", shown)
+
+
+def hook(name: str) -> ModuleType:
+    spec = spec_from_file_location(name, ROOT / "docs" / "hooks" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_docstrings_become_markdown():
+    result = doctest.testmod(hook("docstrings"))
+    assert result.attempted
+    assert result.failed == 0
+
+
+@pytest.mark.parametrize(("tex", "understood"), [(r"\frac{a}{b} \le \mathcal H", True), (r"\nonsense{a}", False)])
+def test_a_formula_that_is_not_understood_is_a_warning(tex, understood, caplog):
+    page = SimpleNamespace(file=SimpleNamespace(src_path="page.md"))
+    with caplog.at_level(logging.WARNING):
+        made = hook("formulas").on_page_content(rf'<p><span class="arithmatex">\({tex}\)</span></p>', page)
+    assert ("<math" in made and "ℋ" in made) or not understood
+    assert bool(caplog.records) is not understood
+
+
+def test_a_page_that_loads_from_elsewhere_is_a_warning(caplog):
+    page = SimpleNamespace(file=SimpleNamespace(src_path="page.md"), url="page.html")
+    with caplog.at_level(logging.WARNING):
+        hook("no_network").on_post_page('<script src="https://unpkg.com/iframe-worker/shim">', page)
+        assert not caplog.records
+        hook("no_network").on_post_page('<img src="https://example.org/a.png">', page)
+    assert len(caplog.records) == 1
