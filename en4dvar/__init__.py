@@ -14,9 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from en4dvar.batch import Batch as Batch
+    from en4dvar.campaign import Campaign as Campaign
     from en4dvar.checks import Preview as Preview
     from en4dvar.checks import preview as preview
     from en4dvar.checks import validate as validate
+    from en4dvar.compare import Comparison as Comparison
+    from en4dvar.compare import compare_runs as compare_runs
     from en4dvar.config import Config as Config
     from en4dvar.config import TwinConfig as TwinConfig
     from en4dvar.config import load_config as load_config
@@ -26,6 +29,8 @@ if TYPE_CHECKING:
     from en4dvar.errors import En4dvarError as En4dvarError
     from en4dvar.errors import OutputError as OutputError
     from en4dvar.errors import TooFewMembersError as TooFewMembersError
+    from en4dvar.export import export_table as export_table
+    from en4dvar.export import write_report as write_report
     from en4dvar.forward import Failure as Failure
     from en4dvar.forward import ForwardModel as ForwardModel
     from en4dvar.forward import Observable as Observable
@@ -39,6 +44,7 @@ if TYPE_CHECKING:
     from en4dvar.problem import InverseProblem as InverseProblem
     from en4dvar.runner import run as run
     from en4dvar.runner import run_campaign as run_campaign
+    from en4dvar.simulation import Simulation as Simulation
     from en4dvar.simulation import simulate as simulate
     from en4dvar.state import Field as Field
     from en4dvar.state import Parameter as Parameter
@@ -50,15 +56,18 @@ if TYPE_CHECKING:
 
 _HOME = {
     "batch": ("Batch",),
+    "campaign": ("Campaign",),
     "checks": ("Preview", "preview", "validate"),
+    "compare": ("Comparison", "compare_runs"),
     "config": ("Config", "TwinConfig", "load_config", "load_twin"),
     "errors": ("ConfigError", "DataError", "En4dvarError", "OutputError", "TooFewMembersError"),
+    "export": ("export_table", "write_report"),
     "forward": ("Failure", "ForwardModel", "Observable", "StateField", "Trajectory"),
     "observations": ("Observations",),
     "prior": ("Prior", "PriorTerm"),
     "problem": ("Analysis", "AssimilationSettings", "InverseProblem"),
     "runner": ("run", "run_campaign"),
-    "simulation": ("simulate",),
+    "simulation": ("Simulation", "simulate"),
     "state": ("Field", "Parameter", "StateLayout"),
     "store": ("Result", "load_result"),
     "twin_run": ("run_twin",),

@@ -73,12 +73,14 @@ def _problem_faults(config: Config) -> Iterator[Fault]:
 
 
 def _data_faults(path: Path, overrides: Mapping[str, Any] | None) -> Iterator[Fault]:
-    """Faults of the data files of a configuration that has faults of its own, where its data section has none."""
+    """Faults of the data section and its files, for a configuration that has faults elsewhere."""
     try:
         document = override(read_document(path), overrides or {})
     except ConfigError:
         return
-    plan = _plan(document, path.resolve().parent)
+    faults: list[Fault] = []
+    plan = _plan(document, path.resolve().parent, faults)
+    yield from faults
     if plan is None:
         return
     try:
@@ -95,12 +97,16 @@ def _data_faults(path: Path, overrides: Mapping[str, Any] | None) -> Iterator[Fa
             yield _located(document, error)
 
 
-def _plan(document: Document, base: Path) -> DataPlan | None:
-    ignored: list[Fault] = []
+def _plan(document: Document, base: Path, faults: list[Fault]) -> DataPlan | None:
+    """How the data would be read, with the model's default settings where those given are at fault."""
     model_section, section = document.data.get("model"), document.data.get("data")
-    found = read_model(model_section, base, document, ignored) if isinstance(model_section, dict) else None
-    data = check(schema.Data, section, ("data",), document, ignored) if isinstance(section, dict) else None
-    return read_data(data, base, found[0], document, ignored) if found and data and not ignored else None
+    if not isinstance(model_section, dict) or not isinstance(section, dict):
+        return None
+    found = read_model(model_section, base, document, []) or read_model(
+        {"name": model_section.get("name")}, base, document, []
+    )
+    data = check(schema.Data, section, ("data",), document, faults)
+    return read_data(data, base, found[0], document, faults) if found and data else None
 
 
 def _located(document: Document, error: DataError) -> Fault:

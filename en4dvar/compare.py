@@ -65,6 +65,7 @@ class Comparison:
 
     @property
     def runs(self) -> tuple[str, ...]:
+        """Names of the runs, in the order given."""
         return tuple(dict.fromkeys(score.run for score in self.scores))
 
     @property
@@ -73,10 +74,12 @@ class Comparison:
         return tuple(dict.fromkeys(estimate.summary.name for estimate in self.estimates))
 
     def of(self, dataset: str) -> tuple[ModelScore, ...]:
+        """The scores of one data set, or of :data:`ALL` together, runs in the order given."""
         return tuple(score for score in self.scores if score.dataset == dataset)
 
     @property
     def datasets(self) -> tuple[str, ...]:
+        """Names of the data sets; where the runs share several, :data:`ALL` comes last."""
         return tuple(dict.fromkeys(score.dataset for score in self.scores))
 
     def verdict(self, dataset: str) -> str:

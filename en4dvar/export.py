@@ -1,11 +1,14 @@
-"""Tables of a run for other programs: CSV of summary or members, LaTeX for a paper. netCDF needs no export."""
+"""Tables of a run for other programs: CSV of summary or members, LaTeX for a paper; its report once more.
+
+netCDF needs no export: ``posterior.nc`` follows the ArviZ schema as it is.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -39,6 +42,22 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
     from en4dvar.report import summary_csv
 
     return summary_csv(((r.name, r.summary(), r.cautions) for r in results(run_dir)), {})
+
+
+def write_report(run_dir: str | Path, datasets: Sequence[str] = ()) -> Path:
+    """Write the report of a run again from its netCDF files; returns the path of ``report.html``.
+
+    Parameters
+    ----------
+    datasets: of a campaign, data sets that get a page of their own in any case.
+
+    Raises
+    ------
+    OutputError: there is nothing to read, the directory is in use or cannot be written.
+    """
+    from en4dvar.runner import report
+
+    return report(run_dir, datasets)
 
 
 def posterior_file(run_dir: str | Path) -> Path:

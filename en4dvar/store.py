@@ -172,10 +172,32 @@ class Result:
         return self.posterior.isel(chain=0, drop=True).to_dataframe()
 
     def plot_histograms(self) -> Figure:
-        """Posterior over prior, one panel a parameter, in display units."""
+        """Posterior over prior, one panel a parameter, in display units; a matplotlib figure, shown by a notebook."""
         from en4dvar.report.figures import histograms
 
         return histograms(self)
+
+    def plot_history(self) -> Figure:
+        """Data, prior and posterior predictive bands and the residuals of the centre, in display units."""
+        from en4dvar.report.figures import history
+
+        return history(self)
+
+    def plot_pairs(self) -> Figure:
+        """Posterior members of every pair of parameters with their correlation, in display units."""
+        from en4dvar.report.figures import pairs
+
+        return pairs(self)
+
+    def __str__(self) -> str:
+        """The summary as a table (display units), how the fit ended, and the warnings."""
+        from en4dvar.describe import results_table
+
+        s = self.sample_stats.attrs
+        ended = f"{'converged' if s['converged'] else 'not converged'}: {s['stop_reason']}"
+        fit = f"chi2/K {s['chi2_per_observation']:.3g}, NRMSE {s['nrmse']:.3g}, DFS {s['dfs']:.3g}"
+        parts = [results_table({self.name: self.summary()}), f"{ended}; {fit}"]
+        return "\n".join([*parts, *(f"warning: {words}" for words in self.warnings)])
 
 
 def _living(values: Array, alive: Any, unit: str, display_unit: str) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import sys
@@ -14,8 +13,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 if TYPE_CHECKING:
-    from en4dvar.state import Array
-    from en4dvar_bubble.starter.page import Source
     from en4dvar_bubble.starter.proposal import Proposal
 
 _TIME = re.compile(r"(?i)t|time|t[ _(\[].*|time[ _(\[].*")
@@ -55,36 +52,32 @@ def init(
     Example:
       en4dvar init --data bubble.csv --time-unit us --radius-unit um
     """
-    from en4dvar.errors import OutputError
-    from en4dvar.files import write_text
-    from en4dvar_bubble.starter.page import SCHEMA_FILE, Source, yaml_text
-    from en4dvar_bubble.starter.proposal import propose, starter
-
     if example is not None:
         if data is not None or out is not None:
             raise click.UsageError("--example comes with its own data and file names")
         _write_example(example, force)
         return
-    name = _name(data)
+    from en4dvar.config.json_schema import schema_text
+    from en4dvar.errors import OutputError
+    from en4dvar.files import write_text
+    from en4dvar_bubble.starter.config import propose_config, run_name
+    from en4dvar_bubble.starter.page import SCHEMA_FILE, Source, yaml_text
+    from en4dvar_bubble.starter.proposal import starter
+
+    name, words = run_name(data), shlex.join(["en4dvar", *sys.argv[1:]])
     target = out or Path(f"{name}.yaml")
     if target.exists() and not force:
         raise OutputError(f"{target}: exists; give --force to replace it, or another --out")
     if not target.absolute().parent.is_dir():
         raise OutputError(f"{target}: the folder {target.parent} does not exist")
     if data is None:
-        source = Source("bubble.csv", ("t_us", "us"), None, ("R_um", "um"))
         proposal = starter(start or "acoustic", law)
+        text = yaml_text(name, Source("bubble.csv", ("t_us", "us"), None, ("R_um", "um")), proposal, words)
     else:
-        asked = _Asked(time_unit, radius_unit, time_column, radius_column, time_step)
-        source, histories = _read(data, asked, target)
-        proposal = propose(histories, start, law)
-    words = ["en4dvar", *sys.argv[1:]]
-    text = yaml_text(name, source, proposal, shlex.join(words))
-    if data is not None:
-        _check(text, target)
+        columns = _columns_of(data, _Asked(time_unit, radius_unit, time_column, radius_column, time_step))
+        proposed = propose_config(data, **columns, start=start, law=law, folder=target.parent, command=words)
+        text, proposal = proposed.text, proposed.proposal
     write_text(target, text)
-    from en4dvar.config.json_schema import schema_text
-
     write_text(target.parent / SCHEMA_FILE, schema_text())
     _tell(target, proposal, example_only=data is None)
 
@@ -108,47 +101,31 @@ class _Asked:
     time_step: str | None
 
 
-def _read(data: str, asked: _Asked, target: Path) -> tuple[Source, dict[str, tuple[Array, Array]]]:
-    """How the data are read, and the histories in SI."""
+def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
+    """Columns and units for ``propose_config``: by option, by a telling name, or asked for."""
     from en4dvar.build import find_files
-    from en4dvar.readers import Column, Step, read_contents, read_series
-    from en4dvar.units import convert, parse_quantity
-    from en4dvar_bubble.starter.page import Source
+    from en4dvar.readers import read_contents
+    from en4dvar.units import convert
 
-    files = find_files(Path.cwd(), [data])
-    first = next(iter(files.values()))
+    first = next(iter(find_files(Path.cwd(), [data]).values()))
     contents = read_contents(first)
     shown = {name: f"{len(v)} values, {_range(v)}" for name, v in contents.columns.items()}
     click.echo(f"{first}: {'; '.join(f'{name} ({words})' for name, words in shown.items())}", err=True)
     time, radius, missing = _columns(asked, shown)
     time_unit, radius_unit = asked.time_unit, asked.radius_unit
     if _interactive():
-        time, radius = time or _ask_column("times", shown), radius or _ask_column("radii", shown)
         missing = []
+        radius = radius or _ask_column("radii", shown)
         if asked.time_step is None:
+            time = time or _ask_column("times", shown)
             time_unit = time_unit or _ask_unit(time, shown, "s", "us, ms or s")
         radius_unit = radius_unit or _ask_unit(radius, shown, "m", "um, mm or m")
     _require(missing, time_unit, radius_unit, asked, first, shown)
     convert(1.0, str(radius_unit), "m")
-    column: Column | Step
     if asked.time_step is not None:
-        column = Step(value=parse_quantity(asked.time_step, "s"))
-        named = None
-    else:
-        convert(1.0, str(time_unit), "s")
-        column = Column(str(time), str(time_unit), "s")
-        named = (str(time), str(time_unit))
-    value = Column(str(radius), str(radius_unit), "m")
-    series = {name: read_series(file, column, value) for name, file in files.items()}
-    source = Source(_path_in(target, data), named, asked.time_step, (str(radius), str(radius_unit)))
-    return source, {name: (s.times, s.values) for name, s in series.items()}
-
-
-def _path_in(target: Path, data: str) -> str:
-    """``data`` as the file ``target`` says it: relative to its folder where both share more than the root."""
-    path, folder = Path(data).expanduser().absolute(), target.absolute().parent
-    near = path.parts[:2] == folder.parts[:2] and len(folder.parts) > 1
-    return Path(os.path.relpath(path, folder)).as_posix() if near else path.as_posix()
+        return {"radius": (radius, radius_unit), "time_step": asked.time_step}
+    convert(1.0, str(time_unit), "s")
+    return {"radius": (radius, radius_unit), "time": (time, time_unit)}
 
 
 def _columns(asked: _Asked, shown: Mapping[str, str]) -> tuple[str | None, str | None, list[str]]:
@@ -212,24 +189,6 @@ def _range(values: Any) -> str:
 
     finite = values[np.isfinite(values)]
     return f"{finite.min():g} to {finite.max():g}" if len(finite) else "none of them finite"
-
-
-def _name(data: str | None) -> str:
-    """Name of the run and of the file: that of the data, with letters, digits, dots and dashes."""
-    if data is None:
-        return "bubble"
-    path = Path(data).expanduser().absolute()
-    stem = path.parent.name if any(sign in path.name for sign in "*?[") else path.name if path.is_dir() else path.stem
-    return re.sub(r"[^\w.+-]", "_", stem).lstrip(".-+") or "bubble"
-
-
-def _check(text: str, target: Path) -> None:
-    """What is written loads, and its data can be used; raises what is wrong before anything is written."""
-    from en4dvar.build import build
-    from en4dvar.config import resolve
-    from en4dvar.config.document import parse_document
-
-    build(resolve(parse_document(text, str(target)), target.absolute().parent))
 
 
 def _tell(target: Path, proposal: Proposal, example_only: bool) -> None:

@@ -168,7 +168,7 @@ def test_wrong_options(tmp_path: Path, options: tuple[str, ...], message: str) -
 
 def test_on_a_terminal_it_asks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(commands_init, "_interactive", lambda: True)
-    done = call("init", "--data", write(tmp_path / "b.csv", "when,size"), input="when\nsize\nus\nPa\num\n")
+    done = call("init", "--data", write(tmp_path / "b.csv", "when,size"), input="size\nwhen\nus\nPa\num\n")
     assert done.exit_code == 0, done.output
     assert "unit 'Pa' cannot be converted to 'm'" in done.stderr  # asked again
     columns = proposed(Path("b.yaml")).document.data["data"]["columns"]

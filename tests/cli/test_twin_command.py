@@ -67,7 +67,10 @@ def test_run_prints_and_writes_the_scores(finished):
     assert float(shown[1]) == pytest.approx(float(rmse[10:].mean()), rel=1e-3)
     assert data.attrs["seed"] == 4
     assert data.attrs["configuration"] == YAML
-    assert outcome.stdout.rstrip().endswith(f"result: {directory / 'twin.nc'}")
+    assert outcome.stdout.splitlines()[-2:] == [
+        f"result: {directory / 'twin.nc'}",
+        f"report: {directory / 'report.html'}",
+    ]
     lines = (directory / "summary.csv").read_text().splitlines()
     assert [line.split(",")[0] for line in lines] == ["estimate", "forecast", "analysis", "smoothed"]
     names = {p.name for p in directory.iterdir()}
@@ -78,7 +81,38 @@ def test_resolved_configuration_gives_the_same_result(finished, tmp_path):
     directory, outcome = finished
     again = call("run", directory / "config.resolved.yaml", "--out", tmp_path / "again")
     assert again.exit_code == 0, again.output
-    assert again.stdout.splitlines()[:-1] == outcome.stdout.splitlines()[:-1]
+    assert again.stdout.splitlines()[:-2] == outcome.stdout.splitlines()[:-2]
+
+
+def test_report_again_from_the_file(finished):
+    directory, _ = finished
+    page = (directory / "report.html").read_text()
+    for words in ("Twin experiment", "ienks", '<td class="words">smoothed</td>', "lag: 2", "10 of them do not count"):
+        assert words in page
+    assert "http" not in re.sub(r"<pre>.*?</pre>|doi|<table class=\"pairs\">.*?</table>", "", page, flags=re.DOTALL)
+    for file in ("report.html", "figures/scores.png"):
+        (directory / file).unlink()
+    again = call("report", directory)
+    assert again.exit_code == 0, again.output
+    assert (directory / "figures" / "scores.png").stat().st_size > 10_000
+    strip = lambda text: re.sub(r"20\d\d-\S+", "", text)  # noqa: E731
+    assert strip((directory / "report.html").read_text()) == strip(page)
+
+
+def test_interrupted_run_says_how_to_continue(tmp_path, monkeypatch):
+    monkeypatch.setattr("en4dvar.twin_run.conduct", _interrupt)
+    outcome = call("run", write(tmp_path), "--out", tmp_path / "run")
+    assert outcome.exit_code == 130
+    assert "to continue: en4dvar" in outcome.stderr
+    assert outcome.stderr.rstrip().endswith("--resume")
+    monkeypatch.undo()
+    assert call("run", tmp_path / "twin.yaml", "--out", tmp_path / "run", "--resume", "--no-report").exit_code == 0
+    assert not (tmp_path / "run" / "report.html").exists()
+    assert call("run", tmp_path / "twin.yaml", "--out", tmp_path / "run", "--resume", "--force").exit_code == 2
+
+
+def _interrupt(*_):
+    raise KeyboardInterrupt
 
 
 def test_run_directory_is_not_replaced_without_force(finished):
@@ -109,6 +143,11 @@ def test_validate(tmp_path):
         ("scheme: ienks", "scheme: enkf", r"twin\.yaml:11:\d+: assimilation\.scheme: 'enkf' is not one of etkf, ienks"),
         ("lag: 2", "localisation: {radius: 3}", r"localisation: only with scheme etkf"),
         ("model: {name: lorenz96, size: 12}", "model: {name: lorenz69}", r"unknown model 'lorenz69'; did you mean"),
+        (
+            "burn_in: 10",
+            "error_correlation: c.csv",
+            r"twin\.yaml:6:\d+: twin\.error_correlation: .*c\.csv: no such file",
+        ),
         ("seed: 4", "sed: 4", r"twin\.yaml:2:1: sed: unknown key 'sed'; did you mean 'seed'"),
         ("seed: 4", "parameters: {F: {from_file: F, unit: '1'}}", r"parameters\.F: a twin experiment has no data file"),
     ],

@@ -41,6 +41,12 @@ def test_every_fault_is_told_at_once_and_in_place(tmp_path: Path) -> None:
     assert done.stdout == ""
 
 
+def test_a_fault_of_the_model_does_not_hide_those_of_the_data(tmp_path: Path) -> None:
+    path = write_toy(tmp_path, ("mass: 2 g", "law: cubik"), ("unit: um", "unit: Pa"))
+    done = call("validate", path)
+    assert [line.split(": ")[1] for line in done.stderr.splitlines()] == ["data.columns.position.unit", "model.law"]
+
+
 def test_faults_of_several_data_files(tmp_path: Path) -> None:
     path = write_toy(tmp_path, ("toy.csv", "'*.csv'"))
     (tmp_path / "odd.csv").write_text("a,b\n1,2\n")
