@@ -84,8 +84,9 @@ def styled(draw: Callable[P, T]) -> Callable[P, T]:
 
 def _settle(figure: Figure) -> None:
     """Compute the layout once; constrained layout would do it again for every format."""
-    if figure.get_layout_engine() is not None:
-        figure.draw_without_rendering()
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
         figure.set_layout_engine("none")
 
 

@@ -1,0 +1,113 @@
+"""Pages of a run, a campaign and a comparison, opened by a headless Chromium through Playwright.
+
+Needed are Playwright (extra ``dev``; its own browsers are not used and need not be downloaded) and Chromium: on Debian
+and Ubuntu ``apt-get install chromium``, or any Chrome named by the variable ``CHROMIUM``. Without them the tests are
+skipped by name; with ``CI=true`` that is a failure.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from en4dvar import report
+from en4dvar.compare import compare_runs
+from en4dvar.honesty import caution
+from en4dvar.provenance import provenance
+from en4dvar.report import overlay, write_report
+from en4dvar.store import Result, save
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+FLAGS = (
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+EVIL = "<script>window.hacked=1</script><img src=x onerror='window.hacked=2'>"
+
+
+def missing(what: str) -> None:
+    if os.environ.get("CI") == "true":
+        pytest.fail(f"{what}: the browser tests must run in CI; see tests/browser/conftest.py")
+    pytest.skip(f"{what}: see tests/browser/conftest.py")
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """A Chromium with a fresh profile."""
+    found = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
+    if found is None:
+        missing("no Chromium")
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        missing("no Playwright")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=list(FLAGS))
+        yield browser
+        browser.close()
+
+
+@dataclass
+class Seen:
+    """A page of the browser with what it asked for and complained about."""
+
+    page: Any
+    requests: list[str]
+    complaints: list[str]
+
+
+@pytest.fixture
+def opened(browser: Any) -> Iterator[Any]:
+    """``opened(path, scheme="light", width=1200)``: the page at ``path``, from file://."""
+    contexts = []
+
+    def open_page(path: Path, scheme: str = "light", width: int = 1200) -> Seen:
+        context = browser.new_context(color_scheme=scheme, viewport={"width": width, "height": 900})
+        contexts.append(context)
+        seen = Seen(context.new_page(), [], [])
+        seen.page.on("request", lambda request: seen.requests.append(request.url))
+        seen.page.on("console", lambda message: seen.complaints.append(message.text))
+        seen.page.on("pageerror", lambda error: seen.complaints.append(str(error)))
+        seen.page.goto(path.as_uri())
+        return seen
+
+    yield open_page
+    for context in contexts:
+        context.close()
+
+
+@pytest.fixture(scope="session")
+def pages(analysis: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]]:
+    """Kind of page → its file. One data set of the campaign has a name made to break out of the page."""
+    with pytest.MonkeyPatch.context() as patch:  # the PDF and PNG copies of the figures are no part of a page
+        patch.setattr(report, "save_figure", lambda *_: None)
+        patch.setattr(overlay, "save_figure", lambda *_: None)
+        yield _write_pages(analysis, tmp_path_factory.mktemp("pages"))
+
+
+def _write_pages(analysis: Any, folder: Path) -> dict[str, Path]:
+    found = {}
+    notes = (caution("misfit", f"bad {EVIL}"), *analysis.cautions, caution("not-informed", "mu is hardly informed"))
+    single = replace(analysis, cautions=notes)
+    calm = replace(analysis, name="calm", cautions=(), centre=1.1 * analysis.centre)
+    for name, one in (("single", single), ("calm", calm)):
+        run = folder / name
+        run.mkdir()
+        save(Result.from_analysis(one, provenance("name: test\n")), run / "posterior.nc")
+    found["single"] = write_report(folder / "single")
+    comparison = compare_runs([folder / "single", folder / "calm"])
+    found["compare"] = overlay.write_comparison(comparison, folder / "compare")
+    campaign = folder / "campaign"
+    (campaign / "datasets").mkdir(parents=True)
+    for i, (stem, name) in enumerate((("b", "beta"), ("a", "alpha"), ("c", EVIL))):
+        one = replace(calm, name=name, posterior=(1 + 0.2 * i) * calm.posterior, cautions=notes[:i])
+        save(Result.from_analysis(one, provenance("name: test\n")), campaign / "datasets" / f"{stem}.nc")
+    found["campaign"] = write_report(campaign)
+    found["set"] = campaign / "pages" / "c.html"
+    return found

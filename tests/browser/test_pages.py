@@ -1,0 +1,107 @@
+"""What a reader meets: pages open from a folder, ask for nothing, and can be read in the dark, on a phone, on paper."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+LOOK = (Path(__file__).parent / "look.js").read_text(encoding="utf-8")
+KINDS = ("single", "campaign", "set", "compare")
+FIGURES = {"single": 5, "campaign": 1, "set": 5, "compare": 1}
+
+
+def look(seen, question):
+    seen.page.evaluate(LOOK)
+    return seen.page.evaluate(f"window.look.{question}()")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_opens_without_a_complaint_and_asks_for_nothing(opened, pages, kind):
+    seen = opened(pages[kind])
+    assert seen.page.title().endswith("– en4dvar")
+    assert look(seen, "drawings") == [True] * FIGURES[kind]
+    assert seen.complaints == []
+    assert seen.requests == [pages[kind].as_uri()]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_contrast_is_adequate(opened, pages, kind, scheme):
+    seen = opened(pages[kind], scheme=scheme)
+    faint = look(seen, "faint")
+    assert faint["seen"] > 50
+    assert faint["found"] == []
+    dark = seen.page.evaluate("getComputedStyle(document.body).backgroundColor") != "rgb(255, 255, 255)"
+    assert dark is (scheme == "dark")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fits_a_phone(opened, pages, kind):
+    wide = look(opened(pages[kind], width=360), "wide")
+    assert wide["scroll"] <= wide["width"] == 360
+
+
+def column(page, i):
+    return page.locator("table.sets tbody tr").evaluate_all(f"rows => rows.map(r => r.cells[{i}].textContent.trim())")
+
+
+def test_table_sorts_by_click_and_by_key(opened, pages):
+    page = opened(pages["campaign"]).page
+    names = column(page, 0)
+    assert [name[:5] for name in names] == ["alpha", "beta", "<scri"]
+    head = page.locator("table.sets th").nth(2)
+    assert head.inner_text().startswith("G")
+    head.get_by_role("button").click()
+    values = [float(text.split(" ±")[0]) for text in column(page, 2)]
+    assert values == sorted(values)
+    assert len(set(values)) == 3
+    assert head.get_attribute("aria-sort") == "ascending"
+    head.get_by_role("button").press("Enter")
+    assert [float(text.split(" ±")[0]) for text in column(page, 2)] == values[::-1]
+    assert head.get_attribute("aria-sort") == "descending"
+    page.locator("table.sets th").nth(0).get_by_role("button").click()
+    assert column(page, 0) == ["<scri" + names[2][5:], "alpha", "beta"]
+    assert head.get_attribute("aria-sort") is None
+    page.locator("table.sets th").nth(1).get_by_role("button").click()
+    assert column(page, 1) == ["", "serious", "serious"]
+
+
+def test_data_sets_are_reached_and_left_by_links(opened, pages):
+    page = opened(pages["campaign"]).page
+    page.get_by_role("link", name="alpha").click()
+    assert page.locator("h1").inner_text() == "alpha"
+    page.get_by_role("link", name="→").click()
+    assert page.locator("h1").inner_text() == "beta"
+    page.get_by_role("link", name="All data sets").click()
+    assert page.locator("h1").inner_text() == "3 data sets"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_came_from_data_does_not_run(opened, pages, kind):
+    seen = opened(pages[kind])
+    assert seen.page.evaluate("typeof window.hacked") == "undefined"
+    if kind != "compare":
+        assert "window.hacked" in seen.page.locator("body").inner_text()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_escaping_might_miss_would_not_run(opened, pages, kind):
+    """The content policy of the page refuses a script of another's and an address."""
+    seen = opened(pages[kind])
+    seen.page.evaluate(
+        "() => { const s = document.createElement('script'); s.textContent = 'window.hacked = 3';"
+        " document.body.append(s); const i = new Image(); i.src = 'http://example.org/a.png'; }"
+    )
+    assert seen.page.evaluate("typeof window.hacked") == "undefined"
+    assert len([c for c in seen.complaints if "Content Security Policy" in c]) == 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_prints_in_full(opened, pages, kind):
+    seen = opened(pages[kind], scheme="dark")
+    seen.page.emulate_media(media="print", color_scheme="dark")
+    assert seen.page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    for details in seen.page.locator("details").all():
+        assert details.locator("> :not(summary)").first.is_visible()
+    assert seen.page.pdf(format="A4").startswith(b"%PDF")
