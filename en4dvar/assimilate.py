@@ -362,7 +362,8 @@ class _Run:
 
     def record(self, iteration: int, at: Local, step: Step, transform: Array, step_length: float) -> IterationRecord:
         space, w = self.space, at.weights.w
-        ensemble = space.control(w + transform)
+        ensemble = space.control(np.vstack([w + transform, w]))
+        physical = self.problem.prior.to_physical(ensemble)
         rates = None if at.central.rates is None else at.central.rates[0]
         scale = None if at.central.noise_scale is None else at.central.noise_scale[0]
         predictions = at.central.predictions[0]
@@ -375,10 +376,10 @@ class _Run:
             step_length=step_length,
             chi2_per_observation=diag.chi2_per_observation(self.problem.observations, predictions, rates, scale),
             dfs=diag.dfs(step.hessian.singular_values, len(w)),
-            spread=diag.spread(ensemble, space.members),
+            spread=diag.spread(ensemble[:-1], space.members),
             active=at.active,
-            members=self.problem.prior.to_physical(ensemble),
-            centre=self.problem.prior.to_physical(space.control(w)),
+            members=physical[:-1],
+            centre=physical[-1],
         )
 
     def require_step(self, at: Local, stage: str) -> Step:

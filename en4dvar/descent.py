@@ -126,16 +126,16 @@ class WeightSpace:
         step = self.scheme.step(weights, Evaluation(*whiten(observations, at), self.basis))
         tangent = None
         if self.settings.linearisation == "bundle":
-            tangent = Tangent(at.prediction, at.anomalies, precision_times(observations, at, at.anomalies))
+            tangent = Tangent(at.prediction, at.anomalies, precision_times(observations, at, at.anomalies), self.basis)
         return Local(weights, members, central, active, observation, total, step, tangent)
 
     def _linearisation(
         self, weights: Weights, members: Forecast, central: Forecast, reduced: bool
     ) -> tuple[Array, Array]:
-        """Reference (Ky,) and anomalies per unit weight (N, Ky) of all that :func:`_stack` puts side by side."""
+        """Reference (Ky,) and anomalies (r, Ky) of all that :func:`_stack` puts side by side, per unit coordinate."""
         stacked, reference = _stack(members), _stack(central)
         if reduced:
-            return reference[0], self.basis @ ((stacked - reference[0]) / self._short)
+            return reference[0], (stacked - reference[0]) / self._short
         return self.scheme.linearise(weights, self.basis, stacked, reference[0], members.active)
 
 

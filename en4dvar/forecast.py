@@ -71,11 +71,11 @@ def forecast(
     alive, states = initial_states(problem, physical, failures)
     observed = np.full((len(reading.quantities), len(x), len(times)), np.nan)
     extremes = np.full((len(x), len(reading.largest)), np.nan)
-    if len(alive):
+    if len(states):
         shifted = times + _of_framework(problem, physical, TIME_SHIFT, 0.0)[alive, None]
         outcomes = (executor or SerialExecutor()).trajectories(problem.model, states, shifted)
         observed[:, alive], extremes[alive], reasons = reading.observe(outcomes, len(times))
-        for i, reason in zip(alive, reasons, strict=True):
+        for i, reason in zip(np.arange(len(x))[alive], reasons, strict=True):
             failures[i] = reason
     return Forecast(
         observed[0][:, at_observations],
@@ -89,8 +89,8 @@ def forecast(
 
 def has_noise_scale(problem: InverseProblem) -> bool:
     """Whether ``sigma`` is given and scales the observation errors (rather than being the model's own)."""
-    own = {p.name for p in problem.model.parameters}
-    return NOISE_SCALE.name not in own and NOISE_SCALE.name in {*problem.prior.names, *problem.fixed}
+    given = NOISE_SCALE.name in problem.prior.names or NOISE_SCALE.name in problem.fixed
+    return given and all(p.name != NOISE_SCALE.name for p in problem.model.parameters)
 
 
 def cost(problem: InverseProblem, x: Array, executor: Executor | None = None) -> Array:

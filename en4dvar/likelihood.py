@@ -92,8 +92,8 @@ def log_normalisation(observations: Observations) -> float:
 class Linearisation:
     """Predictions about one point: ``prediction`` m (K,), ``anomalies`` ∂m (N, K), and the same of the rates or None.
 
-    ``log_noise_scale`` is ln σ with anomalies (N,), or None. Anomalies are per unit weight: row i is the change of the
-    prediction when the control vector moves by the prior anomaly of member i.
+    ``log_noise_scale`` is ln σ with anomalies (N,), or None. Anomalies are per unit of some N coordinates: of weights,
+    row i is the change of the prediction when the control vector moves by the prior anomaly of member i.
     """
 
     prediction: Array

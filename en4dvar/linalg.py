@@ -71,15 +71,15 @@ class Hessian:
     def of(cls, s: Array, basis: Array | None = None) -> Hessian:
         """From the smallest matrix that tells.
 
-        With ``basis`` (N, r), orthonormal columns that hold the rows of S (S = S U Uᵀ), from the SVD of S U (K', r).
+        With ``basis`` U (N, r), orthonormal columns, S is s Uᵀ: then from the SVD of s (K', r).
         Else from the eigenvectors of the smaller one of SᵀS and SSᵀ, several times faster than the SVD of S, where
         that loses no accuracy: squaring S costs rounding errors of eps · ‖S‖² in A ≥ N − 1, which vanish while the
         observations inform less than ``GRAM_LIMIT`` times the prior.
         """
-        n_observations, n_members = s.shape
-        if basis is not None and basis.shape[1] < n_members - 1:
-            _, sigma, right = np.linalg.svd(s @ basis, full_matrices=False)
+        if basis is not None:
+            _, sigma, right = np.linalg.svd(s, full_matrices=False)
             return cls(sigma, sigma[:, None] * (right @ basis.T))
+        n_observations, n_members = s.shape
         small = n_observations < n_members
         gram = s @ s.T if small else s.T @ s
         if np.vdot(gram, gram) <= (GRAM_LIMIT * (n_members - 1)) ** 2:  # Frobenius: no less than ‖S‖⁴

@@ -49,4 +49,4 @@ def _fill(space: WeightSpace, at: Local, predictions: Array) -> Array:
         return predictions
     central = np.zeros(predictions.shape[1])
     reference, anomalies = space.scheme.linearise(at.weights, space.basis, predictions, central, active)
-    return np.where(active[:, None], predictions, reference + at.weights.T @ anomalies)
+    return np.where(active[:, None], predictions, reference + at.weights.T @ space.basis @ anomalies)

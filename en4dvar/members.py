@@ -20,7 +20,8 @@ from en4dvar.prior import Prior
 from en4dvar.problem import InverseProblem
 from en4dvar.state import Array
 
-Indices = npt.NDArray[np.intp]
+Indices = npt.NDArray[np.intp] | slice
+EVERYONE = slice(None)
 
 
 def out_of_bounds(prior: Prior, physical: Array) -> list[str]:
@@ -41,25 +42,25 @@ def initial_states(problem: InverseProblem, physical: Array, failures: list[str]
     Members with an entry in ``failures`` (B,) have none; the reasons of those that the model refuses are added there.
     """
     alive = _without(failures)
+    size = problem.model.layout.size
     fixed = {name: np.full(len(physical), float(value)) for name, value in problem.fixed.items()}
     theta = {**fixed, **dict(zip(problem.prior.names, physical.T, strict=True))}
-    size = problem.model.layout.size
 
     def build(members: Indices) -> Array:
         values = {name: value[members] for name, value in theta.items()}
         own = {p.name: values[p.name] for p in problem.model.parameters if p.name in values}
         states = _perturbed(problem, np.asarray(problem.model.initial_states(own), dtype=float), values)
-        if states.shape != (len(members), size) or not np.isfinite(states).all():
+        if states.shape != (len(physical[members]), size) or not np.isfinite(states).all():
             raise ValueError("non-finite or misshapen initial state")
         return states
 
-    if not len(alive):
+    if all(failures):
         return alive, np.empty((0, size))
     try:
         return alive, build(alive)
     except Exception:  # some member has no state: find out which, one by one
         states = []
-    for i in alive:
+    for i in np.arange(len(failures))[alive]:
         try:
             states.append(build(np.array([i])))
         except Exception as error:  # a model may refuse parameters in any way; the reason is kept
@@ -68,7 +69,7 @@ def initial_states(problem: InverseProblem, physical: Array, failures: list[str]
 
 
 def _without(failures: list[str]) -> Indices:
-    return np.array([i for i, reason in enumerate(failures) if not reason], dtype=np.intp)
+    return np.flatnonzero([not reason for reason in failures]) if any(failures) else EVERYONE
 
 
 def _perturbed(problem: InverseProblem, states: Array, theta: Mapping[str, Array]) -> Array:

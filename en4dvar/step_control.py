@@ -33,12 +33,14 @@ class Trials:
 class Tangent:
     """The observations' part of a tangent linearisation, for rules that look at curvature.
 
-    ``prediction`` (K,) at the centre, ``anomalies`` Y (N, K) of the predictions per unit weight, ``weighted`` Y βR⁻¹.
+    ``prediction`` (K,) at the centre, ``anomalies`` C (r, K) of the predictions per unit of the coordinates of
+    ``basis`` U (N, r), ``weighted`` C βR⁻¹.
     """
 
     prediction: Array
     anomalies: Array
     weighted: Array
+    basis: Array
 
 
 @dataclass(frozen=True)
@@ -107,8 +109,8 @@ def acceleration(step: Step, tangent: Tangent, lengths: Array, predictions: Arra
         return np.zeros_like(step.direction)
     shortest = runnable[np.argmin(lengths[runnable])]
     a = lengths[shortest]
-    departure = predictions[shortest] - tangent.prediction - a * step.direction @ tangent.anomalies
-    bend = -step.hessian.solve(tangent.weighted @ (departure * 2 / a**2))
+    departure = predictions[shortest] - tangent.prediction - a * (step.direction @ tangent.basis) @ tangent.anomalies
+    bend = -step.hessian.solve(tangent.basis @ (tangent.weighted @ (departure * 2 / a**2)))
     longest = MOST_BENT * float(np.linalg.norm(step.direction))
     return np.asarray(bend * min(1.0, longest / (float(np.linalg.norm(bend)) or 1.0)))
 

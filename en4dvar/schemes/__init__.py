@@ -42,7 +42,7 @@ class Weights:
 class Evaluation:
     """What a forecast says about the centre: whitened innovation ``d`` (K',) and whitened anomalies ``S`` (K', N).
 
-    ``basis`` (N, r): orthonormal columns that hold the rows of S, where it is known that there are such.
+    With ``basis`` U (N, r), orthonormal columns, ``S`` (K', r) is per unit of its coordinates: the anomalies are S Uᵀ.
     """
 
     d: Array
@@ -80,7 +80,8 @@ class Step:
 def gauss_newton(weights: Weights, evaluation: Evaluation) -> Step:
     """The analysis that all schemes share: g = (N−1) w − Sᵀd, A = (N−1) I + SᵀS, δw = −A⁻¹g, T = √(N−1) A^{-1/2}."""
     hessian = Hessian.of(evaluation.S, evaluation.basis)
-    gradient = hessian.prior_precision * weights.w - evaluation.S.T @ evaluation.d
+    slope = evaluation.S.T @ evaluation.d
+    gradient = hessian.prior_precision * weights.w - (slope if evaluation.basis is None else evaluation.basis @ slope)
     return Step(gradient, hessian, -hessian.solve(gradient))
 
 
@@ -114,11 +115,11 @@ class Scheme(Protocol):
     def linearise(
         self, weights: Weights, basis: Array, predictions: Array, central: Array, active: Array
     ) -> tuple[Array, Array]:
-        """Reference prediction (Ky,) and anomalies per unit weight (N, Ky).
+        """Reference prediction (Ky,) and anomalies C (r, Ky) per unit of the coordinates of ``basis``.
 
         ``predictions`` (N, Ky) of the members of :meth:`member_weights`, ``central`` (Ky,) of the centre, ``active``
-        (N,) bool; rows of failed members are not read. ``basis`` (N, r) spans the prior anomalies
-        (:func:`en4dvar.linalg.anomaly_basis`).
+        (N,) bool; rows of failed members are not read. ``basis`` U (N, r) spans the prior anomalies
+        (:func:`en4dvar.linalg.anomaly_basis`): per unit weight the anomalies are U C.
         """
 
     def step(self, weights: Weights, evaluation: Evaluation) -> Step:

@@ -43,18 +43,18 @@ class En4DVar:
     ) -> tuple[Array, Array]:
         """Reference prediction (Ky,) and anomalies Y = T⁻¹(P − p̄) or (P − p_c)/ε, projected on the prior anomalies.
 
-        Y = U C, with C the minimum-norm regression of the survivors' predictions on their coordinates. With all
-        members alive and r = N − 1 this is Y itself. With r < N − 1 it keeps the weights from fitting nonlinearity
-        along directions that do not move the state. With members lost, their rows follow from the survivors, exactly
-        if F and H are linear and the survivors span the control space.
+        Y = U C, returned as C (r, Ky), the minimum-norm regression of the survivors' predictions on their coordinates.
+        With all members alive and r = N − 1, U C is Y itself. With r < N − 1 it keeps the weights from fitting
+        nonlinearity along directions that do not move the state. With members lost, their rows follow from the
+        survivors, exactly if F and H are linear and the survivors span the control space.
         """
         coordinates = (self._spread(weights) @ basis)[active]
         survivors = predictions[active]
         if self.linearisation == "bundle":
-            return central, basis @ min_norm_fit(coordinates, survivors - central)
+            return central, min_norm_fit(coordinates, survivors - central)
         design = np.column_stack([np.ones(len(coordinates)), coordinates])
         fit = min_norm_fit(design, survivors - central)
-        return central + fit[0], basis @ fit[1:]
+        return central + fit[0], fit[1:]
 
     def step(self, weights: Weights, evaluation: Evaluation) -> Step:
         """Gauss–Newton direction and symmetric transform."""

@@ -41,7 +41,7 @@ def test_gradient_of_the_scheme_is_the_gradient_of_j(model, time_std, weights):
         at = Linearisation(reference[:9], y[:, :9])
         if run.rates is not None:
             at = Linearisation(reference[:9], y[:, :9], reference[9:], y[:, 9:])
-        gradients.append(scheme.step(state, Evaluation(*whiten(problem.observations, at))).gradient)
+        gradients.append(scheme.step(state, Evaluation(*whiten(problem.observations, at), basis)).gradient)
     gradient = np.mean(gradients, axis=0)
     h = 2e-5
     numeric = np.array([np.diff(j(np.stack([w - h * e, w + h * e])))[0] for e in np.eye(10)]) / (2 * h)

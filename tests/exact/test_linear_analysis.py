@@ -101,10 +101,12 @@ def test_single_observation_is_the_etkf():
     scheme = En4DVar("transform")
     mean, anomalies = centre(members)
     weights = scheme.init(6)
-    reference, spread = scheme.linearise(
-        weights, anomaly_basis(anomalies), predictions, np.zeros(1), np.ones(6, dtype=bool)
-    )
-    step = scheme.step(weights, Evaluation((y - reference) / np.sqrt(r), spread.T / np.sqrt(r)))
+    basis = anomaly_basis(anomalies)
+    reference, spread = scheme.linearise(weights, basis, predictions, np.zeros(1), np.ones(6, dtype=bool))
+    step = scheme.step(weights, Evaluation((y - reference) / np.sqrt(r), spread.T / np.sqrt(r), basis))
+    whole = scheme.step(weights, Evaluation((y - reference) / np.sqrt(r), (basis @ spread).T / np.sqrt(r)))
+    close(step.direction, whole.direction, 1e-13)
+    close(step.transform, whole.transform, 1e-13)
     close(mean + (step.direction + step.transform) @ anomalies, expected, 1e-12)
 
 
