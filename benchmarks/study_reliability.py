@@ -1,15 +1,18 @@
 """Reliability of model probabilities: experiments generated half by each law from its prior, both laws compared.
 
-    python benchmarks/study_reliability.py 200            # the paper's noise
-    python benchmarks/study_reliability.py 100 0.1        # noise of 0.1 µm: the experiment that decides
+    python benchmarks/study_reliability.py paper 200 [first]      # the paper's experiment, 0.3 % gel
+    python benchmarks/study_reliability.py deciding 100 [first]   # one that tells the laws apart
 
-Truths are drawn from the priors the evidence integrates over, so stated probability and frequency must agree.
+Adds a line an experiment to models/en4dvar_bubble/study/measured/reliability.csv, which the study's report shows; those
+found there are left out, so a run that was stopped continues. Truths are drawn from the priors the evidence integrates
+over, so stated probability and frequency must agree.
 """
 
 from __future__ import annotations
 
+import csv
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,55 +23,97 @@ from en4dvar.config import load_config
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.forecast import forecast
 from en4dvar.observations import Observations
-from en4dvar_bubble.study.evidence import DECISIVE, probability
+from en4dvar.problem import InverseProblem
+from en4dvar_bubble.study.evidence import probability
+from en4dvar_bubble.study.measured import FOLDER, RELIABILITY_HEAD
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
-STOP, MOST, FEWEST = 0.35, 60, 5
+FEWEST = 5
 
 
-def experiments(count: int, noise: float, gel: str = "03") -> tuple[np.ndarray, np.ndarray]:
-    """Δ log-evidence (count,) of the quadratic law, and whether it generated the data (count,)."""
-    configs = {m: load_config(CONFIGS / f"agarose_{gel}_{m}.yaml") for m in ("nh", "qlkv")}
-    bases = {m: build(c)[0] for m, c in configs.items()}
-    difference, quadratic = np.empty(count), np.arange(count) % 2 == 1
-    with ThreadsExecutor(2) as executor:
-        for i in range(count):
-            observed = draw(bases["qlkv" if quadratic[i] else "nh"], noise, np.random.default_rng([11, i]))
-            log = {
-                m: assimilate(replace(b, observations=observed), configs[m].assimilation, 1, executor).log_evidence
-                for m, b in bases.items()
-            }
-            difference[i] = log["qlkv"] - log["nh"]
-    return difference, quadratic
+@dataclass(frozen=True)
+class Experiment:
+    """Readings from 4.25–5.5 µs on, ``spacing`` apart (s), std ``noise`` (m), until the first below ``stop`` times the
+    largest so far; at most ``most``. ``changes`` of the priors, a law each.
+    """
+
+    gel: str = "03"
+    noise: float = 1.2e-6
+    spacing: tuple[float, float] = (1.25e-6, 2e-6)
+    stop: float = 0.35
+    most: int = 60
+    changes: dict[str, dict[str, str]] = field(default_factory=dict)
 
 
-def draw(base, noise: float, rng: np.random.Generator) -> Observations:
+EXPERIMENTS = {
+    "paper": Experiment(),
+    # 1 % gel, two frames a µs, 0.3 µm, 32 µs: growth, collapse and the first rebound
+    "deciding": Experiment(gel="10", noise=0.3e-6, spacing=(0.4e-6, 0.6e-6), stop=-1.0, most=64),
+}
+
+
+def problems(experiment: Experiment) -> dict[str, tuple[InverseProblem, object]]:
+    """Law → a problem to put readings in, and the settings of its estimation."""
+    found = {}
+    for law in ("nh", "qlkv"):
+        changes = {f"parameters.{k}": v for k, v in experiment.changes.get(law, {}).items()}
+        config = load_config(CONFIGS / f"agarose_{experiment.gel}_{law}.yaml", changes)
+        found[law] = (build(config)[0], config.assimilation)
+    return found
+
+
+def draw(base: InverseProblem, experiment: Experiment, rng: np.random.Generator) -> Observations:
     """Readings of one bubble drawn from the prior; when they end is decided by the readings alone."""
-    prior = base.prior
+    prior, most, noise = base.prior, experiment.most, experiment.noise
     while True:
         x = prior.mean + prior.std * rng.standard_normal(len(prior.names))
-        times = rng.uniform(4.25e-6, 5.5e-6) + np.cumsum(np.r_[0.0, rng.uniform(1.25e-6, 2e-6, MOST - 1)])
-        ones = np.ones(MOST)
+        gaps = rng.uniform(*experiment.spacing, most - 1)
+        times = rng.uniform(4.25e-6, 5.5e-6) + np.cumsum(np.r_[0.0, gaps])
+        ones = np.ones(most)
         run = forecast(replace(base, observations=Observations(times, ones, noise * ones, 0 * ones, ones)), x[None])
-        values = run.predictions[0] + noise * rng.standard_normal(MOST)
+        values = run.predictions[0] + noise * rng.standard_normal(most)
         if run.failures[0]:
             continue
-        below = np.flatnonzero(values < STOP * np.maximum.accumulate(values))
-        k = int(below[0]) + 1 if len(below) else MOST
+        below = np.flatnonzero(values < experiment.stop * np.maximum.accumulate(values))
+        k = int(below[0]) + 1 if len(below) else most
         if k >= FEWEST:
             return Observations(times[:k], values[:k], noise * ones[:k], 0 * ones[:k], ones[:k])
 
 
+def compare(experiment: Experiment, number: int, executor: ThreadsExecutor) -> tuple[str, float]:
+    """The law that generated experiment ``number`` and the log-evidence of the quadratic over the neo-Hookean law."""
+    bases = problems(experiment)
+    law = "qlkv" if number % 2 else "nh"
+    observed = draw(bases[law][0], experiment, np.random.default_rng([11, number]))
+    log = {
+        name: assimilate(replace(base, observations=observed), settings, 1, executor).log_evidence  # type: ignore[arg-type]
+        for name, (base, settings) in bases.items()
+    }
+    return law, log["qlkv"] - log["nh"]
+
+
+def main() -> None:
+    name, count = sys.argv[1], int(sys.argv[2])
+    first = int(sys.argv[3]) if len(sys.argv) > 3 else 0
+    file = FOLDER / "reliability.csv"
+    kept = list(csv.reader(file.read_text(encoding="utf-8").splitlines())) if file.exists() else [RELIABILITY_HEAD]
+    done = {(row[0], row[1]) for row in kept[1:]}
+    with ThreadsExecutor(2) as executor:
+        for number in range(first, first + count):
+            if (name, str(number)) in done:
+                continue
+            law, difference = compare(EXPERIMENTS[name], number, executor)
+            with file.open("a", encoding="utf-8", newline="") as stream:
+                writer = csv.writer(stream, lineterminator="\n")
+                writer.writerows(
+                    [*([] if file.stat().st_size else [RELIABILITY_HEAD]), [name, number, law, f"{difference:.4f}"]]
+                )
+    rows = [row for row in csv.reader(file.read_text(encoding="utf-8").splitlines()) if row[0] == name]
+    delta = np.array([float(row[3]) for row in rows])
+    right = (delta > 0) == np.array([row[2] == "qlkv" for row in rows])
+    stated = np.maximum(probability(delta), probability(-delta))
+    print(f"{name}: {len(rows)} experiments, {right.mean():.3f} decided rightly, stated {stated.mean():.3f}")
+
+
 if __name__ == "__main__":
-    noise = float(sys.argv[2]) * 1e-6 if len(sys.argv) > 2 else 1.2e-6
-    delta, truth = experiments(int(sys.argv[1]), noise, sys.argv[3] if len(sys.argv) > 3 else "03")
-    p = probability(delta)
-    right = (delta > 0) == truth
-    print(f"decided rightly {right.mean():.3f}; undecidable {np.mean(np.abs(delta) < DECISIVE):.3f}")
-    confidence = np.maximum(p, 1 - p)
-    for low, high in ((0.5, 0.6), (0.6, 0.75), (0.75, 0.9), (0.9, 0.99), (0.99, 1.0001)):
-        here = (confidence >= low) & (confidence < high)
-        if here.any():
-            n, stated = int(here.sum()), float(confidence[here].mean())
-            error = np.sqrt(stated * (1 - stated) / n)
-            print(f"stated {stated:.3f}: right {right[here].mean():.3f} of {n} (binomial std {error:.3f})")
+    main()

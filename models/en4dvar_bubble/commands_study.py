@@ -12,7 +12,7 @@ import click
 
 
 @click.command()
-@click.argument("config", type=click.Path())
+@click.argument("configs", metavar="CONFIG...", nargs=-1, required=True, type=click.Path())
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a value of the configuration.")
 @click.option("--data", metavar="FILE", help="Data file (or glob) instead of data.path.")
 @click.option(
@@ -29,16 +29,18 @@ import click
 @click.option("--resume", is_flag=True, help="Continue an interrupted sweep.")
 @click.option("--workers", type=click.IntRange(min=1), help="Threads; the numbers do not depend on it.")
 def sweep(
-    config: str, settings: tuple[str, ...], data: str | None, trajectories: int, shift: str, step: str, width: float,
-    refine: int, out: Path | None, force: bool, resume: bool, workers: int | None,
+    configs: tuple[str, ...], settings: tuple[str, ...], data: str | None, trajectories: int, shift: str, step: str,
+    width: float, refine: int, out: Path | None, force: bool, resume: bool, workers: int | None,
 ) -> None:  # fmt: skip
     """Fit every data set by a search over simulations (the paper's IMR approach, NRMSE).
 
-    The design spans the priors of the configuration; the time shift is searched within --shift.
+    The design spans the priors of the configuration; the time shift is searched within --shift. Several
+    configurations of one model share a design, and each trajectory is computed once for all their data sets.
 
     \b
-    Example:
-      en4dvar sweep configs/agarose_03_qlkv.yaml --trajectories 200000 --refine 4
+    Examples:
+      en4dvar sweep configs/agarose_03_qlkv.yaml --refine 4
+      en4dvar sweep configs/agarose_03_qlkv.yaml configs/agarose_10_qlkv.yaml --trajectories 200000
     """
     import hashlib
 
@@ -51,22 +53,22 @@ def sweep(
 
     if force and resume:
         raise click.UsageError("--force and --resume exclude each other")
-    loaded = load_config(config, _overrides(settings, data))
+    loaded = [load_config(config, _overrides(settings, data)) for config in configs]
     try:
         within, grid = parse_quantity(shift, "s"), parse_quantity(step, "s")
     except UnitError as error:
         raise click.UsageError(str(error)) from None
     if within < 0 or grid <= 0 or not width > 0:
         raise click.UsageError("--shift must not be negative, --step and --width must be positive")
-    problems = build(loaded)
+    problems = [problem for config in loaded for problem in build(config)]
     chosen = SweepSettings(trajectories, within, grid, width, rounds=refine)
-    folder = out or Path("runs") / f"{loaded.name}_sweep"
+    folder = out or Path("runs") / f"{loaded[0].name}_sweep"
     readings = b"".join(p.observations.times.tobytes() + p.observations.values.tobytes() for p in problems)
-    key = hashlib.sha256(f"{loaded.resolved}{chosen}".encode() + readings).hexdigest()
+    key = hashlib.sha256(f"{[c.resolved for c in loaded]}{chosen}".encode() + readings).hexdigest()
     chunks = prepare_folder(folder / "chunks", key, "force" if force else "resume" if resume else "new")
     with _bar(trajectories + refinement_size(chosen, len(problems))) as progress:
         try:
-            result = run_sweep(problems, chosen, loaded.seed, workers or _cores(), chunks, progress)
+            result = run_sweep(problems, chosen, loaded[0].seed, workers or _cores(), chunks, progress)
         except KeyboardInterrupt:
             words = [word for word in sys.argv[1:] if word not in ("--force", "--resume")]
             again = shlex.join(["en4dvar", *words, "--resume"])
@@ -85,24 +87,35 @@ def sweep(
 )
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the results; default runs/<name>.")
 @click.option("--force", is_flag=True, help="Replace an earlier study.")
+@click.option("--resume", is_flag=True, help="Continue a study that was interrupted.")
 @click.option("--workers", type=click.IntRange(min=1), help="Threads; the numbers do not depend on it.")
-def study(config: str, settings: tuple[str, ...], out: Path | None, force: bool, workers: int | None) -> None:
+def study(
+    config: str, settings: tuple[str, ...], out: Path | None, force: bool, resume: bool, workers: int | None
+) -> None:
     """Repeat the paper's study: sweep and En4D-Var, three models, tables, figures, population.
 
     \b
     Example:
       en4dvar study configs/agarose_study.yaml
     """
+    import shutil
+
     from en4dvar.errors import OutputError
+    from en4dvar_bubble.study.keep import FOLDER, Keep, key_of
     from en4dvar_bubble.study.report import write_study
     from en4dvar_bubble.study.run import run_study
     from en4dvar_bubble.study.settings import load_study
 
     plan = load_study(config, _overrides(settings, None))
     folder = out or Path("runs") / plan.name
-    if folder.exists() and any(folder.iterdir()) and not force:
-        raise OutputError(f"{folder}: is not empty; give --force to replace its study")
-    result = run_study(plan, workers or _cores(), lambda message: click.echo(message, err=True))
+    if force and resume:
+        raise click.UsageError("--force and --resume exclude each other")
+    if folder.exists() and any(folder.iterdir()) and not (force or resume):
+        raise OutputError(f"{folder}: is not empty; give --resume to continue its study or --force to replace it")
+    if force:
+        shutil.rmtree(folder / FOLDER, ignore_errors=True)
+    keep = Keep(folder / FOLDER, key_of(plan))
+    result = run_study(plan, workers or _cores(), lambda message: click.echo(message, err=True), keep)
     page = write_study(result, folder)
     for gel, comparison in result.comparisons.items():
         click.echo(f"{gel}: {comparison.undecidable} of {len(comparison.single)} data sets cannot tell the laws apart")

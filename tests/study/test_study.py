@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from click.testing import CliRunner
 
 from en4dvar.assimilate import assimilate
@@ -86,6 +88,38 @@ def test_tables_hold_the_printed_values(small):
 def test_an_earlier_study_is_kept(small):
     _, _, call = small
     assert isinstance(CliRunner().invoke(study_command, call).exception, OutputError)
+
+
+def test_results_as_netcdf(small):
+    out, _, _ = small
+    with xr.open_datatree(out / "study.nc") as tree:
+        assert "SYNTHETIC" in tree.attrs["title"]
+        fit = tree["/0.3 %/qlkv"].to_dataset()
+        assert dict(fit.sizes) == {"dataset": 4, "draw": 48}
+        assert fit["G"].attrs["units"] == "Pa"
+        rows = list(csv.DictReader((out / "sets.csv").read_text().splitlines()))
+        row = next(r for r in rows if (r["gel"], r["model"], r["parameter"]) == ("0.3 %", "qlkv", "G"))
+        told = fit.sel(dataset=row["dataset"])
+        assert float(told["G"].mean()) * 1e-3 == pytest.approx(float(row["en4dvar_mean"]), rel=1e-5)
+        assert float(told["sweep_G"]) * 1e-3 == pytest.approx(float(row["sweep"]), rel=1e-5)
+        assert float(told["truth_G"]) * 1e-3 == pytest.approx(float(row["truth"]), rel=1e-5)
+        assert tree["/1 %/population"].to_dataset()["mean_R0"].attrs["units"] == "m"
+
+
+@pytest.mark.slow
+def test_a_study_that_lost_some_results_is_resumed_to_the_same_tables(small):
+    out, _, call = small
+    before = {file.name: file.read_bytes() for file in [*out.glob("*.csv"), *out.glob("table*.md")]}
+    lost = out / "checkpoints" / "population_1_qlkv"
+    kept = out / "checkpoints" / "population_0_3_qlkv"
+    stamp = kept.stat().st_mtime_ns
+    lost.unlink()
+    next((out / "checkpoints").glob("sweep_0_3_qlkv/*.npz")).unlink()
+    result = CliRunner().invoke(study_command, [*call, "--resume"])
+    assert result.exit_code == 0, (result.output, result.exception)
+    assert lost.exists()
+    assert kept.stat().st_mtime_ns == stamp
+    assert {file.name: file.read_bytes() for file in [*out.glob("*.csv"), *out.glob("table*.md")]} == before
 
 
 def test_faults_of_the_study_file(tmp_path):

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -127,6 +131,41 @@ def test_the_design_is_shared(problems):
     other = replace(problems[1], fixed={"G": 1.0})
     with pytest.raises(ConfigError, match="the design is shared"):
         run_sweep([problems[0], other], SMALL, seed=1)
+
+
+def test_one_design_serves_two_gels_and_each_keeps_to_its_own_range(problems):
+    stiff = build(load_config(CONFIGS / "agarose_10_qlkv.yaml"))[:2]
+    calls = []
+    result = run_sweep(
+        [*problems, *stiff], replace(SMALL, rounds=1), seed=1, progress=lambda done, _: calls.append(done)
+    )
+    assert calls[-1] == result.trajectories == 192 + 2 * 32 * 5  # once, not once a gel
+    kept = [j for j, name in enumerate(problems[0].prior.names) if name != "t_s"]
+    for sets, part in ((problems, result.part(slice(0, 3))), (stiff, result.part(slice(3, 5)))):
+        prior = sets[0].prior
+        assert part.names == tuple(p.observations.name for p in sets)
+        z = (np.log(part.theta) - prior.mean[kept]) / prior.std[kept]
+        assert np.all(np.abs(z) <= SMALL.width + 1e-6)
+    soft, hard = result.theta[:3, 0], result.theta[3:, 0]
+    assert soft.max() < 1300 < 2800 < hard.min()  # their ranges of G do not meet: 0.5 and 7 kPa, a factor 2.46 each way
+
+
+@pytest.mark.slow
+def test_a_killed_sweep_is_resumed_to_the_same_numbers(tmp_path):
+    call = [sys.executable, "-c", "from en4dvar.cli import main; main()", "sweep"]
+    call += [str(CONFIGS / "agarose_03_nh.yaml"), "--trajectories", "16384"]
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    subprocess.run([*call, "--out", str(whole)], check=True, capture_output=True)
+    with subprocess.Popen(
+        [*call, "--out", str(killed)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
+        while process.poll() is None and len(list(killed.glob("chunks/*.npz"))) < 2:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    assert 2 <= len(list(killed.glob("chunks/*.npz"))) < 8
+    subprocess.run([*call, "--out", str(killed), "--resume"], check=True, capture_output=True)
+    assert (killed / "sweep.csv").read_bytes() == (whole / "sweep.csv").read_bytes()
 
 
 def test_readings_before_the_start_are_refused(problems):

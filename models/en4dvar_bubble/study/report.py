@@ -10,7 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from en4dvar.errors import OutputError
-from en4dvar.files import write_text
+from en4dvar.files import write_bytes, write_text
 from en4dvar.report.style import COLUMN, DARK, LIGHT, css_variables, inline_svg, save_figure
 from en4dvar_bubble.study import tables
 from en4dvar_bubble.study.evidence import DECISIVE, MISFIT, probability, verdict
@@ -18,6 +18,7 @@ from en4dvar_bubble.study.figures import all_figures
 from en4dvar_bubble.study.paper import LABELS, NAMES, QUANTITIES, ROUTES, Route
 from en4dvar_bubble.study.population import HyperPrior
 from en4dvar_bubble.study.run import Study, per_set_csv
+from en4dvar_bubble.study.store import study_netcdf
 
 ROUTE_KEYS: tuple[Route, ...] = ("sweep", "en4dvar")
 Block = dict[str, Any]
@@ -37,6 +38,7 @@ def write_study(study: Study, directory: Path) -> Path:
         write_text(directory / f"table{number}.tex", tables.as_latex(study, rows, route))
     write_text(directory / "sets.csv", per_set_csv(study))
     write_text(directory / "study.yaml", study.plan.text)
+    write_bytes(directory / "study.nc", study_netcdf(study))
     drawn = []
     for name, caption, figure in all_figures(study):
         save_figure(figure, figures_folder, name)
@@ -82,8 +84,9 @@ def _method(study: Study) -> str:
     s, seconds = study.plan.sweep, study.seconds
     members = next(iter(next(iter(study.fits.values())).values())).analyses[0].settings.members
     sweep = (
-        f"{s.trajectories} trajectories of a Sobol design a model and gel, uniform in the transformed parameters "
-        f"within {s.width:g} prior standard deviations, then {s.rounds} rounds of refinement with {s.local} a set; "
+        f"{s.trajectories} trajectories a model, of one Sobol design for all data sets (quasi-static: for those with "
+        "the same G), uniform in the transformed parameters; each set is searched within "
+        f"{s.width:g} prior standard deviations, then {s.rounds} rounds of refinement with {s.local} a set; "
         f"nearest neighbour in time on a grid of {s.step * 1e6:g} µs, time shift within ±{s.shift * 1e6:g} µs; "
         "weights are the NRMSE of the best fits"
     )

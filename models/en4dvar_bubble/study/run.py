@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from en4dvar.prior import Prior
 from en4dvar.problem import Analysis, InverseProblem
 from en4dvar.state import Array
 from en4dvar_bubble.study.evidence import Comparison, compare_laws
+from en4dvar_bubble.study.keep import Keep
 from en4dvar_bubble.study.one_gel import OneGel, fit_one_gel
 from en4dvar_bubble.study.paper import QUANTITIES, Model, Route
 from en4dvar_bubble.study.population import Population, estimate_population
@@ -118,40 +120,51 @@ class Study:
         return float(np.mean(inside)) if inside else float("nan")
 
 
-def run_study(plan: StudyPlan, workers: int = 1, tell: Tell | None = None) -> Study:
+def run_study(plan: StudyPlan, workers: int = 1, tell: Tell | None = None, keep: Keep | None = None) -> Study:
     """Compute everything; the truth of a twin is read last and enters no estimate.
+
+    ``keep``: where sweeps and populations are kept as they are done, and found by a study that continues.
 
     Raises
     ------
     DataError, ConfigError, TooFewMembersError: as the routes do.
     """
     say = tell or (lambda message: None)
-    seconds = {"sweep": 0.0, "en4dvar": 0.0, "population": 0.0}
-    fits: dict[str, dict[Model, Fit]] = {}
-    for gel, configs in plan.configs.items():
-        fits[gel] = {}
-        for model, config in configs.items():
-            problems = build(config)
-            start = time.perf_counter()
-            sweep = run_sweep(problems, plan.sweep, plan.seed, workers)
-            middle = time.perf_counter()
-            say(f"{gel} {model}: sweep of {sweep.trajectories} trajectories in {middle - start:.1f} s")
-            with make_executor(config.model, workers) as executor:
-                analyses = tuple(assimilate(p, config.assimilation, config.seed, executor) for p in problems)
-            end = time.perf_counter()
-            say(f"{gel} {model}: En4D-Var of {len(problems)} data sets in {end - middle:.1f} s")
-            seconds["sweep"] += middle - start
-            seconds["en4dvar"] += end - middle
-            fits[gel][model] = Fit(gel, model, problems, sweep, analyses)
+    seconds = {}
+    start = time.perf_counter()
+    problems = {(gel, m): build(c) for gel, models in plan.configs.items() for m, c in models.items()}
+    sweeps: dict[tuple[str, Model], SweepResult] = {}
+    for sharing in _sharing(problems):
+        every = [p for key in sharing for p in problems[key]]
+        began = time.perf_counter()
+        found = run_sweep(every, plan.sweep, plan.seed, workers, keep.sweep(*sharing[0]) if keep else None)
+        first = 0
+        for key in sharing:
+            sweeps[key] = found.part(slice(first, first + len(problems[key])))
+            first += len(problems[key])
+        told = " and ".join(f"{gel} {model}" for gel, model in sharing)
+        spent = time.perf_counter() - began
+        say(f"{told}: sweep of {found.trajectories} trajectories against {len(every)} data sets in {spent:.1f} s")
+    seconds["sweep"] = time.perf_counter() - start
+    start = time.perf_counter()
+    fits: dict[str, dict[Model, Fit]] = {gel: {} for gel in plan.configs}
+    for (gel, model), sets in problems.items():
+        config, began = plan.configs[gel][model], time.perf_counter()
+        with make_executor(config.model, workers) as executor:
+            analyses = tuple(assimilate(p, config.assimilation, config.seed, executor) for p in sets)
+        say(f"{gel} {model}: En4D-Var of {len(sets)} data sets in {time.perf_counter() - began:.1f} s")
+        fits[gel][model] = Fit(gel, model, sets, sweeps[gel, model], analyses)
+    seconds["en4dvar"] = time.perf_counter() - start
     start = time.perf_counter()
     populations, comparisons = {}, {}
     for gel, models in fits.items():
-        found: dict[Model, Population | None]
-        found = {m: _population(fit, plan, workers) for m, fit in models.items() if m in ("nh", "qlkv")}
-        if (general := found.get("qlkv")) is not None:
+        kept = {m: fit for m, fit in models.items() if m in ("nh", "qlkv")}
+        found_for: dict[Model, Population | None]
+        found_for = {m: _population(fit, plan, workers, keep) for m, fit in kept.items()}
+        if (general := found_for.get("qlkv")) is not None:
             populations[gel] = general
-        if len(found) == 2:
-            comparisons[gel] = _compare(models, found, workers)
+        if len(kept) == 2:
+            comparisons[gel] = _compare(models, found_for, workers, keep)
     seconds["population"] = time.perf_counter() - start
     say(f"population and model comparison in {seconds['population']:.1f} s")
     truth = read_truth(plan.truth) if plan.truth else {}
@@ -164,20 +177,37 @@ def _start(fit: Fit) -> Array:
     return np.stack([fit.prior.from_physical(m) for m in members])
 
 
-def _population(fit: Fit, plan: StudyPlan, workers: int) -> Population | None:
+def _sharing(problems: Mapping[tuple[str, Model], Sequence[InverseProblem]]) -> list[list[tuple[str, Model]]]:
+    """Gel and model of the data sets that one design serves: those of one model with the same values fixed."""
+    groups: dict[object, list[tuple[str, Model]]] = {}
+    for (gel, model), sets in problems.items():
+        groups.setdefault((model, tuple(sorted(sets[0].fixed.items()))), []).append((gel, model))
+    return list(groups.values())
+
+
+def _population(fit: Fit, plan: StudyPlan, workers: int, keep: Keep | None) -> Population | None:
     """None with fewer than 3 data sets."""
     if len(fit.problems) < 3:
         return None
     names = [name for name in POPULATION if fit.estimated(name)]
-    return estimate_population(
-        SetRuns(fit.problems, workers), _start(fit), fit.prior, names, plan.seed, effort=plan.population
-    )
+    compute = partial(_estimated, fit, plan, workers, names)
+    return keep.of(Population, compute, fit.gel, fit.model) if keep else compute()
 
 
-def _compare(models: Mapping[Model, Fit], populations: Mapping[Model, Population | None], workers: int) -> Comparison:
+def _estimated(fit: Fit, plan: StudyPlan, workers: int, names: Sequence[str]) -> Population:
+    runs = SetRuns(fit.problems, workers)
+    return estimate_population(runs, _start(fit), fit.prior, names, plan.seed, effort=plan.population)
+
+
+def _compare(
+    models: Mapping[Model, Fit], populations: Mapping[Model, Population | None], workers: int, keep: Keep | None
+) -> Comparison:
     single = {m: np.array([a.log_evidence for a in models[m].analyses]) for m in populations}
     pooled = {m: np.nan if found is None else found.log_evidence for m, found in populations.items()}
-    gels = {m: _one_gel(models[m], workers) for m in populations}
+    gels = {}
+    for m in populations:
+        compute = partial(_one_gel, models[m], workers)
+        gels[m] = keep.of(OneGel, compute, models[m].gel, m) if keep else compute()
     return compare_laws(single["qlkv"] - single["nh"], pooled["qlkv"] - pooled["nh"], gels["nh"], gels["qlkv"])
 
 

@@ -1,8 +1,9 @@
 """Route 1, the paper's "IMR Approach": every trajectory of one design against every data set, best fit by NRMSE.
 
 The design is a scrambled Sobol sequence, uniform in the transformed coordinates of the priors within ``width`` standard
-deviations of their means. It is shared by the data sets, so a trajectory is computed once. Trajectories stream
-through in chunks; of each chunk only the best fit of every set is kept, on disk where a folder is given, and an
+deviations of their means. It is shared by all data sets, so a trajectory is computed once: where their priors differ
+(two gels) it fills the smallest box around all of them, and each set takes its fit from within its own. Trajectories
+stream through in chunks; of each chunk only the best fit of every set is kept, on disk where a folder is given, and an
 interrupted sweep continues with the chunks that are missing.
 """
 
@@ -11,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,6 +20,7 @@ import numpy as np
 
 from en4dvar.errors import ConfigError, DataError, OutputError
 from en4dvar.files import atomic_path
+from en4dvar.forward import ForwardModel
 from en4dvar.prior import member_stream
 from en4dvar.problem import InverseProblem
 from en4dvar.state import TIME_SHIFT, Array, Parameter
@@ -74,6 +76,12 @@ class SweepResult:
     nrmse: Array
     trajectories: int
 
+    def part(self, rows: slice) -> SweepResult:
+        """Of some of the data sets."""
+        return replace(
+            self, names=self.names[rows], theta=self.theta[rows], shift=self.shift[rows], nrmse=self.nrmse[rows]
+        )
+
     @property
     def mean(self) -> Array:
         """(n,) NRMSE-weighted mean over the sets, Σ w θ / Σ w with w the NRMSE of the best fit."""
@@ -97,19 +105,21 @@ def run_sweep(
 
     Parameters
     ----------
-    problems: with one model and one prior. A prior on ``t_s`` plays no part: the shift is searched within its limits.
+    problems: of one model and the same parameters with the same transforms, whose priors may differ. A prior on
+        ``t_s`` plays no part: the shift is searched within its limits.
     folder: where finished chunks are kept, and found again by a sweep that continues; the caller clears it.
     progress: called with the trajectories done and to do.
 
     Raises
     ------
-    ConfigError: the data sets do not share a model, fixed values or prior; nothing but t_s is estimated.
+    ConfigError: the data sets do not share a model, fixed values or parameters; nothing but t_s is estimated.
     DataError: no trajectory fits a set.
     """
     sweep = _Sweep(problems, settings, workers, folder)
     total = settings.trajectories + refinement_size(settings, len(problems))
     done, best = 0, None
-    design = sobol_box(sweep.mean, settings.width * sweep.std, settings.trajectories, seed)
+    low, high = sweep.low.min(axis=0), sweep.high.max(axis=0)
+    design = sobol_box((low + high) / 2, (high - low) / 2, settings.trajectories, seed)
     for x, found in sweep.run(design):
         best = found if best is None else best.merged(found)
         done += len(x)
@@ -141,6 +151,15 @@ def sobol_box(centre: Array, half: Array, count: int, seed: int) -> Array:
     return np.asarray(centre + (2 * unit - 1) * half)
 
 
+def _same_model(a: BubbleModel, b: ForwardModel) -> bool:
+    """Whether two configurations made the same model. A law has no settings but its parameters: its class is all."""
+    if a is b:
+        return True
+    if not isinstance(b, BubbleModel) or type(a.law) is not type(b.law):
+        return False
+    return all(getattr(a, f.name) == getattr(b, f.name) for f in fields(a) if f.name != "law")
+
+
 class _Sweep:
     """What all chunks share: model, targets, and how a coordinate becomes a state."""
 
@@ -149,9 +168,13 @@ class _Sweep:
         if not isinstance(first.model, BubbleModel):
             raise ConfigError("a sweep needs the model 'bubble'")
         for other in problems[1:]:
-            if other.prior.terms != first.prior.terms or other.fixed != first.fixed or other.model is not first.model:
+            same = [(t.parameter.name, t.transform, t.bounds) for t in other.prior.terms] == [
+                (t.parameter.name, t.transform, t.bounds) for t in first.prior.terms
+            ]
+            if not same or other.fixed != first.fixed or not _same_model(first.model, other.model):
                 raise ConfigError(
-                    f"{other.observations.name}: the design is shared, but priors or fixed values refer to the data set"
+                    f"{other.observations.name}: the design is shared, but model, parameters or fixed values are not "
+                    f"those of {first.observations.name}"
                 )
         self.model, self.settings, self.workers, self.folder = first.model, settings, workers, folder
         self.terms = tuple(t for t in first.prior.terms if t.parameter.name != TIME_SHIFT.name)
@@ -159,8 +182,10 @@ class _Sweep:
             raise ConfigError("nothing but the time shift is estimated; a sweep needs a prior on a parameter")
         self.fixed = {name: v for name, v in first.fixed.items() if name != TIME_SHIFT.name}
         self.parameters = tuple(t.parameter for t in self.terms)
-        self.mean = np.array([t.mean for t in self.terms])
-        self.std = np.array([t.std for t in self.terms])
+        kept = [first.prior.names.index(p.name) for p in self.parameters]
+        self.std = np.stack([p.prior.std[kept] for p in problems])  # (S, n), as the range of each set
+        means = np.stack([p.prior.mean[kept] for p in problems])
+        self.low, self.high = means - settings.width * self.std, means + settings.width * self.std
         earliest = 0.0 if first.model.start == "acoustic" else -np.inf
         try:
             self.aims: Targets = targets([p.observations for p in problems], settings.shift, settings.step, earliest)
@@ -182,7 +207,9 @@ class _Sweep:
         if not settings.rounds:
             return
         half = settings.width / 4 * self.std
-        x = np.stack([sobol_box(centre, half, settings.local, seed + 1 + s) for s, centre in enumerate(best.x)])
+        x = np.stack(
+            [sobol_box(c, h, settings.local, seed + 1 + s) for s, (c, h) in enumerate(zip(best.x, half, strict=True))]
+        )
         nrmse, shift = self._own(x)
         stream = member_stream(seed, "sweep refinement")
         for number in range(settings.rounds + 1):
@@ -205,8 +232,7 @@ class _Sweep:
         pairs = np.argsort(stream.uniform(size=(n_sets, count, count)), axis=2)[..., :2]
         b, c = (np.take_along_axis(x, pairs[..., k, None], axis=1) for k in (0, 1))
         step = stream.uniform(0.4, 1.0, (n_sets, count, 1)) * (b - c)
-        reach = self.settings.width * self.std
-        return np.clip(best.x[:, None] + step, self.mean - reach, self.mean + reach)
+        return np.clip(best.x[:, None] + step, self.low[:, None], self.high[:, None])
 
     def _own(self, x: Array) -> tuple[Array, Array]:
         """NRMSE and shift (S, L) of coordinates (S, L, n), each against its own set."""
@@ -238,6 +264,10 @@ class _Sweep:
 
     def _fit(self, x: Array) -> Best:
         nrmse, shift = self._score(x)
+        # the box around all priors holds coordinates that belong to no range of a set; a rounding is not outside
+        edge = 1e-9 * self.std
+        inside = np.all((x[:, None] >= self.low - edge) & (x[:, None] <= self.high + edge), axis=2)
+        nrmse = np.where(inside, nrmse, -np.inf)
         row, sets = np.argmax(nrmse, axis=0), np.arange(nrmse.shape[1])
         return Best(x[row], shift[row, sets], nrmse[row, sets])
 
