@@ -83,12 +83,12 @@ def opened(browser: Any) -> Iterator[Any]:
 
 
 @pytest.fixture(scope="session")
-def pages(analysis: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]]:
+def pages(analysis: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Kind of page → its file. One data set of the campaign has a name made to break out of the page."""
     with pytest.MonkeyPatch.context() as patch:  # the PDF and PNG copies of the figures are no part of a page
         patch.setattr(report, "save_figure", lambda *_: None)
         patch.setattr(overlay, "save_figure", lambda *_: None)
-        yield _write_pages(analysis, tmp_path_factory.mktemp("pages"))
+        return _write_pages(analysis, tmp_path_factory.mktemp("pages"))
 
 
 def _write_pages(analysis: Any, folder: Path) -> dict[str, Path]:
