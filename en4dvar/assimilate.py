@@ -17,12 +17,13 @@ from en4dvar.honesty import Caution, Ending, caution, examine
 from en4dvar.honesty.checks import down_weighted
 from en4dvar.likelihood import error_std, log_likelihood, robust_weights, whitened_residual
 from en4dvar.mda import assimilate_once
+from en4dvar.noise_scale import mean_beyond_mode
 from en4dvar.problem import Analysis, AssimilationSettings, InverseProblem, IterationRecord
 from en4dvar.schemes import Step, Weights
 from en4dvar.schemes.esmda import ESMDA
 from en4dvar.shape import examine_shape, guide
 from en4dvar.start import choose_start
-from en4dvar.state import NOISE_SCALE, Array
+from en4dvar.state import Array
 from en4dvar.units import convert
 
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
@@ -130,10 +131,10 @@ class _Run:
         space.forward_runs = state.forward_runs
         end = self.assimilate_repeatedly(state, self.mda) if self.mda else self.iterate(state)
 
-        posterior = space.control(end.weights.w + end.transform)
-        posterior = posterior + self.mean_beyond_mode(posterior, end.step)
+        posterior, mode = space.control(end.weights.w + end.transform), space.control(end.weights.w)
+        dfs = diag.dfs(end.step.hessian.singular_values, len(space.members))
+        posterior = posterior + mean_beyond_mode(problem, mode, posterior, dfs)
         posterior, refinement, refine_warnings = self.refine(posterior, state.refinement)
-        mode = space.control(end.weights.w)
         final = space.forecast(np.vstack([posterior, mode]), grid)
         after, last = final[:-1], final[-1:]
         self.require_members(after.failures, "posterior forecast")
@@ -227,23 +228,6 @@ class _Run:
         return LoopState(
             Weights(start.w, weights.T), self.space.forward_runs, start.warnings, tuple(records), worst_loss
         )
-
-    def mean_beyond_mode(self, posterior: Array, step: Step) -> Array:
-        """What the estimate of ln σ adds to the mode (n,) for the posterior mean; zero without a noise scale.
-
-        J depends on ln σ as e^{−2 ln σ}, so its derivatives with respect to ln σ and any two directions are −2 SᵀS.
-        The mean then lies −½ A⁻¹ tr(A⁻¹ ∇³J) = cov(x, ln σ) · DFS beyond the mode: the degrees of freedom that the fit
-        has used up. Source: Tierney & Kadane (1986), J. Am. Stat. Assoc. 81, 82. Gaussian errors only.
-        """
-        prior, name = self.problem.prior, NOISE_SCALE.name
-        if name not in prior.names or not has_noise_scale(self.problem) or self.problem.observations.huber is not None:
-            return np.zeros(posterior.shape[1])
-        column = prior.names.index(name)
-        if prior.terms[column].transform != "lognormal":
-            return np.zeros(posterior.shape[1])
-        anomalies = posterior - posterior.mean(axis=0)
-        covariance = anomalies.T @ anomalies[:, column] / (len(posterior) - 1)
-        return np.asarray(covariance * diag.dfs(step.hessian.singular_values, len(posterior)))
 
     def robust(
         self, prediction: Array, rate: Array | None, scale: Array | None

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -91,3 +92,26 @@ def run_and_signal(number: signal.Signals, after: float, *arguments: object, **v
         process.send_signal(number)
         _, told = process.communicate()
     return process.returncode, told
+
+
+def kill_after_writes(file: Path, writes: int, wait: float, *arguments: object, **variables: object) -> tuple[int, str]:
+    """Run, and SIGKILL ``wait`` seconds after ``file`` was written so many times; exit code (0: it had ended)."""
+    process = subprocess.Popen(command(*arguments), stderr=subprocess.PIPE, text=True, env=environment(**variables))
+    before = latest = _written(file)
+    while process.poll() is None and writes:
+        latest = _written(file)
+        if latest not in (before, 0):
+            before, writes = latest, writes - 1
+        time.sleep(0.001)
+    if process.poll() is None:
+        time.sleep(wait)
+        process.kill()
+    _, told = process.communicate()
+    return process.returncode, told
+
+
+def _written(file: Path) -> int:
+    try:
+        return file.stat().st_mtime_ns
+    except FileNotFoundError:
+        return 0

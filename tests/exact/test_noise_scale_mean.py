@@ -1,0 +1,81 @@
+"""Where the noise scale is estimated: the ensemble's mean against the posterior summed over a grid."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from toys import Vectorised, make_problem
+
+from en4dvar.assimilate import assimilate, log_posterior
+from en4dvar.noise_scale import log_derivatives, scale_skewness
+from en4dvar.prior import Prior, PriorTerm
+from en4dvar.problem import AssimilationSettings
+from en4dvar.state import NOISE_SCALE
+
+TERMS = {
+    "lognormal": PriorTerm.lognormal(NOISE_SCALE, 1.0, 0.4),
+    "normal": PriorTerm.normal(NOISE_SCALE, 1.0, 0.4),
+    "logit": PriorTerm.logit(NOISE_SCALE, (0.2, 4.0), 1.0, 1.0),
+}
+
+
+def summed(problem, mode, std):
+    """Mean and std (n,) of the posterior by the sum over a grid of 2 parameters."""
+    axes = [m + s * np.linspace(-6, 10, 121) for m, s in zip(mode, std, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    grid = grid[problem.prior.to_physical(grid)[:, 1] > 0.05]
+    log = log_posterior(problem, grid)
+    p = np.exp(log - log.max())
+    p /= p.sum()
+    mean = p @ grid
+    return mean, np.sqrt(p @ (grid - mean) ** 2)
+
+
+@pytest.mark.parametrize("transform", TERMS)
+@pytest.mark.parametrize("huber", [None, 1.345])
+def test_mean_of_the_noise_scale(huber, transform):
+    """The mode lies a good part of a standard deviation off, which is the leading order in 1/√K; the next is left."""
+    offsets = []
+    for seed in range(3):
+        base = make_problem(Vectorised(("a",)), [1.0], k=30, seed=seed)
+        prior = Prior((*base.prior.terms, TERMS[transform]))
+        problem = replace(base, prior=prior, observations=replace(base.observations, huber=huber))
+        analysis = assimilate(problem, AssimilationSettings(members=39), seed)
+        x, mode = (prior.from_physical(values) for values in (analysis.posterior, analysis.centre))
+        mean, std = summed(problem, mode, x.std(axis=0, ddof=1))
+        offsets.append([(mode[1] - mean[1]) / std[1], (x[:, 1].mean() - mean[1]) / std[1]])
+        assert abs(x[:, 0].mean() - mean[0]) < 0.1 * std[0]
+    of_mode, of_mean = np.mean(offsets, axis=0)
+    assert of_mode < -0.15
+    assert abs(of_mean) < 2 * of_mode**2
+
+
+@pytest.mark.parametrize("c", [0.7, 1.345, 3.0])
+def test_expectations_under_hubers_density(c):
+    def density(v):
+        return np.exp(-0.5 * v * v if abs(v) < c else 0.5 * c * c - c * abs(v))
+
+    def mean(of):
+        parts = [quad(lambda v: of(v) * density(v), a, b)[0] for a, b in ((0, c), (c, 60))]
+        return sum(parts) / sum(quad(density, a, b)[0] for a, b in ((0, c), (c, 60)))
+
+    norm = 2 * sum(quad(density, a, b)[0] for a, b in ((0, c), (c, 60)))
+    slope, edge = mean(lambda v: float(v < c)), 2 * density(c) / norm
+    square, weight = mean(lambda v: v * v * (v < c)), mean(lambda v: min(1.0, c / v) if v else 1.0)
+    score = mean(lambda v: (v * min(v, c) - 1) ** 2)
+    ratio, scale_ratio, information = scale_skewness(c)
+    assert information == pytest.approx(score, rel=1e-8)  # two forms of the Fisher information
+    assert ratio == pytest.approx((2 * slope - c * edge) / weight, rel=1e-8)
+    assert scale_ratio == pytest.approx((1 + 3 * square - c**3 * edge) / information, rel=1e-8)
+
+
+@pytest.mark.parametrize("transform", TERMS)
+def test_derivatives_of_the_logarithm(transform):
+    term, x, h = TERMS[transform], 0.8, 1e-3
+    u = np.log(term.to_physical(x + h * np.arange(-3, 4)))
+    stencils = ([-1, 9, -45, 0, 45, -9, 1], [2, -27, 270, -490, 270, -27, 2], [1, -8, 13, 0, -13, 8, -1])
+    expected = [np.dot(s, u) / (n * h**k) for k, (s, n) in enumerate(zip(stencils, (60, 180, 8), strict=True), 1)]
+    assert log_derivatives(term, x) == pytest.approx(expected, rel=1e-5, abs=1e-6)
