@@ -134,6 +134,10 @@ def report(path: str | Path, datasets: Sequence[str] = ()) -> Path:
     Raises :class:`OutputError`.
     """
     with RunDirectory.open(path, "report") as directory:
+        if (directory.work / "twin.nc").exists():
+            from en4dvar.twin_run import report_twin
+
+            return report_twin(directory)
         return _report(directory, datasets)
 
 

@@ -16,19 +16,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from en4dvar.errors import En4dvarError
+from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.forward import Failure, ForwardModel, Observable
 from en4dvar.moments import Moments
 from en4dvar.prior import Prior, member_stream
-from en4dvar.sequential import SequentialResult, SequentialSettings, predictions, run_sequential
-from en4dvar.series import Series
+from en4dvar.sequential import SequentialResult, SequentialSettings, SequentialState, predictions, run_sequential
+from en4dvar.series import Series, root_of_correlation
 from en4dvar.state import Array
 
 
 @dataclass(frozen=True)
 class TwinExperiment:
     """The truth's model is the members' model. ``error_std`` and ``initial_std`` are one number an observable or field.
+    ``error_correlation`` (p, p) is that of the errors of one instant, None: independent.
 
     Observations are taken every ``interval`` (the model's time unit); the first ``burn_in`` of ``cycles`` do not count
     in averages. ``fixed`` are the values of the parameters that ``prior`` does not draw.
@@ -42,6 +43,7 @@ class TwinExperiment:
     error_std: Mapping[str, float]
     initial_std: Mapping[str, float]
     burn_in: int = 0
+    error_correlation: Array | None = None
     prior: Prior | None = None
     fixed: Mapping[str, float] = field(default_factory=dict)
 
@@ -100,7 +102,12 @@ class TwinResult:
 
 
 def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, Series]:
-    """The truth (K, n_state) and its observations. Raises :class:`En4dvarError` where it cannot be integrated."""
+    """The truth (K, n_state) and its observations.
+
+    Raises
+    ------
+    En4dvarError: the truth cannot be integrated. ConfigError: the correlation of the errors does not fit.
+    """
     model, times = experiment.model, experiment.times
     start = _initial(experiment, [member_stream(seed, "truth")])
     (outcome,) = model.trajectories(start, times)
@@ -110,7 +117,12 @@ def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, Series]
     widths = [predictions([o], outcome).shape[1] for o in experiment.observables]
     std = np.repeat([experiment.error_std[o.name] for o in experiment.observables], widths)
     noise = member_stream(seed, "observation error").standard_normal(exact.shape)
-    return outcome.states, Series(times, exact + std * noise, std)
+    if experiment.error_correlation is not None:
+        try:
+            noise = noise @ root_of_correlation(experiment.error_correlation, len(std)).T
+        except ValueError as error:
+            raise ConfigError(f"twin.error_correlation: {error}") from None
+    return outcome.states, Series(times, exact + std * noise, std, experiment.error_correlation)
 
 
 def initial_ensemble(experiment: TwinExperiment, seed: int) -> Array:
@@ -123,8 +135,12 @@ def conduct(
     seed: int,
     executor: Executor | None = None,
     on_cycle: Callable[[int], None] | None = None,
+    resume: SequentialState | None = None,
+    keep: Callable[[Callable[[], SequentialState]], None] | None = None,
 ) -> TwinResult:
     """Draw a truth, observe it, assimilate the observations. The same seed gives the same bits for any executor.
+
+    ``resume`` and ``keep`` as for :func:`~en4dvar.sequential.run_sequential`.
 
     Raises
     ------
@@ -141,6 +157,8 @@ def conduct(
         seed,
         executor or SerialExecutor(),
         on_cycle,
+        resume,
+        keep,
     )
     return TwinResult(experiment, seed, truth, series, run)
 

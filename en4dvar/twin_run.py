@@ -1,24 +1,27 @@
-"""A twin experiment from YAML to a run directory: ``twin.nc`` and ``summary.csv``."""
+"""A twin experiment from YAML to a run directory: ``twin.nc``, ``summary.csv``, report. Resumable at any moment."""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import xarray as xr
-
+from en4dvar.checkpoint import FOLDER, CheckpointError, Keeper, digest, read_checkpoint, write_checkpoint
 from en4dvar.config import TwinConfig, load_twin
 from en4dvar.describe import table
+from en4dvar.errors import ConfigError, OutputError
 from en4dvar.executor import make_executor
 from en4dvar.files import atomic_path, write_text
+from en4dvar.fingerprint import Identity, identity
+from en4dvar.interrupt import Interrupted, terminate_as_interrupt
 from en4dvar.progress import RunLog
 from en4dvar.provenance import provenance
-from en4dvar.rundir import RunDirectory
+from en4dvar.rundir import Mode, RunDirectory
+from en4dvar.sequential import SequentialState
 from en4dvar.twin import TwinResult, conduct
+from en4dvar.twin_file import dataset, summary_csv
+
+IDENTITY, STATE = f"{FOLDER}/run", f"{FOLDER}/twin.cycle"
 
 
 def run_twin(
@@ -26,6 +29,7 @@ def run_twin(
     *,
     overrides: Mapping[str, Any] | None = None,
     force: bool = False,
+    resume: bool = False,
     on_cycle: Callable[[int], None] | None = None,
     command: str = "",
 ) -> TwinResult:
@@ -35,34 +39,105 @@ def run_twin(
     ----------
     config: a loaded configuration, or the path of a YAML file. overrides: of dotted keys, when it is a path.
     force: replace the files of an earlier run in the same directory.
+    resume: continue an interrupted run in the same directory, to the same bits.
     on_cycle: called with the number of each cycle, from 0.
     command: what the user typed, for the file's history.
 
     Raises
     ------
-    ConfigError, OutputError: before anything is computed. TooFewMembersError: the ensemble is lost.
+    ConfigError, OutputError: before anything is computed; also where a changed run cannot be resumed.
+    TooFewMembersError: the ensemble is lost. Interrupted: Ctrl-C or SIGTERM.
     """
     if not isinstance(config, TwinConfig):
         config = load_twin(config, overrides)
+    if force and resume:
+        raise ConfigError("force replaces a run, resume continues it; give one of them")
+    mode: Mode = "force" if force else "resume" if resume else "new"
     with (
-        RunDirectory.open(config.directory, "force" if force else "new") as directory,
-        RunLog(directory.claim("run.log")) as log,
+        terminate_as_interrupt(),
+        RunDirectory.open(config.directory, mode) as directory,
+        RunLog(directory.work / "run.log", append=resume) as log,
     ):
-        write_text(directory.claim("config.yaml"), config.text)
-        write_text(directory.claim("config.resolved.yaml"), config.resolved)
         attributes = {
             **provenance(config.text, config.document.file, command),
             "configuration_resolved": config.resolved,
+            "name": config.name,
+            "scheme": config.scheme,
         }
         log.write(attributes["history"])
-        with make_executor(config.experiment.model, config.execution.workers) as executor:
-            result = conduct(config.experiment, config.seed, executor, on_cycle)
+        run = identity(config.resolved, config.experiment.model, {})
+        _prepare(config, run, directory, resume)
+        result = _conduct(config, digest(run.settings.encode()), directory, log, resume, on_cycle)
         log.write("\n".join(f"member lost: {reason}" for reason in result.run.failures))
-        with atomic_path(directory.claim("twin.nc")) as partial:
+        with atomic_path(directory.work / "twin.nc") as partial:
             dataset(result, attributes).to_netcdf(partial, engine="netcdf4", format="NETCDF4")
-        write_text(directory.claim("summary.csv"), summary_csv(result))
+        write_text(directory.work / "summary.csv", summary_csv(result))
+        if config.report:
+            report_twin(directory)
         log.write("done")
         directory.publish()
+    return result
+
+
+def report_twin(directory: RunDirectory) -> Path:
+    """Write the figures and the page of a finished twin experiment. Raises :class:`OutputError`."""
+    from en4dvar.report.twin import write_twin_report
+
+    directory.claim("report.html")
+    before = directory.listing("figures")
+    try:
+        return write_twin_report(directory.work)
+    finally:
+        directory.claim_folder("figures", before)
+
+
+def _prepare(config: TwinConfig, run: Identity, directory: RunDirectory, resume: bool) -> None:
+    """Write what the run is, or check that it is the one to be resumed. Raises :class:`OutputError`."""
+    directory.folder(FOLDER)
+    earlier = read_checkpoint(directory.work / IDENTITY, "run", Identity) if resume else None
+    if earlier is not None and (difference := run.difference(earlier, frozenset())):
+        raise OutputError(
+            f"{directory.path}: the run cannot be resumed to the same result, for this has changed:\n{difference}\n"
+            "give --force to conduct the experiment again, or another --out"
+        )
+    directory.claim("run.log", "config.yaml", "config.resolved.yaml", "twin.nc", "summary.csv", IDENTITY, STATE)
+    write_text(directory.work / "config.yaml", config.text)
+    write_text(directory.work / "config.resolved.yaml", config.resolved)
+    write_checkpoint(directory.work / IDENTITY, "run", run)
+
+
+def _conduct(
+    config: TwinConfig,
+    fingerprint: str,
+    directory: RunDirectory,
+    log: RunLog,
+    resume: bool,
+    on_cycle: Callable[[int], None] | None,
+) -> TwinResult:
+    """The experiment, from its latest checkpoint on; what it ends with is kept, too, so that it is never repeated."""
+    path, experiment = directory.work / STATE, config.experiment
+    state = None
+    if resume:
+        try:
+            state = read_checkpoint(path, fingerprint, SequentialState)
+        except CheckpointError as error:
+            log.write(f"warning: {error}; the experiment is conducted from the start")
+    if state is not None:
+        log.write(f"continued after {state.cycle} of {experiment.cycles} cycles")
+    keeper = Keeper(path, fingerprint, config.execution.checkpoint_every)
+    latest: list[Callable[[], SequentialState]] = []
+
+    def keep(now: Callable[[], SequentialState]) -> None:
+        latest[:] = [now]
+        keeper.keep(now)
+
+    try:
+        with make_executor(experiment.model, config.execution.workers) as executor:
+            result = conduct(experiment, config.seed, executor, on_cycle, state, keep)
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted; the cycles up to the last checkpoint are kept in {directory.path}") from None
+    for last in latest:
+        keeper.write(last())
     return result
 
 
@@ -87,48 +162,3 @@ def twin_summary(config: TwinConfig) -> str:
         f"{experiment.cycles} cycles every {experiment.interval:g}{unit} ({experiment.burn_in} not counted), "
         f"observed: {observed}\nrun directory: {config.directory}"
     )
-
-
-def summary_csv(result: TwinResult) -> str:
-    """RMSE, spread and iterations, averaged after the burn-in, as CSV."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["estimate", "rmse", "spread", "cycles", "forecasts_per_cycle"])
-    counted = slice(result.experiment.burn_in, None)
-    forecasts = float(np.mean(result.run.iterations[counted]))
-    for name, score in result.scores.items():
-        cycles = int(np.isfinite(score.rmse[counted]).sum())
-        writer.writerow([name, f"{score.mean_rmse:.6g}", f"{score.mean_spread:.6g}", cycles, f"{forecasts:.4g}"])
-    return text.getvalue()
-
-
-def dataset(result: TwinResult, attributes: Mapping[str, Any]) -> xr.Dataset:
-    """Truth, observations, moments and scores over (time, state), with units."""
-    experiment, model = result.experiment, result.experiment.model
-    names = [f"{f.name}_{j}" if f.size > 1 else f.name for f in model.layout for j in range(f.size)]
-    units = [f.unit for f in model.layout for _ in range(f.size)]
-    unit = units[int(np.argmax(experiment.dynamic))]
-    along = ("time", "state")
-    variables: dict[str, Any] = {
-        "truth": (along, result.truth, {"long_name": "state of the truth"}),
-        "observations": (("time", "observation"), result.series.values, {"long_name": "observations of the truth"}),
-        "observation_std": ("observation", result.series.std, {"long_name": "std of the observation errors"}),
-        "iterations": ("time", result.run.iterations, {"long_name": "forecasts of the window", "units": "1"}),
-    }
-    run = result.run
-    for kind, moments in (("forecast", run.forecast), ("analysis", run.analysis), ("smoothed", run.smoothed)):
-        if kind in result.scores:
-            score = result.scores[kind]
-            variables |= {
-                f"{kind}_mean": (along, moments.mean, {"long_name": f"mean of the {kind} ensemble"}),
-                f"{kind}_std": (along, moments.std, {"long_name": f"standard deviation of the {kind} ensemble"}),
-                f"{kind}_rmse": ("time", score.rmse, {"long_name": f"RMSE of the {kind} mean", "units": unit}),
-                f"{kind}_spread": ("time", score.spread, {"long_name": f"spread of the {kind}", "units": unit}),
-            }
-    coordinates = {
-        "time": ("time", result.series.times, {"units": model.time_unit, "long_name": "observation time"}),
-        "state": ("state", names, {"long_name": "variable of the state"}),
-        "units": ("state", units, {"long_name": "unit of the variable"}),
-    }
-    root = {"Conventions": "CF-1.10, ACDD-1.3", "title": "Twin experiment", "seed": result.seed, **attributes}
-    return xr.Dataset(variables, coordinates, root)

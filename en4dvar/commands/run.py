@@ -55,9 +55,9 @@ def run(
     from en4dvar.config import TwinConfig
 
     if isinstance(loaded, TwinConfig):
-        if resume or scheduler:
-            raise click.UsageError("a twin experiment takes neither --resume nor --scheduler")
-        _run_twin(loaded, force)
+        if scheduler:
+            raise click.UsageError("a twin experiment takes no --scheduler: its cycles are too short to be sent away")
+        _run_twin(loaded, force, resume)
         return
     from en4dvar.build import data_files, inverse_plan
     from en4dvar.progress import terminal_progress
@@ -68,8 +68,7 @@ def run(
         try:
             campaign = execute(loaded, force=force, resume=resume, progress=progress, command=shlex.join(words))
         except KeyboardInterrupt as interrupt:
-            again = shlex.join([*(w for w in words if w not in ("--force", "--resume")), "--resume"])
-            raise Failed(f"{interrupt}\nto continue: {again}", 130) from None
+            raise _to_continue(interrupt) from None
     _tell(campaign, with_report=not no_report)
 
 
@@ -95,14 +94,24 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
         raise Failed("\n".join([head, *reasons[:MOST_TOLD], *more]), campaign.exit_code)
 
 
-def _run_twin(config: TwinConfig, force: bool) -> None:
+def _to_continue(interrupt: KeyboardInterrupt) -> Failed:
+    again = shlex.join([*(w for w in command_words() if w not in ("--force", "--resume")), "--resume"])
+    return Failed(f"{interrupt}\nto continue: {again}", 130)
+
+
+def _run_twin(config: TwinConfig, force: bool, resume: bool) -> None:
     from en4dvar.progress import cycle_progress
     from en4dvar.twin_run import run_twin, scores_table
 
     with cycle_progress(config.experiment.cycles) as on_cycle:
-        result = run_twin(config, force=force, on_cycle=on_cycle, command=command_line())
+        try:
+            result = run_twin(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
+        except KeyboardInterrupt as interrupt:
+            raise _to_continue(interrupt) from None
     click.echo(scores_table(result))
     if result.run.failures:
         lost = f"{len(result.run.failures)} of {config.experiment.members} members lost"
         click.echo(f"warning: {config.name}: {lost}, the last: {result.run.failures[-1]}", err=True)
     click.echo(f"result: {config.directory / 'twin.nc'}")
+    if config.report:
+        click.echo(f"report: {config.directory / 'report.html'}")

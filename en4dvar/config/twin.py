@@ -17,15 +17,18 @@ from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Fixed, Uncertain, read_parameters
 from en4dvar.config.schema import QuantityText, Section
 from en4dvar.config.validate import check
-from en4dvar.errors import ConfigError, Fault
+from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.forward import ForwardModel
 from en4dvar.hints import suggest
 from en4dvar.inflation import Inflation
 from en4dvar.localisation import Localisation
 from en4dvar.prior import Prior
+from en4dvar.readers import Matrix, read_covariance
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.sequential import SequentialSettings
+from en4dvar.series import root_of_correlation
+from en4dvar.state import Array
 from en4dvar.twin import TwinExperiment
 from en4dvar.units import UnitError, parse_quantity
 
@@ -41,6 +44,9 @@ class Twin(Section):
     """Time between two observations, in the model's unit of time."""
     error: Annotated[dict[str, QuantityText], Field(min_length=1)]
     """Std of the observation errors, by observable: ``<observable>_std``."""
+    error_correlation: Annotated[str, Field(min_length=1)] | None = None
+    """CSV file of the correlation of the errors at one instant, full or block diagonal, one row an observation, without
+    header; relative to the configuration's folder. Default: independent errors."""
     initial_std: Annotated[dict[str, QuantityText], Field(min_length=1)]
     """Std of the initial ensemble, by field of the state."""
 
@@ -109,6 +115,8 @@ class Workers(Section):
 
     workers: Annotated[int, Field(ge=1)] = 1
     """Parallel workers."""
+    checkpoint_every: Annotated[float, Field(ge=0)] = 2.0
+    """Seconds between two checkpoints, 0: one after every cycle. Each holds the moments of all cycles done."""
 
 
 class TwinSchema(Section):
@@ -143,6 +151,7 @@ class TwinConfig:
     scheme: str
     execution: Workers
     directory: Path
+    report: bool
     resolved: str
 
     @property
@@ -176,6 +185,13 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
         message = f"RMSE and spread need one unit, but the state has {', '.join(sorted(set(fields.values())))}"
         faults.append(document.fault(("model",), message))
     observed = {name.removesuffix("_std"): std for name, std in error.items()}
+    correlation = None
+    if twin.error_correlation is not None:
+        twin = twin.model_copy(update={"error_correlation": str((base / twin.error_correlation).absolute())})
+        correlation = _correlation(str(twin.error_correlation), document, faults)
+        if settings.localisation:
+            message = "needs observations with independent errors, but twin.error_correlation is given"
+            faults.append(document.fault(("assimilation", "localisation"), message))
     local = None
     if settings.localisation and not faults:
         local = _localisation(settings.localisation, model, set(observed), document, faults)
@@ -193,6 +209,7 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
         error_std=observed,
         initial_std=initial,
         burn_in=twin.burn_in,
+        error_correlation=correlation,
         prior=Prior(terms) if terms else None,
         fixed={entry.parameter.name: entry.value for entry in entries if isinstance(entry, Fixed)},
     )
@@ -204,6 +221,7 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
         scheme=settings.scheme,
         execution=top.execution,
         directory=top.output.directory or Path("runs") / top.name,
+        report=top.output.report,
         resolved=_resolved(top, model_resolved, twin, settings),
     )
 
@@ -230,6 +248,17 @@ def _quantities(
         if not values[name] > 0:
             faults.append(document.fault(where, f"must be positive, not {text}"))
     return values
+
+
+def _correlation(file: str, document: Document, faults: list[Fault]) -> Array | None:
+    """The correlation matrix of the observation errors, or None with a fault appended."""
+    try:
+        correlation = read_covariance(Matrix(Path(file).expanduser(), "1", "1"))
+        root_of_correlation(correlation, len(correlation))
+    except (DataError, ValueError) as error:
+        faults.append(document.fault(("twin", "error_correlation"), str(error)))
+        return None
+    return correlation
 
 
 def _localisation(

@@ -195,3 +195,31 @@ def test_iterations_end_at_a_minimum_of_the_cost():
     start_gradient = [(cost(h * e) - cost(-h * e)) / (2 * h) for e in np.eye(5)]
     assert np.linalg.norm(gradient) < 1e-5 * np.linalg.norm(start_gradient)
     assert cost(weights.w) < cost(np.zeros(5))
+
+
+BLOCKS = np.array([[1.0, 0.6, 0.0], [0.6, 1.0, 0.0], [0.0, 0.0, 1.0]])
+FULL = np.array([[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]])
+
+
+@pytest.mark.parametrize("correlation", [BLOCKS, FULL])
+@pytest.mark.parametrize("scheme", [ETKF(), IEnKS(0), IEnKS(2)])
+def test_correlated_errors_are_those_of_the_kalman_filter(scheme, correlation):
+    model, observed, members, series = linear_twin(12)
+    each = STD * np.array([1.0, 0.5, 2.0])
+    series = Series(series.times, series.values, each, correlation)
+    result = run_sequential(model, observed, members, series, SequentialSettings(scheme))
+    mean, cov = members[:, :8].mean(axis=0), np.cov(members[:, :8].T)
+    m, h, r = flow(model, DT), np.eye(8)[SEEN], np.outer(each, each) * correlation
+    for k in range(CYCLES):
+        mean, cov = m @ mean, m @ cov @ m.T
+        gain = cov @ h.T @ np.linalg.inv(h @ cov @ h.T + r)
+        mean, cov = mean + gain @ (series.values[k] - h @ mean), (np.eye(8) - gain @ h) @ cov
+        close(result.analysis.mean[k, :8], mean)
+        close(result.analysis.std[k, :8], np.sqrt(np.diag(cov)))
+    independent = run_sequential(
+        model, observed, members, Series(series.times, series.values, each, np.eye(3)), SequentialSettings(scheme)
+    )
+    plain = run_sequential(
+        model, observed, members, Series(series.times, series.values, each), SequentialSettings(scheme)
+    )
+    close(independent.members, plain.members)

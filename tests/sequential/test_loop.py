@@ -7,6 +7,7 @@ import pytest
 
 from en4dvar.errors import TooFewMembersError
 from en4dvar.forward import Failure, ForwardModel, Observable, StateField
+from en4dvar.localisation import Localisation
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.sequential import SequentialSettings, Series, run_sequential
@@ -135,6 +136,27 @@ def test_progress_is_told_each_cycle():
 def test_bad_series(times, values, std, message):
     with pytest.raises(ValueError, match=message):
         Series(times, values, std)
+
+
+@pytest.mark.parametrize(
+    ("correlation", "message"),
+    [
+        (np.eye(3), "does not match 2 observations"),
+        (np.array([[1.0, 0.2], [0.3, 1.0]]), "symmetric with a unit diagonal"),
+        (np.array([[2.0, 0.2], [0.2, 2.0]]), "symmetric with a unit diagonal"),
+        (np.array([[1.0, 1.2], [1.2, 1.0]]), "not positive definite"),
+    ],
+)
+def test_bad_correlation(correlation, message):
+    with pytest.raises(ValueError, match=message):
+        Series(np.array([1.0]), np.zeros((1, 2)), np.ones(2), correlation)
+
+
+def test_localisation_needs_independent_errors():
+    local = Localisation([np.arange(2)], np.ones((1, 2)))
+    y = Series(np.array([1.0]), np.zeros((1, 2)), np.ones(2), np.eye(2))
+    with pytest.raises(ValueError, match="independent errors"):
+        run_sequential(Forced(), Forced.observables, members(), y, SequentialSettings(ETKF(), localisation=local))
 
 
 def test_errors_may_differ_by_time():

@@ -15,7 +15,7 @@ from en4dvar.inflation import Inflation
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
-from en4dvar.sequential import SequentialSettings
+from en4dvar.sequential import SequentialSettings, run_sequential
 from en4dvar.twin import TwinExperiment, conduct, initial_ensemble, observe_truth
 from en4dvar_lorenz import Lorenz63, Lorenz96
 from en4dvar_lorenz.lorenz63 import Lorenz63Settings
@@ -69,6 +69,34 @@ def test_what_is_observed():
     assert [o.name for o in experiment.observables] == ["x", "z"]
     assert series.std.tolist() == [0.1, 0.5]
     assert np.std(series.values - truth[:, [0, 2]], axis=0) == pytest.approx([0.1, 0.5], rel=0.15)
+
+
+def test_correlated_errors(tmp_path):
+    """Drawn and assimilated with the same R, read from a table; knowing R helps."""
+    correlation = 0.9 ** np.abs(np.subtract.outer(np.arange(3), np.arange(3)))
+    np.savetxt(tmp_path / "c.csv", correlation, delimiter=",")
+    text = (CONFIGS / "lorenz63_ienks.yaml").read_text().replace("  burn_in:", "  error_correlation: c.csv\n  burn_in:")
+    (tmp_path / "twin.yaml").write_text(text)
+    config = load_twin(tmp_path / "twin.yaml", {"twin.cycles": 400, "twin.burn_in": 50})
+    truth, series = observe_truth(config.experiment, 1)
+    assert np.array_equal(series.correlation, correlation)
+    errors = (series.values - truth[:, :3]) / series.std
+    assert np.corrcoef(errors.T) == pytest.approx(correlation, abs=0.06)
+    assert str(tmp_path / "c.csv") in config.resolved
+    known = conduct(config.experiment, 1)
+    blind = run_sequential(
+        config.experiment.model,
+        config.experiment.observables,
+        initial_ensemble(config.experiment, 1),
+        replace(series, correlation=None),
+        config.experiment.sequential,
+        1,
+    )
+    rmse_blind = np.sqrt(np.mean((blind.analysis.mean - truth)[50:, :3] ** 2, axis=1)).mean()
+    assert known.scores["analysis"].mean_rmse < rmse_blind
+    small = replace(config.experiment, error_correlation=np.eye(2))
+    with pytest.raises(En4dvarError, match=r"twin\.error_correlation: correlation \(2, 2\) does not match 3"):
+        conduct(small, 1)
 
 
 def test_scores_by_hand():
@@ -158,6 +186,7 @@ PUBLISHED = [  # DAPPER 1.7.1, its suggested settings: analysis RMSE in long run
 @pytest.mark.slow
 @pytest.mark.parametrize(("system", "scheme", "options", "published"), PUBLISHED)
 def test_published_rmse(system, scheme, options, published):
-    """Within 5 %, averaged over four seeds."""
+    """Within 5 %, averaged over four seeds; Lorenz-63 loses its way now and then, so that runs scatter by 8 %: 16."""
     experiment = system(scheme, 3000, burn_in=300, **options)
-    assert np.mean([rmse(experiment, seed) for seed in range(4)]) < 1.05 * published
+    seeds = range(16 if system is lorenz63 else 4)
+    assert np.mean([rmse(experiment, seed) for seed in seeds]) < 1.05 * published

@@ -1,0 +1,154 @@
+"""Page and figures of a twin experiment, from ``twin.nc`` alone: RMSE and spread in time, the state and its truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from en4dvar.errors import OutputError
+from en4dvar.files import write_text
+from en4dvar.report.html import render
+from en4dvar.report.page import PROVENANCE
+from en4dvar.report.style import COLUMN, LIGHT, inline_svg, save_figure, styled
+from en4dvar.report.text import plain_number, pretty_unit, with_unit
+from en4dvar.twin_file import MEAN
+
+COLOURS = {"forecast": "prior", "analysis": "posterior", "smoothed": "background"}
+SHOWN = 4  # variables of the state in the second figure
+LAST = 200  # cycles in it
+
+
+def write_twin_report(run_dir: Path) -> Path:
+    """Write figures (PDF and PNG) and ``report.html`` from ``twin.nc``; returns the path of the page.
+
+    Raises :class:`~en4dvar.errors.OutputError` where there is nothing to read or the directory cannot be written.
+    """
+    try:
+        with xr.open_dataset(run_dir / "twin.nc") as file:
+            data = file.load()
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{run_dir / 'twin.nc'}: not a readable result: {error}") from None
+    folder = run_dir / "figures"
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be created: {error.strerror}") from None
+    drawn = []
+    for name, caption, figure in twin_figures(data):
+        save_figure(figure, folder, name)
+        drawn.append((name, caption, Markup(inline_svg(figure, name, caption))))
+    a = data.attrs
+    return write_text(
+        run_dir / "report.html",
+        render(
+            "twin.html.j2",
+            title=str(a["name"]),
+            created=str(a.get("date_created", "")),
+            facts=_facts(data),
+            scores=_scores(data),
+            unit=_unit(data),
+            figures=drawn,
+            lost=[reason for reason in str(a["members_lost_why"]).split("\n") if reason],
+            provenance=[(key.replace("_", " "), str(a[key])) for key in PROVENANCE if str(a.get(key, ""))],
+            configuration=str(a["configuration_resolved"]),
+        ),
+    )
+
+
+def twin_figures(data: xr.Dataset) -> Iterator[tuple[str, str, Figure]]:
+    """(name, caption, figure) of each figure."""
+    burn_in = int(data.attrs["burn_in"])
+    words = " The first cycles, shaded, do not count in the averages." if burn_in else ""
+    yield "scores", f"RMSE against the truth (line) and spread (dashed) of each estimate in time.{words}", scores(data)
+    shown = f"Error of the analysis within two standard deviations, last {min(LAST, data.sizes['time'])} cycles"
+    yield "errors", f"{shown}, first variables of the state. A reliable ensemble has 95 % within.", errors(data)
+
+
+@styled
+def scores(data: xr.Dataset) -> Figure:
+    """RMSE and spread in time, one panel an estimate, averages after the burn-in as thin lines."""
+    kinds = _kinds(data)
+    figure = Figure(figsize=(COLUMN, (1.2 + 3.0 * len(kinds)) / 2.54), layout="constrained")
+    time = data["time"].values
+    panels = figure.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, kind in zip(panels, kinds, strict=True):
+        colour = LIGHT[COLOURS[kind]]
+        rmse, spread = data[f"{kind}_rmse"], data[f"{kind}_spread"]
+        ax.plot(time, rmse, color=colour, lw=0.9, label="RMSE")
+        ax.plot(time, spread, color=LIGHT["centre"], lw=0.8, ls="--", label="spread")
+        ax.axhline(float(rmse.attrs[MEAN]), color=colour, lw=0.6)
+        if burn_in := int(data.attrs["burn_in"]):
+            ax.axvspan(time[0], time[burn_in - 1], color=LIGHT["grid"], alpha=0.5, lw=0)
+        ax.set_title(f"{kind}: RMSE {plain_number(float(rmse.attrs[MEAN]), 3)}", loc="left")
+        ax.set_ylim(0, _upper(rmse.values, spread.values))
+        ax.set_ylabel(with_unit("error", _unit(data)))
+        ax.margins(x=0)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
+    panels[-1].set_xlabel(with_unit("time", str(data["time"].attrs["units"])))
+    return figure
+
+
+@styled
+def errors(data: xr.Dataset) -> Figure:
+    """Error of the analysis within ± 2 std, in the last cycles; titles say how often over all that count."""
+    burn_in = int(data.attrs["burn_in"])
+    error, std = (data["analysis_mean"] - data["truth"]).values, data["analysis_std"].values
+    inside = np.mean(np.abs(error[burn_in:]) <= 2 * std[burn_in:], axis=0)
+    count = min(SHOWN, data.sizes["state"])
+    figure = Figure(figsize=(COLUMN, (1.2 + 2.6 * count) / 2.54), layout="constrained")
+    time = data["time"].values[-LAST:]
+    for i, ax in enumerate(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]):
+        width = 2 * std[-LAST:, i]
+        ax.fill_between(time, -width, width, color=LIGHT["posterior"], alpha=0.25, lw=0, label="± 2 std")
+        ax.axhline(0, color=LIGHT["muted"], lw=0.5)
+        ax.plot(time, error[-LAST:, i], color=LIGHT["ink"], lw=0.8, label="analysis − truth")
+        name = str(data["state"].values[i])
+        ax.set_title(f"{name}: {100 * inside[i]:.0f} % within 2 std", loc="left")
+        ax.set_ylabel(with_unit("error", str(data["units"].values[i])))
+        ax.margins(x=0)
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper right", ncols=2)
+    ax.set_xlabel(with_unit("time", str(data["time"].attrs["units"])))
+    return figure
+
+
+def _kinds(data: xr.Dataset) -> list[str]:
+    return [kind for kind in COLOURS if f"{kind}_rmse" in data]
+
+
+def _unit(data: xr.Dataset) -> str:
+    return pretty_unit(str(data["analysis_rmse"].attrs["units"]))
+
+
+def _upper(*series: Any) -> float:
+    """A limit that one bad beginning does not set: twice the 98 % quantile, no more than the maximum."""
+    values = np.concatenate([s[np.isfinite(s)] for s in series])
+    return float(min(1.05 * values.max(), 2 * np.quantile(values, 0.98))) if len(values) else 1.0
+
+
+def _scores(data: xr.Dataset) -> list[tuple[str, str, str, str]]:
+    """(estimate, RMSE, spread, spread over RMSE) after the burn-in."""
+    rows = []
+    for kind in _kinds(data):
+        rmse, spread = (float(data[f"{kind}_{what}"].attrs[MEAN]) for what in ("rmse", "spread"))
+        rows.append((kind, plain_number(rmse, 4), plain_number(spread, 4), plain_number(spread / rmse, 3)))
+    return rows
+
+
+def _facts(data: xr.Dataset) -> list[tuple[str, str, str]]:
+    """(quantity, value, in words) for the tiles on top."""
+    a = data.attrs
+    cycles, burn_in, members, lost = data.sizes["time"], int(a["burn_in"]), int(a["members"]), int(a["members_lost"])
+    iterations = float(data["iterations"].values[burn_in:].mean())
+    return [
+        ("Scheme", str(a["scheme"]), f"{plain_number(iterations, 3)} forecasts of the window a cycle"),
+        ("Members alive", f"{members - lost} of {members}", "at the end of the run"),
+        ("Cycles", str(cycles), f"{burn_in} of them do not count in the averages"),
+        ("Observations", str(data.sizes["observation"]), "a cycle"),
+        ("Forward runs", str(int(a["forward_runs"])), "of one member over a window"),
+    ]
