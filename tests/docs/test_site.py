@@ -25,6 +25,7 @@ from en4dvar_bubble.settings import BubbleSettings
 pytest.importorskip("mkdocs", reason="the extra docs is not installed")
 pytest.importorskip("latex2mathml", reason="the extra docs is not installed")
 pytestmark = pytest.mark.slow
+BROWSER = shutil.which(os.environ.get("CHROMIUM", "chromium"))
 TAG = r"<(?:script|img|iframe|source|link(?! rel=.canonical)) [^>]*"
 REMOTE = re.compile(TAG + r"(?:src|href)=[\"']?(https?://[^\"' >]+)")
 
@@ -77,9 +78,9 @@ def test_the_reference_is_complete(site):
         assert re.search(rf'id="en4dvar[\w.]*\.{name}"', python), name
 
 
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium")
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium")
 def test_the_search_works_from_a_file(site):
-    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=20000", "--dump-dom"]
+    command = [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=20000", "--dump-dom"]
     page = f"{(site / 'index.html').as_uri()}?q=Kirchhoff"
     shown = subprocess.run([*command, page], capture_output=True, text=True, timeout=120).stdout
     assert re.search(r"md-search-result__meta\">\s*\d+ matching", shown)
