@@ -7,7 +7,8 @@ from en4dvar.executor.base import Executor, ExecutorError, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread
 from en4dvar.executor.chunks import Outcome, cut, describe, run_chunk
 from en4dvar.executor.limits import NO_LIMITS, Limits, TimeLimitError
-from en4dvar.executor.local import ProcessesExecutor, SerialExecutor, ThreadsExecutor
+from en4dvar.executor.local import SerialExecutor, ThreadsExecutor
+from en4dvar.executor.processes import ProcessesExecutor
 from en4dvar.forward import ForwardModel
 
 __all__ = [

@@ -1,0 +1,117 @@
+"""Workers that die at the worst moments, and what they hand back when it cannot be sent."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from en4dvar.executor import ProcessesExecutor, WorkerLostError
+
+LARGE = 4_000_000  # bytes; a pipe holds 65 536, so that a worker is writing until we have read most of it
+
+
+class DiesWhileItIsSent:
+    """Pickled, it is large; the process is killed by a child of its own while most of it is still to be written."""
+
+    def __init__(self, flag):
+        self.flag = flag
+
+    def __reduce__(self):
+        if not Path(self.flag).exists():
+            Path(self.flag).touch()
+            victim = os.getpid()
+            if os.fork() == 0:
+                time.sleep(0.3)
+                os.kill(victim, signal.SIGKILL)
+                os._exit(0)
+        return bytes, (bytes(LARGE),)
+
+
+def half_a_message(flag):
+    return DiesWhileItIsSent(flag)
+
+
+def fine(number):
+    return number, bytes(LARGE)
+
+
+def slow(number):
+    time.sleep(0.02)
+    return number
+
+
+@pytest.mark.fault("worker-killed")
+def test_a_worker_killed_while_it_hands_back_its_result(tmp_path, monkeypatch):
+    """Half of a message: the rest never comes, and nobody waits for it."""
+    flag = str(tmp_path / "died")
+    ready = ProcessesExecutor._ready
+
+    def late(executor):
+        found = ready(executor)
+        time.sleep(1.0)  # the worker has filled the pipe, and is dead before the first byte is read
+        return found
+
+    with ProcessesExecutor(2) as executor:
+        with monkeypatch.context() as patch:
+            patch.setattr(ProcessesExecutor, "_ready", late)
+            ((i, value),) = executor.map(half_a_message, [(flag,)])
+        assert (i, len(value)) == (0, LARGE)
+        assert [v[0] for _, v in sorted(executor.map(fine, [(j,) for j in range(5)]))] == list(range(5))
+
+
+@pytest.mark.fault("worker-killed")
+def test_only_the_calls_of_killed_workers_are_repeated():
+    with ProcessesExecutor(2) as executor:
+        found = []
+        for i, value in executor.map(slow, [(j,) for j in range(60)]):
+            found.append((i, value))
+            if len(found) in (10, 30):
+                executor._busy[0].process.kill()
+        assert sorted(found) == [(j, j) for j in range(60)]
+
+
+@pytest.mark.fault("worker-always")
+def test_a_call_that_kills_is_given_up_after_three_workers(tmp_path):
+    with ProcessesExecutor(2) as executor:
+        found = dict(executor.map(counted_suicide, [(str(tmp_path),), (str(tmp_path / "none"),)]))
+    assert isinstance(found[0], WorkerLostError)
+    assert found[1] == 0
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def counted_suicide(folder):
+    if not Path(folder).is_dir():
+        return 0
+    (Path(folder) / f"{os.getpid()}").touch()
+    os.kill(os.getpid(), signal.SIGKILL)
+    return 1
+
+
+def cannot_be_sent(what):
+    if what == "value":
+        return lambda: None
+    raise ValueError("with something in it", lambda: None)
+
+
+@pytest.mark.fault("worker-killed")
+def test_what_cannot_be_sent_is_told():
+    with ProcessesExecutor(1) as executor:
+        found = dict(executor.map(cannot_be_sent, [("value",), ("exception",), (lambda: None,)]))
+    assert "pickle" in str(found[0])
+    assert "ValueError: ('with something in it'" in str(found[1])
+    assert "pickle" in str(found[2])
+
+
+def test_interrupted_workers_are_gone_at_once():
+    executor = ProcessesExecutor(2)
+    calls = executor.map(time.sleep, [(0,), (600,), (600,)])
+    next(calls)
+    begin = time.monotonic()
+    processes = [worker.process for worker in executor._busy]
+    executor.kill()
+    calls.close()
+    assert time.monotonic() - begin < 20
+    assert len(processes) == 2
+    assert not any(p.is_alive() for p in processes)
