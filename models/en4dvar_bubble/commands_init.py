@@ -134,6 +134,10 @@ def _columns(asked: _Asked, shown: Mapping[str, str]) -> tuple[str | None, str |
     if time is None and asked.time_step is None:
         time = _only(_TIME, shown)
     radius = radius or _only(_RADIUS, shown)
+    if len(shown) == 2 and asked.time_step is None:  # of two columns, one tells what the other is
+        first, second = shown
+        other = {first: second, second: first}
+        time, radius = time or other.get(radius or ""), radius or other.get(time or "")
     missing = ["--time-column NAME"] * (time is None and asked.time_step is None)
     missing += ["--radius-column NAME"] * (radius is None)
     return time, radius, missing

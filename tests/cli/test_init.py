@@ -186,6 +186,26 @@ def test_nothing_is_replaced_without_force(tmp_path: Path) -> None:
     assert proposed(Path("b.yaml")).document.data["data"]["path"] == "b.csv"
 
 
+def test_one_column_tells_what_the_other_is(tmp_path: Path) -> None:
+    done = call("init", "--data", write(tmp_path / "b.csv", "Zeit;radius".replace(";", ",")), *UNITS)
+    assert done.exit_code == 0, done.output
+    assert proposed(Path("b.yaml")).document.data["data"]["columns"]["time"]["name"] == "Zeit"
+
+
+def test_a_shallow_rebound_is_in_the_window(tmp_path: Path) -> None:
+    """Two minima between which the radius rises by 7 % of its range."""
+    times = np.arange(90) * 0.5
+    radius = np.where(times < 18, 195 * np.clip(1 - (times / 18.5) ** 2, 0, 1) ** 0.4, 0)
+    after = times >= 18
+    radius[after] = 40 + 7 * (1 - np.cos(2 * np.pi * (times[after] - 18) / 12))
+    (tmp_path / "b.csv").write_text("t,R\n" + "".join(f"{t:g},{r:g}\n" for t, r in zip(times, radius, strict=True)))
+    assert call("init", "--data", "b.csv", *UNITS).exit_code == 0
+    config = proposed(Path("b.yaml"))
+    assert config.document.data["data"]["window"] == {"from": "R_max", "to": "minimum 2", "prominence": "5 %"}
+    (problem,) = build(config)
+    assert problem.observations.times[-1] == pytest.approx(30e-6, abs=1e-6)
+
+
 def test_a_constant_step_instead_of_times(tmp_path: Path) -> None:
     done = call("init", "--data", write(tmp_path / "b.csv"), "--time-step", "0.7 us", "--radius-unit", "um")
     assert done.exit_code == 0, done.output

@@ -50,7 +50,8 @@ class Look:
     ``noise`` is the std of the scatter about a smooth curve near the maximum, NaN with too few samples there.
     ``rebound`` is the second maximum over the first, NaN where none is seen; ``rest`` the median of the last quarter
     of a history that rebounds and comes to rest, NaN else. ``step`` is the median time between samples; ``descent``
-    the last instant of the first descent, NaN where the history ends with it. ``reason`` says in words why ``start`` is
+    the last instant of the first descent, NaN where the history ends with it. ``n_minima`` follow the maximum with a
+    ``prominence`` relative to the range. ``reason`` says in words why ``start`` is
     proposed, ``clear`` whether the data leave no doubt.
     """
 
@@ -62,6 +63,7 @@ class Look:
     rebound: float
     rest: float
     n_minima: int
+    prominence: float
     descent: float
     start: Start
     reason: str
@@ -81,7 +83,8 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     """
     top = int(np.argmax(radius))
     found = lobe(times, radius)
-    after = minima(radius[top:]) + top
+    scatter = noise(times, radius)
+    prominence, after = _minima(radius[top:], scatter)
     rebound = second_maximum(radius)
     first = float(radius[0] / radius[top])
     tail = radius[-max(3, len(radius) // 4) :]
@@ -95,10 +98,11 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
         times=(float(times[0]), float(times[-1])),
         lobe=found,
         step=float(np.median(np.diff(times))),
-        noise=noise(times, radius),
+        noise=scatter,
         rebound=rebound,
         rest=rest,
-        n_minima=len(after),
+        n_minima=after,
+        prominence=prominence,
         descent=_end_of_descent(times, radius),
         start=chosen,
         reason=reason,
@@ -131,6 +135,16 @@ def _falling(radius: Array) -> slice:
     while last + 1 < len(radius) and LOWEST * radius[top] < radius[last + 1] <= radius[last] + 0.1 * radius[top]:
         last += 1
     return slice(first, last + 1)
+
+
+def _minima(radius: Array, scatter: float) -> tuple[float, int]:
+    """How prominent minima have to be for two of them to be seen, well above the scatter; and how many there are."""
+    spread = float(np.ptp(radius))
+    for prominence in (0.1, 0.05, 0.03):
+        found = len(minima(radius, prominence))
+        if found >= 2 and (prominence == 0.1 or prominence * spread > 4 * scatter):
+            return prominence, found
+    return 0.1, len(minima(radius))
 
 
 def _end_of_descent(times: Array, radius: Array) -> float:

@@ -138,6 +138,7 @@ def _seen(views: Sequence[Look]) -> Look:
         rebound=typical([v.rebound for v in views]),
         rest=typical([v.rest for v in views]),
         n_minima=min(v.n_minima for v in views),
+        prominence=min(v.prominence for v in views),
         descent=max((v.descent for v in views if np.isfinite(v.descent)), default=float("nan")),
         start=first.start,
         reason=first.reason,
@@ -161,8 +162,9 @@ def _data(start: Start, seen: Look, model: BubbleModel, theta: Mapping[str, floa
     """Window, clock and errors."""
     if start == "laser":
         end = f"minimum {min(seen.n_minima, 2)}" if seen.n_minima else "end"
+        low = f", prominence: {100 * seen.prominence:g} %" if seen.prominence < 0.1 else ""
         lines = [
-            Entry("window", f"{{from: R_max, to: {end}}}", "what happens before R_max is not modelled"),
+            Entry("window", f"{{from: R_max, to: {end}{low}}}", "what happens before R_max is not modelled"),
             Entry("time_zero", "window", "the model's clock starts at R_max"),
         ]
     else:
