@@ -16,17 +16,19 @@ import traceback
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
-from en4dvar.executor.base import ATTEMPTS_ALONE, Executor, T, WorkerLostError
+from en4dvar.executor.base import ATTEMPTS_ALONE, Executor, ExecutorError, T, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
 from en4dvar.executor.chunks import describe
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
 
 CLOSE_TIMEOUT = 10.0  # s for a worker to end by itself
+MOST_STILLBORN = 8  # workers in a row that end before they have begun
 Call = tuple[Any, ...]
 _SPAWN = get_context("spawn")
 
@@ -51,7 +53,7 @@ class _Worker:
             self.pipe.send_bytes(message)
 
     def answer(self) -> Any:
-        """The value of the call or what it raised. Raises :class:`_Dead`."""
+        """The value of the call or what it raised; of a worker that has just started, None. Raises :class:`_Dead`."""
         try:
             content = self.pipe.recv_bytes()
         except (EOFError, OSError):
@@ -71,6 +73,26 @@ class _Worker:
             self.process.join()
 
 
+@dataclass
+class _Crew:
+    """The workers, by what they are doing."""
+
+    starting: list[_Worker] = field(default_factory=list)
+    idle: list[_Worker] = field(default_factory=list)
+    busy: list[_Worker] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.starting) + len(self.idle) + len(self.busy)
+
+    def __iter__(self) -> Iterator[_Worker]:
+        return iter((*self.starting, *self.idle, *self.busy))
+
+    def end(self) -> None:
+        for workers in (self.starting, self.idle, self.busy):
+            while workers:
+                workers.pop().end(at_once=False)
+
+
 class ProcessesExecutor(Executor):
     """Fresh (spawned) processes, within ``limits``; model and calls must be picklable and importable.
 
@@ -81,92 +103,102 @@ class ProcessesExecutor(Executor):
         if workers < 1:
             raise ValueError(f"workers must be at least 1, not {workers}")
         self.workers, self.limits = workers, limits
-        self._idle: list[_Worker] = []
-        self._busy: list[_Worker] = []
-        weakref.finalize(self, _end_all, self._idle, self._busy)  # also at the end of the interpreter
+        self._crew = _Crew()
+        self._stillborn = 0  # one after the other
+        weakref.finalize(self, self._crew.end)  # also at the end of the interpreter
 
     def map(self, function: Callable[..., T], calls: Iterable[Call]) -> Iterator[tuple[int, T | Exception]]:
-        following = enumerate(calls)
-        again: deque[tuple[int, bytes]] = deque()  # calls whose worker has died
+        crew, following = self._crew, enumerate(calls)
+        todo: deque[tuple[int, bytes]] = deque()
         sent: dict[int, bytes] = {}
         deaths: dict[int, int] = {}
         answers: deque[tuple[int, Any]] = deque()
 
-        def dispatch() -> None:
-            while len(self._busy) < self.workers:
-                if again:
-                    i, message = again.popleft()
-                elif (item := next(following, None)) is None:
-                    return
-                else:
-                    i, call = item
-                    try:
-                        message = bytes(ForkingPickler.dumps((function, call)))
-                    except Exception as error:  # it cannot be sent
-                        answers.append((i, error))
-                        continue
-                sent[i] = message
-                self._hand_over(i, message)
+        def fetch() -> None:
+            """Have a call ready for every worker that is not at work."""
+            while len(todo) < self.workers - len(crew.busy) and (item := next(following, None)) is not None:
+                i, call = item
+                try:
+                    todo.append((i, bytes(ForkingPickler.dumps((function, call)))))
+                except Exception as error:  # it cannot be sent
+                    answers.append((i, error))
+
+        def hand_over() -> None:
+            while todo and crew.idle:
+                i, message = todo.popleft()
+                worker, sent[i] = crew.idle.pop(), message
+                crew.busy.append(worker)
+                worker.send(i, message)
+            while len(todo) > len(crew.starting) and len(crew) < self.workers:
+                crew.starting.append(_Worker(self.limits))
 
         try:
             while True:
-                dispatch()
+                fetch()
+                hand_over()
                 while answers:
                     yield answers.popleft()
-                if not self._busy:
+                if not crew.busy and not todo:
                     return
                 for worker in self._ready():
                     i = worker.task
                     try:
-                        answers.append((i, worker.answer()))
+                        value = worker.answer()
                     except _Dead:
-                        self._bury(worker)
+                        if worker in crew.starting:
+                            self._bury(worker, crew.starting)
+                            self._count_stillborn(worker)
+                            continue
+                        self._bury(worker, crew.busy)
                         deaths[i] = deaths.get(i, 0) + 1
                         if deaths[i] <= ATTEMPTS_ALONE:
-                            again.append((i, sent[i]))
+                            todo.append((i, sent.pop(i)))
                             continue
-                        answers.append((i, WorkerLostError(self.limits.death)))
+                        value = WorkerLostError(self.limits.death)
                     else:
-                        self._busy.remove(worker)
-                        self._idle.append(worker)
+                        crew.idle.append(worker)
+                        if worker in crew.starting:
+                            crew.starting.remove(worker)
+                            self._stillborn = 0
+                            continue
+                        crew.busy.remove(worker)
                     del sent[i]
+                    answers.append((i, value))
         finally:  # given up half-way: what is under way is of no use to the next call
-            for worker in list(self._busy):
-                worker.process.kill()
-                self._bury(worker)
-
-    def _hand_over(self, i: int, message: bytes) -> None:
-        worker = self._idle.pop() if self._idle else _Worker(self.limits)
-        self._busy.append(worker)
-        worker.send(i, message)
+            for worker in list(crew.busy):
+                self._bury(worker, crew.busy)
 
     def _ready(self) -> list[_Worker]:
-        """Waits for workers that have answered or died."""
-        ready = wait([worker.pipe for worker in self._busy])
-        return [worker for worker in self._busy if worker.pipe in ready]
+        """Waits for workers that have started, answered or died."""
+        active = [*self._crew.starting, *self._crew.busy]
+        ready = wait([worker.pipe for worker in active])
+        return [worker for worker in active if worker.pipe in ready]
 
-    def _bury(self, worker: _Worker) -> None:
-        self._busy.remove(worker)
+    def _bury(self, worker: _Worker, among: list[_Worker]) -> None:
+        among.remove(worker)
         worker.end(at_once=True)
 
+    def _count_stillborn(self, worker: _Worker) -> None:
+        self._stillborn += 1
+        if self._stillborn > MOST_STILLBORN:
+            raise ExecutorError(
+                f"worker processes end while they start (exit code {worker.process.exitcode}); a script that starts "
+                "them needs: if __name__ == '__main__':"
+            )
+
     def close(self) -> None:
-        _end_all(self._idle, self._busy)
+        self._crew.end()
 
     def kill(self) -> None:
-        for worker in (*self._idle, *self._busy):
+        for worker in self._crew:
             worker.process.kill()
         self.close()
-
-
-def _end_all(*groups: list[_Worker]) -> None:
-    for workers in groups:
-        while workers:
-            workers.pop().end(at_once=False)
 
 
 def _serve(pipe: Connection, limits: Limits) -> None:
     """What a worker does until its pipe is closed."""
     prepare_worker(limits)
+    pipe.send_bytes(pickle.dumps(None))  # ready: from here on a death may be a call's fault
     while True:
         try:
             message = pipe.recv_bytes()

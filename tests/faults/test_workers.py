@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from en4dvar.executor import ProcessesExecutor, WorkerLostError
+from en4dvar.executor import ExecutorError, ProcessesExecutor, WorkerLostError, processes
+from en4dvar.executor.processes import _Worker
 
 LARGE = 4_000_000  # bytes; a pipe holds 65 536, so that a worker is writing until we have read most of it
 
@@ -68,7 +69,7 @@ def test_only_the_calls_of_killed_workers_are_repeated():
         for i, value in executor.map(slow, [(j,) for j in range(60)]):
             found.append((i, value))
             if len(found) in (10, 30):
-                executor._busy[0].process.kill()
+                executor._crew.busy[0].process.kill()
         assert sorted(found) == [(j, j) for j in range(60)]
 
 
@@ -104,12 +105,34 @@ def test_what_cannot_be_sent_is_told():
     assert "pickle" in str(found[2])
 
 
+@pytest.mark.fault("worker-killed")
+def test_a_worker_killed_at_its_start_is_nobodys_fault(monkeypatch):
+    """Five in a row: more than a call may cost."""
+    started = []
+    start = _Worker.__init__
+
+    def stillborn(worker, limits):
+        start(worker, limits)
+        started.append(worker)
+        if len(started) <= 5:
+            worker.process.kill()
+
+    monkeypatch.setattr(_Worker, "__init__", stillborn)
+    with ProcessesExecutor(1) as executor:
+        assert list(executor.map(slow, [(7,)])) == [(0, 7)]
+    assert len(started) == 6
+    monkeypatch.setattr(processes, "MOST_STILLBORN", 2)
+    started.clear()
+    with ProcessesExecutor(1) as executor, pytest.raises(ExecutorError, match="worker processes end while they start"):
+        list(executor.map(slow, [(7,)]))
+
+
 def test_interrupted_workers_are_gone_at_once():
     executor = ProcessesExecutor(2)
     calls = executor.map(time.sleep, [(0,), (600,), (600,)])
     next(calls)
     begin = time.monotonic()
-    processes = [worker.process for worker in executor._busy]
+    processes = [worker.process for worker in executor._crew]
     executor.kill()
     calls.close()
     assert time.monotonic() - begin < 20
