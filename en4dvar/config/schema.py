@@ -13,7 +13,7 @@ from en4dvar.problem import AssimilationSettings
 from en4dvar.units import Quantity, parse_unit
 
 QuantityText = str | int | float
-Name = Annotated[str, Field(pattern=r"^[\w.][\w.+ -]*$", max_length=100)]
+Name = Annotated[str, Field(pattern=r"^\w[\w.+ -]*$", max_length=100)]
 
 
 class Section(BaseModel):

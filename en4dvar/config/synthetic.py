@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -101,11 +102,17 @@ def resolve_campaign(document: Document, base: Path) -> CampaignPlan:
     data = document.data
     top = check(CampaignSchema, data, (), document, faults)
     found = read_model(data["model"], base, document, faults) if isinstance(data.get("model"), dict) else None
-    campaign = check(Campaign, data["campaign"], ("campaign",), document, faults)
+    section = data.get("campaign")
+    if section is None:
+        faults.append(document.fault((), "required: campaign:, what is to be drawn"))
+    campaign = None if section is None else check(Campaign, section, ("campaign",), document, faults)
     if top is None or found is None or campaign is None:
         raise ConfigError(faults)
     model, observable = found[0], found[0].observables[0]
     groups = tuple(_group(name, group, model, document, faults) for name, group in campaign.groups.items())
+    below = Path(os.path.abspath(base))  # a link may lead elsewhere, the configuration may not
+    if below not in Path(os.path.abspath(base / campaign.directory)).parents:
+        faults.append(document.fault(("campaign", "directory"), f"must be a folder below {below}"))
     unit = model.time_unit
     first = _interval(campaign.first, "first", unit, document, faults)
     spacing = _interval(campaign.spacing, "spacing", unit, document, faults)

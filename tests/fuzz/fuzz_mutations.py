@@ -1,0 +1,67 @@
+"""Changes to a valid configuration that keep it YAML: the way people get configurations wrong."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+from hypothesis import strategies as st
+
+Path = tuple[str | int, ...]
+
+ODD: tuple[Any, ...] = (
+    None, True, False, 0, -1, 1, 10**18, -(10**18), 1e308, 5e-324, float("inf"), float("nan"), "", " ", "nan", "1e-6",
+    "0 kPa", "-3 um", "1e400 us", "5", "5 parsec", "R_max", "R_max/7", "0.5 kPa", "us", "../../../etc/passwd",
+    "/dev/null", ".", "~", "*.csv", "[", "\x00", "\ud7ff", "💥", "a" * 5000, "!!python/object:os.system", "{{ 7*7 }}",
+    "<script>", "./nowhere.py:Law", "os:system", "heat", "laser", "bubble", "linear", "lognormal", [], {}, [[]], [1, "a", None],
+    {"a": {"b": {"c": []}}}, {"prior": "normal"}, {"prior": "lognormal", "median": "1 kPa", "log_std": -1},
+)  # fmt: skip
+
+
+def paths(node: Any, here: Path = ()) -> list[Path]:
+    """Every place in a document."""
+    found: list[Path] = [here] if here else []
+    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for key, child in items:
+        found += paths(child, (*here, key))
+    return found
+
+
+def parent(document: Any, path: Path) -> Any:
+    for key in path[:-1]:
+        document = document[key]
+    return document
+
+
+values = st.one_of(
+    st.sampled_from(ODD),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=30),
+    st.recursive(st.none() | st.text(max_size=5), lambda inner: st.lists(inner, max_size=3), max_leaves=4),
+)
+
+
+@st.composite
+def mutated(draw: st.DrawFn, document: dict[str, Any]) -> dict[str, Any]:
+    """``document`` with one to three places replaced, removed, renamed, added to or swapped."""
+    document = copy.deepcopy(document)
+    for _ in range(draw(st.integers(1, 3))):
+        places = paths(document)
+        if not places:
+            break
+        path = draw(st.sampled_from(places))
+        holder, key = parent(document, path), path[-1]
+        match draw(st.sampled_from(["replace", "remove", "rename", "add", "swap"])):
+            case "replace":
+                holder[key] = draw(values)
+            case "remove":
+                del holder[key]
+            case "rename" if isinstance(holder, dict):
+                holder[str(key)[1:] or draw(st.text(max_size=8))] = holder.pop(key)
+            case "add" if isinstance(holder, dict):
+                holder[draw(st.sampled_from(["prior", "std", "unit", "path", "seed", "x", "__class__"]))] = draw(values)
+            case _:
+                other = draw(st.sampled_from(places))
+                holder[key] = copy.deepcopy(parent(document, other)[other[-1]])
+    return document

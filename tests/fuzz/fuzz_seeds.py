@@ -1,0 +1,42 @@
+"""Valid inputs to start from: what the project ships, and small files made here."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+SERIES = b"t_us,R_um\n" + b"\n".join(b"%g,%g" % (5 + 1.5 * k, 40 + 3 * k - 0.2 * k * k) for k in range(12)) + b"\n"
+
+
+def of(target: str) -> Iterator[bytes]:
+    """Inputs of a target that its reader accepts."""
+    match target:
+        case "configuration":
+            yield from (p.read_bytes() for p in sorted(CONFIGS.glob("*.yaml")) if not _of_a_command(p))
+        case "campaign":
+            yield (CONFIGS / "agarose_twin.yaml").read_bytes()
+        case "csv":
+            yield SERIES
+            yield SERIES.replace(b",", b";").replace(b"t_us", b"# by hand\nt_us")
+        case "covariance":
+            yield b"1.0,0.2,0\n0.2,1.5,0.1\n0,0.1,2\n"
+        case "mat":
+            from scipy.io import savemat
+
+            for compressed in (False, True):
+                file = io.BytesIO()
+                savemat(file, {"R": 1e-4 * np.linspace(1, 0.3, 9), "dt": 1e-6}, do_compression=compressed)
+                yield file.getvalue()
+        case "quantity":
+            yield from (b"1.5 Pa s", b"-2e3 mPa*s", b"3 kg/m/s", b"4 (N/m^2) s")
+        case _:
+            raise ValueError(f"no seeds for {target!r}")
+
+
+def _of_a_command(path: Path) -> bool:
+    """Study and campaign files belong to commands of their own."""
+    return path.stem in ("agarose_study", "agarose_twin")

@@ -1,0 +1,102 @@
+"""What reads from outside, as functions of raw bytes: each must take anything without a traceback and without hanging.
+
+A target returns whether the input was accepted. Whatever escapes it is a finding: an exception that is not an
+:class:`~en4dvar.errors.En4dvarError`, an error that does not say where, or a Python detail in its words.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from en4dvar.checks import validate
+from en4dvar.config.document import read_document
+from en4dvar.config.synthetic import resolve_campaign
+from en4dvar.errors import ConfigError, DataError, En4dvarError
+from en4dvar.readers import Column, Matrix, Step, read_contents, read_covariance, read_series
+from en4dvar.store import load_result
+from en4dvar.units import UnitError, parse_quantity
+
+TIME, RADIUS = Column("t_us", "us", "s"), Column("R_um", "um", "m")
+LEAK = re.compile(r"Traceback|object at 0x|<class |NoneType|KeyError|AttributeError|not subscriptable")
+LONGEST = 20_000  # characters of a message: every fault is told, but a wall of text helps nobody
+
+
+def configuration(content: bytes, folder: Path) -> bool:
+    """A YAML file, the data it names and the inverse problems it means."""
+    path = folder / "case.yaml"
+    path.write_bytes(content)
+    return _accepted(lambda: validate(path), ConfigError, path)
+
+
+def campaign(content: bytes, folder: Path) -> bool:
+    """The YAML of a synthetic campaign."""
+    path = folder / "case.yaml"
+    path.write_bytes(content)
+    return _accepted(lambda: resolve_campaign(read_document(path), folder), ConfigError, path)
+
+
+def csv_series(content: bytes, folder: Path) -> bool:
+    path = folder / "case.csv"
+    path.write_bytes(content)
+    _accepted(lambda: read_contents(path), DataError, path)
+    return _accepted(lambda: read_series(path, TIME, RADIUS), DataError, path)
+
+
+def csv_covariance(content: bytes, folder: Path) -> bool:
+    path = folder / "case.csv"
+    path.write_bytes(content)
+    return _accepted(lambda: read_covariance(Matrix(path, "um^2", "m^2")), DataError, path)
+
+
+def mat_series(content: bytes, folder: Path) -> bool:
+    path = folder / "case.mat"
+    path.write_bytes(content)
+    _accepted(lambda: read_contents(path), DataError, path)
+    return _accepted(lambda: read_series(path, Step(Column("dt", "s", "s")), Column("R", "m", "m")), DataError, path)
+
+
+def quantity(content: bytes, folder: Path) -> bool:
+    text = content.decode("utf-8", "replace")
+    try:
+        parse_quantity(text, "Pa s")
+    except UnitError as error:
+        _check(str(error), repr(text.strip()[:5])[1:-1])
+        return False
+    return True
+
+
+def result_file(content: bytes, folder: Path) -> bool:
+    """A result whose bytes were changed; the seal must tell before the HDF5 library reads a byte."""
+    path = folder / "case.nc"
+    path.write_bytes(content)
+    return _accepted(lambda: load_result(path), En4dvarError, path)
+
+
+TARGETS: Mapping[str, Callable[[bytes, Path], bool]] = {
+    "configuration": configuration,
+    "campaign": campaign,
+    "csv": csv_series,
+    "covariance": csv_covariance,
+    "mat": mat_series,
+    "quantity": quantity,
+    "result": result_file,
+}
+
+
+def _accepted(read: Callable[[], object], kind: type[En4dvarError], path: Path) -> bool:
+    try:
+        read()
+    except kind as error:
+        _check(str(error), path.stem)
+        return False
+    return True
+
+
+def _check(message: str, where: str) -> None:
+    assert message.strip(), "an empty message"
+    assert where in message, f"does not say where: {message!r}"
+    leak = LEAK.search(message)
+    assert leak is None, f"a Python detail: {message!r}"
+    assert len(message) < LONGEST, f"{len(message)} characters"
