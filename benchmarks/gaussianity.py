@@ -75,8 +75,7 @@ def chain_of(key: str) -> Record:
     problem, seed = of_key(key)
     analysis = assimilate(problem, SETTINGS, seed)
     x = problem.prior.from_physical(analysis.posterior)
-    found = guide(WeightSpace(problem, SETTINGS, seed, SerialExecutor()), x, seed)
-    emulated = None if found is None else found[0].cost
+    emulated = guide(WeightSpace(problem, SETTINGS, seed, SerialExecutor()), x, seed)
     chain = mcmc.sample(lambda z: log_posterior(problem, z), x, 10_000 + seed, target=TARGET, emulated=emulated)
     return {
         "mean": chain.flat.mean(axis=0),

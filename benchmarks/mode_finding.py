@@ -5,7 +5,7 @@
     python benchmarks/mode_finding.py --prior wide --minutes 4   a piece of it: records are kept, the next call goes on
 
 The reference is the lowest J among all ways, twenty starts of another, random ensemble of 120 members, and a Markov
-chain of 300 steps of 48 walkers. A plain run is one descent from the member of lowest J.
+chain of 100 steps of 48 walkers. A plain run is one descent from the member of lowest J.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ WAYS = {
     "2 starts, Levenberg-Marquardt": replace(COUNTED, step_control="levenberg-marquardt"),
 }
 TOLERANCE = 0.1  # of J: closer ends are the same minimum
-CHAIN_STEPS = 300
+CHAIN_STEPS = 100
 
 
 def experiment(seed: int, of: Prior) -> Record:

@@ -264,8 +264,7 @@ class _Run:
             if self.on_iteration is not None:
                 self.on_iteration(replace(self.latest, refinement=Refinement(chain, space.forward_runs)))
 
-        guiding = guide(space, posterior, self.seed)  # made again after an interruption, from the same runs
-        emulated = None if guiding is None else guiding[0].cost
+        emulated = guide(space, posterior, self.seed)  # made again after an interruption, from the same runs
         if earlier is not None:
             space.forward_runs = earlier.forward_runs
         resume = earlier.chain if earlier else None

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -29,9 +29,10 @@ from en4dvar.walkers import advance
 DEGREES = (3, 2)  # tried in this order
 RUNS_PER_TERM = 4
 FEWEST_RUNS, MOST_RUNS = 96, 512  # of one fit
+CEILING = 20.0  # above the lowest J_o of the runs
 RIDGE = 1e-9  # relative: decides where the runs leave a coefficient open
 WALKERS = 120
-SCATTERED, SETTLED = 8, 20  # rounds of the walkers before the second fit, after it
+SCATTERED, SETTLED = 8, 40  # rounds of the walkers before the second fit, after it
 PER_ROUND = 5  # moves of each half in a round
 
 Run = Callable[[Array], Forecast]
@@ -42,7 +43,9 @@ class Emulator:
     """Ĵ (B,) of control vectors (B, n), from polynomials of z = root⁻¹ (x − centre).
 
     ``terms`` are the index pairs that make each degree from the one before; ``coefficients`` (C, Ky) of predictions,
-    rates and ln σ side by side. ``share`` is the effective share of the runs that judge it.
+    rates and ln σ side by side. The observations' part is cut at ``ceiling``: far from its runs a polynomial says only
+    that J is large, and a walker that true J lets in there must find its way out. ``share`` is the effective share of
+    the runs that judge it, ``draws`` (S, n) are of exp(−Ĵ).
     """
 
     prior: Prior
@@ -52,7 +55,9 @@ class Emulator:
     terms: tuple[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]], ...]
     coefficients: Array
     columns: tuple[bool, bool]
+    ceiling: float = math.inf
     share: float = math.nan
+    draws: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     def cost(self, x: Array) -> Array:
         """Ĵ (B,) of control vectors (B, n)."""
@@ -61,7 +66,8 @@ class Emulator:
         has_rates, has_scale = self.columns
         rates = outputs[k : 2 * k].T if has_rates else None
         scale = np.exp(outputs[-1]) if has_scale else None
-        return _prior_cost(self.prior, x) + observation_cost(self.observations, outputs[:k].T, rates, scale)
+        observed = observation_cost(self.observations, outputs[:k].T, rates, scale)
+        return _prior_cost(self.prior, x) + np.minimum(observed, self.ceiling)
 
     def walk(self, x: Array, random: np.random.Generator, rounds: int) -> list[Array]:
         """Positions (W, n) of walkers from ``x`` after each round, sampling exp(−Ĵ)."""
@@ -99,8 +105,8 @@ def needed_runs(n_parameters: int) -> tuple[int, int] | None:
 
 def emulate(
     run: Run, prior: Prior, observations: Observations, ensemble: Array, random: np.random.Generator
-) -> tuple[Emulator, Array] | None:
-    """An emulator about a Gaussian ensemble (N, n), transformed, and draws (S, n) of exp(−Ĵ).
+) -> Emulator | None:
+    """An emulator about a Gaussian ensemble (N, n), transformed, with draws of it.
 
     Takes twice the :func:`needed_runs` of the model through ``run``. None where there are too many parameters for
     polynomials, or so many runs fail that the rest does not determine them.
@@ -132,7 +138,8 @@ def emulate(
     # judged where the rough one sampled: its weights, of the better one's J
     settled = fine.walk(positions[-1], random, SETTLED)
     share = effective_share(rough.cost(second[0].x) - second[0].costs) * len(second[0].x) / count
-    return replace(fine, share=share), np.concatenate(settled[SETTLED // 4 :])
+    ceiling = float(np.min(runs.costs - _prior_cost(prior, runs.x))) + CEILING
+    return replace(fine, ceiling=ceiling, share=share, draws=np.concatenate(settled[SETTLED // 4 :]))
 
 
 def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> tuple[_Runs, tuple[bool, bool]] | None:

@@ -22,14 +22,15 @@ import numpy as np
 
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.state import Array
-from en4dvar.walkers import advance
+from en4dvar.walkers import Emulated, advance
 
 DE_SHARE = 0.8  # of the moves, the rest are stretches
-GUIDED_SHARE, GUIDED_MOVES = 0.75, 50  # of the steps where there is an emulator; its moves in one of them
+GUIDED_SHARE, GUIDED_MOVES = 0.85, 60  # of the steps where there is an emulator; its moves in one of them
 BURN_IN = 0.25  # of the chain, dropped at its start
 MAX_R_HAT = 1.1  # Gelman et al. (2013), § 11.5
 BLOCK = 50  # steps between two looks at convergence
 SCATTER = 0.1  # walkers are spread by this much more than the ensemble, so that no two coincide
+ASTRAY = 10.0  # by which J exceeds the emulator's where a walker must not start: an empty basin would trap it
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ def sample(
     target: float = 1000.0,
     resume: ChainState | None = None,
     keep: Callable[[ChainState], None] | None = None,
-    emulated: Callable[[Array], Array] | None = None,
+    emulated: Emulated | None = None,
 ) -> Chain:
     """Sample a density from the neighbourhood of an ensemble.
 
@@ -127,7 +128,7 @@ def sample(
     walkers: at least 2 (n + 1), even. max_steps: at most. target: effective sample size to reach in each direction.
     resume: where an earlier call with the same arguments was interrupted; the chain has the same bits as without.
     keep: called with the state of the chain at each look at convergence.
-    emulated: minus the log density, approximately, (B, n) → (B,), at no cost; it guides the walkers.
+    emulated: an approximation at no cost; it guides the walkers, which start from draws of it.
 
     Raises
     ------
@@ -137,7 +138,7 @@ def sample(
     n = ensemble.shape[1]
     walkers = max(walkers, 2 * (n + 1)) + max(walkers, 2 * (n + 1)) % 2
     if resume is None:
-        state, chain = _start(emcee, log_density, ensemble, seed, walkers), _Blocks(walkers, n)
+        state, chain = _start(emcee, log_density, ensemble, seed, walkers, emulated), _Blocks(walkers, n)
     else:
         state, chain = _state_of(emcee, resume), _Blocks.of(resume)
     guided = 0.0 if emulated is None else GUIDED_SHARE
@@ -146,7 +147,7 @@ def sample(
         (emcee.moves.StretchMove(), (1 - guided) * (1 - DE_SHARE)),
     ]
     if emulated is not None:
-        moves.append((_guided(emcee, emulated), guided))
+        moves.append((emcee.moves.MHMove(_guided(emulated)), guided))
     sampler = emcee.EnsembleSampler(walkers, n, log_density, vectorize=True, moves=moves)
     steps, converged = chain.steps, False
     while True:
@@ -212,13 +213,25 @@ class _Blocks:
         )
 
 
-def _start(emcee: Any, log_density: Callable[[Array], Array], ensemble: Array, seed: int, walkers: int) -> Any:
+def _start(
+    emcee: Any,
+    log_density: Callable[[Array], Array],
+    ensemble: Array,
+    seed: int,
+    walkers: int,
+    emulated: Emulated | None,
+) -> Any:
     """The walkers' first positions and the state of the random numbers. Raises :class:`En4dvarError`."""
     n_members, n = ensemble.shape
     random = np.random.Generator(np.random.Philox(key=seed))
-    start = ensemble[np.arange(walkers) % n_members]
-    start = start + SCATTER * ensemble.std(axis=0) * random.standard_normal(start.shape)
-    density = log_density(start)
+    if emulated is None:
+        start = ensemble[np.arange(walkers) % n_members]
+        start = start + SCATTER * ensemble.std(axis=0) * random.standard_normal(start.shape)
+        density = log_density(start)
+    else:
+        start = emulated.draws[np.linspace(0, len(emulated.draws) - 1, walkers).astype(int)]
+        density = log_density(start)
+        density = np.where(density + emulated.cost(start) > -ASTRAY, density, -np.inf)
     alive = np.flatnonzero(np.isfinite(density))
     if len(alive) < n + 1:
         raise En4dvarError(f"refine: mcmc: the model cannot run {walkers - len(alive)} of {walkers} walkers")
@@ -234,16 +247,15 @@ def _state_of(emcee: Any, chain: ChainState) -> Any:
     return emcee.State(chain.samples[-1], log_prob=chain.log_density[-1], random_state=random)
 
 
-def _guided(emcee: Any, cost: Callable[[Array], Array]) -> Any:
-    """The move of half of the walkers, about the others, on an emulator of −log density."""
+def _guided(emulated: Emulated) -> Callable[[Array, Any], tuple[Array, Array]]:
+    """Proposals (W, n), every walker many moves on the emulator away, and the log of what corrects for it (W,)."""
 
-    class Guided(emcee.moves.RedBlueMove):
-        def get_proposal(self, sample: Array, complement: list[Array], random: Any) -> tuple[Array, Array]:
-            before = cost(sample)
-            after, costs = advance(cost, sample, before, np.concatenate(complement), random, GUIDED_MOVES)
-            return after, costs - before
+    def propose(x: Array, random: Any) -> tuple[Array, Array]:
+        before = emulated.cost(x)
+        after, costs = advance(emulated.cost, x, before, emulated.draws, random, GUIDED_MOVES)
+        return after, costs - before
 
-    return Guided()
+    return propose
 
 
 def split_r_hat(samples: Array) -> Array:

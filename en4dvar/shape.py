@@ -29,9 +29,9 @@ def examine_shape(space: WeightSpace, ensemble: Array, mode: Array, costs: Array
     """
     shape = diag.gaussianity(ensemble, mode, costs)
     if shape["gaussian_fit"] < CLEARED:
-        found = guide(space, ensemble, seed)
-        if found is not None:
-            emulator, draws = found
+        emulator = guide(space, ensemble, seed)
+        if emulator is not None:
+            draws = emulator.draws
             std = draws.std(axis=0)
             ratio = ensemble.std(axis=0, ddof=1) / std
             shape |= {
@@ -42,8 +42,8 @@ def examine_shape(space: WeightSpace, ensemble: Array, mode: Array, costs: Array
     return {**shape, "non_gaussian": diag.is_non_gaussian(shape)}
 
 
-def guide(space: WeightSpace, ensemble: Array, seed: int) -> tuple[Emulator, Array] | None:
-    """An emulator of J about an ensemble (N, n) and draws (S, n) of it; None where the settings or the model forbid."""
+def guide(space: WeightSpace, ensemble: Array, seed: int) -> Emulator | None:
+    """An emulator of J about an ensemble (N, n); None where the settings or the model forbid."""
     wanted = space.settings.emulator
     if wanted == "off" or (wanted == "auto" and not space.problem.model.compiled):
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -12,6 +12,16 @@ from en4dvar.state import Array
 STRETCHES = 0.3  # share of the moves, the others are differential evolution
 LEAPS = 0.1  # share of the latter of length 1, which takes walkers from one mode to another
 JITTER = 1e-5  # of the spread
+
+
+class Emulated(Protocol):
+    """An approximate −log density that costs nothing, and draws (S, n) of what it describes."""
+
+    @property
+    def draws(self) -> Array: ...
+
+    def cost(self, x: Array) -> Array:
+        """Minus the log density (B,) at positions (B, n), up to a constant."""
 
 
 def advance(
