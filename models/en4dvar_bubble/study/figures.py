@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, styled
 from en4dvar.state import Array
 from en4dvar_bubble.model import BubbleModel
+from en4dvar_bubble.study import measured
 from en4dvar_bubble.study.paper import NAMES, QUANTITIES, Quantity, Route
 from en4dvar_bubble.study.run import Fit, Study
 
@@ -57,6 +58,12 @@ def _figures(study: Study) -> Iterator[Drawn]:
             "Log-evidence of the quadratic over the neo-Hookean law; shaded: undecidable.",
             evidence(study),
         )
+
+    if study.plan.synthetic:
+        stated = (
+            "Stated probability of the favoured law against how often it was right; bars: binomial standard deviation."
+        )
+        yield "reliability", f"{stated} Repeated synthetic experiments, half by each law.", reliability_figure()
 
 
 def gel_key(gel: str) -> str:
@@ -312,4 +319,36 @@ def evidence(study: Study) -> Figure:
     axes.set_yticks(range(len(study.comparisons)), [f"{gel} gel" for gel in study.comparisons])
     reach = max(4.0, *(1.1 * np.max(np.abs(c.single)) for c in study.comparisons.values()))
     axes.set(xlabel=r"$\Delta$ log-evidence (neo-Hookean $\leftarrow$ 0 $\rightarrow$ quadratic)", xlim=(-reach, reach))
+    return figure
+
+
+@styled
+def reliability_figure() -> Figure:
+    """Measured once and shipped: (a) stated probability against frequency, (b) the differences themselves."""
+    figure = Figure(figsize=(PAGE, 0.36 * PAGE), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.plot([0.5, 1], [0.5, 1], "-", color=LIGHT["muted"], lw=0.8)
+    for row, (name, words) in enumerate(measured.EXPERIMENTS.items()):
+        difference, quadratic = measured.reliability(name)
+        colour, marker = GEL_COLOURS[row], "os"[row]
+        found = measured.bins(difference, quadratic)
+        left.errorbar(
+            [b.stated for b in found], [b.right for b in found], [b.error for b in found], fmt=marker, ms=4,
+            color=colour, lw=1, capsize=2, label=words,
+        )  # fmt: skip
+        for b in found if row == 0 else ():
+            left.annotate(f"{b.count}", (b.stated, b.right), (5, -8), textcoords="offset points", fontsize=6)
+        favoured = np.where(quadratic, difference, -difference)  # positive: for the law that made the data
+        reach = np.clip(favoured, -12, 30)
+        right.hist(
+            reach, np.arange(-12, 31.5, 1.5), histtype="stepfilled", alpha=0.45, color=colour, ec=colour, lw=1,
+            hatch=("", "////")[row],
+        )  # fmt: skip
+    right.axvspan(-3, 3, color=LIGHT["grid"], zorder=0)
+    left.set(xlabel="stated probability", ylabel="right", xlim=(0.48, 1.02), ylim=(0.35, 1.05))
+    right.set(xlabel=r"$\Delta$ log-evidence for the true law (ends: beyond)", ylabel="experiments")
+    left.set_title("(a)", loc="left")
+    right.set_title("(b)", loc="left")
+    handles, labels = left.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=2)
     return figure

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from en4dvar.state import Array
 from en4dvar_bubble.study.evidence import Comparison, compare_laws
 from en4dvar_bubble.study.keep import Keep
 from en4dvar_bubble.study.one_gel import OneGel, fit_one_gel
-from en4dvar_bubble.study.paper import QUANTITIES, Model, Route
+from en4dvar_bubble.study.paper import QUANTITIES, TABLE_2, Model, Route
 from en4dvar_bubble.study.population import Population, estimate_population
 from en4dvar_bubble.study.set_runs import SetRuns
 from en4dvar_bubble.study.settings import StudyPlan
@@ -93,7 +93,9 @@ class Fit:
 
 @dataclass(frozen=True)
 class Study:
-    """All that the report shows. ``truth``: data set → parameter → SI value, empty without a twin."""
+    """All that the report shows. ``truth``: data set → parameter → SI value, empty without a twin. ``narrow``: the
+    general quadratic law again, with a prior on R0 as narrow as the spread that Table 2 prints.
+    """
 
     plan: StudyPlan
     fits: Mapping[str, Mapping[Model, Fit]]
@@ -101,6 +103,7 @@ class Study:
     comparisons: Mapping[str, Comparison]
     truth: Mapping[str, Mapping[str, float]]
     seconds: Mapping[str, float] = field(default_factory=dict)
+    narrow: Mapping[str, Fit] = field(default_factory=dict)
 
     def true_values(self, gel: str, name: str) -> Array:
         """(S,) true values of a gel's data sets, SI; empty where there is no truth."""
@@ -154,6 +157,8 @@ def run_study(plan: StudyPlan, workers: int = 1, tell: Tell | None = None, keep:
             analyses = tuple(assimilate(p, config.assimilation, config.seed, executor) for p in sets)
         say(f"{gel} {model}: En4D-Var of {len(sets)} data sets in {time.perf_counter() - began:.1f} s")
         fits[gel][model] = Fit(gel, model, sets, sweeps[gel, model], analyses)
+    again = {gel: _narrow(models.get("qlkv"), plan, workers) for gel, models in fits.items()}
+    narrow = {gel: fit for gel, fit in again.items() if fit is not None}
     seconds["en4dvar"] = time.perf_counter() - start
     start = time.perf_counter()
     populations, comparisons = {}, {}
@@ -168,7 +173,21 @@ def run_study(plan: StudyPlan, workers: int = 1, tell: Tell | None = None, keep:
     seconds["population"] = time.perf_counter() - start
     say(f"population and model comparison in {seconds['population']:.1f} s")
     truth = read_truth(plan.truth) if plan.truth else {}
-    return Study(plan, fits, populations, comparisons, truth, seconds)
+    return Study(plan, fits, populations, comparisons, truth, seconds, narrow)
+
+
+def _narrow(fit: Fit | None, plan: StudyPlan, workers: int) -> Fit | None:
+    """None where the paper prints no spread of R0, or R0 is not estimated."""
+    printed = TABLE_2.get(fit.gel, {}).get(fit.model, {}).get("R0") if fit else None
+    if fit is None or printed is None or not fit.estimated("R0"):
+        return None
+    relative = printed[1] / printed[0]
+    terms = tuple(replace(t, std=relative) if t.parameter.name == "R0" else t for t in fit.prior.terms)
+    problems = tuple(replace(p, prior=Prior(terms)) for p in fit.problems)
+    config = plan.configs[fit.gel][fit.model]
+    with make_executor(config.model, workers) as executor:
+        analyses = tuple(assimilate(p, config.assimilation, config.seed, executor) for p in problems)
+    return replace(fit, problems=problems, analyses=analyses)
 
 
 def _start(fit: Fit) -> Array:
