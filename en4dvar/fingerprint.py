@@ -35,7 +35,12 @@ class Identity:
 
     def of_dataset(self, name: str) -> str:
         """Fingerprint of one data set's result."""
-        return digest(f"{self.settings}\n{name}: {dict(self.data)[name]}".encode())
+        return digest(f"{self.settings}\n{name}: {self.content[name]}".encode())
+
+    @functools.cached_property
+    def content(self) -> Mapping[str, str]:
+        """``data`` by name."""
+        return dict(self.data)
 
     def difference(self, earlier: Identity, retried: frozenset[str]) -> str:
         """Unified diff from ``earlier`` to this, "" where they agree. Files of ``retried`` data sets may differ."""

@@ -203,7 +203,7 @@ def _interrupted(work: Worklist, error: BaseException) -> BaseException:
 
 
 def _has_failed(work: Worklist, d: Dataset, earlier: Identity) -> bool:
-    if d.name not in dict(earlier.data):
+    if d.name not in earlier.content:
         return False
     try:
         record = read_checkpoint(work.directory.work / d.done, earlier.of_dataset(d.name), Done)

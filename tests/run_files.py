@@ -10,10 +10,14 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pytest
 import xarray as xr
+from execution_models import Stops
 from toy_config import csv_text, write_toy
 
 from en4dvar.config import Config, load_config
+from en4dvar.interrupt import Interrupted
+from en4dvar.runner import run_campaign
 
 TESTS = Path(__file__).parent
 
@@ -40,6 +44,15 @@ def configuration(path: Path, out: Path, **execution: object) -> Config:
     """The configuration with ``execution`` settings and run directory ``out``; every iteration is kept."""
     overrides = {"output.directory": str(out), "output.report": False, "execution.checkpoint_every": 0}
     return load_config(path, overrides | {f"execution.{key}": value for key, value in execution.items()})
+
+
+def interrupt(path: Path, out: Path, call: int, resume: bool = False) -> str:
+    """Run a configuration of ``execution_models:Stops`` until call number ``call`` of the model; the reason told."""
+    Stops.calls, Stops.stop_at = 0, call
+    with pytest.raises(Interrupted) as stopped:
+        run_campaign(configuration(path, out), resume=resume)
+    Stops.stop_at = 0
+    return str(stopped.value)
 
 
 def posterior_files(run: Path) -> dict[str, Path]:

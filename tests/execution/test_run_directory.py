@@ -21,6 +21,8 @@ def contents(folder):
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.mark.fault("two-runs")
+@pytest.mark.fault("stale-lock")
 def test_second_run_is_refused_and_a_dead_one_is_not_in_the_way(tmp_path):
     path, out = write_toy(tmp_path, ("toy_models:Oscillator", "execution_models:Slow")), tmp_path / "run"
     words = command("run", path, "--out", out, "--no-report")

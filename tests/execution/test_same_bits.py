@@ -36,6 +36,7 @@ def test_members_on_workers_where_data_sets_are_few(quiet, tmp_path, kind):
 
 @pytest.mark.parametrize("kind", ["processes", "dask"])
 @pytest.mark.parametrize("workers", [2, 5], ids=["data sets", "members"])
+@pytest.mark.fault("worker-killed")
 def test_death_of_a_worker_changes_nothing(quiet, tmp_path, monkeypatch, kind, workers):
     _, run = quiet
     path = make_campaign(tmp_path, 4, "execution_models:DiesOnce", large=2)
@@ -47,6 +48,7 @@ def test_death_of_a_worker_changes_nothing(quiet, tmp_path, monkeypatch, kind, w
 
 
 @pytest.mark.parametrize("kind", ["processes", "dask"])
+@pytest.mark.fault("worker-always")
 def test_a_data_set_that_kills_every_worker_is_named_and_the_others_are_not_disturbed(quiet, tmp_path, kind):
     _, run = quiet
     path = make_campaign(tmp_path, 4, "execution_models:DiesAlways", large=2)

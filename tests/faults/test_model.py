@@ -39,21 +39,15 @@ def faulty(folder):
     return write_toy(folder, ("toy_models:Oscillator", "faulty_models:Faulty"))
 
 
-def fault(name, *marks):
-    rows = {"not_a_number": "model-nan", "wrong_shape": "model-shape", "allocates": "model-memory"}
-    row = rows.get(name, "model-hangs" if name.startswith("hangs") else "model-raises")
-    return pytest.param(name, marks=[pytest.mark.fault(row), *marks])
-
-
 @pytest.mark.parametrize(
     "name",
     [
-        fault("raises"),
-        fault("not_a_number"),
-        fault("wrong_shape"),
-        fault("hangs"),
-        fault("hangs_in_compiled_code", pytest.mark.slow, pytest.mark.long),
-        fault("allocates"),
+        pytest.param("raises", marks=pytest.mark.fault("model-raises")),
+        pytest.param("not_a_number", marks=pytest.mark.fault("model-nan")),
+        pytest.param("wrong_shape", marks=pytest.mark.fault("model-shape")),
+        pytest.param("hangs", marks=pytest.mark.fault("model-hangs")),
+        pytest.param("hangs_in_compiled_code", marks=[pytest.mark.slow, pytest.mark.long]),
+        pytest.param("allocates", marks=pytest.mark.fault("model-memory")),
     ],
 )
 def test_only_the_faulty_members_are_lost(raising, tmp_path, monkeypatch, name):

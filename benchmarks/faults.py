@@ -1,0 +1,64 @@
+"""What the faults of docs/faults.md were tried with: python benchmarks/faults.py [--quick] [--seed 1]
+
+Runs are killed at every operation on the file system and at random moments (forecasts, checkpoints, netCDF, report),
+resumed and compared bit by bit with an undisturbed run; a folder of 10 000 data sets is estimated; the soak is run.
+Prints kills survived and sets completed. Some 20 minutes; ``--quick`` does a little of each in two.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT / "tests" / "faults"), str(ROOT / "tests")]
+
+from killing import survive  # noqa: E402
+from many import estimate_many  # noqa: E402
+from soak import soak  # noqa: E402
+
+from en4dvar.provenance import cpu_model, git_commit  # noqa: E402
+
+HOUR = 3600.0  # s, nothing takes that long
+
+
+def kills(quick: bool, seed: int) -> int:
+    """Kills survived; an :class:`AssertionError` says which was not."""
+    share, each = (0.1, 4) if quick else (1.0, 20)
+    total = 0
+    for label, task in {
+        "at file operations, new run": {"share": share},
+        "at file operations, with --force": {"share": share, "force": True},
+        "at file operations, with the report": {"share": 0.5 * share, "sets": 1, "report": True},
+        "at random moments, serial": {"kills": each, "sets": 4},
+        "at random moments, threads": {"kills": each, "sets": 4, "executor": "threads"},
+        "at random moments, processes": {"kills": each, "sets": 4, "executor": "processes"},
+    }.items():
+        found = survive(HOUR, seed=seed, **task)["kills"]
+        print(f"kills survived {label:37} {found:6}", flush=True)
+        total += found
+    return total
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    print(f"commit {git_commit(Path(__file__))}, seed {given.seed}, {cpu_model()}")
+    print(f"kills survived {'in all, the same bits after each':37} {kills(given.quick, given.seed):6}")
+    sets = 200 if given.quick else 10_000
+    with tempfile.TemporaryDirectory() as folder:
+        early, late, first = estimate_many(Path(folder), sets, "processes")
+    print(
+        f"sets completed of one folder {sets:29}   first after {first:.1f} s, peak memory {early:.0f} MB after a tenth,"
+    )
+    print(f"{'':60} peak memory {early:.0f} MB after a tenth, {late:.0f} MB at the end")
+    for name, value in soak(200 if given.quick else 2000, 10.0, given.seed).items():
+        print(f"soak: {name:55} {value}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,140 @@
+"""The rows of docs/faults.md: what goes wrong, what the user sees, what is kept. Tests name the row they prove.
+
+``python tests/faults/rows.py`` writes the table of the page again.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "faults.md"
+BEGIN, END = "<!-- table: python tests/faults/rows.py -->\n", "<!-- end of the table -->\n"
+
+
+@dataclass(frozen=True)
+class Row:
+    """``message`` is what the tests find word by word, but for what stands in braces."""
+
+    name: str
+    fault: str
+    message: str
+    exit_code: str
+    kept: str
+
+    def told(self, text: str) -> bool:
+        """Whether ``text`` holds the message."""
+        parts = (re.escape(part) for part in re.split(r"\{[^}]*\}", self.message))
+        return re.search(".*".join(parts), text) is not None
+
+
+DONE = "every finished data set; the others continue from their last iteration"
+ROWS = tuple(
+    Row(*cells)
+    for cells in (
+        ("kill", "SIGKILL, a crash, the power gone: at any moment", "", "137", f"{DONE}; the same bits after --resume"),
+        ("kill-force", "the same while --force replaces an earlier run", "", "137",
+         "the earlier result until the new one is whole; then the new one"),
+        ("interrupt", "Ctrl-C (SIGINT) or the time limit of a batch system (SIGTERM)",
+         "interrupted; {n} of {all} data sets are done and kept in {run}\nto continue: en4dvar run {words} --resume",
+         "130", DONE),
+        ("disk-full", "the disk is full",
+         "{file}: cannot be written: No space left on device; {n} of {all} data sets are done and kept in {run}; "
+         "give --resume to continue", "2", f"{DONE}; no half-written file"),
+        ("read-only", "the output directory cannot be written",
+         "{run}: cannot be used as run directory: Permission denied", "2", "nothing is begun"),
+        ("removed", "the run directory is removed or renamed during the run",
+         "{file}: cannot be written: No such file or directory; the run directory {run} was removed or renamed while "
+         "the run was at work", "2", "what was renamed; it can be resumed there"),
+        ("checkpoint-damaged", "a checkpoint is cut short, altered or of another run",
+         "{file}: damaged or incomplete (its checksum does not match); {data set} is estimated from the start", "0",
+         "everything else"),
+        ("checkpoint-older", "a checkpoint of another version",
+         "{file}: checkpoint format 0; this version reads 1; {data set} is estimated from the start", "0",
+         "everything else"),
+        ("result-damaged", "a result file is altered",
+         "{file}: damaged or altered since it was written (its checksum does not match)", "2",
+         "the file is not read; --resume estimates it again"),
+        ("result-cut", "a result file is cut short",
+         "{file}: not a complete result of en4dvar: it is cut short, was altered, or comes from an older version", "2",
+         "the file is not read; --resume estimates it again"),
+        ("result-older", "a result file of another version",
+         "{file}: result format 0; this version of en4dvar reads 1", "2", "the file stays as it is"),
+        ("two-runs", "two runs in one directory",
+         "{run}: in use by process {pid} on {machine}; wait for it to end, or give another --out", "2",
+         "the first run"),
+        ("stale-lock", "the lock of a run that was killed", "", "0", "the lock goes with its process"),
+        ("worker-killed", "a worker process is killed (processes, dask), by the system for its memory, or by hand", "",
+         "0", "everything; its work is repeated, to the same bits"),
+        ("worker-always", "a data set kills every worker that tries it",
+         "{data set}: WorkerLostError: a worker process died", "1", "all other data sets"),
+        ("scheduler-lost", "the dask scheduler is lost",
+         "lost the connection to the dask scheduler {address}; {n} of {all} data sets are done and kept in {run}; "
+         "give --resume to continue", "1", DONE),
+        ("model-raises", "the forward model raises an exception", "ArithmeticError: no such oscillation", "0",
+         "all other members; the member is lost, its reason in the result"),
+        ("model-nan", "it returns NaN", "non-finite state", "0", "the same"),
+        ("model-shape", "it returns an array of the wrong shape", "step returned shape (3,), expected (4,)", "0",
+         "the same"),
+        ("model-hangs", "it never returns (with `execution: {time_limit: 60 s}`)",
+         "TimeLimitError: not done after {time} s", "0", "the same; compiled code is ended with its worker process"),
+        ("model-memory", "it allocates without bound (with `execution: {memory_limit: 4 GB}`)", "MemoryError: {size}",
+         "0", "the same; without the limit the system kills the worker, see there"),
+        ("half-lost", "half of the members fail at once, in any iteration",
+         "4 of 8 members failed in the {stage}: {reason} (4×)", "0", "the result, with a warning"),
+        ("all-lost", "all members fail at once, in any iteration",
+         "8 of 8 members failed in the {stage}; at least 4 must survive. Most frequent reasons: {reason} (8×)", "3",
+         "all other data sets"),
+        ("clock", "the clock jumps backwards", "", "0", "everything; only monotonic clocks are used"),
+        ("many-sets", "10 000 data sets in a folder", "", "0", "memory flat, the first estimate within seconds"),
+        ("many-rows", "a data file of 1 000 000 rows", "", "0", "read within seconds; estimated in flat memory"),
+        ("paths", "blanks, any script, bytes that are not UTF-8 in the names of files and folders", "", "0",
+         "everything"),
+    )
+)  # fmt: skip
+
+
+def row(name: str) -> Row:
+    """Raises :class:`KeyError`."""
+    return {r.name: r for r in ROWS}[name]
+
+
+def proofs() -> dict[str, set[str]]:
+    """Name of the row → files of tests (relative to ``tests/``) that are marked with it."""
+    found: dict[str, set[str]] = {}
+    for file in sorted((ROOT / "tests").rglob("test_*.py")):
+        for name in _marks(ast.parse(file.read_text(encoding="utf-8"))):
+            found.setdefault(name, set()).add(file.relative_to(ROOT / "tests").as_posix())
+    return found
+
+
+def _marks(tree: ast.AST) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("mark.fault"):
+            yield from (str(a.value) for a in node.args if isinstance(a, ast.Constant))
+
+
+def table() -> str:
+    """The table in Markdown."""
+    lines = ["| fault | what the user sees | exit code | what is kept | test |", "|---|---|---|---|---|"]
+    tests = proofs()
+    for r in ROWS:
+        message = "<br>".join(f"`{part}`" for part in r.message.splitlines()) or "nothing"
+        files = "<br>".join(f"`{name}`" for name in sorted(tests.get(r.name, ())))
+        lines.append(f"| {r.fault} | {message} | {r.exit_code} | {r.kept} | {files} |")
+    return "".join(f"{line}\n" for line in lines)
+
+
+def rendered(page: str) -> str:
+    """The page with the table of today."""
+    before, _, rest = page.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    return f"{before}{BEGIN}\n{table()}\n{END}{after}"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(rendered(PAGE.read_text(encoding="utf-8")), encoding="utf-8")

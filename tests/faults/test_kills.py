@@ -1,0 +1,65 @@
+"""SIGKILL, SIGINT, SIGTERM: what is left can always be resumed, to the same bits."""
+
+import re
+import signal
+
+import pytest
+from killing import survive
+from rows import row
+from run_files import run_and_signal, run_cli
+from toy_config import write_toy
+
+
+@pytest.mark.fault("kill")
+def test_killed_at_some_file_operations():
+    """Checkpoints, netCDF, lists of files: a write half done, a rename not done, a folder not made."""
+    found = survive(90, share=0.08, seed=5)
+    assert found["operations"] > 60
+    assert found["kills"] >= 5
+
+
+@pytest.mark.fault("kill-force")
+def test_killed_while_an_earlier_run_is_replaced():
+    found = survive(90, share=0.06, seed=2, force=True)
+    assert found["operations"] > 90
+    assert found["kills"] >= 4
+
+
+@pytest.mark.slow
+@pytest.mark.fault("kill")
+def test_killed_while_the_report_is_written():
+    found = survive(300, sets=1, report=True, share=0.12, seed=3)
+    assert any("png" in name or "pdf" in name for name in found["at"].values())
+    assert found["kills"] >= 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("executor", ["serial", "threads", pytest.param("processes", marks=pytest.mark.long)])
+@pytest.mark.fault("kill")
+def test_killed_at_random(executor):
+    """During forecasts, mostly: that is where the time goes."""
+    assert survive(300, sets=4, executor=executor, kills=10, seed=1)["kills"] >= 10
+
+
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.fault("kill")
+def test_killed_at_every_file_operation(force):
+    found = survive(900, share=1.0, seed=1, force=force)
+    assert found["kills"] == found["operations"] > 60
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
+@pytest.mark.fault("interrupt")
+def test_interrupted(tmp_path, number):
+    path, out = write_toy(tmp_path, ("toy_models:Oscillator", "execution_models:Slow")), tmp_path / "run"
+    words = ("run", path, "--out", out, "--no-report")
+    code, told = run_and_signal(number, 4.0, *words, EN4DVAR_TEST_PAUSE=1.0)
+    assert code == int(row("interrupt").exit_code), told
+    first, second = told.splitlines()
+    assert row("interrupt").told(f"{first}\n{second}")
+    assert re.search(r"^to continue: en4dvar run .* --resume$", second)
+    done = run_cli(*words, "--resume")
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,105 @@
+"""Clocks that jump, folders and files of unusual size, names in any script."""
+
+import datetime
+import itertools
+import os
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cheap_model import write_campaign
+from many import estimate_many
+from run_files import assert_same_results, command, configuration, environment, make_campaign, run_cli
+from toy_config import csv_text, write_toy
+
+from en4dvar.runner import run_campaign
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+@pytest.mark.fault("clock")
+def test_a_clock_that_jumps_backwards(tmp_path, monkeypatch):
+    """An hour at every reading: nothing waits for it, nothing is computed from it."""
+    path = make_campaign(tmp_path, 2)
+    settings = {"executor": "threads", "workers": 2}
+    run_campaign(configuration(path, tmp_path / "quiet", **settings))
+    jumps = itertools.count(0, -3600)
+
+    class Clock(datetime.datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return super().now(tz) + datetime.timedelta(seconds=next(jumps))
+
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + next(jumps))
+    monkeypatch.setattr("en4dvar.progress.datetime", Clock)
+    monkeypatch.setattr("en4dvar.provenance.datetime", Clock)
+    config = configuration(path, tmp_path / "run", **settings)
+    campaign = run_campaign(config)
+    assert campaign.exit_code == 0
+    assert next(jumps) < -5 * 3600
+    assert_same_results(tmp_path / "run", tmp_path / "quiet")
+    assert run_campaign(config, resume=True).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    "sets", [100, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.long])], ids=["few", "many"]
+)
+@pytest.mark.fault("many-sets")
+def test_many_data_sets_in_flat_memory(tmp_path, sets):
+    early, late, first = estimate_many(tmp_path, sets)
+    assert late - early < 60 + 0.008 * sets, "MB; what is told of each data set at the end is kept, no more"
+    assert first < 30
+
+
+@pytest.mark.parametrize("rows", [20_000, pytest.param(10**6, marks=pytest.mark.slow)])
+@pytest.mark.fault("many-rows")
+def test_a_long_data_file(tmp_path, rows):
+    """Every row is an observation; memory stays at a few arrays of members by observations."""
+    path = write_campaign(tmp_path, 1)
+    t = np.linspace(0.0, 3.0, rows)
+    np.savetxt(tmp_path / "data" / "set00000.csv", np.c_[t, 1 + t], "%.9g", ",", header="t,y", comments="")
+
+    def limited():
+        resource.setrlimit(resource.RLIMIT_AS, (6 * 2**30,) * 2)
+
+    words = ("run", path, "--out", tmp_path / "run", "--set", "execution.executor=serial")
+    done = subprocess.run(
+        command(*words), capture_output=True, text=True, timeout=400,
+        env=environment(PYTHONPATH=BENCHMARKS), preexec_fn=limited,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "set00000" in done.stdout
+
+
+@pytest.mark.fault("paths")
+def test_names_in_any_script(tmp_path):
+    folder = tmp_path / "Messung 50 % – ゲル"
+    folder.mkdir()
+    path = write_toy(folder, ("path: toy.csv", "path: Daten überall/*.csv")).rename(folder / "Näherung 1.yaml")
+    (folder / "Daten überall").mkdir()
+    for name in ("a b", "ゲル", "x'y"):
+        (folder / "Daten überall" / f"{name}.csv").write_text(csv_text())
+    done = run_cli("run", path, "--out", folder / "Läufe und mehr", "--no-report")
+    assert done.returncode == 0, done.stderr
+    assert {line.split("  ")[0] for line in done.stdout.splitlines()[1:]} >= {"ゲル", "a b"}
+    done = run_cli("run", path, "--out", folder / "Läufe und mehr", "--no-report", "--resume")
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="file names are bytes on Linux")
+@pytest.mark.fault("paths")
+def test_names_that_are_not_text(tmp_path):
+    path = make_campaign(tmp_path, 1)
+    for name, text in ((b"g\xfcl.csv", csv_text()), (b"\xff.csv", "t_ms,x_um\n")):
+        with open(os.fsencode(tmp_path / "data") + b"/" + name, "w") as file:
+            file.write(text)
+    campaign = run_campaign(configuration(path, tmp_path / "run", executor="serial"))
+    assert {o.name for o in campaign.outcomes} == {"set0", "g\\udcfcl", "\\udcff"}
+    (failed,) = campaign.failures
+    assert "\\udcff.csv: " in failed.failure
+    assert (tmp_path / "run" / "summary.csv").read_text(encoding="utf-8").count("\\udcff") == 2
