@@ -13,7 +13,8 @@ ODD: tuple[Any, ...] = (
     None, True, False, 0, -1, 1, 10**18, -(10**18), 1e308, 5e-324, float("inf"), float("nan"), "", " ", "nan", "1e-6",
     "0 kPa", "-3 um", "1e400 us", "5", "5 parsec", "R_max", "R_max/7", "0.5 kPa", "us", "../../../etc/passwd",
     "/dev/null", ".", "~", "*.csv", "[", "\x00", "\ud7ff", "💥", "a" * 5000, "!!python/object:os.system", "{{ 7*7 }}",
-    "<script>", "./nowhere.py:Law", "os:system", "heat", "laser", "bubble", "linear", "lognormal", [], {}, [[]], [1, "a", None],
+    "<script>", "./nowhere.py:Law", "os:system", "heat", "laser", "bubble", "linear", "lognormal", [], {}, [[]],
+    [1, "a", None],
     {"a": {"b": {"c": []}}}, {"prior": "normal"}, {"prior": "lognormal", "median": "1 kPa", "log_std": -1},
 )  # fmt: skip
 
