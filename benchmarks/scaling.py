@@ -1,21 +1,30 @@
-"""Scaling and bookkeeping of a campaign: python benchmarks/scaling.py [SETS]
+"""Scaling and cost of a campaign.
 
-Synthetic acoustic data sets (quadratic law, truths from the 30 % priors, 1.4 µm noise, 15 points) are estimated by one
-and by two workers, in threads and in processes; one worker's time is split into forecast (forward model), analysis with
-bookkeeping, and writing. Times are the best of REPEATS by the wall clock, in the profile processor time (but for the
-disk); start-up of the interpreter and compilation are not counted. Ratios mean something on an idle machine only.
+    python benchmarks/scaling.py [--docs] [profile] [workers] [campaign]
+
+Prints Markdown tables; ``--docs`` writes them between the markers of ``docs/performance.md``. ``profile``: what one
+worker's time goes into in the 19 data sets of ``configs/agarose_03_qs.yaml``, without and with the emulator that
+examines the shape of the posterior. ``workers``: 40 synthetic acoustic data sets (quadratic law, truths from the 30 %
+priors, 1.4 µm noise, 15 points) on one and two workers that are already there. ``campaign``: such sets as `en4dvar run`
+estimates them, start of the workers, files and campaign file included. Times are by the wall clock, medians, taken in
+turns; in the profile processor time, but for the disk. Compilation is not counted. Ratios mean something on an idle
+machine only.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
+import en4dvar.jobs
 import en4dvar_bubble
 from en4dvar.build import build_one, data_files, inverse_plan
 from en4dvar.config import Config, load_config
@@ -23,8 +32,13 @@ from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, Thread
 from en4dvar.files import write_bytes
 from en4dvar.jobs import Job, estimate
 from en4dvar.runner import run_campaign
+from en4dvar_bubble.model import BubbleModel
 
-REPEATS = 3
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs" / "performance.md"
+STUDY = ROOT / "configs" / "agarose_03_qs.yaml"
+SETS, CAMPAIGNS = 40, (40, 160)
+REPEATS = 5
 MEDIAN = {"G": 500.0, "alpha": 0.03, "mu": 0.1, "R0": 0.5e-6}
 YAML = """\
 name: scaling
@@ -66,99 +80,158 @@ def jobs(config: Config) -> list[Job]:
     ]
 
 
-def best(action: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
-    def seconds() -> float:
-        start = clock()
-        action()
-        return clock() - start
-
-    return min(seconds() for _ in range(REPEATS))
+def seconds(action: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
+    start = clock()
+    action()
+    return clock() - start
 
 
-class Timed(SerialExecutor):
-    """Counts the seconds spent in the forward model."""
+class Stopwatch:
+    """Processor seconds spent in functions, by label, while they are watched."""
 
-    seconds = 0.0
+    def __init__(self) -> None:
+        self.spent: dict[str, float] = {}
 
-    def trajectories(self, *arguments):
-        start = time.thread_time()
+    @contextmanager
+    def watching(self, label: str, *functions: tuple[Any, str]) -> Iterator[None]:
+        """``functions``: the objects that hold them, and their names there."""
+        before = [getattr(owner, name) for owner, name in functions]
+        for (owner, name), function in zip(functions, before, strict=True):
+            setattr(owner, name, self.timed(label, function))
         try:
-            return super().trajectories(*arguments)
+            yield
         finally:
-            self.seconds += time.thread_time() - start
+            for (owner, name), function in zip(functions, before, strict=True):
+                setattr(owner, name, function)
+
+    def timed(self, label: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            start = time.thread_time()
+            try:
+                return function(*arguments)
+            finally:
+                self.spent[label] = self.spent.get(label, 0.0) + time.thread_time() - start
+
+        return call
 
 
-def profile(work: list[Job], folder: Path) -> None:
-    """One worker's time by what it is spent on."""
-    executor = Timed()
-    start = time.thread_time()
-    contents = [estimate(job, executor).content for job in work]
-    total = time.thread_time() - start
-    forecast = executor.seconds
-
-    from en4dvar.assimilate import assimilate
-    from en4dvar.netcdf import to_bytes
-    from en4dvar.store import Result
-
-    analyses = [assimilate(job.problem, job.settings, job.seed) for job in work]
-    encode = best(lambda: [to_bytes(Result.from_analysis(a, {}).tree) for a in analyses], time.thread_time)
-    write = best(lambda: [write_bytes(folder / "x.nc", content) for content in contents])
-    rest = total - forecast - encode
-    n = len(work)
-    print(f"\none worker, per data set ({n} sets)                  ms   of the forecast")
-    for label, value in (
-        ("forecast (forward model)", forecast),
-        ("analysis and bookkeeping", rest),
-        ("result: netCDF in memory", encode),
-        ("result: to disk, flushed", write),
-    ):
-        print(f"  {label:34} {1e3 * value / n:14.2f} {100 * value / forecast:12.0f} %")
-    print(
-        f"  writing a result {1e3 * (encode + write) / n:.1f} ms (target < 60); analysis {100 * rest / forecast:.0f} %"
+def profile() -> list[str]:
+    """One worker's time by what it is spent on, without and with the examination of the posterior's shape."""
+    config = load_config(STUDY)
+    plain = spent(config, "off")
+    whole = spent(config, "auto")
+    labels = (
+        "reading the data file",
+        "forecast: initial states and trajectories",
+        "analysis and bookkeeping: the rest of the estimate",
+        "result: summary and netCDF in memory",
+        "result: to disk, flushed",
     )
+    return [
+        f"| {label} | {a:.2f} | {100 * a / plain[1]:.0f} % | {b:.2f} | {100 * b / whole[1]:.0f} % |"
+        for label, a, b in zip(labels, plain, whole, strict=True)
+    ]
 
 
-def scaling(work: list[Job], make_executor: Callable[[int], Executor], label: str) -> None:
-    times = {}
-    for workers in (1, 2):
-        with make_executor(workers) as executor:
-            start = time.perf_counter()
-            for _ in executor.map(estimate, ((job,) for job in work[: 2 * workers])):
-                pass
-            begin = time.perf_counter() - start
-            times[workers] = best(lambda e=executor: list(e.map(estimate, ((job,) for job in work))))
-        print(
-            f"{label:10} {workers} worker(s): {times[workers]:6.2f} s for {len(work)} sets (first calls {begin:.1f} s)"
-        )
-    print(f"{label:10} 2 workers are {times[1] / times[2]:.2f} times one (target 1.7)")
+def spent(config: Config, emulator: Literal["off", "auto"]) -> list[float]:
+    """Milliseconds a data set: reading, forecast, analysis and bookkeeping, making the result, writing it."""
+    work = [replace(job, settings=replace(job.settings, emulator=emulator)) for job in jobs(config)]
+    contents = [estimate(job).content for job in work]
+    clock, rows = time.thread_time, []
+    forward = (BubbleModel, "initial_states"), (SerialExecutor, "trajectories")
+    making = (en4dvar.jobs, "build_groups"), (en4dvar.jobs, "to_bytes"), (en4dvar.jobs, "summarise")
+    with tempfile.TemporaryDirectory() as folder:
+        for _ in range(REPEATS):
+            read = seconds(lambda: jobs(config), clock)
+            watch = Stopwatch()
+            with watch.watching("forecast", *forward), watch.watching("result", *making):
+                total = seconds(lambda: [estimate(job) for job in work], clock)
+            forecast, result = watch.spent["forecast"], watch.spent["result"]
+            write = seconds(lambda: [write_bytes(Path(folder, "x.nc"), content) for content in contents])
+            rows.append((read, forecast, total - forecast - result, result, write))
+    return list(1e3 * np.median(rows, axis=0) / len(work))
 
 
-def whole(path: Path, folder: Path) -> None:
-    """Everything of `en4dvar run --no-report`: checkpoints, files, the campaign's posterior.nc."""
-    times = {}
-    for workers in (1, 2):
-        overrides = {"output.report": False, "execution.workers": workers, "execution.executor": "threads"}
+def workers() -> list[str]:
+    """One and two workers that are already there."""
+    with tempfile.TemporaryDirectory() as folder:
+        work = jobs(load_config(make(Path(folder), SETS)))
+    estimate(work[0])  # compile
+    rows = []
+    kinds: tuple[tuple[str, Callable[[int], Executor]], ...] = (
+        ("threads", ThreadsExecutor),
+        ("processes", ProcessesExecutor),
+    )
+    for label, make_executor in kinds:
+        with make_executor(1) as one, make_executor(2) as two:
 
-        def go(overrides: dict[str, object] = overrides) -> None:
-            out = tempfile.mkdtemp(dir=folder)
-            run_campaign(path, overrides={**overrides, "output.directory": out})
+            def run(executor: Executor) -> float:
+                return seconds(lambda: list(executor.map(estimate, ((job,) for job in work))))
 
-        times[workers] = best(go)
-    ratio = times[1] / times[2]
-    print(f"whole run, threads: {times[1]:.2f} s with one worker, {times[2]:.2f} s with two: {ratio:.2f} times")
+            first = run(one), run(two)  # each with the start of its workers
+            times = np.median([(run(one), run(two)) for _ in range(REPEATS)], axis=0)
+        started = max(0.0, first[1] - times[1])
+        rows.append(f"| {label} | {times[0]:.2f} | {times[1]:.2f} | {times[0] / times[1]:.2f} | {started:.1f} |")
+    return rows
+
+
+def campaign() -> list[str]:
+    """Everything of `en4dvar run --no-report`, in a process that has run one before."""
+    cases = (("serial", 1), ("threads", 2), ("processes", 2))
+    rows = []
+    with tempfile.TemporaryDirectory() as name:
+        for n_sets in CAMPAIGNS:
+            folder = Path(name, str(n_sets))
+            folder.mkdir()
+            path = make(folder, n_sets)
+
+            def go(kind: str, n_workers: int, path: Path = path, folder: Path = folder) -> float:
+                out = tempfile.mkdtemp(dir=folder)
+                overrides = {"output.report": False, "execution.workers": n_workers, "execution.executor": kind}
+                return seconds(lambda: run_campaign(path, overrides={**overrides, "output.directory": out}))
+
+            one, threads, processes = np.median([[go(*case) for case in cases] for _ in range(2)], axis=0)
+            rows.append(f"| {n_sets} | {one:.1f} | {threads:.1f} | {processes:.1f} |")
+    return rows
+
+
+TABLES: dict[str, tuple[str, Callable[[], list[str]]]] = {
+    "profile": (
+        "| one worker, 19 data sets, ms per set | `emulator: off` | of the forecast | `auto` | of the forecast |\n"
+        "|---|---|---|---|---|",
+        profile,
+    ),
+    "workers": (
+        "| 40 data sets on | one worker, s | two, s | ratio | start of two workers, s |\n|---|---|---|---|---|",
+        workers,
+    ),
+    "campaign": (
+        "| data sets, `en4dvar run` | one worker, s | two threads, s | two processes, s |\n|---|---|---|---|",
+        campaign,
+    ),
+}
 
 
 def main() -> None:
-    n_sets = int(sys.argv[1]) if len(sys.argv) > 1 else 40
-    with tempfile.TemporaryDirectory() as name, one_blas_thread():
-        folder = Path(name)
-        path = make(folder, n_sets)
-        work = jobs(load_config(path))
-        estimate(work[0])  # compile
-        profile(work, folder)
-        scaling(work, ThreadsExecutor, "threads")
-        scaling(work, ProcessesExecutor, "processes")
-        whole(path, folder)
+    from solver import machine, replaced
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--docs", action="store_true", help="write the tables into docs/performance.md")
+    parser.add_argument("tables", nargs="*", metavar="TABLE", help=f"of: {', '.join(TABLES)} (default: all)")
+    options = parser.parse_args()
+    if unknown := set(options.tables) - set(TABLES):
+        parser.error(f"no table {', '.join(unknown)}; there are {', '.join(TABLES)}")
+    text = DOCS.read_text(encoding="utf-8") if options.docs else ""
+    print(machine())
+    for name in options.tables or TABLES:
+        head, measure = TABLES[name]
+        with one_blas_thread():
+            table = "\n".join([head, *measure()])
+        print(f"\n## {name}\n{table}", flush=True)
+        if options.docs:
+            text = replaced(text, name, f"{table}\n\n{machine()}, {time.strftime('%Y-%m-%d')}.")
+    if options.docs:
+        DOCS.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -359,7 +359,7 @@ class _Run:
             step_length=step_length,
             chi2_per_observation=diag.chi2_per_observation(self.problem.observations, predictions, rates, scale),
             dfs=diag.dfs(step.hessian.singular_values, len(w)),
-            spread=diag.spread(ensemble[:-1], space.members),
+            spread=diag.spread(ensemble[:-1], space.prior_variance),
             active=at.active,
             members=physical[:-1],
             centre=physical[-1],

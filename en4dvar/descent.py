@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from en4dvar.executor import Executor
 from en4dvar.forecast import NO_TIMES, Forecast, forecast
 from en4dvar.likelihood import Linearisation, observation_cost, precision_times, whiten
 from en4dvar.linalg import anomaly_basis, centre
+from en4dvar.prior import Prior, Sampling
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.schemes import Evaluation, Scheme, Step, Weights
 from en4dvar.schemes.en4dvar import En4DVar
@@ -43,6 +45,28 @@ class Local:
     tangent: Tangent | None
 
 
+@dataclass(frozen=True)
+class PriorEnsemble:
+    """Members E0 (N, n), transformed, their mean (n,), anomalies X0 (N, n), variance (n,) and basis (N, r) of X0."""
+
+    members: Array
+    mean: Array
+    anomalies: Array
+    variance: Array
+    basis: Array
+
+
+@lru_cache(maxsize=4)
+def prior_ensemble(prior: Prior, n_members: int, seed: int, sampling: Sampling) -> PriorEnsemble:
+    """The ensemble that every data set of a campaign starts from: drawn once, read-only."""
+    members = prior.sample(n_members, seed, sampling)
+    mean, anomalies = centre(members)
+    drawn = PriorEnsemble(members, mean, anomalies, members.var(axis=0), anomaly_basis(anomalies))
+    for array in vars(drawn).values():
+        array.flags.writeable = False
+    return drawn
+
+
 class WeightSpace:
     """The ensemble of a problem, its model behind an executor, and the count of forward runs."""
 
@@ -50,9 +74,9 @@ class WeightSpace:
         self.problem, self.settings, self.executor = problem, settings, executor
         self.scheme: Scheme = En4DVar(settings.linearisation, settings.epsilon)
         self.step_control = STEP_CONTROLS[settings.step_control]
-        self.members = problem.prior.sample(settings.members, seed, settings.sampling)
-        self.mean, self.anomalies = centre(self.members)
-        self.basis = anomaly_basis(self.anomalies)
+        drawn = prior_ensemble(problem.prior, settings.members, seed, settings.sampling)
+        self.members, self.mean, self.anomalies = drawn.members, drawn.mean, drawn.anomalies
+        self.prior_variance, self.basis = drawn.variance, drawn.basis
         self.forward_runs = 0
 
     @property

@@ -34,9 +34,9 @@ def dfs_per_parameter(prior: Array, posterior: Array) -> Array:
     return np.asarray(1 - posterior.var(axis=0) / prior.var(axis=0))
 
 
-def spread(members: Array, prior: Array) -> float:
-    """Root mean over the parameters of ensemble variance / prior variance; 1 for the prior. (N, n), transformed."""
-    return float(np.sqrt(np.mean(members.var(axis=0) / prior.var(axis=0))))
+def spread(members: Array, prior_variance: Array) -> float:
+    """Root mean over the parameters of ensemble variance / prior variance; (N, n) and (n,), transformed."""
+    return math.sqrt(float(np.mean(members.var(axis=0) / prior_variance)))
 
 
 def chi2_per_observation(

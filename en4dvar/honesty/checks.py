@@ -88,6 +88,8 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
         low, high = term.bounds if term.transform == "logit" else parameter.bounds
         if term.transform == "lognormal":
             low = -math.inf
+        if math.isinf(low) and math.isinf(high):
+            continue
         width = high - low if math.isfinite(high - low) else float(before[:, j].std())
         outside = np.array([reason.startswith(f"{parameter.name} outside") for reason in failures], dtype=bool)
         for bound, side, sign in ((low, "lower", 1), (high, "upper", -1)):

@@ -8,6 +8,7 @@ from toys import OBSERVABLE, Linear, Vectorised, make_observations, make_problem
 
 from en4dvar import diagnostics as diag
 from en4dvar.assimilate import assimilate
+from en4dvar.descent import prior_ensemble
 from en4dvar.linalg import Hessian, anomaly_basis, centre
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
@@ -122,7 +123,9 @@ def test_member_order_permutes_the_posterior(monkeypatch):
     order = np.random.default_rng(2).permutation(20)
     sample = Prior.sample
     monkeypatch.setattr(Prior, "sample", lambda *args: sample(*args)[order])
+    prior_ensemble.cache_clear()
     shuffled = run(problem)
+    prior_ensemble.cache_clear()
     close(shuffled.posterior, plain.posterior[order], 1e-12)
     close(shuffled.centre, plain.centre, 1e-12)
 
@@ -231,7 +234,7 @@ def test_diagnostics_by_hand():
     assert diag.nrmse(np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 4.0])) == pytest.approx(1 - 1 / np.sqrt(2))
     prior = np.array([[1.0, 2.0], [3.0, -2.0]])
     assert diag.dfs_per_parameter(prior, prior * [0.5, 1.0]) == pytest.approx([0.75, 0.0])
-    assert diag.spread(prior * [0.5, 1.0], prior) == pytest.approx(np.sqrt(0.625))
+    assert diag.spread(prior * [0.5, 1.0], prior.var(axis=0)) == pytest.approx(np.sqrt(0.625))
     assert float(diag.background_cost(np.array([1.0, -1.0, 0.0]))) == pytest.approx(2.0)
     low, high = diag.chi2_interval(10.0)  # tabulated: χ²_10 at 0.0005 and 0.9995
     assert (low, high) == pytest.approx((1.265, 31.420), abs=2e-3)
