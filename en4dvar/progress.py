@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -64,33 +65,38 @@ class RunLog:
 
 
 class LiveProgress:
-    """One line on a terminal: the data set at work with its last iteration, data sets done, time gone and left.
+    """One line on a terminal: the iteration that ended last, data sets done, time gone and left.
 
-    Where data sets run side by side, each is told when it ends.
+    Threads may call it side by side. Iterations in other processes are not seen; there a data set is told as it ends.
     """
 
     def __init__(self, bar: Any, total: int):
         self._bar, self._total = bar, total
         self._task = bar.add_task("prior forecast", total=total, left="")
         self._began = time.monotonic()
-        self._before: int | None = None  # data sets that an earlier run had done
-        self._done = 0
+        self._lock = threading.Lock()
+        self._before = self._done = 0  # data sets that an earlier run had done; that are done
         self._open: dict[str, int] = {}  # data set → its last iteration
         self._lengths: list[int] = []  # iterations of the data sets that have ended
 
     def __call__(self, name: str, record: IterationRecord) -> None:
-        self._open[name] = record.iteration
-        self._show(_short(name, record))
+        with self._lock:
+            self._open[name] = record.iteration
+            self._show(_short(name, record))
 
-    def ended(self, count: int) -> None:
-        """``count`` data sets are done now."""
-        if self._before is None:
-            self._before = count
-        if count > self._done:
-            self._lengths += self._open.values()
-            self._open.clear()
-        self._done = count
-        self._show("files and report" if count == self._total else None)
+    def begin(self, done: int) -> None:
+        """``done`` data sets were done by an earlier run."""
+        with self._lock:
+            self._before = self._done = done
+            self._show(None)
+
+    def ended(self, name: str, done: int) -> None:
+        """A data set has ended; ``done`` are done now."""
+        with self._lock:
+            if name in self._open:
+                self._lengths.append(self._open.pop(name))
+            self._done = done
+            self._show("files and report" if done == self._total else None)
 
     def _show(self, description: str | None) -> None:
         fields = {"completed": self._done, "left": self._left()}
@@ -98,8 +104,8 @@ class LiveProgress:
 
     def _left(self) -> str:
         gone = time.monotonic() - self._began
-        before = self._before or 0
-        return time_left(gone, self._done - before, self._total - before, list(self._open.values()), self._lengths)
+        done, total = self._done - self._before, self._total - self._before
+        return time_left(gone, done, total, list(self._open.values()), self._lengths)
 
 
 def time_left(gone: float, done: int, total: int, iterations: Sequence[int], lengths: Sequence[int]) -> str:

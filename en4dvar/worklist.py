@@ -123,7 +123,8 @@ class Worklist:
         OutputError: results cannot be written. ExecutorError: the workers are gone. Where the run has one data set
         only, also what its estimate raises.
         """
-        self._count()
+        if isinstance(self.progress, LiveProgress):
+            self.progress.begin(len(self.ended))
         todo = [d for d in self.sets if d.name not in self.ended]
         side_by_side = len(todo) > 1 and len(todo) >= executor.workers > 1
         for d, value in self._side_by_side(todo, executor) if side_by_side else self._in_turn(todo, executor):
@@ -145,9 +146,12 @@ class Worklist:
     def _side_by_side(self, todo: list[Dataset], executor: Executor) -> Iterator[tuple[Dataset, Estimate | Exception]]:
         sent: list[Dataset] = []
         unusable: list[tuple[Dataset, Exception]] = []
-        stop = self.stop if isinstance(executor, ThreadsExecutor) else None
+        here = isinstance(executor, ThreadsExecutor)
+        stop = self.stop if here else None
+        # Iterations of other processes are not seen; these are told by the data set's last one.
+        live = (None, self.progress) if here and isinstance(self.progress, LiveProgress) else ()
 
-        def jobs() -> Iterator[tuple[Job]]:
+        def jobs() -> Iterator[tuple[Any, ...]]:
             for d in todo:
                 try:
                     job = self._job(d, stop)
@@ -155,7 +159,7 @@ class Worklist:
                     unusable.append((d, error))
                     continue
                 sent.append(d)
-                yield (job,)
+                yield (job, *live)
 
         for i, value in executor.map(estimate, jobs()):
             yield sent[i], value
@@ -224,8 +228,5 @@ class Worklist:
         write_checkpoint(self.directory.work / d.done, self.identity.of_dataset(d.name), record)
         self.directory.remove(d.iteration)
         self.ended[d.name] = record
-        self._count()
-
-    def _count(self) -> None:
         if isinstance(self.progress, LiveProgress):
-            self.progress.ended(len(self.ended))
+            self.progress.ended(d.name, len(self.ended))

@@ -4,10 +4,13 @@ import re
 from pathlib import Path
 
 import pytest
+from toy_config import csv_text, write_toy
 
+from en4dvar.config import load_config
 from en4dvar.errors import OutputError
 from en4dvar.problem import Analysis
 from en4dvar.progress import RunLog, describe, terminal_progress, time_left
+from en4dvar.runner import run_campaign
 
 
 def test_terminal_only(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, analysis: Analysis) -> None:
@@ -34,7 +37,7 @@ def test_no_color(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Monkey
     with terminal_progress(1) as progress:
         assert progress is not None
         progress("gel", analysis.iterations[-1])
-        progress.ended(1)
+        progress.ended("gel", 1)
     err = capsys.readouterr().err
     assert "files and report" in err
     assert not re.search(r"\x1b\[[0-9;]*(3|4|9)\d*m", err)
@@ -47,12 +50,33 @@ def test_data_sets_are_counted_as_they_end(
     monkeypatch.setenv("COLUMNS", "90")
     with terminal_progress(3) as progress:
         assert progress is not None
-        progress.ended(1)  # by an earlier run
+        progress.begin(1)
         progress("a very long name of a data set", analysis.iterations[3])
-        progress.ended(2)
+        progress.ended("a very long name of a data set", 2)
         assert "a very long name of a d… iteration 3" in progress._bar.tasks[0].description
         assert progress._bar.tasks[0].completed == 2
     capsys.readouterr()
+
+
+def test_iterations_of_data_sets_side_by_side_are_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[tuple[str, int]] = []
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    for n in (1, 2, 3):
+        (tmp_path / f"set{n}.csv").write_text(csv_text(k=1.5 + n / 4))
+    config = load_config(
+        write_toy(tmp_path),
+        {"data.path": "set*.csv", "output.directory": str(tmp_path / "run"), "output.report": False,
+         "execution.executor": "threads", "execution.workers": 2},
+    )  # fmt: skip
+    with terminal_progress(3) as progress:
+        assert progress is not None
+        monkeypatch.setattr(progress, "_show", lambda _: told.append((" ".join(progress._open), progress._done)))
+        campaign = run_campaign(config, progress=progress)
+        assert progress._open == {}
+        assert len(progress._lengths) == 3
+    iterations = [one.iterations.sizes["iteration"] for one in campaign]
+    assert len(told) == 1 + sum(iterations) + 3 + 3  # begin, each iteration, the last once more, each end
+    assert told[-1] == ("", 3)
 
 
 @pytest.mark.parametrize(
