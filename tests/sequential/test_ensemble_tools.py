@@ -113,7 +113,7 @@ def test_both_decompositions_give_the_same_analysis(scale):
     """Below GRAM_LIMIT eigenvectors of SᵀS, above it the SVD of S; both against plain linear algebra."""
     s = scale * centre(RNG(0).standard_normal((10, 40)))[1].T
     hessian, g = Hessian.of(s), RNG(1).standard_normal(10)
-    assert (np.sum(s**2) / 9 <= GRAM_LIMIT) == (scale < 1.5)
+    assert (np.linalg.norm(s.T @ s) / 9 <= GRAM_LIMIT) == (scale < 1.5)
     a = 9 * np.eye(10) + s.T @ s
     # a textbook solve loses eps · cond(A), most of it at the largest scale
     tolerance = 1e-13 * max(1.0, np.linalg.cond(a) / 100)
@@ -124,6 +124,21 @@ def test_both_decompositions_give_the_same_analysis(scale):
     singular = np.linalg.svd(s, compute_uv=False)
     assert hessian.singular_values[:9] == pytest.approx(singular[:9], rel=1e-12)
     assert hessian.singular_values[9] < 1e-6 * scale * 10
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("count", [2, 7, 40])
+def test_decomposition_in_a_span_and_of_few_observations(count, scale):
+    """S = s Uᵀ: from s, from the smaller Gram matrix or the SVD of S; against plain linear algebra."""
+    basis = np.linalg.qr(RNG(0).standard_normal((12, 3)))[0]
+    s = scale * RNG(1).standard_normal((count, 3))
+    whole, a = s @ basis.T, 11 * np.eye(12) + basis @ s.T @ s @ basis.T
+    g, tolerance = RNG(2).standard_normal((4, 12)), 1e-13 * max(1.0, np.linalg.cond(a) / 100)
+    for hessian in (Hessian.of(s, basis), Hessian.of(whole)):
+        assert hessian.solve(g) == pytest.approx(np.linalg.solve(a, g.T).T, rel=tolerance, abs=tolerance)
+        assert hessian.norm(g[0]) == pytest.approx(np.sqrt(g[0] @ a @ g[0]), rel=1e-13)
+        t = hessian.transform
+        assert t @ t == pytest.approx(11 * np.linalg.inv(a), abs=tolerance)
 
 
 @pytest.mark.parametrize("shape", [(16, 40), (40, 25), (40, 40)])
