@@ -94,8 +94,8 @@ def pages(analysis: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
 def _write_pages(analysis: Any, folder: Path) -> dict[str, Path]:
     found = {}
     notes = (caution("misfit", f"bad {EVIL}"), *analysis.cautions, caution("not-informed", "mu is hardly informed"))
-    single = replace(analysis, cautions=notes)
-    calm = replace(analysis, name="calm", cautions=(), centre=1.1 * analysis.centre)
+    single = replace(analysis, cautions=notes, log_evidence=-100.0)
+    calm = replace(single, cautions=(), log_evidence=-100.5, posterior=1.1 * analysis.posterior)
     for name, one in (("single", single), ("calm", calm)):
         run = folder / name
         run.mkdir()
