@@ -192,7 +192,7 @@ class _Loop:
         self.series, self.settings, self.scheme = series, settings, settings.scheme
         self.initial_members, size = members.shape
         self.rotations = Rotations(seed, self.initial_members) if settings.rotation else None
-        self.times = np.concatenate([[0.0], series.times])
+        self.times = [0.0, *series.times.tolist()]
         cycles = len(series.times)
         self.iterations = np.zeros(cycles)
         self.ensemble, self.start, self.forward_runs = members, 0, 0  # start: k is the k-th observation time
@@ -287,7 +287,8 @@ class _Loop:
         if not ahead:
             return [states] * len(indices), []
         self.forward_runs += len(states)
-        paths, failed = propagate(self.model, states, self.times[self.start], self.times[ahead], self.executor)
+        times = np.array([self.times[i] for i in ahead])
+        paths, failed = propagate(self.model, states, self.times[self.start], times, self.executor)
         if failed:
             return [], failed
         return [states] * (len(indices) - len(ahead)) + [paths[:, j] for j in range(len(ahead))], []

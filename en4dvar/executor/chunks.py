@@ -31,7 +31,6 @@ def run_chunk(model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
 
     Where batches are timed (see :mod:`en4dvar.executor.limits`) they are run one by one from the start.
     """
-    times = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
     if has_time_limit() and len(x) > model.batch:
         return _by_batch(model, x, times)
     try:
@@ -48,6 +47,7 @@ def run_chunk(model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
 
 
 def _by_batch(model: ForwardModel, x: Array, times: Array) -> list[Outcome]:
+    times = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
     parts = [slice(i, i + model.batch) for i in range(0, len(x), model.batch)]
     return [outcome for part in parts for outcome in run_chunk(model, x[part], times[part])]
 
