@@ -21,9 +21,12 @@ from scipy.stats import binomtest, chisquare
 
 from en4dvar import mcmc
 from en4dvar.assimilate import assimilate
+from en4dvar.descent import WeightSpace
 from en4dvar.errors import En4dvarError
+from en4dvar.executor import SerialExecutor
 from en4dvar.forecast import log_posterior
 from en4dvar.problem import AssimilationSettings
+from en4dvar.shape import guide
 
 BINS = 7  # of 49 ranks
 CHAINS = 20  # runs of case a that are compared with a chain
@@ -59,7 +62,8 @@ def experiment(seed: int, widths: dict[str, float], settings: AssimilationSettin
         **analysis.refinement,
     }
     if chain:
-        sampled = mcmc.sample(lambda z: log_posterior(twin.problem, z), x, 10_000 + seed)
+        emulated = guide(WeightSpace(twin.problem, settings, seed, SerialExecutor()), x, seed)
+        sampled = mcmc.sample(lambda z: log_posterior(twin.problem, z), x, 10_000 + seed, emulated=emulated)
         record |= {
             "chain_mean": sampled.flat.mean(axis=0),
             "chain_std": sampled.flat.std(axis=0),

@@ -76,7 +76,9 @@ def chain_of(key: str) -> Record:
     analysis = assimilate(problem, SETTINGS, seed)
     x = problem.prior.from_physical(analysis.posterior)
     emulated = guide(WeightSpace(problem, SETTINGS, seed, SerialExecutor()), x, seed)
-    chain = mcmc.sample(lambda z: log_posterior(problem, z), x, 10_000 + seed, target=TARGET, emulated=emulated)
+    chain = mcmc.sample(
+        lambda z: log_posterior(problem, z), x, 10_000 + seed, target=TARGET, max_steps=600, emulated=emulated
+    )
     return {
         "mean": chain.flat.mean(axis=0),
         "std": chain.flat.std(axis=0),
