@@ -1,0 +1,92 @@
+"""``refine: mcmc``: a run killed while its Markov chain is under way goes on to the same bits."""
+
+from __future__ import annotations
+
+import random
+import signal
+from pathlib import Path
+
+import pytest
+from run_files import assert_same_results, configuration, kill_after_writes, make_campaign, run_cli
+
+from en4dvar.assimilate import LoopState, mcmc
+from en4dvar.checkpoint import read_checkpoint
+from en4dvar.fingerprint import identity
+from en4dvar.interrupt import Interrupted
+from en4dvar.runner import run_campaign
+
+REFINED = ("members: 8", "members: 8\n  refine: mcmc")
+
+
+def make(folder: Path, sets: int) -> Path:
+    path = make_campaign(folder, sets, "execution_models:Swift")
+    text = path.read_text()
+    assert REFINED[0] in text
+    path.write_text(text.replace(*REFINED))
+    return path
+
+
+def test_interrupted_in_the_chain(tmp_path, monkeypatch):
+    """At the second look: the chain of the checkpoint is taken up, not begun again."""
+    monkeypatch.setattr(mcmc, "BLOCK", 20)
+    monkeypatch.setattr(mcmc.sample, "__kwdefaults__", {**mcmc.sample.__kwdefaults__, "max_steps": 80})
+    path, out = make(tmp_path, 1), tmp_path / "run"
+    run_campaign(configuration(path, tmp_path / "quiet"))
+
+    sample, looks = mcmc.sample, []
+
+    def stopped(*arguments, keep, **options):
+        def look(state):
+            keep(state)
+            looks.append(len(state.samples))
+            if len(looks) == 2:
+                raise KeyboardInterrupt
+
+        return sample(*arguments, keep=look, **options)
+
+    monkeypatch.setattr(mcmc, "sample", stopped)
+    with pytest.raises(Interrupted):
+        run_campaign(configuration(path, out))
+    assert looks == [20, 40]
+    config = configuration(path, out)
+    fingerprint = identity(config.resolved, config.model, {"set0": tmp_path / "data" / "set0.csv"}).of_dataset("set0")
+    state = read_checkpoint(out / "checkpoints" / "set0.iteration", fingerprint, LoopState)
+    assert state is not None
+    assert state.refinement is not None
+    assert len(state.refinement.chain.samples) == 40
+    run_campaign(config, resume=True)
+    assert looks == [20, 40, 60, 80]
+    assert_same_results(out, tmp_path / "quiet")
+
+
+def kill_and_resume(folder: Path, kills: int, seed: int) -> None:
+    path = make(folder, 1)
+    words = ("run", path, "--no-report", "--set", "execution.executor=serial", "--set", "execution.checkpoint_every=0")
+    pause = {"EN4DVAR_TEST_PAUSE": 0.002}
+    quiet = run_cli(*words, "--out", folder / "quiet", **pause)
+    assert quiet.returncode == 0, quiet.stderr
+    draw, done, finished = random.Random(seed), 0, 0
+    while done < kills or finished == 0:
+        out, resume = folder / f"run{finished}", ()
+        while True:
+            file = out / "checkpoints" / "set0.iteration"
+            writes, wait = draw.randint(1, 9), draw.uniform(0, 0.3)
+            code, told = kill_after_writes(file, writes, wait, *words, *resume, "--out", out, **pause)
+            assert code in (0, -signal.SIGKILL), told
+            if code == 0:
+                break
+            done += 1
+            resume = ("--resume",)
+        assert_same_results(out, folder / "quiet")
+        finished += 1
+
+
+def test_killed_and_resumed(tmp_path):
+    """SIGKILL at two random moments, each followed by a resume that may be killed as well."""
+    kill_and_resume(tmp_path, 2, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_killed_at_20_random_moments(tmp_path):
+    kill_and_resume(tmp_path, 20, 2)
