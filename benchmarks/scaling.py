@@ -31,6 +31,7 @@ from en4dvar.config import Config, load_config
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, ThreadsExecutor, one_blas_thread
 from en4dvar.files import write_bytes
 from en4dvar.jobs import Job, estimate
+from en4dvar.members import Reading
 from en4dvar.runner import run_campaign
 from en4dvar_bubble.model import BubbleModel
 
@@ -122,7 +123,7 @@ def profile() -> list[str]:
     whole = spent(config, "auto")
     labels = (
         "reading the data file",
-        "forecast: initial states and trajectories",
+        "forecast: F and H of all members",
         "analysis and bookkeeping: the rest of the estimate",
         "result: summary and netCDF in memory",
         "result: to disk, flushed",
@@ -138,7 +139,7 @@ def spent(config: Config, emulator: Literal["off", "auto"]) -> list[float]:
     work = [replace(job, settings=replace(job.settings, emulator=emulator)) for job in jobs(config)]
     contents = [estimate(job).content for job in work]
     clock, rows = time.thread_time, []
-    forward = (BubbleModel, "initial_states"), (SerialExecutor, "trajectories")
+    forward = (BubbleModel, "initial_states"), (SerialExecutor, "trajectories"), (Reading, "observe")
     making = (en4dvar.jobs, "build_groups"), (en4dvar.jobs, "to_bytes"), (en4dvar.jobs, "summarise")
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(REPEATS):

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate
 
 import numpy as np
 
@@ -115,7 +116,7 @@ class WeightSpace:
         """Steps at several weights, from one call of the model."""
         rows = [np.vstack([self._member_weights(each), each.w]) for each in weights]
         whole = self.forecast(self.control(np.concatenate(rows)))
-        ends = np.cumsum([len(r) for r in rows])
+        ends = accumulate(len(r) for r in rows)
         runs = [whole[end - len(r) : end] for end, r in zip(ends, rows, strict=True)]
         return [self._local(at, run[:-1], run[-1:]) for at, run in zip(weights, runs, strict=True)]
 
@@ -171,7 +172,7 @@ def _stack(run: Forecast) -> Array:
     if run.noise_scale is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
             parts.append(np.log(run.noise_scale)[:, None])
-    return np.hstack(parts)
+    return np.hstack(parts) if len(parts) > 1 else parts[0]
 
 
 def _split(run: Forecast, reference: Array, anomalies: Array) -> Linearisation:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -67,6 +68,7 @@ def log_evidence(cost: float, singular_values: Array, n_members: int, observatio
     return float(-cost - 0.5 * log_det - log_normalisation(observations))
 
 
+@lru_cache(maxsize=256)
 def chi2_interval(degrees: float) -> tuple[float, float]:
     """Central 99.9 % interval of χ² with ``degrees`` degrees of freedom (need not be whole)."""
     from scipy.special import gammaincinv  # scipy is not needed to import the package
