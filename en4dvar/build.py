@@ -59,7 +59,11 @@ def inverse_plan(config: Config) -> DataPlan:
 
 def build_one(config: Config, name: str, path: Path) -> InverseProblem:
     """The inverse problem of one of :func:`data_files`. Raises :class:`ConfigError`, :class:`DataError`."""
-    observations = read_observations(inverse_plan(config), path, name, config.weights)
+    return problem_of(config, read_observations(inverse_plan(config), path, name, config.weights))
+
+
+def problem_of(config: Config, observations: Observations) -> InverseProblem:
+    """The inverse problem of observations, wherever they come from. Raises :class:`ConfigError`."""
     terms, fixed = resolve_parameters(config, observations)
     terms = (*terms, *(term for term, _ in config.initial_state))
     perturbations = tuple(perturbation for _, perturbation in config.initial_state)

@@ -12,7 +12,7 @@ import click
 
 from en4dvar.commands.common import Failed
 from en4dvar.commands.listings import models, schema
-from en4dvar.commands.results import compare, export, report
+from en4dvar.commands.results import compare, export, report, rerun
 from en4dvar.commands.run import run
 from en4dvar.commands.simulate import simulate
 from en4dvar.commands.validate import validate
@@ -51,7 +51,7 @@ def main() -> None:
     """
 
 
-for command in (compare, export, models, report, run, schema, simulate, validate):
+for command in (compare, export, models, report, rerun, run, schema, simulate, validate):
     main.add_command(command)
 
 if __name__ == "__main__":

@@ -101,16 +101,15 @@ def execute(
         ) as executor,
         RunDirectory.open(config.directory, mode) as directory,
     ):
+        who = identity(config.resolved, config.model, files)
         attributes = {
             **provenance(config.text, config.document.file, command),
             "configuration_resolved": config.resolved,
+            "identity": who.settings,
         }
         with RunLog(directory.work / "run.log", append=resume) as log:
             log.write(attributes["history"])
-            work = Worklist(
-                config, identity(config.resolved, config.model, files), datasets(files), directory, log, attributes,
-                progress,
-            )  # fmt: skip
+            work = Worklist(config, who, datasets(files), directory, log, attributes, progress)
             prepared = False
             try:
                 _prepare(work, resume)

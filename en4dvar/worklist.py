@@ -179,7 +179,7 @@ class Worklist:
             problem=build_one(self.config, d.name, d.source),
             settings=self.config.assimilation,
             seed=self.config.seed,
-            attributes=self.attributes,
+            attributes={**self.attributes, "data_sha256": self.identity.content[d.name]},
             fingerprint=fingerprint,
             checkpoint=path,
             checkpoint_every=self.config.execution.checkpoint_every,

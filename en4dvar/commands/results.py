@@ -1,4 +1,4 @@
-"""Commands that read run directories: ``en4dvar report`` and ``en4dvar compare``."""
+"""Commands that read run directories: ``en4dvar report``, ``en4dvar rerun`` and ``en4dvar compare``."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import re
 from pathlib import Path
 
 import click
+
+from en4dvar.commands.common import Failed
 
 MOST_ROWS = 60  # of estimates on the terminal
 LONGEST = 120  # name of the folder of a comparison
@@ -90,3 +92,24 @@ def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
     if out.exists() and not force:
         raise OutputError(f"{out}: exists; give --force to replace it")
     click.echo(f"table: {write_text(out, text)}")
+
+
+@click.command()
+@click.argument("run_dir", type=click.Path(path_type=Path))
+@click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
+def rerun(run_dir: Path, workers: int | None) -> None:
+    """Repeat a run from what its result files record, and compare to the last bit. Nothing is written.
+
+    Configuration, seed and observations are those in the files. Where a bit differs, or anything that decides them has
+    changed since (versions, sources, processor, data files), it is told; the exit code is 1 where a bit differs.
+
+    \b
+    Example:
+      en4dvar rerun runs/quickstart
+    """
+    from en4dvar.rerun import rerun as repeat
+
+    found = repeat(run_dir, workers)
+    click.echo(str(found))
+    if not found.same:
+        raise Failed("the run is not reproduced", 1)

@@ -1,0 +1,87 @@
+"""A run repeated from its result files alone: the same bits, or what has changed."""
+
+import pytest
+from run_files import configuration, make_campaign, run_cli
+from toy_config import write_toy
+
+from en4dvar.errors import OutputError
+from en4dvar.rerun import rerun
+from en4dvar.runner import run, run_campaign
+from en4dvar.store import load_result, save
+
+
+@pytest.fixture
+def campaign(tmp_path):
+    path = make_campaign(tmp_path, 2)
+    (tmp_path / "data" / "empty.csv").write_text("t_ms,x_um\n")
+    run_campaign(configuration(path, tmp_path / "run", executor="serial"))
+    return tmp_path
+
+
+def test_a_campaign_is_repeated(campaign):
+    found = rerun(campaign / "run", workers=2)
+    assert found.same
+    assert (found.changed, found.surroundings) == ("", ())
+    assert [one.name for one in found.sets] == ["set0", "set1"]
+    assert all(one.variables > 40 for one in found.sets)
+    assert list(found.failures) == ["empty"]
+    assert str(found).splitlines()[-1] == "not repeated, for they have no result: empty"
+
+
+def test_without_the_data_and_with_other_data(campaign):
+    (campaign / "data" / "set0.csv").unlink()
+    (campaign / "data" / "set1.csv").write_text("t_ms,x_um\n0,1\n1,2\n2,3\n")
+    (campaign / "toy.yaml").unlink()
+    done = run_cli("rerun", campaign / "run")
+    assert done.returncode == 0, done.stderr
+    first, second, *_ = done.stdout.splitlines()
+    gone = f"{campaign}/data/set0.csv is gone, the recorded observations were used"
+    assert first.startswith("set0: the same bits (")
+    assert first.endswith(f"; {gone}")
+    assert "set1.csv has changed since, the recorded observations were used" in second
+
+
+def test_what_differs_is_named(campaign):
+    file = campaign / "run" / "datasets" / "set1.nc"
+    result = load_result(file)
+    result.tree["posterior/k"].values[0, 2] *= 1 + 1e-9
+    save(result, file)
+    done = run_cli("rerun", campaign / "run")
+    assert done.returncode == 1
+    assert "set0: the same bits" in done.stdout
+    assert "set1: /posterior/k differs by up to" in done.stdout
+    assert done.stderr == "the run is not reproduced\n"
+
+
+def test_what_has_changed_is_told(campaign, monkeypatch):
+    monkeypatch.setattr("en4dvar.fingerprint.source_digest", lambda module: f"another {module}")
+    monkeypatch.setattr("en4dvar.provenance.cpu_model", lambda: "another processor")
+    found = rerun(campaign / "run")
+    assert found.same
+    assert "+  toy_models: another toy_models" in found.changed
+    assert any(line.startswith("cpu: ") and "→ another processor" in line for line in found.surroundings)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        [("{position_std: 2 um}", "{position_std: 2 um, time_std: 0.01 ms}")],
+        [("{position_std: 2 um}", "{position_std: 2 um, correlation_time: 3 ms}")],
+        [("{position_std: 2 um}", "{position_std: 2 um, robust: huber, threshold: 1.5}")],
+        [("  c: 0.02 N s/m", "  c: 0.02 N s/m\ninitial_state:\n  v: {std: 1 mm/s}")],
+        [("members: 8", "weights: mean\n  members: 8"), ("seed: 3", "seed: 123456789012")],
+    ],
+    ids=["timing error", "correlation", "robust", "initial state", "weights"],
+)
+def test_everything_that_decides_the_numbers_is_recorded(tmp_path, changes):
+    path = write_toy(tmp_path, *changes)
+    run(configuration(path, tmp_path / "run", executor="serial"))
+    (tmp_path / "toy.csv").unlink()
+    found = rerun(tmp_path / "run")
+    assert found.same, str(found)
+    assert found.changed == ""
+
+
+def test_no_run(tmp_path):
+    with pytest.raises(OutputError, match=r"posterior\.nc: no such file"):
+        rerun(tmp_path)
