@@ -119,11 +119,11 @@ def shape_warnings(shape: Mapping[str, float]) -> tuple[str, ...]:
         return (
             "the posterior is far from Gaussian: the ensemble's mean is off by about "
             f"{shape['mean_shift']:.1f} posterior standard deviations and its spread by a factor of about "
-            f"{shape['spread_ratio']:.2g} in the parameter where they are worst; refine: mcmc samples it",
+            f"{shape['spread_ratio']:.2g} in the parameter where they are worst",
         )
     return (
         f"the posterior is far from Gaussian (effective share of members {shape['gaussian_fit']:.2f}): mean and spread "
-        "of the ensemble may be off by more than they say; refine: mcmc samples it",
+        "of the ensemble may be off by more than they say",
     )
 
 
