@@ -64,6 +64,13 @@ def test_every_command_exists(page):
                 pytest.fail(f"{where}: {error.format_message()}")
 
 
+def test_every_benchmark_is_on_the_page_of_figures():
+    text = (ROOT / "docs" / "figures.md").read_text(encoding="utf-8")
+    scripts = [p for p in (ROOT / "benchmarks").glob("*.py") if "__main__" in p.read_text(encoding="utf-8")]
+    assert scripts
+    assert [p.name for p in scripts if f"benchmarks/{p.name}" not in text] == []
+
+
 def test_merged_keeps_what_is_not_named():
     assert merged({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 4}, "d": 5}) == {"a": {"b": 4, "c": 2}, "d": 5}
 
