@@ -160,7 +160,7 @@ def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> tuple[
 
 def _prior_cost(prior: Prior, x: Array) -> Array:
     z = (x - prior.mean) / prior.std
-    return np.asarray(0.5 * np.sum(z * z, axis=1))
+    return np.asarray(0.5 * (z * z).sum(axis=1))
 
 
 def _fit(
@@ -197,8 +197,12 @@ def _terms(n: int, degree: int) -> tuple[tuple[npt.NDArray[np.intp], npt.NDArray
 
 def _basis(z: Array, terms: tuple[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]], ...]) -> Array:
     """Monomials (C, B) of coordinates (n, B): 1, z_i, z_i z_j, …"""
-    parts, current = [np.ones((1, z.shape[1])), z], z
+    n = len(z)
+    monomials = np.empty((1 + n + sum(len(by) for _, by in terms), z.shape[1]))
+    monomials[0], monomials[1 : n + 1] = 1.0, z
+    before, end = z, n + 1
     for of_before, by in terms:
-        current = current[of_before] * z[by]
-        parts.append(current)
-    return np.concatenate(parts)
+        here = monomials[end : end + len(by)]
+        np.multiply(before[of_before], z[by], out=here)
+        before, end = here, end + len(by)
+    return monomials

@@ -44,12 +44,15 @@ def advance(
     stretched = uniform[:, 3] < STRETCHES
     stretch = 0.5 * (1 + uniform[:, 4]) ** 2  # density ∝ 1/√s on [½, 2]
     threshold = np.log1p(-uniform[:, 5]) - np.where(stretched, (n - 1) * np.log(stretch), 0.0)
+    # either is affine in x, so that everything but x is known beforehand: x + leap, or anchor + stretch (x − anchor)
+    anchor = others[first]
+    leap = length * (anchor - others[second]) + jitter
+    factor = np.where(stretched, stretch, 1.0)[..., None]
+    offset = np.where(stretched[..., None], (1 - factor) * anchor, leap)
     for move in range(moves):
-        anchor = others[first[move]]
-        evolved = x + length[move] * (anchor - others[second[move]]) + jitter[move]
-        drawn = anchor + stretch[move][:, None] * (x - anchor)
-        proposed = np.where(stretched[move][:, None], drawn, evolved)
+        proposed = factor[move] * x + offset[move]
         new = cost(proposed)
         accepted = threshold[move] < costs - new
-        x[accepted], costs[accepted] = proposed[accepted], new[accepted]
+        np.copyto(x, proposed, where=accepted[:, None])
+        np.copyto(costs, new, where=accepted)
     return x, costs
