@@ -31,7 +31,7 @@ MACH_LIMITS: Mapping[Radial, tuple[float, str]] = {
     "rayleigh-plesset": (0.3, "an incompressible liquid; 0.3 is the usual limit"),
     "keller-miksis": (1.0, FIRST_ORDER),
     "keller-miksis-enthalpy": (1.0, FIRST_ORDER),
-    "gilmore": (2.2, "agrees with the full equations up to there: Hickling & Plesset (1964), Phys. Fluids 7, 7"),
+    "gilmore": (2.2, "the usual limit of the Kirkwood-Bethe hypothesis: Hickling & Plesset (1964), Phys. Fluids 7, 7"),
 }
 
 

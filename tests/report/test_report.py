@@ -10,6 +10,7 @@ import shutil
 from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
+from itertools import islice
 from urllib.parse import unquote
 
 import numpy as np
@@ -21,6 +22,7 @@ from en4dvar.errors import OutputError
 from en4dvar.honesty import Caution
 from en4dvar.provenance import provenance
 from en4dvar.report import write_report
+from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import Entry, overview_figures, render_overview
 from en4dvar.report.page import judge_chi2
 from en4dvar.store import Result, save
@@ -173,8 +175,13 @@ def campaign_dir(analysis, tmp_path_factory):
         save(result, folder / "datasets" / f"{file}.nc")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "COPIES", 0)
+        patch.setattr(report, "all_figures", first_figure)
         write_report(folder)
     return folder
+
+
+def first_figure(result):
+    return islice(all_figures(result), 1)
 
 
 def test_campaign_is_a_table_with_a_page_for_each_data_set(campaign_dir):
@@ -207,6 +214,7 @@ def test_the_script_that_runs_is_the_one_the_policy_names(campaign_dir):
 
 def test_large_campaign_gets_pages_on_demand(campaign_dir, tmp_path, monkeypatch):
     shutil.copytree(campaign_dir / "datasets", tmp_path / "datasets")
+    monkeypatch.setattr(report, "all_figures", first_figure)
     monkeypatch.setattr(report, "PAGES", 1)
     monkeypatch.setattr(report, "COPIES", 0)
     html = write_report(tmp_path).read_text(encoding="utf-8")
@@ -216,8 +224,8 @@ def test_large_campaign_gets_pages_on_demand(campaign_dir, tmp_path, monkeypatch
     html = write_report(tmp_path, ["two"]).read_text(encoding="utf-8")
     assert "1 data set has no page of its own" in html
     assert set(Page(html).links) == {"pages/one.html", "pages/two.html"}
-    assert (tmp_path / "figures" / "two_pairs.pdf").is_file()
-    assert not (tmp_path / "figures" / "one_pairs.pdf").exists()
+    assert (tmp_path / "figures" / "two_posterior.pdf").is_file()
+    assert not (tmp_path / "figures" / "one_posterior.pdf").exists()
     with pytest.raises(OutputError, match="no data set 'tow'; did you mean 'two'"):
         write_report(tmp_path, ["tow"])
 
