@@ -64,7 +64,8 @@ def init(
     from en4dvar_bubble.starter.page import SCHEMA_FILE, Source, yaml_text
     from en4dvar_bubble.starter.proposal import starter
 
-    name, words = run_name(data), shlex.join(["en4dvar", *sys.argv[1:]])
+    name = run_name(str(out) if out else data or "bubble")  # a file that is called my_gel is run as my_gel
+    words = shlex.join(["en4dvar", *sys.argv[1:]])
     target = out or Path(f"{name}.yaml")
     if target.exists() and not force:
         raise OutputError(f"{target}: exists; give --force to replace it, or another --out")
@@ -75,7 +76,7 @@ def init(
         text = yaml_text(name, Source("bubble.csv", ("t_us", "us"), None, ("R_um", "um")), proposal, words)
     else:
         columns = _columns_of(data, _Asked(time_unit, radius_unit, time_column, radius_column, time_step))
-        proposed = propose_config(data, **columns, start=start, law=law, folder=target.parent, command=words)
+        proposed = propose_config(data, **columns, start=start, law=law, folder=target.parent, name=name, command=words)
         text, proposal = proposed.text, proposed.proposal
     write_text(target, text)
     write_text(target.parent / SCHEMA_FILE, schema_text())

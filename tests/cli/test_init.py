@@ -206,6 +206,16 @@ def test_a_shallow_rebound_is_in_the_window(tmp_path: Path) -> None:
     assert problem.observations.times[-1] == pytest.approx(30e-6, abs=1e-6)
 
 
+def test_the_run_is_called_like_the_file(tmp_path: Path) -> None:
+    write(tmp_path / "film 1.csv")
+    assert call("init", "--data", "film 1.csv", *UNITS).exit_code == 0
+    assert proposed(Path("film_1.yaml")).name == "film_1"
+    assert call("init", "--data", "film 1.csv", *UNITS, "--out", "my_gel.yaml").exit_code == 0
+    assert proposed(Path("my_gel.yaml")).name == "my_gel"
+    assert call("init", "--out", "other.yaml").exit_code == 0
+    assert load_config("other.yaml").name == "other"
+
+
 def test_a_constant_step_instead_of_times(tmp_path: Path) -> None:
     done = call("init", "--data", write(tmp_path / "b.csv"), "--time-step", "0.7 us", "--radius-unit", "um")
     assert done.exit_code == 0, done.output

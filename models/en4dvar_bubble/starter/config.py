@@ -37,6 +37,7 @@ def propose_config(
     start: Start | None = None,
     law: str | None = None,
     folder: str | Path = ".",
+    name: str | None = None,
     command: str = "en4dvar_bubble.starter.propose_config",
 ) -> Proposed:
     """A commented configuration for radius histories that loads and whose data can be read.
@@ -48,6 +49,7 @@ def propose_config(
         as ``"3.7 us"``.
     start, law: instead of what the data suggest.
     folder: where the file will be; the path of the data inside it is relative to this folder.
+    name: of the run, whose results go to ``runs/<name>``; default: that of the data.
     command: told in the head of the file.
 
     Raises
@@ -60,7 +62,7 @@ def propose_config(
     source = Source(path_from(Path(folder), str(data)), time, time_step, radius)
     files = find_files(Path.cwd(), [str(data)])
     proposal = propose(histories(files, source), start, law)
-    text = yaml_text(run_name(str(data)), source, proposal, command)
+    text = yaml_text(name or run_name(str(data)), source, proposal, command)
     build(resolve(parse_document(text), Path(folder).absolute()))
     return Proposed(text, proposal)
 
@@ -80,10 +82,8 @@ def path_from(folder: Path, data: str) -> str:
     return Path(os.path.relpath(path, here)).as_posix() if near else path.as_posix()
 
 
-def run_name(data: str | None) -> str:
-    """Name of the run and of its file: that of the data, with letters, digits, dots and dashes."""
-    if data is None:
-        return "bubble"
+def run_name(data: str) -> str:
+    """Name of a run from the path of its data (or of its file): letters, digits, dots and dashes."""
     path = Path(data).expanduser().absolute()
     stem = path.parent.name if any(sign in path.name for sign in "*?[") else path.name if path.is_dir() else path.stem
     return re.sub(r"[^\w.+-]", "_", stem).lstrip(".-+") or "bubble"
