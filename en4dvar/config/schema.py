@@ -173,7 +173,8 @@ class Execution(Section):
     address: Annotated[str, Field(pattern=r"^\w+://\S+$")] | None = None
     """Address of a running dask scheduler, e.g. tcp://10.0.0.1:8786."""
     checkpoint_every: Annotated[float, Field(ge=0)] = 0.2
-    """Seconds between two checkpoints of a data set; an iteration that follows sooner is not written, 0 writes all."""
+    """Seconds between two checkpoints of a data set; an iteration that follows sooner is not written, 0 writes all.
+    Never so often that writing takes more than 5 % of the time."""
 
     time_limit: Annotated[float, Quantity("s"), Field(gt=0)] | None = None
     """Longest that one batch of members (one member, unless the model batches) may take, e.g. 60 s; past it they have
