@@ -153,7 +153,9 @@ def test_plus_minus_and_verdicts():
 
 @pytest.fixture(scope="module")
 def twin():
-    return run_study(load_study(CONFIGS / "agarose_study.yaml", {"sweep.trajectories": 8192}), workers=2)
+    few = {"rounds": 60, "blocks": 1, "draws": 300, "exact": 50}  # no test here asks how good the populations are
+    changes = {"sweep.trajectories": 8192, **{f"population.{key}": value for key, value in few.items()}}
+    return run_study(load_study(CONFIGS / "agarose_study.yaml", changes), workers=2)
 
 
 @pytest.mark.slow

@@ -167,8 +167,8 @@ def _apparent_modulus(study: Study, gel: str) -> str:
     apparent = np.log(study.fits[gel]["nh"].values("en4dvar", "G"))
     return (
         f"{gel}: G of the neo-Hookean law stands for the stiffening it lacks: from bubble to bubble its logarithm "
-        f"follows that of the true G α / R₀ (correlation {np.corrcoef(sheet, apparent)[0, 1]:.2f}), so it scatters as α "
-        f"and R₀ do, by ± {apparent.std():.2f} in ln G."
+        f"follows that of the true G α / R₀ (correlation {np.corrcoef(sheet, apparent)[0, 1]:.2f}), so it scatters as "
+        f"α and R₀ do, by ± {apparent.std():.2f} in ln G."
     )
 
 
