@@ -17,6 +17,7 @@ from en4dvar.interrupt import Interrupted, terminate_as_interrupt
 from en4dvar.progress import RunLog
 from en4dvar.provenance import provenance
 from en4dvar.rundir import Mode, RunDirectory
+from en4dvar.seal import seal_file
 from en4dvar.sequential import SequentialState
 from en4dvar.twin import TwinResult, conduct
 from en4dvar.twin_file import dataset, summary_csv
@@ -71,6 +72,7 @@ def run_twin(
         log.write("\n".join(f"member lost: {reason}" for reason in result.run.failures))
         with atomic_path(directory.work / "twin.nc") as partial:
             dataset(result, attributes).to_netcdf(partial, engine="netcdf4", format="NETCDF4")
+            seal_file(partial)
         write_text(directory.work / "summary.csv", summary_csv(result))
         if config.report:
             report_twin(directory)

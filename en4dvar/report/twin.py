@@ -17,6 +17,7 @@ from en4dvar.report.html import render
 from en4dvar.report.page import PROVENANCE
 from en4dvar.report.style import COLUMN, LIGHT, inline_svg, save_figure, styled
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
+from en4dvar.seal import check_seal
 from en4dvar.twin_file import MEAN
 
 COLOURS = {"forecast": "prior", "analysis": "posterior", "smoothed": "background"}
@@ -29,6 +30,7 @@ def write_twin_report(run_dir: Path) -> Path:
 
     Raises :class:`~en4dvar.errors.OutputError` where there is nothing to read or the directory cannot be written.
     """
+    check_seal(run_dir / "twin.nc")
     try:
         with xr.open_dataset(run_dir / "twin.nc") as file:
             data = file.load()

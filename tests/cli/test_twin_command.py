@@ -95,6 +95,12 @@ def test_report_again_from_the_file(finished):
     again = call("report", directory)
     assert again.exit_code == 0, again.output
     assert (directory / "figures" / "scores.png").stat().st_size > 10_000
+    damaged = (directory / "twin.nc").read_bytes()
+    (directory / "twin.nc").write_bytes(damaged.replace(b"analysis", b"analisys", 1))
+    refused = call("report", directory)
+    assert refused.exit_code == 2
+    assert "twin.nc" in refused.stderr
+    (directory / "twin.nc").write_bytes(damaged)
     strip = lambda text: re.sub(r"20\d\d-\S+", "", text)  # noqa: E731
     assert strip((directory / "report.html").read_text()) == strip(page)
 
