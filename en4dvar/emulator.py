@@ -104,12 +104,18 @@ def needed_runs(n_parameters: int) -> tuple[int, int] | None:
 
 
 def emulate(
-    run: Run, prior: Prior, observations: Observations, ensemble: Array, random: np.random.Generator
+    run: Run,
+    prior: Prior,
+    observations: Observations,
+    ensemble: Array,
+    random: np.random.Generator,
+    fits: int = 2,
 ) -> Emulator | None:
     """An emulator about a Gaussian ensemble (N, n), transformed, with draws of it.
 
-    Takes twice the :func:`needed_runs` of the model through ``run``. None where there are too many parameters for
-    polynomials, or so many runs fail that the rest does not determine them.
+    Each of the ``fits`` takes the :func:`needed_runs` of the model through ``run``, from the second on where the one
+    before says the posterior is. None where there are too many parameters for polynomials, or so many runs fail that
+    the rest does not determine them.
     """
     n = ensemble.shape[1]
     wanted = needed_runs(n)
@@ -118,28 +124,26 @@ def emulate(
     degree, count = wanted
     mean = ensemble.mean(axis=0)
     root = np.asarray(np.linalg.cholesky(np.atleast_2d(np.cov(ensemble.T))), dtype=float)
-    inverse_root = np.asarray(np.linalg.inv(root), dtype=float)
-    z = random.standard_normal((count, n))
-    first = _run(run, prior, observations, mean + z @ root.T)
-    terms = _terms(n, degree)
-    columns = (False, False) if first is None else first[1]
-    if first is None or len(first[0].x) < 0.75 * count:
+    inverse_root, terms = np.asarray(np.linalg.inv(root), dtype=float), _terms(n, degree)
+    found = _run(run, prior, observations, mean + random.standard_normal((count, n)) @ root.T)
+    if found is None or len(found[0].x) < 0.75 * count:
         return None
-    rough = _fit(prior, observations, mean, inverse_root, terms, first[0], columns)
-    start = first[0].x[random.permutation(len(first[0].x))[:WALKERS]]
-    positions = rough.walk(start, random, SCATTERED)
-    kept = np.concatenate(positions[SCATTERED // 2 :])
-    x = kept[np.linspace(0, len(kept) - 1, count).astype(int)]
-    second = _run(run, prior, observations, x)
-    if second is None:
-        return None
-    runs = first[0].joined(second[0])
-    fine = _fit(prior, observations, mean, inverse_root, terms, runs, columns)
-    # judged where the rough one sampled: its weights, of the better one's J
-    settled = fine.walk(positions[-1], random, SETTLED)
-    share = effective_share(rough.cost(second[0].x) - second[0].costs) * len(second[0].x) / count
+    runs, columns = found
+    emulator = _fit(prior, observations, mean, inverse_root, terms, runs, columns)
+    walkers, share = runs.x[random.permutation(len(runs.x))[:WALKERS]], math.nan
+    for _ in range(fits - 1):
+        positions = emulator.walk(walkers, random, SCATTERED)
+        walkers, kept = positions[-1], np.concatenate(positions[SCATTERED // 2 :])
+        found = _run(run, prior, observations, kept[np.linspace(0, len(kept) - 1, count).astype(int)])
+        if found is None:
+            return None
+        new = found[0]
+        share = effective_share(emulator.cost(new.x) - new.costs) * len(new.x) / count  # of the fit without them
+        runs = runs.joined(new)
+        emulator = _fit(prior, observations, mean, inverse_root, terms, runs, columns)
+    settled = emulator.walk(walkers, random, SETTLED)
     ceiling = float(np.min(runs.costs - _prior_cost(prior, runs.x))) + CEILING
-    return replace(fine, ceiling=ceiling, share=share, draws=np.concatenate(settled[SETTLED // 4 :]))
+    return replace(emulator, ceiling=ceiling, share=share, draws=np.concatenate(settled[SETTLED // 4 :]))
 
 
 def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> tuple[_Runs, tuple[bool, bool]] | None:

@@ -16,6 +16,7 @@ from en4dvar.emulator import Emulator, emulate
 from en4dvar.prior import member_stream
 from en4dvar.state import Array
 
+CHAIN_FITS = 4  # of an emulator that has to guide a chain into the tails; two tell mean and spread
 CLEARED = 0.85  # effective share of the members above which mean and spread are those of the posterior
 
 
@@ -29,7 +30,7 @@ def examine_shape(space: WeightSpace, ensemble: Array, mode: Array, costs: Array
     """
     shape = diag.gaussianity(ensemble, mode, costs)
     if shape["gaussian_fit"] < CLEARED:
-        emulator = guide(space, ensemble, seed)
+        emulator = guide(space, ensemble, seed, fits=2)
         if emulator is not None:
             draws = emulator.draws
             std = draws.std(axis=0)
@@ -42,10 +43,10 @@ def examine_shape(space: WeightSpace, ensemble: Array, mode: Array, costs: Array
     return {**shape, "non_gaussian": diag.is_non_gaussian(shape)}
 
 
-def guide(space: WeightSpace, ensemble: Array, seed: int) -> Emulator | None:
+def guide(space: WeightSpace, ensemble: Array, seed: int, fits: int = CHAIN_FITS) -> Emulator | None:
     """An emulator of J about an ensemble (N, n); None where the settings or the model forbid."""
     wanted = space.settings.emulator
     if wanted == "off" or (wanted == "auto" and not space.problem.model.compiled):
         return None
     random = member_stream(seed, "emulator")
-    return emulate(space.forecast, space.problem.prior, space.problem.observations, ensemble, random)
+    return emulate(space.forecast, space.problem.prior, space.problem.observations, ensemble, random, fits)
