@@ -105,6 +105,7 @@ class Worklist:
                 continue
             if file_digest(self.directory.work / d.file) == record.sha256:
                 self.ended[d.name] = record
+                self.directory.remove(d.iteration)  # of a run killed between its last two steps
             else:
                 self.notice(f"{self.directory.path / d.file}: missing or changed since it was written; estimated again")
 

@@ -234,11 +234,12 @@ def survive(
     environment = {**os.environ, "PYTHONPATH": str(TESTS), "EN4DVAR_TEST_PAUSE": "0", "MPLBACKEND": "agg"}
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     process = subprocess.Popen([sys.executable, __file__], text=True, env=environment, start_new_session=True, **pipes)
-    try:
-        out, told = process.communicate(json.dumps(task), timeout=timeout)
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
+    with process:
+        try:
+            out, told = process.communicate(json.dumps(task), timeout=timeout)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == 0, told[-4000:]
     return dict(json.loads(out))
 
