@@ -69,7 +69,7 @@ def twin_figures(data: xr.Dataset) -> Iterator[tuple[str, str, Figure]]:
     words = " The first cycles, shaded, do not count in the averages." if burn_in else ""
     yield "scores", f"RMSE against the truth (line) and spread (dashed) of each estimate in time.{words}", scores(data)
     shown = f"Error of the analysis within two standard deviations, last {min(LAST, data.sizes['time'])} cycles"
-    yield "errors", f"{shown}, first variables of the state. A reliable ensemble has 95 % within.", errors(data)
+    yield "errors", f"{shown}, some variables of the state. A reliable ensemble has 95 % within.", errors(data)
 
 
 @styled
@@ -82,8 +82,8 @@ def scores(data: xr.Dataset) -> Figure:
     for ax, kind in zip(panels, kinds, strict=True):
         colour = LIGHT[COLOURS[kind]]
         rmse, spread = data[f"{kind}_rmse"], data[f"{kind}_spread"]
-        ax.plot(time, rmse, color=colour, lw=0.9, label="RMSE")
-        ax.plot(time, spread, color=LIGHT["centre"], lw=0.8, ls="--", label="spread")
+        ax.plot(time, rmse, color=colour, lw=0.7, label="RMSE")
+        ax.plot(time, spread, color=LIGHT["centre"], lw=0.7, ls="--", label="spread")
         ax.axhline(float(rmse.attrs[MEAN]), color=colour, lw=0.6)
         if burn_in := int(data.attrs["burn_in"]):
             ax.axvspan(time[0], time[burn_in - 1], color=LIGHT["grid"], alpha=0.5, lw=0)
@@ -102,10 +102,12 @@ def errors(data: xr.Dataset) -> Figure:
     burn_in = int(data.attrs["burn_in"])
     error, std = (data["analysis_mean"] - data["truth"]).values, data["analysis_std"].values
     inside = np.mean(np.abs(error[burn_in:]) <= 2 * std[burn_in:], axis=0)
-    count = min(SHOWN, data.sizes["state"])
+    varied = np.flatnonzero(std.max(axis=0) > 1e-9 * np.abs(data["truth"].values).max(axis=0))  # not what is held fixed
+    chosen = np.unique([*varied[: SHOWN - 1], varied[-1]])  # the last is an estimated parameter, if there is one
+    count = len(chosen)
     figure = Figure(figsize=(COLUMN, (1.2 + 2.6 * count) / 2.54), layout="constrained")
     time = data["time"].values[-LAST:]
-    for i, ax in enumerate(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]):
+    for i, ax in zip(chosen, figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0], strict=True):
         width = 2 * std[-LAST:, i]
         ax.fill_between(time, -width, width, color=LIGHT["posterior"], alpha=0.25, lw=0, label="± 2 std")
         ax.axhline(0, color=LIGHT["muted"], lw=0.5)
@@ -148,7 +150,7 @@ def _facts(data: xr.Dataset) -> list[tuple[str, str, str]]:
     cycles, burn_in, members, lost = data.sizes["time"], int(a["burn_in"]), int(a["members"]), int(a["members_lost"])
     iterations = float(data["iterations"].values[burn_in:].mean())
     return [
-        ("Scheme", str(a["scheme"]), f"{plain_number(iterations, 3)} forecasts of the window a cycle"),
+        ("Scheme", str(a["scheme"]), f"forecasts of the window a cycle: {plain_number(iterations, 3)}"),
         ("Members alive", f"{members - lost} of {members}", "at the end of the run"),
         ("Cycles", str(cycles), f"{burn_in} of them do not count in the averages"),
         ("Observations", str(data.sizes["observation"]), "a cycle"),
