@@ -124,7 +124,7 @@ def soak(sets: int, every: float, seed: int) -> dict[str, object]:
         with (folder / "troubled" / "summary.csv").open(newline="") as file:
             named = {row["dataset"]: row["failure"] for row in csv.DictReader(file) if row["failure"]}
         with netCDF4.Dataset(folder / "troubled" / "posterior.nc") as result:
-            lost = 1 - float(np.mean(result["sample_stats/prior_active"][...]))
+            lost = 1 - float(np.mean(result["sample_stats/active"][...]))
         return {
             "sets completed": len(files),
             "of them with the bits of the quiet run": equal,
@@ -132,7 +132,7 @@ def soak(sets: int, every: float, seed: int) -> dict[str, object]:
             "of them named with a reason": sum(bool(named.get(name)) for name in bad),
             "good files named as bad": len(set(named) - bad),
             "workers killed": len(watch.killed),
-            "members lost in the prior forecast": f"{100 * lost:.2f} %",
+            "members lost in the posterior forecast": f"{100 * lost:.2f} %",
             "seconds": round(watch.seconds),
             "memory of the main process by quarter of the run, MB": [round(watch.quarter(i)) for i in range(4)],
             "held": equal == len(files) == sets - len(bad) and set(named) == bad,
