@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.forecast import forecast
+from en4dvar.ensemble.forecast import forecast
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem

@@ -18,7 +18,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from en4dvar.linalg import centre
+from en4dvar.ensemble.linalg import centre
 from en4dvar.schemes import Evaluation, Weights
 from en4dvar.schemes.esmda import ESMDA
 

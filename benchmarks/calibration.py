@@ -20,14 +20,14 @@ from acoustic_twin import NARROW, WIDE, make_twin, prior
 from records import Record, fill
 from scipy.stats import binomtest, chisquare
 
-from en4dvar import mcmc
 from en4dvar.assimilate import assimilate
-from en4dvar.descent import WeightSpace
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.ensemble.forecast import log_posterior
 from en4dvar.errors import En4dvarError
 from en4dvar.executor import SerialExecutor
-from en4dvar.forecast import log_posterior
 from en4dvar.problem import AssimilationSettings
-from en4dvar.shape import guide
+from en4dvar.sampling import mcmc
+from en4dvar.sampling.shape import guide
 
 BINS = 7  # of 49 ranks
 CENTRAL = (25, 45)  # of 49 ranks: the central intervals nearest to 50 and 90 %

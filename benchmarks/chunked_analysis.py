@@ -19,7 +19,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from en4dvar.linalg import apply_weights
+from en4dvar.ensemble.linalg import apply_weights
 from en4dvar.schemes import Evaluation, Weights
 from en4dvar.schemes.etkf import ETKF
 

@@ -19,7 +19,7 @@ from killing import survive  # noqa: E402
 from many import estimate_many  # noqa: E402
 from soak import soak  # noqa: E402
 
-from en4dvar.provenance import cpu_model, git_commit  # noqa: E402
+from en4dvar.storage.provenance import cpu_model, git_commit  # noqa: E402
 
 HOUR = 3600.0  # s, nothing takes that long
 

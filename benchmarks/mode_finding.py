@@ -18,11 +18,11 @@ import numpy as np
 from acoustic_twin import NARROW, WIDE, make_twin, prior
 from records import Record, fill
 
-from en4dvar import mcmc
 from en4dvar.assimilate import assimilate
-from en4dvar.forecast import log_posterior
+from en4dvar.ensemble.forecast import log_posterior
 from en4dvar.prior import Prior
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.sampling import mcmc
 
 PLAIN = "best member (plain)"
 COUNTED = AssimilationSettings(emulator="off")  # without the runs that judge the shape of the posterior

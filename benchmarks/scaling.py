@@ -24,15 +24,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-import en4dvar.jobs
+import en4dvar.runs.jobs
 import en4dvar_bubble
-from en4dvar.build import build_one, data_files, inverse_plan
 from en4dvar.config import Config, load_config
+from en4dvar.ensemble.members import Reading
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, ThreadsExecutor, one_blas_thread
-from en4dvar.files import write_bytes
-from en4dvar.jobs import Job, estimate
-from en4dvar.members import Reading
-from en4dvar.runner import run_campaign
+from en4dvar.inputs.build import build_one, data_files, inverse_plan
+from en4dvar.runs.jobs import Job, estimate
+from en4dvar.runs.runner import run_campaign
+from en4dvar.storage.files import write_bytes
 from en4dvar_bubble.model import BubbleModel
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -140,7 +140,7 @@ def spent(config: Config, emulator: Literal["off", "auto"]) -> list[float]:
     contents = [estimate(job).content for job in work]
     clock, rows = time.thread_time, []
     forward = (BubbleModel, "initial_states"), (SerialExecutor, "trajectories"), (Reading, "observe")
-    making = (en4dvar.jobs, "build_groups"), (en4dvar.jobs, "to_bytes"), (en4dvar.jobs, "summarise")
+    making = (en4dvar.runs.jobs, "build_groups"), (en4dvar.runs.jobs, "to_bytes"), (en4dvar.runs.jobs, "summarise")
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(REPEATS):
             read = seconds(lambda: jobs(config), clock)

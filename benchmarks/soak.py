@@ -23,7 +23,7 @@ import netCDF4
 import numpy as np
 from cheap_model import write_campaign
 
-from en4dvar.provenance import cpu_model, git_commit
+from en4dvar.storage.provenance import cpu_model, git_commit
 
 HERE = Path(__file__).resolve().parent
 ALLOWED = {0, 1}  # exit codes: 1 where data sets have failed, as they must

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from en4dvar.assimilate import assimilate
-from en4dvar.build import build
 from en4dvar.config import load_config
+from en4dvar.ensemble.forecast import forecast
 from en4dvar.executor import ThreadsExecutor
-from en4dvar.forecast import forecast
+from en4dvar.inputs.build import build
 from en4dvar.observations import Observations
 from en4dvar.problem import InverseProblem
 from en4dvar_bubble.study.evidence import probability

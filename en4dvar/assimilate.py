@@ -8,23 +8,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar import diagnostics as diag
-from en4dvar import mcmc
-from en4dvar.descent import Local, WeightSpace
+from en4dvar.cycling.mda import assimilate_once
+from en4dvar.descent.start import choose_start
+from en4dvar.descent.weight_space import Local, WeightSpace
+from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, has_noise_scale, log_posterior
 from en4dvar.errors import ConfigError, TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
-from en4dvar.forecast import Forecast, check_problem, cost, forecast, has_noise_scale, log_posterior
 from en4dvar.honesty import Caution, Ending, caution, examine
 from en4dvar.honesty.checks import down_weighted
+from en4dvar.inputs.units import convert
 from en4dvar.likelihood import error_std, log_likelihood, robust_weights, whitened_residual
-from en4dvar.mda import assimilate_once
 from en4dvar.noise_scale import mean_beyond_mode
 from en4dvar.problem import Analysis, AssimilationSettings, InverseProblem, IterationRecord
+from en4dvar.sampling import mcmc
+from en4dvar.sampling.shape import examine_shape, guide
 from en4dvar.schemes import Step, Weights
 from en4dvar.schemes.esmda import ESMDA
-from en4dvar.shape import examine_shape, guide
-from en4dvar.start import choose_start
 from en4dvar.state import Array
-from en4dvar.units import convert
 
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 

@@ -12,12 +12,12 @@ import click
 
 from en4dvar.commands.common import Failed
 from en4dvar.commands.listings import models, schema
+from en4dvar.commands.plugin_commands import PluginCommand, plugin_commands
 from en4dvar.commands.results import compare, export, report, rerun
 from en4dvar.commands.run import run
 from en4dvar.commands.simulate import simulate
 from en4dvar.commands.validate import validate
 from en4dvar.errors import En4dvarError
-from en4dvar.plugin_commands import PluginCommand, plugin_commands
 
 
 class Commands(click.Group):

@@ -104,7 +104,9 @@ def gaussianity(members: Array, mode: Array, costs: Array) -> dict[str, float]:
 
 
 def is_non_gaussian(shape: Mapping[str, float]) -> bool:
-    """Whether mean or spread of the ensemble are not the posterior's, from :func:`~en4dvar.shape.examine_shape`."""
+    """Whether mean or spread of the ensemble are not the posterior's, from
+    :func:`~en4dvar.sampling.shape.examine_shape`.
+    """
     if shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH:
         off = abs(shape["spread_ratio"] - 1)
         return shape["mean_shift"] > MEAN_OFF or off > SPREAD_OFF

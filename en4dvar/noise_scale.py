@@ -20,7 +20,7 @@ import math
 
 import numpy as np
 
-from en4dvar.forecast import has_noise_scale
+from en4dvar.ensemble.forecast import has_noise_scale
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.state import NOISE_SCALE, Array

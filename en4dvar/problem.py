@@ -54,9 +54,9 @@ class AssimilationSettings:
 
     ``step_tolerance`` is a length in posterior standard deviations, √(δwᵀAδw); ``cost_tolerance`` is relative to J,
     and absolute below J = 1. ``full`` takes the whole step or, where that raises J, none. ``starts`` prior members of
-    lowest J are compared by a descent from each (see :mod:`en4dvar.start`). ``emulator`` spends a few hundred more runs
-    on how Gaussian the posterior is, where the members leave it open (see :mod:`en4dvar.shape`), and on the guidance of
-    ``refine: mcmc``; ``auto`` does so with compiled models. ES-MDA reads, besides ``members``,
+    lowest J are compared by a descent from each (see :mod:`en4dvar.descent.start`). ``emulator`` spends a few hundred
+    more runs on how Gaussian the posterior is, where the members leave it open (see :mod:`en4dvar.sampling.shape`), and
+    on the guidance of ``refine: mcmc``; ``auto`` does so with compiled models. ES-MDA reads, besides ``members``,
     ``sampling`` and ``min_active_fraction``, only ``mda_coefficients``, scaled so that Σ 1/α = 1, and ``mda_form``
     (see :mod:`en4dvar.schemes.esmda`).
     """
@@ -141,7 +141,7 @@ class Analysis:
     settings: AssimilationSettings
     cautions: tuple[Caution, ...] = ()  # why not to trust the posterior, the worst first
     log_evidence: float = float("nan")  # ln p(y), Laplace approximation
-    shape: Mapping[str, float] = field(default_factory=dict)  # how Gaussian the posterior is (en4dvar.shape)
+    shape: Mapping[str, float] = field(default_factory=dict)  # how Gaussian the posterior is (en4dvar.sampling.shape)
     huber_weight: Array | None = None  # (K,) weights of the robust cost at the centre, where there is one
     refinement: Mapping[str, float] = field(default_factory=dict)  # summary of the Markov chain, if any
     limits: tuple[ValidityLimit, ...] = ()  # V of the model

@@ -16,8 +16,8 @@ from execution_models import Stops
 from toy_config import csv_text, write_toy
 
 from en4dvar.config import Config, load_config
-from en4dvar.interrupt import Interrupted
-from en4dvar.runner import run_campaign
+from en4dvar.runs.interrupt import Interrupted
+from en4dvar.runs.runner import run_campaign
 
 TESTS = Path(__file__).parent
 

@@ -27,7 +27,7 @@ def report(run_dir: Path, datasets: tuple[str, ...]) -> None:
     Example:
       en4dvar report runs/quickstart
     """
-    from en4dvar.runner import report as write_report
+    from en4dvar.runs.runner import report as write_report
 
     click.echo(f"report: {write_report(run_dir, datasets)}")
 
@@ -45,7 +45,7 @@ def compare(run_dirs: tuple[Path, ...], out: Path | None, no_report: bool) -> No
     Example:
       en4dvar compare runs/neo_hookean runs/quadratic
     """
-    from en4dvar.compare import compare_runs, comparison_table, estimates_table
+    from en4dvar.storage.compare import compare_runs, comparison_table, estimates_table
 
     comparison = compare_runs(run_dirs)
     if len(comparison.estimates) <= MOST_ROWS:
@@ -78,8 +78,8 @@ def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
       en4dvar export runs/quickstart --latex --out table.tex
     """
     from en4dvar.errors import OutputError
-    from en4dvar.export import export_table, posterior_file
-    from en4dvar.files import write_text
+    from en4dvar.storage.export import export_table, posterior_file
+    from en4dvar.storage.files import write_text
 
     if kind == "netcdf":
         path = posterior_file(run_dir)
@@ -107,7 +107,7 @@ def rerun(run_dir: Path, workers: int | None) -> None:
     Example:
       en4dvar rerun runs/quickstart
     """
-    from en4dvar.rerun import rerun as repeat
+    from en4dvar.runs.rerun import rerun as repeat
 
     found = repeat(run_dir, workers)
     click.echo(str(found))

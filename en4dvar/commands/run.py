@@ -11,8 +11,8 @@ import click
 from en4dvar.commands.common import Failed, command_line, command_words, config_options, load_any
 
 if TYPE_CHECKING:
-    from en4dvar.campaign import Campaign
     from en4dvar.config import TwinConfig
+    from en4dvar.runs.campaign import Campaign
 
 MOST_TOLD = 30  # data sets, warnings and failures on the terminal; all of them are in the run directory
 
@@ -59,9 +59,9 @@ def run(
             raise click.UsageError("a twin experiment takes no --scheduler: its cycles are too short to be sent away")
         _run_twin(loaded, force, resume)
         return
-    from en4dvar.build import data_files, inverse_plan
-    from en4dvar.progress import terminal_progress
-    from en4dvar.runner import execute
+    from en4dvar.inputs.build import data_files, inverse_plan
+    from en4dvar.runs.progress import terminal_progress
+    from en4dvar.runs.runner import execute
 
     words = command_words()
     with terminal_progress(len(data_files(inverse_plan(loaded)))) as progress:
@@ -74,7 +74,7 @@ def run(
 
 def _tell(campaign: Campaign, with_report: bool) -> None:
     """The posterior on standard output, warnings on standard error. Raises :class:`Failed` where a data set has."""
-    from en4dvar.describe import results_table
+    from en4dvar.commands.describe import results_table
 
     if len(campaign) <= MOST_TOLD:
         click.echo(results_table({o.name: o.summary for o in campaign.outcomes if not o.failure}))
@@ -100,8 +100,8 @@ def _to_continue(interrupt: KeyboardInterrupt) -> Failed:
 
 
 def _run_twin(config: TwinConfig, force: bool, resume: bool) -> None:
-    from en4dvar.progress import cycle_progress
-    from en4dvar.twin_run import run_twin, scores_table
+    from en4dvar.runs.progress import cycle_progress
+    from en4dvar.runs.twin_run import run_twin, scores_table
 
     with cycle_progress(config.experiment.cycles) as on_cycle:
         try:

@@ -11,9 +11,9 @@ import click
 from en4dvar.commands.common import config_options, overrides
 
 if TYPE_CHECKING:
-    from en4dvar.checks import Preview
     from en4dvar.config import Config
     from en4dvar.problem import InverseProblem
+    from en4dvar.runs.checks import Preview
 
 
 @click.command()
@@ -28,20 +28,20 @@ def validate(config: str, data: str | None, settings: tuple[str, ...], plot: boo
     Example:
       en4dvar validate configs/quickstart.yaml --plot
     """
-    from en4dvar.checks import validate as check
     from en4dvar.config import TwinConfig
+    from en4dvar.runs.checks import validate as check
 
     loaded = check(config, overrides(data, settings))
     if isinstance(loaded, TwinConfig):
-        from en4dvar.twin_run import twin_summary
+        from en4dvar.runs.twin_run import twin_summary
 
         if plot:
             raise click.UsageError("a twin experiment has no data to plot the prior over")
         click.echo(twin_summary(loaded))
         return
-    from en4dvar.build import build
-    from en4dvar.checks import preview
-    from en4dvar.describe import cost_summary, problem_summary
+    from en4dvar.commands.describe import cost_summary, problem_summary
+    from en4dvar.inputs.build import build
+    from en4dvar.runs.checks import preview
 
     problems = build(loaded)
     click.echo(problem_summary(loaded, problems))

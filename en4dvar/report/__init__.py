@@ -14,16 +14,16 @@ from dataclasses import fields
 from pathlib import Path
 from urllib.parse import quote
 
-from en4dvar.campaign_file import failed_datasets
+from en4dvar.commands.hints import suggest
 from en4dvar.errors import OutputError
-from en4dvar.files import write_text
-from en4dvar.hints import suggest
 from en4dvar.honesty import Caution
 from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import Entry, overview_figures, render_overview
 from en4dvar.report.page import make_section, render_set
 from en4dvar.report.style import save_figure
-from en4dvar.store import ParameterSummary, Result, load_result
+from en4dvar.storage.campaign_file import failed_datasets
+from en4dvar.storage.files import write_text
+from en4dvar.storage.store import ParameterSummary, Result, load_result
 
 Summarised = tuple[str, Iterable[ParameterSummary], Iterable[Caution]]
 PAGES = 40  # data sets of a campaign with a page from the start

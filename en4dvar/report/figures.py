@@ -10,11 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from en4dvar.inputs.units import convert
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, styled
 from en4dvar.report.text import plus_minus, pretty_unit, with_unit
 from en4dvar.state import Array
-from en4dvar.store import Result
-from en4dvar.units import convert
+from en4dvar.storage.store import Result
 
 MAX_PAIRS = 6
 

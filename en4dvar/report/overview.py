@@ -16,7 +16,7 @@ from en4dvar.honesty.caution import SEVERITIES, worst_first
 from en4dvar.report.html import render
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, inline_svg, styled
 from en4dvar.report.text import number_like, plain_number, plus_minus, pretty_unit, symbol_html, with_unit
-from en4dvar.store import ParameterSummary, Result
+from en4dvar.storage.store import ParameterSummary, Result
 
 NAMED = 40  # data sets whose names fit below a figure
 

@@ -12,7 +12,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from en4dvar.diagnostics import chi2_interval
-from en4dvar.groups import ITERATION_SCALARS
+from en4dvar.inputs.units import convert
 from en4dvar.report.html import render
 from en4dvar.report.style import inline_svg
 from en4dvar.report.text import (
@@ -24,8 +24,8 @@ from en4dvar.report.text import (
     symbol_html,
     words_for,
 )
-from en4dvar.store import ParameterSummary, Result
-from en4dvar.units import convert
+from en4dvar.storage.groups import ITERATION_SCALARS
+from en4dvar.storage.store import ParameterSummary, Result
 
 PROVENANCE = (
     "history", "date_created", "seed", "data_source", "git_commit", "configuration_file", "configuration_git_commit",

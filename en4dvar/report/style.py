@@ -16,7 +16,7 @@ from typing import Any, ParamSpec, TypeVar
 from matplotlib import style
 from matplotlib.figure import Figure
 
-from en4dvar.files import atomic_path
+from en4dvar.storage.files import atomic_path
 
 P = ParamSpec("P")
 T = TypeVar("T")

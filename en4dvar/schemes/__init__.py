@@ -2,7 +2,7 @@
 
 A scheme never sees x, F, H or a truth. It says with which weights to run the members, turns their predictions into a
 linearisation in weight space, and turns the whitened linearisation into a direction and a transform. The loop
-(:mod:`en4dvar.assimilate`) runs the model; step control (:mod:`en4dvar.step_control`) decides how far to go.
+(:mod:`en4dvar.assimilate`) runs the model; step control (:mod:`en4dvar.descent.step_control`) decides how far to go.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Protocol
 
 import numpy as np
 
-from en4dvar.linalg import Hessian
-from en4dvar.near_prior import NearPrior
+from en4dvar.ensemble.linalg import Hessian
+from en4dvar.ensemble.near_prior import NearPrior
 from en4dvar.state import Array
 
 
@@ -119,7 +119,7 @@ class Scheme(Protocol):
 
         ``predictions`` (N, Ky) of the members of :meth:`member_weights`, ``central`` (Ky,) of the centre, ``active``
         (N,) bool; rows of failed members are not read. ``basis`` U (N, r) spans the prior anomalies
-        (:func:`en4dvar.linalg.anomaly_basis`): per unit weight the anomalies are U C.
+        (:func:`en4dvar.ensemble.linalg.anomaly_basis`): per unit weight the anomalies are U C.
         """
 
     def step(self, weights: Weights, evaluation: Evaluation) -> Step:

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from en4dvar.linalg import min_norm_fit
+from en4dvar.ensemble.linalg import min_norm_fit
 from en4dvar.schemes import Evaluation, Step, Weights, gauss_newton
 from en4dvar.state import Array
 

@@ -20,7 +20,7 @@ from typing import Literal
 
 import numpy as np
 
-from en4dvar.linalg import Hessian
+from en4dvar.ensemble.linalg import Hessian
 from en4dvar.schemes import Evaluation, Weights
 from en4dvar.state import Array
 

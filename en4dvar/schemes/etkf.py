@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from en4dvar.linalg import centre
+from en4dvar.ensemble.linalg import centre
 from en4dvar.schemes import Evaluation, FullStep, Weights, full_step
 from en4dvar.state import Array
 

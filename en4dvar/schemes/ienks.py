@@ -18,7 +18,7 @@ from typing import Literal
 
 import numpy as np
 
-from en4dvar.linalg import centre
+from en4dvar.ensemble.linalg import centre
 from en4dvar.schemes import Evaluation, FullStep, Weights, full_step
 from en4dvar.state import Array
 

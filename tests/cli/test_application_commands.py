@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from en4dvar.cli import main
-from en4dvar.plugin_commands import GROUP
+from en4dvar.commands.plugin_commands import GROUP
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
 

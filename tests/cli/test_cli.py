@@ -14,7 +14,7 @@ from toy_config import YAML, csv_text, write_toy
 
 from en4dvar.cli import main
 from en4dvar.config import load_config
-from en4dvar.store import load_result
+from en4dvar.storage.store import load_result
 
 
 def call(*arguments: str | Path) -> Result:
@@ -202,7 +202,7 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         raise KeyboardInterrupt
 
     path, out = write_toy(tmp_path), tmp_path / "out"
-    monkeypatch.setattr("en4dvar.jobs.assimilate", interrupt)
+    monkeypatch.setattr("en4dvar.runs.jobs.assimilate", interrupt)
     monkeypatch.setattr("sys.argv", ["en4dvar", "run", str(path), "--out", str(out), "--force"])
     outcome = call("run", path, "--out", out)
     assert outcome.exit_code == 130

@@ -12,10 +12,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 from en4dvar.cli import main
-from en4dvar.export import escaped, export_table, latex_unit
 from en4dvar.problem import Analysis
-from en4dvar.store import Result as Posterior
-from en4dvar.store import load_result, save
+from en4dvar.storage.export import escaped, export_table, latex_unit
+from en4dvar.storage.store import Result as Posterior
+from en4dvar.storage.store import load_result, save
 
 
 def call(*arguments: str | Path) -> Result:

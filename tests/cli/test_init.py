@@ -11,12 +11,12 @@ from click.testing import CliRunner, Result
 from jsonschema import Draft202012Validator
 from scipy.integrate import solve_ivp
 
-from en4dvar.build import build
 from en4dvar.cli import main
 from en4dvar.config import Config, load_config, resolve
 from en4dvar.config.document import parse_document, read_document
 from en4dvar.errors import DataError
-from en4dvar.store import load_result
+from en4dvar.inputs.build import build
+from en4dvar.storage.store import load_result
 from en4dvar_bubble import commands_init
 from en4dvar_bubble.laws import REGISTRY
 from en4dvar_bubble.starter.look import RAYLEIGH, lobe, look, noise

@@ -5,8 +5,8 @@ from importlib.metadata import EntryPoint
 import pytest
 from click.testing import CliRunner
 
-from en4dvar import listing
 from en4dvar.cli import main
+from en4dvar.commands import listing
 from en4dvar.config import models
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from en4dvar import plugin_commands
 from en4dvar.cli import main
+from en4dvar.commands import plugin_commands
 
 MODULE = '''
 import click

@@ -9,8 +9,8 @@ from toy_config import csv_text, write_toy
 from en4dvar.config import load_config
 from en4dvar.errors import OutputError
 from en4dvar.problem import Analysis
-from en4dvar.progress import RunLog, describe, terminal_progress, time_left
-from en4dvar.runner import run_campaign
+from en4dvar.runs.progress import RunLog, describe, terminal_progress, time_left
+from en4dvar.runs.runner import run_campaign
 
 
 def test_terminal_only(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, analysis: Analysis) -> None:

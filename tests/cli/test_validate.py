@@ -11,11 +11,11 @@ from click.testing import CliRunner, Result
 from toy_config import csv_text, write_toy
 
 import en4dvar
-from en4dvar.build import build
-from en4dvar.checks import preview, validate
 from en4dvar.cli import main
 from en4dvar.config import load_config
+from en4dvar.inputs.build import build
 from en4dvar.report.predictive import prior_predictive
+from en4dvar.runs.checks import preview, validate
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -121,8 +121,8 @@ def test_a_prior_far_from_the_data_and_lost_members_are_told(tmp_path: Path) -> 
 def test_a_slow_model_is_not_run_in_full_unasked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = load_config(write_toy(tmp_path))
     (problem,) = build(config)
-    monkeypatch.setattr("en4dvar.checks.LONGEST", 0.0)
-    monkeypatch.setattr("en4dvar.checks.ENOUGH", 0.0)
+    monkeypatch.setattr("en4dvar.runs.checks.LONGEST", 0.0)
+    monkeypatch.setattr("en4dvar.runs.checks.ENOUGH", 0.0)
     assert len(preview(problem, config.assimilation, 3).run.failures) == 1
     assert len(preview(problem, config.assimilation, 3, whole=True).run.failures) == 8
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.io import savemat
 
 from en4dvar.errors import DataError
-from en4dvar.readers import Column, Series, Step, read_series
+from en4dvar.inputs.readers import Column, Series, Step, read_series
 
 TIME, RADIUS = Column("t", "us", "s"), Column("R", "um", "m")
 

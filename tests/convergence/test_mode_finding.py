@@ -7,12 +7,12 @@ import pytest
 from toys import Decay, Toy, Wave, make_problem
 
 from en4dvar.assimilate import assimilate
-from en4dvar.descent import WeightSpace
+from en4dvar.descent.step_control import Point, Tangent, Trials, acceleration, line_search, run_searches
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.ensemble.linalg import Hessian
 from en4dvar.executor import SerialExecutor
-from en4dvar.linalg import Hessian
 from en4dvar.problem import AssimilationSettings
 from en4dvar.schemes import Step, Weights
-from en4dvar.step_control import Point, Tangent, Trials, acceleration, line_search, run_searches
 
 
 @pytest.mark.parametrize("time_std", [0.0, 0.05])

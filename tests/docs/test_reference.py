@@ -7,7 +7,7 @@ import re
 import pytest
 from doc_pages import ROOT, blocks
 
-from en4dvar.store import Result, save
+from en4dvar.storage.store import Result, save
 
 PAGE = ROOT / "docs" / "reference_netcdf.md"
 

@@ -8,16 +8,16 @@ import pytest
 from same_bits import assert_same_bits
 from toys import Decay, Fragile, Linear, Toy, make_problem
 
-from en4dvar import mcmc
 from en4dvar.assimilate import assimilate, log_posterior
 from en4dvar.diagnostics import effective_share, is_non_gaussian, shape_warnings
-from en4dvar.emulator import emulate, needed_runs
+from en4dvar.ensemble.forecast import forecast
 from en4dvar.executor import ThreadsExecutor
-from en4dvar.forecast import forecast
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import AssimilationSettings
+from en4dvar.sampling import mcmc
+from en4dvar.sampling.emulator import emulate, needed_runs
+from en4dvar.sampling.walkers import advance
 from en4dvar.state import NOISE_SCALE
-from en4dvar.walkers import advance
 
 LEVELS = {"plain": {}, "timing errors": {"time_std": 0.05}}
 

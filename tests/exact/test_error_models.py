@@ -9,11 +9,11 @@ from scipy.stats import multivariate_normal
 from toys import Decay, Linear, Wave, make_observations, make_problem
 
 from en4dvar.assimilate import assimilate, forecast, log_posterior
-from en4dvar.descent import WeightSpace
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.ensemble.linalg import centre
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.executor import SerialExecutor
 from en4dvar.likelihood import Linearisation, log_likelihood, log_normalisation, observation_cost, whiten
-from en4dvar.linalg import centre
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings
 from en4dvar.schemes import Weights

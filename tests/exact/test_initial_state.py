@@ -9,8 +9,8 @@ from toys import make_observations
 
 from en4dvar.assimilate import assimilate, forecast
 from en4dvar.config.initial_state import perturbation
+from en4dvar.ensemble.forecast import check_problem
 from en4dvar.errors import ConfigError
-from en4dvar.forecast import check_problem
 from en4dvar.prior import Prior
 from en4dvar.problem import AssimilationSettings, InverseProblem
 

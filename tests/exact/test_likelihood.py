@@ -7,11 +7,11 @@ import pytest
 from toys import Decay, Linear, Wave, make_observations, make_problem
 
 from en4dvar.assimilate import cost, forecast, log_posterior
+from en4dvar.ensemble.forecast import check_problem
+from en4dvar.ensemble.linalg import anomaly_basis, centre
 from en4dvar.errors import ConfigError
-from en4dvar.forecast import check_problem
 from en4dvar.forward import Observable, StateField
 from en4dvar.likelihood import Linearisation, error_std, log_likelihood, observation_cost, whiten
-from en4dvar.linalg import anomaly_basis, centre
 from en4dvar.schemes import Evaluation, Weights
 from en4dvar.schemes.en4dvar import En4DVar
 

@@ -8,8 +8,8 @@ from toys import OBSERVABLE, Linear, Vectorised, make_observations, make_problem
 
 from en4dvar import diagnostics as diag
 from en4dvar.assimilate import assimilate
-from en4dvar.descent import prior_ensemble
-from en4dvar.linalg import Hessian, anomaly_basis, centre
+from en4dvar.descent.weight_space import prior_ensemble
+from en4dvar.ensemble.linalg import Hessian, anomaly_basis, centre
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.schemes import Evaluation

@@ -9,8 +9,8 @@ from toys import Linear, Vectorised, make_problem
 
 from en4dvar import Batch
 from en4dvar.assimilate import assimilate
-from en4dvar.descent import prior_ensemble
-from en4dvar.forecast import forecast
+from en4dvar.descent.weight_space import prior_ensemble
+from en4dvar.ensemble.forecast import forecast
 from en4dvar.forward import Observable, ValidityLimit
 from en4dvar.problem import AssimilationSettings
 

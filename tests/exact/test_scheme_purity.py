@@ -9,7 +9,7 @@ import pytest
 import en4dvar.schemes
 from en4dvar.schemes import Scheme
 
-ALLOWED = {"en4dvar.linalg", "en4dvar.near_prior", "en4dvar.schemes", "en4dvar.state"}
+ALLOWED = {"en4dvar.ensemble.linalg", "en4dvar.ensemble.near_prior", "en4dvar.schemes", "en4dvar.state"}
 FILES = sorted(Path(en4dvar.schemes.__file__).parent.glob("*.py"))
 
 

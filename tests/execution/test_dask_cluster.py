@@ -7,7 +7,7 @@ from run_files import assert_same_results, configuration, make_campaign
 from en4dvar.errors import ConfigError
 from en4dvar.executor import ExecutorError
 from en4dvar.executor import dask as dask_executor
-from en4dvar.runner import run_campaign
+from en4dvar.runs.runner import run_campaign
 
 
 @pytest.mark.fault("scheduler-lost")

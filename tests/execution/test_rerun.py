@@ -5,9 +5,9 @@ from run_files import configuration, make_campaign, run_cli
 from toy_config import write_toy
 
 from en4dvar.errors import OutputError
-from en4dvar.rerun import rerun
-from en4dvar.runner import run, run_campaign
-from en4dvar.store import load_result, save
+from en4dvar.runs.rerun import rerun
+from en4dvar.runs.runner import run, run_campaign
+from en4dvar.storage.store import load_result, save
 
 
 @pytest.fixture
@@ -54,8 +54,8 @@ def test_what_differs_is_named(campaign):
 
 
 def test_what_has_changed_is_told(campaign, monkeypatch):
-    monkeypatch.setattr("en4dvar.fingerprint.source_digest", lambda module: f"another {module}")
-    monkeypatch.setattr("en4dvar.provenance.cpu_model", lambda: "another processor")
+    monkeypatch.setattr("en4dvar.storage.fingerprint.source_digest", lambda module: f"another {module}")
+    monkeypatch.setattr("en4dvar.storage.provenance.cpu_model", lambda: "another processor")
     found = rerun(campaign / "run")
     assert found.same
     assert "+  toy_models: another toy_models" in found.changed

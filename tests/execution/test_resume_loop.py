@@ -4,10 +4,10 @@ import pytest
 from same_bits import assert_same_bits
 from toys import Decay, Wave, make_problem
 
-from en4dvar import mcmc
 from en4dvar.assimilate import LoopState, assimilate
-from en4dvar.codec import decode, encode
 from en4dvar.problem import AssimilationSettings
+from en4dvar.sampling import mcmc
+from en4dvar.storage.codec import decode, encode
 
 
 @pytest.mark.parametrize("starts", [1, 2])

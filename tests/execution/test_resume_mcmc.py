@@ -10,10 +10,10 @@ import pytest
 from run_files import assert_same_results, configuration, kill_after_writes, make_campaign, run_cli
 
 from en4dvar.assimilate import LoopState, mcmc
-from en4dvar.checkpoint import read_checkpoint
-from en4dvar.fingerprint import identity
-from en4dvar.interrupt import Interrupted
-from en4dvar.runner import run_campaign
+from en4dvar.runs.interrupt import Interrupted
+from en4dvar.runs.runner import run_campaign
+from en4dvar.storage.checkpoint import read_checkpoint
+from en4dvar.storage.fingerprint import identity
 
 REFINED = ("members: 8", "members: 8\n  refine: mcmc")
 

@@ -10,11 +10,11 @@ import pytest
 from run_files import assert_same_results, command, configuration, environment, make_campaign
 from toy_config import write_toy
 
-from en4dvar import rundir
 from en4dvar.errors import OutputError, TooFewMembersError
-from en4dvar.lock import LOCK, locked
-from en4dvar.rundir import NEXT, RunDirectory
-from en4dvar.runner import run, run_campaign
+from en4dvar.runs import rundir
+from en4dvar.runs.lock import LOCK, locked
+from en4dvar.runs.rundir import NEXT, RunDirectory
+from en4dvar.runs.runner import run, run_campaign
 
 
 def contents(folder):
@@ -45,7 +45,9 @@ def test_second_run_is_refused_and_a_dead_one_is_not_in_the_way(tmp_path):
 
 def test_lock_goes_with_its_holder(tmp_path):
     with locked(tmp_path):
-        script = f"from en4dvar.lock import locked\nwith locked(__import__('pathlib').Path({str(tmp_path)!r})): pass"
+        script = (
+            f"from en4dvar.runs.lock import locked\nwith locked(__import__('pathlib').Path({str(tmp_path)!r})): pass"
+        )
         other = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
         assert "in use by process" in other.stderr
     with locked(tmp_path):
@@ -135,7 +137,7 @@ def test_resume_continues_an_interrupted_replacement(earlier, monkeypatch):
     def full(*_, **__):
         raise OutputError("disk full")
 
-    monkeypatch.setattr("en4dvar.runner.save_campaign", full)
+    monkeypatch.setattr("en4dvar.runs.runner.save_campaign", full)
     with pytest.raises(OutputError, match="disk full"):
         run_campaign(configuration(path, out), force=True)
     monkeypatch.undo()

@@ -3,7 +3,7 @@
 import pytest
 from run_files import assert_same_results, configuration, make_campaign
 
-from en4dvar.runner import run_campaign
+from en4dvar.runs.runner import run_campaign
 
 WHERE = [(kind, n) for kind in ("serial", "threads", "processes", "dask") for n in (1, 2)]
 

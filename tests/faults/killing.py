@@ -96,7 +96,7 @@ class Campaign:
 
     def run(self, out: Path, resume: bool) -> None:
         from en4dvar.config import load_config
-        from en4dvar.runner import run_campaign
+        from en4dvar.runs.runner import run_campaign
 
         settings: dict[str, Any] = {"output.directory": str(out), "output.report": self.report}
         settings |= {"execution.executor": self.executor, "execution.checkpoint_every": 0}
@@ -208,8 +208,8 @@ def main() -> None:
     task = json.loads(sys.stdin.read())
     sys.path.insert(0, str(TESTS))
     import en4dvar.report
-    import en4dvar.runner  # noqa: F401
-    from en4dvar.fingerprint import source_digest
+    import en4dvar.runs.runner  # noqa: F401
+    from en4dvar.storage.fingerprint import source_digest
 
     source_digest("en4dvar")  # once for all children
     with tempfile.TemporaryDirectory() as folder:

@@ -12,7 +12,7 @@ import cheap_model
 SCRIPT = """
 import resource, sys, time
 start = time.perf_counter()
-from en4dvar.runner import run_campaign
+from en4dvar.runs.runner import run_campaign
 peak, first, ended = [], [], set()
 def told(name, record):
     first.append(time.perf_counter() - start) if not first else None

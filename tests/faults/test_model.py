@@ -10,7 +10,7 @@ from toy_config import write_toy
 
 from en4dvar.errors import ConfigError, TooFewMembersError
 from en4dvar.executor.limits import parse_bytes
-from en4dvar.runner import run
+from en4dvar.runs.runner import run
 
 LIMITS = {
     "hangs": {"workers": 2, "time_limit": "0.3 s"},

@@ -16,7 +16,7 @@ from many import estimate_many
 from run_files import assert_same_results, command, configuration, environment, make_campaign, run_cli
 from toy_config import csv_text, write_toy
 
-from en4dvar.runner import run_campaign
+from en4dvar.runs.runner import run_campaign
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
@@ -36,8 +36,8 @@ def test_a_clock_that_jumps_backwards(tmp_path, monkeypatch):
 
     now = time.time()
     monkeypatch.setattr(time, "time", lambda: now + next(jumps))
-    monkeypatch.setattr("en4dvar.progress.datetime", Clock)
-    monkeypatch.setattr("en4dvar.provenance.datetime", Clock)
+    monkeypatch.setattr("en4dvar.runs.progress.datetime", Clock)
+    monkeypatch.setattr("en4dvar.storage.provenance.datetime", Clock)
     config = configuration(path, tmp_path / "run", **settings)
     campaign = run_campaign(config)
     assert campaign.exit_code == 0

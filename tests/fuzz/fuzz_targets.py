@@ -10,13 +10,13 @@ import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from en4dvar.checks import validate
 from en4dvar.config.document import read_document
 from en4dvar.config.synthetic import resolve_campaign
 from en4dvar.errors import ConfigError, DataError, En4dvarError
-from en4dvar.readers import Column, Matrix, Step, read_contents, read_covariance, read_series
-from en4dvar.store import load_result
-from en4dvar.units import UnitError, parse_quantity
+from en4dvar.inputs.readers import Column, Matrix, Step, read_contents, read_covariance, read_series
+from en4dvar.inputs.units import UnitError, parse_quantity
+from en4dvar.runs.checks import validate
+from en4dvar.storage.store import load_result
 
 TIME, RADIUS = Column("t_us", "us", "s"), Column("R_um", "um", "m")
 LEAK = re.compile(r"Traceback|object at 0x|<class |NoneType|KeyError|AttributeError|not subscriptable")

@@ -20,12 +20,12 @@ from PIL import Image
 from en4dvar import report
 from en4dvar.errors import OutputError
 from en4dvar.honesty import Caution
-from en4dvar.provenance import provenance
 from en4dvar.report import write_report
 from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import Entry, overview_figures, render_overview
 from en4dvar.report.page import judge_chi2
-from en4dvar.store import Result, save
+from en4dvar.storage.provenance import provenance
+from en4dvar.storage.store import Result, save
 
 FIGURES = ("posterior", "history", "cost", "iterations", "pairs")
 VOID = {"meta", "link", "br", "img", "path", "use"}

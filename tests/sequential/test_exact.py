@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from en4dvar.cycling.sequential import SequentialSettings, Series, run_sequential
+from en4dvar.ensemble.linalg import centre
 from en4dvar.executor import SerialExecutor, ThreadsExecutor
 from en4dvar.forward import Observable
-from en4dvar.linalg import centre
 from en4dvar.schemes import Evaluation, Weights
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
-from en4dvar.sequential import SequentialSettings, Series, run_sequential
 from en4dvar_lorenz import Linear, Lorenz63, Lorenz96
 from en4dvar_lorenz.linear import LinearSettings
 from en4dvar_lorenz.lorenz63 import Lorenz63Settings

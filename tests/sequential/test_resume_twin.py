@@ -14,18 +14,18 @@ import pytest
 from run_files import kill_after_writes, run_cli
 from twin_models import Ring
 
-from en4dvar.codec import decode, encode
 from en4dvar.config import load_twin
+from en4dvar.cycling.sequential import SequentialSettings, SequentialState, run_sequential
+from en4dvar.cycling.series import Series
+from en4dvar.ensemble.inflation import Inflation
+from en4dvar.ensemble.moments import Moments
 from en4dvar.errors import OutputError
 from en4dvar.forward import Failure
-from en4dvar.inflation import Inflation
-from en4dvar.interrupt import Interrupted
-from en4dvar.moments import Moments
+from en4dvar.runs.interrupt import Interrupted
+from en4dvar.runs.twin_run import run_twin
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
-from en4dvar.sequential import SequentialSettings, SequentialState, run_sequential
-from en4dvar.series import Series
-from en4dvar.twin_run import run_twin
+from en4dvar.storage.codec import decode, encode
 
 YAML = """\
 name: ring

@@ -11,9 +11,9 @@ import pytest
 import xarray as xr
 
 from en4dvar.errors import OutputError
-from en4dvar.provenance import git_commit, provenance
-from en4dvar.seal import sealed
-from en4dvar.store import Result, load_result, save
+from en4dvar.storage.provenance import git_commit, provenance
+from en4dvar.storage.seal import sealed
+from en4dvar.storage.store import Result, load_result, save
 
 FAILED = 3
 GROUPS = {

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import halfnorm, multivariate_normal, norm
 
-from en4dvar.build import build
 from en4dvar.config import load_config
+from en4dvar.ensemble.forecast import cost
 from en4dvar.errors import ConfigError
-from en4dvar.forecast import cost
+from en4dvar.inputs.build import build
 from en4dvar.prior import Prior, PriorTerm, member_stream
 from en4dvar.state import Parameter
 from en4dvar_bubble.study.emulator import design_matrix, draw_interim, fit_emulators, monomials

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from en4dvar.readers import Column, Format, read_series
+from en4dvar.inputs.readers import Column, Format, read_series
 from en4dvar.state import Array
 from en4dvar_bubble.driving.base import Driving
 

@@ -8,13 +8,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from en4dvar.build import build, find_files
 from en4dvar.config import resolve
 from en4dvar.config.document import parse_document
 from en4dvar.errors import ConfigError
-from en4dvar.readers import Column, Step, read_series
+from en4dvar.inputs.build import build, find_files
+from en4dvar.inputs.readers import Column, Step, read_series
+from en4dvar.inputs.units import parse_quantity
 from en4dvar.state import Array
-from en4dvar.units import parse_quantity
 from en4dvar_bubble.starter.look import Start
 from en4dvar_bubble.starter.page import Source, yaml_text
 from en4dvar_bubble.starter.proposal import Proposal, propose

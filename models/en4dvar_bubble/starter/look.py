@@ -20,8 +20,8 @@ from typing import Literal
 import numpy as np
 
 from en4dvar.errors import DataError
+from en4dvar.inputs.window import minima
 from en4dvar.state import Array
-from en4dvar.window import minima
 from en4dvar_bubble.medium import Medium
 
 Start = Literal["acoustic", "laser"]

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from en4dvar.build import build
-from en4dvar.checkpoint import CheckpointError, read_checkpoint, write_checkpoint
+from en4dvar.inputs.build import build
+from en4dvar.storage.checkpoint import CheckpointError, read_checkpoint, write_checkpoint
 from en4dvar_bubble.study.settings import StudyPlan
 from en4dvar_bubble.study.sweep import prepare_folder
 

@@ -25,8 +25,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.mcmc import effective_sample_size, split_r_hat
 from en4dvar.prior import Prior, member_stream
+from en4dvar.sampling.mcmc import effective_sample_size, split_r_hat
 from en4dvar.state import Array
 from en4dvar_bubble.study.emulator import Emulators, draw_interim, fit_emulators
 from en4dvar_bubble.study.mixture import Mixtures, fit_mixtures

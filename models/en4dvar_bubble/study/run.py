@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from en4dvar.assimilate import assimilate
-from en4dvar.build import build
 from en4dvar.diagnostics import nrmse
 from en4dvar.errors import DataError
 from en4dvar.executor import make_executor
+from en4dvar.inputs.build import build
 from en4dvar.prior import Prior
 from en4dvar.problem import Analysis, InverseProblem
 from en4dvar.state import Array

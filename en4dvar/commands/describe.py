@@ -1,0 +1,97 @@
+"""Plain-text tables for the terminal: what would be estimated, and what was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from en4dvar.config import Config
+from en4dvar.inputs.units import convert
+from en4dvar.problem import InverseProblem
+from en4dvar.state import Parameter
+
+if TYPE_CHECKING:
+    from en4dvar.runs.checks import Preview
+    from en4dvar.storage.store import ParameterSummary
+
+
+def table(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of cells as aligned columns; the first row is the header."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+
+
+def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
+    """What ``validate`` prints: data sets, priors (centre and 5–95 %), fixed values, scheme."""
+    first = problems[0]
+    settings = config.assimilation
+    parts = [
+        f"{config.name}: {len(first.prior.names)} parameters from {len(problems)} data set(s) with "
+        f"{settings.scheme}, {settings.members} members, weights {config.weights}, seed {config.seed}",
+        table([("data set", "observations", "window", "maximum", "error std"), *(_data_row(p) for p in problems)]),
+    ]
+    for problem in problems if any(e.needs_data for e in config.parameters) else problems[:1]:
+        title = f"estimated ({problem.observations.name})" if len(problems) > 1 else "estimated"
+        parts.append(table([(title, "unit", "prior", "median", "5 %", "95 %"), *_prior_rows(problem)]))
+        if problem.fixed:
+            known = {p.parameter.name: p.parameter for p in config.parameters}
+            fixed = [(name, *_shown(known[name], value)) for name, value in problem.fixed.items()]
+            parts.append(table([("fixed", "value", "unit"), *fixed]))
+    parts.append(f"run directory: {config.directory}")
+    return "\n\n".join(parts)
+
+
+def cost_summary(config: Config, one: Preview, count: int) -> str:
+    """What an estimate costs: forward runs of a data set and of all ``count``, and the time on one thread."""
+    total = one.runs * count
+    runs = f"about {one.runs} forward runs" + (f" a data set, {total} in all" if count > 1 else "")
+    chain = "; the Markov chain comes on top" if config.assimilation.refine == "mcmc" else ""
+    took = f"{_seconds(one.seconds)} each: {_seconds(total * one.seconds)} on one thread"
+    return f"cost: {runs}, {took}, plus some seconds for files and report{chain}"
+
+
+def _seconds(value: float) -> str:
+    """A duration as people say it, to two digits."""
+    for limit, unit, size in ((1e-3, "us", 1e-6), (1.0, "ms", 1e-3), (120.0, "s", 1.0), (7200.0, "min", 60.0)):
+        if value < limit:
+            return f"{float(f'{value / size:.2g}'):g} {unit}"
+    return f"{value / 3600:.2g} h"
+
+
+def results_table(summaries: Mapping[str, Iterable[ParameterSummary]]) -> str:
+    """Posterior mean, std and 5/50/95 % of every parameter (data set → its rows), in display units."""
+    header = ("data set", "parameter", "unit", "mean", "std", "5 %", "50 %", "95 %")
+    rows = [
+        (name, row.name, row.unit, *(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q50, row.q95)))
+        for name, summary in summaries.items()
+        for row in summary
+    ]
+    return table([header, *rows])
+
+
+def _data_row(problem: InverseProblem) -> tuple[str, ...]:
+    y, model, observable = problem.observations, problem.model, problem.observable
+    start, end = (convert(float(t), model.time_unit, model.time_display_unit) for t in y.times[[0, -1]])
+    top, std = (convert(float(v), observable.unit, observable.display_unit) for v in (y.values.max(), np.median(y.std)))
+    timing = convert(float(np.median(y.time_std)), model.time_unit, model.time_display_unit)
+    also = f", {timing:.3g} {model.time_display_unit} in time" if timing else ""
+    also += ", correlated" if y.correlation is not None else ""
+    also += f", robust beyond {y.huber:g} std" if y.huber is not None else ""
+    unit = observable.display_unit
+    window = f"{start:.4g} to {end:.4g} {model.time_display_unit}"
+    return y.name, str(len(y)), window, f"{top:.4g} {unit}", f"{std:.3g} {unit}{also}"
+
+
+def _prior_rows(problem: InverseProblem) -> list[tuple[str, ...]]:
+    rows = []
+    for term in problem.prior.terms:
+        quantiles = term.to_physical(term.mean + term.std * np.array([0.0, -1.6448536, 1.6448536]))
+        shown = [_shown(term.parameter, float(q))[0] for q in quantiles]
+        rows.append((term.parameter.name, term.parameter.display_unit, term.transform, *shown))
+    return rows
+
+
+def _shown(parameter: Parameter, value: float) -> tuple[str, str]:
+    return f"{convert(value, parameter.unit, parameter.display_unit):.4g}", parameter.display_unit

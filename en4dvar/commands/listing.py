@@ -1,0 +1,36 @@
+"""The models there are, for ``en4dvar models``."""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from typing import Any
+
+from en4dvar.commands.describe import table
+from en4dvar.config.models import GROUP, find_model
+from en4dvar.errors import En4dvarError
+
+
+def model_listing() -> str:
+    """Every registered model, built with its default settings: observables and parameters with units.
+
+    A model that cannot be loaded or whose settings have no defaults is listed with the reason.
+    """
+    return "\n\n".join(_description(name) for name in sorted({e.name for e in entry_points(group=GROUP)}))
+
+
+def _description(name: str) -> str:
+    try:
+        kind: Any = find_model(name)
+    except En4dvarError as error:
+        return f"{name}: {error}"
+    title = (kind.__doc__ or "").strip().split("\n", 1)[0]
+    needed = [field for field, info in kind.Settings.model_fields.items() if info.is_required()]
+    options = ", ".join(kind.Settings.model_fields)
+    if needed:
+        return f"{name}: {title}\n  parameters depend on settings without default: {', '.join(needed)}"
+    model = kind.from_settings(kind.Settings())
+    rows = [("  observable", "unit", "", "")]
+    rows += [(f"  {o.name}", o.display_unit, "", o.label) for o in model.observables]
+    rows += [("  parameter", "unit", "bounds", "")]
+    rows += [(f"  {p.name}", p.display_unit, f"{p.bounds[0]:g} … {p.bounds[1]:g}", p.label) for p in model.parameters]
+    return f"{name}: {title}\n{table(rows)}\n  settings: {options}"

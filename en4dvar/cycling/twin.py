@@ -1,0 +1,180 @@
+"""Twin experiments: a truth is drawn and observed, and the assimilation is judged against it.
+
+The truth and every member start from the model's initial state plus independent N(0, initial_std²) in the dynamic
+variables; a parameter with a prior is drawn from it, for the truth and for each member. The state that is estimated
+includes such parameters. RMSE and spread are over the dynamic variables, which share a unit:
+
+    RMSE_k = √ mean_j (x̄_j − x_j^true)²,   spread_k = √ mean_j σ_j².
+
+Random numbers: one stream for the truth, one for the errors of the observations, one a member.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from en4dvar.cycling.sequential import (
+    SequentialResult,
+    SequentialSettings,
+    SequentialState,
+    predictions,
+    run_sequential,
+)
+from en4dvar.cycling.series import Series, root_of_correlation
+from en4dvar.ensemble.moments import Moments
+from en4dvar.errors import ConfigError, En4dvarError
+from en4dvar.executor import Executor, SerialExecutor
+from en4dvar.forward import Failure, ForwardModel, Observable
+from en4dvar.prior import Prior, member_stream
+from en4dvar.state import Array
+
+
+@dataclass(frozen=True)
+class TwinExperiment:
+    """The truth's model is the members' model. ``error_std`` and ``initial_std`` are one number an observable or field.
+    ``error_correlation`` (p, p) is that of the errors of one instant, None: independent.
+
+    Observations are taken every ``interval`` (the model's time unit); the first ``burn_in`` of ``cycles`` do not count
+    in averages. ``fixed`` are the values of the parameters that ``prior`` does not draw.
+    """
+
+    model: ForwardModel
+    sequential: SequentialSettings
+    members: int
+    cycles: int
+    interval: float
+    error_std: Mapping[str, float]
+    initial_std: Mapping[str, float]
+    burn_in: int = 0
+    error_correlation: Array | None = None
+    prior: Prior | None = None
+    fixed: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def observables(self) -> tuple[Observable, ...]:
+        """Those of the model that are observed."""
+        return tuple(o for o in self.model.observables if o.name in self.error_std)
+
+    @property
+    def dynamic(self) -> Array:
+        """(n_state,) bool: the variables that are not parameters."""
+        constant = {p.name for p in self.model.parameters}
+        return np.concatenate([np.full(f.size, f.name not in constant) for f in self.model.layout])
+
+    @property
+    def times(self) -> Array:
+        """(K,) observation times."""
+        return np.asarray(self.interval * np.arange(1, self.cycles + 1), dtype=float)
+
+
+@dataclass(frozen=True)
+class Score:
+    """RMSE and spread (K,) of one kind of estimate and their means after the burn-in; NaN where there is none."""
+
+    rmse: Array
+    spread: Array
+    mean_rmse: float
+    mean_spread: float
+
+
+@dataclass(frozen=True)
+class TwinResult:
+    """``truth`` (K, n_state) at ``series.times``, the observations and what the assimilation made of them."""
+
+    experiment: TwinExperiment
+    seed: int
+    truth: Array
+    series: Series
+    run: SequentialResult
+
+    @property
+    def scores(self) -> dict[str, Score]:
+        """Of the forecast, the analysis and (with a lag) the smoothed ensemble."""
+        kinds = {"forecast": self.run.forecast, "analysis": self.run.analysis}
+        if self.experiment.sequential.scheme.lag:
+            kinds["smoothed"] = self.run.smoothed
+        return {name: self._score(moments) for name, moments in kinds.items()}
+
+    def _score(self, moments: Moments) -> Score:
+        where, counted = self.experiment.dynamic, slice(self.experiment.burn_in, None)
+        rmse = np.sqrt(np.mean((moments.mean - self.truth)[:, where] ** 2, axis=1))
+        spread = np.sqrt(np.mean(moments.std[:, where] ** 2, axis=1))
+        known = np.isfinite(rmse[counted])
+        means = [float(np.mean(values[counted][known])) if known.any() else float("nan") for values in (rmse, spread)]
+        return Score(rmse, spread, *means)
+
+
+def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, Series]:
+    """The truth (K, n_state) and its observations.
+
+    Raises
+    ------
+    En4dvarError: the truth cannot be integrated. ConfigError: the correlation of the errors does not fit.
+    """
+    model, times = experiment.model, experiment.times
+    start = _initial(experiment, [member_stream(seed, "truth")])
+    (outcome,) = model.trajectories(start, times)
+    if isinstance(outcome, Failure):
+        raise En4dvarError(f"the truth cannot be integrated: {outcome.reason}")
+    exact = predictions(experiment.observables, outcome)
+    widths = [predictions([o], outcome).shape[1] for o in experiment.observables]
+    std = np.repeat([experiment.error_std[o.name] for o in experiment.observables], widths)
+    noise = member_stream(seed, "observation error").standard_normal(exact.shape)
+    if experiment.error_correlation is not None:
+        try:
+            noise = noise @ root_of_correlation(experiment.error_correlation, len(std)).T
+        except ValueError as error:
+            raise ConfigError(f"twin.error_correlation: {error}") from None
+    return outcome.states, Series(times, exact + std * noise, std, experiment.error_correlation)
+
+
+def initial_ensemble(experiment: TwinExperiment, seed: int) -> Array:
+    """Members (N, n_state) at time zero, each from its own stream."""
+    return _initial(experiment, [member_stream(seed, "initial state", i) for i in range(experiment.members)])
+
+
+def conduct(
+    experiment: TwinExperiment,
+    seed: int,
+    executor: Executor | None = None,
+    on_cycle: Callable[[int], None] | None = None,
+    resume: SequentialState | None = None,
+    keep: Callable[[Callable[[], SequentialState]], None] | None = None,
+) -> TwinResult:
+    """Draw a truth, observe it, assimilate the observations. The same seed gives the same bits for any executor.
+
+    ``resume`` and ``keep`` as for :func:`~en4dvar.cycling.sequential.run_sequential`.
+
+    Raises
+    ------
+    TooFewMembersError: the ensemble is lost. En4dvarError: the truth cannot be integrated.
+    """
+    truth, series = observe_truth(experiment, seed)
+    members = initial_ensemble(experiment, seed)
+    run = run_sequential(
+        experiment.model,
+        experiment.observables,
+        members,
+        series,
+        experiment.sequential,
+        seed,
+        executor or SerialExecutor(),
+        on_cycle,
+        resume,
+        keep,
+    )
+    return TwinResult(experiment, seed, truth, series, run)
+
+
+def _initial(experiment: TwinExperiment, streams: list[np.random.Generator]) -> Array:
+    model, prior = experiment.model, experiment.prior
+    theta = {name: np.full(len(streams), value) for name, value in experiment.fixed.items()}
+    if prior is not None:
+        x = prior.mean + prior.std * np.array([stream.standard_normal(len(prior.terms)) for stream in streams])
+        theta |= dict(zip(prior.names, prior.to_physical(x).T, strict=True))
+    states = np.asarray(model.initial_states(theta) if theta else [model.initial_state({})] * len(streams), dtype=float)
+    std = np.concatenate([np.full(f.size, experiment.initial_std.get(f.name, 0.0)) for f in model.layout])
+    return states + std * np.array([stream.standard_normal(model.layout.size) for stream in streams])

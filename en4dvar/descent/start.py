@@ -1,0 +1,110 @@
+"""Where the iterations start: the prior forecast ranks its members, and a few descents tell which basin is lowest.
+
+J of a strongly nonlinear model has several minima. The descents go side by side, so each costs r + 5 or so runs an
+iteration (see :mod:`en4dvar.descent.weight_space`), and stop as soon as they tell: converged roughly, or close to
+another one. The lowest is not descended again: its moves are the first iterations of the assimilation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from en4dvar import diagnostics as diag
+from en4dvar.descent.step_control import Move
+from en4dvar.descent.weight_space import Local, WeightSpace
+from en4dvar.ensemble.forecast import Forecast
+from en4dvar.honesty import Caution, caution
+from en4dvar.schemes import Weights
+from en4dvar.state import Array
+
+ROUGH = 1e-2  # relative decrease of J at which a scout stops: it only has to tell basins apart
+SAME = 1.0  # posterior standard deviations between scouts that have met
+
+
+@dataclass(frozen=True)
+class Start:
+    """Weights (N,) from which the iterations go on, the moves that led there from a member, and warnings."""
+
+    w: Array
+    path: tuple[tuple[Local, Move], ...] = ()
+    warnings: tuple[Caution, ...] = ()
+
+
+def choose_start(space: WeightSpace, run: Forecast) -> Start:
+    """Where to start. ``run`` is the forecast of the prior members and, last, of their mean.
+
+    ``start: best-member`` compares descents from the ``starts`` members of lowest J, where a linearisation takes so
+    few runs that all of them cost no more than one bundle of N members; else it takes the member of lowest J.
+    """
+    n_members = len(space.members)
+    # e_i moved to the minimum-norm weights of the same member, so that J_b is ½‖x − x̄0‖² in the prior covariance
+    candidates = np.vstack([space.basis @ space.basis.T, np.zeros(n_members)])
+    costs = diag.background_cost(candidates) + space.observation_cost(run)
+    warnings: tuple[Caution, ...] = ()
+    if space.settings.start == "prior-mean":
+        if np.isfinite(costs[-1]):
+            return Start(candidates[-1])
+        words = f"the prior mean cannot be run ({run.failures[-1]}); started from the best prior member"
+        warnings = (caution("start-moved", words),)
+    best = np.argsort(costs, kind="stable")
+    affordable = n_members // (space.basis.shape[1] + 1) if space.economical else 1
+    chosen = [candidates[i] for i in best[: min(space.settings.starts, affordable)] if np.isfinite(costs[i])]
+    if len(chosen) < 2:
+        return Start(candidates[best[0]], (), warnings)
+    lowest = lowest_basin(space, chosen)
+    return Start(lowest.w, tuple(lowest.path), warnings)
+
+
+@dataclass
+class Scout:
+    """A descent as far as it has gone: weights (N,), J there, and its moves."""
+
+    w: Array
+    cost: float = np.inf
+    active: bool = True
+    path: list[tuple[Local, Move]] = field(default_factory=list)
+
+
+def lowest_basin(space: WeightSpace, starts: list[Array]) -> Scout:
+    """The descent from one of the starts (N,) that reaches the lowest J."""
+    scouts = [Scout(w) for w in starts]
+    transform = np.eye(len(space.members))
+    for _ in range(space.settings.max_iterations):
+        going = [scout for scout in scouts if scout.active]
+        if not going:
+            break
+        locals_ = space.linearise([Weights(scout.w, transform) for scout in going])
+        for scout, at in zip(going, locals_, strict=True):
+            scout.cost = at.cost
+        _stop_those_that_met(going, locals_)
+        going, locals_ = _still_active(going, locals_)
+        for scout, at, move in zip(going, locals_, space.search(locals_), strict=True):
+            if move is None or at.step is None:
+                scout.active = False
+                continue
+            small = ROUGH * max(1.0, move.cost)
+            scout.active = max(at.cost - move.cost, at.step.predicted_decrease) > small
+            scout.w, scout.cost = move.w, move.cost
+            scout.path.append((at, move))
+        if len(going) == 1 and going[0].cost <= min(scout.cost for scout in scouts):
+            break  # it can only go lower: the comparison is decided
+    return min(scouts, key=lambda scout: scout.cost)
+
+
+def _still_active(scouts: list[Scout], locals_: list[Local]) -> tuple[list[Scout], list[Local]]:
+    pairs = [(scout, at) for scout, at in zip(scouts, locals_, strict=True) if scout.active]
+    return [scout for scout, _ in pairs], [at for _, at in pairs]
+
+
+def _stop_those_that_met(scouts: list[Scout], locals_: list[Local]) -> None:
+    """Of scouts within ``SAME`` of each other, in the metric of the lower one's Hessian, keep the lower one."""
+    order = np.argsort([scout.cost for scout in scouts], kind="stable")
+    for position, i in enumerate(order):
+        step = locals_[i].step
+        if step is None or not scouts[i].active:
+            continue
+        for j in order[position + 1 :]:
+            if step.hessian.norm(scouts[j].w - scouts[i].w) < SAME:
+                scouts[j].active = False

@@ -1,0 +1,1 @@
+"""The members of an ensemble: their paths, their forecast, their moments."""

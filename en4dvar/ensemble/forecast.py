@@ -1,0 +1,169 @@
+"""The composite operator 𝓗: control vectors → predictions, and the cost and posterior density built on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from en4dvar.ensemble.members import Indices, Reading, initial_states, out_of_bounds
+from en4dvar.errors import ConfigError
+from en4dvar.executor import Executor, SerialExecutor
+from en4dvar.forward import RateOperator
+from en4dvar.likelihood import observation_cost
+from en4dvar.problem import InverseProblem
+from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Array, Parameter
+
+NO_TIMES: Array = np.empty(0)
+SAME_INSTANT = 1e-9  # of the window: an extra time this close to an observation is read at the observation
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Predictions of B members; NaN rows where a member failed.
+
+    ``predictions`` (B, K) at the observations, ``rates`` (B, K) of the observable or None where no observation has a
+    timing error, ``path`` (B, M) at the extra times, ``failures`` (B,) reasons, "" for members alive, ``noise_scale``
+    (B,) σ of each member or None where it is neither estimated nor fixed, ``extremes`` (B, V) what the members reached
+    of the model's V limits of validity (empty without extra times).
+    """
+
+    predictions: Array
+    rates: Array | None
+    path: Array
+    failures: tuple[str, ...]
+    noise_scale: Array | None = None
+    extremes: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def active(self) -> Array:
+        """(B,) bool."""
+        return np.array([not reason for reason in self.failures])
+
+    def __getitem__(self, members: slice) -> Forecast:
+        return Forecast(
+            self.predictions[members],
+            None if self.rates is None else self.rates[members],
+            self.path[members],
+            self.failures[members],
+            None if self.noise_scale is None else self.noise_scale[members],
+            self.extremes[members],
+        )
+
+
+def forecast(
+    problem: InverseProblem, x: Array, executor: Executor | None = None, extra_times: Array = NO_TIMES
+) -> Forecast:
+    """Run control vectors ``x`` (B, n; transformed) through F and H.
+
+    Member i is observed at t_k + t_s,i. ``extra_times`` (M,), on the clock of the observations, are read from the same
+    run. A member fails, without disturbing the others, where a parameter leaves its bounds, ``initial_state`` raises,
+    the model returns a :class:`Failure`, or H gives anything but finite numbers.
+
+    Raises
+    ------
+    ConfigError: a timing error on an observable without a rate.
+    """
+    reading = _reading(problem, limits=len(extra_times) > 0)
+    times, at_observations, at_extra = _union(problem.observations.times, extra_times)
+    physical = problem.prior.to_physical(x)
+    failures = out_of_bounds(problem.prior, physical)
+    alive, states = initial_states(problem, physical, failures)
+    observed = np.full((len(reading.quantities), len(x), len(times)), np.nan)
+    extremes = np.full((len(x), len(reading.largest)), np.nan)
+    if len(states):
+        shifted = times + _of_framework(problem, physical, TIME_SHIFT, 0.0)[alive, None]
+        outcomes = (executor or SerialExecutor()).trajectories(problem.model, states, shifted)
+        observed[:, alive], extremes[alive], reasons = reading.observe(outcomes, len(times))
+        for i, reason in zip(np.arange(len(x))[alive], reasons, strict=True):
+            failures[i] = reason
+    return Forecast(
+        observed[0][:, at_observations],
+        observed[1][:, at_observations] if len(observed) > 1 else None,
+        observed[0][:, at_extra],
+        tuple(failures),
+        _of_framework(problem, physical, NOISE_SCALE, 1.0) if has_noise_scale(problem) else None,
+        extremes,
+    )
+
+
+def has_noise_scale(problem: InverseProblem) -> bool:
+    """Whether ``sigma`` is given and scales the observation errors (rather than being the model's own)."""
+    given = NOISE_SCALE.name in problem.prior.names or NOISE_SCALE.name in problem.fixed
+    return given and all(p.name != NOISE_SCALE.name for p in problem.model.parameters)
+
+
+def cost(problem: InverseProblem, x: Array, executor: Executor | None = None) -> Array:
+    """J (B,) of control vectors ``x`` (B, n), with the prior's own mean and covariance; +inf where the model fails.
+
+    J = ½ Σ_j ((x_j − mean_j)/std_j)² + Σ_k β_k [½ (y_k − m_k)²/s_k² + ln(s_k/std_k)].
+    """
+    run = forecast(problem, x, executor)
+    observation = observation_cost(problem.observations, run.predictions, run.rates, run.noise_scale)
+    with np.errstate(over="ignore"):
+        z = (x - problem.prior.mean) / problem.prior.std
+        return np.where(run.active, 0.5 * np.sum(z * z, axis=-1) + observation, np.inf)
+
+
+def log_posterior(problem: InverseProblem, x: Array, executor: Executor | None = None) -> Array:
+    """Log posterior density (B,) in transformed space up to a constant that does not depend on x: −J.
+
+    The dropped constant is that of the prior, ``Prior.log_density`` at its mean, and −Σ β_k ln(std_k √2π).
+    """
+    return -cost(problem, x, executor)
+
+
+def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
+    """The parameters of ``problem.fixed``, in its order.
+
+    Raises
+    ------
+    ConfigError: a parameter neither fixed nor estimated, both, or unknown to the model; a timing error on an
+        observable without a rate.
+    """
+    perturbed = [p.parameter for p in problem.perturbations]
+    known = {p.name: p for p in (TIME_SHIFT, NOISE_SCALE, *perturbed, *problem.model.parameters)}
+    estimated, fixed = set(problem.prior.names), set(problem.fixed)
+    if unknown := {p.field for p in problem.perturbations} - set(problem.model.layout.names):
+        raise ConfigError(f"initial_state: {', '.join(sorted(unknown))}: not a field of the model's state")
+    required = {p.name for p in (*perturbed, *problem.model.parameters)} - {TIME_SHIFT.name}
+    for names, message in (
+        (required - estimated - fixed, "neither fixed nor estimated"),
+        (estimated & fixed, "both fixed and estimated"),
+        ((estimated | fixed) - set(known), "not a parameter of the model"),
+    ):
+        if names:
+            raise ConfigError(f"{', '.join(sorted(names))}: {message}")
+    _reading(problem, limits=False)
+    return tuple(known[name] for name in problem.fixed)
+
+
+def _reading(problem: InverseProblem, limits: bool) -> Reading:
+    """H; its rate where an observation has a timing error; the model's limits of validity where asked for."""
+    operator = problem.observable.operator
+    largest = tuple(limit.name for limit in problem.model.validity) if limits else ()
+    batched = getattr(operator, "batched", False)
+    if not problem.observations.timed:
+        return Reading((operator,), largest, batched)
+    if not isinstance(operator, RateOperator):
+        raise ConfigError(
+            f"a timing error needs the rate of {problem.observable.name}, which the model does not provide"
+        )
+    return Reading((operator, operator.rate), largest, batched)
+
+
+def _of_framework(problem: InverseProblem, physical: Array, parameter: Parameter, default: float) -> Array:
+    """Values (B,) of a parameter that the framework itself uses, t_s or σ."""
+    if parameter.name in problem.prior.names:
+        return np.asarray(physical[:, problem.prior.names.index(parameter.name)])
+    return np.full(len(physical), problem.fixed.get(parameter.name, default))
+
+
+def _union(times: Array, extra: Array) -> tuple[Array, Indices | slice, Indices | slice]:
+    """Increasing union of the times and where the observations and the extra times stand in it."""
+    if not len(extra):
+        return times, slice(None), slice(0, 0)
+    nearest = times[np.abs(extra[:, None] - times).argmin(axis=1)]
+    extra = np.where(np.abs(extra - nearest) <= SAME_INSTANT * (times[-1] - times[0]), nearest, extra)
+    union: Array = np.unique(np.concatenate([times, extra]))
+    return union, np.searchsorted(union, times), np.searchsorted(union, extra)

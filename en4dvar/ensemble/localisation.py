@@ -1,0 +1,76 @@
+"""Localisation of field states: every block of the state is analysed with the observations near it (LETKF).
+
+Observation-error variances are divided by the taper, so that an observation fades out with its distance and is absent
+beyond the support. Sources: Hunt, Kostelich & Szunyogh (2007), Physica D 230, 112 (local analysis); Gaspari & Cohn
+(1999), Q. J. R. Meteorol. Soc. 125, 723, eq. 4.10 (taper).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.ensemble.linalg import apply_weights
+from en4dvar.schemes import Evaluation, Weights, gauss_newton
+from en4dvar.state import Array
+
+
+def gaspari_cohn(distance: Array, radius: float) -> Array:
+    """The compactly supported fifth-order correlation: 1 at distance 0, 5/24 at ``radius``, 0 from 2 ``radius`` on.
+
+    >>> gaspari_cohn(np.array([0.0, 1.0, 2.0]), 1.0).round(4).tolist()
+    [1.0, 0.2083, 0.0]
+    """
+    z = np.abs(np.asarray(distance, dtype=float)) / radius
+    near = 1 + z * z * (-5 / 3 + z * (5 / 8 + z * (1 / 2 - z / 4)))
+    y = np.clip(z, 1, 2)
+    far = 4 - 5 * y + y * y * (5 / 3 + y * (5 / 8 + y * (-1 / 2 + y / 12))) - 2 / (3 * y)
+    return np.where(z < 1, near, np.maximum(far, 0.0))
+
+
+def distances(a: Array, b: Array, period: float | None = None) -> Array:
+    """Distances (p, q) between positions (p,) and (q,) on a line, or on a circle of length ``period``."""
+    gap = np.abs(a[:, None] - b)
+    return gap if period is None else np.minimum(gap % period, -gap % period)
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """``blocks``: indices of the state variables analysed together; ``taper`` (blocks, K') weighs the observations.
+
+    State variables in no block keep their forecast.
+    """
+
+    blocks: Sequence[npt.NDArray[np.intp]]
+    taper: Array
+
+    @classmethod
+    def on_line(
+        cls, state: Array, observed: Array, radius: float, period: float | None = None, block_size: int = 1
+    ) -> Localisation:
+        """Blocks of ``block_size`` neighbours of a field at positions ``state`` (n,), NaN for variables not analysed.
+
+        ``observed`` (K',) are the positions of the observations; distances are measured from the middle of a block.
+        """
+        order = np.argsort(state, kind="stable")[: int(np.sum(np.isfinite(state)))]
+        blocks = [order[i : i + block_size] for i in range(0, len(order), block_size)]
+        middles = np.array([state[block].mean() for block in blocks])
+        return cls(blocks, gaspari_cohn(distances(middles, observed, period), radius))
+
+    def analysis(self, ensemble: Array, evaluation: Evaluation) -> Array:
+        """Local analysis (N, n) of members (N, n); one symmetric transform a block."""
+        analysed = ensemble.copy()
+        n_members = len(ensemble)
+        prior = Weights.prior(n_members)
+        for block, taper in zip(self.blocks, self.taper, strict=True):
+            near = taper > 0
+            if not near.any():
+                continue
+            root = np.sqrt(taper[near])
+            local = Evaluation(root * evaluation.d[near], root[:, None] * evaluation.S[near])
+            step = gauss_newton(prior, local)
+            analysed[:, block] = apply_weights(ensemble[:, block], step.direction + step.transform)
+        return analysed

@@ -1,0 +1,1 @@
+"""What comes in: data files, units, windows; settings to inverse problems."""

@@ -1,0 +1,208 @@
+"""Settings → inverse problems: reads the data files, cuts the windows, evaluates what refers to the data."""
+
+from __future__ import annotations
+
+import glob
+import itertools
+import os
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.config import Config
+from en4dvar.config.data import DataPlan
+from en4dvar.config.parameters import Fixed, Uncertain, located
+from en4dvar.ensemble.forecast import check_problem
+from en4dvar.errors import ConfigError, DataError, Fault
+from en4dvar.inputs.readers import SUFFIXES, read_covariance, read_series
+from en4dvar.inputs.units import UnitError, convert
+from en4dvar.inputs.window import select
+from en4dvar.observations import Observations
+from en4dvar.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
+from en4dvar.state import Array
+from en4dvar.storage.files import readable
+
+
+def build(config: Config) -> tuple[InverseProblem, ...]:
+    """One inverse problem a data set, in the order of the paths (of a glob: sorted).
+
+    Raises
+    ------
+    ConfigError: there is no ``data:`` section, nothing is estimated, or a prior does not suit the data.
+    DataError: data files cannot be used; names every one of them.
+    """
+    plan = inverse_plan(config)
+    problems: list[InverseProblem] = []
+    unusable: list[DataError] = []
+    for name, path in data_files(plan).items():
+        try:
+            problems.append(build_one(config, name, path))
+        except DataError as error:
+            unusable.append(error)
+    if unusable:
+        raise DataError("\n".join(map(str, unusable)))
+    return tuple(problems)
+
+
+def inverse_plan(config: Config) -> DataPlan:
+    """How the observations are read. Raises :class:`ConfigError` without data or without anything to estimate."""
+    if config.data is None:
+        raise ConfigError([Fault("required: where the observations are", "data", config.document.file)])
+    if not config.initial_state and not any(isinstance(entry, Uncertain) for entry in config.parameters):
+        raise ConfigError([config.document.fault(("parameters",), "no parameter has a prior; nothing to estimate")])
+    return config.data
+
+
+def build_one(config: Config, name: str, path: Path) -> InverseProblem:
+    """The inverse problem of one of :func:`data_files`. Raises :class:`ConfigError`, :class:`DataError`."""
+    return problem_of(config, read_observations(inverse_plan(config), path, name, config.weights))
+
+
+def problem_of(config: Config, observations: Observations) -> InverseProblem:
+    """The inverse problem of observations, wherever they come from. Raises :class:`ConfigError`."""
+    terms, fixed = resolve_parameters(config, observations)
+    terms = (*terms, *(term for term, _ in config.initial_state))
+    perturbations = tuple(perturbation for _, perturbation in config.initial_state)
+    problem = InverseProblem(config.model, config.observable, observations, Prior(terms), fixed, perturbations)
+    check_problem(problem)
+    return problem
+
+
+def data_files(plan: DataPlan) -> dict[str, Path]:
+    """Name of the data set → file: the file's stem, made unique by its folders, then by a number.
+
+    Raises
+    ------
+    DataError: no file matches a pattern, or a file is named twice.
+    """
+    return find_files(plan.base, plan.paths)
+
+
+def find_files(base: Path, texts: Sequence[str]) -> dict[str, Path]:
+    """:func:`data_files` of paths, folders and patterns relative to ``base``. Raises :class:`DataError`."""
+    paths: list[Path] = []
+    for text in texts:
+        path = base / Path(text).expanduser()
+        if glob.has_magic(text) and not path.exists():
+            found = sorted(Path(p) for p in glob.glob(str(path), recursive=True))
+            if not found:
+                raise DataError(f"{path}: no file matches")
+            paths += found
+        elif path.is_dir():
+            held = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+            if not held:
+                raise DataError(f"{path}: the folder holds no data file ({', '.join(SUFFIXES)})")
+            paths += held
+        else:
+            paths.append(path)
+    again = [path for path, count in Counter(os.path.abspath(p) for p in paths).items() if count > 1]
+    if again:
+        raise DataError(f"{again[0]}: occurs more than once in data.path")
+    return dict(zip(_unique_names(paths), paths, strict=True))
+
+
+def _unique_names(paths: list[Path]) -> list[str]:
+    stems = Counter(p.stem for p in paths)
+    names: dict[str, None] = {}
+    for path in paths:
+        name = path.stem if stems[path.stem] == 1 else f"{path.parent.name}_{path.stem}"
+        same = itertools.chain([name], (f"{name}_{i}" for i in itertools.count(2)))
+        names[next(n for n in same if n not in names)] = None
+    return list(map(readable, names))
+
+
+def read_observations(plan: DataPlan, path: Path, name: str, weights: str = "sum") -> Observations:
+    """The observations (y, t, R) of one file inside the window. Raises :class:`DataError`."""
+    series = read_series(path, plan.time, plan.value, plan.format)
+    try:
+        window = select(series.times, series.values, plan.start, plan.end, plan.prominence)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
+    times, values = series.times[window], series.values[window]
+    if not len(times):
+        raise DataError(f"{path}: no observation lies in the window")
+    zero = {"file": 0.0, "window": times[0]}.get(str(plan.time_zero), plan.time_zero)
+    times = times - float(zero)
+    if times[0] < 0:
+        raise DataError(f"{path}: the first observation used lies {-times[0]:g} before time zero; see data.time_zero")
+    count = len(times)
+    std, correlation = _errors(plan, times, values, np.arange(len(series.times))[window])
+    return Observations(
+        times=times,
+        values=values,
+        std=std,
+        time_std=np.full(count, plan.error.time_std),
+        weights=np.full(count, 1.0 if weights == "sum" else 1.0 / count),
+        name=name,
+        source=readable(path),
+        scalars=series.scalars,
+        correlation=correlation,
+        huber=plan.error.huber,
+    )
+
+
+def _errors(plan: DataPlan, times: Array, values: Array, samples: npt.NDArray[np.intp]) -> tuple[Array, Array | None]:
+    """std (K,) and correlation (K, K) or None; ``samples`` (K,) are the places of the observations in the series.
+
+    A covariance file holds one row an observation of the window, or one a usable sample of the whole series.
+    """
+    error = plan.error
+    if error.covariance is not None:
+        covariance = read_covariance(error.covariance)
+        if len(covariance) > samples[-1] and len(covariance) != len(times):
+            covariance = covariance[np.ix_(samples, samples)]
+        if len(covariance) != len(times):
+            raise DataError(f"{error.covariance.path}: {len(covariance)} rows, but {len(times)} observations")
+        std = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(std, std)
+        np.fill_diagonal(correlation, 1.0)
+        return std, correlation
+    if error.std is None:
+        raise ConfigError("data.error: neither a std nor a covariance")
+    std = np.full(len(times), error.std.absolute(float(values.max())))
+    if error.correlation_time is None:
+        return std, None
+    return std, np.exp(-np.abs(np.subtract.outer(times, times)) / error.correlation_time)
+
+
+def resolve_parameters(
+    config: Config, observations: Observations | None
+) -> tuple[tuple[PriorTerm, ...], dict[str, float]]:
+    """Prior terms and fixed values, evaluated on the data where they refer to them.
+
+    Raises
+    ------
+    ConfigError: every entry that cannot be evaluated, located in the file.
+    """
+    terms: list[PriorTerm] = []
+    fixed: dict[str, float] = {}
+    faults: list[Fault] = []
+    for entry in config.parameters:
+        path = ("parameters", entry.parameter.name)
+        try:
+            if isinstance(entry, Fixed):
+                fixed[entry.parameter.name] = entry.value
+            elif isinstance(entry, Uncertain):
+                terms.append(entry.term(_maximum(entry, config, observations)))
+            elif observations is None:
+                raise ConfigError("the value comes from the data file, and there is none; set a value")
+            else:
+                fixed[entry.parameter.name] = entry.value(observations.scalars, observations.source)
+        except ConfigError as error:
+            faults += [located(config.document, path, fault) for fault in error.problems]
+        except UnitError as error:
+            faults.append(config.document.fault(path, str(error)))
+    if faults:
+        raise ConfigError(faults)
+    return tuple(terms), fixed
+
+
+def _maximum(entry: Uncertain, config: Config, observations: Observations | None) -> float | None:
+    """The observed maximum in the parameter's unit, where the entry asks for it."""
+    if observations is None or not entry.needs_data:
+        return None
+    return convert(float(observations.values.max()), config.observable.unit, entry.parameter.unit)

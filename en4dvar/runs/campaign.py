@@ -1,0 +1,94 @@
+"""What a run leaves behind: for each data set its file or the reason of its failure."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from en4dvar.errors import TooFewMembersError
+from en4dvar.honesty import Caution
+from en4dvar.storage.store import ParameterSummary, Result, load_result
+
+_RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")  # names of devices on Windows
+_LONGEST = 120  # bytes; file systems allow 255, and temporary names are longer
+
+
+@dataclass(frozen=True)
+class DatasetOutcome:
+    """``file`` is the posterior's netCDF, or None where ``failure`` says why there is none.
+
+    ``exit_code`` is that of the failure (1, 2 or 3), 0 where there is none.
+    """
+
+    name: str
+    file: Path | None
+    failure: str = ""
+    exit_code: int = 0
+    warnings: tuple[Caution, ...] = ()
+    summary: tuple[ParameterSummary, ...] = ()
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """The outcome of a run over any number of data sets, in their order; posteriors are read from disk when asked for.
+
+    ``notices`` are what the run itself found worth a warning, e.g. a damaged checkpoint.
+    """
+
+    directory: Path
+    outcomes: tuple[DatasetOutcome, ...]
+    notices: tuple[str, ...] = ()
+
+    @property
+    def failures(self) -> tuple[DatasetOutcome, ...]:
+        """The data sets without a posterior."""
+        return tuple(o for o in self.outcomes if o.failure)
+
+    @property
+    def exit_code(self) -> int:
+        """0: every data set has a posterior; 3: all failures are lost ensembles; 1: others failed."""
+        codes = {o.exit_code for o in self.failures}
+        if codes <= {TooFewMembersError.exit_code}:
+            return max(codes, default=0)
+        return 1
+
+    def __len__(self) -> int:
+        return len(self.outcomes) - len(self.failures)
+
+    def __iter__(self) -> Iterator[Result]:
+        """Posteriors, one after the other; none is kept."""
+        return (load_result(o.file) for o in self.outcomes if o.file is not None)
+
+    def __getitem__(self, name: str) -> Result:
+        """The posterior of a data set. Raises :class:`KeyError` where it is unknown or has failed."""
+        for outcome in self.outcomes:
+            if outcome.name == name and outcome.file is not None:
+                return load_result(outcome.file)
+        raise KeyError(name)
+
+
+def file_names(names: Iterable[str]) -> dict[str, str]:
+    """Name of the data set → name of a file, without suffix, that every file system takes and that is unique there.
+
+    Letters of any script stay; blanks and signs become ``_``; names that differ only in case or accents' encoding get
+    a number.
+
+    >>> file_names(["gel 1", "gel/1", "Gel_1", "ゲル"])
+    {'gel 1': 'gel_1', 'gel/1': 'gel_1_2', 'Gel_1': 'Gel_1_3', 'ゲル': 'ゲル'}
+    """
+    used: set[str] = set()
+    found = {}
+    for name in names:
+        base = re.sub(r"[^\w.+-]", "_", unicodedata.normalize("NFC", name)).lstrip(".") or "_"
+        base = base.encode("utf-8")[:_LONGEST].decode("utf-8", "ignore").rstrip(".")
+        base = f"_{base}" if _RESERVED.fullmatch(base) else base
+        candidate, number = base, 1
+        while candidate.casefold() in used:
+            number += 1
+            candidate = f"{base}_{number}"
+        used.add(candidate.casefold())
+        found[name] = candidate
+    return found

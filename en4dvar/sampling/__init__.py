@@ -1,0 +1,1 @@
+"""The posterior beyond its Gaussian: emulated J, walkers, Markov chains, the measure of its shape."""

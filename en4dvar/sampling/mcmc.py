@@ -1,0 +1,299 @@
+"""Refinement by Markov chain Monte Carlo: the posterior ensemble as the first positions of an ensemble sampler.
+
+Walkers move by differential evolution (ter Braak 2006, Stat. Comput. 16, 239) and stretches (Goodman & Weare 2010,
+Commun. Appl. Math. Comput. Sci. 5, 65), half of them at a time, so that a step is two calls of the forward model. The
+chain is lengthened until it has mixed (split R-hat, effective sample size: Gelman et al. 2013, Bayesian Data Analysis,
+§ 11.4-11.5) and thinned to the size of the ensemble.
+
+With an emulator of the density most steps are guided: a walker makes many moves on the emulator, which costs no run of
+the model, and the end point is accepted on the density itself, so that the chain samples it exactly whatever the
+emulator is worth (surrogate transition method: Liu 2001, Monte Carlo Strategies in Scientific Computing, § 9.4.3).
+
+emcee's snooker move is not used: with 48 walkers in 5 dimensions it gave standard deviations 30 % too small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from en4dvar.errors import ConfigError, En4dvarError
+from en4dvar.sampling.walkers import Emulated, advance
+from en4dvar.state import Array
+
+DE_SHARE = 0.8  # of the moves, the rest are stretches
+GUIDED_SHARE, GUIDED_MOVES = 0.85, 60  # of the steps where there is an emulator; its moves in one of them
+BURN_IN = 0.25  # of the chain, dropped at its start
+MAX_R_HAT = 1.1  # Gelman et al. (2013), § 11.5
+BLOCK = 50  # steps between two looks at convergence
+SCATTER = 0.1  # walkers are spread by this much more than the ensemble, so that no two coincide
+ASTRAY = 10.0  # by which J exceeds the emulator's where a walker must not start: an empty basin would trap it
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The sampler's output: ``samples`` (steps, walkers, n) after burn-in and the numbers that judge it.
+
+    ``r_hat`` and ``effective`` (n,) are split R-hat and effective sample size; ``moved`` (n,) is the change of the
+    mean against the ensemble it started from in posterior standard deviations, ``widened`` (n,) the ratio of the
+    standard deviations.
+    """
+
+    samples: Array
+    log_density: Array
+    r_hat: Array
+    effective: Array
+    acceptance: float
+    steps: int
+    converged: bool
+    moved: Array
+    widened: Array
+
+    @property
+    def flat(self) -> Array:
+        return np.asarray(self.samples.reshape(-1, self.samples.shape[-1]))
+
+    def thin(self, n_members: int, exact: bool = False) -> Array:
+        """(N, n) draws, evenly spaced over the chain, walkers in turn.
+
+        ``exact``: mapped linearly so that their mean and covariance are those of the whole chain.
+        """
+        steps, walkers, n = self.samples.shape
+        index = np.arange(n_members)
+        draws = self.samples[steps - 1 - (index * steps) // n_members, index % walkers]
+        if not exact or n_members <= n:
+            return np.asarray(draws)
+        anomalies = draws - draws.mean(axis=0)
+        target = np.linalg.cholesky(np.atleast_2d(np.cov(self.flat.T)))
+        own = np.linalg.cholesky(np.atleast_2d(np.cov(draws.T)))
+        return np.asarray(self.flat.mean(axis=0) + np.linalg.solve(own, anomalies.T).T @ target.T)
+
+    def warning(self) -> str:
+        """Words for a chain that has not mixed."""
+        return (
+            f"the Markov chain has not converged after {self.steps} steps (R-hat {np.max(self.r_hat):.3f}, effective "
+            f"sample size {np.min(self.effective):.0f}): its ensemble is not yet the posterior"
+        )
+
+    def summary(self) -> dict[str, float]:
+        """The numbers that judge the chain, for the result file."""
+        return {
+            "mcmc_steps": self.steps,
+            "mcmc_walkers": self.samples.shape[1],
+            "mcmc_acceptance": self.acceptance,
+            "mcmc_r_hat": float(np.max(self.r_hat)),
+            "mcmc_effective_sample_size": float(np.min(self.effective)),
+            "mcmc_converged": self.converged,
+            "mcmc_largest_shift": float(np.max(np.abs(self.moved))),
+            "mcmc_largest_spread_ratio": float(np.exp(np.max(np.abs(np.log(self.widened))))),
+        }
+
+
+@dataclass(frozen=True)
+class ChainState:
+    """All that the rest of a chain depends on: positions (steps, walkers, n) and log densities (steps, walkers) so far,
+    steps accepted (walkers,), and the state of numpy's ``RandomState`` (its key, position and stored normal draw)."""
+
+    samples: Array
+    log_density: Array
+    accepted: Array
+    random_key: Array
+    random_position: int
+    random_has_normal: int
+    random_normal: float
+
+
+def sample(
+    log_density: Callable[[Array], Array],
+    ensemble: Array,
+    seed: int,
+    *,
+    walkers: int = 48,
+    max_steps: int = 4000,
+    target: float = 1000.0,
+    resume: ChainState | None = None,
+    keep: Callable[[ChainState], None] | None = None,
+    emulated: Emulated | None = None,
+) -> Chain:
+    """Sample a density from the neighbourhood of an ensemble.
+
+    Parameters
+    ----------
+    log_density: of positions (B, n) → (B,), −inf where it vanishes; called with half of the walkers at a time.
+    ensemble: (N, n) the Gaussian approximation; walkers start from its members, slightly scattered.
+    seed: of the walkers; the same seed gives the same bits.
+    walkers: at least 2 (n + 1), even. max_steps: at most. target: effective sample size to reach in each direction.
+    resume: where an earlier call with the same arguments was interrupted; the chain has the same bits as without.
+    keep: called with the state of the chain at each look at convergence.
+    emulated: an approximation at no cost; it guides the walkers, which start from draws of it.
+
+    Raises
+    ------
+    ConfigError: emcee is not installed. En4dvarError: the density vanishes at (nearly) every member.
+    """
+    emcee = _emcee()
+    n = ensemble.shape[1]
+    walkers = max(walkers, 2 * (n + 1)) + max(walkers, 2 * (n + 1)) % 2
+    if resume is None:
+        state, chain = _start(emcee, log_density, ensemble, seed, walkers, emulated), _Blocks(walkers, n)
+    else:
+        state, chain = _state_of(emcee, resume), _Blocks.of(resume)
+    guided = 0.0 if emulated is None else GUIDED_SHARE
+    moves = [
+        (emcee.moves.DEMove(), (1 - guided) * DE_SHARE),
+        (emcee.moves.StretchMove(), (1 - guided) * (1 - DE_SHARE)),
+    ]
+    if emulated is not None:
+        moves.append((emcee.moves.MHMove(_guided(emulated)), guided))
+    sampler = emcee.EnsembleSampler(walkers, n, log_density, vectorize=True, moves=moves)
+    steps, converged = chain.steps, False
+    while True:
+        if steps:
+            samples = chain.samples[int(BURN_IN * steps) :]
+            r_hat, effective = split_r_hat(samples), effective_sample_size(samples)
+            converged = bool(np.all(r_hat < MAX_R_HAT) and np.all(effective >= target))
+            if converged or steps >= max_steps:
+                break
+        block = min(max_steps - steps, max(BLOCK, steps // 4))
+        sampler.reset()
+        state = sampler.run_mcmc(state, block, skip_initial_state_check=True)
+        chain.add(sampler.get_chain(), sampler.get_log_prob(), sampler.backend.accepted)
+        steps += block
+        if keep is not None:
+            keep(chain.state(state.random_state))
+    flat = samples.reshape(-1, n)
+    spread = flat.std(axis=0)
+    return Chain(
+        samples=samples,
+        log_density=chain.log_density[int(BURN_IN * steps) :],
+        r_hat=r_hat,
+        effective=effective,
+        acceptance=float(np.mean(chain.accepted / steps)),
+        steps=steps,
+        converged=converged,
+        moved=(flat.mean(axis=0) - ensemble.mean(axis=0)) / spread,
+        widened=spread / ensemble.std(axis=0, ddof=1),
+    )
+
+
+@dataclass
+class _Blocks:
+    """The chain as it grows, block by block."""
+
+    walkers: int
+    size: int
+
+    def __post_init__(self) -> None:
+        self.samples = np.empty((0, self.walkers, self.size))
+        self.log_density = np.empty((0, self.walkers))
+        self.accepted = np.zeros(self.walkers)
+
+    @classmethod
+    def of(cls, state: ChainState) -> _Blocks:
+        chain = cls(*state.samples.shape[1:])
+        chain.add(state.samples, state.log_density, state.accepted)
+        return chain
+
+    @property
+    def steps(self) -> int:
+        return len(self.samples)
+
+    def add(self, samples: Array, log_density: Array, accepted: Array) -> None:
+        self.samples = np.concatenate([self.samples, samples])
+        self.log_density = np.concatenate([self.log_density, log_density])
+        self.accepted = self.accepted + accepted
+
+    def state(self, random: Any) -> ChainState:
+        _, key, position, has_normal, normal = random
+        return ChainState(
+            self.samples, self.log_density, self.accepted, key, int(position), int(has_normal), float(normal)
+        )
+
+
+def _start(
+    emcee: Any,
+    log_density: Callable[[Array], Array],
+    ensemble: Array,
+    seed: int,
+    walkers: int,
+    emulated: Emulated | None,
+) -> Any:
+    """The walkers' first positions and the state of the random numbers. Raises :class:`En4dvarError`."""
+    n_members, n = ensemble.shape
+    random = np.random.Generator(np.random.Philox(key=seed))
+    if emulated is None:
+        start = ensemble[np.arange(walkers) % n_members]
+        start = start + SCATTER * ensemble.std(axis=0) * random.standard_normal(start.shape)
+        density = log_density(start)
+    else:
+        start = emulated.draws[np.linspace(0, len(emulated.draws) - 1, walkers).astype(int)]
+        density = log_density(start)
+        density = np.where(density + emulated.cost(start) > -ASTRAY, density, -np.inf)
+    alive = np.flatnonzero(np.isfinite(density))
+    if len(alive) < n + 1:
+        raise En4dvarError(f"refine: mcmc: the model cannot run {walkers - len(alive)} of {walkers} walkers")
+    for i in np.flatnonzero(~np.isfinite(density)):  # one that cannot be run starts beside one that can
+        twin = alive[i % len(alive)]
+        start[i] = start[twin] + 1e-3 * (start[twin] - ensemble.mean(axis=0))
+    return emcee.State(start, random_state=np.random.RandomState(int(random.integers(2**32))).get_state())
+
+
+def _state_of(emcee: Any, chain: ChainState) -> Any:
+    """Where the walkers stand at the end of a chain."""
+    random = ("MT19937", chain.random_key, chain.random_position, chain.random_has_normal, chain.random_normal)
+    return emcee.State(chain.samples[-1], log_prob=chain.log_density[-1], random_state=random)
+
+
+def _guided(emulated: Emulated) -> Callable[[Array, Any], tuple[Array, Array]]:
+    """Proposals (W, n), every walker many moves on the emulator away, and the log of what corrects for it (W,)."""
+
+    def propose(x: Array, random: Any) -> tuple[Array, Array]:
+        before = emulated.cost(x)
+        after, costs = advance(emulated.cost, x, before, emulated.draws, random, GUIDED_MOVES)
+        return after, costs - before
+
+    return propose
+
+
+def split_r_hat(samples: Array) -> Array:
+    """Split R-hat (n,) of chains (steps, chains, n): √(V/W) over half chains; 1 where all agree.
+
+    Walkers of one ensemble sampler are not independent chains; each half of each is compared with the others all the
+    same, which shows drift. Source: Gelman et al. (2013), § 11.4.
+    """
+    half = len(samples) // 2
+    chains = np.concatenate([samples[:half], samples[half : 2 * half]], axis=1)
+    within = chains.var(axis=0, ddof=1).mean(axis=0)
+    between = half * chains.mean(axis=0).var(axis=0, ddof=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.sqrt(((half - 1) / half * within + between / half) / within))
+
+
+def effective_sample_size(samples: Array) -> Array:
+    """Effective number of independent draws (n,) in chains (steps, chains, n), for the mean.
+
+    steps · chains / τ with τ = 1 + 2 Σ ρ_t, ρ_t the autocorrelation averaged over the chains and about the common mean,
+    summed while pairs ρ_{2t} + ρ_{2t+1} are positive and decreasing (Geyer 1992, Stat. Sci. 7, 473).
+    """
+    steps, chains, n = samples.shape
+    centred = samples - samples.mean(axis=(0, 1))
+    size = 1 << (2 * steps - 1).bit_length()
+    spectrum = np.fft.rfft(centred, size, axis=0)
+    covariance = np.fft.irfft(np.abs(spectrum) ** 2, size, axis=0)[:steps].mean(axis=1) / steps
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rho = covariance / covariance[0]
+    pairs = rho[: steps // 2 * 2].reshape(-1, 2, n).sum(axis=1)
+    positive = np.minimum.accumulate(np.where(np.cumprod(pairs > 0, axis=0), pairs, 0.0), axis=0)
+    tau = np.maximum(2 * positive.sum(axis=0) - 1, 1.0 / (steps * chains))
+    return np.asarray(steps * chains / tau)
+
+
+def _emcee() -> Any:
+    try:
+        import emcee
+    except ImportError:
+        raise ConfigError("refine: mcmc needs emcee; install the extra: pip install 'en4dvar[mcmc]'") from None
+    return emcee

@@ -1,0 +1,52 @@
+"""How far the posterior is from the Gaussian that an ensemble describes, by a few hundred more runs where it matters.
+
+The members' own J, known from the posterior forecast, clear most runs. Where they do not, and the model is cheap, an
+emulator of J is fitted about the ensemble and sampled: its mean and standard deviations are those of the posterior
+within about a tenth, and what they differ from the ensemble's is what a Markov chain would find
+(benchmarks/gaussianity.py).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from en4dvar import diagnostics as diag
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.prior import member_stream
+from en4dvar.sampling.emulator import Emulator, emulate
+from en4dvar.state import Array
+
+CHAIN_FITS = 4  # of an emulator that has to guide a chain into the tails; two tell mean and spread
+CLEARED = 0.85  # effective share of the members above which mean and spread are those of the posterior
+
+
+def examine_shape(space: WeightSpace, ensemble: Array, mode: Array, costs: Array, seed: int) -> dict[str, float]:
+    """Numbers for :func:`~en4dvar.diagnostics.is_non_gaussian`, and its answer.
+
+    ``ensemble`` (N, n) and its centre ``mode`` (n,), transformed; ``costs`` J (N,) of its members. Deterministic in
+    ``seed``. ``gaussian_fit``: effective share of the members; where an emulator was needed ``mean_shift``, the largest
+    distance of the ensemble's mean from the posterior's in posterior standard deviations, ``spread_ratio``, the
+    standard deviation of the ensemble over the posterior's where that is farthest from 1, and ``emulator_fit``.
+    """
+    shape = diag.gaussianity(ensemble, mode, costs)
+    if shape["gaussian_fit"] < CLEARED:
+        emulator = guide(space, ensemble, seed, fits=2)
+        if emulator is not None:
+            draws = emulator.draws
+            std = draws.std(axis=0)
+            ratio = ensemble.std(axis=0, ddof=1) / std
+            shape |= {
+                "mean_shift": float(np.max(np.abs(ensemble.mean(axis=0) - draws.mean(axis=0)) / std)),
+                "spread_ratio": float(ratio[np.argmax(np.abs(np.log(ratio)))]),
+                "emulator_fit": emulator.share,
+            }
+    return {**shape, "non_gaussian": diag.is_non_gaussian(shape)}
+
+
+def guide(space: WeightSpace, ensemble: Array, seed: int, fits: int = CHAIN_FITS) -> Emulator | None:
+    """An emulator of J about an ensemble (N, n); None where the settings or the model forbid."""
+    wanted = space.settings.emulator
+    if wanted == "off" or (wanted == "auto" and not space.problem.model.compiled):
+        return None
+    random = member_stream(seed, "emulator")
+    return emulate(space.forecast, space.problem.prior, space.problem.observations, ensemble, random, fits)

@@ -1,0 +1,1 @@
+"""What is kept: results as netCDF, checkpoints, seals, provenance, tables."""

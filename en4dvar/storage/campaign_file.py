@@ -1,0 +1,148 @@
+"""``posterior.nc`` of a campaign: the files of its data sets side by side along the dimension ``dataset``.
+
+It is written by streaming: one data set is in memory at a time. Dimensions follow the files of the data sets, in the
+ArviZ schema, with ``dataset`` in front; ``time`` becomes ``observation`` (padded with NaN to the longest data set) and
+the observation times a variable. Scalars that judge a fit become variables of ``sample_stats``. The paths between the
+observations and the iterations stay in ``datasets/``.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+
+from en4dvar.errors import OutputError
+from en4dvar.storage.files import atomic_path
+from en4dvar.storage.seal import check_seal, seal_file
+
+GROUPS = (
+    "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "constant_data", "sample_stats",
+    "log_likelihood",
+)  # fmt: skip
+LEFT_OUT = {"path_time", "iteration"}
+RENAMED = {"time": "observation", "time_column": "observation_column"}  # padded to the longest data set
+_LITTLE = 1 << 16  # bytes left on a disk that is full
+FAILURES = "failed_datasets"  # root attribute: JSON of name → reason
+
+
+def save_campaign(
+    path: Path,
+    sources: Mapping[str, Path],
+    n_observations: int,
+    attributes: Mapping[str, Any],
+    failures: Mapping[str, str],
+) -> Path:
+    """Write the campaign's file.
+
+    Parameters
+    ----------
+    sources: name of the data set → its file, in order; not empty.
+    n_observations: of the longest data set.
+    attributes: of the root. failures: name of the data set without a posterior → reason.
+
+    Raises
+    ------
+    OutputError: the file cannot be written.
+    """
+    with atomic_path(path) as partial:
+        try:
+            _write(partial, sources, n_observations, {**attributes, FAILURES: json.dumps(failures, ensure_ascii=False)})
+        except RuntimeError as error:  # the library's own; of the operating system's reason it only tells "HDF error"
+            free = shutil.disk_usage(partial.parent).free
+            reason = os.strerror(errno.ENOSPC) if free < _LITTLE else str(error)
+            raise OutputError(f"{path}: cannot be written: {reason}") from None
+        seal_file(partial)
+    return path
+
+
+def _write(path: Path, sources: Mapping[str, Path], n_observations: int, attributes: Mapping[str, Any]) -> None:
+    with netCDF4.Dataset(path, "w", format="NETCDF4") as target:
+        target.setncatts(attributes)
+        for i, (name, file) in enumerate(sources.items()):
+            with netCDF4.Dataset(file) as source:
+                source.set_auto_maskandscale(False)
+                if i == 0:
+                    _define(target, source, len(sources), n_observations)
+                for group in GROUPS:
+                    target[group]["dataset"][i] = name
+                    _copy(target[group], source[group], i)
+
+
+def failed_datasets(path: Path) -> dict[str, str]:
+    """Name of the data set without a posterior → reason, from a campaign's file; empty where there is no such file."""
+    if not path.is_file():
+        return {}
+    check_seal(path)
+    try:
+        with netCDF4.Dataset(path) as file:
+            return {str(k): str(v) for k, v in json.loads(getattr(file, FAILURES, "{}")).items()}
+    except OSError as error:
+        raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
+
+
+def _define(target: netCDF4.Dataset, first: netCDF4.Dataset, n_datasets: int, n_observations: int) -> None:
+    """Groups, dimensions, variables and coordinates, as in the file of the first data set."""
+    for name in GROUPS:
+        source, group = first[name], target.createGroup(name)
+        group.createDimension("dataset", n_datasets)
+        dims = {d for variable in _kept(source) for d in variable.dimensions}
+        for d in sorted(dims):
+            group.createDimension(_renamed(d), n_observations if d in RENAMED else len(source.dimensions[d]))
+        names = group.createVariable("dataset", str, ("dataset",))
+        names.setncatts({"units": "1", "long_name": "data set"})
+        for variable in _kept(source):
+            scattered = variable.name not in variable.dimensions or variable.name == "time"
+            shape = tuple(map(_renamed, variable.dimensions))
+            kind = str if variable.dtype is str else variable.dtype
+            fill = np.nan if variable.dtype is not str and variable.dtype.kind == "f" and scattered else None
+            made = group.createVariable(
+                variable.name, kind, ("dataset", *shape) if scattered else shape, fill_value=fill
+            )
+            made.setncatts({k: variable.getncattr(k) for k in variable.ncattrs() if k != "_FillValue"})
+            made.set_auto_maskandscale(False)
+            if not scattered:
+                made[...] = variable[...]
+        for key in source.ncattrs():
+            kind = str if isinstance(source.getncattr(key), str) else np.float64
+            made = group.createVariable(
+                _free(group, key), kind, ("dataset",), fill_value=None if kind is str else np.nan
+            )
+            made.setncatts({"units": "1", "long_name": key.replace("_", " "), "attribute": key})
+
+
+def _copy(group: netCDF4.Group, source: netCDF4.Group, i: int) -> None:
+    """The values of data set ``i``; what it lacks stays missing."""
+    for variable in group.variables.values():
+        if variable.dimensions[:1] != ("dataset",) or variable.name == "dataset":
+            continue
+        if "attribute" in variable.ncattrs():
+            key = variable.getncattr("attribute")
+            if key in source.ncattrs():
+                variable[i] = source.getncattr(key)
+        elif variable.name in source.variables:
+            values = source[variable.name][...]
+            if values.ndim:
+                variable[(i, *(slice(n) for n in values.shape))] = values
+            else:
+                variable[i] = values
+
+
+def _kept(group: netCDF4.Group) -> Sequence[netCDF4.Variable]:
+    return [v for v in group.variables.values() if not LEFT_OUT & {*v.dimensions, v.name}]
+
+
+def _renamed(dimension: str) -> str:
+    return RENAMED.get(dimension, dimension)
+
+
+def _free(group: netCDF4.Group, key: str) -> str:
+    """Name of the variable for an attribute; that of a parameter's share stays with the share."""
+    return f"{key}_total" if key in group.variables else key

@@ -1,0 +1,172 @@
+"""Tables of a run for other programs: CSV of summary or members, LaTeX for a paper; its report once more.
+
+netCDF needs no export: ``posterior.nc`` follows the ArviZ schema as it is.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from en4dvar.errors import OutputError
+from en4dvar.report.text import number_like
+from en4dvar.storage.store import ParameterSummary, Result, load_result
+
+Kind = Literal["csv", "latex", "members"]
+_ESCAPES = {c: f"\\{c}" for c in "#$%&_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
+
+
+def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
+    """A table of a run directory as text, in display units.
+
+    Parameters
+    ----------
+    kind: ``csv``: a line for each data set and parameter (prior, mean, std, 5/50/95 %, centre, DFS), every digit kept;
+        ``members``: a line for each data set and living posterior member, a column a parameter; ``latex``: mean ± std
+        for a paper (package booktabs), a row a parameter, or with several data sets a row a data set.
+
+    Raises
+    ------
+    OutputError: the directory holds no results.
+    """
+    if kind == "members":
+        return _members_csv(results(run_dir))
+    if kind == "latex":
+        return _latex([(r.name, r.summary()) for r in results(run_dir)])
+    from en4dvar.report import summary_csv
+
+    return summary_csv(((r.name, r.summary(), r.cautions) for r in results(run_dir)), {})
+
+
+def write_report(run_dir: str | Path, datasets: Sequence[str] = ()) -> Path:
+    """Write the report of a run again from its netCDF files; returns the path of ``report.html``.
+
+    Parameters
+    ----------
+    datasets: of a campaign, data sets that get a page of their own in any case.
+
+    Raises
+    ------
+    OutputError: there is nothing to read, the directory is in use or cannot be written.
+    """
+    from en4dvar.runs.runner import report
+
+    return report(run_dir, datasets)
+
+
+def posterior_file(run_dir: str | Path) -> Path:
+    """The netCDF file of a run or campaign, in the ArviZ schema as it is. Raises :class:`OutputError`."""
+    path = Path(run_dir) / "posterior.nc"
+    if not path.is_file():
+        raise OutputError(f"{run_dir}: holds no posterior.nc; is it the directory of a finished run?")
+    return path
+
+
+def results(run_dir: str | Path) -> Iterator[Result]:
+    """The posteriors of a run directory, one after the other. Raises :class:`OutputError`."""
+    files = sorted((Path(run_dir) / "datasets").glob("*.nc")) or [posterior_file(run_dir)]
+    return (load_result(file) for file in files)
+
+
+def _members_csv(found: Iterator[Result]) -> str:
+    """Living members; the header is that of the first data set, columns missing elsewhere stay empty."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    names: list[str] = []
+    for result in found:
+        rows = result.summary()
+        if not names:
+            names = [row.name for row in rows]
+            writer.writerow(["dataset", "member", *(f"{r.name} ({r.unit})" if r.unit != "1" else r.name for r in rows)])
+        alive = np.flatnonzero(result.sample_stats["active"].values.ravel().astype(bool))
+        values = {row.name: result.members("posterior", row.name) for row in rows}
+        for i, member in enumerate(alive):
+            writer.writerow([result.name, member, *(values[n][i] if n in values else "" for n in names)])
+    return text.getvalue()
+
+
+def _latex(found: list[tuple[str, tuple[ParameterSummary, ...]]]) -> str:
+    header = "% en4dvar export: posterior mean and standard deviation; needs \\usepackage{booktabs}"
+    table = _one_set(found[0][1]) if len(found) == 1 else _many_sets(found)
+    return "\n".join([header, *table]) + "\n"
+
+
+def _one_set(rows: tuple[ParameterSummary, ...]) -> list[str]:
+    lines = [
+        " & ".join(
+            (
+                latex_symbol(row),
+                latex_unit(row.unit) or "--",
+                _plus_minus(row.prior_mean, row.prior_std),
+                _plus_minus(row.mean, row.std),
+                f"${_tex(number_like(row.q05, row.std))}$ to ${_tex(number_like(row.q95, row.std))}$",
+            )
+        )
+        for row in rows
+    ]
+    head = "parameter & unit & prior & posterior & 5--95\\,\\%"
+    return _tabular("llrrr", head, lines)
+
+
+def _many_sets(found: list[tuple[str, tuple[ParameterSummary, ...]]]) -> list[str]:
+    first = {row.name: row for _, rows in found for row in reversed(rows)}
+    names = list(dict.fromkeys(row.name for _, rows in found for row in rows))
+    units = {n: latex_unit(first[n].unit) for n in names}
+    head = " & ".join(
+        ["data set", *(f"{latex_symbol(first[n])}" + (f" ({units[n]})" if units[n] else "") for n in names)]
+    )
+    lines = []
+    for dataset, rows in found:
+        own = {row.name: row for row in rows}
+        cells = [_plus_minus(own[n].mean, own[n].std) if n in own else "--" for n in names]
+        lines.append(" & ".join([escaped(dataset), *cells]))
+    return _tabular("l" + "r" * len(names), head, lines)
+
+
+def _tabular(columns: str, head: str, lines: list[str]) -> list[str]:
+    body = [f"  {line} \\\\" for line in lines]
+    return [
+        f"\\begin{{tabular}}{{{columns}}}", "  \\toprule", f"  {head} \\\\", "  \\midrule", *body,
+        "  \\bottomrule", "\\end{tabular}",
+    ]  # fmt: skip
+
+
+def _plus_minus(mean: float, std: float) -> str:
+    return f"${_tex(number_like(mean, std))} \\pm {_tex(number_like(std, std))}$"
+
+
+def _tex(number: str) -> str:
+    """A number of the report in math mode."""
+    text = number.replace("−", "-").replace("–", "\\mbox{--}")
+    superscripts = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+    return re.sub(r"×10([⁰¹²³⁴⁵⁶⁷⁸⁹⁻]+)", lambda m: f" \\times 10^{{{m[1].translate(superscripts)}}}", text)
+
+
+def latex_symbol(row: ParameterSummary) -> str:
+    """Matplotlib's mathtext is LaTeX; a bare name is escaped text."""
+    return row.symbol if re.fullmatch(r"\$[^$]+\$", row.symbol) else escaped(row.symbol)
+
+
+def latex_unit(unit: str) -> str:
+    r"""``"um"`` → ``$\mu$m``, ``"J/m^2"`` → ``J/m$^{2}$``, ``"1"`` → nothing.
+
+    >>> latex_unit("um"), latex_unit("Pa s"), latex_unit("m s-1"), latex_unit("%"), latex_unit("1")
+    ('$\\mu$m', 'Pa\\,s', 'm\\,s$^{-1}$', '\\%', '')
+    """
+    if unit == "1":
+        return ""
+    text = escaped(unit).replace("\\^{}", "^")
+    text = re.sub(r"(?<=[A-Za-z])(?:\^|\*\*)?(-?\d+)", r"$^{\1}$", text)
+    text = re.sub(r"(?<![A-Za-z\\])u(?=[A-Za-z])", r"$\\mu$", text)
+    return re.sub(r"\s*\*\s*|\s+", r"\\,", text)
+
+
+def escaped(text: str) -> str:
+    """``text`` as LaTeX prints it."""
+    return "".join(_ESCAPES.get(character, character) for character in text)

@@ -1,0 +1,106 @@
+"""What decides the numbers of a run, as text that can be compared: a run is continued only where it agrees.
+
+Configuration (without ``execution`` and ``output``, which never change the numbers), versions of the numerical
+packages, sources of the framework and of the model, files that the model's settings name, content of the data files.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import inspect
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from en4dvar.forward import ForwardModel
+from en4dvar.storage.checkpoint import digest, file_digest
+
+PACKAGES = ("en4dvar", "numpy", "scipy", "numba", "llvmlite")
+_NO_NUMBERS = ("execution", "output")
+
+
+@dataclass(frozen=True)
+class Identity:
+    """``settings``: all but the data, as YAML; ``data``: name of the data set → SHA-256 of its file."""
+
+    settings: str
+    data: tuple[tuple[str, str], ...]
+
+    def of_dataset(self, name: str) -> str:
+        """Fingerprint of one data set's result."""
+        return digest(f"{self.settings}\n{name}: {self.content[name]}".encode())
+
+    @functools.cached_property
+    def content(self) -> Mapping[str, str]:
+        """``data`` by name."""
+        return dict(self.data)
+
+    def difference(self, earlier: Identity, retried: frozenset[str]) -> str:
+        """Unified diff from ``earlier`` to this, "" where they agree. Files of ``retried`` data sets may differ."""
+
+        def lines(identity: Identity) -> list[str]:
+            data = [f"{name}: {'' if name in retried else content}" for name, content in identity.data]
+            return [*identity.settings.splitlines(), "data files:", *data]
+
+        return "\n".join(difflib.unified_diff(lines(earlier), lines(self), "earlier run", "now", lineterm="", n=1))
+
+
+def identity(resolved: str, model: ForwardModel, data: Mapping[str, Path]) -> Identity:
+    """The identity of a run of the resolved configuration (YAML) on ``data`` (name → file)."""
+    content = yaml.safe_load(resolved)
+    settings = {key: value for key, value in content.items() if key not in _NO_NUMBERS}
+    software: dict[str, str] = {"python": f"{sys.version_info.major}.{sys.version_info.minor}"}
+    for name in PACKAGES:
+        try:
+            software[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    errors = (content.get("data") or {}).get("error", {})
+    sources = {"en4dvar": source_digest("en4dvar"), **_model_sources(model, content["model"])}
+    sources |= {str(path): file_digest(path) for path in _paths(errors)}
+    text = yaml.safe_dump(
+        {**settings, "software": software, "sources": sources}, sort_keys=False, allow_unicode=True, width=120
+    )
+    return Identity(text, tuple((name, file_digest(path)) for name, path in data.items()))
+
+
+@functools.cache  # the code that runs is that of the first import
+def source_digest(module: str) -> str:
+    """SHA-256 over the Python files of the package (or the file of the module) that holds ``module``."""
+    top = sys.modules[module.partition(".")[0]]
+    if hasattr(top, "__path__"):
+        files = sorted(file for folder in top.__path__ for file in Path(folder).rglob("*.py"))
+        return digest("\n".join(f"{file.name} {file_digest(file)}" for file in files).encode())
+    return file_digest(Path(getattr(top, "__file__", None) or ""))
+
+
+def _model_sources(model: ForwardModel, section: Mapping[str, Any]) -> dict[str, str]:
+    sources = {}
+    for kind in type(model).__mro__:
+        top = kind.__module__.partition(".")[0]
+        if top not in ("en4dvar", "builtins", "abc", "typing") and inspect.getmodule(kind):
+            sources[top] = source_digest(top)
+    for path in _paths(section):
+        sources[str(path)] = file_digest(path)
+    return sources
+
+
+def _paths(value: Any) -> Iterator[Path]:
+    """Files named anywhere in a section, e.g. a tabulated pressure or the file of a user's own law."""
+    if isinstance(value, Mapping):
+        for item in value.values():
+            yield from _paths(item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from _paths(item)
+    elif isinstance(value, str):
+        for text in (value, value.rpartition(":")[0]):  # also file:object
+            if os.path.isfile(text):
+                yield Path(text)

@@ -1,0 +1,124 @@
+"""Groups of variables → the bytes of a NETCDF4 file, several times faster than through xarray's file backend.
+
+All definitions come before all data: HDF5 then lays out its metadata once. The encoding is xarray's own (NaN as fill
+value of floats, truth values as bytes with ``dtype: bool``, text as variable-length strings), so that every reader
+sees the same. Everything happens in memory: a worker far away can do it, and a file system is touched once.
+
+:class:`Group` and :class:`Variable` are what a worker makes; :func:`tree_of` shows them through xarray.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import netCDF4
+import numpy as np
+import xarray as xr
+
+from en4dvar.storage.seal import sealed
+
+_LOCK = threading.Lock()  # the netCDF library is not safe to use from several threads
+_INITIAL_SIZE = 1 << 19  # bytes; grows as needed
+
+
+@dataclass(frozen=True)
+class Variable:
+    """Values along named dimensions: floats, integers, truth values or text. ``fill``: NaN means a missing value."""
+
+    dims: tuple[str, ...]
+    values: np.ndarray[Any, Any]
+    attrs: Mapping[str, Any]
+    fill: bool = True
+
+
+@dataclass(frozen=True)
+class Group:
+    """Variables and coordinates by name."""
+
+    variables: Mapping[str, Variable] = field(default_factory=dict)
+    coords: Mapping[str, Variable] = field(default_factory=dict)
+    attrs: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Length of every dimension."""
+        every = (*self.variables.values(), *self.coords.values())
+        return {dim: size for v in every for dim, size in zip(v.dims, v.values.shape, strict=True)}
+
+
+Groups = Mapping[str, Group]
+"""By path, the root ``/`` first."""
+
+
+def tree_of(groups: Groups) -> xr.DataTree:
+    """The groups as xarray shows them."""
+
+    def shown(v: Variable) -> xr.Variable:
+        return xr.Variable(v.dims, v.values, v.attrs, {} if v.fill else {"_FillValue": None})
+
+    def dataset(group: Group) -> xr.Dataset:
+        variables, coords = ({n: shown(v) for n, v in part.items()} for part in (group.variables, group.coords))
+        return xr.Dataset(variables, coords, group.attrs)
+
+    return xr.DataTree.from_dict({path: dataset(group) for path, group in groups.items()})
+
+
+def groups_of(tree: xr.DataTree) -> dict[str, Group]:
+    """The reverse of :func:`tree_of`."""
+
+    def plain(v: xr.Variable) -> Variable:
+        attributes = {str(key): value for key, value in v.attrs.items()}
+        return Variable(tuple(map(str, v.dims)), v.values, attributes, "_FillValue" not in v.encoding)
+
+    def group(dataset: xr.Dataset) -> Group:
+        coords = {str(name): plain(dataset.variables[name]) for name in dataset.coords}
+        variables = {str(name): plain(dataset.variables[name]) for name in dataset.data_vars}
+        return Group(variables, coords, {str(key): value for key, value in dataset.attrs.items()})
+
+    return {node.path: group(node.to_dataset(inherit=False)) for node in tree.subtree}
+
+
+def to_bytes(content: xr.DataTree | Groups) -> bytes:
+    """The file of a tree or of groups; its last line seals it."""
+    groups = groups_of(content) if isinstance(content, xr.DataTree) else content
+    with _LOCK:
+        file = netCDF4.Dataset("in-memory.nc", "w", format="NETCDF4", memory=_INITIAL_SIZE)
+        try:
+            data = [item for path, group in groups.items() for item in _define(file, path, group)]
+            for variable, values in data:
+                variable[...] = values if values.ndim else values[()]
+        except BaseException:
+            file.close()
+            raise
+        memory = file.close()
+    return sealed(bytes(memory))
+
+
+def _define(file: netCDF4.Dataset, path: str, content: Group) -> Iterator[tuple[Any, Any]]:
+    """Define a group; yields its variables with the values to be written."""
+    group = file if path == "/" else file.createGroup(path)
+    group.setncatts(dict(content.attrs))
+    sizes = content.sizes
+    for name, size in sizes.items():
+        group.createDimension(name, size)
+    scattered = {name: set(c.dims) for name, c in content.coords.items() if name not in sizes}
+    unused = set(scattered)
+    for name, variable in (*content.variables.items(), *content.coords.items()):
+        values, attributes = variable.values, dict(variable.attrs)
+        along = {c for c, dims in scattered.items() if dims <= set(variable.dims)} if name in content.variables else ()
+        if along:
+            unused -= set(along)
+            attributes["coordinates"] = " ".join(sorted(along))
+        if values.dtype == bool:
+            values, attributes["dtype"] = values.astype(np.int8), "bool"
+        kind = str if values.dtype.kind in "OU" else values.dtype
+        missing = values.dtype.kind == "f" and variable.fill and name in content.variables
+        target = group.createVariable(name, kind, variable.dims, fill_value=np.nan if missing else None)
+        target.set_auto_maskandscale(False)
+        target.setncatts(attributes)
+        yield target, values.astype(object) if kind is str else values
+    if unused:
+        group.setncattr("coordinates", " ".join(sorted(unused)))
