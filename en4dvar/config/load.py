@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -76,6 +77,9 @@ def resolve(document: Document, base: Path) -> Config:
     found = read_model(model_section, base, document, faults) if isinstance(model_section, dict) else None
     section = document.data.get("assimilation", {})
     assimilation = check(schema.Assimilation, section, ("assimilation",), document, faults)
+    if assimilation and assimilation.refine == "mcmc" and find_spec("emcee") is None:
+        message = "mcmc needs emcee; install the extra: pip install 'en4dvar[mcmc]'"
+        faults.append(document.fault(("assimilation", "refine"), message))
     section = document.data.get("data")
     data = check(schema.Data, section, ("data",), document, faults) if section is not None else None
     if found is None:
