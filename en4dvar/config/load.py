@@ -77,7 +77,7 @@ def resolve(document: Document, base: Path) -> Config:
     found = read_model(model_section, base, document, faults) if isinstance(model_section, dict) else None
     section = document.data.get("assimilation", {})
     assimilation = check(schema.Assimilation, section, ("assimilation",), document, faults)
-    if assimilation and assimilation.refine == "mcmc" and find_spec("emcee") is None:
+    if assimilation and assimilation.model_dump()["refine"] == "mcmc" and find_spec("emcee") is None:
         message = "mcmc needs emcee; install the extra: pip install 'en4dvar[mcmc]'"
         faults.append(document.fault(("assimilation", "refine"), message))
     section = document.data.get("data")
