@@ -131,7 +131,8 @@ class _Run:
         space.forward_runs = state.forward_runs
         end = self.assimilate_repeatedly(state, self.mda) if self.mda else self.iterate(state)
 
-        posterior, mode = space.control(end.weights.w + end.transform), space.control(end.weights.w)
+        both = space.control(np.vstack([end.weights.w + end.transform, end.weights.w]))
+        posterior, mode = both[:-1], both[-1]
         dfs = diag.dfs(end.step.hessian.singular_values, len(space.members))
         posterior = posterior + mean_beyond_mode(problem, mode, posterior, dfs)
         posterior, refinement, refine_warnings = self.refine(posterior, state.refinement)

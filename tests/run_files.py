@@ -96,9 +96,16 @@ def run_cli(*arguments: object, **variables: object) -> subprocess.CompletedProc
     return subprocess.run(command(*arguments), capture_output=True, text=True, env=environment(**variables))
 
 
+def _heed_ctrl_c() -> None:
+    """A test run in the background of a shell has been told to ignore it, and its children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def run_and_signal(number: signal.Signals, after: float, *arguments: object, **variables: object) -> tuple[int, str]:
     """Run, send a signal after some seconds; exit code and standard error."""
-    process = subprocess.Popen(command(*arguments), stderr=subprocess.PIPE, text=True, env=environment(**variables))
+    process = subprocess.Popen(
+        command(*arguments), stderr=subprocess.PIPE, text=True, env=environment(**variables), preexec_fn=_heed_ctrl_c
+    )
     try:
         _, told = process.communicate(timeout=after)
     except subprocess.TimeoutExpired:
