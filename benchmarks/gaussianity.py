@@ -1,6 +1,7 @@
 """Does the result say when a posterior is not the Gaussian that its ensemble describes? (case c of the calibration)
 
     python benchmarks/gaussianity.py --set wide --n 500               runs of ``calibration.py b``, before refinement
+    python benchmarks/gaussianity.py --set wide --n 500 --linearisation transform    the plain smoother, which is off
     python benchmarks/gaussianity.py --set mixed --n 20               20 experiments of each of the designs below
     python benchmarks/gaussianity.py --set mixed --start 100 --n 20   others, for validation
 
@@ -90,11 +91,11 @@ def chain_of(key: str) -> Record:
     }
 
 
-def judged(key: str, chain: Record) -> Record:
+def judged(key: str, chain: Record, settings: AssimilationSettings = SETTINGS) -> Record:
     """How far the run was off, whether it says so, and what it cost to say."""
     problem, seed = of_key(key)
     began = time.process_time()
-    analysis = assimilate(problem, SETTINGS, seed)
+    analysis = assimilate(problem, settings, seed)
     took = time.process_time() - began
     x = problem.prior.from_physical(analysis.posterior)
     mean, std = np.array(chain["mean"]), np.array(chain["std"])
@@ -136,6 +137,8 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=20, help="number of seeds (of each design)")
     parser.add_argument("--minutes", type=float, default=np.inf, help="start no chain after so long")
     parser.add_argument("--records", type=Path, default=Path("runs/calibration"), help="folder of the records")
+    parser.add_argument("--linearisation", choices=("bundle", "transform"), default=SETTINGS.linearisation)
+    parser.add_argument("--step-control", choices=("line-search", "full"), default=SETTINGS.step_control)
     parser.add_argument("--list", action="store_true", help="print every run")
     options = parser.parse_args()
     seeds = range(options.start, options.start + options.n)
@@ -147,7 +150,8 @@ def main() -> None:
         chains = fill(options.records / "mixed.jsonl", keys, chain_of, options.minutes)
     usable = {key: chain for key, chain in chains.items() if chain.get("mcmc_converged")}
     print(f"{options.set}: seeds {seeds.start} to {seeds.stop - 1}, {len(chains)} chains, {len(usable)} converged")
-    found = {key: judged(key, chain) for key, chain in usable.items()}
+    settings = replace(SETTINGS, linearisation=options.linearisation, step_control=options.step_control)
+    found = {key: judged(key, chain, settings) for key, chain in usable.items()}
     table({key: found[key] for key in sorted(found, key=lambda k: [*DESIGNS].index(k.rsplit("/", 1)[0]))})
     if options.list:
         for key, record in found.items():
