@@ -44,10 +44,12 @@ class System:
     every: int
     error_std: float
     initial_std: float
+    tolerance: float = 0.05  # of the iterations, in posterior standard deviations
 
 
 # Sakov, Oliver & Bertino (2012), Table 1; Sakov & Oke (2008)
-L63 = System("L63", Lorenz63.from_settings(Lorenz63Settings()), 0.01, 25, 2**0.5, 2**0.5)
+# In Lorenz-63 a window of four intervals loses its way now and then; the iterations go as far as DAPPER's there.
+L63 = System("L63", Lorenz63.from_settings(Lorenz63Settings()), 0.01, 25, 2**0.5, 2**0.5, tolerance=1e-5)
 L96 = System("L96", Lorenz96.from_settings(Lorenz96Settings()), 0.05, 1, 1.0, 0.001**0.5)
 # system, members, lag (0: ETKF), inflation
 CASES = [
@@ -92,7 +94,8 @@ def ours(
     ensemble[:, :n] += system.initial_std * member_stream(seed, "members").standard_normal((members, n))
     times = system.step * system.every * np.arange(1, len(y) + 1)
     series = Series(times, y, np.full(n, system.error_std))
-    settings = SequentialSettings(IEnKS(lag) if lag else ETKF(), Inflation(inflation), rotation=True)
+    scheme = IEnKS(lag, tolerance=system.tolerance) if lag else ETKF()
+    settings = SequentialSettings(scheme, Inflation(inflation), rotation=True)
     began = time.process_time()
     result = run_sequential(system.model, system.model.observables, ensemble, series, settings, seed)
     took = time.process_time() - began
