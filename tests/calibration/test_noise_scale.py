@@ -16,6 +16,7 @@ RUNS, K = 300, 40
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_noise_scale_is_calibrated():
     """Ranks uniform (p > 0.01), 50 % and 90 % intervals within three binomial errors, mean and std of the z-scores.
 
