@@ -76,6 +76,7 @@ UNPREFIXED = {
 }
 PREFIXES = {"T": 12, "G": 9, "M": 6, "k": 3, "h": 2, "d": -1, "c": -2, "m": -3, "u": -6, "n": -9, "p": -12, "f": -15}
 
+LARGEST_POWER, LONGEST = 12, 100  # of a symbol; characters of a unit
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?(?![\d.])")
 _TOKEN = re.compile(r"\s*(?:(?P<symbol>[A-Za-z%]+|1(?![\d.]))(?:(?:\^|\*\*)?(?P<power>[+-]?\d+))?|(?P<op>[*/()]))\s*")
 _SUPERSCRIPT = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
@@ -106,6 +107,8 @@ def parse_unit(text: str) -> Unit:
 
     A product after a quotient (``"W/m K"``) is refused as ambiguous. Raises :class:`UnitError`.
     """
+    if len(text) > LONGEST:
+        raise UnitError(f"cannot read unit {text[:20]!r}…: {len(text)} characters")
     clean = text.replace("µ", "u").replace("μ", "u").replace("·", "*").translate(_SUPERSCRIPT)
     tokens: list[re.Match[str]] = []
     at = 0
@@ -139,7 +142,10 @@ def _product(tokens: list[re.Match[str]], i: int, text: str) -> tuple[Unit, int]
             if i == len(tokens):
                 raise UnitError(f"cannot read unit {text!r}: unbalanced '('")
         else:
-            factor = _symbol(tokens[i]["symbol"]) ** int(tokens[i]["power"] or 1)
+            power = tokens[i]["power"] or "1"
+            if len(power) > 3 or abs(int(power)) > LARGEST_POWER:
+                raise UnitError(f"cannot read unit {text!r}: no unit has the power {power}")
+            factor = _symbol(tokens[i]["symbol"]) ** int(power)
         if divided and operator != "/":
             raise UnitError(f"ambiguous unit {text!r}: write brackets, as in 'W/(m K)'")
         divided = divided or operator == "/"

@@ -79,3 +79,10 @@ def test_pydantic_annotation() -> None:
     for bad, message in (("0.42", "has no unit"), ("-1 Pa", "greater than 0")):
         with pytest.raises(ValidationError, match=message):
             Settings.model_validate({"pressure": bad})
+
+
+@pytest.mark.parametrize("text", ["mm44444444444444/m/m", "m99", "m-13", "(" * 50_000, "m " * 51, "kPa^" + "9" * 5000])
+def test_units_that_would_take_for_ever_are_refused(text: str) -> None:
+    """The first was found by fuzzing: the parser was raising 1/1000 to the power."""
+    with pytest.raises(UnitError, match="cannot read unit"):
+        parse_unit(text)
