@@ -24,7 +24,7 @@ FINDINGS = ROOT / "runs" / "fuzz"
 SHAPE = "shape"
 SECONDS = 30  # for one input
 _ONE = "--one"  # target in this process
-_DONE = re.compile(r"Done (\d+) runs? in")
+_DONE = re.compile(r"Done (\d+)(?: runs?)? in")
 _COVERAGE = re.compile(r"cov: (\d+)")
 
 
