@@ -8,6 +8,8 @@ scalars collected.
 from __future__ import annotations
 
 import csv
+import struct
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +25,7 @@ from en4dvar.state import Array
 Format = Literal["csv", "mat"]
 SUFFIXES: Mapping[str, Format] = {".csv": "csv", ".txt": "csv", ".dat": "csv", ".tsv": "csv", ".mat": "mat"}
 COMMENT = ("#", "%", "//")
+COMPRESSED = 15  # miCOMPRESSED of the MAT-file format, level 5
 BLANK = ("", "nan", "na", "n/a", "-")
 
 
@@ -263,6 +266,11 @@ def _mat_vectors(path: Path, wanted: Sequence[str] = ()) -> tuple[dict[str, Any]
     """Real vectors of a ``.mat`` file, those ``wanted`` among them, and its finite scalars."""
     from scipy.io import loadmat
 
+    raw = path.read_bytes()  # scipy's reader may take the whole process down with a damaged file
+    if not raw.startswith((b"MATLAB 5.0", b"MATLAB 7.3")):
+        raise DataError(f"{path}: not a MATLAB v5 file (no such header); save it in MATLAB with save(..., '-v7')")
+    if raw.startswith(b"MATLAB 5.0") and _damaged(raw):
+        raise DataError(f"{path}: not a MATLAB v5 file (a compressed variable is damaged)")
     try:
         content = {k: v for k, v in loadmat(path).items() if not k.startswith("__")}
     except NotImplementedError:
@@ -277,6 +285,30 @@ def _mat_vectors(path: Path, wanted: Sequence[str] = ()) -> tuple[dict[str, Any]
             fault = "is not a row or column of real numbers" if name in content else "is not in the file"
             raise DataError(f"{path}: field {name!r} {fault}; the vectors are: {', '.join(sorted(vectors)) or 'none'}")
     return vectors, {k: float(v.flat[0]) for k, v in vectors.items() if v.size == 1 and np.isfinite(v.flat[0])}
+
+
+def _damaged(content: bytes) -> bool:
+    """Whether a compressed variable of a v5 file does not unpack to its end with the right checksum."""
+    order = "<" if content[126:128] == b"IM" else ">"
+    at = 128
+    while at + 8 <= len(content):
+        kind, size = struct.unpack_from(f"{order}II", content, at)
+        at += 8
+        if kind == 0:
+            break  # padding
+        if kind == COMPRESSED:
+            packed = zlib.decompressobj()
+            rest = content[at : at + size]
+            try:
+                while rest and not packed.eof:
+                    packed.decompress(rest, 1 << 20)
+                    rest = packed.unconsumed_tail
+            except zlib.error:
+                return True
+            if not packed.eof:
+                return True
+        at += size
+    return False
 
 
 def _is_vector(value: Any) -> bool:

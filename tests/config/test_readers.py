@@ -1,5 +1,6 @@
 """CSV and .mat files, good and bad."""
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -122,3 +123,21 @@ def test_bad_mat(tmp_path: Path) -> None:
     (tmp_path / "cut.mat").write_bytes(whole[: len(whole) - 60])
     with pytest.raises(DataError, match="not a MATLAB v5 file"):
         read_series(tmp_path / "cut.mat", TIME, RADIUS)
+
+
+def test_a_damaged_compressed_variable_is_told_before_scipy_reads_it(tmp_path: Path) -> None:
+    """scipy 1.16's reader ends the process (SIGSEGV) at some of these; found by fuzzing."""
+    path = tmp_path / "a.mat"
+    savemat(path, {"t": np.arange(50.0), "R": 1 + np.arange(50.0) ** 2}, do_compression=True)
+    good = path.read_bytes()
+    assert len(read_series(path, TIME, RADIUS).times) == 50
+    told = 0
+    for at in range(144, len(good), 7):
+        flipped = good[:at] + bytes([good[at] ^ 0x55]) + good[at + 1 :]
+        for bad in (good[:at] + b"b" * 48 + good[at:], flipped, good[:at], b"MATRIX" + good[6:]):
+            path.write_bytes(bad)
+            with contextlib.suppress(DataError):
+                read_series(path, TIME, RADIUS)
+                continue
+            told += 1
+    assert told > 0.9 * 4 * len(range(144, len(good), 7))
