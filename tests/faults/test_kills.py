@@ -26,6 +26,7 @@ def test_killed_while_an_earlier_run_is_replaced():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.fault("kill")
 def test_killed_while_the_report_is_written():
     found = survive(300, sets=1, report=True, share=0.12, seed=3)
