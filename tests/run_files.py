@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -135,3 +136,14 @@ def _written(file: Path) -> int:
         return file.stat().st_mtime_ns
     except FileNotFoundError:
         return 0
+
+
+def resumed_until_done(attempt: Callable[[tuple[str, ...]], tuple[int, str]]) -> int:
+    """Make an attempt with no option, then with --resume after every kill, until one ends well: kills survived."""
+    kills, resume = 0, ()
+    while True:
+        code, told = attempt(resume)
+        assert code in (0, -signal.SIGKILL), told
+        if code == 0:
+            return kills
+        kills, resume = kills + 1, ("--resume",)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import random
-import signal
 from pathlib import Path
 
 import pytest
-from run_files import assert_same_results, configuration, kill_after_writes, make_campaign, run_cli
+from run_files import assert_same_results, configuration, kill_after_writes, make_campaign, resumed_until_done, run_cli
 
 from en4dvar.assimilate import LoopState, mcmc
 from en4dvar.runs.interrupt import Interrupted
@@ -67,16 +66,14 @@ def kill_and_resume(folder: Path, kills: int, seed: int) -> None:
     assert quiet.returncode == 0, quiet.stderr
     draw, done, finished = random.Random(seed), 0, 0
     while done < kills or finished == 0:
-        out, resume = folder / f"run{finished}", ()
-        while True:
-            file = out / "checkpoints" / "set0.iteration"
+        out = folder / f"run{finished}"
+
+        def attempt(resume: tuple[str, ...], out: Path = out) -> tuple[int, str]:
             writes, wait = draw.randint(1, 9), draw.uniform(0, 0.3)
-            code, told = kill_after_writes(file, writes, wait, *words, *resume, "--out", out, **pause)
-            assert code in (0, -signal.SIGKILL), told
-            if code == 0:
-                break
-            done += 1
-            resume = ("--resume",)
+            file = out / "checkpoints" / "set0.iteration"
+            return kill_after_writes(file, writes, wait, *words, *resume, "--out", out, **pause)
+
+        done += resumed_until_done(attempt)
         assert_same_results(out, folder / "quiet")
         finished += 1
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import random
 import re
 import shutil
-import signal
 from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
-from run_files import kill_after_writes, run_cli
+from run_files import kill_after_writes, resumed_until_done, run_cli
 from twin_models import Ring
 
 from en4dvar.config import load_twin
@@ -185,17 +184,14 @@ def kill_and_resume(tmp_path: Path, kills: int, seed: int) -> None:
     assert quiet.returncode == 0, quiet.stderr
     draw, done, finished = random.Random(seed), 0, 0
     while done < kills or finished == 0:
-        out, resume = tmp_path / f"run{finished}", ()
-        while True:
-            code, told = kill_after_writes(
-                out / "checkpoints" / "twin.cycle", draw.randint(1, 30), draw.uniform(0, 0.03),
-                "run", path, "--out", out, *resume, **pause,
-            )  # fmt: skip
-            assert code in (0, -signal.SIGKILL), told
-            if code == 0:
-                break
-            done += 1
-            resume = ("--resume",)
+        out = tmp_path / f"run{finished}"
+
+        def attempt(resume: tuple[str, ...], out: Path = out) -> tuple[int, str]:
+            writes, wait = draw.randint(1, 30), draw.uniform(0, 0.03)
+            file = out / "checkpoints" / "twin.cycle"
+            return kill_after_writes(file, writes, wait, "run", path, "--out", out, *resume, **pause)
+
+        done += resumed_until_done(attempt)
         assert_same_files(out, tmp_path / "quiet")
         finished += 1
 
