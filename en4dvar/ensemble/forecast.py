@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from en4dvar.ensemble.members import Indices, Reading, initial_states, out_of_bounds
+from en4dvar.ensemble.members import EVERYONE, Indices, Reading, initial_states, out_of_bounds
 from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.forward import RateOperator
@@ -69,12 +69,16 @@ def forecast(
     physical = problem.prior.to_physical(x)
     failures = out_of_bounds(problem.prior, physical)
     alive, states = initial_states(problem, physical, failures)
-    observed = np.full((len(reading.quantities), len(x), len(times)), np.nan)
-    extremes = np.full((len(x), len(reading.largest)), np.nan)
-    if len(states):
-        shifted = times + _of_framework(problem, physical, TIME_SHIFT, 0.0)[alive, None]
-        outcomes = (executor or SerialExecutor()).trajectories(problem.model, states, shifted)
-        observed[:, alive], extremes[alive], reasons = reading.observe(outcomes, len(times))
+    shifted = times + _of_framework(problem, physical, TIME_SHIFT, 0.0)[alive, None]
+    outcomes = (executor or SerialExecutor()).trajectories(problem.model, states, shifted) if len(states) else ()
+    observed, extremes, reasons = reading.observe(outcomes, len(times))
+    if alive is EVERYONE:
+        failures = reasons
+    else:
+        read = observed, extremes
+        observed = np.full((len(observed), len(x), len(times)), np.nan)
+        extremes = np.full((len(x), len(reading.largest)), np.nan)
+        observed[:, alive], extremes[alive] = read
         for i, reason in zip(np.arange(len(x))[alive], reasons, strict=True):
             failures[i] = reason
     return Forecast(

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -31,54 +32,86 @@ RUNS_PER_TERM = 4
 FEWEST_RUNS, MOST_RUNS = 96, 512  # of one fit
 CEILING = 20.0  # above the lowest J_o of the runs
 RIDGE = 1e-9  # relative: decides where the runs leave a coefficient open
-WALKERS = 120
-SCATTERED, SETTLED = 8, 40  # rounds of the walkers before the second fit, after it
-PER_ROUND = 5  # moves of each half in a round
+WALKERS = 300
+SCATTERED, SETTLED = 4, 7  # rounds of the walkers before the second fit, after it
+PER_ROUND = 10  # moves in a round
 
 Run = Callable[[Array], Forecast]
 
 
 @dataclass(frozen=True)
-class Emulator:
-    """Ĵ (B,) of control vectors (B, n), from polynomials of z = root⁻¹ (x − centre).
+class _Coordinates:
+    """z = root⁻¹ (x − centre) of control vectors (B, n), in which an ensemble is N(0, 1), and monomials of them.
 
-    ``terms`` are the index pairs that make each degree from the one before; ``coefficients`` (C, Ky) of predictions,
-    rates and ln σ side by side. The observations' part is cut at ``ceiling``: far from its runs a polynomial says only
-    that J is large, and a walker that true J lets in there must find its way out. ``share`` is the effective share of
-    the runs that judge it, ``draws`` (S, n) are of exp(−Ĵ).
+    ``terms``: for every degree from 2, which monomials of the degree before are multiplied by which coordinates.
     """
 
-    prior: Prior
-    observations: Observations
     centre: Array
+    root: Array
     inverse_root: Array
     terms: tuple[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]], ...]
-    coefficients: Array
-    columns: tuple[bool, bool]
+
+    @classmethod
+    def about(cls, ensemble: Array, degree: int) -> _Coordinates:
+        """Those of an ensemble (N, n), with monomials up to ``degree``."""
+        root = np.asarray(np.linalg.cholesky(np.atleast_2d(np.cov(ensemble.T))), dtype=float)
+        return cls(ensemble.mean(axis=0), root, np.linalg.inv(root), _terms(ensemble.shape[1], degree))
+
+    def to(self, x: Array) -> Array:
+        return np.asarray((x - self.centre) @ self.inverse_root.T)
+
+    def back(self, z: Array) -> Array:
+        return np.asarray(self.centre + z @ self.root.T)
+
+    def basis(self, z: Array) -> Array:
+        """Monomials (C, B) of coordinates (B, n): 1, z_i, z_i z_j, …"""
+        count, n = z.shape
+        monomials = np.empty((1 + n + sum(len(by) for _, by in self.terms), count))
+        monomials[0], monomials[1 : n + 1] = 1.0, z.T
+        coordinates = before = monomials[1 : n + 1]
+        end = n + 1
+        for of_before, by in self.terms:
+            here = monomials[end : end + len(by)]
+            np.multiply(before[of_before], coordinates[by], out=here)
+            before, end = here, end + len(by)
+        return monomials
+
+
+@dataclass(frozen=True)
+class Emulator:
+    """Ĵ (B,) of control vectors (B, n), from polynomials (…, C) of ``coordinates``.
+
+    ``observed`` is J_o (B,) of what ``of_outputs`` (Ky, C) gives, ``of_prior`` (n, C) the normalised departure from the
+    prior's mean. J_o is cut at ``ceiling``: far from its runs a polynomial says only that J is large, and a walker that
+    true J lets in there must find its way out. ``share`` is the effective share of the runs that judge it, ``draws``
+    (S, n) are of exp(−Ĵ).
+    """
+
+    coordinates: _Coordinates
+    of_outputs: Array
+    of_prior: Array
+    observed: Callable[[Array], Array]
     ceiling: float = math.inf
     share: float = math.nan
     draws: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     def cost(self, x: Array) -> Array:
         """Ĵ (B,) of control vectors (B, n)."""
-        outputs = self.coefficients.T @ _basis(self.inverse_root @ (x - self.centre).T, self.terms)
-        k = len(self.observations.times)
-        has_rates, has_scale = self.columns
-        rates = outputs[k : 2 * k].T if has_rates else None
-        scale = np.exp(outputs[-1]) if has_scale else None
-        observed = observation_cost(self.observations, outputs[:k].T, rates, scale)
-        return _prior_cost(self.prior, x) + np.minimum(observed, self.ceiling)
+        return self._cost(self.coordinates.to(x))
 
-    def walk(self, x: Array, random: np.random.Generator, rounds: int) -> list[Array]:
-        """Positions (W, n) of walkers from ``x`` after each round, sampling exp(−Ĵ)."""
-        half = len(x) // 2
-        halves = [x[:half], x[half : 2 * half]]
-        costs = [self.cost(part) for part in halves]
-        positions = []
+    def _cost(self, z: Array) -> Array:
+        basis = self.coordinates.basis(z)
+        departure = self.of_prior @ basis[: self.of_prior.shape[1]]
+        observed = np.minimum(self.observed(self.of_outputs @ basis), self.ceiling)
+        return np.asarray(observed + _half_square(departure))
+
+    def walk(self, x: Array, others: Array, random: np.random.Generator, rounds: int) -> list[Array]:
+        """Positions (W, n) of walkers from ``x`` after each round, sampling exp(−Ĵ); ``others`` (W', n) stand still."""
+        z, others = self.coordinates.to(x), self.coordinates.to(others)
+        costs, positions = self._cost(z), []
         for _ in range(rounds):
-            for i in (0, 1):
-                halves[i], costs[i] = advance(self.cost, halves[i], costs[i], halves[1 - i], random, PER_ROUND)
-            positions.append(np.concatenate(halves))
+            z, costs = advance(self._cost, z, costs, others, random, PER_ROUND)
+            positions.append(self.coordinates.back(z))
         return positions
 
 
@@ -122,17 +155,16 @@ def emulate(
     if wanted is None or len(ensemble) <= n:
         return None
     degree, count = wanted
-    mean = ensemble.mean(axis=0)
-    root = np.asarray(np.linalg.cholesky(np.atleast_2d(np.cov(ensemble.T))), dtype=float)
-    inverse_root, terms = np.asarray(np.linalg.inv(root), dtype=float), _terms(n, degree)
-    found = _run(run, prior, observations, mean + random.standard_normal((count, n)) @ root.T)
+    coordinates = _Coordinates.about(ensemble, degree)
+    found = _run(run, prior, observations, coordinates.back(random.standard_normal((count, n))))
     if found is None or len(found[0].x) < 0.75 * count:
         return None
     runs, columns = found
-    emulator = _fit(prior, observations, mean, inverse_root, terms, runs, columns)
-    walkers, share = runs.x[random.permutation(len(runs.x))[:WALKERS]], math.nan
+    emulator = _fit(prior, observations, coordinates, runs, columns)
+    kept, share = runs.x, math.nan
+    walkers = kept[random.permutation(len(kept))[:WALKERS]]
     for _ in range(fits - 1):
-        positions = emulator.walk(walkers, random, SCATTERED)
+        positions = emulator.walk(walkers, kept, random, SCATTERED)
         walkers, kept = positions[-1], np.concatenate(positions[SCATTERED // 2 :])
         found = _run(run, prior, observations, kept[np.linspace(0, len(kept) - 1, count).astype(int)])
         if found is None:
@@ -140,10 +172,10 @@ def emulate(
         new = found[0]
         share = effective_share(emulator.cost(new.x) - new.costs) * len(new.x) / count  # of the fit without them
         runs = runs.joined(new)
-        emulator = _fit(prior, observations, mean, inverse_root, terms, runs, columns)
-    settled = emulator.walk(walkers, random, SETTLED)
+        emulator = _fit(prior, observations, coordinates, runs, columns)
+    settled = emulator.walk(walkers, kept, random, SETTLED)
     ceiling = float(np.min(runs.costs - _prior_cost(prior, runs.x))) + CEILING
-    return replace(emulator, ceiling=ceiling, share=share, draws=np.concatenate(settled[SETTLED // 4 :]))
+    return replace(emulator, ceiling=ceiling, share=share, draws=np.concatenate(settled[SETTLED // 3 :]))
 
 
 def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> tuple[_Runs, tuple[bool, bool]] | None:
@@ -168,28 +200,47 @@ def _prior_cost(prior: Prior, x: Array) -> Array:
 
 
 def _fit(
-    prior: Prior,
-    observations: Observations,
-    centre: Array,
-    inverse_root: Array,
-    terms: tuple[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]], ...],
-    runs: _Runs,
-    columns: tuple[bool, bool],
+    prior: Prior, observations: Observations, coordinates: _Coordinates, runs: _Runs, columns: tuple[bool, bool]
 ) -> Emulator:
     """Weighted least squares; a run whose J exceeds the lowest by the width of a posterior, 2n, counts half."""
-    excess = (runs.costs - runs.costs.min()) / (2 * len(centre))
+    n = len(coordinates.centre)
+    excess = (runs.costs - runs.costs.min()) / (2 * n)
     root_weight = 1 / np.sqrt(1 + excess**2)
-    design = _basis(inverse_root @ (runs.x - centre).T, terms).T * root_weight[:, None]
+    design = coordinates.basis(coordinates.to(runs.x)).T * root_weight[:, None]
     scale = np.sqrt(np.sum(design**2, axis=0))
     normal = (design / scale).T @ (design / scale)
     normal[np.diag_indices_from(normal)] += RIDGE
     right = (design / scale).T @ (runs.outputs * root_weight[:, None])
-    coefficients = np.linalg.solve(normal, right) / scale[:, None]
-    return Emulator(prior, observations, centre, inverse_root, terms, coefficients, columns)
+    coefficients = (np.linalg.solve(normal, right) / scale[:, None]).T
+    of_prior = np.column_stack([coordinates.centre - prior.mean, coordinates.root]) / prior.std[:, None]
+    if any(columns) or observations.huber is not None:
+        observed = partial(_cost_of_outputs, observations, columns)
+        return Emulator(coordinates, coefficients, of_prior, observed)
+    # R is constant and J_o quadratic: the polynomials can be those of whitened residuals, of which C tell as much as K
+    residuals = -coefficients
+    residuals[:, 0] += observations.values
+    residuals *= (np.sqrt(observations.weights) / observations.std)[:, None]
+    if observations.correlation is not None:
+        residuals = observations.whitening @ residuals  # the weights of correlated errors are all the same
+    if len(residuals) > residuals.shape[1]:
+        residuals = np.linalg.qr(residuals, mode="r")
+    return Emulator(coordinates, residuals, of_prior, _half_square)
+
+
+def _cost_of_outputs(observations: Observations, columns: tuple[bool, bool], outputs: Array) -> Array:
+    """J_o (B,) of predictions, rates and ln σ on top of each other (Ky, B)."""
+    k = len(observations.times)
+    has_rates, has_scale = columns
+    rates = outputs[k : 2 * k].T if has_rates else None
+    return observation_cost(observations, outputs[:k].T, rates, np.exp(outputs[-1]) if has_scale else None)
+
+
+def _half_square(residuals: Array) -> Array:
+    """½ |v|² (B,) of residuals (K, B)."""
+    return np.asarray(0.5 * np.einsum("kb,kb->b", residuals, residuals))
 
 
 def _terms(n: int, degree: int) -> tuple[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]], ...]:
-    """For every degree from 2: which monomials of the degree before are multiplied by which coordinates."""
     terms = []
     last = list(range(n))  # the highest coordinate in each monomial
     for _ in range(2, degree + 1):
@@ -197,16 +248,3 @@ def _terms(n: int, degree: int) -> tuple[tuple[npt.NDArray[np.intp], npt.NDArray
         terms.append((np.array([i for i, _ in pairs]), np.array([j for _, j in pairs])))
         last = [j for _, j in pairs]
     return tuple(terms)
-
-
-def _basis(z: Array, terms: tuple[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]], ...]) -> Array:
-    """Monomials (C, B) of coordinates (n, B): 1, z_i, z_i z_j, …"""
-    n = len(z)
-    monomials = np.empty((1 + n + sum(len(by) for _, by in terms), z.shape[1]))
-    monomials[0], monomials[1 : n + 1] = 1.0, z
-    before, end = z, n + 1
-    for of_before, by in terms:
-        here = monomials[end : end + len(by)]
-        np.multiply(before[of_before], z[by], out=here)
-        before, end = here, end + len(by)
-    return monomials

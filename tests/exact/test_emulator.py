@@ -58,7 +58,7 @@ def test_emulator_of_cubic_predictions_is_j_itself(level):
     problem = make_problem(Cubic(), [0.8, 1.1], **LEVELS[level])
     emulator = emulated(problem)
     x = problem.prior.mean + problem.prior.std * np.random.default_rng(5).standard_normal((200, 2))
-    assert_emulated(emulator, problem, np.concatenate([x, emulator.draws[::200]]))
+    assert_emulated(emulator, problem, np.concatenate([x, emulator.draws[::50]]))
     assert emulator.share > 0.999
     assert np.all(np.isfinite(emulator.draws))
 
@@ -69,7 +69,7 @@ def test_emulator_of_an_estimated_noise_scale():
     problem = replace(base, prior=prior)
     emulator = emulated(problem)
     x = prior.mean + 0.3 * prior.std * np.random.default_rng(5).standard_normal((50, 3))
-    assert_emulated(emulator, problem, np.concatenate([x, emulator.draws[::200]]))
+    assert_emulated(emulator, problem, np.concatenate([x, emulator.draws[::50]]))
 
 
 def test_no_emulator_of_many_parameters_or_few_survivors():
