@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from pathlib import Path
 
@@ -77,3 +78,33 @@ class Swift(Oscillator):
         velocity = decay * (v0 * cosine - (a * v0 + (a**2 + w**2) * x0) * sine)
         states = np.stack(np.broadcast_arrays(position, velocity, k, c), axis=-1)
         return Batch(np.array(own), states, self.layout)
+
+
+class Waits(Oscillator):
+    """Call number 8 of its thread, in the first iterations of a data set, waits for the file ``EN4DVAR_TEST_FLAG``."""
+
+    calls = threading.local()
+
+    def trajectories(self, x, times):
+        self.calls.n = getattr(self.calls, "n", 0) + 1
+        if self.calls.n == 8:
+            self.wait(Path(os.environ["EN4DVAR_TEST_FLAG"]))
+        return super().trajectories(x, times)
+
+    def wait(self, flag):
+        end = time.monotonic() + 60
+        while not flag.exists():
+            if time.monotonic() > end:
+                raise TimeoutError("nobody has heard of the iterations before")
+            time.sleep(0.001)
+
+
+class WaitsAndDies(Waits):
+    """Kills its process there, the first of all."""
+
+    def wait(self, flag):
+        super().wait(flag)
+        died = flag.with_suffix(".died")
+        if not died.exists():
+            died.touch()
+            os.kill(os.getpid(), signal.SIGKILL)

@@ -14,6 +14,7 @@ from en4dvar.forward import Failure, ForwardModel
 from en4dvar.state import Array
 
 T = TypeVar("T")
+Hear = Callable[[int, Any], None]
 ATTEMPTS_ALONE = 2  # before a call is held responsible for the death of its worker
 
 
@@ -31,12 +32,18 @@ class Executor(ABC):
     workers: int = 1
 
     @abstractmethod
-    def map(self, function: Callable[..., T], calls: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, T | Exception]]:
+    def map(
+        self, function: Callable[..., T], calls: Iterable[tuple[Any, ...]], hear: Hear | None = None
+    ) -> Iterator[tuple[int, T | Exception]]:
         """``function(*call)`` of every call, as they end: (index of the call, value or what it raised).
 
         ``calls`` is consumed as workers become free, so that neither calls nor values pile up. A call whose worker
         dies is repeated; :class:`WorkerLostError` is its value where it takes every worker down. ``function`` and calls
         can be pickled.
+
+        With ``hear`` the calls tell while they run: they are ``function(*call, tell)``, and ``tell(message)`` there
+        becomes ``hear(index of the call, message)`` here, in the thread that iterates, in order and before the call
+        ends. Messages are small, few and picklable. A call that is repeated tells again.
 
         Raises
         ------

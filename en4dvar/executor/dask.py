@@ -13,18 +13,22 @@ from __future__ import annotations
 import contextlib
 import itertools
 import logging
+import pickle
 import queue
 import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from en4dvar.executor.base import ATTEMPTS_ALONE, Executor, ExecutorError, T, WorkerLostError
+from en4dvar.executor.base import ATTEMPTS_ALONE, Executor, ExecutorError, Hear, T, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster
 
+    News = queue.SimpleQueue[Future | tuple[int, Any]]  # calls that ended; what they tell
+
+TOPIC = "en4dvar"  # of events that calls tell; one for all runs, for a scheduler keeps the last events of each
 CONNECT_TIMEOUT = 15.0  # s
 NO_WORKER_TIMEOUT = 60.0  # s without any worker before the run is given up
 POLL = 2.0  # s
@@ -54,6 +58,8 @@ class DaskExecutor(Executor):
         self._address, self._limits = address, limits
         self._cluster: LocalCluster | None = None
         self._client: Client | None = None
+        self._listening: dict[str, News] = {}  # for what the calls of a map tell
+        self._maps = itertools.count()
         for name in ("distributed.client", "distributed.comm", "distributed.core", "distributed.batched"):
             logging.getLogger(name).setLevel(logging.CRITICAL)  # what they tell of lost connections, we tell once
         try:
@@ -68,6 +74,7 @@ class DaskExecutor(Executor):
             self._client = distributed.Client(
                 self._cluster or address, timeout=CONNECT_TIMEOUT, set_as_default=False, heartbeat_interval="1s"
             )
+            self._client.subscribe_topic(TOPIC, self._told)
             self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT)
             self.workers = workers or max(1, sum(self._client.nthreads().values()))
         except (OSError, ValueError) as error:
@@ -76,16 +83,26 @@ class DaskExecutor(Executor):
             message = "has no worker; start some with: dask worker" if connected else "cannot be reached"
             raise ExecutorError(f"dask scheduler {address or ''}: {message} ({error})") from None
 
-    def map(self, function: Callable[..., T], calls: Iterable[tuple[Any, ...]]) -> Iterator[tuple[int, T | Exception]]:
-        ended: queue.SimpleQueue[Future] = queue.SimpleQueue()
+    def map(
+        self, function: Callable[..., T], calls: Iterable[tuple[Any, ...]], hear: Hear | None = None
+    ) -> Iterator[tuple[int, T | Exception]]:
+        news: News = queue.SimpleQueue()
+        name = f"{getattr(self._client, 'id', '')}-{next(self._maps)}"
+        if hear:
+            self._listening[name] = news
         pending: dict[Any, tuple[int, tuple[Any, ...], Future]] = {}
         following = enumerate(calls)
         suspects: list[tuple[int, tuple[Any, ...]]] = []  # repeated when nothing else is under way
 
         def submit(i: int, call: tuple[Any, ...]) -> None:
-            future = self._submit(function, call)
+            future = self._submit(function, call, (name, i) if hear else None)
             pending[future.key] = i, call, future
-            future.add_done_callback(ended.put)
+            future.add_done_callback(news.put)
+
+        def ended() -> tuple[int, tuple[Any, ...], Any]:
+            future = self._next(news, hear)
+            i, call, _ = pending.pop(future.key)
+            return i, call, self._value(future)
 
         try:
             while True:
@@ -93,30 +110,44 @@ class DaskExecutor(Executor):
                     submit(i, call)
                 if not pending:
                     break
-                future = self._next(ended)
-                i, call, _ = pending.pop(future.key)
-                value = self._value(future)
+                i, call, value = ended()
                 if isinstance(value, WorkerLostError):
                     suspects.append((i, call))
                 else:
                     yield i, value
-            for i, call in suspects:
-                yield i, self._alone(function, call)
+            for i, call in suspects:  # several workers died under it; calls around it may have been the reason
+                for _ in range(ATTEMPTS_ALONE):
+                    submit(i, call)
+                    *_, value = ended()
+                    if not isinstance(value, WorkerLostError):
+                        break
+                yield i, value
         finally:
+            self._listening.pop(name, None)
             for _, _, future in pending.values():
                 future.release()
 
-    def _submit(self, function: Callable[..., T], call: tuple[Any, ...]) -> Future:
+    def _submit(self, function: Callable[..., T], call: tuple[Any, ...], listener: tuple[str, int] | None) -> Future:
         if self._client is None or self._client.status != "running":
             raise self._lost()
-        return self._client.submit(_on_worker, self._limits, function, call, pure=False)
+        return self._client.submit(_on_worker, self._limits, function, call, listener, pure=False)
 
-    def _next(self, ended: queue.SimpleQueue[Future]) -> Future:
+    def _told(self, event: tuple[float, tuple[str, int, bytes]]) -> None:
+        """What a call tells, in dask's thread; calls of other runs tell it too."""
+        name, i, message = event[1]
+        if (news := self._listening.get(name)) is not None:
+            news.put((i, pickle.loads(message)))
+
+    def _next(self, news: News, hear: Hear | None) -> Future:
         """The next future that ends. Raises :class:`ExecutorError` where the cluster is gone."""
         last_worker = time.monotonic()
         while True:
             try:
-                return ended.get(timeout=POLL)
+                item = news.get(timeout=POLL)
+                if not isinstance(item, tuple):
+                    return item
+                if hear:
+                    hear(*item)
             except queue.Empty:
                 if self._client is None or self._client.status != "running":
                     raise self._lost() from None
@@ -141,18 +172,6 @@ class DaskExecutor(Executor):
                 return error
             raise self._lost() from error
 
-    def _alone(self, function: Callable[..., T], call: tuple[Any, ...]) -> T | Exception:
-        """Repeat a call under which several workers died; calls around it may have been the reason."""
-        value: Any = None
-        for _ in range(ATTEMPTS_ALONE):
-            ended: queue.SimpleQueue[Future] = queue.SimpleQueue()
-            future = self._submit(function, call)
-            future.add_done_callback(ended.put)
-            value = self._value(self._next(ended))
-            if not isinstance(value, WorkerLostError):
-                break
-        return value
-
     def _lost(self) -> ExecutorError:
         return ExecutorError(f"lost the connection to the dask scheduler {self._address or 'of this machine'}")
 
@@ -167,7 +186,14 @@ class DaskExecutor(Executor):
                 cluster.close(timeout=CLOSE_TIMEOUT)
 
 
-def _on_worker(limits: Limits, function: Callable[..., T], call: tuple[Any, ...]) -> T:
+def _on_worker(
+    limits: Limits, function: Callable[..., T], call: tuple[Any, ...], listener: tuple[str, int] | None
+) -> T:
     one_blas_thread_for_good()
     apply_limits(limits)
-    return function(*call)
+    if listener is None:
+        return function(*call)
+    from distributed import get_worker
+
+    worker = get_worker()
+    return function(*call, lambda message: worker.log_event(TOPIC, (*listener, pickle.dumps(message))))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
+import queue
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-from en4dvar.executor.base import Executor, T
+from en4dvar.executor.base import Executor, Hear, T
 from en4dvar.executor.chunks import Outcome, kept, run_chunk
 from en4dvar.forward import ForwardModel
 from en4dvar.state import Array
@@ -17,10 +20,12 @@ Call = tuple[Any, ...]
 class SerialExecutor(Executor):
     """Everything in this process, one call after the other."""
 
-    def map(self, function: Callable[..., T], calls: Iterable[Call]) -> Iterator[tuple[int, T | Exception]]:
+    def map(
+        self, function: Callable[..., T], calls: Iterable[Call], hear: Hear | None = None
+    ) -> Iterator[tuple[int, T | Exception]]:
         for i, call in enumerate(calls):
             try:
-                value: T | Exception = function(*call)
+                value: T | Exception = function(*call, *([functools.partial(hear, i)] if hear else []))
             except Exception as error:
                 value = error
             yield i, value
@@ -50,22 +55,34 @@ class ThreadsExecutor(Executor):
             self._pool = ThreadPoolExecutor(self.workers, thread_name_prefix="en4dvar")
         return self._pool.submit(function, *call)
 
-    def map(self, function: Callable[..., T], calls: Iterable[Call]) -> Iterator[tuple[int, T | Exception]]:
-        queue = enumerate(calls)
+    def map(
+        self, function: Callable[..., T], calls: Iterable[Call], hear: Hear | None = None
+    ) -> Iterator[tuple[int, T | Exception]]:
+        news: queue.SimpleQueue[Future[T] | tuple[int, Any]] = queue.SimpleQueue()  # calls that ended; what they tell
+        following = enumerate(calls)
         pending: dict[Future[T], int] = {}
+
+        def teller(i: int) -> Callable[[Any], None]:
+            return lambda message: news.put((i, message))
+
         try:
             while True:
-                while len(pending) < 2 * self.workers and (following := next(queue, None)) is not None:
-                    i, call = following
-                    pending[self._submit(function, call)] = i
+                for i, call in itertools.islice(following, max(0, 2 * self.workers - len(pending))):
+                    future = self._submit(function, (*call, *([teller(i)] if hear else [])))
+                    pending[future] = i
+                    future.add_done_callback(news.put)
                 if not pending:
                     return
-                for future in wait(pending, return_when=FIRST_COMPLETED).done:
-                    i = pending.pop(future)
-                    try:
-                        yield i, future.result()
-                    except Exception as error:
-                        yield i, error
+                item = news.get()
+                if not isinstance(item, Future):
+                    if hear:
+                        hear(*item)
+                    continue
+                i = pending.pop(item)
+                try:
+                    yield i, item.result()
+                except Exception as error:
+                    yield i, error
         finally:
             for future in pending:
                 future.cancel()

@@ -22,13 +22,14 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
-from en4dvar.executor.base import ATTEMPTS_ALONE, Executor, ExecutorError, T, WorkerLostError
+from en4dvar.executor.base import ATTEMPTS_ALONE, Executor, ExecutorError, Hear, T, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
 from en4dvar.executor.chunks import describe
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
 
 CLOSE_TIMEOUT = 10.0  # s for a worker to end by itself
 MOST_STILLBORN = 8  # workers in a row that end before they have begun
+ANSWER, TOLD = b"a", b"t"  # what a worker sends begins with one of them
 Call = tuple[Any, ...]
 _SPAWN = get_context("spawn")
 
@@ -52,16 +53,20 @@ class _Worker:
         with contextlib.suppress(OSError):  # dead already: told when its answer is read
             self.pipe.send_bytes(message)
 
-    def answer(self) -> Any:
-        """The value of the call or what it raised; of a worker that has just started, None. Raises :class:`_Dead`."""
+    def answer(self) -> tuple[bool, Any]:
+        """Whether the call has ended, and its value or what it raised, else what it tells; None as it starts.
+
+        Raises :class:`_Dead`.
+        """
         try:
-            content = self.pipe.recv_bytes()
+            content = memoryview(self.pipe.recv_bytes())
         except (EOFError, OSError):
             raise _Dead from None
+        ended = content[:1] == ANSWER
         try:
-            return pickle.loads(content)
+            return ended, pickle.loads(content[1:])
         except Exception as error:  # a value that cannot be made again here
-            return error
+            return ended, error
 
     def end(self, at_once: bool) -> None:
         if at_once:
@@ -107,7 +112,9 @@ class ProcessesExecutor(Executor):
         self._stillborn = 0  # one after the other
         weakref.finalize(self, self._crew.end)  # also at the end of the interpreter
 
-    def map(self, function: Callable[..., T], calls: Iterable[Call]) -> Iterator[tuple[int, T | Exception]]:
+    def map(
+        self, function: Callable[..., T], calls: Iterable[Call], hear: Hear | None = None
+    ) -> Iterator[tuple[int, T | Exception]]:
         crew, following = self._crew, enumerate(calls)
         todo: deque[tuple[int, bytes]] = deque()
         sent: dict[int, bytes] = {}
@@ -119,7 +126,7 @@ class ProcessesExecutor(Executor):
             while len(todo) < self.workers - len(crew.busy) and (item := next(following, None)) is not None:
                 i, call = item
                 try:
-                    todo.append((i, bytes(ForkingPickler.dumps((function, call)))))
+                    todo.append((i, bytes(ForkingPickler.dumps((function, call, hear is not None)))))
                 except Exception as error:  # it cannot be sent
                     answers.append((i, error))
 
@@ -143,7 +150,7 @@ class ProcessesExecutor(Executor):
                 for worker in self._ready():
                     i = worker.task
                     try:
-                        value = worker.answer()
+                        ended, value = worker.answer()
                     except _Dead:
                         if worker in crew.starting:
                             self._bury(worker, crew.starting)
@@ -156,6 +163,10 @@ class ProcessesExecutor(Executor):
                             continue
                         value = WorkerLostError(self.limits.death)
                     else:
+                        if not ended:
+                            if hear:
+                                hear(i, value)
+                            continue
                         crew.idle.append(worker)
                         if worker in crew.starting:
                             crew.starting.remove(worker)
@@ -198,15 +209,19 @@ class ProcessesExecutor(Executor):
 def _serve(pipe: Connection, limits: Limits) -> None:
     """What a worker does until its pipe is closed."""
     prepare_worker(limits)
-    pipe.send_bytes(pickle.dumps(None))  # ready: from here on a death may be a call's fault
+
+    def tell(message: Any) -> None:
+        pipe.send_bytes(TOLD + bytes(ForkingPickler.dumps(message)))
+
+    pipe.send_bytes(ANSWER + pickle.dumps(None))  # ready: from here on a death may be a call's fault
     while True:
         try:
             message = pipe.recv_bytes()
         except (EOFError, OSError):
             return
         try:
-            function, call = pickle.loads(message)
-            value: Any = function(*call)
+            function, call, listening = pickle.loads(message)
+            value: Any = function(*call, *([tell] if listening else []))
         except Exception as error:
             error.add_note(f"in a worker process:\n{traceback.format_exc()}")
             value = error
@@ -216,7 +231,7 @@ def _serve(pipe: Connection, limits: Limits) -> None:
             reason = value if isinstance(value, Exception) else error
             answer = bytes(ForkingPickler.dumps(RuntimeError(describe(reason))))
         try:
-            pipe.send_bytes(answer)
+            pipe.send_bytes(ANSWER + answer)
         except OSError:
             return
 

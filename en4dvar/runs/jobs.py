@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +14,14 @@ from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.executor import Executor
 from en4dvar.honesty import Caution
 from en4dvar.problem import AssimilationSettings, InverseProblem, IterationRecord
-from en4dvar.runs.progress import Progress, describe
+from en4dvar.runs.progress import Progress
 from en4dvar.storage.checkpoint import Keeper
 from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import to_bytes
 from en4dvar.storage.store import ParameterSummary, summarise
+
+TELL_EVERY = 0.1  # s; a worker sends no more often what its iterations have to tell
+News = tuple[tuple[str, IterationRecord], ...]
 
 
 @dataclass(frozen=True)
@@ -41,12 +46,9 @@ class Job:
 
 @dataclass(frozen=True)
 class Estimate:
-    """``content`` is the netCDF file; ``log`` what the iterations had to tell, ``last`` the last of them; ``ending``
-    how they ended."""
+    """``content`` is the netCDF file; ``ending`` how the iterations ended."""
 
     content: bytes
-    log: tuple[str, ...]
-    last: IterationRecord
     ending: str
     summary: tuple[ParameterSummary, ...]
     warnings: tuple[Caution, ...]
@@ -64,26 +66,40 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
     ------
     TooFewMembersError: the ensemble is lost. OutputError: a checkpoint cannot be written.
     """
-    log: list[str] = []
-
-    def tell(name: str, record: IterationRecord) -> None:
-        log.append(describe(name, record))
-        if progress is not None:
-            progress(name, record)
-
     analysis = assimilate(
-        job.problem, job.settings, job.seed, executor, tell, job.resume, on_iteration=_checkpoints(job)
+        job.problem, job.settings, job.seed, executor, progress, job.resume, on_iteration=_checkpoints(job)
     )
     outcome = "converged" if analysis.converged else "not converged"
     return Estimate(
         content=to_bytes(build_groups(analysis, job.attributes)),
-        log=tuple(log),
-        last=analysis.iterations[-1],
         summary=summarise(analysis),
         ending=f"{outcome}: {analysis.stop_reason}; {analysis.forward_runs} forward runs",
         warnings=analysis.cautions,
         n_observations=len(analysis.observations),
     )
+
+
+def estimate_and_tell(job: Job, tell: Callable[[News], None]) -> Estimate:
+    """As :func:`estimate`, on a worker: ``tell`` gets the iterations, without their members, as they end."""
+    waiting: list[tuple[str, IterationRecord]] = []
+    sent = -math.inf
+
+    def send() -> None:
+        nonlocal sent
+        if waiting:
+            tell(tuple(waiting))
+            waiting.clear()
+            sent = time.monotonic()
+
+    def progress(name: str, record: IterationRecord) -> None:
+        waiting.append((name, replace(record, members=record.members[:0])))
+        if time.monotonic() - sent >= TELL_EVERY:
+            send()
+
+    try:
+        return estimate(job, None, progress)
+    finally:
+        send()
 
 
 def _checkpoints(job: Job) -> Callable[[LoopState], None]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -65,38 +64,31 @@ class RunLog:
 
 
 class LiveProgress:
-    """One line on a terminal: the iteration that ended last, data sets done, time gone and left.
-
-    Threads may call it side by side. Iterations in other processes are not seen; there a data set is told as it ends.
-    """
+    """One line on a terminal: the iteration that ended last, data sets done, time gone and left."""
 
     def __init__(self, bar: Any, total: int):
         self._bar, self._total = bar, total
         self._task = bar.add_task("prior forecast", total=total, left="")
         self._began = time.monotonic()
-        self._lock = threading.Lock()
         self._before = self._done = 0  # data sets that an earlier run had done; that are done
         self._open: dict[str, int] = {}  # data set → its last iteration
         self._lengths: list[int] = []  # iterations of the data sets that have ended
 
     def __call__(self, name: str, record: IterationRecord) -> None:
-        with self._lock:
-            self._open[name] = record.iteration
-            self._show(_short(name, record))
+        self._open[name] = record.iteration
+        self._show(_short(name, record))
 
     def begin(self, done: int) -> None:
         """``done`` data sets were done by an earlier run."""
-        with self._lock:
-            self._before = self._done = done
-            self._show(None)
+        self._before = self._done = done
+        self._show(None)
 
     def ended(self, name: str, done: int) -> None:
         """A data set has ended; ``done`` are done now."""
-        with self._lock:
-            if name in self._open:
-                self._lengths.append(self._open.pop(name))
-            self._done = done
-            self._show("files and report" if done == self._total else None)
+        if name in self._open:
+            self._lengths.append(self._open.pop(name))
+        self._done = done
+        self._show("files and report" if done == self._total else None)
 
     def _show(self, description: str | None) -> None:
         fields = {"completed": self._done, "left": self._left()}

@@ -44,7 +44,8 @@ def run(
     overrides: of dotted keys, when ``config`` is a path; e.g. ``{"data.path": "/data/gel.csv"}``.
     force: replace the files of an earlier run in the same directory, once this run is complete.
     resume: continue an interrupted run in the same directory, to the same bits.
-    progress: called with the data set's name and the record of each iteration.
+    progress: called with the data set's name and the record of each iteration as it ends, in the calling thread; its
+        ``members`` are empty where data sets are estimated side by side.
     command: what the user typed, for the file's history.
 
     Raises

@@ -15,9 +15,10 @@ from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, ThreadsExecutor
 from en4dvar.honesty import Caution
 from en4dvar.inputs.build import build_one
+from en4dvar.problem import IterationRecord
 from en4dvar.runs.campaign import DatasetOutcome, file_names
-from en4dvar.runs.jobs import Estimate, Job, estimate
-from en4dvar.runs.progress import LiveProgress, Progress, RunLog
+from en4dvar.runs.jobs import Estimate, Job, News, estimate, estimate_and_tell
+from en4dvar.runs.progress import LiveProgress, Progress, RunLog, describe
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.storage.checkpoint import FOLDER, CheckpointError, digest, file_digest, read_checkpoint, write_checkpoint
 from en4dvar.storage.files import readable, write_bytes
@@ -77,6 +78,7 @@ class Worklist:
     notices: list[str] = field(default_factory=list)
     ended: dict[str, Done] = field(default_factory=dict)
     stop: threading.Event = field(default_factory=threading.Event)
+    told: dict[str, int] = field(default_factory=dict)  # data set at work → its last iteration
 
     def outcomes(self) -> tuple[DatasetOutcome, ...]:
         """What came of each data set, in order."""
@@ -134,12 +136,12 @@ class Worklist:
             if isinstance(value, Exception):
                 self._failed(d, value)
             else:
-                self._keep(d, value, side_by_side)
+                self._keep(d, value)
 
     def _in_turn(self, todo: list[Dataset], executor: Executor) -> Iterator[tuple[Dataset, Estimate | Exception]]:
         for d in todo:
             try:
-                value: Estimate | Exception = estimate(self._job(d), executor, self._live)
+                value: Estimate | Exception = estimate(self._job(d), executor, self._tell)
             except Exception as error:
                 value = error
             yield d, value
@@ -147,10 +149,7 @@ class Worklist:
     def _side_by_side(self, todo: list[Dataset], executor: Executor) -> Iterator[tuple[Dataset, Estimate | Exception]]:
         sent: list[Dataset] = []
         unusable: list[tuple[Dataset, Exception]] = []
-        here = isinstance(executor, ThreadsExecutor)
-        stop = self.stop if here else None
-        # Iterations of other processes are not seen; these are told by the data set's last one.
-        live = (None, self.progress) if here and isinstance(self.progress, LiveProgress) else ()
+        stop = self.stop if isinstance(executor, ThreadsExecutor) else None
 
         def jobs() -> Iterator[tuple[Any, ...]]:
             for d in todo:
@@ -160,9 +159,13 @@ class Worklist:
                     unusable.append((d, error))
                     continue
                 sent.append(d)
-                yield (job, *live)
+                yield (job,)
 
-        for i, value in executor.map(estimate, jobs()):
+        def hear(_: int, news: News) -> None:
+            for name, record in news:
+                self._tell(name, record)
+
+        for i, value in executor.map(estimate_and_tell, jobs(), hear):
             yield sent[i], value
         yield from unusable
 
@@ -188,22 +191,15 @@ class Worklist:
             stop=stop,
         )
 
-    @property
-    def _live(self) -> Progress:
-        from en4dvar.runs.progress import describe
+    def _tell(self, name: str, record: IterationRecord) -> None:
+        if record.iteration <= self.told.get(name, -1):
+            self.log.write(f"{name}: its worker was lost; another one repeats it")
+        self.told[name] = record.iteration
+        self.log.write(describe(name, record))
+        if self.progress is not None:
+            self.progress(name, record)
 
-        def tell(name: str, record: Any) -> None:
-            self.log.write(describe(name, record))
-            if self.progress is not None:
-                self.progress(name, record)
-
-        return tell
-
-    def _keep(self, d: Dataset, value: Estimate, tell: bool) -> None:
-        if tell:
-            self.log.write("\n".join(value.log))
-            if self.progress is not None:
-                self.progress(d.name, value.last)
+    def _keep(self, d: Dataset, value: Estimate) -> None:
         self.log.write(f"{d.name}: {value.ending}")
         self.log.write("\n".join(f"{d.name}: {warning.severity}: {warning}" for warning in value.warnings))
         write_bytes(self.directory.work / d.file, value.content)
@@ -229,5 +225,6 @@ class Worklist:
         write_checkpoint(self.directory.work / d.done, self.identity.of_dataset(d.name), record)
         self.directory.remove(d.iteration)
         self.ended[d.name] = record
+        self.told.pop(d.name, None)
         if isinstance(self.progress, LiveProgress):
             self.progress.ended(d.name, len(self.ended))

@@ -75,7 +75,7 @@ def test_iterations_of_data_sets_side_by_side_are_seen(tmp_path: Path, monkeypat
         assert progress._open == {}
         assert len(progress._lengths) == 3
     iterations = [one.iterations.sizes["iteration"] for one in campaign]
-    assert len(told) == 1 + sum(iterations) + 3 + 3  # begin, each iteration, the last once more, each end
+    assert len(told) == 1 + sum(iterations) + 3  # begin, each iteration, each end
     assert told[-1] == ("", 3)
 
 

@@ -1,5 +1,6 @@
 """Workers that die at the worst moments, and what they hand back when it cannot be sent."""
 
+import contextlib
 import os
 import signal
 import time
@@ -43,23 +44,49 @@ def slow(number):
     return number
 
 
-@pytest.mark.fault("worker-killed")
-def test_a_worker_killed_while_it_hands_back_its_result(tmp_path, monkeypatch):
-    """Half of a message: the rest never comes, and nobody waits for it."""
-    flag = str(tmp_path / "died")
+@pytest.fixture
+def reads_late(monkeypatch):
+    """Within, a worker has filled its pipe, and is dead before the first byte is read."""
     ready = ProcessesExecutor._ready
 
     def late(executor):
         found = ready(executor)
-        time.sleep(1.0)  # the worker has filled the pipe, and is dead before the first byte is read
+        time.sleep(1.0)
         return found
 
-    with ProcessesExecutor(2) as executor:
+    @contextlib.contextmanager
+    def within():
         with monkeypatch.context() as patch:
             patch.setattr(ProcessesExecutor, "_ready", late)
+            yield
+
+    return within
+
+
+@pytest.mark.fault("worker-killed")
+def test_a_worker_killed_while_it_hands_back_its_result(tmp_path, reads_late):
+    """Half of a message: the rest never comes, and nobody waits for it."""
+    flag = str(tmp_path / "died")
+    with ProcessesExecutor(2) as executor:
+        with reads_late():
             ((i, value),) = executor.map(half_a_message, [(flag,)])
         assert (i, len(value)) == (0, LARGE)
         assert [v[0] for _, v in sorted(executor.map(fine, [(j,) for j in range(5)]))] == list(range(5))
+
+
+def half_a_word(flag, tell):
+    tell("before")
+    tell(DiesWhileItIsSent(flag))
+    return "done"
+
+
+@pytest.mark.fault("worker-killed")
+def test_a_worker_killed_while_it_tells_something(tmp_path, reads_late):
+    heard = []
+    with ProcessesExecutor(1) as executor, reads_late():
+        calls = executor.map(half_a_word, [(str(tmp_path / "died"),)], lambda _, message: heard.append(message))
+        assert list(calls) == [(0, "done")]
+    assert heard == ["before", "before", bytes(LARGE)]
 
 
 @pytest.mark.fault("worker-killed")

@@ -1,0 +1,94 @@
+"""Iterations are told while they run, wherever that is: the model waits until its first ones have been heard of."""
+
+import re
+
+import pytest
+from run_files import assert_same_results, configuration, make_campaign
+
+from en4dvar.executor import choose_executor
+from en4dvar.runs.runner import run_campaign
+
+
+class Listener:
+    """Lets the waiting models go on once an iteration of theirs is in the log."""
+
+    def __init__(self, out, flag):
+        self.out, self.flag, self.heard = out, flag, []
+
+    def __call__(self, name, record):
+        lines = log(self.out)
+        if not self.heard:
+            assert any(f"{name}: iteration {record.iteration:2d}  J " in line for line in lines)
+            assert not any(f"{name}: converged" in line for line in lines)
+        self.heard.append((name, record.iteration))
+        self.flag.touch()
+
+
+def log(out):
+    return (out / "run.log").read_text().splitlines()
+
+
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("quiet")
+    run_campaign(configuration(make_campaign(folder, 3), folder / "run", executor="serial"))
+    return folder / "run"
+
+
+def iterations(lines, name):
+    return [int(found[1]) for line in lines if (found := re.search(rf" {name}: iteration +(\d+)  J ", line))]
+
+
+@pytest.mark.parametrize("kind", ["threads", "processes", "dask"])
+def test_an_iteration_is_told_before_its_data_set_ends(quiet, tmp_path, monkeypatch, kind):
+    monkeypatch.setenv("EN4DVAR_TEST_FLAG", str(tmp_path / "heard"))
+    path, out = make_campaign(tmp_path, 3, "execution_models:Waits"), tmp_path / "run"
+    listener = Listener(out, tmp_path / "heard")
+    campaign = run_campaign(configuration(path, out, executor=kind, workers=2), progress=listener)
+    assert campaign.exit_code == 0
+    assert_same_results(out, quiet)
+    for result in campaign:
+        n = result.iterations.sizes["iteration"]
+        assert [i for name, i in listener.heard if name == result.name] == list(range(n))
+        assert iterations(log(out), result.name) == list(range(n))
+
+
+@pytest.mark.parametrize("kind", ["processes", "dask"])
+@pytest.mark.fault("worker-killed")
+def test_iterations_of_a_killed_worker_are_told_again(quiet, tmp_path, monkeypatch, kind):
+    monkeypatch.setenv("EN4DVAR_TEST_FLAG", str(tmp_path / "heard"))
+    path, out = make_campaign(tmp_path, 3, "execution_models:WaitsAndDies"), tmp_path / "run"
+    campaign = run_campaign(
+        configuration(path, out, executor=kind, workers=2), progress=Listener(out, tmp_path / "heard")
+    )
+    assert (tmp_path / "heard.died").exists()
+    assert campaign.exit_code == 0
+    assert_same_results(out, quiet)
+    lines = log(out)
+    assert sum("its worker was lost; another one repeats it" in line for line in lines) == 1
+    told = {result.name: iterations(lines, result.name) for result in campaign}
+    for result in campaign:
+        n = result.iterations.sizes["iteration"]
+        assert told[result.name][-n:] == list(range(n))
+    assert sum(numbers.count(0) for numbers in told.values()) == 4
+
+
+@pytest.mark.parametrize("kind", ["serial", "threads", "processes", "dask"])
+def test_what_calls_tell_comes_in_order_and_before_their_end(kind):
+    """For any call; one that raises has told too."""
+    seen = []
+    with choose_executor(None, kind, 1 if kind == "serial" else 2) as executor:
+        for i, value in executor.map(counts, [(3,), (0,), (5,)], lambda i, message: seen.append((i, message))):
+            seen.append((i, repr(value)))
+        assert sorted(executor.map(abs, [(-1,), (-2,)])) == [(0, 1), (1, 2)]  # no listener, nothing to tell
+    assert [m for i, m in seen if i == 0] == [0, 1, 2, "3"]
+    assert [m for i, m in seen if i == 1] == ["ValueError('nothing to count')"]
+    assert [m for i, m in seen if i == 2] == [0, 1, 2, 3, 4, "5"]
+
+
+def counts(n, tell):
+    for i in range(n):
+        tell(i)
+    if not n:
+        raise ValueError("nothing to count")
+    return n
