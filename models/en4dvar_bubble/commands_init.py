@@ -84,9 +84,13 @@ def init(
 
 
 def _write_example(name: str, force: bool) -> None:
+    from en4dvar.config.json_schema import schema_text
+    from en4dvar.storage.files import write_text
     from en4dvar_bubble.examples import write_example
+    from en4dvar_bubble.starter.page import SCHEMA_FILE
 
     file = write_example(name, Path(), force)
+    write_text(Path(SCHEMA_FILE), schema_text())  # that the first line of the configuration names
     click.echo(f"configuration: {file}, its data are synthetic")
     click.echo(f"next: en4dvar validate {file}, then en4dvar run {file}")
 

@@ -35,6 +35,15 @@ def test_shipped_configurations_are_valid(validator: Draft202012Validator, path:
     assert faults == []
 
 
+def test_shipped_configurations_name_the_schema_that_lies_beside_them() -> None:
+    outcome = CliRunner().invoke(main, ["schema"])
+    text = (ROOT / "configs" / "en4dvar.schema.json").read_text(encoding="utf-8")
+    assert text == outcome.stdout, "run: en4dvar schema --out configs/en4dvar.schema.json"
+    for path in CONFIGS:
+        first, _ = path.read_text(encoding="utf-8").split("\n", 1)
+        assert first == "# yaml-language-server: $schema=en4dvar.schema.json", path
+
+
 @pytest.mark.parametrize(
     "given",
     ["  driving: none\n", "  driving: {amplitude: -20 MPa}\n", "  driving: {kind: gaussian, amplitude: 1 MPa, "

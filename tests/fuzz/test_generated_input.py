@@ -122,7 +122,7 @@ def test_a_run_is_written_below_the_folder_of_runs(tmp_path, monkeypatch, name):
     Path("case.yaml").write_text(text, encoding="utf-8")
     done = CliRunner().invoke(main, ["validate", "case.yaml"])
     assert done.exit_code == 2
-    assert "case.yaml:3:7: name:" in done.output
+    assert "case.yaml:4:7: name:" in done.output
 
 
 @pytest.mark.parametrize("directory", ["..", "../elsewhere", "/tmp/elsewhere", "data/../../x", "."])

@@ -42,6 +42,9 @@ def test_from_the_command_line(tmp_path, monkeypatch):
     assert done.exit_code == 0, done.output
     assert "quickstart.yaml" in done.output
     assert (tmp_path / "data" / "agarose_synthetic.csv").is_file()
+    first, _ = (tmp_path / "quickstart.yaml").read_text().split("\n", 1)
+    assert first == "# yaml-language-server: $schema=en4dvar.schema.json"
+    assert (tmp_path / "en4dvar.schema.json").read_bytes() == (ROOT / "configs" / "en4dvar.schema.json").read_bytes()
     for again in (["init", "--example", "quickstart"], ["init", "--example", "quickstart", "--data", "x.csv"]):
         refused = CliRunner().invoke(main, again)
         assert refused.exit_code == 2
