@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from en4dvar.ensemble.batch import Batch
-from en4dvar.executor.limits import TimeLimitError, has_time_limit, time_limit
+from en4dvar.executor.limits import TimeLimitError, has_time_limit, within_time_limit
 from en4dvar.forward import Failure, ForwardModel, Trajectory
 from en4dvar.state import Array
 
@@ -34,8 +34,7 @@ def run_chunk(model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
     if has_time_limit() and len(x) > model.batch:
         return _by_batch(model, x, times)
     try:
-        with time_limit():
-            outcomes = kept(model.trajectories(x, times))
+        outcomes = within_time_limit(lambda: kept(model.trajectories(x, times)))
         reason = f"the model returned {len(outcomes)} trajectories for {len(x)} members"
     except (Exception, TimeLimitError) as error:  # a model may fail in any way; the reason is kept
         outcomes, reason = [], describe(error)

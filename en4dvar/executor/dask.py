@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from en4dvar.executor.base import ATTEMPTS_ALONE, Executor, ExecutorError, Hear, T, WorkerLostError
+from en4dvar.executor.base import Executor, ExecutorError, Hear, T, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
 
@@ -116,11 +116,8 @@ class DaskExecutor(Executor):
                 else:
                     yield i, value
             for i, call in suspects:  # several workers died under it; calls around it may have been the reason
-                for _ in range(ATTEMPTS_ALONE):
-                    submit(i, call)
-                    *_, value = ended()
-                    if not isinstance(value, WorkerLostError):
-                        break
+                submit(i, call)
+                *_, value = ended()
                 yield i, value
         finally:
             self._listening.pop(name, None)

@@ -1,14 +1,15 @@
 """What a forward model may take in a worker process: time for a batch of members, memory for the process.
 
-A batch past its time is interrupted by an alarm, as Ctrl-C would; where its code never returns to the interpreter (a
-compiled loop), or where the call is not in the main thread of its process (dask), the process is ended instead. Memory
-is the size of the data segment (Linux) beyond what the process had at its start; an allocation past it raises
-MemoryError, or ends a process whose compiled code does not check. Either way the members have failed, with the reason,
-and the run goes on. Other executors share the process of the run, which cannot be ended: they know no limits.
+A batch past its time is interrupted, as Ctrl-C would; where its code never returns to the interpreter (a compiled loop;
+on dask, where calls are not in the main thread, also a system call), the process is ended instead. Memory is the size
+of the data segment (Linux) beyond what the process had at its start; an allocation past it raises MemoryError, or ends
+a process whose compiled code does not check. Either way the members have failed, with the reason, and the run goes on.
+Other executors share the process of the run, which cannot be ended: they know no limits.
 """
 
 from __future__ import annotations
 
+import ctypes
 import faulthandler
 import os
 import re
@@ -16,12 +17,12 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+T = TypeVar("T")
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30, "Ti": 2**40}
 _BYTES = re.compile(r"\s*(\d+(?:\.\d+)?)\s*(k|M|G|T|Ki|Mi|Gi|Ti)?B\s*")
 
@@ -89,28 +90,66 @@ def has_time_limit() -> bool:
     return _limits.seconds is not None
 
 
-@contextmanager
-def time_limit() -> Iterator[None]:
-    """Around one batch. Raises :class:`TimeLimitError` past the limit, or ends the process after twice the time."""
+def within_time_limit(batch: Callable[[], T]) -> T:
+    """What ``batch()`` returns. Raises :class:`TimeLimitError` past the limit; past twice the time the process ends.
+
+    No context manager: an exception may come at any moment, in the manager's own ``__exit__`` too.
+    """
     seconds = _limits.seconds
     if seconds is None:
-        yield
-        return
-    alarm = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
-
-    def stop(*_: Any) -> None:
-        raise TimeLimitError(f"not done after {seconds:g} s")
-
-    _watch(time.monotonic() + (2 * seconds + 1 if alarm else seconds))
+        return batch()
+    by_signal = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+    alarm = _Signal() if by_signal else _ThreadException()
+    _watch(time.monotonic() + 2 * seconds + 1)
     try:
-        if alarm:
-            signal.signal(signal.SIGALRM, stop)
-            signal.setitimer(signal.ITIMER_REAL, seconds)
-        yield
+        try:
+            alarm.start(seconds)
+            return batch()
+        finally:
+            alarm.stop()
+    except TimeLimitError:
+        raise TimeLimitError(f"not done after {seconds:g} s") from None
     finally:
-        if alarm:
-            signal.setitimer(signal.ITIMER_REAL, 0)
+        alarm.stop()  # again, for the exception may have come while it was stopped; it comes once
         _watch(None)
+
+
+class _Signal:
+    """Raises :class:`TimeLimitError` in the main thread."""
+
+    def start(self, seconds: float) -> None:
+        self.armed = True
+        signal.signal(signal.SIGALRM, self._raise)
+        signal.setitimer(signal.ITIMER_REAL, seconds)
+
+    def _raise(self, *_: Any) -> None:
+        if self.armed:
+            raise TimeLimitError
+
+    def stop(self) -> None:
+        self.armed = False
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+class _ThreadException:
+    """Raises :class:`TimeLimitError` in the thread that starts it, as soon as that runs Python."""
+
+    def start(self, seconds: float) -> None:
+        self.armed, self.lock, self.thread = True, threading.Lock(), ctypes.c_ulong(threading.get_ident())
+        self.timer = threading.Timer(seconds, self._raise)
+        self.timer.daemon = True
+        self.timer.start()
+
+    def _raise(self) -> None:
+        with self.lock:
+            if self.armed:
+                ctypes.pythonapi.PyThreadState_SetAsyncExc(self.thread, ctypes.py_object(TimeLimitError))
+
+    def stop(self) -> None:
+        self.timer.cancel()
+        with self.lock:
+            self.armed = False
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(self.thread, None)  # set, but not raised yet
 
 
 def _watch(deadline: float | None) -> None:

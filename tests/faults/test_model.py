@@ -1,6 +1,8 @@
 """A forward model that fails in every way it can: the members are lost with their reason, the run is not."""
 
 import re
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from run_files import configuration
 from toy_config import write_toy
 
 from en4dvar.errors import ConfigError, TooFewMembersError
+from en4dvar.executor import limits
 from en4dvar.executor.limits import parse_bytes
 from en4dvar.runs.runner import run
 
@@ -52,8 +55,24 @@ def faulty(folder):
 )
 def test_only_the_faulty_members_are_lost(raising, tmp_path, monkeypatch, name):
     """Whatever a member does, the others are as they are where it raises an exception, and it is told why."""
+    check_losses(raising, tmp_path, monkeypatch, name, LIMITS.get(name, {"executor": "serial"}))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("hangs", marks=pytest.mark.fault("model-hangs")),
+        pytest.param("hangs_in_compiled_code", marks=[pytest.mark.slow, pytest.mark.long]),
+        pytest.param("allocates", marks=pytest.mark.fault("model-memory")),
+    ],
+)
+def test_limits_on_dask(raising, tmp_path, monkeypatch, name):
+    check_losses(raising, tmp_path, monkeypatch, name, {**LIMITS[name], "executor": "dask"})
+
+
+def check_losses(raising, tmp_path, monkeypatch, name, execution):
     monkeypatch.setenv("EN4DVAR_TEST_FAULT", name)
-    result = run(configuration(faulty(tmp_path), tmp_path / "run", **LIMITS.get(name, {"executor": "serial"})))
+    result = run(configuration(faulty(tmp_path), tmp_path / "run", **execution))
     reasons = result.sample_stats["prior_failure_reason"].values.ravel()
     stiff = result.prior["k"].values.ravel() > STIFF
     assert 0 < stiff.sum() < 4
@@ -62,6 +81,36 @@ def test_only_the_faulty_members_are_lost(raising, tmp_path, monkeypatch, name):
     assert result.sample_stats["active"].all()
     for key in ("A", "k"):
         assert np.array_equal(result.posterior[key], raising.posterior[key])
+
+
+@pytest.mark.parametrize("thread", [False, True], ids=["main thread", "another thread"])
+def test_a_time_limit_is_over_with_its_batch(monkeypatch, thread):
+    """Batches that end just when their time is up: interrupted or not, but never what comes after them."""
+    monkeypatch.setattr(limits, "_limits", limits.Limits(seconds=0.002))
+    monkeypatch.setattr(limits, "_watch", lambda _: None)  # which would end this process
+    reasons = set()
+
+    def batches():
+        for i in range(300):
+            end = time.perf_counter() + 0.0018 + 1e-6 * i
+            try:
+                limits.within_time_limit(lambda end=end: busy_until(end))
+            except limits.TimeLimitError as error:
+                reasons.add(str(error))
+            for _ in range(1000):
+                pass
+
+    if thread:
+        with ThreadPoolExecutor(1) as pool:
+            pool.submit(batches).result()
+    else:
+        batches()
+    assert reasons == {"not done after 0.002 s"}
+
+
+def busy_until(end):
+    while time.perf_counter() < end:
+        pass
 
 
 def test_a_limit_needs_a_process_to_end(tmp_path):
