@@ -54,11 +54,11 @@ class AssimilationSettings:
 
     ``step_tolerance`` is a length in posterior standard deviations, √(δwᵀAδw); ``cost_tolerance`` is relative to J,
     and absolute below J = 1. ``full`` takes the whole step or, where that raises J, none. ``starts`` prior members of
-    lowest J are compared by a descent from each (see :mod:`en4dvar.descent.start`). ``emulator`` spends a few hundred
-    more runs on how Gaussian the posterior is, where the members leave it open (see :mod:`en4dvar.sampling.shape`), and
-    on the guidance of ``refine: mcmc``; ``auto`` does so with compiled models. ES-MDA reads, besides ``members``,
-    ``sampling`` and ``min_active_fraction``, only ``mda_coefficients``, scaled so that Σ 1/α = 1, and ``mda_form``
-    (see :mod:`en4dvar.schemes.esmda`).
+    lowest J are compared by a descent from each, then others as long as none explains the data (see
+    :mod:`en4dvar.descent.start`). ``emulator`` spends a few hundred more runs on how Gaussian the posterior is, where
+    the members leave it open (see :mod:`en4dvar.sampling.shape`), and on the guidance of ``refine: mcmc``; ``auto``
+    does so with compiled models. ES-MDA reads, besides ``members``, ``sampling`` and ``min_active_fraction``, only
+    ``mda_coefficients``, scaled so that Σ 1/α = 1, and ``mda_form`` (see :mod:`en4dvar.schemes.esmda`).
     """
 
     scheme: Literal["en4dvar", "es-mda"] = "en4dvar"

@@ -255,7 +255,7 @@ _WORDS = {
     "epsilon": "Size of the bundle, in prior standard deviations.",
     "step_control": "What keeps J from rising along the iterations.",
     "start": "Where the iterations start: the prior members of lowest J, or the prior mean.",
-    "starts": "How many prior members of lowest J start a descent; the best end is kept.",
+    "starts": "How many prior members of lowest J start a descent; others follow while none explains the data.",
     "max_iterations": "Iteration limit.",
     "step_tolerance": "Converged where the step is shorter than this, in posterior standard deviations.",
     "cost_tolerance": "Converged where J falls by less than this, relative to J (absolute below J = 1).",

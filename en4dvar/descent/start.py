@@ -2,7 +2,8 @@
 
 J of a strongly nonlinear model has several minima. The descents go side by side, so each costs r + 5 or so runs an
 iteration (see :mod:`en4dvar.descent.weight_space`), and stop as soon as they tell: converged roughly, or close to
-another one. The lowest is not descended again: its moves are the first iterations of the assimilation.
+another one. The lowest is not descended again: its moves are the first iterations of the assimilation. Where even that
+J is higher than noise and prior explain, other members are tried, as many again and again while there are some left.
 """
 
 from __future__ import annotations
@@ -50,11 +51,26 @@ def choose_start(space: WeightSpace, run: Forecast) -> Start:
         warnings = (caution("start-moved", words),)
     best = np.argsort(costs, kind="stable")
     affordable = n_members // (space.basis.shape[1] + 1) if space.economical else 1
-    chosen = [candidates[i] for i in best[: min(space.settings.starts, affordable)] if np.isfinite(costs[i])]
-    if len(chosen) < 2:
+    starts = [candidates[i] for i in best[:affordable] if np.isfinite(costs[i])]
+    together = min(space.settings.starts, len(starts))
+    if together < 2:
         return Start(candidates[best[0]], (), warnings)
-    lowest = lowest_basin(space, chosen)
+    lowest = Scout(starts[0])
+    for first in range(0, len(starts), together):
+        lowest = min(lowest, lowest_basin(space, starts[first : first + together]), key=lambda scout: scout.cost)
+        if lowest.cost <= highest_plausible(space):
+            break
     return Start(lowest.w, tuple(lowest.path), warnings)
+
+
+def highest_plausible(space: WeightSpace) -> float:
+    """The 99.95 % point of J at its minimum where model, prior and R are right: 2 J is χ²_K then (Talagrand 1999).
+
+    To first order: with a noise scale or timing errors J also holds Σ β ln(s/std), and other members are tried earlier.
+    """
+    weights = space.problem.observations.weights
+    used = weights[weights > 0]
+    return 0.5 * float(np.mean(used)) * diag.chi2_interval(len(used))[1] if len(used) else np.inf
 
 
 @dataclass
@@ -70,7 +86,7 @@ class Scout:
 def lowest_basin(space: WeightSpace, starts: list[Array]) -> Scout:
     """The descent from one of the starts (N,) that reaches the lowest J."""
     scouts = [Scout(w) for w in starts]
-    transform = np.eye(len(space.members))
+    transform, plausible = np.eye(len(space.members)), highest_plausible(space)
     for _ in range(space.settings.max_iterations):
         going = [scout for scout in scouts if scout.active]
         if not going:
@@ -88,7 +104,7 @@ def lowest_basin(space: WeightSpace, starts: list[Array]) -> Scout:
             scout.active = max(at.cost - move.cost, at.step.predicted_decrease) > small
             scout.w, scout.cost = move.w, move.cost
             scout.path.append((at, move))
-        if len(going) == 1 and going[0].cost <= min(scout.cost for scout in scouts):
+        if len(going) == 1 and going[0].cost <= min(*(scout.cost for scout in scouts), plausible):
             break  # it can only go lower: the comparison is decided
     return min(scouts, key=lambda scout: scout.cost)
 

@@ -11,8 +11,10 @@ from en4dvar.descent.step_control import Point, Tangent, Trials, acceleration, l
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.linalg import Hessian
 from en4dvar.executor import SerialExecutor
+from en4dvar.prior import PriorTerm
 from en4dvar.problem import AssimilationSettings
 from en4dvar.schemes import Step, Weights
+from en4dvar.state import Parameter
 
 
 @pytest.mark.parametrize("time_std", [0.0, 0.05])
@@ -120,6 +122,30 @@ def test_three_starts_find_the_lowest_of_many_minima(seed):
     assert ends[3] < reference + 0.01
     if seed == 1:
         assert ends[1] > reference + 1  # the member of lowest J lies in the wrong basin
+
+
+class Ridge(Toy):
+    """y = (a + 2 sin 3a) t: where the factor falls short of the data's it has a maximum, a false minimum of J."""
+
+    def curve(self, theta, t):
+        return float(self.rate(theta, t) * t)
+
+    def rate(self, theta, t):
+        return float(theta[0] + 2 * np.sin(3 * theta[0]))
+
+
+@pytest.mark.parametrize("seed", [1, 11, 12, 13])
+def test_where_no_start_explains_the_data_others_are_tried(seed, monkeypatch):
+    prior = (PriorTerm.normal(Parameter("a", "m"), 4.8, 0.6),)
+    problem = make_problem(Ridge(("a",)), [6.42], std=0.02, seed=seed, prior=prior)
+    settings = AssimilationSettings(members=16)
+    more = assimilate(problem, settings, seed)
+    assert more.converged
+    assert more.iterations[-1].centre == pytest.approx([6.42], abs=0.003)
+    monkeypatch.setattr("en4dvar.descent.start.highest_plausible", lambda space: np.inf)
+    two = assimilate(problem, settings, seed)
+    assert two.iterations[-1].centre == pytest.approx([4.77], abs=0.01)  # the maximum of the factor
+    assert two.forward_runs < more.forward_runs
 
 
 class Remembering(Decay):
