@@ -15,6 +15,7 @@ from en4dvar.config.validate import check
 from en4dvar.errors import Fault
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.inputs.readers import Column, Format, Step
+from en4dvar.inputs.text_table import Decimal
 from en4dvar.inputs.units import UnitError, convert, parse_quantity
 from en4dvar.inputs.window import Instant, parse_instant
 
@@ -30,6 +31,7 @@ class DataPlan:
     base: Path
     paths: tuple[str, ...]
     format: Format | None
+    decimal: Decimal
     observable: Observable
     time: Column | Step
     value: Column
@@ -70,7 +72,7 @@ def read_data(
     if start is None or end is None or prominence is None or zero is None:
         return None
     paths = (raw.path,) if isinstance(raw.path, str) else raw.path
-    return DataPlan(base, paths, raw.format, observable, time, value, start, end, prominence, zero, error)
+    return DataPlan(base, paths, raw.format, raw.decimal, observable, time, value, start, end, prominence, zero, error)
 
 
 def _observable(

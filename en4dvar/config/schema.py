@@ -107,6 +107,8 @@ class Data(Section):
     """A data file, a folder, a pattern such as data/*.csv, or a list of them; relative to this file's folder."""
     format: Literal["csv", "mat"] | None = None
     """Format of the files; default: by their suffix."""
+    decimal: Literal[".", ","] = "."
+    """Decimal sign of the numbers in a CSV file."""
     columns: dict[str, Any]
     """Which columns hold the time and the observable, each with its unit: ``time: {name: t, unit: us}``."""
     window: Window = Window()

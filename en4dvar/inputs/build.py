@@ -117,7 +117,7 @@ def _unique_names(paths: list[Path]) -> list[str]:
 
 def read_observations(plan: DataPlan, path: Path, name: str, weights: str = "sum") -> Observations:
     """The observations (y, t, R) of one file inside the window. Raises :class:`DataError`."""
-    series = read_series(path, plan.time, plan.value, plan.format)
+    series = read_series(path, plan.time, plan.value, plan.format, plan.decimal)
     try:
         window = select(series.times, series.values, plan.start, plan.end, plan.prominence)
     except DataError as error:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 if TYPE_CHECKING:
+    from en4dvar.inputs.readers import Contents
+    from en4dvar.inputs.text_table import Decimal
     from en4dvar_bubble.starter.proposal import Proposal
 
 _TIME = re.compile(r"(?i)t|time|t[ _(\[].*|time[ _(\[].*")
@@ -109,13 +111,12 @@ class _Asked:
 def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
     """Columns and units for ``propose_config``: by option, by a telling name, or asked for."""
     from en4dvar.inputs.build import find_files
-    from en4dvar.inputs.readers import read_contents
     from en4dvar.inputs.units import convert
 
-    first = next(iter(find_files(Path.cwd(), [data]).values()))
-    contents = read_contents(first)
+    first, contents, decimal = _first_with_columns(list(find_files(Path.cwd(), [data]).values()))
     shown = {name: f"{len(v)} values, {_range(v)}" for name, v in contents.columns.items()}
-    click.echo(f"{first}: {'; '.join(f'{name} ({words})' for name, words in shown.items())}", err=True)
+    commas = ", decimal commas" if decimal == "," else ""
+    click.echo(f"{first}{commas}: {'; '.join(f'{name} ({words})' for name, words in shown.items())}", err=True)
     time, radius, missing = _columns(asked, shown)
     time_unit, radius_unit = asked.time_unit, asked.radius_unit
     if _interactive():
@@ -125,12 +126,32 @@ def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
             time = time or _ask_column("times", shown)
             time_unit = time_unit or _ask_unit(time, shown, "s", "us, ms or s")
         radius_unit = radius_unit or _ask_unit(radius, shown, "m", "um, mm or m")
-    _require(missing, time_unit, radius_unit, asked, first, shown)
+    _require(missing, time_unit, radius_unit, asked, first, shown, contents.others)
     convert(1.0, str(radius_unit), "m")
     if asked.time_step is not None:
-        return {"radius": (radius, radius_unit), "time_step": asked.time_step}
+        return {"radius": (radius, radius_unit), "time_step": asked.time_step, "decimal": decimal}
     convert(1.0, str(time_unit), "s")
-    return {"radius": (radius, radius_unit), "time": (time, time_unit)}
+    return {"radius": (radius, radius_unit), "time": (time, time_unit), "decimal": decimal}
+
+
+def _first_with_columns(files: Sequence[Path]) -> tuple[Path, Contents, Decimal]:
+    """The first file that holds columns of numbers, and its decimal sign. Raises :class:`DataError`: there is none."""
+    from en4dvar.errors import DataError
+    from en4dvar.inputs.readers import read_contents
+
+    faults: list[str] = []
+    for file in files:
+        try:
+            contents, with_commas = (read_contents(file, decimal=sign) for sign in (".", ","))
+        except DataError as error:
+            faults.append(str(error))
+            continue
+        if len(with_commas.columns) > len(contents.columns):
+            return file, with_commas, ","
+        if contents.columns:
+            return file, contents, "."
+        faults.append(next(iter(contents.others.values()), f"{file}: no column holds numbers"))
+    raise DataError("\n".join(faults))
 
 
 def _columns(asked: _Asked, shown: Mapping[str, str]) -> tuple[str | None, str | None, list[str]]:
@@ -160,6 +181,7 @@ def _require(
     asked: _Asked,
     path: Path,
     shown: Mapping[str, str],
+    others: Mapping[str, str],
 ) -> None:
     """Raise one error that names every option to add."""
     needed = list(missing)
@@ -169,7 +191,8 @@ def _require(
         from en4dvar.errors import ConfigError
 
         columns = ", ".join(shown) or "none"
-        raise ConfigError(f"{path}: columns with numbers: {columns}; units are never guessed: add {', '.join(needed)}")
+        message = f"{path}: columns with numbers: {columns}; units are never guessed: add {', '.join(needed)}"
+        raise ConfigError("\n".join([*(others.values() if missing else ()), message]))
 
 
 def _interactive() -> bool:

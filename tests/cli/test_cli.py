@@ -165,7 +165,7 @@ BAD: dict[str, tuple[Callable[[Path], list[str | Path]], str]] = {
     "negative prior std": (replaced("std: 1 %", "std: -1 um"), "toy.yaml:13:42: parameters.A.std: must be positive"),
     "empty data": (with_data(""), "toy.csv: the file holds no data"),
     "all NaN": (with_data(HEAD + "0,nan\n1,nan\n2,nan\n3,\n"), "toy.csv: 'x_um' holds no usable value"),
-    "non-monotone": (with_data(HEAD + "0,1\n2,1\n1,1\n3,1\n"), "toy.csv: times must increase"),
+    "non-monotone": (with_data(HEAD + "0,1\n2,1\n1,1\n3,1\n"), "toy.csv:4: times must increase"),
     "few observations": (with_data(HEAD + "0,1\n1,1\n"), "toy.csv: 2 usable observations; at least 3"),
     "unknown law": (replaced("mass: 2 g", "law: cubik"), "toy.yaml:11:8: model.law: 'cubik' is not one of"),
     "no prior": (replaced("  A: {prior: normal, mean: maximum, std: 1 %}\n", ""), "toy.yaml:12:1: parameters.A: "),

@@ -237,8 +237,18 @@ def test_a_folder_is_a_campaign_and_its_odd_file_is_named(tmp_path: Path) -> Non
     done = call("init", "--data", folder, *UNITS, "--force")
     assert done.exit_code == 2
     assert "suggest different starts (acoustic: other; laser: b1, b2); say --start" in done.stderr
+    (folder / "another.csv").write_text("")  # first of the folder, and empty
     (folder / "other.csv").write_text("a,b\n1,2\n")
-    assert "other.csv: no column" in call("init", "--data", folder, *UNITS, "--force").stderr
+    done = call("init", "--data", folder, *UNITS, "--force")
+    assert done.exit_code == 0, done.output  # as in a campaign: what cannot be used is named and ends nothing
+    assert "other.csv: no column" in done.stderr
+    assert "another.csv: the file holds no data" in done.stderr
+    assert Path("gel_one.yaml").read_text().count("# MIND: ") == 2
+    for n in (1, 2):
+        (folder / f"b{n}.csv").unlink()
+    done = call("init", "--data", folder, *UNITS, "--force")
+    assert done.exit_code == 2
+    assert done.stderr.count("other.csv: ") == 2
 
 
 def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
@@ -246,6 +256,60 @@ def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert "are the units of both columns right?" in done.stderr
     assert "# MIND: the collapse takes" in Path("b.yaml").read_text()
+    done = call("init", "--data", "b.csv", "--time-unit", "s", "--radius-unit", "m", "--force")  # both, by as much
+    assert "no bubble has such a radius; are the units of both columns right?" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("header", "options", "told"),
+    [
+        ("t_us,R [mm]", UNITS, ["the name of column 'R [mm]' says mm, but its unit is given as um"]),
+        ("time (ms),R_um", UNITS, ["the name of column 'time (ms)' says ms, but its unit is given as us"]),
+        ("frame,R_um", UNITS, ["'frame' seems to count frames; then give --time-step"]),
+        ("t_us,D_um", UNITS, ["'D_um' seems to hold diameters"]),
+        ("t_us,radius_px", UNITS, ["'radius_px' seems to hold pixels"]),
+        ("t_us,R_um", UNITS, []),
+        ("Time (µs),R [µm]", UNITS, []),
+        ("t,radius at equator", UNITS, []),
+    ],
+)
+def test_a_name_that_says_something_else_is_noticed(
+    tmp_path: Path, header: str, options: tuple[str, ...], told: list[str]
+) -> None:
+    text = write(tmp_path / "b.csv").read_text()
+    Path("b.csv").write_text(text.replace("t_us,R_um", header), encoding="utf-8")
+    time, radius = header.split(",")
+    done = call("init", "--data", "b.csv", *options, "--time-column", time, "--radius-column", radius)
+    assert done.exit_code == 0, done.output
+    doubts = [line for line in done.stderr.splitlines() if "seems to" in line or "the name of column" in line]
+    assert len(doubts) == len(told)
+    assert all(words in doubts[0] for words in told)
+
+
+def test_decimal_commas_are_noticed(tmp_path: Path) -> None:
+    text = write(tmp_path / "b.csv").read_text().replace(",", ";").replace(".", ",")
+    Path("b.csv").write_text(text)
+    done = call("init", "--data", "b.csv", *UNITS)
+    assert done.exit_code == 0, done.output
+    assert "b.csv, decimal commas: t_us (60 values, 0 to 41.3)" in done.stderr
+    config = proposed(Path("b.yaml"))
+    assert config.document.data["data"]["decimal"] == ","
+    assert build(config)[0].observations.values.max() == pytest.approx(195e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t,R\nus,um\n0,1\n", "b.csv:2: 'us' in column 't' is not a number; if this is no reading, put # before"),
+        ("t,R\n", "b.csv: no line follows the header"),
+    ],
+)
+def test_without_a_column_of_numbers_the_reason_is_told(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "b.csv").write_text(text)
+    done = call("init", "--data", "b.csv", *UNITS)
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert "columns with numbers" not in done.stderr
 
 
 @pytest.mark.parametrize("start", ["acoustic", "laser"])

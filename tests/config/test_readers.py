@@ -47,16 +47,25 @@ def test_csv_dialects(tmp_path: Path, text: str) -> None:
     [
         ("t,r\n0,1\n1,2\n2,3\n", "no column 'R'; the columns are: t, r"),
         ("t,R,R\n0,1,1\n", "more than one column 'R'"),
-        ("0,1\n1,2\n2,3\n", "the first line must name the columns"),
+        (
+            "0,1\n1,2\n2,3\n",
+            "the first line must name the columns, but it holds numbers; put a line such as 't_us,R_um'",
+        ),
         ("t,R\n0,1\n1,abc\n2,3\n", "a.csv:3: 'abc' in column 'R' is not a number"),
-        ("t;R\n0;1\n1;2,5\n2;3\n", "a.csv:3: '2,5' in column 'R' is not a number; write a decimal point"),
+        (
+            "t;R\n0;1\n1;2,5\n2;3\n",
+            "a.csv:3: '2,5' in column 'R' is not a number; write a decimal point, or data.decimal: ','",
+        ),
         ("t,R\n0,1\n1,2,5\n2,3\n", "a.csv:3: 3 cells, but the header names 2 columns"),
         ("t,R\n0,nan\n1,\n2,NA\n", "'R' holds no usable value"),
         ("t,R\n", "no data"),
         ("", "the file holds no data"),
         ("# only this\n", "the file holds no data"),
-        ("t,R\n0,1\n2,2\n1,3\n", "times must increase, but usable sample 2 at 2e-06 is followed by 1e-06"),
-        ("t,R\n0,1\n0,2\n1,3\n", "times must increase"),
+        ("t,R\n0,1\n# x\n2,2\n1,3\n", "a.csv:5: times must increase, but 1 us follows 2 us\n"),
+        ("t,R\n0,1\n0,2\n1,3\n", "a.csv:3: times must increase, but 0 us follows 0 us; keep one of the two"),
+        ("t,R\n1,1\n2,2\n3,3\n1,1\n", "a.csv:5: times must increase, but 1 us follows 3 us; if another bubble begins"),
+        ("Camera,X\n\nt,R\n0,1\n", "no column 'R'; the columns are: Camera, X; line 3 names it: put # before"),
+        ("t,R\nus,um\n0,1\n1,2\n", "a.csv:2: 'um' in column 'R' is not a number; if this is no reading, put # before"),
         ("t,R\n0,1\n1,2\n", "2 usable observations; at least 3"),
         ("t,R\n0,1\n1,inf\n2,3\n", "infinite"),
     ],
@@ -64,8 +73,30 @@ def test_csv_dialects(tmp_path: Path, text: str) -> None:
 def test_bad_csv(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(DataError) as error:
         csv(tmp_path, text)
-    assert message in str(error.value)
+    assert message in f"{error.value}\n"
     assert str(tmp_path / "a.csv") in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "text", ["t;R\n0;1,5\n,5;2,5\n1;3\n", "t\tR\n0,0\t1,5\n0.5\t2,5\n1,0\t3\n", 't,R\n"0","1,5"\n"0,5","2,5"\n1,3\n']
+)
+def test_decimal_commas_are_read_where_it_is_said(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(text, encoding="utf-8")
+    series = read_series(path, TIME, RADIUS, decimal=",")
+    assert series.times.tolist() == [0.0, 0.5e-6, 1e-6]
+    assert series.values.tolist() == [1.5e-6, 2.5e-6, 3e-6]
+    path.write_text("t;R\n0;1.000,5\n", encoding="utf-8")
+    with pytest.raises(DataError, match=r"a\.csv:2: '1\.000,5' in column 'R' is not a number$"):
+        read_series(path, TIME, RADIUS, decimal=",")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+@pytest.mark.parametrize("asked", ["Größe [\u00b5m]", "Größe [\u03bcm]", "Gro\u0308ße [\u00b5m]"])
+def test_text_of_windows_and_names_that_look_alike(tmp_path: Path, encoding: str, asked: str) -> None:
+    path = tmp_path / "a.txt"
+    path.write_bytes("t;Größe [\u00b5m]\r\n0;1\r\n1;2\r\n2;3\r\n".encode(encoding))
+    assert read_series(path, TIME, Column(asked, "um", "m")).values.tolist() == [1e-6, 2e-6, 3e-6]
 
 
 def test_file_not_there(tmp_path: Path) -> None:
@@ -77,9 +108,12 @@ def test_file_not_there(tmp_path: Path) -> None:
     (tmp_path / "a.xlsx").write_text("")
     with pytest.raises(DataError, match=r"suffix '\.xlsx'"):
         read_series(tmp_path / "a.xlsx", TIME, RADIUS)
-    (tmp_path / "b.csv").write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(DataError, match="not a text file"):
-        read_series(tmp_path / "b.csv", TIME, RADIUS)
+    with pytest.raises(DataError, match="save the sheet as CSV"):
+        read_series(tmp_path / "a.xlsx", TIME, RADIUS)
+    for binary in (b"\xff\xfe\x00\xd8", b"\x89PNG\r\n\x1a\n\x00\x00", b"t,R\n\x00\x01\n", b"t,R\n\x81\n"):
+        (tmp_path / "b.csv").write_bytes(binary)
+        with pytest.raises(DataError, match="not a text file"):
+            read_series(tmp_path / "b.csv", TIME, RADIUS)
 
 
 @pytest.mark.parametrize("shape", [(1, -1), (-1, 1)])
@@ -104,10 +138,20 @@ def test_mat_time_step(tmp_path: Path) -> None:
 
 
 def test_bad_mat(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="field 'R' is not in the file; the vectors are: Rnew, t"):
+    told = r"field 'R' is not in the file; the vectors are: Rnew, t; no vectors: image \(an array of 3 x 3\)"
+    with pytest.raises(DataError, match=told):
         mat(tmp_path, Rnew=np.ones(4), t=np.arange(4.0), image=np.ones((3, 3)))
-    with pytest.raises(DataError, match="field 'R' is not a row or column of real numbers"):
-        mat(tmp_path, R=np.ones((2, 2)), t=np.arange(4.0))
+    for value, words in (
+        (np.ones((2, 2)), "an array of 2 x 2"),
+        ({"R": np.ones(3)}, "a struct"),
+        (np.array([np.ones(3), np.ones(2)], dtype=object), "a cell array"),
+        ("radius", "text"),
+        (1j * np.ones(3), "complex"),
+    ):
+        with pytest.raises(DataError, match=f"field 'R' is {words}, not a row or column of real numbers; .* are: t$"):
+            mat(tmp_path, R=value, t=np.arange(4.0))
+    with pytest.raises(DataError, match="'R' is empty"):
+        mat(tmp_path, R=np.ones((0, 0)), t=np.ones((0, 0)))
     with pytest.raises(DataError, match="5 times but 4 values of 'R'"):
         mat(tmp_path, R=np.ones(4), t=np.arange(5.0))
     with pytest.raises(DataError, match="no usable value"):

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from en4dvar.inputs.text_table import Decimal
 from en4dvar_bubble.starter.proposal import Entry, Proposal
 
 SCHEMA_FILE = "en4dvar.schema.json"
@@ -22,6 +23,7 @@ class Source:
     time: tuple[str, str] | None
     time_step: str | None
     radius: tuple[str, str]
+    decimal: Decimal = "."
 
     @property
     def time_entry(self) -> str:
@@ -56,6 +58,7 @@ def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> st
         "seed: 1 # the same seed gives the same bits",
         "data:",
         f"  path: {quoted(source.path)}",
+        *(['  decimal: ","'] if source.decimal == "," else []),
         "  columns:",
         f"    time: {source.time_entry}",
         f"    radius: {source.radius_entry}",

@@ -29,6 +29,7 @@ GAS_FRACTION = 0.12  # R_eq/R_max of laser-induced bubbles, where no radius at r
 WIDTHS = {"G": (1.0, 1.5), "mu": (0.7, 1.2)}  # bounds of the log_std of a guess
 SAME_CLOCK = 2e-6  # s: what a first guess can be off by
 PLAUSIBLE = (0.3, 2.0)  # collapse time over Rayleigh's
+BUBBLES = (1e-7, 0.1)  # m: between these radii
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,8 @@ def propose(
     warnings = [doubt] * (not seen.clear)
     if not PLAUSIBLE[0] < ratio < PLAUSIBLE[1]:
         warnings.append(f"the collapse takes {ratio:.3g} of the Rayleigh time; are the units of both columns right?")
+    elif not BUBBLES[0] < seen.lobe.R_max < BUBBLES[1]:
+        warnings.append("no bubble has such a radius; are the units of both columns right?")
     elif guess.far:
         warnings.append(
             f"no G and mu of {model.law.name} give this {'R_max and ' if chosen == 'acoustic' else ''}collapse time: "
