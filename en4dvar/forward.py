@@ -143,8 +143,9 @@ class ForwardModel(ABC):
     sequential schemes may start ``trajectories`` at any instant, where otherwise they repeat ``step``. ``validity``
     names quantities and the limits beyond which the equations do not hold.
 
-    To be usable from YAML a model class also has ``Settings`` (a pydantic model of its ``model:`` section) and
-    ``from_settings``.
+    A model that has settings in YAML also has ``Settings`` (a pydantic model of its ``model:`` section) and
+    ``from_settings``; without them the class is called without arguments. In a sequence, parameters that the state
+    carries are fields with their names: RMSE and spread are over the others.
     """
 
     parameters: tuple[Parameter, ...]
@@ -191,7 +192,7 @@ class ForwardModel(ABC):
 
     def _march(self, x: Array, times: Array) -> Trajectory | Failure:
         states = np.empty((len(times), self.layout.size))
-        t = 0.0
+        x, t = np.array(x, dtype=float), 0.0  # a step may work in place; the ensemble stays as it is
         for k, t_next in enumerate(times):
             if t_next != t:
                 try:

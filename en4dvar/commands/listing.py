@@ -6,7 +6,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from en4dvar.commands.describe import table
-from en4dvar.config.models import GROUP, find_model
+from en4dvar.config.models import GROUP, build_model, find_model, settings_of
 from en4dvar.errors import En4dvarError
 
 
@@ -24,11 +24,12 @@ def _description(name: str) -> str:
     except En4dvarError as error:
         return f"{name}: {error}"
     title = (kind.__doc__ or "").strip().split("\n", 1)[0]
-    needed = [field for field, info in kind.Settings.model_fields.items() if info.is_required()]
-    options = ", ".join(kind.Settings.model_fields)
+    settings = settings_of(kind)
+    needed = [field for field, info in settings.model_fields.items() if info.is_required()]
+    options = ", ".join(settings.model_fields)
     if needed:
         return f"{name}: {title}\n  parameters depend on settings without default: {', '.join(needed)}"
-    model = kind.from_settings(kind.Settings())
+    model = build_model(kind, settings())
     rows = [("  observable", "unit", "", "")]
     rows += [(f"  {o.name}", o.display_unit, "", o.label) for o in model.observables]
     rows += [("  parameter", "unit", "bounds", "")]

@@ -112,6 +112,8 @@ def _run_twin(config: TwinConfig, force: bool, resume: bool) -> None:
     if result.run.failures:
         lost = f"{len(result.run.failures)} of {config.experiment.members} members lost"
         click.echo(f"warning: {config.name}: {lost}, the last: {result.run.failures[-1]}", err=True)
+    for warning in result.warnings:
+        click.echo(f"warning: {config.name}: {warning}", err=True)
     click.echo(f"result: {config.directory / 'twin.nc'}")
     if config.report:
         click.echo(f"report: {config.directory / 'report.html'}")

@@ -17,7 +17,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from en4dvar.config import schema, synthetic, twin
-from en4dvar.config.models import GROUP, find_model
+from en4dvar.config.models import GROUP, find_model, settings_of
 from en4dvar.errors import En4dvarError
 from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Parameter
 
@@ -107,7 +107,7 @@ def _models(definitions: Json) -> Iterator[tuple[str, str]]:
             kind: Any = find_model(name)
         except En4dvarError:
             continue
-        settings = _of(kind.Settings)
+        settings = _of(settings_of(kind))
         settings["properties"] = {
             "name": {"const": name, "description": "Name of the model."},
             **settings["properties"],
@@ -119,8 +119,9 @@ def _models(definitions: Json) -> Iterator[tuple[str, str]]:
 
 def _possible_parameters(kind: Any) -> tuple[Parameter, ...]:
     """Every parameter that a model may have; where they depend on its settings, these tell."""
-    if hasattr(kind.Settings, "possible_parameters"):
-        return tuple(kind.Settings.possible_parameters())
+    settings: Any = settings_of(kind)
+    if hasattr(settings, "possible_parameters"):
+        return tuple(settings.possible_parameters())
     fixed = getattr(kind, "parameters", ())
     return fixed if isinstance(fixed, tuple) else ()
 

@@ -8,15 +8,21 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict
 
 from en4dvar.commands.hints import suggest
 from en4dvar.config.document import Document
 from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, En4dvarError, Fault
-from en4dvar.forward import ForwardModel
+from en4dvar.forward import ForwardModel, StateField
 
 GROUP = "en4dvar.models"
+
+
+class NoSettings(BaseModel):
+    """The ``model:`` section of a class without ``Settings``: the name alone."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def find_model(name: str) -> type[ForwardModel]:
@@ -35,9 +41,37 @@ def find_model(name: str) -> type[ForwardModel]:
         raise ConfigError(f"model {name!r} cannot be loaded: {error}") from error
     if not (isinstance(found, type) and issubclass(found, ForwardModel)):
         raise ConfigError(f"{name!r} is not a subclass of en4dvar.ForwardModel")
-    if not hasattr(found, "Settings") or not hasattr(found, "from_settings"):
-        raise ConfigError(f"{name!r} cannot be used from YAML: it lacks Settings and from_settings")
+    if hasattr(found, "Settings") != hasattr(found, "from_settings"):
+        lacking = "from_settings" if hasattr(found, "Settings") else "Settings"
+        raise ConfigError(
+            f"{name!r} cannot be used from YAML: Settings and from_settings go together, it lacks {lacking}"
+        )
     return found
+
+
+def settings_of(kind: type[ForwardModel]) -> type[BaseModel]:
+    """What the ``model:`` section of a class may say besides its name."""
+    settings: type[BaseModel] = getattr(kind, "Settings", NoSettings)
+    return settings
+
+
+def build_model(kind: type[ForwardModel], settings: BaseModel) -> ForwardModel:
+    """The model of validated settings. Raises :class:`ConfigError` where the class does not fit together."""
+    try:
+        model: ForwardModel = kind.from_settings(settings) if hasattr(kind, "from_settings") else kind()
+    except TypeError as error:
+        if hasattr(kind, "from_settings"):
+            raise
+        raise ConfigError(f"{error}; a class that takes arguments needs Settings and from_settings") from error
+    for observable in model.observables:
+        if isinstance(observable.operator, StateField):
+            for field in (observable.operator.name, observable.operator.rate_of):
+                if field is not None and field not in model.layout.names:
+                    raise ConfigError(
+                        f"the observable {observable.name!r} reads {field!r}, which is not in the layout"
+                        f"{suggest(field, model.layout.names)}"
+                    )
+    return model
 
 
 def read_model(
@@ -57,11 +91,11 @@ def read_model(
         faults.append(document.fault(("model", "name"), str(error)))
         return None
     options = {key: value for key, value in raw.items() if key != "name"}
-    settings: BaseModel | None = check(kind.Settings, options, ("model",), document, faults, {"base": base})
+    settings: BaseModel | None = check(settings_of(kind), options, ("model",), document, faults, {"base": base})
     if settings is None:
         return None
     try:
-        model: ForwardModel = kind.from_settings(settings)
+        model = build_model(kind, settings)
     except (En4dvarError, ValueError) as error:
         faults.append(document.fault(("model",), str(error)))
         return None

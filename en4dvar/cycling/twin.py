@@ -31,6 +31,8 @@ from en4dvar.forward import Failure, ForwardModel, Observable
 from en4dvar.prior import Prior, member_stream
 from en4dvar.state import Array
 
+OVERCONFIDENT = 0.5  # spread over RMSE of an ensemble that has lost the truth
+
 
 @dataclass(frozen=True)
 class TwinExperiment:
@@ -97,6 +99,30 @@ class TwinResult:
         if self.experiment.sequential.scheme.lag:
             kinds["smoothed"] = self.run.smoothed
         return {name: self._score(moments) for name, moments in kinds.items()}
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What makes the scores say less than they seem to."""
+        found = []
+        fields, prior = self.experiment.model.layout, self.experiment.prior
+        names = np.array([f.name for f in fields for _ in range(f.size)])
+        hidden = [value for name, value in self.experiment.fixed.items() if name not in fields.names]
+        still = self.experiment.dynamic & (np.ptp(self.truth, axis=0) == 0)
+        if prior is None or {*prior.names} <= {*fields.names}:
+            still &= np.isin(self.truth[0], hidden)
+        if still.any():
+            found.append(
+                f"{still.sum()} variables of {', '.join(dict.fromkeys(names[still]))} never change and have the values "
+                "of parameters, but count in RMSE and spread; give each parameter in the state a field with its name"
+            )
+        score = self.scores["analysis"]
+        if score.mean_spread < OVERCONFIDENT * score.mean_rmse:
+            ratio = score.mean_spread / score.mean_rmse
+            found.append(
+                f"the spread of the analysis is {ratio:.2g} of its RMSE: the ensemble is far too sure of itself; give "
+                "more members, inflation or localisation"
+            )
+        return tuple(found)
 
     def _score(self, moments: Moments) -> Score:
         where, counted = self.experiment.dynamic, slice(self.experiment.burn_in, None)
@@ -175,6 +201,15 @@ def _initial(experiment: TwinExperiment, streams: list[np.random.Generator]) -> 
     if prior is not None:
         x = prior.mean + prior.std * np.array([stream.standard_normal(len(prior.terms)) for stream in streams])
         theta |= dict(zip(prior.names, prior.to_physical(x).T, strict=True))
-    states = np.asarray(model.initial_states(theta) if theta else [model.initial_state({})] * len(streams), dtype=float)
+    try:
+        states = np.array(
+            model.initial_states(theta) if theta else [model.initial_state({})] * len(streams), dtype=float
+        )
+    except Exception as error:  # a model may fail in any way
+        raise En4dvarError(f"the initial state cannot be made: {type(error).__name__}: {error}") from error
+    if states.shape != (len(streams), model.layout.size):
+        raise En4dvarError(
+            f"initial_state returned shape {states.shape[1:]}, but the layout has ({model.layout.size},)"
+        )
     std = np.concatenate([np.full(f.size, experiment.initial_std.get(f.name, 0.0)) for f in model.layout])
     return states + std * np.array([stream.standard_normal(model.layout.size) for stream in streams])

@@ -56,6 +56,7 @@ def write_twin_report(run_dir: Path) -> Path:
             scores=_scores(data),
             unit=_unit(data),
             figures=drawn,
+            warnings=[line for line in str(a.get("warnings", "")).split("\n") if line],
             lost=[reason for reason in str(a["members_lost_why"]).split("\n") if reason],
             provenance=[(key.replace("_", " "), str(a[key])) for key in PROVENANCE if str(a.get(key, ""))],
             configuration=str(a["configuration_resolved"]),

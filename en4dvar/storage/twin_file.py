@@ -76,6 +76,7 @@ def dataset(result: TwinResult, attributes: Mapping[str, Any]) -> xr.Dataset:
         "forward_runs": run.forward_runs,
         "members_lost": len(run.failures),
         "members_lost_why": "\n".join(run.failures),
+        "warnings": "\n".join(result.warnings),
         **attributes,
     }
     return xr.Dataset(variables, coordinates, root)

@@ -78,5 +78,8 @@ def test_sequences(capsys):
     assert analysis
     assert float(analysis[1]) < 0.45
     assert load_twin("twin.yaml").experiment.members == 10
-    runpy.run_path("sequence.py")
+    names = runpy.run_path("sequence.py")
+    assert names["ranks"].sum() == 300
+    assert names["ranks"].max() < 120  # neither a heap at the ends nor in the middle
+    assert np.std(names["innovations"]) > 1  # they hold the errors of the observations
     assert float(capsys.readouterr().out) < 0.6  # the observations err by 1

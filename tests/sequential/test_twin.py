@@ -10,13 +10,15 @@ import pytest
 
 from en4dvar.config import load_twin
 from en4dvar.cycling.sequential import SequentialSettings, run_sequential
-from en4dvar.cycling.twin import TwinExperiment, conduct, initial_ensemble, observe_truth
+from en4dvar.cycling.twin import TwinExperiment, TwinResult, conduct, initial_ensemble, observe_truth
 from en4dvar.ensemble.inflation import Inflation
 from en4dvar.errors import En4dvarError
 from en4dvar.executor import ThreadsExecutor
+from en4dvar.forward import ForwardModel, Observable, StateField
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
+from en4dvar.state import Field, Parameter, StateLayout
 from en4dvar_lorenz import Lorenz63, Lorenz96
 from en4dvar_lorenz.lorenz63 import Lorenz63Settings
 from en4dvar_lorenz.lorenz96 import Lorenz96Settings
@@ -112,6 +114,80 @@ def test_scores_by_hand():
     assert np.isnan(smoothed.rmse).tolist() == [False] * 10 + [True] * 2
     assert smoothed.mean_rmse == pytest.approx(smoothed.rmse[4:10].mean())
     assert "smoothed" not in conduct(lorenz63(ETKF(), 6), 1).scores
+
+
+class Decay(ForwardModel):
+    """Two decaying variables; the rates are carried in a field of another name."""
+
+    parameters = (Parameter("a", "1/s"), Parameter("b", "1/s"))
+    layout = StateLayout((Field("x", 2), Field("theta", 2)))
+    observables = (Observable("x", "1", StateField("x")),)
+    in_place = False
+
+    def initial_state(self, theta):
+        return np.array([1.0, 2.0, theta["a"], theta["b"]])
+
+    def step(self, x, t0, t1):
+        if not self.in_place:
+            x = x.copy()
+        x[:2] *= np.exp(-x[2:] * (t1 - t0))
+        return x
+
+
+class Named(Decay):
+    layout = StateLayout((Field("x", 2), Field("a"), Field("b")))
+
+
+class InPlace(Named):
+    in_place = True
+
+
+def decay(model, **changes):
+    rates = {"a": 0.1, "b": 0.2}
+    experiment = TwinExperiment(model, SequentialSettings(ETKF()), 8, 6, 0.5, {"x": 0.1}, {"x": 0.1}, fixed=rates)
+    return replace(experiment, **changes)
+
+
+def test_parameters_in_a_field_of_another_name_are_told_for_they_count_as_state():
+    hidden, named = conduct(decay(Decay()), 1), conduct(decay(Named()), 1)
+    assert hidden.scores["analysis"].rmse * 2**0.5 == pytest.approx(named.scores["analysis"].rmse)
+    assert len(hidden.warnings) == 1
+    assert hidden.warnings[0].startswith("2 variables of theta never change and have the values of parameters")
+    assert named.warnings == ()
+    prior = Prior((PriorTerm.normal(Decay.parameters[0], 0.1, 0.01),))
+    assert "2 variables of theta" in conduct(decay(Decay(), prior=prior, fixed={"b": 0.2}), 1).warnings[0]
+
+
+def test_an_ensemble_that_has_lost_the_truth_is_told():
+    lost = decay(Named(), initial_std={"x": 1e-6})
+    truth, series = observe_truth(lost, 1)
+    members = initial_ensemble(lost, 1) + np.array([0.5, 0.5, 0, 0])
+    run = run_sequential(lost.model, lost.observables, members, series, lost.sequential)
+    (warning,) = TwinResult(lost, 1, truth, series, run).warnings
+    assert "far too sure of itself" in warning
+
+
+def test_a_step_may_work_in_place():
+    """The members at the start of a window stay as they are."""
+    for scheme in (SequentialSettings(ETKF()), SequentialSettings(IEnKS(2))):
+        one, other = (conduct(decay(model, sequential=scheme), 1) for model in (Named(), InPlace()))
+        assert np.array_equal(one.run.analysis.mean, other.run.analysis.mean)
+        assert np.array_equal(one.truth, other.truth)
+
+
+def test_an_initial_state_that_does_not_fit_is_told():
+    class Short(Named):
+        def initial_state(self, theta):
+            return np.array([1.0, theta["a"], theta["b"]])
+
+    class Misspelt(Named):
+        def initial_state(self, theta):
+            return np.array([1.0, 2.0, theta["A"], theta["b"]])
+
+    with pytest.raises(En4dvarError, match=r"initial_state returned shape \(3,\), but the layout has \(4,\)"):
+        conduct(decay(Short()), 1)
+    with pytest.raises(En4dvarError, match="the initial state cannot be made: KeyError: 'A'"):
+        conduct(decay(Misspelt()), 1)
 
 
 def test_truth_that_cannot_be_integrated():

@@ -1,0 +1,85 @@
+"""A class of the user's own named in the ``model:`` section: with and without settings, and what does not fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import toy_models
+from pydantic import BaseModel
+
+from en4dvar.config import load_twin
+from en4dvar.errors import ConfigError
+from en4dvar.forward import ForwardModel, Observable, StateField
+from en4dvar.state import Field, StateLayout
+
+TWIN = """\
+name: bare
+model: {{name: "toy_models:{name}"{more}}}
+twin: {{cycles: 3, interval: 1 s, error: {{x_std: 1}}, initial_std: {{x: 1}}}}
+assimilation: {{scheme: etkf, members: 4}}
+"""
+
+
+class Bare(ForwardModel):
+    """Stands still; takes no settings."""
+
+    parameters = ()
+    layout = StateLayout((Field("x"),))
+    observables = (Observable("x", "1", StateField("x")),)
+
+    def initial_state(self, theta):
+        return np.ones(1)
+
+    def step(self, x, t0, t1):
+        return x
+
+
+class Sized(Bare):
+    def __init__(self, size):
+        raise AssertionError("not reached")
+
+
+class Half(Bare):
+    Settings = BaseModel
+
+
+class Blind(Bare):
+    observables = (Observable("x", "1", StateField("x_1")),)
+
+
+class Rateless(Bare):
+    observables = (Observable("x", "1", StateField("x", rate_of="v")),)
+
+
+def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: type[ForwardModel], more: str = ""):
+    monkeypatch.setattr(toy_models, kind.__name__, kind, raising=False)
+    path = tmp_path / "twin.yaml"
+    path.write_text(TWIN.format(name=kind.__name__, more=more))
+    return load_twin(path)
+
+
+def test_a_class_without_settings_is_called_without_arguments(tmp_path, monkeypatch):
+    config = load(tmp_path, monkeypatch, Bare)
+    assert type(config.experiment.model) is Bare
+    assert "model:\n  name: toy_models:Bare\n" in config.resolved
+
+
+@pytest.mark.parametrize(
+    ("kind", "more", "message"),
+    [
+        (Bare, ", size: 3", "unknown key 'size'"),
+        (Sized, "", "missing 1 required positional argument: 'size'; a class that takes arguments needs Settings and"),
+        (Half, "", "Settings and from_settings go together, it lacks from_settings"),
+        (Blind, "", "the observable 'x' reads 'x_1', which is not in the layout; known: x"),
+        (Rateless, "", "the observable 'x' reads 'v', which is not in the layout"),
+    ],
+)
+def test_what_does_not_fit_is_told_at_its_place(tmp_path, monkeypatch, kind, more, message):
+    with pytest.raises(ConfigError) as error:
+        load(tmp_path, monkeypatch, kind, more)
+    (fault,) = error.value.problems
+    assert fault.file.endswith("twin.yaml")
+    assert fault.line == 2
+    assert message in fault.message
