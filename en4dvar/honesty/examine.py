@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -90,8 +90,9 @@ def unfinished(end: Ending) -> tuple[Caution, ...]:
     words = f"not converged: {end.stop_reason}"
     if not end.step_norm <= SHORT_STEP:
         return (caution("not-converged", words),)
-    words = f"{words}; the next step would be {end.step_norm:.2g} posterior standard deviations, which is little"
-    return (caution("not-converged", words, "note"),)
+    words = f"{words}; the next step would be {end.step_norm:.2g} posterior standard deviations"
+    advice = "no action is needed where this is little to you; else start again from another seed"
+    return (replace(caution("not-converged", words, "note"), advice=advice),)
 
 
 def collapse(end: Ending) -> tuple[Caution, ...]:

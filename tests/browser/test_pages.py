@@ -46,6 +46,17 @@ def column(page, i):
     return page.locator("table.sets tbody tr").evaluate_all(f"rows => rows.map(r => r.cells[{i}].textContent.trim())")
 
 
+def test_the_table_of_parameters_fits_a_screen_with_long_values(opened, pages):
+    script = """() => {
+      const table = document.querySelector("table.parameters");
+      for (const cell of table.querySelectorAll("td[data-label]"))
+        cell.textContent = cell.classList.contains("words") ? "determined by the data" : "−0.10852";
+      return [table.parentElement.scrollWidth, table.parentElement.clientWidth];
+    }"""
+    needed, there = opened(pages["single"], width=1200).page.evaluate(script)
+    assert needed <= there
+
+
 def test_table_sorts_by_click_and_by_key(opened, pages):
     page = opened(pages["campaign"]).page
     names = column(page, 0)

@@ -11,7 +11,7 @@ from honesty.provoked import TWO, bounded, linear, run
 from toys import Fragile, make_problem
 
 from en4dvar.forward import ValidityLimit
-from en4dvar.honesty import Ending, examine
+from en4dvar.honesty import CATALOGUE, Ending, examine
 from en4dvar.honesty.checks import at_bound, rank, validity
 from en4dvar.honesty.examine import collapse
 from en4dvar.honesty.lost import loss, where_lost
@@ -121,3 +121,14 @@ def test_a_tenth_of_the_members_may_leave_the_validity(beyond, told):
     if told:
         assert "speed of the wall reaches 3.5 m/s (median 2), the limit is 3 m/s" in found[0].words
     assert validity((), np.empty((40, 0))) == ()
+
+
+def test_iterations_that_end_next_to_their_criterion_are_a_note_without_alarm():
+    end = replace(gaussian_ending(), converged=False, stop_reason="no decrease possible along the step")
+    (near,) = examine(replace(end, step_norm=0.05))
+    (far,) = examine(replace(end, step_norm=0.6))
+    (unknown,) = examine(replace(end, step_norm=np.nan))
+    assert (near.code, near.severity) == ("not-converged", "note")
+    assert near.advice.startswith("no action is needed")
+    assert (far.severity, unknown.severity) == ("serious", "serious")
+    assert far.advice == unknown.advice == CATALOGUE["not-converged"][1]
