@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from en4dvar.commands.hints import suggest
 from en4dvar.errors import En4dvarError
 from en4dvar.inputs.units import parse_unit
 from en4dvar.state import Array
@@ -43,6 +44,15 @@ class Finding:
 def run_battery(law: ConstitutiveLaw) -> list[Finding]:
     """All checks on one law."""
     return [Finding(describe(check), _reason(check, law)) for check in CHECKS]
+
+
+def small_strain(law: ConstitutiveLaw) -> str:
+    """Shear modulus and viscosity at small strain and rate: what no check can know, and the author can."""
+    values = law.example_values()
+    slope = evaluate(differentiate(law.table(values)), GRID.span, np.zeros((1, 1)))[0, 0]
+    viscosity = law.mean_viscosity(np.array([[_RATES[0]]]), values)[0, 0]
+    branches = ", without its memory" if law.memory_tables(values).convection.size else ""
+    return f"shear modulus {0.0 - slope / 4:.4g} Pa, viscosity {viscosity:.4g} Pa s{branches} ({_at(values)})"
 
 
 def describe(check: Check) -> str:
@@ -131,6 +141,9 @@ def limits_hold(law: ConstitutiveLaw) -> None:
     """With the declared values of its parameters the law is its parent, over closed cycles."""
     for parent_type, special in type(law).__dict__.get("limits", ()):
         parent = parent_type()
+        known = [p.name for p in (*law.parameters, *parent.parameters)]
+        unknown = [name for name in special if name not in known]
+        assert not unknown, f"limits: {unknown[0]!r} is not a parameter of the law{suggest(unknown[0], known)}"
         merged = parent.example_values() | law.example_values() | {n: np.array([v]) for n, v in special.items()}
         for cycle in cycles(law):
             own, theirs = (respond(one, {p.name: merged[p.name] for p in one.parameters}, cycle).J

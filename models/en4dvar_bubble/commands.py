@@ -51,7 +51,7 @@ def laws(names: tuple[str, ...], check: bool) -> None:
 
 def _check(chosen: Sequence[ConstitutiveLaw]) -> list[str]:
     """Print the battery's findings; return a line for each law that fails."""
-    from en4dvar_bubble.battery import run_battery
+    from en4dvar_bubble.battery import run_battery, small_strain
 
     failing = []
     for law in chosen:
@@ -62,6 +62,9 @@ def _check(chosen: Sequence[ConstitutiveLaw]) -> list[str]:
             click.echo(f"  {'FAIL' if finding.reason else 'ok  '}  {finding.check}")
             if finding.reason:
                 click.echo(f"        {finding.reason}")
+        click.echo(f"  At small strain: {small_strain(law)}")
+        if "limits" not in type(law).__dict__ and type(law).reference is not None:
+            click.echo("  No parent law is declared (limits): a wrong factor or unit shows in the line above alone")
         if wrong:
             failing.append(f"{law.name}: {len(wrong)} of {len(findings)} checks fail")
     return failing

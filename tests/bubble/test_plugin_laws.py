@@ -44,6 +44,12 @@ def yeoh(tmp_path):
     return path
 
 
+def limited(text, name):
+    """The law with the neo-Hookean one as its parent where ``name`` is zero."""
+    text = text.replace("import ConstitutiveLaw", "import ConstitutiveLaw, NeoHookeanKelvinVoigt")
+    return text.replace('"Yeoh"\n', f'"Yeoh"\n    limits = ((NeoHookeanKelvinVoigt, {{"{name}": 0.0}}),)\n')
+
+
 def write(tmp_path, body, header="from en4dvar_bubble import *\nfrom en4dvar_bubble.laws.parameters import *\n"):
     path = tmp_path / "mine.py"
     path.write_text(header + body)
@@ -138,6 +144,8 @@ class TestRefusing:
         ("returned", "words"),
         [
             ("p.modulus * stretch", ("stress(stretch, p)", "AttributeError", "mine.py:5")),
+            ("p.mue * stretch", ("p has no 'mue'; did you mean 'mu'?",)),
+            ("stretch if stretch > 1 else -stretch", ("write np.where instead of if", "mine.py:5")),
             ("p.mu[:, 0]", ("stress(stretch, p)", "shape (3,)", "(3, 4)")),
             ("stretch[:2]", ("shape (2,)",)),
             ("None", ("object",)),
@@ -234,6 +242,26 @@ class TestCommand:
         assert "FAIL  The elastic stress opposes the strain" in done.output
         assert "at λ = " in done.output
         assert "Yeoh: 1 of 7 checks fail" in done.output
+
+    def test_a_factor_shows_at_small_strain_and_against_the_parent(self, yeoh):
+        told = "At small strain: shear modulus {} Pa, viscosity 0.1 Pa s (G = 5e+03, "
+        alone = "No parent law is declared (limits): a wrong factor or unit shows in the line above alone"
+        assert told.format(5000) in self.run("--check", f"{yeoh}:Yeoh").output
+        twice = YEOH.replace("return 2 *", "return 4 *")
+        yeoh.write_text(twice)
+        done = self.run("--check", f"{yeoh}:Yeoh")
+        assert (done.exit_code, told.format("1e+04") in done.output, alone in done.output) == (0, True, True)
+        yeoh.write_text(limited(twice, "alpha"))
+        done = self.run("--check", f"{yeoh}:Yeoh")
+        assert (done.exit_code, told.format("1e+04") in done.output, alone in done.output) == (1, True, False)
+        assert "differs from neo-hookean-kelvin-voigt" in done.output
+        yeoh.write_text(limited(YEOH, "alpha"))
+        assert self.run("--check", f"{yeoh}:Yeoh").exit_code == 0
+
+    def test_a_limit_that_names_no_parameter_fails(self, yeoh):
+        yeoh.write_text(limited(YEOH, "alfa"))
+        done = self.run("--check", f"{yeoh}:Yeoh")
+        assert "limits: 'alfa' is not a parameter of the law; did you mean 'alpha'?" in done.output
 
     def test_unknown_law(self):
         assert self.run("--check", "nowhere.py:Law").exit_code == 2

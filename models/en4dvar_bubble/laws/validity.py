@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from en4dvar.commands.hints import suggest
 from en4dvar.errors import ConfigError
 from en4dvar.state import Array, Parameter
 from en4dvar_bubble.laws.base import ConstitutiveLaw
@@ -103,4 +104,11 @@ def _run(call: Callable[[], Any], where: str) -> Any:
             return call()
     except Exception as error:
         frame = traceback.extract_tb(error.__traceback__)[-1]
-        raise ConfigError(f"{where}: {type(error).__name__}: {error} ({frame.filename}:{frame.lineno})") from error
+        hint = ""
+        if isinstance(error, AttributeError) and isinstance(error.obj, SimpleNamespace):
+            hint = f"; p has no {error.name!r}{suggest(error.name, vars(error.obj))}"
+        elif isinstance(error, ValueError) and "truth value" in str(error):
+            hint = "; the arguments are arrays: write np.where instead of if, np.minimum instead of min"
+        raise ConfigError(
+            f"{where}: {type(error).__name__}: {error}{hint} ({frame.filename}:{frame.lineno})"
+        ) from error
