@@ -24,7 +24,8 @@ class Fault:
 
     def __str__(self) -> str:
         where = ":".join(str(part) for part in (self.file, self.line, self.column) if part)
-        return ": ".join(part for part in (where, self.path, self.message) if part)
+        path = "" if where.removeprefix("--set ") == self.path else self.path
+        return ": ".join(part for part in (where, path, self.message) if part)
 
 
 class ConfigError(En4dvarError):

@@ -101,7 +101,7 @@ def override(document: Document, overrides: Mapping[str, Any]) -> Document:
     origins = dict(document.origins)
     faults: list[Fault] = []
     for dotted, value in overrides.items():
-        path, origin = tuple(dotted.split(".")), f"--set {dotted}"
+        path, origin = tuple(dotted.split(".")), "--data" if dotted == "data.path" else f"--set {dotted}"
         if isinstance(value, str):
             value = _parse(value, origin, {}, {}, faults)
         node = data

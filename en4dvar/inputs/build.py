@@ -17,7 +17,7 @@ from en4dvar.config.data import DataPlan
 from en4dvar.config.parameters import Fixed, Uncertain, located
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.errors import ConfigError, DataError, Fault
-from en4dvar.inputs.readers import SUFFIXES, read_covariance, read_series
+from en4dvar.inputs.readers import SUFFIXES, Column, read_covariance, read_series
 from en4dvar.inputs.units import UnitError, convert
 from en4dvar.inputs.window import select
 from en4dvar.observations import Observations
@@ -121,10 +121,10 @@ def read_observations(plan: DataPlan, path: Path, name: str, weights: str = "sum
     try:
         window = select(series.times, series.values, plan.start, plan.end, plan.prominence)
     except DataError as error:
-        raise DataError(f"{path}: {error}") from None
+        raise DataError(f"{path}: {error}{_span(series.times, plan)}") from None
     times, values = series.times[window], series.values[window]
     if not len(times):
-        raise DataError(f"{path}: no observation lies in the window")
+        raise DataError(f"{path}: no observation lies in the window{_span(series.times, plan)}")
     zero = {"file": 0.0, "window": times[0]}.get(str(plan.time_zero), plan.time_zero)
     times = times - float(zero)
     if times[0] < 0:
@@ -143,6 +143,14 @@ def read_observations(plan: DataPlan, path: Path, name: str, weights: str = "sum
         correlation=correlation,
         huber=plan.error.huber,
     )
+
+
+def _span(times: Array, plan: DataPlan) -> str:
+    """Where the readings are, on the file's clock."""
+    if not isinstance(plan.time, Column):
+        return ""
+    first, last = convert(times[[0, -1]], plan.time.target, plan.time.unit)
+    return f"; the readings go from {first:g} to {last:g} {plan.time.unit}"
 
 
 def _errors(plan: DataPlan, times: Array, values: Array, samples: npt.NDArray[np.intp]) -> tuple[Array, Array | None]:

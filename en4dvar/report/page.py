@@ -146,11 +146,12 @@ def judge_chi2(chi2: float, n_observations: int, dfs: float) -> tuple[str, bool]
     if not math.isfinite(chi2):
         return "cannot be told", True
     low, high = chi2_interval(max(1.0, n_observations - dfs))
+    expected = f"expected are {plain_number(low / n_observations, 2)} to {plain_number(high / n_observations, 2)}"
     if chi2 * n_observations > high:
-        return "misfit exceeds the stated noise: model or noise is wrong", True
+        return f"misfit exceeds the stated noise: model or noise is wrong; {expected}", True
     if chi2 * n_observations < low:
-        return "misfit is below the stated noise: the noise may be overstated", True
-    return "misfit agrees with the stated noise", False
+        return f"misfit is below the stated noise, which may be overstated; {expected}", True
+    return f"misfit agrees with the stated noise; {expected}", False
 
 
 def make_section(result: Result, anchor: str, figures: Sequence[tuple[str, str, Figure]]) -> Section:

@@ -118,7 +118,7 @@ def test_overrides(tmp_path: Path) -> None:
     assert config.parameters[2] == Fixed(config.model.parameters[2], 1.0)
     assert config.directory == Path("x")
     assert config.text == YAML
-    with pytest.raises(ConfigError, match=r"^--set assimilation\.member: assimilation\.member: unknown key"):
+    with pytest.raises(ConfigError, match=r"^--set assimilation\.member: unknown key"):
         load_config(path, {"assimilation.member": "12"})
 
 

@@ -18,6 +18,7 @@ import pytest
 from PIL import Image
 
 from en4dvar import report
+from en4dvar.diagnostics import chi2_interval
 from en4dvar.errors import OutputError
 from en4dvar.honesty import Caution
 from en4dvar.report import write_report
@@ -276,7 +277,10 @@ def test_single_parameter_has_no_pairs(write_run, analysis):
 
 @pytest.mark.parametrize(("chi2", "attention"), [(1.0, False), (1.4, False), (4.0, True), (0.05, True), (np.nan, True)])
 def test_chi2_in_words(chi2, attention):
-    assert judge_chi2(chi2, 40, 2.0)[1] is attention
+    words, needs_attention = judge_chi2(chi2, 40, 2.0)
+    assert needs_attention is attention
+    low, high = (f"{value / 40:.2g}" for value in chi2_interval(38.0))
+    assert (f"expected are {low} to {high}" in words) is bool(np.isfinite(chi2))
 
 
 def test_nothing_to_report_is_one_clear_error(tmp_path):
