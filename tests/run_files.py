@@ -102,13 +102,17 @@ def _heed_ctrl_c() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def run_and_signal(number: signal.Signals, after: float, *arguments: object, **variables: object) -> tuple[int, str]:
-    """Run, send a signal after some seconds; exit code and standard error."""
+def run_and_signal(
+    number: signal.Signals, when: float | Path, *arguments: object, **variables: object
+) -> tuple[int, str]:
+    """Run, send a signal after some seconds, or once a file holds something; exit code and standard error."""
     process = subprocess.Popen(
         command(*arguments), stderr=subprocess.PIPE, text=True, env=environment(**variables), preexec_fn=_heed_ctrl_c
     )
     try:
-        _, told = process.communicate(timeout=after)
+        while isinstance(when, Path) and process.poll() is None and not (when.exists() and when.stat().st_size):
+            time.sleep(0.01)
+        _, told = process.communicate(timeout=0.0 if isinstance(when, Path) else when)
     except subprocess.TimeoutExpired:
         process.send_signal(number)
         _, told = process.communicate()

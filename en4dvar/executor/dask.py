@@ -10,11 +10,13 @@ reads while it runs. Dask repeats the calls of a worker that dies; a worker that
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import itertools
 import logging
 import pickle
 import queue
+import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
@@ -33,6 +35,7 @@ CONNECT_TIMEOUT = 15.0  # s
 NO_WORKER_TIMEOUT = 60.0  # s without any worker before the run is given up
 POLL = 2.0  # s
 CLOSE_TIMEOUT = 10.0  # s; workers end by themselves when their scheduler is gone
+KILL_TIMEOUT = 0.5  # s for a worker of this machine to end by itself when it is killed
 
 
 class DaskExecutor(Executor):
@@ -60,7 +63,13 @@ class DaskExecutor(Executor):
         self._client: Client | None = None
         self._listening: dict[str, News] = {}  # for what the calls of a map tell
         self._maps = itertools.count()
-        for name in ("distributed.client", "distributed.comm", "distributed.core", "distributed.batched"):
+        for name in (
+            "distributed.client",
+            "distributed.comm",
+            "distributed.core",
+            "distributed.batched",
+            "distributed.process",
+        ):
             logging.getLogger(name).setLevel(logging.CRITICAL)  # what they tell of lost connections, we tell once
         try:
             if address is None:
@@ -70,6 +79,7 @@ class DaskExecutor(Executor):
                     memory_limit=0,  # a member that needs memory is not a reason to kill its worker
                     dashboard_address=":0",
                     silence_logs=logging.CRITICAL,
+                    preload=__name__,  # dask_setup
                 )
             self._client = distributed.Client(
                 self._cluster or address, timeout=CONNECT_TIMEOUT, set_as_default=False, heartbeat_interval="1s"
@@ -181,6 +191,22 @@ class DaskExecutor(Executor):
         with contextlib.suppress(TimeoutError):
             if cluster is not None:
                 cluster.close(timeout=CLOSE_TIMEOUT)
+
+    def kill(self) -> None:
+        cluster = self._cluster
+        if cluster is not None:  # workers elsewhere are not ours to end
+
+            async def end_workers() -> None:
+                await asyncio.gather(*(nanny.close(timeout=KILL_TIMEOUT) for nanny in cluster.workers.values()))
+
+            with contextlib.suppress(OSError, TimeoutError):
+                cluster.sync(end_workers)
+        self.close()
+
+
+def dask_setup(_: Any) -> None:
+    """In a worker of this machine: Ctrl-C is the main process's business."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _on_worker(

@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -81,25 +82,49 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
 
 def estimate_and_tell(job: Job, tell: Callable[[News], None]) -> Estimate:
     """As :func:`estimate`, on a worker: ``tell`` gets the iterations, without their members, as they end."""
-    waiting: list[tuple[str, IterationRecord]] = []
-    sent = -math.inf
-
-    def send() -> None:
-        nonlocal sent
-        if waiting:
-            tell(tuple(waiting))
-            waiting.clear()
-            sent = time.monotonic()
-
-    def progress(name: str, record: IterationRecord) -> None:
-        waiting.append((name, replace(record, members=record.members[:0])))
-        if time.monotonic() - sent >= TELL_EVERY:
-            send()
-
+    teller = _Teller(tell)
     try:
-        return estimate(job, None, progress)
+        return estimate(job, None, teller)
     finally:
-        send()
+        teller.close()
+
+
+class _Teller:
+    """Passes iterations on at once, or, where the last message is too young, as soon as it is old enough."""
+
+    def __init__(self, tell: Callable[[News], None]):
+        self._tell, self._lock = tell, threading.Lock()
+        self._waiting: list[tuple[str, IterationRecord]] = []
+        self._sent = -math.inf
+        self._timer: threading.Timer | None = None
+
+    def __call__(self, name: str, record: IterationRecord) -> None:
+        with self._lock:
+            self._waiting.append((name, replace(record, members=record.members[:0])))
+            rest = self._sent + TELL_EVERY - time.monotonic()
+            if rest <= 0:
+                self._send()
+            elif self._timer is None:
+                self._timer = threading.Timer(rest, self._later)
+                self._timer.daemon = True
+                self._timer.start()
+
+    def close(self) -> None:
+        with self._lock:
+            self._send()
+
+    def _later(self) -> None:
+        with self._lock, suppress(OSError):  # nobody is there to hear it: the call's own thread will notice
+            self._send()
+
+    def _send(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if self._waiting:
+            self._tell(tuple(self._waiting))
+            self._waiting.clear()
+            self._sent = time.monotonic()
 
 
 def _checkpoints(job: Job) -> Callable[[LoopState], None]:

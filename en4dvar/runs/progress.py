@@ -13,6 +13,7 @@ from typing import Any, Self
 
 from en4dvar.errors import OutputError
 from en4dvar.problem import IterationRecord
+from en4dvar.runs.interrupt import Interrupted
 
 Progress = Callable[[str, IterationRecord], None]
 TYPICAL_ITERATIONS = 8.0
@@ -58,7 +59,7 @@ class RunLog:
     ) -> None:
         with suppress(OutputError, OSError):  # on a full disk: the reason that ended the run is told all the same
             if value is not None:
-                self.write(f"failed: {type(value).__name__}: {value}")
+                self.write(str(value) if isinstance(value, Interrupted) else f"failed: {type(value).__name__}: {value}")
         with suppress(OSError):
             self._file.close()
 

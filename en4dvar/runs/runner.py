@@ -122,7 +122,8 @@ def execute(
                 if isinstance(error, OutputError) and not prepared:
                     raise
                 work.stop.set()
-                executor.kill()
+                with suppress(KeyboardInterrupt):  # of an impatient user: on to the next step
+                    executor.kill()
                 raise _interrupted(work, error) from error
         directory.publish()
         return Campaign(directory.path, work.outcomes(), tuple(work.notices))
@@ -193,8 +194,6 @@ def _interrupted(work: Worklist, error: BaseException) -> BaseException:
     kept = f"{len(work.ended)} of {len(work.sets)} data sets are done and kept in {path}"
     if gone := not work.directory.work.is_dir():
         kept = f"the run directory {path} was removed or renamed while the run was at work"
-    with suppress(OutputError):
-        work.log.write(f"interrupted; {kept}")
     if isinstance(error, KeyboardInterrupt):
         return Interrupted(f"interrupted; {kept}")
     advice = "" if gone else "; give --resume to continue"

@@ -186,7 +186,7 @@ def test_a_changed_result_is_named_and_estimated_again(quiet, tmp_path, change):
 def test_signals_leave_a_run_that_says_how_to_continue(tmp_path, number):
     path, out = write_toy(tmp_path, ("toy_models:Oscillator", "execution_models:Slow")), tmp_path / "run"
     words = ("run", path, "--out", out, "--no-report")
-    code, told = run_and_signal(number, 4.0, *words, EN4DVAR_TEST_PAUSE=1.0)
+    code, told = run_and_signal(number, out / "run.log", *words, EN4DVAR_TEST_PAUSE=1.0)
     assert code == 130, told
     assert "0 of 1 data sets are done" in told
     assert re.search(r"^to continue: en4dvar run .* --resume$", told, re.MULTILINE)

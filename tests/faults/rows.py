@@ -39,6 +39,8 @@ ROWS = tuple(
         ("kill", "SIGKILL, a crash, the power gone: at any moment", "", "137", f"{DONE}; the same bits after --resume"),
         ("kill-force", "the same while --force replaces an earlier run", "", "137",
          "the earlier result until the new one is whole; then the new one"),
+        ("kill-workers", "the main process is killed while workers are at work (processes, dask)", "", "137",
+         "the same; the workers end by themselves"),
         ("interrupt", "Ctrl-C (SIGINT) or the time limit of a batch system (SIGTERM)",
          "interrupted; {n} of {all} data sets are done and kept in {run}\nto continue: en4dvar run {words} --resume",
          "130", DONE),

@@ -1,13 +1,7 @@
-"""SIGKILL, SIGINT, SIGTERM: what is left can always be resumed, to the same bits."""
-
-import re
-import signal
+"""SIGKILL: what is left can always be resumed, to the same bits."""
 
 import pytest
 from killing import survive
-from rows import row
-from run_files import run_and_signal, run_cli
-from toy_config import write_toy
 
 
 @pytest.mark.fault("kill")
@@ -49,18 +43,3 @@ def test_killed_at_random(executor):
 def test_killed_at_every_file_operation(force):
     found = survive(900, share=1.0, seed=1, force=force)
     assert found["kills"] == found["operations"] > 60
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
-@pytest.mark.fault("interrupt")
-def test_interrupted(tmp_path, number):
-    path, out = write_toy(tmp_path, ("toy_models:Oscillator", "execution_models:Slow")), tmp_path / "run"
-    words = ("run", path, "--out", out, "--no-report")
-    code, told = run_and_signal(number, 4.0, *words, EN4DVAR_TEST_PAUSE=1.0)
-    assert code == int(row("interrupt").exit_code), told
-    first, second = told.splitlines()
-    assert row("interrupt").told(f"{first}\n{second}")
-    assert re.search(r"^to continue: en4dvar run .* --resume$", second)
-    done = run_cli(*words, "--resume")
-    assert done.returncode == 0, done.stderr

@@ -1,0 +1,110 @@
+"""Ctrl-C at a terminal, where every process of the run gets it, and what is left of workers without a main process."""
+
+import fcntl
+import os
+import pty
+import re
+import signal
+import subprocess
+import termios
+import time
+
+import psutil
+import pytest
+from rows import row
+from run_files import assert_same_results, command, configuration, environment, make_campaign, run_cli
+
+from en4dvar.runs.runner import run_campaign
+
+CTRL_C = b"\x03"
+
+
+class Terminal:
+    """A command at a terminal of its own; ``told`` is what it has shown."""
+
+    def __init__(self, words, **variables):
+        self.end, theirs = pty.openpty()
+        self.told = ""
+
+        def take_over():
+            fcntl.ioctl(0, termios.TIOCSCTTY)
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+        self.process = subprocess.Popen(
+            words, stdin=theirs, stdout=theirs, stderr=theirs, env=environment(TERM="xterm", **variables),
+            start_new_session=True, preexec_fn=take_over,
+        )  # fmt: skip
+        os.close(theirs)
+
+    def read_until(self, pattern):
+        """Until ``pattern`` is shown, or to the end."""
+        while not re.search(pattern, self.told):
+            try:
+                more = os.read(self.end, 1 << 16)
+            except OSError:  # the other end is closed
+                return False
+            self.told += more.decode("utf-8", "replace")
+        return True
+
+    def press(self, keys):
+        os.write(self.end, keys)
+
+    def close(self):
+        self.read_until(r"$^")
+        os.close(self.end)
+        return self.process.wait()
+
+
+def words(path, out, kind):
+    return ["run", path, "--out", out, "--no-report", "--set", f"execution.executor={kind}", "--workers", 2]
+
+
+@pytest.mark.parametrize(
+    ("kind", "presses"),
+    [("serial", 1), ("processes", 1), ("dask", 2)]
+    + [
+        pytest.param(*case, marks=pytest.mark.slow)
+        for case in (("serial", 2), ("threads", 1), ("threads", 2), ("processes", 2), ("dask", 1))
+    ],
+)
+@pytest.mark.fault("interrupt")
+def test_ctrl_c_at_a_terminal(tmp_path, kind, presses):
+    """Pressed twice it is no worse; when all is said, the second one may end the interpreter."""
+    path, out = make_campaign(tmp_path, 4, "execution_models:Waits"), tmp_path / "run"
+    flag = tmp_path / "go on"
+    again = words(path, out, kind)
+    terminal = Terminal(command(*again), EN4DVAR_TEST_FLAG=flag)
+    assert terminal.read_until(r"set\d iteration 2: J [\d.]+, χ²/K [\d.e-]+, step 1")
+    for _ in range(presses):
+        terminal.press(CTRL_C)
+        time.sleep(0.2)
+    if kind == "threads":  # they end with their iteration
+        flag.touch()
+    code = terminal.close()
+    assert code == int(row("interrupt").exit_code) or (presses, code) == (2, -signal.SIGINT), terminal.told
+    assert "Traceback" not in terminal.told
+    shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.told).splitlines()
+    assert row("interrupt").told("\n".join(line.strip() for line in shown)), terminal.told
+    done = run_cli(*again, "--resume", EN4DVAR_TEST_FLAG=path)
+    assert done.returncode == 0, done.stderr
+    run_campaign(configuration(path, tmp_path / "quiet", executor="serial"))
+    assert_same_results(out, tmp_path / "quiet")
+
+
+@pytest.mark.parametrize("kind", ["processes", "dask"])
+@pytest.mark.fault("kill-workers")
+def test_workers_end_with_the_main_process(tmp_path, kind):
+    path, out = make_campaign(tmp_path, 4, "execution_models:Waits"), tmp_path / "run"
+    process = subprocess.Popen(
+        command(*words(path, out, kind)),
+        stderr=subprocess.DEVNULL,
+        env=environment(EN4DVAR_TEST_FLAG=tmp_path / "never"),
+    )
+    log = out / "run.log"
+    while process.poll() is None and not (log.exists() and "iteration  2" in log.read_text()):
+        time.sleep(0.01)
+    workers = psutil.Process(process.pid).children(recursive=True)
+    process.kill()
+    process.wait()
+    assert len(workers) >= 2
+    assert psutil.wait_procs(workers, timeout=20)[1] == []
