@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,6 +67,15 @@ class Local(Section):
     """The field is a circle: the last index is next to the first."""
     block_size: Annotated[int, Field(ge=1)] = 1
     """Neighbouring indices that share one analysis."""
+    shape: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] | None = None
+    """Cells along each axis of a field in two or three dimensions, the last running fastest; distances are then in
+    cells of this grid. Default: the indices lie on a line."""
+
+    @model_validator(mode="after")
+    def _one_cell_each(self) -> Local:
+        if self.shape and self.block_size > 1:
+            raise ValueError("block_size: only without shape")
+        return self
 
 
 class Sequential(Section):
@@ -271,6 +281,13 @@ def _localisation(
         message = "needs a model whose state is one field, and this field observed"
         faults.append(document.fault(("assimilation", "localisation"), message))
         return None
+    if settings.shape:
+        if math.prod(settings.shape) != fields[0].size:
+            message = f"{' x '.join(map(str, settings.shape))} cells, but {fields[0].name} has {fields[0].size}"
+            faults.append(document.fault(("assimilation", "localisation", "shape"), message))
+            return None
+        where = np.arange(model.layout.size)[model.layout[fields[0].name]]
+        return Localisation.on_grid(where, settings.shape, settings.radius, settings.periodic)
     positions = np.arange(fields[0].size, dtype=float)
     state = np.full(model.layout.size, np.nan)
     state[model.layout[fields[0].name]] = positions

@@ -60,6 +60,18 @@ class Localisation:
         middles = np.array([state[block].mean() for block in blocks])
         return cls(blocks, gaspari_cohn(distances(middles, observed, period), radius))
 
+    @classmethod
+    def on_grid(cls, where: npt.NDArray[np.intp], shape: Sequence[int], radius: float, periodic: bool) -> Localisation:
+        """Every cell by itself of a field on a grid of ``shape``, all cells observed, in C order.
+
+        ``where`` (n,) are the places of the cells in the state; distances are Euclidean, in cells, and around the ends
+        of each axis where ``periodic``.
+        """
+        cells = np.indices(shape, dtype=float).reshape(len(shape), -1)
+        lengths = [float(length) if periodic else None for length in shape]
+        squares = sum(distances(x, x, length) ** 2 for x, length in zip(cells, lengths, strict=True))
+        return cls([where[i : i + 1] for i in range(len(where))], gaspari_cohn(np.sqrt(squares), radius))
+
     def analysis(self, ensemble: Array, evaluation: Evaluation) -> Array:
         """Local analysis (N, n) of members (N, n); one symmetric transform a block."""
         analysed = ensemble.copy()

@@ -149,6 +149,7 @@ def sample(
     if emulated is not None:
         moves.append((emcee.moves.MHMove(_guided(emulated)), guided))
     sampler = emcee.EnsembleSampler(walkers, n, log_density, vectorize=True, moves=moves)
+    sampler.log_prob_fn = log_density  # bare: emcee's wrapper prints every position where Ctrl-C comes
     steps, converged = chain.steps, False
     while True:
         if steps:

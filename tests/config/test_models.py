@@ -66,6 +66,35 @@ def test_a_class_without_settings_is_called_without_arguments(tmp_path, monkeypa
     assert "model:\n  name: toy_models:Bare\n" in config.resolved
 
 
+class Sheet(Bare):
+    """A field of 2 x 3 cells."""
+
+    layout = StateLayout((Field("x", 6),))
+
+    def initial_state(self, theta):
+        return np.ones(6)
+
+
+def test_a_field_on_a_grid_is_localised_in_cells(tmp_path, monkeypatch):
+    path = tmp_path / "twin.yaml"
+    load(tmp_path, monkeypatch, Sheet)
+    text = path.read_text().replace("members: 4", "members: 4, localisation: {radius: 0.5, shape: [2, 3]}")
+    path.write_text(text)
+    taper = load_twin(path).experiment.sequential.localisation.taper
+    assert np.array_equal(taper, np.eye(6))  # a line apart, as 2 and 3 in the order of the state, is far
+    path.write_text(text.replace("0.5", "1"))
+    taper = load_twin(path).experiment.sequential.localisation.taper
+    assert taper[0, 3] == taper[0, 1] == pytest.approx(5 / 24)
+    assert taper[2, 3] == 0
+    for wrong, message in (
+        ("shape: [2, 4]", "2 x 4 cells, but x has 6"),
+        ("shape: [2, 3], block_size: 2", "block_size: only"),
+    ):
+        path.write_text(text.replace("shape: [2, 3]", wrong))
+        with pytest.raises(ConfigError, match=message):
+            load_twin(path)
+
+
 @pytest.mark.parametrize(
     ("kind", "more", "message"),
     [

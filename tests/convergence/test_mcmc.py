@@ -63,6 +63,20 @@ def test_chain_of_a_gaussian_and_its_thinning():
     assert {tuple(row) for row in plain} <= {tuple(row) for row in chain.flat}
 
 
+def test_an_interrupt_in_the_density_passes_in_silence(capfd):
+    """emcee's own wrapper would print every position and a traceback."""
+    calls = iter(range(1000))
+
+    def density(x):
+        if next(calls) == 5:
+            raise KeyboardInterrupt
+        return -0.5 * np.sum(x * x, axis=1)
+
+    with pytest.raises(KeyboardInterrupt):
+        mcmc.sample(density, np.random.default_rng(0).standard_normal((20, 2)), seed=1)
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_density_that_vanishes_is_an_error():
     with pytest.raises(En4dvarError, match="cannot run 48 of 48 walkers"):
         mcmc.sample(lambda x: np.full(len(x), -np.inf), np.eye(5), 1)

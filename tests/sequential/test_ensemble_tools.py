@@ -218,6 +218,23 @@ def test_variables_without_position_or_observation_stay():
     assert not np.allclose(analysed[:, :2], ensemble[:, :2])
 
 
+@pytest.mark.parametrize("periodic", [False, True])
+def test_localisation_on_a_grid(periodic):
+    """The taper between all cells, by hand; a grid of one row is the line."""
+    where = np.arange(2, 14)  # the field lies behind two other variables
+    local = Localisation.on_grid(where, (3, 4), 1.5, periodic)
+    for a in range(12):
+        for b in range(12):
+            gap = np.abs(np.subtract(divmod(a, 4), divmod(b, 4)))
+            if periodic:
+                gap = np.minimum(gap, np.array([3, 4]) - gap)
+            assert local.taper[a, b] == pytest.approx(float(gaspari_cohn(np.hypot(*gap), 1.5)), abs=1e-15)
+    assert np.concatenate(local.blocks).tolist() == where.tolist()
+    row, index = Localisation.on_grid(np.arange(6), (6,), 1.5, periodic), np.arange(6.0)
+    line = Localisation.on_line(index, index, 1.5, 6.0 if periodic else None)
+    assert np.array_equal(row.taper, line.taper)
+
+
 def test_localisation_needs_a_filter():
     with pytest.raises(ValueError, match="filter"):
         SequentialSettings(IEnKS(1), localisation=Localisation([np.arange(2)], np.ones((1, 2))))
