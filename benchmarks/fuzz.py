@@ -71,7 +71,7 @@ def campaign(target: str, runs: int, seed: int) -> tuple[int, int, float, int]:
         seconds = time.perf_counter() - begin
     finished, reached = _DONE.search(done.stderr), _COVERAGE.findall(done.stderr)
     if done.returncode:
-        print(done.stdout[-3000:], done.stderr[-3000:], file=sys.stderr)
+        print(done.stdout[-3000:], done.stderr[-3000:], f"exit code {done.returncode}", file=sys.stderr)
     tried = int(finished[1]) if finished else max([0, *map(int, re.findall(r"^#(\d+)", done.stderr, re.MULTILINE))])
     return tried, int(reached[-1]) if reached else 0, seconds, int(done.returncode != 0)
 
