@@ -134,7 +134,11 @@ def read_contents(path: Path, format: Format | None = None, decimal: Decimal = "
 def _mat_contents(path: Path) -> Contents:
     vectors, scalars, others = mat_vectors(path)
     columns = {k: np.asarray(v, dtype=float).ravel() for k, v in vectors.items() if v.size > 1}
-    return Contents(columns, scalars, {name: f"{path}: {name} is {kind}" for name, kind in others.items()})
+    return Contents(
+        columns,
+        scalars,
+        {name: f"{path}: {name} is {kind}; save what is in it as vectors" for name, kind in others.items()},
+    )
 
 
 def _csv_contents(path: Path, decimal: Decimal) -> Contents:

@@ -150,7 +150,9 @@ def _first_with_columns(files: Sequence[Path]) -> tuple[Path, Contents, Decimal]
             return file, with_commas, ","
         if contents.columns:
             return file, contents, "."
-        faults.append(next(iter(contents.others.values()), f"{file}: no column holds numbers"))
+        reason = next(iter(contents.others.values()), f"{file}: no column holds numbers")
+        header = "; the first line that is no comment (#) must name the columns" if file.suffix != ".mat" else ""
+        faults.append(reason + header * ("put #" not in reason))
     raise DataError("\n".join(faults))
 
 

@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner, Result
 from jsonschema import Draft202012Validator
 from scipy.integrate import solve_ivp
+from scipy.io import savemat
 
 from en4dvar.cli import main
 from en4dvar.config import Config, load_config, resolve
@@ -297,11 +298,25 @@ def test_decimal_commas_are_noticed(tmp_path: Path) -> None:
     assert build(config)[0].observations.values.max() == pytest.approx(195e-6)
 
 
+def test_vectors_that_a_mat_file_hides_are_told(tmp_path: Path) -> None:
+    savemat("b.mat", {"film": {"t": np.arange(9.0), "R": np.ones(9)}})
+    done = call("init", "--data", "b.mat", *UNITS)
+    assert (done.exit_code, done.stderr) == (2, f"{tmp_path}/b.mat: film is a struct; save what is in it as vectors\n")
+    savemat("b.mat", {"t": np.arange(9.0), "R": np.ones((3, 9))})
+    done = call("init", "--data", "b.mat", *UNITS)
+    assert "b.mat: R is an array of 3 x 9; save what is in it as vectors\n" in done.stderr
+    assert "columns with numbers: t; units are never guessed: add --radius-column NAME" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("t,R\nus,um\n0,1\n", "b.csv:2: 'us' in column 't' is not a number; if this is no reading, put # before"),
         ("t,R\n", "b.csv: no line follows the header"),
+        (
+            "Camera,X\nrate,2e6\n\nt,R\n0,1\n",
+            "b.csv:2: 'rate' in column 'Camera' is not a number; the first line that is no comment (#) must name",
+        ),
     ],
 )
 def test_without_a_column_of_numbers_the_reason_is_told(tmp_path: Path, text: str, message: str) -> None:
