@@ -25,7 +25,7 @@ REASONS = {
     "not_a_number": "non-finite state",
     "wrong_shape": "step returned shape (3,), expected (4,)",
     "hangs": "TimeLimitError: not done after 0.3 s",
-    "hangs_in_compiled_code": "a worker process died, or was ended at its time limit of 0.3 s",
+    "hangs_in_compiled_code": "a worker process died, or was ended at its time limit of ",
     "allocates": "MemoryError: ",
 }
 
@@ -67,7 +67,10 @@ def test_only_the_faulty_members_are_lost(raising, tmp_path, monkeypatch, name):
     ],
 )
 def test_limits_on_dask(raising, tmp_path, monkeypatch, name):
-    check_losses(raising, tmp_path, monkeypatch, name, {**LIMITS[name], "executor": "dask"})
+    execution = {**LIMITS[name], "executor": "dask"}
+    if name == "hangs_in_compiled_code":  # workers live that long, and are looked for every two seconds
+        execution["time_limit"] = "1 s"
+    check_losses(raising, tmp_path, monkeypatch, name, execution)
 
 
 def check_losses(raising, tmp_path, monkeypatch, name, execution):
