@@ -70,11 +70,7 @@ def sweep(
         try:
             result = run_sweep(problems, chosen, loaded[0].seed, workers or _cores(), chunks, progress)
         except KeyboardInterrupt:
-            words = [word for word in sys.argv[1:] if word not in ("--force", "--resume")]
-            again = shlex.join(["en4dvar", *words, "--resume"])
-            raise KeyboardInterrupt(
-                f"interrupted; finished chunks are kept in {chunks}\nto continue: {again}"
-            ) from None
+            raise KeyboardInterrupt(_to_continue(f"finished chunks are kept in {chunks}")) from None
     write_text(folder / "sweep.csv", sweep_csv(result))
     click.echo(sweep_text(result))
     click.echo(f"best fits: {folder / 'sweep.csv'}")
@@ -98,28 +94,38 @@ def study(
     Example:
       en4dvar study configs/agarose_study.yaml
     """
-    import shutil
-
-    from en4dvar.errors import OutputError
-    from en4dvar_bubble.study.keep import FOLDER, Keep, key_of
+    from en4dvar.runs.interrupt import terminate_as_interrupt
+    from en4dvar.runs.rundir import RunDirectory
+    from en4dvar_bubble.study.keep import Keep
     from en4dvar_bubble.study.report import write_study
     from en4dvar_bubble.study.run import run_study
     from en4dvar_bubble.study.settings import load_study
 
-    plan = load_study(config, _overrides(settings, None))
-    folder = out or Path("runs") / plan.name
     if force and resume:
         raise click.UsageError("--force and --resume exclude each other")
-    if folder.exists() and any(folder.iterdir()) and not (force or resume):
-        raise OutputError(f"{folder}: is not empty; give --resume to continue its study or --force to replace it")
-    if force:
-        shutil.rmtree(folder / FOLDER, ignore_errors=True)
-    keep = Keep(folder / FOLDER, key_of(plan))
-    result = run_study(plan, workers or _cores(), lambda message: click.echo(message, err=True), keep)
-    page = write_study(result, folder)
+    plan = load_study(config, _overrides(settings, None))
+    folder = out or Path("runs") / plan.name
+    with (
+        terminate_as_interrupt(),
+        RunDirectory.open(folder, "force" if force else "resume" if resume else "new") as directory,
+    ):
+        try:
+            keep = Keep.open(directory, plan)
+            result = run_study(plan, workers or _cores(), lambda message: click.echo(message, err=True), keep)
+            page = write_study(result, directory.work)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(_to_continue(f"finished parts are kept in {folder}")) from None
+        files = (p for p in directory.work.rglob("*") if p.is_file() and not p.name.startswith("."))
+        directory.claim(*sorted(p.relative_to(directory.work).as_posix() for p in files))
+        directory.publish()
     for gel, comparison in result.comparisons.items():
         click.echo(f"{gel}: {comparison.undecidable} of {len(comparison.single)} data sets cannot tell the laws apart")
-    click.echo(f"report: {page}" + (" (synthetic twin, no measurement)" if plan.synthetic else ""))
+    click.echo(f"report: {folder / page.name}" + (" (synthetic twin, no measurement)" if plan.synthetic else ""))
+
+
+def _to_continue(kept: str) -> str:
+    words = [word for word in sys.argv[1:] if word not in ("--force", "--resume")]
+    return f"interrupted; {kept}\nto continue: {shlex.join(['en4dvar', *words, '--resume'])}"
 
 
 def _overrides(settings: tuple[str, ...], data: str | None) -> dict[str, Any]:

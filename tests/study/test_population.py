@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +15,18 @@ from en4dvar.errors import ConfigError
 from en4dvar.inputs.build import build
 from en4dvar.prior import Prior, PriorTerm, member_stream
 from en4dvar.state import Parameter
+from en4dvar_bubble.study.effort import Effort
 from en4dvar_bubble.study.emulator import design_matrix, draw_interim, fit_emulators, monomials
 from en4dvar_bubble.study.gaussian import divide_out
-from en4dvar_bubble.study.mixture import fit_mixtures
-from en4dvar_bubble.study.population import Effort, HyperPrior, estimate_population
+from en4dvar_bubble.study.hyper import HyperPrior, Proposal
+from en4dvar_bubble.study.marginals import DEFENSIVE, marginals
+from en4dvar_bubble.study.mixture import Mixtures, fit_mixtures
+from en4dvar_bubble.study.population import estimate_population
 from en4dvar_bubble.study.set_runs import SetRuns, log_likelihood
+from en4dvar_bubble.study.training import Training
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-SMALL = Effort(rounds=80, refits=2, components=8, chains=24, block=400, blocks=4, draws=1500, inner=16, exact=400)
+SMALL = Effort(rounds=80, refits=2, components=8, hyper_walkers=32, draws=1500, exact=600)
 
 
 def prior_of(names, means, stds, transform="lognormal"):
@@ -31,18 +36,34 @@ def prior_of(names, means, stds, transform="lognormal"):
 
 
 class Curved:
-    """m = (a + b + 0.6 b², 0.5 a − 0.3 a b): one combination of a and b is sharp and curved, the other hardly told."""
+    """m = (a + b + 0.6 b², 0.5 a − 0.3 a b): one combination of a and b is sharp and curved, the other hardly told.
 
-    def __init__(self, n_sets=8, seed=0):
+    ``outlier``: how much further than the others the first bubble's a lies.
+    """
+
+    def __init__(self, n_sets=8, seed=0, outlier=0.0):
         rng = np.random.default_rng(seed)
         self.truth = np.stack([0.4 + 0.3 * rng.standard_normal(n_sets), 0.5 * rng.standard_normal(n_sets)], axis=1)
+        self.truth[0, 0] += outlier
         self.weight = np.tile(1 / np.array([0.1, 0.5]) ** 2, (n_sets, 1))
         exact = self.predictions(self.truth[None])[0]
         self.values = exact + rng.standard_normal(exact.shape) / np.sqrt(self.weight)
 
-    def predictions(self, x):
+    def predictions(self, x, sets=None):
         a, b = x[..., 0], x[..., 1]
         return np.stack([a + b + 0.6 * b**2, 0.5 * a - 0.3 * a * b], axis=-1)
+
+    def start(self, seed):
+        noise = np.random.default_rng(seed).standard_normal((len(self.truth), 30, 2))
+        return self.truth[:, None] + 0.2 * noise
+
+
+class Cusped(Curved):
+    """The second prediction has a cusp that no polynomial follows, as the radius at the end of a collapse."""
+
+    def predictions(self, x, sets=None):
+        a, b = x[..., 0], x[..., 1]
+        return np.stack([a + b + 0.6 * b**2, 1.5 * np.sqrt(np.abs(a - 0.4 * b - 0.5))], axis=-1)
 
 
 def by_quadrature(runs, prior, hyper):
@@ -68,22 +89,68 @@ def by_quadrature(runs, prior, hyper):
     return np.interp([0.025, 0.5, 0.975], cdf, mean.ravel()[order]), evidence
 
 
-def test_a_population_of_curved_likelihoods_against_quadrature():
-    runs, prior, hyper = Curved(), prior_of(("a", "b"), (0.0, 0.0), (0.8, 0.6)), HyperPrior(mean_std=0.8, spread=0.4)
-    rng = np.random.default_rng(1)
-    start = runs.truth[:, None] + 0.2 * rng.standard_normal((len(runs.truth), 30, 2))
-    found = estimate_population(runs, start, prior, ["a"], 3, hyper, SMALL)
-    quantiles, evidence = by_quadrature(runs, prior, hyper)
+LEVELS = (0.025, 0.5, 0.975)
+CURVED_PRIOR, CURVED_HYPER = prior_of(("a", "b"), (0.0, 0.0), (0.8, 0.6)), HyperPrior(mean_std=0.8, spread=0.4)
+
+
+def estimated(runs, seed):
+    return estimate_population(runs, runs.start(seed), CURVED_PRIOR, ["a"], seed, CURVED_HYPER, SMALL)
+
+
+@pytest.mark.parametrize("runs", [Curved(), Curved(outlier=2.0), Cusped()], ids=["curved", "outlier", "cusped"])
+def test_a_population_of_curved_likelihoods_against_quadrature(runs):
+    found = estimated(runs, 3)
+    quantiles, evidence = by_quadrature(runs, CURVED_PRIOR, CURVED_HYPER)
     assert found.converged
-    for level, value in zip((0.025, 0.5, 0.975), quantiles, strict=True):
+    assert found.size > 200
+    for level, value in zip(LEVELS, quantiles, strict=True):
         error = np.sqrt(level * (1 - level) / found.size)
         assert np.mean(found.mean[:, 0] < value) == pytest.approx(level, abs=3 * error), level
-    assert found.size > 150
     assert found.log_evidence == pytest.approx(evidence, abs=0.1)
-    again = estimate_population(runs, start, prior, ["a"], 3, hyper, SMALL)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("runs", [Curved(), Curved(outlier=2.0), Cusped()], ids=["curved", "outlier", "cusped"])
+def test_repeated_estimates_are_as_good_as_they_say(runs):
+    """No bias, and no more scatter than the effective number of draws: a degenerate weight would show in either."""
+    quantiles, evidence = by_quadrature(runs, CURVED_PRIOR, CURVED_HYPER)
+    several = [estimated(runs, seed) for seed in range(8)]
+    size = np.mean([found.size for found in several])
+    below = np.array([[np.mean(found.mean[:, 0] < value) for value in quantiles] for found in several])
+    for j, level in enumerate(LEVELS):
+        error = np.sqrt(level * (1 - level) / size)
+        assert below[:, j].mean() == pytest.approx(level, abs=3 * error / np.sqrt(len(several))), level
+        assert below[:, j].std() < 1.5 * error
+    assert np.mean([found.log_evidence for found in several]) == pytest.approx(evidence, abs=0.05)
+
+
+def test_the_same_seed_gives_the_same_bits_with_any_number_of_threads():
+    runs = Curved()
+    found = estimated(runs, 3)
+    again = estimate_population(runs, runs.start(3), CURVED_PRIOR, ["a"], 3, CURVED_HYPER, SMALL, workers=3)
     np.testing.assert_array_equal(again.nu, found.nu)
+    assert again.log_evidence == found.log_evidence
     with pytest.raises(ValueError, match="at least 3"):
-        estimate_population(runs, start[:2], prior, ["a"], 3, hyper, SMALL)
+        estimate_population(runs, runs.start(3)[:2], CURVED_PRIOR, ["a"], 3, CURVED_HYPER, SMALL)
+
+
+def test_ensembles_in_a_minimum_that_is_not_the_lowest_are_left():
+    """a³ − 3a = 4 has the root 2.196; walkers close about the local maximum at −1, where it is 2, stay there."""
+
+    class Folded:
+        values, weight = np.array([[4.0, 0.0]] * 3), np.array([[100.0, 1.0]] * 3)
+
+        def predictions(self, x, sets=None):
+            return np.stack([x[..., 0] ** 3 - 3 * x[..., 0], x[..., 1]], axis=-1)
+
+    runs, rng = Folded(), np.random.default_rng(2)
+    start = np.array([-1.0, 0.0]) + 0.01 * rng.standard_normal((3, 30, 2))
+    start[2, :, 0] += 3.196  # the third is where it should be, and stays
+    training = Training(runs, start, np.zeros(2), np.array([1.2, 1.0]), 1, replace(SMALL, refits=0))
+    root = np.array([2.196, 0.0])
+    for s in range(3):
+        assert np.median(np.abs(training.at[s] - root)[:, 0]) < 0.2
+    assert training.count == 3 * 81 * 16 + 2 * (512 + 80 * 16)
 
 
 def test_monomials_are_all_of_them():
@@ -98,21 +165,37 @@ def test_emulators_return_polynomials_as_they_are():
     n_sets = len(runs.truth)
     x = runs.truth[:, None] + 0.4 * rng.standard_normal((n_sets, 300, 2))
     seen = runs.predictions(x.transpose(1, 0, 2)).transpose(1, 0, 2)
-    emulators = fit_emulators(x, seen, runs.values, runs.weight, x, degree=2)
+    emulators = fit_emulators(x, seen, np.zeros(x.shape[:2]), runs.values, runs.weight, x, degree=2)
     other = runs.truth + 0.7 * rng.standard_normal((50, n_sets, 2))
     exact = log_likelihood(runs, runs.predictions(other))
     np.testing.assert_allclose(emulators.log_likelihood(other), exact, rtol=1e-7, atol=1e-7)
     with pytest.raises(ValueError, match="monomials"):
-        fit_emulators(x[:, :20], seen[:, :20], runs.values, runs.weight, x, degree=4)
+        fit_emulators(x[:, :5], seen[:, :5], np.zeros((n_sets, 5)), runs.values, runs.weight, x, degree=4)
+
+
+def test_what_an_emulator_misses_widens_its_likelihood():
+    """Degree 1 on a parabola at evenly spread points: the error of the reading is known, and adds to its variance."""
+    line = np.linspace(-1, 1, 101)
+    x = np.stack(np.meshgrid(line, line), axis=-1).reshape(1, -1, 2)
+    seen = np.stack([0.3 * x[..., 0], x[..., 0] ** 2], axis=2)
+    log_prior = np.zeros(x.shape[:2])
+    # log-likelihoods all but equal, so that every point counts the same
+    emulators = fit_emulators(x, seen, log_prior, np.zeros((1, 2)), np.full((1, 2), 1e-4), x, degree=1)
+    error = 1 / emulators.weight[0] - 1e4
+    np.testing.assert_allclose(error, [0, np.var(line**2)], atol=1e-3)
+    at = np.array([1.0, 3.4, 4.6])
+    told = emulators.log_likelihood(np.stack([at, 0 * at], axis=1)[:, None])[:, 0]
+    np.testing.assert_allclose(told[:2], 0, atol=1e-3)  # 3.4 is 5.9 standard deviations of the points
+    assert told[2] == pytest.approx(-10 * (4.6 / (2 * line.std()) - 3) ** 2, rel=0.01)
 
 
 def test_interim_draws_have_the_moments_of_quadrature():
     runs, rng = Curved(n_sets=3), np.random.default_rng(2)
     x = runs.truth[:, None] + 0.6 * rng.standard_normal((3, 600, 2))
     seen = runs.predictions(x.transpose(1, 0, 2)).transpose(1, 0, 2)
-    emulators = fit_emulators(x, seen, runs.values, runs.weight, x, degree=2)
+    emulators = fit_emulators(x, seen, np.zeros(x.shape[:2]), runs.values, runs.weight, x, degree=2)
     mean, std = np.zeros(2), np.array([0.9, 0.7])
-    draws = draw_interim(emulators, mean, std, seed=4, count=400)
+    draws = draw_interim(emulators, mean, std, 4, "x", count=400)
     a, b = np.meshgrid(np.linspace(-4, 4, 801), np.linspace(-3, 3, 601), indexing="ij")
     at = np.stack([a, b], axis=-1)
     for s in range(3):
@@ -127,30 +210,90 @@ def test_interim_draws_have_the_moments_of_quadrature():
             assert draws[s, :, j].std() == pytest.approx(spread, rel=0.1)
 
 
+class LinearSets:
+    """y_i = H_i x_i + noise: marginals over x ~ N(ν, D), posteriors given ν and D, all known."""
+
+    def __init__(self):
+        self.rng = np.random.default_rng(5)
+        self.H, self.y, self.std = self.rng.standard_normal((4, 5, 2)), self.rng.standard_normal((4, 5)), 0.7
+        self.nu, self.variance = np.array([[0.0, 0.0], [0.5, -0.4]]), np.array([[0.3, 0.2], [0.05, 0.4]])
+
+    def log_marginals(self, b, power=1):
+        """(S,) of population b; ∫ L(x)^power N(x; ν, D) dx with ln L = −½ Σ (y − Hx)²/std²."""
+        H, d, std = self.H, np.diag(self.variance[b]), self.std / np.sqrt(power)
+        covariance = [H[s] @ d @ H[s].T + std**2 * np.eye(5) for s in range(4)]
+        logs = [multivariate_normal(H[s] @ self.nu[b], covariance[s]).logpdf(self.y[s]) for s in range(4)]
+        return np.array(logs) + 5 * np.log(std * np.sqrt(2 * np.pi))
+
+    def posterior(self, b, s):
+        """Mean and covariance of x_s given population b."""
+        covariance = np.linalg.inv(np.diag(1 / self.variance[b]) + self.H[s].T @ self.H[s] / self.std**2)
+        return covariance @ (self.nu[b] / self.variance[b] + self.H[s].T @ self.y[s] / self.std**2), covariance
+
+    def interim(self, mean, wide):
+        """Moments of the posteriors under N(mean, wide²)."""
+        cov = np.linalg.inv(np.diag(wide**-2.0) + np.einsum("ski,skj->sij", self.H, self.H) / self.std**2)
+        return np.einsum("sij,sj->si", cov, mean / wide**2 + np.einsum("ski,sk->si", self.H, self.y) / self.std**2), cov
+
+    def emulators(self):
+        """Exact ones, trusted everywhere that counts."""
+        x = 2 * self.rng.standard_normal((4, 200, 2))
+        seen, weight = np.einsum("skj,sbj->sbk", self.H, x), np.full((4, 5), self.std**-2.0)
+        return fit_emulators(x, seen, np.zeros((4, 200)), self.y, weight, x, degree=1, visited=200)
+
+
 def test_a_gaussian_likelihood_has_the_marginal_of_a_gaussian():
     """Linear likelihoods: mixture draws of one component each against the normal density of the data."""
-    rng = np.random.default_rng(5)
-    H, y, std = rng.standard_normal((4, 5, 2)), rng.standard_normal((4, 5)), 0.7
+    case = LinearSets()
     mean, wide = np.array([0.2, -0.1]), np.array([1.0, 1.3])
-    cov = np.linalg.inv(np.diag(wide**-2.0) + np.einsum("ski,skj->sij", H, H) / std**2)
-    middle = np.einsum("sij,sj->si", cov, mean / wide**2 + np.einsum("ski,sk->si", H, y) / std**2)
-    draws = np.stack([rng.multivariate_normal(m, c, 20_000) for m, c in zip(middle, cov, strict=True)])
-    mixtures = fit_mixtures(draws, mean, wide, rng, components=1)
-    nu, variance = np.array([[0.0, 0.0], [0.5, -0.4]]), np.array([[0.3, 0.2], [0.05, 0.4]])
-    exact = [
-        sum(
-            multivariate_normal(H[s] @ v, H[s] @ np.diag(d) @ H[s].T + std**2 * np.eye(5)).logpdf(y[s])
-            for s in range(4)
-        )
-        for v, d in zip(nu, variance, strict=True)
-    ]
-    told = mixtures.log_marginal(nu, variance)
+    draws = np.stack(
+        [case.rng.multivariate_normal(m, c, 20_000) for m, c in zip(*case.interim(mean, wide), strict=True)]
+    )
+    mixtures = fit_mixtures(draws, mean, wide, case.rng, components=1)
+    exact = [case.log_marginals(b).sum() for b in (0, 1)]
+    told = mixtures.log_marginal(case.nu, case.variance)
     assert told[1] - told[0] == pytest.approx(exact[1] - exact[0], abs=0.1)
-    x = mixtures.draw(rng, nu[1:], variance[1:], 20_000)[0, :, 0]
-    precision = np.diag(1 / variance[1]) + H[0].T @ H[0] / std**2
-    expected = np.linalg.solve(precision, nu[1] / variance[1] + H[0].T @ y[0] / std**2)
-    np.testing.assert_allclose(x.mean(axis=0), expected, atol=0.02)
-    np.testing.assert_allclose(np.cov(x.T), np.linalg.inv(precision), atol=0.01)
+
+
+@pytest.mark.parametrize(("shift", "shrink"), [(0, 1), (0, 0.2), (1, 0.5)], ids=["fitting", "narrow", "beside"])
+def test_marginals_are_unbiased_and_their_draws_the_posterior_however_bad_the_mixtures(shift, shrink):
+    """Mixtures of a fifth of the standard deviation, or beside the likelihood, alone would give unbounded weights."""
+    case, count, repeats = LinearSets(), 60, 4000
+    centre, covariance = case.interim(np.zeros(2), np.full(2, 1.2))
+    centre = centre + shift * np.sqrt(np.einsum("sii->si", covariance))
+    found = divide_out(("", ""), centre, shrink**2 * covariance, np.zeros(4), np.zeros(2), np.full(2, 1.2))
+    mixtures = Mixtures(found.precision[:, None], found.linear[:, None], found.constant[:, None])
+    emulators = case.emulators()
+    for b in (0, 1):
+        mean, variance = np.tile(case.nu[b], (repeats, 1)), np.tile(case.variance[b], (repeats, 1))
+        told = marginals(emulators, mixtures, mixtures, mean, variance, [count] * 4, 1, 7, f"x{b}", workers=2)
+        ratio = np.exp(told.logs - case.log_marginals(b))
+        variance_of = ratio.var(axis=0)
+        np.testing.assert_array_less(np.abs(ratio.mean(axis=0) - 1), 4 * np.sqrt(variance_of / repeats) + 1e-6)
+        few = round(DEFENSIVE * count)  # ∫ L² N²/q ≤ ∫ L² N/ε: no weight decides
+        np.testing.assert_array_less(variance_of, np.exp(case.log_marginals(b, 2) - 2 * case.log_marginals(b)) / few)
+        if (shift, shrink) == (0, 1):  # where a few draws tell their own variance; less, for they are stratified
+            np.testing.assert_array_less(variance_of, 1.1 * told.variance.mean(axis=0) / count)
+        for s in range(4):  # a pick given its estimate, weighted by that, is a draw of the posterior
+            middle, cov = case.posterior(b, s)
+            weights, x = ratio[:, s] / ratio[:, s].sum(), told.x[:, s, 0]
+            error = 4 * np.sqrt(np.diag(cov) * np.sum(weights**2))
+            np.testing.assert_array_less(np.abs(weights @ x - middle), error)
+            np.testing.assert_allclose(weights @ (x - middle) ** 2, np.diag(cov), rtol=0.15)
+
+
+def test_a_proposal_is_normalised_and_as_heavy_as_it_says():
+    rng = np.random.default_rng(3)
+    draws = np.concatenate([rng.standard_normal((3000, 3)), 4 + 0.3 * rng.standard_normal((1000, 3))])
+    proposal = Proposal.fitted(draws, rng, components=2)
+    h = proposal.draw(50_000, rng)
+    wide = multivariate_normal(np.ones(3), 9 * np.eye(3))
+    x = wide.rvs(50_000, random_state=rng)
+    assert np.mean(np.exp(proposal.log_density(x) - wide.logpdf(x))) == pytest.approx(1, abs=0.05)
+    weights = np.exp(multivariate_normal(np.zeros(3), np.eye(3)).logpdf(h) - proposal.log_density(h))
+    assert weights.mean() == pytest.approx(1, abs=0.02)
+    np.testing.assert_allclose(weights @ h**2 / weights.sum(), 1, atol=0.05)
+    assert weights.max() < 10
 
 
 def test_prior_divided_out_is_the_likelihood():

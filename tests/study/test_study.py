@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import random
+import shutil
+import subprocess
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
 from click.testing import CliRunner
+from run_files import assert_same_results, command, environment, resumed_until_done, run_cli
 
 from en4dvar.errors import ConfigError, OutputError
 from en4dvar_bubble.commands_study import study as study_command
 from en4dvar_bubble.study import tables
 from en4dvar_bubble.study.evidence import probability, verdict
 from en4dvar_bubble.study.figures import collapse
+from en4dvar_bubble.study.keep import identity_of
 from en4dvar_bubble.study.paper import QUANTITIES, TABLE_1, TABLE_2
 from en4dvar_bubble.study.run import run_study
 from en4dvar_bubble.study.settings import load_study
@@ -37,7 +44,7 @@ def small(tmp_path_factory):
     (folder / "study.yaml").write_text(text.replace("data/agarose_twin", str(CONFIGS / "data" / "agarose_twin")))
     call = [str(folder / "study.yaml"), "--set", "sweep.trajectories=128", "--set", "sweep.rounds=1"]
     call += ["--set", "sweep.step=0.1 us", "--out", str(folder / "out"), "--set", "population.rounds=60"]
-    call += ["--set", "population.blocks=1", "--set", "population.draws=200", "--set", "population.exact=50"]
+    call += ["--set", "population.passes=1", "--set", "population.draws=200", "--set", "population.exact=50"]
     result = CliRunner().invoke(study_command, call)
     assert result.exit_code == 0, (result.output, result.exception)
     return folder / "out", result.output, call
@@ -87,6 +94,79 @@ def test_tables_hold_the_printed_values(small):
 def test_an_earlier_study_is_kept(small):
     _, _, call = small
     assert isinstance(CliRunner().invoke(study_command, call).exception, OutputError)
+
+
+def test_a_changed_study_is_not_continued(small):
+    out, _, call = small
+    before = sorted((file, file.stat().st_mtime_ns) for file in out.rglob("*"))
+    error = CliRunner().invoke(study_command, [*call, "--set", "population.draws=250", "--resume"]).exception
+    assert isinstance(error, OutputError)
+    assert "-  draws: 200\n+  draws: 250" in str(error)
+    assert "give --force" in str(error)
+    assert sorted((file, file.stat().st_mtime_ns) for file in out.rglob("*")) == before
+    nowhere = [*call, "--out", str(out.parent / "none"), "--resume"]
+    assert isinstance(CliRunner().invoke(study_command, nowhere).exception, OutputError)
+
+
+def test_what_decides_the_numbers_of_a_study(tmp_path):
+    shutil.copytree(CONFIGS, tmp_path / "configs")
+    file = tmp_path / "configs" / "agarose_study.yaml"
+    before = identity_of(load_study(file))
+    file.write_text(file.read_text().replace("name: agarose_study", "name: other # and a comment"))
+    assert identity_of(load_study(file)).difference(before, frozenset()) == ""
+    reading = tmp_path / "configs" / "data" / "agarose_twin" / "agarose_03_02.csv"
+    reading.write_text(reading.read_text() + "\n")
+    config = tmp_path / "configs" / "agarose_10_nh.yaml"
+    config.write_text(config.read_text().replace("members: 48", "members: 49"))
+    changed = identity_of(load_study(file)).difference(before, frozenset()).splitlines()[2:]
+    told = [line.partition(":")[0].replace(" ", "") for line in changed if line[0] in "+-"]
+    assert told == ["-members", "+members"] + [
+        f"{sign}0.3%,{model},agarose_03_02" for model in ("nh", "qs", "qlkv") for sign in "-+"
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_a_study_killed_at_random_moments_and_resumed_has_the_same_bits(tmp_path):
+    """One gel, two laws; killed up to half a second after one to three more parts were kept."""
+    for model in ("nh", "qlkv"):
+        text = (CONFIGS / f"agarose_03_{model}.yaml").read_text()
+        data = CONFIGS / "data" / "agarose_twin"
+        (tmp_path / f"{model}.yaml").write_text(
+            text.replace("data/agarose_twin/agarose_03_*.csv", str(data / "agarose_03_0[1-4].csv"))
+        )
+    settings = "name: s\nseed: 1\nsynthetic: false\nsweep: {trajectories: 9000, step: 0.2 us, rounds: 1}\n"
+    settings += (
+        "population: {rounds: 60, passes: 1, draws: 200, exact: 50}\ngels:\n  a: {nh: nh.yaml, qlkv: qlkv.yaml}\n"
+    )
+    (tmp_path / "study.yaml").write_text(settings)
+    whole, pieces = tmp_path / "whole", tmp_path / "pieces"
+    done = run_cli("study", tmp_path / "study.yaml", "--out", whole)
+    assert done.returncode == 0, done.stderr
+    rng = random.Random(5)
+
+    def attempt(resume):
+        arguments = ("study", tmp_path / "study.yaml", "--out", pieces, *resume)
+        process = subprocess.Popen(command(*arguments), stderr=subprocess.PIPE, text=True, env=environment())
+        aim = _files(pieces) + rng.randint(1, 3)
+        while process.poll() is None and _files(pieces) < aim:
+            time.sleep(0.01)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=rng.uniform(0, 0.5))
+        process.kill()
+        return process.wait(), process.communicate()[1]
+
+    assert resumed_until_done(attempt) >= 3
+    assert_same_results(whole, pieces)
+    names = {p.relative_to(whole) for p in whole.rglob("*") if p.is_file()}
+    assert {p.relative_to(pieces) for p in pieces.rglob("*") if p.is_file()} == names
+    for name in names:
+        if name.suffix in (".csv", ".md", ".tex", ".yaml"):
+            assert (pieces / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+def _files(folder):
+    return sum(1 for file in folder.rglob("*") if not file.name.startswith("."))
 
 
 def test_results_as_netcdf(small):
@@ -153,7 +233,7 @@ def test_plus_minus_and_verdicts():
 
 @pytest.fixture(scope="module")
 def twin():
-    few = {"rounds": 60, "blocks": 1, "draws": 300, "exact": 50}  # no test here asks how good the populations are
+    few = {"rounds": 60, "passes": 1, "draws": 300, "exact": 50}  # no test here asks how good the populations are
     changes = {"sweep.trajectories": 8192, **{f"population.{key}": value for key, value in few.items()}}
     return run_study(load_study(CONFIGS / "agarose_study.yaml", changes), workers=2)
 

@@ -1,23 +1,29 @@
 """What a study has computed so far, on disk, so that one that was killed continues to the same bits.
 
-Kept are the chunks of the sweeps, the populations and the fits of one gel; En4D-Var is quick and computed again.
+Kept are the chunks of the sweeps, the populations and the fits of one gel; En4D-Var is quick and computed again. What
+decides the numbers is kept with them, and a study is continued only where that agrees.
 """
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from en4dvar.inputs.build import build
-from en4dvar.storage.checkpoint import CheckpointError, read_checkpoint, write_checkpoint
+import yaml
+
+from en4dvar.errors import OutputError
+from en4dvar.inputs.build import data_files, inverse_plan
+from en4dvar.runs.rundir import RunDirectory
+from en4dvar.storage.checkpoint import FOLDER, CheckpointError, digest, read_checkpoint, write_checkpoint
+from en4dvar.storage.fingerprint import Identity, identity
 from en4dvar_bubble.study.settings import StudyPlan
 from en4dvar_bubble.study.sweep import prepare_folder
 
 D = TypeVar("D")
-FOLDER = "checkpoints"
+IDENTITY = f"{FOLDER}/study"
 
 
 class Keep:
@@ -25,21 +31,36 @@ class Keep:
 
     def __init__(self, folder: Path, key: str):
         self.folder, self.key = folder, key
-        folder.mkdir(parents=True, exist_ok=True)
+
+    @classmethod
+    def open(cls, directory: RunDirectory, plan: StudyPlan) -> Keep:
+        """For a new study in ``directory``, or the one that is there.
+
+        Raises
+        ------
+        OutputError: the one there would have other numbers; says what has changed. It cannot be written.
+        """
+        who = identity_of(plan)
+        folder = directory.folder(FOLDER)
+        earlier = read_checkpoint(directory.work / IDENTITY, "study", Identity)
+        if earlier is not None and (difference := who.difference(earlier, frozenset())):
+            raise OutputError(
+                f"{directory.path}: the study cannot be resumed to the same result, for this has changed:\n{difference}"
+                "\ngive --force to compute everything again, or another --out"
+            )
+        write_checkpoint(directory.work / IDENTITY, "study", who)
+        return cls(folder, digest(f"{who.settings}{who.data}".encode()))
 
     def sweep(self, *words: str) -> Path:
-        """The folder of a sweep's chunks; those of another study are removed."""
-        folder = self.folder / _file("sweep", *words)
-        stored = folder / "sweep.key"
-        same = stored.exists() and stored.read_text(encoding="utf-8") == self.key
-        return prepare_folder(folder, self.key, "resume" if same else "force")
+        """The folder of a sweep's chunks."""
+        return prepare_folder(self.folder / _file("sweep", *words), self.key, "resume")
 
     def of(self, kind: type[D], compute: Callable[[], D], *words: str) -> D:
         """The dataclass kept under ``words``, or what ``compute`` gives, then kept."""
         path = self.folder / _file(kind.__name__, *words)
         try:
             found = read_checkpoint(path, self.key, kind)
-        except CheckpointError:  # of another study, or damaged: computed again
+        except CheckpointError:  # damaged: computed again
             found = None
         if found is None:
             found = compute()
@@ -47,15 +68,23 @@ class Keep:
         return found
 
 
-def key_of(plan: StudyPlan) -> str:
-    """What a study depends on: its file, its configurations as resolved, the readings."""
-    digest = hashlib.sha256(f"{plan.text}{plan.sweep}{plan.population}".encode())
+def identity_of(plan: StudyPlan) -> Identity:
+    """What decides the numbers of a study: its effort and seed, its configurations, readings, software and sources."""
+    settings: dict[str, Any] = {"seed": plan.seed, "sweep": asdict(plan.sweep), "population": asdict(plan.population)}
+    common: dict[str, Any] = {"software": {}, "sources": {}}
+    gels: dict[str, dict[str, Any]] = {}
+    data: list[tuple[str, str]] = []
     for gel, models in plan.configs.items():
+        gels[gel] = {}
         for model, config in models.items():
-            digest.update(f"{gel}{model}{config.resolved}".encode())
-            for problem in build(config):
-                digest.update(problem.observations.times.tobytes() + problem.observations.values.tobytes())
-    return digest.hexdigest()
+            one = identity(config.resolved, config.model, data_files(inverse_plan(config)))
+            content = yaml.safe_load(one.settings)
+            for key, values in common.items():
+                values.update(content.pop(key))
+            gels[gel][model] = content
+            data += [(f"{gel}, {model}, {name}", found) for name, found in one.data]
+    text = yaml.safe_dump({**settings, "gels": gels, **common}, sort_keys=False, allow_unicode=True, width=120)
+    return Identity(text, tuple(data))
 
 
 def _file(*words: str) -> str:

@@ -28,26 +28,15 @@ class Mixtures:
     linear: Array
     constant: Array
 
-    def log_density(self, x: Array) -> Array:
-        """ln of the mixtures (B, S) at coordinates (B, S, n)."""
-        squares = np.einsum("bsi,smij,bsj->bsm", x, self.precision, x, optimize=True)
-        exponent = self.constant + np.einsum("smi,bsi->bsm", self.linear, x) - 0.5 * squares
-        top = exponent.max(axis=2, keepdims=True)
-        return np.asarray(top[..., 0] + np.log(np.exp(exponent - top).sum(axis=2)))
+    def joined(self, other: Mixtures) -> Mixtures:
+        """The components of both."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Mixtures(*(np.concatenate(pair, axis=1) for pair in pairs))
 
     def log_marginal(self, mean: Array, variance: Array) -> Array:
         """(B,) sum over the sets of ln ∫ L_i(x) N(x; mean, diag variance) dx, for ``mean`` and ``variance`` (B, n)."""
         out = np.empty(len(mean))
         _log_marginals(self.precision, self.linear, self.constant, mean, variance, out)
-        return out
-
-    def draw(self, rng: np.random.Generator, mean: Array, variance: Array, count: int) -> Array:
-        """(B, count, S, n) draws of x_i given populations (B, n)."""
-        n_sets, _, n = self.linear.shape
-        pick = rng.uniform(size=(len(mean), count, n_sets))
-        normal = rng.standard_normal((len(mean), count, n_sets, n))
-        out = np.empty_like(normal)
-        _draws(self.precision, self.linear, self.constant, mean, variance, pick, normal, out)
         return out
 
 
@@ -58,17 +47,15 @@ def fit_mixtures(
     n_sets, _, n = draws.shape
     parts = (np.empty((n_sets, components, n, n)), np.empty((n_sets, components, n)), np.empty((n_sets, components)))
     for s in range(n_sets):
-        share, centre, covariance = _expectation_maximisation(draws[s], rng, components, rounds)
+        share, centre, covariance = fit_gaussians(draws[s], rng, components, rounds)
         found = divide_out(("",) * n, centre, covariance, np.log(share), prior_mean, prior_std)
         for target, values in zip(parts, (found.precision, found.linear, found.constant), strict=True):
             target[s] = values
     return Mixtures(*parts)
 
 
-def _expectation_maximisation(
-    x: Array, rng: np.random.Generator, components: int, rounds: int
-) -> tuple[Array, Array, Array]:
-    """Shares (M,), means (M, n) and covariances (M, n, n) of a mixture for points (D, n)."""
+def fit_gaussians(x: Array, rng: np.random.Generator, components: int, rounds: int) -> tuple[Array, Array, Array]:
+    """Shares (M,), means (M, n) and covariances (M, n, n) of a mixture for points (D, n); expectation maximisation."""
     count, n = x.shape
     middle, root = x.mean(axis=0), np.linalg.cholesky(np.cov(x, rowvar=False))
     z = np.linalg.solve(root, (x - middle).T).T
@@ -96,7 +83,7 @@ def _expectation_maximisation(
 
 
 @numba.njit(cache=True, nogil=True)
-def _condition(precision, linear, mean, variance, middle, root):  # type: ignore[no-untyped-def]
+def condition(precision, linear, mean, variance, middle, root):  # type: ignore[no-untyped-def]
     """A⁻¹b and the lower root of A; returns ½ bᵀA⁻¹b − ½ ln|DA| − ½ νᵀD⁻¹ν."""
     n = mean.size
     value = 0.0
@@ -133,6 +120,14 @@ def _back(root, z):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
+def draw_conditioned(middle, root, z, out):  # type: ignore[no-untyped-def]
+    """A draw of N(middle, (root rootᵀ)⁻¹) from standard normal z, which is overwritten."""
+    _back(root, z)
+    for i in range(z.size):
+        out[i] = middle[i] + z[i]
+
+
+@numba.njit(cache=True, nogil=True)
 def _log_marginals(precision, linear, constant, mean, variance, out):  # type: ignore[no-untyped-def]
     n_sets, n_parts, n = linear.shape
     middle, root, logs = np.empty(n), np.zeros((n, n)), np.empty(n_parts)
@@ -140,26 +135,6 @@ def _log_marginals(precision, linear, constant, mean, variance, out):  # type: i
         out[b] = 0.0
         for s in range(n_sets):
             for m in range(n_parts):
-                logs[m] = constant[s, m] + _condition(precision[s, m], linear[s, m], mean[b], variance[b], middle, root)
+                logs[m] = constant[s, m] + condition(precision[s, m], linear[s, m], mean[b], variance[b], middle, root)
             top = logs.max()
             out[b] += top + np.log(np.sum(np.exp(logs - top)))
-
-
-@numba.njit(cache=True, nogil=True)
-def _draws(precision, linear, constant, mean, variance, pick, normal, out):  # type: ignore[no-untyped-def]
-    n_sets, n_parts, n = linear.shape
-    middle, root = np.empty((n_parts, n)), np.zeros((n_parts, n, n))
-    logs, z = np.empty(n_parts), np.empty(n)
-    for b in range(mean.shape[0]):
-        for s in range(n_sets):
-            for m in range(n_parts):
-                logs[m] = constant[s, m] + _condition(
-                    precision[s, m], linear[s, m], mean[b], variance[b], middle[m], root[m]
-                )
-            share = np.cumsum(np.exp(logs - logs.max()))
-            share /= share[-1]
-            for c in range(pick.shape[1]):
-                m = min(np.searchsorted(share, pick[b, c, s]), n_parts - 1)
-                z[:] = normal[b, c, s]
-                _back(root[m], z)
-                out[b, c, s] = middle[m] + z

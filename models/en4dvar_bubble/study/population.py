@@ -11,85 +11,64 @@ Gaussian describes, so a Gaussian two-stage step goes astray. In stages, each co
 
 1. forward runs of every set around its posterior under a wide interim prior; polynomial emulators on them;
 2. interim posteriors on the emulators, as Gaussian mixtures with the interim prior divided out (Lunn et al. 2013, Stat.
-   Med. 32, 4139, reweight the draws themselves, which fails where τ is small);
-3. ν, τ by differential evolution with every x_i integrated out analytically, until R-hat and effective size suffice;
-4. importance weights: for each (ν, τ) the marginal likelihood of every set from ``inner`` draws of x_i (Tran et al.
-   2013, "IS²"), with the emulators, then with forward runs. What is returned is resampled by them.
+   Med. 32, 4139, reweight the draws themselves, which fails where τ is small); they tell where (ν, τ) are likely, and 1
+   and 2 are repeated with the interim prior that this gives: in the tail of a wide one a mixture is poor;
+3. a proposal for (ν, τ) with every x_i integrated out analytically (``study.hyper``);
+4. importance weights of its draws: the marginal likelihood of every set from draws of x_i, with the emulators, then
+   with forward runs (``study.weights``). What is returned is resampled by them. Where they leave few draws, the
+   proposal is fitted to what they say, or the interim prior once more, and all after it is done again; the best is
+   kept.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from en4dvar.executor import one_blas_thread
 from en4dvar.prior import Prior, member_stream
-from en4dvar.sampling.mcmc import effective_sample_size, split_r_hat
 from en4dvar.state import Array
-from en4dvar_bubble.study.emulator import Emulators, draw_interim, fit_emulators
+from en4dvar_bubble.study.effort import Effort
+from en4dvar_bubble.study.emulator import draw_interim
+from en4dvar_bubble.study.hyper import Hyper, HyperPrior, Proposal, walk
+from en4dvar_bubble.study.marginals import TEMPERATURE
 from en4dvar_bubble.study.mixture import Mixtures, fit_mixtures
-from en4dvar_bubble.study.set_runs import Runs, log_likelihood
+from en4dvar_bubble.study.set_runs import Runs
+from en4dvar_bubble.study.training import Training
+from en4dvar_bubble.study.weights import Weighed, normalised, with_emulators, with_runs
 
-SPREADS = (1e-3, 10.0)  # of τ; smaller ones are indistinguishable, and lost to rounding in the marginals
-MAX_R_HAT = 1.1  # Gelman et al. (2013), Bayesian Data Analysis, § 11.5
-
-
-@dataclass(frozen=True)
-class HyperPrior:
-    """Standard deviation of ν about the prior mean and scale of τ, in transformed coordinates."""
-
-    mean_std: float = 1.0
-    spread: float = 0.5
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How much is computed: forward runs a set and round of stage 1, mixture components, chain, importance draws."""
-
-    walkers: int = 16
-    rounds: int = 200
-    degree: int = 4
-    refits: int = 5
-    components: int = 12
-    chains: int = 32
-    block: int = 500
-    blocks: int = 8
-    effective: float = 200.0
-    draws: int = 2000
-    inner: int = 24
-    exact: int = 500
+FEWEST = 100.0  # effective draws of a result that can be trusted
+WIDER = 1.3  # the interim prior than the population found
 
 
 @dataclass(frozen=True)
 class Population:
     """Draws of ν and τ (M, p) in transformed coordinates, of the parameters ``names``.
 
-    ``r_hat`` and ``effective`` (2p,) judge the chain of stage 3 (ν, then ln τ); ``weighed`` are the effective sample
-    sizes of the weights of stage 4, with emulators and with forward runs; ``log_evidence``: of all data, hyperpriors
-    included, without Σ ln(std √2π).
+    ``weighed`` are the effective sample sizes of the weights of stage 4, with emulators and with forward runs;
+    ``log_evidence``: of all data, hyperpriors included, without Σ ln(std √2π).
     """
 
     names: tuple[str, ...]
     prior: Prior
     nu: Array
     tau: Array
-    r_hat: Array
-    effective: Array
     weighed: tuple[float, float]
     log_evidence: float
     forward_runs: int
 
     @property
     def converged(self) -> bool:
-        """Whether chain and weights can be trusted: R-hat below 1.1, at least 100 effective draws in the end."""
-        return bool(np.all(self.r_hat < MAX_R_HAT) and self.size >= 100)
+        """Whether the result can be trusted: at least 100 effective draws."""
+        return self.size >= FEWEST
 
     @property
     def size(self) -> float:
-        """Effective number of draws behind the result: no more than the chain, the weights of either kind give."""
-        return min(float(np.min(self.effective)), *self.weighed)
+        """Effective number of independent draws behind the result: the variances that both weights leave add up."""
+        return 1 / (1 / self.weighed[0] + 1 / self.weighed[1])
 
     @property
     def mean(self) -> Array:
@@ -131,186 +110,98 @@ def estimate_population(
     seed: int,
     hyper: HyperPrior | None = None,
     effort: Effort | None = None,
+    workers: int = 1,
 ) -> Population:
     """Sample the population of ``names`` given all data sets.
 
     Parameters
     ----------
     start: (S, N, n) control vectors near the posterior of each set (its ensemble); any rough ones will do.
+    workers: threads besides those of ``runs``; the numbers do not depend on it.
 
     Raises
     ------
     ValueError: fewer than 3 sets, or too few successful runs about the best fit of one.
     """
-    hyper, effort = hyper or HyperPrior(), effort or Effort()
+    scales, effort = hyper or HyperPrior(), effort or Effort()
     if len(start) < 3:
         raise ValueError("a population needs at least 3 data sets")
-    where = [prior.names.index(name) for name in names]
-    wide = prior.std.copy()
-    wide[where] = math.hypot(hyper.mean_std, hyper.spread)  # what ν and τ allow
-    emulators, count = _train(runs, start, prior.mean, wide, seed, effort)
-    interim = draw_interim(emulators, prior.mean, wide, seed, count=60)
-    mixtures = fit_mixtures(interim, prior.mean, wide, member_stream(seed, "mixtures"), effort.components)
-    target = _Target(mixtures, prior, where, hyper)
-    chain = _sample(target, member_stream(seed, "population"), effort)
-    flat = chain.reshape(-1, chain.shape[2])
-    h = flat[np.linspace(0, len(flat) - 1, effort.draws).astype(int)]
-    stream = member_stream(seed, "weights")
-    kept, weights, inner_evidence = _weigh(target, emulators, runs, h, stream, effort)
-    picked = kept[np.searchsorted(np.cumsum(weights[1]), stream.uniform(size=effort.draws)).clip(max=len(kept) - 1)]
-    p = len(where)
-    return Population(
-        tuple(names), prior, picked[:, :p], np.exp(picked[:, p:]), split_r_hat(chain), effective_sample_size(chain),
-        (_effective(weights[0]), _effective(weights[1])), _log_evidence(target, h, stream) + inner_evidence,
-        count + effort.exact * len(start),
-    )  # fmt: skip
+    with one_blas_thread():
+        return _Search(runs, start, prior, names, seed, scales, effort, workers).result(names)
 
 
-def _train(runs: Runs, start: Array, mean: Array, wide: Array, seed: int, effort: Effort) -> tuple[Emulators, int]:
-    """Stage 1: walkers of each set under the interim prior; every forward run on the way is a training point."""
-    stream = member_stream(seed, "interim runs")
-    n_sets, n_members, n = start.shape
-    half = effort.walkers // 2
-    x = start[:, stream.permutation(n_members)[: 2 * half]].transpose(1, 0, 2).reshape(2, half, n_sets, n).copy()
-    seen = runs.predictions(x.reshape(-1, n_sets, n))
-    density = (log_likelihood(runs, seen) + _gauss(x.reshape(-1, n_sets, n), mean, wide)).reshape(2, half, n_sets)
-    points, predictions, kept, sets = [], [], [], np.arange(n_sets)
-    for step in range(effort.rounds):
-        for g in (0, 1):
-            a = stream.integers(half, size=(half, n_sets))
-            b = (a + stream.integers(1, half, size=(half, n_sets))) % half
-            jump = 1.0 if step % 10 == 0 else 2.38 / math.sqrt(2 * n) * (1.0 if step % 2 else 0.5)
-            trial = x[g] + jump * (x[1 - g][a, sets] - x[1 - g][b, sets])
-            trial = trial + 1e-3 * wide * stream.standard_normal(trial.shape)
-            seen = runs.predictions(trial)
-            new = log_likelihood(runs, seen) + _gauss(trial, mean, wide)
-            better = np.log(stream.uniform(size=new.shape)) < new - density[g]
-            x[g] = np.where(better[..., None], trial, x[g])
-            density[g] = np.where(better, new, density[g])
-            if step >= effort.rounds // 6:
-                points.append(trial)
-                predictions.append(seen)
-                kept.append(x[g].copy())
-    at, seen = np.concatenate(points).transpose(1, 0, 2), np.concatenate(predictions).transpose(1, 0, 2)
-    draws = np.concatenate(kept).transpose(1, 0, 2)
-    count, visited = (effort.rounds + 1) * 2 * half * n_sets, 0
-    for number in range(effort.refits + 1):
-        emulators = fit_emulators(at, seen, runs.values, runs.weight, draws, effort.degree, visited)
-        if number < effort.refits:
-            draws = draw_interim(emulators, mean, wide, seed + number, count=4)
-            at = np.concatenate([at, draws], axis=1)
-            told = np.concatenate([runs.predictions(part) for part in np.array_split(draws.transpose(1, 0, 2), 4)])
-            seen = np.concatenate([seen, told.transpose(1, 0, 2)], axis=1)
-            visited += draws.shape[1]
-    return emulators, count + visited * n_sets
+class _Search:
+    """One estimate; see :func:`estimate_population`."""
 
+    def __init__(
+        self, runs: Runs, start: Array, prior: Prior, names: Sequence[str], seed: int, scales: HyperPrior,
+        effort: Effort, workers: int,
+    ):  # fmt: skip
+        self.runs, self.prior, self.seed, self.effort, self.workers = runs, prior, seed, effort, workers
+        self.where = [prior.names.index(name) for name in names]
+        self.hyper = Hyper(prior, self.where, scales)
+        self.mean, self.std = prior.mean.copy(), prior.std.copy()
+        self.std[self.where] = math.hypot(scales.mean_std, scales.spread)  # what ν and τ allow
+        self.training = Training(runs, start, self.mean, self.std, seed, effort)
+        self.tries = 0
 
-def _gauss(x: Array, mean: Array, std: Array) -> Array:
-    return np.asarray(-0.5 * np.sum(((x - mean) / std) ** 2, axis=-1))
+    def result(self, names: Sequence[str]) -> Population:
+        self.narrow(self.walked(self.mixtures(draws=30, components=8))[-2000:])
+        forward_runs, passes = 0, list[Population]()
+        for turn in range(self.effort.passes):
+            self.training.refit(self.mean, self.std, self.effort.refits)
+            mixtures = self.mixtures(draws=60, components=self.effort.components)
+            tempered = self.mixtures(draws=30, components=8, temperature=TEMPERATURE)
+            weighed = self.weighed(mixtures, tempered, self.walked(mixtures))
+            stream = member_stream(self.seed, "forward runs", turn)
+            found, count = with_runs(weighed, self.training.emulators, self.runs, self.effort.exact, stream)
+            forward_runs += count
+            h, p = found.h[found.resampled(self.effort.draws, stream)], len(self.where)
+            evidence = normalised(weighed.logs)[1] + normalised(found.logs)[1]
+            sizes = weighed.effective, found.effective
+            passes.append(Population(tuple(names), self.prior, h[:, :p], np.exp(h[:, p:]), sizes, evidence, 0))
+            if min(sizes) >= self.effort.effective:
+                break
+            if passes[-1].size >= FEWEST:  # a few draws would make it too narrow
+                self.narrow(h)
+        best = max(passes, key=lambda found: found.size)
+        return replace(best, forward_runs=self.training.count + forward_runs)
 
-
-class _Target:
-    """p(ν, ln τ | data) with all x_i integrated out over mixtures; h = (ν, ln τ)."""
-
-    def __init__(self, mixtures: Mixtures, prior: Prior, where: list[int], hyper: HyperPrior):
-        self.mixtures, self.prior, self.where, self.hyper = mixtures, prior, where, hyper
-        self.start = prior.mean[where]
-        p = len(where)
-        self.constant = -p * (0.5 * math.log(2 * math.pi) + math.log(hyper.mean_std))
-        self.constant += p * (0.5 * math.log(2 / math.pi) - math.log(hyper.spread))
-
-    def population(self, h: Array) -> tuple[Array, Array]:
-        """Mean and variance (B, n) of x given h (B, 2p)."""
+    def narrow(self, h: Array) -> None:
+        """Make the interim prior a little wider than populations (B, 2p)."""
         p = len(self.where)
-        mean = np.tile(self.prior.mean, (len(h), 1))
-        variance = np.tile(self.prior.std**2, (len(h), 1))
-        mean[:, self.where], variance[:, self.where] = h[:, :p], np.exp(2 * h[:, p:])
-        return mean, variance
+        self.mean[self.where] = h[:, :p].mean(axis=0)
+        self.std[self.where] = WIDER * np.sqrt(h[:, :p].var(axis=0) + np.exp(2 * h[:, p:]).mean(axis=0))
 
-    def __call__(self, h: Array) -> Array:
-        """(B,) log density, normalised but for the likelihoods."""
-        p = len(self.where)
-        hyper = -0.5 * np.sum(((h[:, :p] - self.start) / self.hyper.mean_std) ** 2, axis=1)
-        hyper += np.sum(h[:, p:] - 0.5 * np.exp(2 * h[:, p:]) / self.hyper.spread**2, axis=1)
-        inside = np.all((h[:, p:] > math.log(SPREADS[0])) & (h[:, p:] < math.log(SPREADS[1])), axis=1)
-        total = np.full(len(h), -np.inf)
-        total[inside] = self.mixtures.log_marginal(*self.population(h[inside])) + hyper[inside] + self.constant
-        return np.where(np.isnan(total), -np.inf, total)
+    def mixtures(self, draws: int, components: int, temperature: float = 1.0) -> Mixtures:
+        """Of the interim posteriors under the interim prior as it is, to the power 1/temperature."""
+        self.tries += 1
+        words, root = f"interim draws {self.tries}", math.sqrt(temperature)
+        interim = draw_interim(
+            self.training.emulators, self.mean, self.std, self.seed, words, draws, temperature=temperature
+        )
+        stream = member_stream(self.seed, "mixtures", self.tries)
+        return fit_mixtures(interim, self.mean, root * self.std, stream, components)
 
+    def walked(self, mixtures: Mixtures) -> Array:
+        """Populations (D, 2p) that the mixtures find likely."""
+        stream = member_stream(self.seed, "population", self.tries)
+        return walk(self.hyper, mixtures, stream, self.effort.hyper_walkers, self.effort.hyper_rounds)
 
-def _sample(target: _Target, stream: np.random.Generator, effort: Effort) -> Array:
-    """Stage 3: (steps, chains, 2p) after a quarter of burn-in."""
-    p, half = len(target.where), effort.chains // 2
-    spread = target.hyper.spread
-    nu = target.start + 0.5 * stream.standard_normal((2, half, p))
-    chains = np.concatenate([nu, math.log(0.6 * spread) + 0.5 * stream.standard_normal((2, half, p))], axis=2)
-    density = np.stack([target(group) for group in chains])
-    kept: list[Array] = []
-    for block in range(effort.blocks):
-        for step in range(effort.block):
-            jump = 1.0 if step % 10 == 0 else 2.38 / math.sqrt(4 * p) * (1.0 if step % 2 else 0.5)
-            for g in (0, 1):
-                a = stream.integers(half, size=half)
-                b = (a + stream.integers(1, half, size=half)) % half
-                trial = chains[g] + jump * (chains[1 - g][a] - chains[1 - g][b])
-                trial = trial + 1e-3 * stream.standard_normal(trial.shape)
-                new = target(trial)
-                better = np.log(stream.uniform(size=half)) < new - density[g]
-                chains[g][better], density[g][better] = trial[better], new[better]
-            kept.append(chains.reshape(-1, 2 * p).copy())
-        chain = np.stack(kept[len(kept) // 4 :])
-        enough = np.all(effective_sample_size(chain) >= effort.effective)
-        if block and enough and np.all(split_r_hat(chain) < MAX_R_HAT):
-            break
-    return chain
+    def weighed(self, mixtures: Mixtures, tempered: Mixtures, h: Array) -> Weighed:
+        """Draws of a proposal fitted to ``h``, with emulators; where few are left, of one fitted to those."""
+        found = self.proposed(mixtures, tempered, h, 0)
+        if found.effective < self.effort.effective:
+            stream = member_stream(self.seed, "second fit", self.tries)
+            found = self.proposed(mixtures, tempered, found.h[found.resampled(len(h), stream)], 1)
+        return found
 
-
-def _weigh(
-    target: _Target, emulators: Emulators, runs: Runs, h: Array, stream: np.random.Generator, effort: Effort
-) -> tuple[Array, tuple[Array, Array], float]:
-    """Stage 4: draws of h that were run (E, 2p), normalised weights of all and of those, ln of the mean weights."""
-    mean, variance = target.population(h)
-    logs, chosen = np.empty(len(h)), []
-    for begin in range(0, len(h), 100):
-        rows = slice(begin, begin + 100)
-        x = target.mixtures.draw(stream, mean[rows], variance[rows], effort.inner)  # (b, J, S, n)
-        flat = x.reshape(-1, *x.shape[2:])
-        ratio = (emulators.log_likelihood(flat) - target.mixtures.log_density(flat)).reshape(x.shape[:3])
-        top = ratio.max(axis=1, keepdims=True)
-        of_draw = np.exp(ratio - top)
-        logs[rows] = np.sum(top[:, 0] + np.log(of_draw.mean(axis=1)), axis=1)
-        share = np.cumsum(of_draw, axis=1)
-        pick = np.argmax(share > stream.uniform(size=(x.shape[0], 1, x.shape[2])) * share[:, -1:], axis=1)
-        chosen.append(np.take_along_axis(x, pick[:, None, :, None], axis=1)[:, 0])
-    weights, middle = _normalised(logs)
-    where = np.searchsorted(np.cumsum(weights), (np.arange(effort.exact) + stream.uniform()) / effort.exact)
-    where = where.clip(max=len(h) - 1)
-    x = np.concatenate(chosen)[where]
-    exact = np.concatenate([log_likelihood(runs, runs.predictions(x[i : i + 50])) for i in range(0, len(x), 50)])
-    of_exact, correction = _normalised(np.sum(exact - emulators.log_likelihood(x), axis=1))
-    return h[where], (weights, of_exact), middle + correction
-
-
-def _normalised(logs: Array) -> tuple[Array, float]:
-    """Weights that add up to one, and ln of their mean before."""
-    top = float(logs.max())
-    weights = np.exp(logs - top)
-    return weights / weights.sum(), top + math.log(float(weights.mean()))
-
-
-def _effective(weights: Array) -> float:
-    return float(1 / np.sum(weights**2))
-
-
-def _log_evidence(target: _Target, h: Array, stream: np.random.Generator, count: int = 2000) -> float:
-    """ln ∫ of the target by importance sampling from a Student t (5 degrees of freedom) about its draws."""
-    d, degrees = h.shape[1], 5
-    centre, root = h.mean(axis=0), np.linalg.cholesky(np.cov(h, rowvar=False))
-    normal = stream.standard_normal((count, d))
-    scale = np.sqrt(degrees / stream.chisquare(degrees, count))[:, None]
-    proposal = centre + (normal * scale) @ root.T
-    log_q = (
-        math.lgamma((degrees + d) / 2) - math.lgamma(degrees / 2) - d / 2 * math.log(degrees * math.pi)
-        - np.sum(np.log(np.diag(root))) - (degrees + d) / 2 * np.log1p(np.sum((normal * scale) ** 2, axis=1) / degrees)
-    )  # fmt: skip
-    return float(np.logaddexp.reduce(target(proposal) - log_q) - math.log(count))
+    def proposed(self, mixtures: Mixtures, tempered: Mixtures, h: Array, turn: int) -> Weighed:
+        number = 2 * self.tries + turn
+        at = h[np.linspace(0, len(h) - 1, 3000).astype(int)]
+        stream = member_stream(self.seed, "fit of the proposal", number)
+        proposal = Proposal.fitted(at, stream, self.effort.hyper_components)
+        return with_emulators(
+            self.hyper, proposal, self.training.emulators, mixtures, tempered, self.effort.draws, self.seed, number,
+            self.workers,
+        )  # fmt: skip

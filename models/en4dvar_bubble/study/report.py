@@ -15,8 +15,8 @@ from en4dvar.storage.files import write_bytes, write_text
 from en4dvar_bubble.study import measured, tables
 from en4dvar_bubble.study.evidence import DECISIVE, MISFIT, probability, verdict
 from en4dvar_bubble.study.figures import all_figures
+from en4dvar_bubble.study.hyper import HyperPrior
 from en4dvar_bubble.study.paper import LABELS, NAMES, QUANTITIES, ROUTES, Route
-from en4dvar_bubble.study.population import HyperPrior
 from en4dvar_bubble.study.run import Study, per_set_csv
 from en4dvar_bubble.study.store import study_netcdf
 
@@ -92,8 +92,15 @@ def _campaigns() -> Block:
         "population mean holds the mean of the lognormal that the truths were drawn from, and the mean of the truths "
         "drawn. Measured once (python benchmarks/study_population.py) and shipped with the package; not computed by "
         "this study.",
-        "heads": ["gel", "parameter", "distribution's mean", "mean of the truths", "campaigns"],
-        "rows": [[gel, name, str(a), str(b), str(n)] for gel, name, a, b, n in measured.coverage()],
+        "heads": ["gel", "parameter", "distribution's mean", "share ± binomial std", "mean of the truths", "campaigns"],
+        "rows": [
+            [
+                c.gel,
+                c.parameter,
+                *map(str, (c.held, f"{c.held / c.campaigns:.2f} ± {c.error:.2f}", c.of_drawn, c.campaigns)),
+            ]
+            for c in measured.coverage()
+        ],
     }
 
 
@@ -147,13 +154,9 @@ def findings(study: Study) -> list[str]:
                 )
     told += [told_of for gel in study.fits if (told_of := _apparent_modulus(study, gel))]
     for route in ROUTE_KEYS:
-        scores = {
-            m: np.concatenate([f.nrmse(route) for models in study.fits.values() for n, f in models.items() if n == m])
-            for m in NAMES
-        }
-        words = ", ".join(
-            f"{LABELS[m]} {v.min():.3f} to {v.max():.3f}, mean {v.mean():.3f}" for m, v in scores.items() if len(v)
-        )
+        used = [m for m in NAMES if any(m in models for models in study.fits.values())]
+        scores = {m: np.concatenate([f[m].nrmse(route) for f in study.fits.values() if m in f]) for m in used}
+        words = ", ".join(f"{LABELS[m]} {v.min():.3f} to {v.max():.3f}, mean {v.mean():.3f}" for m, v in scores.items())
         told.append(f"NRMSE, {ROUTES[route]}: {words}.")
     return told
 
@@ -260,8 +263,8 @@ def _population(study: Study) -> Block:
                 [gel, f"{q.plain} ({q.unit})", *cells, tables.plus_minus((stacked.mean(), stacked.std())), known]
             )
     judged = [
-        f"{gel}: R-hat {f.r_hat.max():.3f}, effective draws {f.size:.0f}"
-        + ("" if f.converged else ", NOT CONVERGED: do not use")
+        f"{gel}: {f.size:.0f} effective draws (weights with emulators {f.weighed[0]:.0f}, with forward runs "
+        f"{f.weighed[1]:.0f})" + ("" if f.converged else ", NOT CONVERGED: do not use")
         for gel, f in study.populations.items()
     ]
     hyper = HyperPrior()

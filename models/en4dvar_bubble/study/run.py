@@ -215,7 +215,7 @@ def _population(fit: Fit, plan: StudyPlan, workers: int, keep: Keep | None) -> P
 
 def _estimated(fit: Fit, plan: StudyPlan, workers: int, names: Sequence[str]) -> Population:
     runs = SetRuns(fit.problems, workers)
-    return estimate_population(runs, _start(fit), fit.prior, names, plan.seed, effort=plan.population)
+    return estimate_population(runs, _start(fit), fit.prior, names, plan.seed, effort=plan.population, workers=workers)
 
 
 def _compare(

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.errors import ConfigError
 from en4dvar.problem import InverseProblem
@@ -22,8 +23,11 @@ class Runs(Protocol):
     values: Array
     weight: Array
 
-    def predictions(self, x: Array) -> Array:
-        """(B, S, K) of coordinates (B, S, n), NaN where a run failed; anything finite where ``weight`` is 0."""
+    def predictions(self, x: Array, sets: npt.NDArray[np.intp] | None = None) -> Array:
+        """(B, S, K) of coordinates (B, S, n), NaN where a run failed; anything finite where ``weight`` is 0.
+
+        ``sets``: the data sets meant, all by default.
+        """
 
 
 class SetRuns:
@@ -53,14 +57,15 @@ class SetRuns:
             self.times[s] = o.times[-1]  # padded: read again, and not counted
             self.times[s, :k], self.values[s, :k], self.weight[s, :k] = o.times, o.values, o.weights / o.std**2
 
-    def predictions(self, x: Array) -> Array:
+    def predictions(self, x: Array, sets: npt.NDArray[np.intp] | None = None) -> Array:
         """See :class:`Runs`."""
         n_batch, n_sets, n = x.shape
+        readings = self.times if sets is None else self.times[sets]
         theta = self.prior.to_physical(x.reshape(-1, n))
         of = dict(zip(self.prior.names, theta.T, strict=True))
         of |= {name: np.full(len(theta), value) for name, value in self.fixed.items()}
         shift = of.get(TIME_SHIFT.name, np.zeros(len(theta)))
-        times = np.maximum(np.tile(self.times, (n_batch, 1)) + shift[:, None], 0.0)
+        times = np.maximum(np.tile(readings, (n_batch, 1)) + shift[:, None], 0.0)
         out = np.full(times.shape, np.nan)
 
         def run(begin: int) -> None:
@@ -74,7 +79,8 @@ class SetRuns:
         return out.reshape(n_batch, n_sets, -1)
 
 
-def log_likelihood(runs: Runs, predictions: Array) -> Array:
-    """−½ Σ β (y − m)²/std² (B, S) of predictions (B, S, K); −inf where a run failed."""
-    squares = np.sum(runs.weight * (runs.values - predictions) ** 2, axis=2)
+def log_likelihood(runs: Runs, predictions: Array, sets: npt.NDArray[np.intp] | None = None) -> Array:
+    """−½ Σ β (y − m)²/std² (B, S) of predictions (B, S, K) for ``sets``, all by default; −inf where a run failed."""
+    chosen = slice(None) if sets is None else sets
+    squares = np.sum(runs.weight[chosen] * (runs.values[chosen] - predictions) ** 2, axis=2)
     return np.where(np.isfinite(squares), -0.5 * squares, -np.inf)

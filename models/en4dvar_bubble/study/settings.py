@@ -14,8 +14,8 @@ from en4dvar.config.schema import Name, QuantityText, Section
 from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.inputs.units import UnitError, parse_quantity
+from en4dvar_bubble.study.effort import Effort
 from en4dvar_bubble.study.paper import Model
-from en4dvar_bubble.study.population import Effort
 from en4dvar_bubble.study.sweep import SweepSettings
 
 MODELS: tuple[Model, ...] = ("nh", "qs", "qlkv")
@@ -52,12 +52,12 @@ class PopulationSection(Section):
     """Rounds of the walkers over each data set, from which its emulator is learnt."""
     components: Annotated[int, Field(ge=1, le=100)] = Effort.components
     """Gaussians in the mixture that stands for a data set's posterior."""
-    blocks: Annotated[int, Field(ge=1)] = Effort.blocks
-    """Blocks of the chain of means and spreads, at most; it ends when it has mixed."""
+    passes: Annotated[int, Field(ge=1)] = Effort.passes
+    """How often, at most, an interim prior is tried; it ends when there are enough effective draws."""
     draws: Annotated[int, Field(ge=100)] = Effort.draws
-    """Draws of the chain that receive importance weights."""
+    """Draws of means and spreads that receive importance weights with emulators."""
     exact: Annotated[int, Field(ge=50)] = Effort.exact
-    """Of them, those weighed by forward runs instead of emulators."""
+    """Of them, those weighed by forward runs as well."""
 
     def built(self) -> Effort:
         """The rest as by default."""

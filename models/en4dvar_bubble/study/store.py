@@ -67,8 +67,9 @@ def _population(found: Population) -> Group:
         variables[f"mean_{name}"] = Variable(("draw",), found.mean[:, j], told)
         variables[f"spread_{name}"] = Variable(("draw",), found.std[:, j], told)
     judged = {
-        "r_hat": float(found.r_hat.max()),
         "effective_draws": found.size,
+        "effective_draws_emulators": found.weighed[0],
+        "effective_draws_forward_runs": found.weighed[1],
         "log_evidence": found.log_evidence,
         "forward_runs": found.forward_runs,
     }

@@ -23,7 +23,7 @@ from en4dvar.forward import ForwardModel
 from en4dvar.prior import member_stream
 from en4dvar.problem import InverseProblem
 from en4dvar.state import TIME_SHIFT, Array, Parameter
-from en4dvar.storage.files import atomic_path
+from en4dvar.storage.files import atomic_path, write_text
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.study.nearest import Targets, best_over_shifts, targets
 
@@ -299,7 +299,9 @@ def prepare_folder(folder: Path, key: str, mode: str) -> Path:
             raise OutputError(f"{folder}: holds a sweep; give --resume to continue it or --force to replace it")
         if stored and stored != key:
             raise OutputError(f"{folder}: holds the sweep of another configuration; give --force to replace it")
-        mark.write_text(key, encoding="utf-8")
+        for partial in folder.glob(".*.tmp"):  # of a process that was killed
+            partial.unlink()
+        write_text(mark, key)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be used: {error.strerror or error}") from None
     return folder

@@ -1,0 +1,135 @@
+"""Importance weights of draws h of a population: with emulators for all of them, with forward runs for the best."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.prior import member_stream
+from en4dvar.state import Array
+from en4dvar_bubble.study.emulator import Emulators
+from en4dvar_bubble.study.hyper import Hyper, Proposal
+from en4dvar_bubble.study.marginals import Marginals, marginals
+from en4dvar_bubble.study.mixture import Mixtures
+from en4dvar_bubble.study.set_runs import Runs, log_likelihood
+
+NOISE = 0.4  # variance of a log-weight that estimates of the marginals may add
+FEWEST, MOST = 8, 1000  # draws of one marginal
+PILOT, TRIAL = 64, 256  # populations and draws from which the numbers of draws are found
+PICKS = 8  # most forward runs of one set for one h
+BATCH = 50  # populations of one call for forward runs
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """Draws ``h`` (B, 2p) with logs of their weights (B,), not normalised, and of each x (B, S, P, n) given h."""
+
+    h: Array
+    logs: Array
+    x: Array
+
+    @property
+    def effective(self) -> float:
+        """Effective number of draws."""
+        weights = normalised(self.logs)[0]
+        return float(1 / np.sum(weights**2))
+
+    def resampled(self, count: int, stream: np.random.Generator) -> npt.NDArray[np.intp]:
+        """(count,) indices, each as often as its weight says (systematic resampling)."""
+        where = np.searchsorted(
+            np.cumsum(normalised(self.logs)[0]), (np.arange(count) + stream.uniform()) / count, side="right"
+        )
+        return where.clip(max=len(self.h) - 1)
+
+
+def normalised(logs: Array) -> tuple[Array, float]:
+    """Weights that add up to one, and ln of their mean before.
+
+    Raises
+    ------
+    ValueError: all of them are zero.
+    """
+    top = float(logs.max())
+    if not np.isfinite(top):
+        raise ValueError("no population that was drawn explains the data")
+    weights = np.exp(logs - top)
+    return weights / weights.sum(), top + math.log(float(weights.mean()))
+
+
+def with_emulators(
+    hyper: Hyper, proposal: Proposal, emulators: Emulators, mixtures: Mixtures, tempered: Mixtures, count: int,
+    seed: int, round_: int, workers: int,
+) -> Weighed:  # fmt: skip
+    """``count`` draws of the proposal with the weights p(h) Π_i p_i(h) / q(h) (Tran et al. 2013, "IS²").
+
+    Each marginal p_i is estimated without bias, so that the weights are right whatever the numbers of draws; these are
+    such that estimates add a variance of :data:`NOISE` to a log-weight.
+    """
+    h = proposal.draw(count, member_stream(seed, "proposal", round_))
+    logs = hyper.log_density(h) - proposal.log_density(h)
+    inside = np.flatnonzero(np.isfinite(logs))
+    mean, variance = hyper.population(h[inside])
+    likely = normalised(logs[inside] + mixtures.log_marginal(mean, variance))[0]
+    pilot = member_stream(seed, "pilot", round_).choice(len(inside), PILOT, p=likely)
+
+    def told(rows: npt.NDArray[np.intp] | slice, counts: list[int], words: str) -> Marginals:
+        words = f"{words} {round_}"
+        return marginals(emulators, mixtures, tempered, mean[rows], variance[rows], counts, PICKS, seed, words, workers)
+
+    n_sets = len(emulators.centre)
+    root = np.sqrt(told(pilot, [TRIAL] * n_sets, "trial marginals").variance.mean(axis=0))
+    counts = np.clip(root * root.sum() / NOISE, FEWEST, MOST).astype(int).tolist()
+    found = told(slice(None), counts, "marginals")
+    logs[inside] += found.logs.sum(axis=1)
+    x = np.empty((len(h), *found.x.shape[1:]))
+    x[inside] = found.x
+    return Weighed(h, logs, x)
+
+
+def with_runs(
+    weighed: Weighed, emulators: Emulators, runs: Runs, count: int, stream: np.random.Generator
+) -> tuple[Weighed, int]:
+    """``count`` draws, as often as their weights say, weighed by Π_i of the mean L_i/L̂_i over draws of x_i; runs made.
+
+    Sets whose emulator errs get more than one forward run for each h, until the variance that the errors give to a
+    log-weight falls below :data:`NOISE` or :data:`PICKS` are reached.
+    """
+    kept = weighed.resampled(count, stream)
+    x = weighed.x[kept]
+    n_sets = x.shape[1]
+    ratio = np.full((count, n_sets, PICKS), -np.inf)  # ln L/L̂
+    done, wanted = np.zeros(n_sets, dtype=int), np.ones(n_sets, dtype=int)
+    while not np.array_equal(done, wanted):
+        for k in range(PICKS):
+            sets = np.flatnonzero((done <= k) & (wanted > k))
+            if len(sets):
+                ratio[:, sets, k] = _errors(runs, emulators, x[:, sets, k], sets)
+        done = wanted.copy()
+        errors = _relative_variance(ratio) / done
+        while errors.sum() > NOISE:
+            worst = int(np.argmax(np.where(wanted < PICKS, errors, 0.0)))
+            if wanted[worst] == PICKS or errors[worst] < NOISE / (2 * n_sets):
+                break  # what remains is beyond more runs
+            wanted[worst] *= 2
+            errors[worst] /= 2
+    logs = np.logaddexp.reduce(ratio, axis=2) - np.log(done)
+    return Weighed(weighed.h[kept], logs.sum(axis=1), x), count * int(done.sum())
+
+
+def _errors(runs: Runs, emulators: Emulators, x: Array, sets: npt.NDArray[np.intp]) -> Array:
+    """ln L/L̂ (B, s) of coordinates (B, s, n) of ``sets``."""
+    parts = [x[i : i + BATCH] for i in range(0, len(x), BATCH)]
+    exact = np.concatenate([log_likelihood(runs, runs.predictions(part, sets), sets) for part in parts])
+    return np.asarray(exact - emulators.log_likelihood(x, sets))
+
+
+def _relative_variance(logs: Array) -> Array:
+    """(S,) of exp(logs) (B, S, P) relative to the square of its mean; entries not computed yet are −inf and no draw."""
+    weights = np.exp(logs - logs.max(axis=(0, 2), keepdims=True))
+    computed = np.isfinite(logs).any(axis=0)  # (S, P)
+    count = len(logs) * np.maximum(computed.sum(axis=1), 1)
+    mean = weights.sum(axis=(0, 2)) / count
+    return np.asarray((weights**2).sum(axis=(0, 2)) / count / mean**2 - 1)
