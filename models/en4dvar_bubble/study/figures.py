@@ -20,6 +20,7 @@ MODEL_COLOURS = {"nh": "#d55e00", "qs": "#009e73", "qlkv": "#0072b2"}
 GEL_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#85858f")
 ALONE = {"nh": "NH", "qs": "QS QLKV", "qlkv": "QLKV"}
 Drawn = tuple[str, str, Figure]
+FARTHEST = 30.0  # difference of log-evidences that the axis shows
 
 
 def all_figures(study: Study) -> Iterator[Drawn]:
@@ -187,7 +188,9 @@ def distributions(study: Study, route: Route) -> Figure:
     inset.tick_params(labelsize=5.5)
     inset.set_xlabel(_label(QUANTITIES[1]), fontsize=6, labelpad=1)
     inset.set_yticks([])
-    inset.set_xticks([t for t in (1, 3, 10) if inset.get_xlim()[0] <= t <= inset.get_xlim()[1]])
+    low, high = inset.get_xlim()
+    ticks = (0.1, 0.3, 1, 3, 10, 30) if high / low > 10 else (0.5, 1, 2, 3, 5, 10, 20)
+    inset.set_xticks([t for t in ticks if low <= t <= high])
     handles, labels = panels[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=4)
     return figure
@@ -309,16 +312,24 @@ def population(study: Study) -> Figure:
 
 @styled
 def evidence(study: Study) -> Figure:
-    """Δ log-evidence of every data set, the undecidable band shaded."""
+    """Δ log-evidence of every data set, the undecidable band shaded; beyond the axis a triangle with the value."""
     figure = Figure(figsize=(COLUMN, 0.6 * COLUMN), layout="constrained")
     axes = figure.subplots()
     axes.axvspan(-3, 3, color=LIGHT["grid"], zorder=0)
     axes.axvline(0, color=LIGHT["muted"], lw=0.6)
     for row, found in enumerate(study.comparisons.values()):
         height = row + np.linspace(-0.25, 0.25, len(found.single))
-        axes.plot(found.single, height, "o" if row == 0 else "s", ms=3.2, color=GEL_COLOURS[row])
+        inside = np.abs(found.single) <= FARTHEST
+        axes.plot(found.single[inside], height[inside], "o" if row == 0 else "s", ms=3.2, color=GEL_COLOURS[row])
+        for value, y in zip(found.single[~inside], height[~inside], strict=True):
+            edge, marker, side = (FARTHEST, ">", "right") if value > 0 else (-FARTHEST, "<", "left")
+            axes.plot(edge, y, marker, ms=4.5, color=GEL_COLOURS[row], clip_on=False)
+            axes.annotate(
+                f"{value:.0f}", (edge, y), (-5 if value > 0 else 5, 0), textcoords="offset points", fontsize=6, ha=side,
+                va="center",
+            )  # fmt: skip
     axes.set_yticks(range(len(study.comparisons)), [f"{gel} gel" for gel in study.comparisons])
-    reach = max(4.0, *(1.1 * np.max(np.abs(c.single)) for c in study.comparisons.values()))
+    reach = min(FARTHEST, max(4.0, *(1.1 * np.max(np.abs(c.single)) for c in study.comparisons.values())))
     axes.set(xlabel=r"$\Delta$ log-evidence (neo-Hookean $\leftarrow$ 0 $\rightarrow$ quadratic)", xlim=(-reach, reach))
     return figure
 
