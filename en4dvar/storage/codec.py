@@ -14,6 +14,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 D = TypeVar("D")
 _TEXT = "content"
@@ -61,7 +62,7 @@ def _typed(raw: Any, kind: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
         if raw is None and type(None) in arguments:
             return None
         return _typed(raw, next(a for a in arguments if a is not type(None)), arrays)
-    if origin is np.ndarray:
+    if origin in (np.ndarray, npt.NDArray):  # from NumPy 2.5 on NDArray is an alias with a name of its own
         return arrays[raw["array"]]
     if origin is tuple:
         items = arguments[:1] * len(raw) if arguments[1:] == (Ellipsis,) else arguments
