@@ -69,6 +69,7 @@ def log_evidence(cost: float, singular_values: Array, n_members: int, observatio
 
 
 @lru_cache(maxsize=256)
+@lru_cache(maxsize=64)  # every start and every examination asks for the same few
 def chi2_interval(degrees: float) -> tuple[float, float]:
     """Central 99.9 % interval of χ² with ``degrees`` degrees of freedom (need not be whole)."""
     from scipy.special import gammaincinv  # scipy is not needed to import the package

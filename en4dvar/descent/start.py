@@ -70,7 +70,7 @@ def highest_plausible(space: WeightSpace) -> float:
     """
     weights = space.problem.observations.weights
     used = weights[weights > 0]
-    return 0.5 * float(np.mean(used)) * diag.chi2_interval(len(used))[1] if len(used) else np.inf
+    return 0.5 * float(used.mean()) * diag.chi2_interval(float(len(used)))[1] if len(used) else np.inf
 
 
 @dataclass
