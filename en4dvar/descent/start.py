@@ -55,10 +55,10 @@ def choose_start(space: WeightSpace, run: Forecast) -> Start:
     together = min(space.settings.starts, len(starts))
     if together < 2:
         return Start(candidates[best[0]], (), warnings)
-    lowest = Scout(starts[0])
+    lowest, plausible = Scout(starts[0]), highest_plausible(space)
     for first in range(0, len(starts), together):
-        lowest = min(lowest, lowest_basin(space, starts[first : first + together]), key=lambda scout: scout.cost)
-        if lowest.cost <= highest_plausible(space):
+        lowest = min(lowest, lowest_basin(space, starts[first : first + together], plausible), key=lambda s: s.cost)
+        if lowest.cost <= plausible:
             break
     return Start(lowest.w, tuple(lowest.path), warnings)
 
@@ -83,10 +83,10 @@ class Scout:
     path: list[tuple[Local, Move]] = field(default_factory=list)
 
 
-def lowest_basin(space: WeightSpace, starts: list[Array]) -> Scout:
-    """The descent from one of the starts (N,) that reaches the lowest J."""
+def lowest_basin(space: WeightSpace, starts: list[Array], plausible: float) -> Scout:
+    """The descent from one of the starts (N,) to the lowest J; the last one goes on while J is above ``plausible``."""
     scouts = [Scout(w) for w in starts]
-    transform, plausible = np.eye(len(space.members)), highest_plausible(space)
+    transform = np.eye(len(space.members))
     for _ in range(space.settings.max_iterations):
         going = [scout for scout in scouts if scout.active]
         if not going:
