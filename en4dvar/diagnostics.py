@@ -22,7 +22,7 @@ HARDLY_INFORMED = 0.1  # DFS of a parameter below which its posterior is said to
 
 def background_cost(w: Array) -> Array:
     """J_b = (N−1)/2 ‖w‖² of weights (…, N)."""
-    return np.asarray(0.5 * (w.shape[-1] - 1) * (w * w).sum(axis=-1))
+    return np.asarray(0.5 * (w.shape[-1] - 1) * np.add.reduce(w * w, axis=-1))
 
 
 def dfs(singular_values: Array, n_members: int) -> float:
@@ -37,7 +37,9 @@ def dfs_per_parameter(prior: Array, posterior: Array) -> Array:
 
 def spread(members: Array, prior_variance: Array) -> float:
     """Root mean over the parameters of ensemble variance / prior variance; (N, n) and (n,), transformed."""
-    return math.sqrt(float(np.mean(members.var(axis=0) / prior_variance)))
+    anomalies = members - np.add.reduce(members, axis=0) / len(members)
+    variance = np.einsum("ij,ij->j", anomalies, anomalies) / len(members)
+    return math.sqrt(float(np.add.reduce(variance / prior_variance)) / len(variance))
 
 
 def chi2_per_observation(
@@ -68,8 +70,7 @@ def log_evidence(cost: float, singular_values: Array, n_members: int, observatio
     return float(-cost - 0.5 * log_det - log_normalisation(observations))
 
 
-@lru_cache(maxsize=256)
-@lru_cache(maxsize=64)  # every start and every examination asks for the same few
+@lru_cache(maxsize=256)  # every start and every examination asks for the same few
 def chi2_interval(degrees: float) -> tuple[float, float]:
     """Central 99.9 % interval of χ² with ``degrees`` degrees of freedom (need not be whole)."""
     from scipy.special import gammaincinv  # scipy is not needed to import the package

@@ -61,7 +61,7 @@ def observation_cost(
         terms = _loss(observations, whitened_residual(observations, predictions, rates, noise_scale))
         if rates is not None or noise_scale is not None:
             terms = terms + np.log(error_std(observations, rates, noise_scale) / observations.std)
-        total = (observations.weights * terms).sum(axis=-1)
+        total = np.add.reduce(observations.weights * terms, axis=-1)
     return np.where(np.isfinite(total), total, np.inf)
 
 

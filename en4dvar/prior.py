@@ -149,6 +149,12 @@ class Prior:
         return np.array([p.bounds[0] for p in self.parameters]), np.array([p.bounds[1] for p in self.parameters])
 
     @cached_property
+    def finite_bounds(self) -> tuple[Array, Array]:
+        """:attr:`bounds` with the largest finite numbers for ±inf, so that an infinite value is outside."""
+        largest = np.finfo(float).max
+        return np.maximum(self.bounds[0], -largest), np.minimum(self.bounds[1], largest)
+
+    @cached_property
     def mean(self) -> Array:
         """(n,) in transformed space."""
         return np.array([term.mean for term in self.terms])

@@ -34,12 +34,12 @@ class Tangent:
     """The observations' part of a tangent linearisation, for rules that look at curvature.
 
     ``prediction`` (K,) at the centre, ``anomalies`` C (r, K) of the predictions per unit of the coordinates of
-    ``basis`` U (N, r), ``weighted`` C βR⁻¹.
+    ``basis`` U (N, r), ``precision`` what applies βR⁻¹ to a vector (K,).
     """
 
     prediction: Array
     anomalies: Array
-    weighted: Array
+    precision: Callable[[Array], Array]
     basis: Array
 
 
@@ -110,7 +110,7 @@ def acceleration(step: Step, tangent: Tangent, lengths: Array, predictions: Arra
     shortest = runnable[np.argmin(lengths[runnable])]
     a = lengths[shortest]
     departure = predictions[shortest] - tangent.prediction - a * (step.direction @ tangent.basis) @ tangent.anomalies
-    bend = -step.hessian.solve(tangent.basis @ (tangent.weighted @ (departure * 2 / a**2)))
+    bend = -step.hessian.solve(tangent.basis @ (tangent.anomalies @ tangent.precision(departure * 2 / a**2)))
     longest = MOST_BENT * float(np.linalg.norm(step.direction))
     return np.asarray(bend * min(1.0, longest / (float(np.linalg.norm(bend)) or 1.0)))
 
@@ -157,9 +157,10 @@ def run_searches(searches: Sequence[Search], try_out: Callable[[Array], Trials])
 
 def _lowest(at: Point, moves: Array, lengths: Array, trials: Trials, sufficient: float = SUFFICIENT) -> Move | None:
     """The trial of lowest J among those that decrease it enough, of ``moves`` (B, N)."""
-    slopes = np.minimum(0.0, moves @ at.step.gradient)
-    passed = np.isfinite(trials.costs) & (trials.costs <= at.cost + sufficient * slopes)
-    if not passed.any():
+    slopes = (moves @ at.step.gradient).tolist()
+    costs = trials.costs.tolist()  # of a few trials, which Python compares faster than numpy
+    passed = [i for i, slope in enumerate(slopes) if costs[i] <= at.cost + sufficient * min(0.0, slope)]
+    if not passed:
         return None
-    best = int(np.argmin(np.where(passed, trials.costs, np.inf)))
-    return Move(at.w + moves[best], float(trials.costs[best]), float(lengths[best]))
+    best = min(passed, key=costs.__getitem__)
+    return Move(at.w + moves[best], costs[best], float(lengths[best]))

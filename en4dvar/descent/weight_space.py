@@ -10,15 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import accumulate
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
 from en4dvar import diagnostics as diag
 from en4dvar.descent.step_control import STEP_CONTROLS, Move, Point, Tangent, Trials, run_searches
 from en4dvar.ensemble.forecast import NO_TIMES, Forecast, forecast
-from en4dvar.ensemble.linalg import anomaly_basis, centre
+from en4dvar.ensemble.linalg import Hessian, anomaly_basis, centre
 from en4dvar.executor import Executor
 from en4dvar.likelihood import Linearisation, observation_cost, precision_times, whiten
 from en4dvar.prior import Prior, Sampling
@@ -33,7 +32,8 @@ class Local:
     """What is known at weights: the runs it took, J_o and J at the centre, and the step from there.
 
     ``members`` are the runs beside the centre, N of them or r. ``active`` counts the members that inform the step: N
-    where r runs stand for all. ``step`` is None where too few do; ``tangent`` is None for a regression.
+    where r runs stand for all. Where too few do, ``linear``, the linearisation in coordinates of the basis, and
+    ``step`` are None.
     """
 
     weights: Weights
@@ -42,8 +42,11 @@ class Local:
     active: int
     observation: float
     cost: float
+    linear: Linearisation | None
     step: Step | None
-    tangent: Tangent | None
+
+
+_Seen = tuple[Weights, Forecast, Forecast, int, float, float, Linearisation | None]  # a Local but for its step
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,7 @@ class WeightSpace:
     def search(self, locals_: Sequence[Local]) -> list[Move | None]:
         """One move of each descent, by the configured step control; None where there is no step or no decrease."""
         stepping = [i for i, at in enumerate(locals_) if at.step is not None]
-        points = [Point(at.weights.w, at.cost, at.step, at.tangent) for at in locals_ if at.step is not None]
+        points = [Point(at.weights.w, at.cost, at.step, self._tangent(at)) for at in locals_ if at.step is not None]
         found = run_searches([self.step_control(point) for point in points], self.try_out)
         moves: list[Move | None] = [None] * len(locals_)
         for i, move in zip(stepping, found, strict=True):
@@ -114,11 +117,34 @@ class WeightSpace:
 
     def linearise(self, weights: Sequence[Weights]) -> list[Local]:
         """Steps at several weights, from one call of the model."""
-        rows = [np.vstack([self._member_weights(each), each.w]) for each in weights]
+        rows = [self._run_at(each) for each in weights]
         whole = self.forecast(self.control(np.concatenate(rows)))
-        ends = accumulate(len(r) for r in rows)
-        runs = [whole[end - len(r) : end] for end, r in zip(ends, rows, strict=True)]
-        return [self._local(at, run[:-1], run[-1:]) for at, run in zip(weights, runs, strict=True)]
+        observation = self.observation_cost(whole).tolist()
+        background = diag.background_cost(np.array([each.w for each in weights])).tolist()
+        seen, first = [], 0
+        for at, row, of_prior in zip(weights, rows, background, strict=True):
+            last = first + len(row) - 1
+            seen.append(self._seen(at, whole[first:last], whole[last : last + 1], of_prior, observation[last]))
+            first = last + 1
+        return self._with_steps(seen)
+
+    def _with_steps(self, seen: Sequence[_Seen]) -> list[Local]:
+        observations = self.problem.observations
+        told = [None if linear is None else whiten(observations, linear) for *_, linear in seen]
+        sensitivities = [s for _, s in filter(None, told)]
+        hessians = iter(Hessian.of_each(np.array(sensitivities), self.basis) if sensitivities else ())
+        steps = [
+            None if pair is None else self.scheme.step(at, Evaluation(*pair, self.basis, next(hessians)))
+            for (at, *_), pair in zip(seen, told, strict=True)
+        ]
+        return [Local(*parts, step) for parts, step in zip(seen, steps, strict=True)]
+
+    def _tangent(self, at: Local) -> Tangent | None:
+        """None for a regression."""
+        if at.linear is None or self.settings.linearisation != "bundle":
+            return None
+        precision = partial(precision_times, self.problem.observations, at.linear)
+        return Tangent(at.linear.prediction, at.linear.anomalies, precision, self.basis)
 
     @property
     def needed_members(self) -> int:
@@ -126,33 +152,33 @@ class WeightSpace:
         n_members, n = self.members.shape
         return max(math.ceil(self.settings.min_active_fraction * n_members), min(n + 1, n_members))
 
-    def _member_weights(self, weights: Weights) -> Array:
+    def _run_at(self, weights: Weights) -> Array:
+        """Weights to be run for a linearisation; the last row is the centre."""
         if self.economical:
-            return np.asarray(weights.w + self._short * self.basis.T)
-        return self.scheme.member_weights(weights)
+            return np.asarray(weights.w + self._offsets)
+        return np.vstack([self.scheme.member_weights(weights), weights.w])
+
+    @cached_property
+    def _offsets(self) -> Array:
+        return np.vstack([self._short * self.basis.T, np.zeros(len(self.members))])
 
     @property
     def _short(self) -> float:
         """Step along a unit direction of the weights that moves the state by ε prior standard deviations."""
         return self.settings.epsilon / math.sqrt(len(self.members) - 1)
 
-    def _local(self, weights: Weights, members: Forecast, central: Forecast) -> Local:
-        reduced = self.economical and bool(members.active.all())
+    def _seen(
+        self, weights: Weights, members: Forecast, central: Forecast, background: float, observation: float
+    ) -> _Seen:
+        reduced = self.economical and not any(members.failures)
         if self.economical and not reduced:
             members = self.forecast(self.control(self.scheme.member_weights(weights)))
-        observation = float(self.observation_cost(central)[0])
-        total = float(diag.background_cost(weights.w)) + observation
+        total = background + observation
         active = len(self.members) if reduced else int(members.active.sum())
-        if active < self.needed_members or not np.isfinite(total):
-            return Local(weights, members, central, active, observation, total, None, None)
-        reference, anomalies = self._linearisation(weights, members, central, reduced)
-        at = _split(central, reference, anomalies)
-        observations = self.problem.observations
-        step = self.scheme.step(weights, Evaluation(*whiten(observations, at), self.basis))
-        tangent = None
-        if self.settings.linearisation == "bundle":
-            tangent = Tangent(at.prediction, at.anomalies, precision_times(observations, at, at.anomalies), self.basis)
-        return Local(weights, members, central, active, observation, total, step, tangent)
+        linear = None
+        if active >= self.needed_members and math.isfinite(total):
+            linear = _split(central, *self._linearisation(weights, members, central, reduced))
+        return weights, members, central, active, observation, total, linear
 
     def _linearisation(
         self, weights: Weights, members: Forecast, central: Forecast, reduced: bool

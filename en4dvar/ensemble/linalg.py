@@ -89,6 +89,13 @@ class Hessian:
         _, sigma, right = np.linalg.svd(s, full_matrices=False)
         return cls(sigma, sigma[:, None] * right)
 
+    @classmethod
+    def of_each(cls, s: Array, basis: Array) -> list[Hessian]:
+        """:meth:`of` every matrix of ``s`` (B, K', r) with the same ``basis``, to the bit, in fewer calls."""
+        _, sigma, right = np.linalg.svd(s, full_matrices=False)
+        rows = sigma[:, :, None] * (right @ basis.T)
+        return [cls(values, of_one) for values, of_one in zip(sigma, rows, strict=True)]
+
     @property
     def prior_precision(self) -> float:
         """N − 1."""

@@ -27,9 +27,10 @@ EVERYONE = slice(None)
 def out_of_bounds(prior: Prior, physical: Array) -> list[str]:
     """Reasons (B,) of the members (B, n) with a parameter outside its bounds, "" for the others."""
     failures = [""] * len(physical)
-    low, high = prior.bounds
-    inside = (physical >= low) & (physical <= high) & np.isfinite(physical)
+    low, high = prior.finite_bounds
+    inside = (physical >= low) & (physical <= high)
     if not inside.all():
+        low, high = prior.bounds
         for i, j in np.argwhere(~inside):
             p = prior.parameters[j]
             failures[i] = failures[i] or f"{p.name} outside [{low[j]:g}, {high[j]:g}] {p.unit}"
@@ -43,15 +44,18 @@ def initial_states(problem: InverseProblem, physical: Array, failures: list[str]
     """
     alive = _without(failures)
     size = problem.model.layout.size
-    fixed = {name: np.full(len(physical), float(value)) for name, value in problem.fixed.items()}
-    theta = {**fixed, **dict(zip(problem.prior.names, physical.T, strict=True))}
+    theta = {name: np.full(len(physical), float(value)) for name, value in problem.fixed.items()}
+    theta.update(zip(problem.prior.names, physical.T, strict=True))
 
     def build(members: Indices) -> Array:
-        values = {name: value[members] for name, value in theta.items()}
+        everyone = isinstance(members, slice)
+        values = theta if everyone else {name: value[members] for name, value in theta.items()}
         own = {p.name: values[p.name] for p in problem.model.parameters if p.name in values}
         states = _perturbed(problem, np.asarray(problem.model.initial_states(own), dtype=float), values)
-        if states.shape != (len(physical[members]), size) or not np.isfinite(states).all():
-            raise ValueError("non-finite or misshapen initial state")
+        if states.shape != (len(physical if everyone else physical[members]), size):
+            raise ValueError("misshapen initial state")
+        if not np.isfinite(states).all():
+            raise ValueError("non-finite initial state")
         return states
 
     if all(failures):

@@ -43,11 +43,13 @@ class Evaluation:
     """What a forecast says about the centre: whitened innovation ``d`` (K',) and whitened anomalies ``S`` (K', N).
 
     With ``basis`` U (N, r), orthonormal columns, ``S`` (K', r) is per unit of its coordinates: the anomalies are S Uᵀ.
+    ``hessian``: that of S, where it was at hand.
     """
 
     d: Array
     S: Array
     basis: Array | None = None
+    hessian: Hessian | None = None
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Step:
     @property
     def norm(self) -> float:
         """√(δwᵀ A δw), the Newton decrement: the length of the step in posterior standard deviations."""
-        return float(np.sqrt(max(0.0, -float(self.gradient @ self.direction))))
+        return math.sqrt(max(0.0, -float(self.gradient @ self.direction)))
 
     @property
     def predicted_decrease(self) -> float:
@@ -79,7 +81,7 @@ class Step:
 
 def gauss_newton(weights: Weights, evaluation: Evaluation) -> Step:
     """The analysis that all schemes share: g = (N−1) w − Sᵀd, A = (N−1) I + SᵀS, δw = −A⁻¹g, T = √(N−1) A^{-1/2}."""
-    hessian = Hessian.of(evaluation.S, evaluation.basis)
+    hessian = evaluation.hessian or Hessian.of(evaluation.S, evaluation.basis)
     slope = evaluation.S.T @ evaluation.d
     gradient = hessian.prior_precision * weights.w - (slope if evaluation.basis is None else evaluation.basis @ slope)
     return Step(gradient, hessian, -hessian.solve(gradient))

@@ -28,7 +28,8 @@ def test_tangent_of_few_runs_is_the_bundle_of_all_members(time_std):
             w = space.basis @ np.array([0.1, -0.2])
             at, whole = (space.linearise([Weights(w, np.eye(members))])[0] for _ in range(2))
             rows = space.scheme.member_weights(at.weights)
-            full = space._local(at.weights, replace(at.members, failures=("lost",) * 2), at.central)
+            lost = replace(at.members, failures=("lost",) * 2)
+            (full,) = space._with_steps([space._seen(at.weights, lost, at.central, 0.0, at.observation)])
             assert len(full.members.failures) == len(rows) == members
             steps.append(np.linalg.norm(at.step.direction - full.step.direction) / np.linalg.norm(full.step.direction))
             assert np.array_equal(at.step.direction, whole.step.direction)
@@ -77,7 +78,7 @@ def test_acceleration_is_exact_for_a_parabola():
     lengths = np.array([1.0, 0.5, 0.25, 0.125])
     predictions = lengths[:, None] * (step.direction @ y) + 0.5 * lengths[:, None] ** 2 * q
     predictions[-1] = np.nan  # the shortest cannot be run: the next one serves
-    tangent = Tangent(np.zeros(6), y, y * scale**2, np.eye(4))
+    tangent = Tangent(np.zeros(6), y, lambda vector: scale**2 * vector, np.eye(4))
     a = 3 * np.eye(4) + (y * scale) @ (y * scale).T
     expected = -np.linalg.solve(a, y @ (scale**2 * q))
     limit = 2 * np.linalg.norm(step.direction)
@@ -97,9 +98,8 @@ def test_searches_side_by_side_find_what_each_finds_alone():
         w, s = rng.standard_normal(3), rng.standard_normal((3, 3))
         hessian, gradient = Hessian.of(s), 4 * (w - 1) ** 3
         step = Step(gradient, hessian, -20 * hessian.solve(gradient))
-        points.append(
-            Point(w, float(try_out(w[None]).costs[0]), step, Tangent(np.sin(w), np.eye(3), np.eye(3), np.eye(3)))
-        )
+        tangent = Tangent(np.sin(w), np.eye(3), lambda vector: vector, np.eye(3))
+        points.append(Point(w, float(try_out(w[None]).costs[0]), step, tangent))
     together = run_searches([line_search(p) for p in points], try_out)
     alone = [run_searches([line_search(p)], try_out)[0] for p in points]
     for a, b, point in zip(together, alone, points, strict=True):
