@@ -249,7 +249,7 @@ def test_a_gaussian_likelihood_has_the_marginal_of_a_gaussian():
     draws = np.stack(
         [case.rng.multivariate_normal(m, c, 20_000) for m, c in zip(*case.interim(mean, wide), strict=True)]
     )
-    mixtures = fit_mixtures(draws, mean, wide, case.rng, components=1)
+    mixtures = fit_mixtures(draws, mean, wide, 5, "mixtures", components=1)
     exact = [case.log_marginals(b).sum() for b in (0, 1)]
     told = mixtures.log_marginal(case.nu, case.variance)
     assert told[1] - told[0] == pytest.approx(exact[1] - exact[0], abs=0.1)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numba
@@ -147,19 +148,24 @@ def draw_interim(
     count: int,
     walkers: int = 40,
     temperature: float = 1.0,
+    workers: int = 1,
 ) -> Array:
     """(S, count · walkers, n) draws of each L_i(x) N(x; mean, std²), to the power 1/temperature, on its emulator.
 
-    ``seed`` and ``words`` name the random streams.
+    ``seed`` and ``words`` name the random streams; ``workers`` threads.
     """
     n_sets, n = emulators.centre.shape
     out = np.empty((n_sets, count, walkers, n))
-    for s in range(n_sets):
+
+    def one(s: int) -> None:
         _walk(
             member_stream(seed, words, s), emulators.centre[s], emulators.whiten[s],
             emulators.coefficients[s], emulators.parents, emulators.values[s], emulators.weight[s], mean, std, 600, 12,
             temperature, out[s],
         )  # fmt: skip
+
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(one, range(n_sets)))
     return out.reshape(n_sets, -1, n)
 
 

@@ -11,11 +11,13 @@ and x given ν, D is drawn exactly: a component, then N(A⁻¹b, A⁻¹).
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numba
 import numpy as np
 
+from en4dvar.prior import member_stream
 from en4dvar.state import Array
 from en4dvar_bubble.study.gaussian import divide_out
 
@@ -41,16 +43,24 @@ class Mixtures:
 
 
 def fit_mixtures(
-    draws: Array, prior_mean: Array, prior_std: Array, rng: np.random.Generator, components: int = 12, rounds: int = 60
-) -> Mixtures:
-    """From draws (S, D, n) of posteriors under the independent prior N(prior_mean, prior_std²), up to constants."""
+    draws: Array, prior_mean: Array, prior_std: Array, seed: int, words: str, components: int = 12, rounds: int = 60,
+    workers: int = 1,
+) -> Mixtures:  # fmt: skip
+    """From draws (S, D, n) of posteriors under the independent prior N(prior_mean, prior_std²), up to constants.
+
+    ``seed`` and ``words`` name the random streams; ``workers`` threads.
+    """
     n_sets, _, n = draws.shape
     parts = (np.empty((n_sets, components, n, n)), np.empty((n_sets, components, n)), np.empty((n_sets, components)))
-    for s in range(n_sets):
-        share, centre, covariance = fit_gaussians(draws[s], rng, components, rounds)
+
+    def one(s: int) -> None:
+        share, centre, covariance = fit_gaussians(draws[s], member_stream(seed, words, s), components, rounds)
         found = divide_out(("",) * n, centre, covariance, np.log(share), prior_mean, prior_std)
         for target, values in zip(parts, (found.precision, found.linear, found.constant), strict=True):
             target[s] = values
+
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(one, range(n_sets)))
     return Mixtures(*parts)
 
 
@@ -65,21 +75,58 @@ def fit_gaussians(x: Array, rng: np.random.Generator, components: int, rounds: i
         centre = np.vstack([centre, z[rng.choice(count, p=distance / distance.sum())]])
     covariance = np.tile(0.3 * np.eye(n), (components, 1, 1))
     share = np.full(components, 1 / components)
-    for _ in range(rounds):
-        lower = np.linalg.cholesky(covariance)
-        scaled = np.linalg.solve(lower, (z - centre[:, None]).transpose(0, 2, 1))
-        log = np.log(share) - np.log(np.einsum("mii->mi", lower)).sum(axis=1)
-        log = (log[:, None] - 0.5 * np.sum(scaled**2, axis=1)).T
-        log -= log.max(axis=1, keepdims=True)
-        of_part = np.exp(log)
-        of_part /= of_part.sum(axis=1, keepdims=True)
-        size = of_part.sum(axis=0) + 1e-9 * count
-        share = size / size.sum()
-        centre = (of_part.T @ z) / size[:, None]
-        apart = z - centre[:, None]
-        covariance = np.einsum("dm,mdi,mdj->mij", of_part, apart, apart, optimize=True) / size[:, None, None]
-        covariance += 1e-4 * np.eye(n)
+    _maximise(z, share, centre, covariance, rounds)
     return share, middle + centre @ root.T, root @ covariance @ root.T
+
+
+@numba.njit(cache=True, nogil=True)
+def _maximise(z, share, centre, covariance, rounds):  # type: ignore[no-untyped-def]
+    """Rounds of expectation maximisation for points (D, n); share, centre and covariance are overwritten."""
+    count, n = z.shape
+    parts = share.size
+    of_part, apart = np.empty((count, parts)), np.empty(n)
+    for _ in range(rounds):
+        for m in range(parts):
+            lower = np.linalg.cholesky(covariance[m])
+            constant = np.log(share[m])
+            for i in range(n):
+                constant -= np.log(lower[i, i])
+            for d in range(count):
+                log = constant
+                for i in range(n):
+                    scaled = z[d, i] - centre[m, i]
+                    for k in range(i):
+                        scaled -= lower[i, k] * apart[k]
+                    apart[i] = scaled / lower[i, i]
+                    log -= 0.5 * apart[i] ** 2
+                of_part[d, m] = log
+        for d in range(count):
+            top, total = of_part[d].max(), 0.0
+            for m in range(parts):
+                of_part[d, m] = np.exp(of_part[d, m] - top)
+                total += of_part[d, m]
+            for m in range(parts):
+                of_part[d, m] /= total
+        for m in range(parts):
+            size = 1e-9 * count
+            centre[m] = 0.0
+            for d in range(count):
+                size += of_part[d, m]
+                for i in range(n):
+                    centre[m, i] += of_part[d, m] * z[d, i]
+            share[m] = size
+            centre[m] /= size
+            covariance[m] = 0.0
+            for d in range(count):
+                for i in range(n):
+                    apart[i] = z[d, i] - centre[m, i]
+                    for k in range(i + 1):
+                        covariance[m, i, k] += of_part[d, m] * apart[i] * apart[k]
+            for i in range(n):
+                for k in range(i + 1):
+                    covariance[m, i, k] = covariance[m, i, k] / size + (1e-4 if i == k else 0.0)
+                    covariance[m, k, i] = covariance[m, i, k]
+        share /= share.sum()
 
 
 @numba.njit(cache=True, nogil=True)

@@ -142,7 +142,7 @@ class _Search:
         self.hyper = Hyper(prior, self.where, scales)
         self.mean, self.std = prior.mean.copy(), prior.std.copy()
         self.std[self.where] = math.hypot(scales.mean_std, scales.spread)  # what ν and τ allow
-        self.training = Training(runs, start, self.mean, self.std, seed, effort)
+        self.training = Training(runs, start, self.mean, self.std, seed, effort, workers)
         self.tries = 0
 
     def result(self, names: Sequence[str]) -> Population:
@@ -178,10 +178,11 @@ class _Search:
         self.tries += 1
         words, root = f"interim draws {self.tries}", math.sqrt(temperature)
         interim = draw_interim(
-            self.training.emulators, self.mean, self.std, self.seed, words, draws, temperature=temperature
-        )
-        stream = member_stream(self.seed, "mixtures", self.tries)
-        return fit_mixtures(interim, self.mean, root * self.std, stream, components)
+            self.training.emulators, self.mean, self.std, self.seed, words, draws, temperature=temperature,
+            workers=self.workers,
+        )  # fmt: skip
+        words = f"mixtures {self.tries}"
+        return fit_mixtures(interim, self.mean, root * self.std, self.seed, words, components, workers=self.workers)
 
     def walked(self, mixtures: Mixtures) -> Array:
         """Populations (D, 2p) that the mixtures find likely."""

@@ -26,8 +26,10 @@ class Training:
     start from where a search from a sample of N(mean, std²) ends, if that is better.
     """
 
-    def __init__(self, runs: Runs, start: Array, mean: Array, std: Array, seed: int, effort: Effort):
-        self.runs, self.seed, self.degree = runs, seed, effort.degree
+    def __init__(
+        self, runs: Runs, start: Array, mean: Array, std: Array, seed: int, effort: Effort, workers: int = 1
+    ):  # fmt: skip
+        self.runs, self.seed, self.degree, self.workers = runs, seed, effort.degree, workers
         walkers, rounds = effort.walkers, effort.rounds
         stream = member_stream(seed, "interim runs")
         n_sets, n_members, n = start.shape
@@ -73,7 +75,9 @@ class Training:
         """
         for _ in range(times):
             words, hot = f"training draws {self.refits}", TEMPERATURE if self.refits % 2 else 1.0
-            draws = draw_interim(self.emulators, mean, std, self.seed, words, count=4, temperature=hot)
+            draws = draw_interim(
+                self.emulators, mean, std, self.seed, words, count=4, temperature=hot, workers=self.workers
+            )
             told = np.concatenate([self.runs.predictions(part) for part in np.array_split(draws.transpose(1, 0, 2), 4)])
             self.at = np.concatenate([self.at, draws], axis=1)
             self.seen = np.concatenate([self.seen, told.transpose(1, 0, 2)], axis=1)
