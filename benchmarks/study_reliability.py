@@ -11,22 +11,24 @@ over, so stated probability and frequency must agree.
 from __future__ import annotations
 
 import csv
+import os
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from en4dvar.assimilate import assimilate
 from en4dvar.config import load_config
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.executor import ThreadsExecutor
 from en4dvar.inputs.build import build
 from en4dvar.observations import Observations
 from en4dvar.problem import InverseProblem
 from en4dvar_bubble.study.evidence import probability
 from en4dvar_bubble.study.measured import FOLDER, RELIABILITY_HEAD
+from en4dvar_bubble.study.set_evidence import set_evidence
+from en4dvar_bubble.study.set_runs import SetRuns
 
+THREADS = int(os.environ.get("THREADS", "2"))
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 FEWEST = 5
 
@@ -52,13 +54,12 @@ EXPERIMENTS = {
 }
 
 
-def problems(experiment: Experiment) -> dict[str, tuple[InverseProblem, object]]:
-    """Law → a problem to put readings in, and the settings of its estimation."""
+def problems(experiment: Experiment) -> dict[str, InverseProblem]:
+    """Law → a problem to put readings in."""
     found = {}
     for law in ("nh", "qlkv"):
         changes = {f"parameters.{k}": v for k, v in experiment.changes.get(law, {}).items()}
-        config = load_config(CONFIGS / f"agarose_{experiment.gel}_{law}.yaml", changes)
-        found[law] = (build(config)[0], config.assimilation)
+        found[law] = build(load_config(CONFIGS / f"agarose_{experiment.gel}_{law}.yaml", changes))[0]
     return found
 
 
@@ -80,14 +81,13 @@ def draw(base: InverseProblem, experiment: Experiment, rng: np.random.Generator)
             return Observations(times[:k], values[:k], noise * ones[:k], 0 * ones[:k], ones[:k])
 
 
-def compare(experiment: Experiment, number: int, executor: ThreadsExecutor) -> tuple[str, float]:
+def compare(bases: dict[str, InverseProblem], experiment: Experiment, number: int) -> tuple[str, float]:
     """The law that generated experiment ``number`` and the log-evidence of the quadratic over the neo-Hookean law."""
-    bases = problems(experiment)
     law = "qlkv" if number % 2 else "nh"
-    observed = draw(bases[law][0], experiment, np.random.default_rng([11, number]))
+    observed = draw(bases[law], experiment, np.random.default_rng([11, number]))
     log = {
-        name: assimilate(replace(base, observations=observed), settings, 1, executor).log_evidence  # type: ignore[arg-type]
-        for name, (base, settings) in bases.items()
+        name: float(set_evidence(SetRuns([replace(base, observations=observed)], THREADS), base.prior, number).log[0])
+        for name, base in bases.items()
     }
     return law, log["qlkv"] - log["nh"]
 
@@ -98,16 +98,17 @@ def main() -> None:
     file = FOLDER / "reliability.csv"
     kept = list(csv.reader(file.read_text(encoding="utf-8").splitlines())) if file.exists() else [RELIABILITY_HEAD]
     done = {(row[0], row[1]) for row in kept[1:]}
-    with ThreadsExecutor(2) as executor:
-        for number in range(first, first + count):
-            if (name, str(number)) in done:
-                continue
-            law, difference = compare(EXPERIMENTS[name], number, executor)
-            with file.open("a", encoding="utf-8", newline="") as stream:
-                writer = csv.writer(stream, lineterminator="\n")
-                writer.writerows(
-                    [*([] if file.stat().st_size else [RELIABILITY_HEAD]), [name, number, law, f"{difference:.4f}"]]
-                )
+    experiment = EXPERIMENTS[name]
+    bases = problems(experiment)
+    for number in range(first, first + count):
+        if (name, str(number)) in done:
+            continue
+        law, difference = compare(bases, experiment, number)
+        with file.open("a", encoding="utf-8", newline="") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerows(
+                [*([] if file.stat().st_size else [RELIABILITY_HEAD]), [name, number, law, f"{difference:.4f}"]]
+            )
     rows = [row for row in csv.reader(file.read_text(encoding="utf-8").splitlines()) if row[0] == name]
     delta = np.array([float(row[3]) for row in rows])
     right = (delta > 0) == np.array([row[2] == "qlkv" for row in rows])

@@ -150,7 +150,7 @@ class Prior:
 
     @cached_property
     def finite_bounds(self) -> tuple[Array, Array]:
-        """:attr:`bounds` with the largest finite numbers for ±inf, so that an infinite value is outside."""
+        """:attr:`bounds` (n,) with the largest finite numbers for ±inf, so that an infinite value is outside."""
         largest = np.finfo(float).max
         return np.maximum(self.bounds[0], -largest), np.minimum(self.bounds[1], largest)
 

@@ -55,8 +55,8 @@ def test_conducting_medium_without_vapour():
     ("vapour", "conducting", "coarse", "fine"),
     [
         ("none", False, COARSE, FINE),
-        ("none", True, COARSE, FINE),
-        ("frozen", True, COARSE, FINE),
+        pytest.param("none", True, COARSE, FINE, marks=pytest.mark.long),
+        pytest.param("frozen", True, COARSE, FINE, marks=pytest.mark.long),
         # Held at T_inf the wall takes up nearly all vapour: the most violent collapse, where the oracle's ṗ needs most.
         ("transport", False, (48, 0), (96, 0)),
         ("transport", True, COARSE, FINE),

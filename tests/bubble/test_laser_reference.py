@@ -50,6 +50,7 @@ def test_medium_grid_explains_the_rest():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_both_together_reproduce_the_reference():
     z = reference("laser.npz")
     times = z["t_s"][:501]

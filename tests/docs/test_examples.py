@@ -20,8 +20,13 @@ def run_here(page: Path) -> list[Block]:
     return [b for b in blocks(page) if b.language not in ("text", "bibtex") and not b.not_run and not b.tested_by]
 
 
+def marked(page: Path) -> object:
+    """The page, left out of .ci/run where its examples take minutes (workers of dask that are started and killed)."""
+    return pytest.param(page, marks=pytest.mark.long) if page.stem == "cluster" else page
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [p for p in PAGES if run_here(p)], ids=lambda p: p.stem)
+@pytest.mark.parametrize("page", [marked(p) for p in PAGES if run_here(p)], ids=lambda p: p.stem)
 def test_the_examples_of_a_page_run(page, tmp_path):
     session = Session(tmp_path, ROOT / "configs" / "quickstart.yaml")
     for block in run_here(page):

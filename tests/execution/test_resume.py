@@ -196,9 +196,8 @@ def test_signals_leave_a_run_that_says_how_to_continue(tmp_path, number):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind", ["serial", *(pytest.param(k, marks=pytest.mark.long) for k in ("threads", "processes"))]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["serial", "threads", "processes"])
 def test_killed_at_random_moments(tmp_path, kind):
     """SIGKILL at 20 random moments of a run, each followed by a resume that may be killed as well."""
     path = make_campaign(tmp_path, 4, "execution_models:Slow")

@@ -56,7 +56,7 @@ def test_many_data_sets_in_flat_memory(tmp_path, sets):
     assert first < 30
 
 
-@pytest.mark.parametrize("rows", [20_000, pytest.param(10**6, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("rows", [20_000, pytest.param(10**6, marks=[pytest.mark.slow, pytest.mark.long])])
 @pytest.mark.fault("many-rows")
 def test_a_long_data_file(tmp_path, rows):
     """Every row is an observation; memory stays at a few arrays of members by observations."""

@@ -110,7 +110,14 @@ def test_a_population_of_curved_likelihoods_against_quadrature(runs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("runs", [Curved(), Curved(outlier=2.0), Cusped()], ids=["curved", "outlier", "cusped"])
+@pytest.mark.parametrize(
+    "runs",
+    [
+        pytest.param(Curved(), id="curved"),
+        pytest.param(Curved(outlier=2.0), id="outlier", marks=pytest.mark.long),
+        pytest.param(Cusped(), id="cusped", marks=pytest.mark.long),
+    ],
+)
 def test_repeated_estimates_are_as_good_as_they_say(runs):
     """No bias, and no more scatter than the effective number of draws: a degenerate weight would show in either."""
     quantiles, evidence = by_quadrature(runs, CURVED_PRIOR, CURVED_HYPER)

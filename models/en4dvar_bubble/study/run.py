@@ -16,6 +16,7 @@ from en4dvar.diagnostics import nrmse
 from en4dvar.errors import DataError
 from en4dvar.executor import make_executor
 from en4dvar.inputs.build import build
+from en4dvar.likelihood import log_normalisation
 from en4dvar.prior import Prior
 from en4dvar.problem import Analysis, InverseProblem
 from en4dvar.state import Array
@@ -24,6 +25,7 @@ from en4dvar_bubble.study.keep import Keep
 from en4dvar_bubble.study.one_gel import OneGel, fit_one_gel
 from en4dvar_bubble.study.paper import QUANTITIES, TABLE_2, Model, Route
 from en4dvar_bubble.study.population import Population, estimate_population
+from en4dvar_bubble.study.set_evidence import Evidence, set_evidence
 from en4dvar_bubble.study.set_runs import SetRuns
 from en4dvar_bubble.study.settings import StudyPlan
 from en4dvar_bubble.study.sweep import SweepResult, run_sweep
@@ -43,6 +45,14 @@ class Fit:
     problems: tuple[InverseProblem, ...]
     sweep: SweepResult
     analyses: tuple[Analysis, ...]
+    evidence: Evidence | None = None
+
+    @property
+    def log_evidence(self) -> Array:
+        """(S,) ln p(y); by Laplace's approximation where it was not computed."""
+        if self.evidence is None:
+            return np.array([a.log_evidence for a in self.analyses])
+        return self.evidence.log - np.array([log_normalisation(p.observations) for p in self.problems])
 
     @property
     def prior(self) -> Prior:
@@ -163,6 +173,8 @@ def run_study(plan: StudyPlan, workers: int = 1, tell: Tell | None = None, keep:
     start = time.perf_counter()
     populations, comparisons = {}, {}
     for gel, models in fits.items():
+        for m, fit in models.items():
+            models[m] = replace(fit, evidence=_evidence(fit, plan, workers, keep))
         kept = {m: fit for m, fit in models.items() if m in ("nh", "qlkv")}
         found_for: dict[Model, Population | None]
         found_for = {m: _population(fit, plan, workers, keep) for m, fit in kept.items()}
@@ -204,6 +216,11 @@ def _sharing(problems: Mapping[tuple[str, Model], Sequence[InverseProblem]]) -> 
     return list(groups.values())
 
 
+def _evidence(fit: Fit, plan: StudyPlan, workers: int, keep: Keep | None) -> Evidence:
+    compute = partial(set_evidence, SetRuns(fit.problems, workers), fit.prior, plan.seed)
+    return keep.of(Evidence, compute, fit.gel, fit.model) if keep else compute()
+
+
 def _population(fit: Fit, plan: StudyPlan, workers: int, keep: Keep | None) -> Population | None:
     """None with fewer than 3 data sets."""
     if len(fit.problems) < 3:
@@ -221,7 +238,7 @@ def _estimated(fit: Fit, plan: StudyPlan, workers: int, names: Sequence[str]) ->
 def _compare(
     models: Mapping[Model, Fit], populations: Mapping[Model, Population | None], workers: int, keep: Keep | None
 ) -> Comparison:
-    single = {m: np.array([a.log_evidence for a in models[m].analyses]) for m in populations}
+    single = {m: models[m].log_evidence for m in populations}
     pooled = {m: np.nan if found is None else found.log_evidence for m, found in populations.items()}
     gels = {}
     for m in populations:
@@ -262,12 +279,12 @@ def per_set_csv(study: Study) -> str:
                 if not fit.estimated(q.name):
                     continue
                 j, best = fit.prior.names.index(q.name), fit.values("sweep", q.name)
-                for i, a in enumerate(fit.analyses):
+                for i, (a, evidence) in enumerate(zip(fit.analyses, fit.log_evidence, strict=True)):
                     x = q.factor * a.posterior[:, j]
                     true = study.truth.get(a.name, {}).get(q.name, np.nan) * q.factor
                     numbers = [best[i] * q.factor, np.nanmean(x), np.nanstd(x, ddof=1)]
                     numbers += [*np.nanquantile(x, (0.05, 0.5, 0.95)), a.dfs_per_parameter[j], true]
-                    numbers += [scores["sweep"][i], scores["en4dvar"][i], a.log_evidence]
+                    numbers += [scores["sweep"][i], scores["en4dvar"][i], evidence]
                     values = ",".join(f"{v:.6g}" for v in numbers)
                     lines.append(f"{gel},{model},{a.name},{q.name},{q.unit},{values}")
     return "\n".join(lines) + "\n"

@@ -53,8 +53,9 @@ def _fit(study: Study, fit: Fit) -> Group:
     variables["sweep_t_s"] = Variable(("dataset",), fit.sweep.shift, {"units": "s", "long_name": "time shift"})
     for route, words in (("sweep", "best fit of the sweep"), ("en4dvar", "centre of the posterior")):
         variables[f"nrmse_{route}"] = _plain(fit.nrmse(route), f"NRMSE, {words}")  # type: ignore[arg-type]
-    evidence = np.array([a.log_evidence for a in fit.analyses])
-    variables["log_evidence"] = _plain(evidence, "log-evidence, Laplace approximation")
+    variables["log_evidence"] = _plain(fit.log_evidence, "log-evidence, adaptive importance sampling")
+    if fit.evidence is not None:
+        variables["evidence_draws"] = _plain(fit.evidence.effective, "effective number of draws of the log-evidence")
     coords = {"dataset": Variable(("dataset",), np.array(fit.names, dtype=object), {"long_name": "data set"})}
     return Group(variables, coords)
 
