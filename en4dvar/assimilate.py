@@ -346,7 +346,9 @@ class _Run:
 
     def record(self, iteration: int, at: Local, step: Step, transform: Array, step_length: float) -> IterationRecord:
         space, w = self.space, at.weights.w
-        ensemble = space.control(np.vstack([w + transform, w]))
+        rows = np.empty((len(w) + 1, len(w)))
+        rows[:-1], rows[-1] = w + transform, w
+        ensemble = space.control(rows)
         physical = self.problem.prior.to_physical(ensemble)
         rates = None if at.central.rates is None else at.central.rates[0]
         scale = None if at.central.noise_scale is None else at.central.noise_scale[0]

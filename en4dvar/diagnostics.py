@@ -100,8 +100,9 @@ def gaussianity(members: Array, mode: Array, costs: Array) -> dict[str, float]:
     anomalies = members - mode
     if int(alive.sum()) < members.shape[1] + 2:
         return {"gaussian_fit": math.nan}
-    covariance = np.atleast_2d(np.cov(members.T))
-    squares = np.sum(anomalies * np.linalg.solve(covariance, anomalies.T).T, axis=1)
+    about_mean = members - np.add.reduce(members, axis=0) / len(members)
+    covariance = about_mean.T @ about_mean / (len(members) - 1)
+    squares = np.einsum("ij,ji->i", anomalies, np.linalg.solve(covariance, anomalies.T))
     return {"gaussian_fit": effective_share(np.where(alive, 0.5 * squares - costs, -np.inf))}
 
 

@@ -167,8 +167,13 @@ class Prior:
     def to_physical(self, x: Array) -> Array:
         """Physical values (…, n) of control vectors ``x`` (…, n)."""
         theta = np.array(x, dtype=float)
-        for columns, term in self._columns:
-            theta[..., columns] = term.to_physical(theta[..., columns])
+        with np.errstate(over="ignore"):
+            for columns, term in self._columns:
+                part = theta[..., columns]
+                if term.transform == "lognormal":  # as PriorTerm.to_physical, in place
+                    np.exp(part, out=part)
+                else:
+                    part[...] = term.to_physical(part)
         return theta
 
     @cached_property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -167,7 +168,15 @@ def _union(times: Array, extra: Array) -> tuple[Array, Indices | slice, Indices 
     """Increasing union of the times and where the observations and the extra times stand in it."""
     if not len(extra):
         return times, slice(None), slice(0, 0)
+    return _union_of_both(times.tobytes(), extra.tobytes())
+
+
+@lru_cache(maxsize=8)
+def _union_of_both(times_: bytes, extra_: bytes) -> tuple[Array, Indices, Indices]:
+    """Kept, because the forecasts of prior and posterior of a data set ask for the same."""
+    times, extra = np.frombuffer(times_), np.frombuffer(extra_)
     nearest = times[np.abs(extra[:, None] - times).argmin(axis=1)]
     extra = np.where(np.abs(extra - nearest) <= SAME_INSTANT * (times[-1] - times[0]), nearest, extra)
     union: Array = np.unique(np.concatenate([times, extra]))
+    union.flags.writeable = False
     return union, np.searchsorted(union, times), np.searchsorted(union, extra)
