@@ -114,7 +114,7 @@ def _reliability() -> Block:
             rows.append([words, f"{b.stated:.3f}", f"{b.right:.3f}", str(b.count), f"{b.error:.3f}"])
     return {
         "title": "Are the probabilities of the laws right?",
-        "words": "Experiments of one bubble, half drawn from each law's prior, compared by their Laplace evidence: "
+        "words": "Experiments of one bubble, half drawn from each law's prior, compared by their evidence: "
         "stated probability of the favoured law and how often it was the right one. The second experiment decides. "
         "Measured once (python benchmarks/study_reliability.py) and shipped with the package; not computed by this "
         "study.",
