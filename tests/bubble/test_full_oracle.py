@@ -59,7 +59,7 @@ def test_conducting_medium_without_vapour():
         pytest.param("frozen", True, COARSE, FINE, marks=pytest.mark.long),
         # Held at T_inf the wall takes up nearly all vapour: the most violent collapse, where the oracle's ṗ needs most.
         ("transport", False, (48, 0), (96, 0)),
-        ("transport", True, COARSE, FINE),
+        pytest.param("transport", True, COARSE, FINE, marks=pytest.mark.long),
     ],
 )
 def test_difference_is_the_oracles_truncation_error(vapour, conducting, coarse, fine):

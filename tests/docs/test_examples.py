@@ -21,8 +21,9 @@ def run_here(page: Path) -> list[Block]:
 
 
 def marked(page: Path) -> object:
-    """The page, left out of .ci/run where its examples take minutes (workers of dask that are started and killed)."""
-    return pytest.param(page, marks=pytest.mark.long) if page.stem == "cluster" else page
+    """The page, left out of .ci/run where its examples take a minute or more and other tests do much the same."""
+    slowest = page.stem in ("cluster", "tutorial_own_forward_model")
+    return pytest.param(page, marks=pytest.mark.long) if slowest else page
 
 
 @pytest.mark.slow

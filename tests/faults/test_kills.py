@@ -29,7 +29,9 @@ def test_killed_while_the_report_is_written():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("executor", ["serial", "threads", pytest.param("processes", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "executor", ["threads", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("serial", "processes"))]
+)
 @pytest.mark.fault("kill")
 def test_killed_at_random(executor):
     """During forecasts, mostly: that is where the time goes."""
