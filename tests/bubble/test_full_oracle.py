@@ -42,6 +42,7 @@ def test_vapour_transport_and_conducting_medium():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_diffusivity_of_kinetic_theory():
     assert difference(FINE, "transport", conducting=True, D_p=1.0, D_T=1.75) < 2e-3
 
@@ -54,7 +55,7 @@ def test_conducting_medium_without_vapour():
 @pytest.mark.parametrize(
     ("vapour", "conducting", "coarse", "fine"),
     [
-        ("none", False, COARSE, FINE),
+        pytest.param("none", False, COARSE, FINE, marks=pytest.mark.long),
         pytest.param("none", True, COARSE, FINE, marks=pytest.mark.long),
         pytest.param("frozen", True, COARSE, FINE, marks=pytest.mark.long),
         # Held at T_inf the wall takes up nearly all vapour: the most violent collapse, where the oracle's ṗ needs most.

@@ -143,7 +143,7 @@ def test_warnings_speak_of_what_they_see():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("linearisation", ["bundle", "transform"])
+@pytest.mark.parametrize("linearisation", ["bundle", pytest.param("transform", marks=pytest.mark.long)])
 def test_posterior_is_calibrated(linearisation):
     """200 truths from the prior: ranks are uniform, 50 and 90 % intervals cover as they say."""
     from scipy.stats import chisquare, norm

@@ -186,6 +186,7 @@ def test_results_as_netcdf(small):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_study_that_lost_some_results_is_resumed_to_the_same_tables(small):
     out, _, call = small
     before = {file.name: file.read_bytes() for file in [*out.glob("*.csv"), *out.glob("table*.md")]}
