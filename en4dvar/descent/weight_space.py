@@ -119,12 +119,12 @@ class WeightSpace:
         """Steps at several weights, from one call of the model."""
         rows = [self._run_at(each) for each in weights]
         whole = self.forecast(self.control(np.concatenate(rows)))
-        observation = self.observation_cost(whole).tolist()
+        centres = np.cumsum([len(row) for row in rows]) - 1
+        observation = self.observation_cost(whole.rows(centres)).tolist()
         background = diag.background_cost(np.array([each.w for each in weights])).tolist()
         seen, first = [], 0
-        for at, row, of_prior in zip(weights, rows, background, strict=True):
-            last = first + len(row) - 1
-            seen.append(self._seen(at, whole[first:last], whole[last : last + 1], of_prior, observation[last]))
+        for at, last, of_prior, of_data in zip(weights, centres.tolist(), background, observation, strict=True):
+            seen.append(self._seen(at, whole[first:last], whole[last : last + 1], of_prior, of_data))
             first = last + 1
         return self._with_steps(seen)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.ensemble.members import EVERYONE, Indices, Reading, initial_states, out_of_bounds
 from en4dvar.errors import ConfigError
@@ -42,11 +43,18 @@ class Forecast:
         return np.array([not reason for reason in self.failures])
 
     def __getitem__(self, members: slice) -> Forecast:
+        return self._part(members, self.failures[members])
+
+    def rows(self, members: npt.NDArray[np.intp]) -> Forecast:
+        """Those members, in that order."""
+        return self._part(members, tuple(self.failures[i] for i in members))
+
+    def _part(self, members: Indices, failures: tuple[str, ...]) -> Forecast:
         return Forecast(
             self.predictions[members],
             None if self.rates is None else self.rates[members],
             self.path[members],
-            self.failures[members],
+            failures,
             None if self.noise_scale is None else self.noise_scale[members],
             self.extremes[members],
         )
@@ -171,7 +179,7 @@ def _union(times: Array, extra: Array) -> tuple[Array, Indices | slice, Indices 
     return _union_of_both(times.tobytes(), extra.tobytes())
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=1)  # arrays as long as the data
 def _union_of_both(times_: bytes, extra_: bytes) -> tuple[Array, Indices, Indices]:
     """Kept, because the forecasts of prior and posterior of a data set ask for the same."""
     times, extra = np.frombuffer(times_), np.frombuffer(extra_)

@@ -77,8 +77,7 @@ class Hessian:
         observations inform less than ``GRAM_LIMIT`` times the prior.
         """
         if basis is not None:
-            _, sigma, right = np.linalg.svd(s, full_matrices=False)
-            return cls(sigma, sigma[:, None] * (right @ basis.T))
+            return cls.of_each(s[None], basis)[0]
         n_observations, n_members = s.shape
         small = n_observations < n_members
         gram = s @ s.T if small else s.T @ s
@@ -91,7 +90,7 @@ class Hessian:
 
     @classmethod
     def of_each(cls, s: Array, basis: Array) -> list[Hessian]:
-        """:meth:`of` every matrix of ``s`` (B, K', r) with the same ``basis``, to the bit, in fewer calls."""
+        """:meth:`of` every matrix of ``s`` (B, K', r) with the same ``basis``, in fewer calls."""
         _, sigma, right = np.linalg.svd(s, full_matrices=False)
         rows = sigma[:, :, None] * (right @ basis.T)
         return [cls(values, of_one) for values, of_one in zip(sigma, rows, strict=True)]
