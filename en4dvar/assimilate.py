@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -86,6 +86,22 @@ class Refinement:
 
 
 @dataclass(frozen=True)
+class Taken:
+    """A step as it was taken: from where, the transform (N, N) there, and how far."""
+
+    at: Local
+    step: Step
+    transform: Array
+    step_length: float
+
+
+def worse(worst: tuple[str, ...], at: Local) -> tuple[str, ...]:
+    """Of two lists of failures, so far the worst and those of the members there, the one with more."""
+    here = at.failures
+    return max(worst, here, key=lambda failures: sum(map(bool, failures))) if any(here) or not worst else worst
+
+
+@dataclass(frozen=True)
 class _Outcome:
     """Where the iterations ended."""
 
@@ -136,7 +152,8 @@ class _Run:
         dfs = diag.dfs(end.step.hessian.singular_values, len(space.members))
         posterior = posterior + mean_beyond_mode(problem, mode, posterior, dfs)
         posterior, refinement, refine_warnings = self.refine(posterior, state.refinement)
-        final = space.forecast(np.vstack([posterior, mode]), grid)
+        ends = np.vstack([posterior, mode])
+        final = space.forecast(ends, grid)
         after, last = final[:-1], final[-1:]
         self.require_members(after.failures, "posterior forecast")
         at_centre = (
@@ -144,11 +161,10 @@ class _Run:
             None if last.noise_scale is None else last.noise_scale[0],
         )
         huber, huber_warnings = self.robust(last.predictions[0], *at_centre)
-        per_parameter = diag.dfs_per_parameter(space.members, posterior)
-        costs = self.costs(posterior, after)
-        shape = {} if refinement else examine_shape(space, posterior, mode, costs, self.seed)
+        per_parameter = diag.dfs_per_parameter(space.prior_variance, posterior)
+        costs = self.costs(ends, final)
+        shape = {} if refinement else examine_shape(space, posterior, mode, costs[:-1], self.seed)
         record = end.records[-1]
-        used = int(np.sum(observations.weights > 0))
         prior = problem.prior
         return Analysis(
             name=observations.name,
@@ -193,13 +209,13 @@ class _Run:
                     members=space.members,
                     posterior=posterior,
                     mode=mode,
-                    costs=costs,
-                    cost=float(self.costs(mode[None], last)[0]),
+                    costs=costs[:-1],
+                    cost=float(costs[-1]),
                     converged=end.converged,
                     stop_reason=end.reason,
                     step_norm=record.step_norm,
-                    chi2=record.chi2_per_observation * used,
-                    n_weighted=used,
+                    chi2=record.chi2_per_observation * len(observations.used),
+                    n_weighted=len(observations.used),
                     dfs=record.dfs,
                     dfs_per_parameter=per_parameter,
                     prior_failures=prior_run.failures[:-1],
@@ -217,15 +233,17 @@ class _Run:
         if self.mda:
             return LoopState(Weights.prior(len(self.space.members)), self.space.forward_runs)
         start, weights = choose_start(self.space, prior_run), self.space.scheme.init(len(self.space.members))
-        records: list[IterationRecord] = []
+        taken: list[Taken] = []
         worst_loss: tuple[str, ...] = ()
         for at, move in start.path:
-            step = self.require_step(at, f"forecast of iteration {len(records) + 1}")
-            worst_loss = max(worst_loss, at.members.failures, key=lambda failures: sum(map(bool, failures)))
-            records.append(self.record(len(records), at, step, step.transform, move.step_length))
+            step = self.require_step(at, f"forecast of iteration {len(taken) + 1}")
+            worst_loss = worse(worst_loss, at)
+            taken.append(Taken(at, step, step.transform, move.step_length))
             weights = Weights(move.w, step.transform)
-            if self.progress is not None:
-                self.progress(self.problem.observations.name, records[-1])
+        records = self.records(0, taken) if taken else []
+        if self.progress is not None:
+            for record in records:
+                self.progress(self.problem.observations.name, record)
         return LoopState(
             Weights(start.w, weights.T), self.space.forward_runs, start.warnings, tuple(records), worst_loss
         )
@@ -242,7 +260,7 @@ class _Run:
         return weights, down_weighted(weights, times, model.time_display_unit, observations.huber)
 
     def costs(self, members: Array, run: Forecast) -> Array:
-        """J (N,) of members (N, n), from their forecast and the prior's own mean and covariance."""
+        """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""
         z = (members - self.problem.prior.mean) / self.problem.prior.std
         return np.asarray(0.5 * np.sum(z**2, axis=1) + self.space.observation_cost(run))
 
@@ -286,7 +304,7 @@ class _Run:
                 self.on_iteration(self.latest)
             (at,) = space.linearise([weights])
             step, total = self.require_step(at, f"forecast of iteration {len(records) + 1}"), at.cost
-            worst_loss = max(worst_loss, at.members.failures, key=lambda failures: sum(map(bool, failures)))
+            worst_loss = worse(worst_loss, at)
 
             move, contracted = None, Weights(weights.w, step.transform)
             if not stop:
@@ -299,7 +317,8 @@ class _Run:
                     if move is None and self.same_members(contracted, weights):
                         stop = "no decrease possible along the step"
                         converged = step.predicted_decrease <= self.small(total)
-            records.append(self.record(len(records), at, step, step.transform, move.step_length if move else 0.0))
+            taken = Taken(at, step, step.transform, move.step_length if move else 0.0)
+            records += self.records(len(records), [taken])
             if self.progress is not None:
                 self.progress(self.problem.observations.name, records[-1])
             if stop:
@@ -325,9 +344,9 @@ class _Run:
                 self.on_iteration(self.latest)
             (at,) = space.linearise([weights])
             step = self.require_step(at, f"forecast of iteration {len(records) + 1}")
-            worst_loss = max(worst_loss, at.members.failures, key=lambda failures: sum(map(bool, failures)))
+            worst_loss = worse(worst_loss, at)
             done = len(records) == count
-            records.append(self.record(len(records), at, step, weights.T, 0.0 if done else 1.0))
+            records += self.records(len(records), [Taken(at, step, weights.T, 0.0 if done else 1.0)])
             if self.progress is not None:
                 self.progress(self.problem.observations.name, records[-1])
             if done:
@@ -344,34 +363,43 @@ class _Run:
         """A decrease of J that counts as none; below J = 1 it is absolute, for there J has no more to tell."""
         return self.settings.cost_tolerance * max(total, 1.0)
 
-    def record(self, iteration: int, at: Local, step: Step, transform: Array, step_length: float) -> IterationRecord:
-        space, w = self.space, at.weights.w
-        rows = np.empty((len(w) + 1, len(w)))
-        rows[:-1], rows[-1] = w + transform, w
-        ensemble = space.control(rows)
-        physical = self.problem.prior.to_physical(ensemble)
-        rates = None if at.central.rates is None else at.central.rates[0]
-        scale = None if at.central.noise_scale is None else at.central.noise_scale[0]
-        predictions = at.central.predictions[0]
-        return IterationRecord(
-            iteration=iteration,
-            cost=at.cost,
-            background=float(diag.background_cost(w)),
-            observation=at.observation,
-            step_norm=step.norm,
-            step_length=step_length,
-            chi2_per_observation=diag.chi2_per_observation(self.problem.observations, predictions, rates, scale),
-            dfs=diag.dfs(step.hessian.singular_values, len(w)),
-            spread=diag.spread(ensemble[:-1], space.prior_variance),
-            active=at.active,
-            members=physical[:-1],
-            centre=physical[-1],
-        )
+    def records(self, first: int, taken: Sequence[Taken]) -> list[IterationRecord]:
+        """Of iterations in a row; ``first`` is the number of the first."""
+        space, observations = self.space, self.problem.observations
+        w = np.array([each.at.weights.w for each in taken])[:, None]
+        members = w + np.array([each.transform for each in taken])
+        ensembles = space.control(np.concatenate([members, w], axis=1))
+        physical = self.problem.prior.to_physical(ensembles)
+        centres = [each.at.central for each in taken]
+        predictions = np.array([run.predictions[0] for run in centres])
+        rates = [run.rates[0] for run in centres if run.rates is not None]
+        scales = [run.noise_scale[0] for run in centres if run.noise_scale is not None]
+        chi2 = diag.chi2_per_observation(
+            observations, predictions, np.array(rates) if rates else None, np.array(scales) if scales else None
+        ).tolist()
+        spreads = diag.spread(ensembles[:, :-1], space.prior_variance).tolist()
+        return [
+            IterationRecord(
+                iteration=first + i,
+                cost=each.at.cost,
+                background=each.at.background,
+                observation=each.at.observation,
+                step_norm=each.step.norm,
+                step_length=each.step_length,
+                chi2_per_observation=chi2[i],
+                dfs=diag.dfs(each.step.hessian.singular_values, len(space.members)),
+                spread=spreads[i],
+                active=each.at.active,
+                members=physical[i, :-1],
+                centre=physical[i, -1],
+            )
+            for i, each in enumerate(taken)
+        ]
 
     def require_step(self, at: Local, stage: str) -> Step:
         """The step from there, or an error where the members lost do not allow one."""
         if at.step is None:
-            self.require_members(at.members.failures, stage)
+            self.require_members(at.failures, stage)
             raise TooFewMembersError(f"{self.problem.observations.name}: the centre cannot be run in the {stage}")
         return at.step
 

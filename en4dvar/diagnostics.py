@@ -27,31 +27,33 @@ def background_cost(w: Array) -> Array:
 
 def dfs(singular_values: Array, n_members: int) -> float:
     """Degrees of freedom for signal: the trace of the influence matrix, Σ σ²/(N−1+σ²), σ the singular values of S."""
-    return float(np.sum(singular_values**2 / (n_members - 1 + singular_values**2)))
+    squares = singular_values * singular_values
+    return float(np.add.reduce(squares / (n_members - 1 + squares)))
 
 
-def dfs_per_parameter(prior: Array, posterior: Array) -> Array:
-    """1 − posterior variance / prior variance (n,), of ensembles (N, n) in transformed space."""
-    return np.asarray(1 - posterior.var(axis=0) / prior.var(axis=0))
+def dfs_per_parameter(prior_variance: Array, posterior: Array) -> Array:
+    """1 − posterior variance / prior variance (n,), of ensembles, (N, n) the posterior, in transformed space."""
+    return np.asarray(1 - posterior.var(axis=0) / prior_variance)
 
 
-def spread(members: Array, prior_variance: Array) -> float:
-    """Root mean over the parameters of ensemble variance / prior variance; (N, n) and (n,), transformed."""
-    anomalies = members - np.add.reduce(members, axis=0) / len(members)
-    variance = np.einsum("ij,ij->j", anomalies, anomalies) / len(members)
-    return math.sqrt(float(np.add.reduce(variance / prior_variance)) / len(variance))
+def spread(members: Array, prior_variance: Array) -> Array:
+    """Root mean over the parameters of ensemble variance / prior variance (…,); (…, N, n) and (n,), transformed."""
+    n_members, n = members.shape[-2:]
+    anomalies = members - np.add.reduce(members, axis=-2, keepdims=True) / n_members
+    variance = np.einsum("...ij,...ij->...j", anomalies, anomalies) / n_members
+    return np.sqrt(np.add.reduce(variance / prior_variance, axis=-1) / n)
 
 
 def chi2_per_observation(
     observations: Observations, predictions: Array, rates: Array | None, noise_scale: Array | None = None
-) -> float:
-    """(y − m)ᵀR⁻¹(y − m) per observation with β > 0, for predictions (K,).
+) -> Array:
+    """(y − m)ᵀR⁻¹(y − m) per observation with β > 0 (…,), for predictions (…, K); NaN where there is none.
 
     With a robust cost each square has its Huber weight, v ρ'(v), whose expectation under the density of ρ is 1 as well.
     """
     v = whitened_residual(observations, predictions, rates, noise_scale)
-    squares = v**2 if observations.huber is None else v**2 * robust_weights(observations, v)
-    return float(np.mean(squares[observations.weights > 0]))
+    squares = v * v if observations.huber is None else v * v * robust_weights(observations, v)
+    return np.asarray(np.add.reduce(squares[..., observations.used], axis=-1) / (len(observations.used) or math.nan))
 
 
 def nrmse(values: Array, predictions: Array) -> float:

@@ -113,7 +113,7 @@ def whiten(observations: Observations, at: Linearisation) -> tuple[Array, Array]
 
     This is the one place that knows the structure of R: anything with R^{-1/2} fits here.
     """
-    root_weight = np.sqrt(observations.weights)
+    root_weight = observations.root_weights
     s = error_std(observations, at.rate, at.noise_scale)
     z = (observations.values - at.prediction) / s
     whitening = None if observations.correlation is None else observations.whitening

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.errors import DataError
 from en4dvar.state import Array
@@ -89,6 +90,16 @@ class Observations:
     def timed(self) -> bool:
         """Whether any observation carries a timing error."""
         return bool(np.any(self.time_std > 0))
+
+    @cached_property
+    def used(self) -> npt.NDArray[np.intp]:
+        """Which have a weight β > 0."""
+        return np.flatnonzero(self.weights > 0)
+
+    @cached_property
+    def root_weights(self) -> Array:
+        """√β (K,)."""
+        return np.sqrt(self.weights)
 
     @cached_property
     def whitening(self) -> Array:

@@ -68,8 +68,8 @@ def highest_plausible(space: WeightSpace) -> float:
 
     To first order: with a noise scale or timing errors J also holds Σ β ln(s/std), and other members are tried earlier.
     """
-    weights = space.problem.observations.weights
-    used = weights[weights > 0]
+    observations = space.problem.observations
+    used = observations.weights[observations.used]
     return 0.5 * float(used.mean()) * diag.chi2_interval(float(len(used)))[1] if len(used) else np.inf
 
 
@@ -116,7 +116,7 @@ def _still_active(scouts: list[Scout], locals_: list[Local]) -> tuple[list[Scout
 
 def _stop_those_that_met(scouts: list[Scout], locals_: list[Local]) -> None:
     """Of scouts within ``SAME`` of each other, in the metric of the lower one's Hessian, keep the lower one."""
-    order = np.argsort([scout.cost for scout in scouts], kind="stable")
+    order = sorted(range(len(scouts)), key=lambda i: scouts[i].cost)
     for position, i in enumerate(order):
         step = locals_[i].step
         if step is None or not scouts[i].active:

@@ -84,11 +84,12 @@ def line_search(at: Point) -> Search:
     direction = at.step.direction
     for first in range(3):
         lengths = LENGTHS * 0.5 ** (BATCH * first)
-        trials = yield at.w + lengths[:, None] * direction
-        move = _lowest(at, lengths[:, None] * direction, lengths, trials)
+        straight = lengths[:, None] * direction
+        trials = yield at.w + straight
+        move = _lowest(at, straight, lengths, trials)
         if first == 0 and at.tangent is not None and (move is None or move.step_length < 1):
             bend = acceleration(at.step, at.tangent, lengths, trials.predictions)
-            bent = LENGTHS[:, None] * direction + 0.5 * LENGTHS[:, None] ** 2 * bend
+            bent = straight + 0.5 * LENGTHS[:, None] ** 2 * bend
             curved = _lowest(at, bent, LENGTHS, (yield at.w + bent))
             if curved is not None and (move is None or curved.cost < move.cost):
                 move = curved

@@ -16,7 +16,7 @@ import numpy as np
 
 from en4dvar import diagnostics as diag
 from en4dvar.descent.step_control import STEP_CONTROLS, Move, Point, Tangent, Trials, run_searches
-from en4dvar.ensemble.forecast import NO_TIMES, Forecast, forecast
+from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
 from en4dvar.ensemble.linalg import Hessian, anomaly_basis, centre
 from en4dvar.executor import Executor
 from en4dvar.likelihood import Linearisation, observation_cost, precision_times, whiten
@@ -29,24 +29,47 @@ from en4dvar.state import Array
 
 @dataclass(frozen=True)
 class Local:
-    """What is known at weights: the runs it took, J_o and J at the centre, and the step from there.
+    """What is known at weights: the runs it took, J_b and J_o at the centre, and the step from there.
 
-    ``members`` are the runs beside the centre, N of them or r. ``active`` counts the members that inform the step: N
+    ``part`` of the runs ``whole``, shared with other places, belongs to this one: N members or r, then the centre.
+    ``again`` are N members that were run because one of r failed. ``active`` counts the members that inform the step: N
     where r runs stand for all. Where too few do, ``linear``, the linearisation in coordinates of the basis, and
     ``step`` are None.
     """
 
     weights: Weights
-    members: Forecast
-    central: Forecast
+    whole: Forecast
+    part: slice
+    again: Forecast | None
     active: int
+    background: float
     observation: float
-    cost: float
     linear: Linearisation | None
     step: Step | None
 
+    @property
+    def cost(self) -> float:
+        """J = J_b + J_o."""
+        return self.background + self.observation
 
-_Seen = tuple[Weights, Forecast, Forecast, int, float, float, Linearisation | None]  # a Local but for its step
+    @property
+    def members(self) -> Forecast:
+        """The runs beside the centre, N of them or r."""
+        return self.whole[self.part.start : self.part.stop - 1] if self.again is None else self.again
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """Of the runs beside the centre."""
+        return self.whole.failures[self.part.start : self.part.stop - 1] if self.again is None else self.again.failures
+
+    @property
+    def central(self) -> Forecast:
+        """The run of the centre."""
+        return self.whole[self.part.stop - 1 : self.part.stop]
+
+
+_Tangent = tuple[Array, Array]  # reference (Ky,) and anomalies (r, Ky) of what :func:`_stack` puts side by side
+_Seen = tuple[Weights, Forecast, slice, Forecast | None, int, float, float, Linearisation | None]  # a Local, no step
 
 
 @dataclass(frozen=True)
@@ -76,6 +99,7 @@ class WeightSpace:
 
     def __init__(self, problem: InverseProblem, settings: AssimilationSettings, seed: int, executor: Executor):
         self.problem, self.settings, self.executor = problem, settings, executor
+        self.composite = Composite(problem, executor)
         self.scheme: Scheme = En4DVar(settings.linearisation, settings.epsilon)
         self.step_control = STEP_CONTROLS[settings.step_control]
         drawn = prior_ensemble(problem.prior, settings.members, seed, settings.sampling)
@@ -95,7 +119,7 @@ class WeightSpace:
 
     def forecast(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
         self.forward_runs += len(x)
-        return forecast(self.problem, x, self.executor, extra_times)
+        return self.composite(x, extra_times)
 
     def observation_cost(self, run: Forecast) -> Array:
         return observation_cost(self.problem.observations, run.predictions, run.rates, run.noise_scale)
@@ -117,15 +141,18 @@ class WeightSpace:
 
     def linearise(self, weights: Sequence[Weights]) -> list[Local]:
         """Steps at several weights, from one call of the model."""
-        rows = [self._run_at(each) for each in weights]
-        whole = self.forecast(self.control(np.concatenate(rows)))
-        centres = np.cumsum([len(row) for row in rows]) - 1
-        observation = self.observation_cost(whole.rows(centres)).tolist()
-        background = diag.background_cost(np.array([each.w for each in weights])).tolist()
-        seen, first = [], 0
-        for at, last, of_prior, of_data in zip(weights, centres.tolist(), background, observation, strict=True):
-            seen.append(self._seen(at, whole[first:last], whole[last : last + 1], of_prior, of_data))
-            first = last + 1
+        w = np.array([each.w for each in weights])
+        rows = self._rows(weights, w)
+        size = rows.shape[1]
+        whole = self.forecast(self.control(rows.reshape(-1, rows.shape[2])))
+        tangents = self._tangents(whole, size) if self.economical else [None] * len(weights)
+        costs = zip(
+            diag.background_cost(w).tolist(), self.observation_cost(whole[size - 1 :: size]).tolist(), strict=True
+        )
+        seen = [
+            self._seen(at, whole, slice(size * i, size * (i + 1)), tangent, *cost)
+            for i, (at, tangent, cost) in enumerate(zip(weights, tangents, costs, strict=True))
+        ]
         return self._with_steps(seen)
 
     def _with_steps(self, seen: Sequence[_Seen]) -> list[Local]:
@@ -152,42 +179,56 @@ class WeightSpace:
         n_members, n = self.members.shape
         return max(math.ceil(self.settings.min_active_fraction * n_members), min(n + 1, n_members))
 
-    def _run_at(self, weights: Weights) -> Array:
-        """Weights to be run for a linearisation; the last row is the centre."""
+    def _rows(self, weights: Sequence[Weights], w: Array) -> Array:
+        """Weights (B, M, N) to be run for linearisations at centres ``w`` (B, N), which come last of each M."""
         if self.economical:
-            return np.asarray(weights.w + self._offsets)
-        return np.vstack([self.scheme.member_weights(weights), weights.w])
+            return np.asarray(w[:, None] + self._offsets)
+        return np.array([[*self.scheme.member_weights(each), each.w] for each in weights])
 
     @cached_property
     def _offsets(self) -> Array:
-        return np.vstack([self._short * self.basis.T, np.zeros(len(self.members))])
+        return np.array([*(self._short * self.basis.T), np.zeros(len(self.members))])
 
     @property
     def _short(self) -> float:
         """Step along a unit direction of the weights that moves the state by ε prior standard deviations."""
         return self.settings.epsilon / math.sqrt(len(self.members) - 1)
 
-    def _seen(
-        self, weights: Weights, members: Forecast, central: Forecast, background: float, observation: float
-    ) -> _Seen:
-        reduced = self.economical and not any(members.failures)
-        if self.economical and not reduced:
-            members = self.forecast(self.control(self.scheme.member_weights(weights)))
-        total = background + observation
-        active = len(self.members) if reduced else int(members.active.sum())
-        linear = None
-        if active >= self.needed_members and math.isfinite(total):
-            linear = _split(central, *self._linearisation(weights, members, central, reduced))
-        return weights, members, central, active, observation, total, linear
+    def _tangents(self, whole: Forecast, size: int) -> list[_Tangent | None]:
+        """From r runs and the centre, ``size`` together, for each place; None where one of the r failed."""
+        outputs = _stack(whole)
+        outputs = outputs.reshape(-1, size, outputs.shape[1])
+        reference = outputs[:, -1]
+        tangents: list[_Tangent | None] = list(
+            zip(reference, (outputs[:, :-1] - reference[:, None]) / self._short, strict=True)
+        )
+        if any(whole.failures):
+            for i in range(len(tangents)):
+                if any(whole.failures[size * i : size * (i + 1) - 1]):
+                    tangents[i] = None
+        return tangents
 
-    def _linearisation(
-        self, weights: Weights, members: Forecast, central: Forecast, reduced: bool
-    ) -> tuple[Array, Array]:
-        """Reference (Ky,) and anomalies (r, Ky) of all that :func:`_stack` puts side by side, per unit coordinate."""
-        stacked, reference = _stack(members), _stack(central)
-        if reduced:
-            return reference[0], (stacked - reference[0]) / self._short
-        return self.scheme.linearise(weights, self.basis, stacked, reference[0], members.active)
+    def _seen(
+        self,
+        weights: Weights,
+        whole: Forecast,
+        part: slice,
+        tangent: _Tangent | None,
+        background: float,
+        observation: float,
+    ) -> _Seen:
+        active, again, runnable = len(self.members), None, math.isfinite(background + observation)
+        if tangent is None:
+            members, central = whole[part.start : part.stop - 1], whole[part.stop - 1 : part.stop]
+            if self.economical:
+                members = again = self.forecast(self.control(self.scheme.member_weights(weights)))
+            active = int(members.active.sum())
+            if active >= self.needed_members and runnable:
+                tangent = self.scheme.linearise(
+                    weights, self.basis, _stack(members), _stack(central)[0], members.active
+                )
+        linear = _split(whole, *tangent) if tangent is not None and runnable else None
+        return weights, whole, part, again, active, background, observation, linear
 
 
 def _stack(run: Forecast) -> Array:

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
-from en4dvar.ensemble.members import EVERYONE, Indices, Reading, initial_states, out_of_bounds
+from en4dvar.ensemble.members import EVERYONE, Indices, InitialStates, Reading, out_of_bounds
 from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.forward import RateOperator
@@ -43,61 +42,71 @@ class Forecast:
         return np.array([not reason for reason in self.failures])
 
     def __getitem__(self, members: slice) -> Forecast:
-        return self._part(members, self.failures[members])
-
-    def rows(self, members: npt.NDArray[np.intp]) -> Forecast:
-        """Those members, in that order."""
-        return self._part(members, tuple(self.failures[i] for i in members))
-
-    def _part(self, members: Indices, failures: tuple[str, ...]) -> Forecast:
         return Forecast(
             self.predictions[members],
             None if self.rates is None else self.rates[members],
             self.path[members],
-            failures,
+            self.failures[members],
             None if self.noise_scale is None else self.noise_scale[members],
             self.extremes[members],
+        )
+
+
+class Composite:
+    """𝓗, F then H then the clock of the observations: control vectors → predictions.
+
+    What does not depend on the members is found out once.
+
+    Raises
+    ------
+    ConfigError: a timing error on an observable without a rate.
+    """
+
+    def __init__(self, problem: InverseProblem, executor: Executor | None = None):
+        self.problem, self.executor = problem, executor or SerialExecutor()
+        self._initial_states = InitialStates(problem)
+        self._reading = {limits: _reading(problem, limits) for limits in (False, True)}
+        self._scaled = has_noise_scale(problem)
+
+    def __call__(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
+        """Run control vectors ``x`` (B, n; transformed) through F and H.
+
+        Member i is observed at t_k + t_s,i. ``extra_times`` (M,), on the clock of the observations, are read from the
+        same run. A member fails, without disturbing the others, where a parameter leaves its bounds, ``initial_state``
+        raises, the model returns a :class:`Failure`, or H gives anything but finite numbers.
+        """
+        problem, reading = self.problem, self._reading[len(extra_times) > 0]
+        times, at_observations, at_extra = _union(problem.observations.times, extra_times)
+        physical = problem.prior.to_physical(x)
+        failures = out_of_bounds(problem.prior, physical)
+        alive, states = self._initial_states(physical, failures)
+        shifted = times + _of_framework(problem, physical, TIME_SHIFT, 0.0)[alive, None]
+        outcomes = self.executor.trajectories(problem.model, states, shifted) if len(states) else ()
+        observed, extremes, reasons = reading.observe(outcomes, len(times))
+        if alive is EVERYONE:
+            failures = reasons
+        else:
+            read = observed, extremes
+            observed = np.full((len(observed), len(x), len(times)), np.nan)
+            extremes = np.full((len(x), len(reading.largest)), np.nan)
+            observed[:, alive], extremes[alive] = read
+            for i, reason in zip(np.arange(len(x))[alive], reasons, strict=True):
+                failures[i] = reason
+        return Forecast(
+            observed[0][:, at_observations],
+            observed[1][:, at_observations] if len(observed) > 1 else None,
+            observed[0][:, at_extra],
+            tuple(failures),
+            _of_framework(problem, physical, NOISE_SCALE, 1.0) if self._scaled else None,
+            extremes,
         )
 
 
 def forecast(
     problem: InverseProblem, x: Array, executor: Executor | None = None, extra_times: Array = NO_TIMES
 ) -> Forecast:
-    """Run control vectors ``x`` (B, n; transformed) through F and H.
-
-    Member i is observed at t_k + t_s,i. ``extra_times`` (M,), on the clock of the observations, are read from the same
-    run. A member fails, without disturbing the others, where a parameter leaves its bounds, ``initial_state`` raises,
-    the model returns a :class:`Failure`, or H gives anything but finite numbers.
-
-    Raises
-    ------
-    ConfigError: a timing error on an observable without a rate.
-    """
-    reading = _reading(problem, limits=len(extra_times) > 0)
-    times, at_observations, at_extra = _union(problem.observations.times, extra_times)
-    physical = problem.prior.to_physical(x)
-    failures = out_of_bounds(problem.prior, physical)
-    alive, states = initial_states(problem, physical, failures)
-    shifted = times + _of_framework(problem, physical, TIME_SHIFT, 0.0)[alive, None]
-    outcomes = (executor or SerialExecutor()).trajectories(problem.model, states, shifted) if len(states) else ()
-    observed, extremes, reasons = reading.observe(outcomes, len(times))
-    if alive is EVERYONE:
-        failures = reasons
-    else:
-        read = observed, extremes
-        observed = np.full((len(observed), len(x), len(times)), np.nan)
-        extremes = np.full((len(x), len(reading.largest)), np.nan)
-        observed[:, alive], extremes[alive] = read
-        for i, reason in zip(np.arange(len(x))[alive], reasons, strict=True):
-            failures[i] = reason
-    return Forecast(
-        observed[0][:, at_observations],
-        observed[1][:, at_observations] if len(observed) > 1 else None,
-        observed[0][:, at_extra],
-        tuple(failures),
-        _of_framework(problem, physical, NOISE_SCALE, 1.0) if has_noise_scale(problem) else None,
-        extremes,
-    )
+    """:class:`Composite` of a problem, called once."""
+    return Composite(problem, executor)(x, extra_times)
 
 
 def has_noise_scale(problem: InverseProblem) -> bool:
@@ -183,7 +192,7 @@ def _union(times: Array, extra: Array) -> tuple[Array, Indices | slice, Indices 
 def _union_of_both(times_: bytes, extra_: bytes) -> tuple[Array, Indices, Indices]:
     """Kept, because the forecasts of prior and posterior of a data set ask for the same."""
     times, extra = np.frombuffer(times_), np.frombuffer(extra_)
-    nearest = times[np.abs(extra[:, None] - times).argmin(axis=1)]
+    nearest = times[np.searchsorted(0.5 * (times[1:] + times[:-1]), extra)]
     extra = np.where(np.abs(extra - nearest) <= SAME_INSTANT * (times[-1] - times[0]), nearest, extra)
     union: Array = np.unique(np.concatenate([times, extra]))
     union.flags.writeable = False

@@ -6,7 +6,7 @@ in trouble get a reason, the others do not notice.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,59 +37,68 @@ def out_of_bounds(prior: Prior, physical: Array) -> list[str]:
     return failures
 
 
-def initial_states(problem: InverseProblem, physical: Array, failures: list[str]) -> tuple[Indices, Array]:
-    """Which members (B', of B) have an initial state, and the states (B', n_state).
+class InitialStates:
+    """Where the members of a problem start."""
 
-    Members with an entry in ``failures`` (B,) have none; the reasons of those that the model refuses are added there.
-    """
-    alive = _without(failures)
-    size = problem.model.layout.size
-    theta = {name: np.full(len(physical), float(value)) for name, value in problem.fixed.items()}
-    theta.update(zip(problem.prior.names, physical.T, strict=True))
+    def __init__(self, problem: InverseProblem):
+        self.problem, self.size = problem, problem.model.layout.size
+        columns = {name: j for j, name in enumerate(problem.prior.names)}
+        own = [p.name for p in problem.model.parameters]
+        self.estimated = tuple((name, columns[name]) for name in own if name in columns)
+        self.fixed = tuple((name, float(problem.fixed[name])) for name in own if name in problem.fixed)
+        self.perturbed = tuple((p, columns.get(p.parameter.name)) for p in problem.perturbations)
 
-    def build(members: Indices) -> Array:
-        everyone = isinstance(members, slice)
-        values = theta if everyone else {name: value[members] for name, value in theta.items()}
-        own = {p.name: values[p.name] for p in problem.model.parameters if p.name in values}
-        states = _perturbed(problem, np.asarray(problem.model.initial_states(own), dtype=float), values)
-        if states.shape != (len(physical if everyone else physical[members]), size):
+    def __call__(self, physical: Array, failures: list[str]) -> tuple[Indices, Array]:
+        """Which members (B', of B) have an initial state, and the states (B', n_state).
+
+        ``physical`` (B, n) is the control vector. Members with an entry in ``failures`` (B,) have no state; the reasons
+        of those that the model refuses are added there.
+        """
+        alive = _without(failures)
+        if all(failures):
+            return alive, np.empty((0, self.size))
+        try:
+            return alive, self._build(physical[alive])
+        except Exception:  # some member has no state: find out which, one by one
+            states = []
+        for i in np.arange(len(failures))[alive]:
+            try:
+                states.append(self._build(physical[i : i + 1]))
+            except Exception as error:  # a model may refuse parameters in any way; the reason is kept
+                failures[i] = describe(error)
+        return _without(failures), np.concatenate([np.empty((0, self.size)), *states])
+
+    def _build(self, physical: Array) -> Array:
+        """States (B, n_state); ValueError where one is not a state."""
+        theta = {name: physical[:, j] for name, j in self.estimated}
+        theta |= {name: np.full(len(physical), value) for name, value in self.fixed}
+        states = np.asarray(self.problem.model.initial_states(theta), dtype=float)
+        if states.shape != (len(physical), self.size):
             raise ValueError("misshapen initial state")
+        if self.perturbed:
+            states = self._perturb(states.copy(), physical)
         if not np.isfinite(states).all():
             raise ValueError("non-finite initial state")
         return states
 
-    if all(failures):
-        return alive, np.empty((0, size))
-    try:
-        return alive, build(alive)
-    except Exception:  # some member has no state: find out which, one by one
-        states = []
-    for i in np.arange(len(failures))[alive]:
-        try:
-            states.append(build(np.array([i])))
-        except Exception as error:  # a model may refuse parameters in any way; the reason is kept
-            failures[i] = describe(error)
-    return _without(failures), np.concatenate([np.empty((0, size)), *states])
+    def _perturb(self, states: Array, physical: Array) -> Array:
+        """States (B, n_state) with the perturbations of the control vector; ValueError outside a field's bounds."""
+        layout = self.problem.model.layout
+        fields = {f.name: f for f in layout}
+        for perturbation, column in self.perturbed:
+            fixed = self.problem.fixed
+            value = fixed[perturbation.parameter.name] if column is None else physical[:, column, None]
+            where = layout[perturbation.field]
+            states[:, where] = states[:, where] * value if perturbation.relative else states[:, where] + value
+            low, high = fields[perturbation.field].bounds
+            if not np.all((states[:, where] > low) & (states[:, where] < high)):
+                unit = fields[perturbation.field].unit
+                raise ValueError(f"perturbed initial {perturbation.field} outside ({low:g}, {high:g}) {unit}")
+        return states
 
 
 def _without(failures: list[str]) -> Indices:
     return np.flatnonzero([not reason for reason in failures]) if any(failures) else EVERYONE
-
-
-def _perturbed(problem: InverseProblem, states: Array, theta: Mapping[str, Array]) -> Array:
-    """Initial states (B, n_state) with the perturbations of the control vector; ValueError outside a field's bounds."""
-    if not problem.perturbations or states.ndim != 2 or states.shape[1] != problem.model.layout.size:
-        return states
-    states = states.copy()
-    fields = {f.name: f for f in problem.model.layout}
-    for perturbation in problem.perturbations:
-        where, value = problem.model.layout[perturbation.field], theta[perturbation.parameter.name][:, None]
-        states[:, where] = states[:, where] * value if perturbation.relative else states[:, where] + value
-        low, high = fields[perturbation.field].bounds
-        if not np.all((states[:, where] > low) & (states[:, where] < high)):
-            unit = fields[perturbation.field].unit
-            raise ValueError(f"perturbed initial {perturbation.field} outside ({low:g}, {high:g}) {unit}")
-    return states
 
 
 @dataclass(frozen=True)

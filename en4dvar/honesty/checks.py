@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
+from statistics import median
 
 import numpy as np
 
@@ -22,7 +24,7 @@ BEYOND = 0.1  # share of members beyond a limit of the model
 def rank(prior: Prior, members: Array, posterior: Array) -> tuple[Caution, ...]:
     """Ensembles (N, n), (N', n) whose anomalies span fewer directions than there are parameters."""
     n = members.shape[1]
-    spanned = _rank((members - members.mean(axis=0)) / prior.std)
+    spanned = _rank(members.tobytes(), prior.std.tobytes())
     if spanned < n:
         return (
             caution(
@@ -83,21 +85,21 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
     at: zero is infinitely far in ln θ. The prior's own share near the bound is no finding, three times it is.
     """
     found = []
-    before, after = prior.to_physical(members), prior.to_physical(posterior)
     for j, (term, parameter) in enumerate(zip(prior.terms, prior.parameters, strict=True)):
         low, high = term.bounds if term.transform == "logit" else parameter.bounds
         if term.transform == "lognormal":
             low = -math.inf
         if math.isinf(low) and math.isinf(high):
             continue
-        width = high - low if math.isfinite(high - low) else float(before[:, j].std())
+        before, after = term.to_physical(members[:, j]), term.to_physical(posterior[:, j])
+        width = high - low if math.isfinite(high - low) else float(before.std())
         outside = np.array([reason.startswith(f"{parameter.name} outside") for reason in failures], dtype=bool)
         for bound, side, sign in ((low, "lower", 1), (high, "upper", -1)):
             if not math.isfinite(bound):
                 continue
-            near = sign * (after[:, j] - bound) <= NEAR * width
-            share = float(np.mean(near & (outside | (sign * (after[:, j] - bound) >= 0))))
-            usual = float(np.mean(sign * (before[:, j] - bound) <= NEAR * width))
+            near = sign * (after - bound) <= NEAR * width
+            share = float(np.mean(near & (outside | (sign * (after - bound) >= 0))))
+            usual = float(np.mean(sign * (before - bound) <= NEAR * width))
             if share >= PILED_UP and share > 3 * usual:
                 words = f"{share:.0%} of the posterior members of {parameter.name} pile up at its {side} bound"
                 found.append(caution("at-bound", f"{words} ({bound:g} {parameter.unit})".replace(" 1)", ")")))
@@ -115,7 +117,7 @@ def validity(limits: Sequence[ValidityLimit], extremes: Array) -> tuple[Caution,
                 caution(
                     "model-validity",
                     f"{beyond.sum()} of {len(reached)} posterior members leave the model's validity: {limit.label} "
-                    f"reaches {np.max(reached):.3g}{unit} (median {np.median(reached):.3g}), the limit is "
+                    f"reaches {np.max(reached):.3g}{unit} (median {median(reached.tolist()):.3g}), the limit is "
                     f"{limit.value:g}{unit}",
                 )
             )
@@ -151,6 +153,10 @@ def down_weighted(weights: Array, times: Array, unit: str, threshold: float, mos
     )
 
 
-def _rank(anomalies: Array) -> int:
-    values = np.linalg.svd(anomalies, compute_uv=False)
+@lru_cache(maxsize=4)  # the data sets of a campaign share their prior members
+def _rank(members_: bytes, scale_: bytes) -> int:
+    """Of the anomalies of members (N, n) in units of a scale (n,)."""
+    scale = np.frombuffer(scale_)
+    members = np.frombuffer(members_).reshape(-1, len(scale))
+    values = np.linalg.svd((members - members.mean(axis=0)) / scale, compute_uv=False)
     return int(np.sum(values > SAME_DIRECTION * values[0])) if values.size and values[0] > 0 else 0

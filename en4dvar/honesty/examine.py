@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -53,7 +54,7 @@ class Ending:
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))
     found: tuple[Caution, ...] = ()
 
-    @property
+    @cached_property
     def alive(self) -> Array:
         """(N,) bool, of the posterior forecast."""
         return np.array([not reason for reason in self.posterior_failures], dtype=bool)

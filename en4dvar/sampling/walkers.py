@@ -11,7 +11,7 @@ from en4dvar.state import Array
 
 STRETCHES = 0.3  # share of the moves, the others are differential evolution
 LEAPS = 0.1  # share of the latter of length 1, which takes walkers from one mode to another
-JITTER = 1e-5  # of the spread
+JITTER = 2e-5  # of the spread, the most
 
 
 class Emulated(Protocol):
@@ -37,7 +37,7 @@ def advance(
     x, costs = x.copy(), costs.copy()
     spread = others.std(axis=0)
     uniform = random.random((moves, 6, count))
-    jitter = JITTER * spread * random.standard_normal((moves, count, n))
+    jitter = JITTER * spread * (2 * random.random((moves, count, n)) - 1)
     first = (uniform[:, 0] * len(others)).astype(int)
     second = (first + 1 + (uniform[:, 1] * (len(others) - 1)).astype(int)) % len(others)
     length = np.where(uniform[:, 2] < LEAPS, 1.0, 2.38 / np.sqrt(2 * n))[..., None]

@@ -17,6 +17,16 @@ from en4dvar.schemes import Step, Weights
 from en4dvar.state import Parameter
 
 
+def where_one_of_the_few_fails(space, at):
+    """The same place, had the model said that the first of the few runs failed."""
+    run = space.composite
+    lost = replace(at.whole, failures=("lost", *at.whole.failures[1:]))
+    space.composite = lambda x, times: lost if len(x) == len(lost.failures) else run(x, times)
+    (again,) = space.linearise([at.weights])
+    space.composite = run
+    return again
+
+
 @pytest.mark.parametrize("time_std", [0.0, 0.05])
 def test_tangent_of_few_runs_is_the_bundle_of_all_members(time_std):
     problem = make_problem(Decay(), [1.5, 1.2], time_std=time_std)
@@ -28,8 +38,7 @@ def test_tangent_of_few_runs_is_the_bundle_of_all_members(time_std):
             w = space.basis @ np.array([0.1, -0.2])
             at, whole = (space.linearise([Weights(w, np.eye(members))])[0] for _ in range(2))
             rows = space.scheme.member_weights(at.weights)
-            lost = replace(at.members, failures=("lost",) * 2)
-            (full,) = space._with_steps([space._seen(at.weights, lost, at.central, 0.0, at.observation)])
+            full = where_one_of_the_few_fails(space, at)
             assert len(full.members.failures) == len(rows) == members
             steps.append(np.linalg.norm(at.step.direction - full.step.direction) / np.linalg.norm(full.step.direction))
             assert np.array_equal(at.step.direction, whole.step.direction)

@@ -233,7 +233,7 @@ def test_diagnostics_by_hand():
     assert diag.dfs(np.array([3.0, 0.0]), 10) == pytest.approx(0.5)
     assert diag.nrmse(np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 4.0])) == pytest.approx(1 - 1 / np.sqrt(2))
     prior = np.array([[1.0, 2.0], [3.0, -2.0]])
-    assert diag.dfs_per_parameter(prior, prior * [0.5, 1.0]) == pytest.approx([0.75, 0.0])
+    assert diag.dfs_per_parameter(prior.var(axis=0), prior * [0.5, 1.0]) == pytest.approx([0.75, 0.0])
     assert diag.spread(prior * [0.5, 1.0], prior.var(axis=0)) == pytest.approx(np.sqrt(0.625))
     assert float(diag.background_cost(np.array([1.0, -1.0, 0.0]))) == pytest.approx(2.0)
     low, high = diag.chi2_interval(10.0)  # tabulated: χ²_10 at 0.0005 and 0.9995
