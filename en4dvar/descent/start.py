@@ -40,9 +40,8 @@ def choose_start(space: WeightSpace, run: Forecast) -> Start:
     few runs that all of them cost no more than one bundle of N members; else it takes the member of lowest J.
     """
     n_members = len(space.members)
-    # e_i moved to the minimum-norm weights of the same member, so that J_b is ½‖x − x̄0‖² in the prior covariance
-    candidates = np.vstack([space.basis @ space.basis.T, np.zeros(n_members)])
-    costs = diag.background_cost(candidates) + space.observation_cost(run)
+    candidates = space.drawn.at_members
+    costs = space.drawn.background_at_members + space.observation_cost(run)
     warnings: tuple[Caution, ...] = ()
     if space.settings.start == "prior-mean":
         if np.isfinite(costs[-1]):

@@ -82,6 +82,21 @@ class PriorEnsemble:
     variance: Array
     basis: Array
 
+    @cached_property
+    def at_members(self) -> Array:
+        """Weights (N + 1, N) of the members and, last, of their mean.
+
+        e_i is moved to the minimum-norm weights of the same member, so that J_b is ½‖x − x̄0‖² in the prior covariance.
+        """
+        weights = np.vstack([self.basis @ self.basis.T, np.zeros(len(self.members))])
+        weights.flags.writeable = False
+        return weights
+
+    @cached_property
+    def background_at_members(self) -> Array:
+        """J_b (N + 1,) there."""
+        return diag.background_cost(self.at_members)
+
 
 @lru_cache(maxsize=4)
 def prior_ensemble(prior: Prior, n_members: int, seed: int, sampling: Sampling) -> PriorEnsemble:
@@ -102,7 +117,7 @@ class WeightSpace:
         self.composite = Composite(problem, executor)
         self.scheme: Scheme = En4DVar(settings.linearisation, settings.epsilon)
         self.step_control = STEP_CONTROLS[settings.step_control]
-        drawn = prior_ensemble(problem.prior, settings.members, seed, settings.sampling)
+        self.drawn = drawn = prior_ensemble(problem.prior, settings.members, seed, settings.sampling)
         self.members, self.mean, self.anomalies = drawn.members, drawn.mean, drawn.anomalies
         self.prior_variance, self.basis = drawn.variance, drawn.basis
         self.forward_runs = 0
