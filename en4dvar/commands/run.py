@@ -80,11 +80,12 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
         click.echo(results_table({o.name: o.summary for o in campaign.outcomes if not o.failure}))
     for notice in campaign.notices:
         click.echo(f"warning: {notice}", err=True)
-    told = [f"{o.name}: {warning}" for o in campaign.outcomes for warning in o.warnings]
-    for warning in told[:MOST_TOLD]:
-        click.echo(f"warning: {warning}", err=True)
+    found = [(o.name, warning) for o in campaign.outcomes for warning in o.warnings]
+    told = sorted(found, key=lambda of_set: of_set[1].kind == "note")  # notes are the first to be left out
+    for name, warning in told[:MOST_TOLD]:
+        click.echo(f"{warning.kind}: {name}: {warning}", err=True)
     if len(told) > MOST_TOLD:
-        click.echo(f"warning: {len(told) - MOST_TOLD} more; see run.log", err=True)
+        click.echo(f"and {len(told) - MOST_TOLD} more warnings and notes; see run.log", err=True)
     if len(campaign) and with_report:
         click.echo(f"report: {campaign.directory / 'report.html'}")
     if campaign.failures:

@@ -53,6 +53,11 @@ class Caution:
         return f"{self.words}; {self.advice} [{self.code}]" if self.advice else f"{self.words} [{self.code}]"
 
     @property
+    def kind(self) -> str:
+        """What a terminal calls it: ``note``, or ``warning``."""
+        return "note" if self.severity == "note" else "warning"
+
+    @property
     def line(self) -> str:
         """One line of text that :meth:`parse` reads, the form kept in netCDF."""
         words = " ".join(self.words.split())

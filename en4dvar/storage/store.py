@@ -197,7 +197,7 @@ class Result:
         ended = f"{'converged' if s['converged'] else 'not converged'}: {s['stop_reason']}"
         fit = f"chi2/K {s['chi2_per_observation']:.3g}, NRMSE {s['nrmse']:.3g}, DFS {s['dfs']:.3g}"
         parts = [results_table({self.name: self.summary()}), f"{ended}; {fit}"]
-        return "\n".join([*parts, *(f"warning: {words}" for words in self.warnings)])
+        return "\n".join([*parts, *(f"{caution.kind}: {caution.words}" for caution in self.cautions)])
 
 
 def _living(values: Array, alive: Any, unit: str, display_unit: str) -> Array:

@@ -13,7 +13,10 @@ from click.testing import CliRunner, Result
 from toy_config import YAML, csv_text, write_toy
 
 from en4dvar.cli import main
+from en4dvar.commands.run import _tell
 from en4dvar.config import load_config
+from en4dvar.honesty import caution
+from en4dvar.runs.campaign import Campaign, DatasetOutcome
 from en4dvar.storage.store import load_result
 
 
@@ -232,3 +235,15 @@ def test_force_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None
     refused = call("run", path, "--out", out, "--force")
     assert refused.exit_code == 2
     assert "was not written by a run" in refused.stderr
+
+
+def test_many_warnings_are_told_before_notes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = caution("not-informed", "k is hardly informed"), caution("misfit", "χ² is large")
+    outcomes = tuple(DatasetOutcome(f"set{n}", tmp_path / "none.nc", warnings=said) for n in range(40))
+    _tell(Campaign(tmp_path, outcomes), with_report=False)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 31
+    assert all(re.match(r"warning: set\d+: χ² is large; .* \[misfit\]", line) for line in lines[:-1])
+    assert lines[-1] == "and 50 more warnings and notes; see run.log"
+    _tell(Campaign(tmp_path, outcomes[:1]), with_report=False)
+    assert [line.split(":")[0] for line in capsys.readouterr().err.splitlines()] == ["warning", "note"]
