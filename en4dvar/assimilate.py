@@ -19,7 +19,7 @@ from en4dvar.honesty.checks import down_weighted
 from en4dvar.inputs.units import convert
 from en4dvar.likelihood import error_std, log_likelihood, robust_weights, whitened_residual
 from en4dvar.noise_scale import mean_beyond_mode
-from en4dvar.problem import Analysis, AssimilationSettings, InverseProblem, IterationRecord
+from en4dvar.problem import Analysis, AssimilationSettings, ChainRecord, InverseProblem, IterationRecord, Record
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.shape import examine_shape, guide
 from en4dvar.schemes import Step, Weights
@@ -29,7 +29,7 @@ from en4dvar.state import Array
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 
 GRID_POINTS = 200  # M, of the plotting grid
-Progress = Callable[[str, IterationRecord], None]
+Progress = Callable[[str, Record], None]
 
 
 def assimilate(
@@ -47,7 +47,7 @@ def assimilate(
     ----------
     seed: of the prior ensemble; the same seed gives the same bits for any executor.
     executor: where members run; default in this process.
-    progress: called with the name of the data set and the record of each iteration.
+    progress: called with the name of the data set and the record of each iteration and each look at the chain.
     resume: where an earlier call with the same arguments was interrupted; the result has the same bits as without.
     on_iteration: called with the state that the next iteration starts from.
 
@@ -283,11 +283,15 @@ class _Run:
             if self.on_iteration is not None:
                 self.on_iteration(replace(self.latest, refinement=Refinement(chain, space.forward_runs)))
 
+        def look(record: ChainRecord) -> None:
+            if self.progress is not None:
+                self.progress(self.problem.observations.name, record)
+
         emulated = guide(space, posterior, self.seed)  # made again after an interruption, from the same runs
         if earlier is not None:
             space.forward_runs = earlier.forward_runs
         resume = earlier.chain if earlier else None
-        chain = mcmc.sample(log_density, posterior, self.seed, resume=resume, keep=keep, emulated=emulated)
+        chain = mcmc.sample(log_density, posterior, self.seed, resume=resume, keep=keep, look=look, emulated=emulated)
         warnings = () if chain.converged else (caution("chain-not-converged", chain.warning()),)
         return chain.thin(len(posterior), self.settings.sampling == "exact"), chain.summary(), warnings
 

@@ -105,6 +105,20 @@ class IterationRecord:
 
 
 @dataclass(frozen=True)
+class ChainRecord:
+    """Where a Markov chain stands (``refine: mcmc``): steps so far, the largest split R-hat of any parameter, and the
+    smallest effective sample size.
+    """
+
+    steps: int
+    r_hat: float
+    effective: float
+
+
+Record = IterationRecord | ChainRecord
+
+
+@dataclass(frozen=True)
 class Analysis:
     """The outcome for one data set: arrays only, members in order, physical SI values, NaN where a member failed.
 

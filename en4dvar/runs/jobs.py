@@ -14,7 +14,7 @@ from typing import Any
 from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.executor import Executor
 from en4dvar.honesty import Caution
-from en4dvar.problem import AssimilationSettings, InverseProblem, IterationRecord
+from en4dvar.problem import AssimilationSettings, InverseProblem, IterationRecord, Record
 from en4dvar.runs.progress import Progress
 from en4dvar.storage.checkpoint import Keeper
 from en4dvar.storage.groups import build_groups
@@ -22,7 +22,7 @@ from en4dvar.storage.netcdf import to_bytes
 from en4dvar.storage.store import ParameterSummary, summarise
 
 TELL_EVERY = 0.1  # s; a worker sends no more often what its iterations have to tell
-News = tuple[tuple[str, IterationRecord], ...]
+News = tuple[tuple[str, Record], ...]
 
 
 @dataclass(frozen=True)
@@ -94,13 +94,15 @@ class _Teller:
 
     def __init__(self, tell: Callable[[News], None]):
         self._tell, self._lock = tell, threading.Lock()
-        self._waiting: list[tuple[str, IterationRecord]] = []
+        self._waiting: list[tuple[str, Record]] = []
         self._sent = -math.inf
         self._timer: threading.Timer | None = None
 
-    def __call__(self, name: str, record: IterationRecord) -> None:
+    def __call__(self, name: str, record: Record) -> None:
+        if isinstance(record, IterationRecord):
+            record = replace(record, members=record.members[:0])
         with self._lock:
-            self._waiting.append((name, replace(record, members=record.members[:0])))
+            self._waiting.append((name, record))
             rest = self._sent + TELL_EVERY - time.monotonic()
             if rest <= 0:
                 self._send()

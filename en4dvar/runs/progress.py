@@ -12,17 +12,22 @@ from types import TracebackType
 from typing import Any, Self
 
 from en4dvar.errors import OutputError
-from en4dvar.problem import IterationRecord
+from en4dvar.problem import ChainRecord, Record
 from en4dvar.runs.interrupt import Interrupted
 
-Progress = Callable[[str, IterationRecord], None]
+Progress = Callable[[str, Record], None]
 TYPICAL_ITERATIONS = 8.0
 LONGEST_NAME = 24  # of a data set in the live line
 WIDE = 110  # columns of a terminal that has room for a bar
 
 
-def describe(name: str, record: IterationRecord) -> str:
-    """One iteration in one line: J and its terms, step, fit, information, members alive."""
+def describe(name: str, record: Record) -> str:
+    """One iteration in one line: J and its terms, step, fit, information, members alive; or how far a chain has got."""
+    if isinstance(record, ChainRecord):
+        return (
+            f"{name}: chain, {record.steps:4d} steps  R-hat {record.r_hat:.3f}  "
+            f"effective sample size {record.effective:.0f}"
+        )
     return (
         f"{name}: iteration {record.iteration:2d}  J {record.cost:.6g} = {record.background:.4g} + "
         f"{record.observation:.6g}  |dw| {record.step_norm:.2e}  step {record.step_length:.3g}  "
@@ -75,8 +80,9 @@ class LiveProgress:
         self._open: dict[str, int] = {}  # data set → its last iteration
         self._lengths: list[int] = []  # iterations of the data sets that have ended
 
-    def __call__(self, name: str, record: IterationRecord) -> None:
-        self._open[name] = record.iteration
+    def __call__(self, name: str, record: Record) -> None:
+        if not isinstance(record, ChainRecord):
+            self._open[name] = record.iteration
         self._show(_short(name, record))
 
     def begin(self, done: int) -> None:
@@ -157,8 +163,12 @@ def cycle_progress(cycles: int) -> Iterator[Callable[[int], None] | None]:
         yield lambda cycle: bar.update(task, completed=cycle + 1)
 
 
-def _short(name: str, record: IterationRecord) -> str:
+def _short(name: str, record: Record) -> str:
     known = name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
+    if isinstance(record, ChainRecord):
+        return (
+            f"{known} chain of {record.steps} steps: R-hat {record.r_hat:.3f}, {record.effective:.0f} independent draws"
+        )
     return (
         f"{known} iteration {record.iteration}: J {record.cost:.4g}, χ²/K {record.chi2_per_observation:.3g}, "
         f"step {record.step_length:.2g}"

@@ -15,7 +15,7 @@ from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, ThreadsExecutor
 from en4dvar.honesty import Caution
 from en4dvar.inputs.build import build_one
-from en4dvar.problem import IterationRecord
+from en4dvar.problem import IterationRecord, Record
 from en4dvar.runs.campaign import DatasetOutcome, file_names
 from en4dvar.runs.jobs import Estimate, Job, News, estimate, estimate_and_tell
 from en4dvar.runs.progress import LiveProgress, Progress, RunLog, describe
@@ -191,10 +191,11 @@ class Worklist:
             stop=stop,
         )
 
-    def _tell(self, name: str, record: IterationRecord) -> None:
-        if record.iteration <= self.told.get(name, -1):
-            self.log.write(f"{name}: its worker was lost; another one repeats it")
-        self.told[name] = record.iteration
+    def _tell(self, name: str, record: Record) -> None:
+        if isinstance(record, IterationRecord):
+            if record.iteration <= self.told.get(name, -1):
+                self.log.write(f"{name}: its worker was lost; another one repeats it")
+            self.told[name] = record.iteration
         self.log.write(describe(name, record))
         if self.progress is not None:
             self.progress(name, record)

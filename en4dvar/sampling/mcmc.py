@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from en4dvar.errors import ConfigError, En4dvarError
+from en4dvar.problem import ChainRecord
 from en4dvar.sampling.walkers import Emulated, advance
 from en4dvar.state import Array
 
@@ -116,6 +117,7 @@ def sample(
     target: float = 1000.0,
     resume: ChainState | None = None,
     keep: Callable[[ChainState], None] | None = None,
+    look: Callable[[ChainRecord], None] | None = None,
     emulated: Emulated | None = None,
 ) -> Chain:
     """Sample a density from the neighbourhood of an ensemble.
@@ -127,7 +129,7 @@ def sample(
     seed: of the walkers; the same seed gives the same bits.
     walkers: at least 2 (n + 1), even. max_steps: at most. target: effective sample size to reach in each direction.
     resume: where an earlier call with the same arguments was interrupted; the chain has the same bits as without.
-    keep: called with the state of the chain at each look at convergence.
+    keep: called with the state of the chain at each look at convergence. look: with what it shows.
     emulated: an approximation at no cost; it guides the walkers, which start from draws of it.
 
     Raises
@@ -156,6 +158,8 @@ def sample(
             samples = chain.samples[int(BURN_IN * steps) :]
             r_hat, effective = split_r_hat(samples), effective_sample_size(samples)
             converged = bool(np.all(r_hat < MAX_R_HAT) and np.all(effective >= target))
+            if look is not None:
+                look(ChainRecord(steps, float(np.max(r_hat)), float(np.min(effective))))
             if converged or steps >= max_steps:
                 break
         block = min(max_steps - steps, max(BLOCK, steps // 4))

@@ -8,7 +8,7 @@ from toy_config import csv_text, write_toy
 
 from en4dvar.config import load_config
 from en4dvar.errors import OutputError
-from en4dvar.problem import Analysis
+from en4dvar.problem import Analysis, ChainRecord
 from en4dvar.runs.progress import RunLog, describe, terminal_progress, time_left
 from en4dvar.runs.runner import run_campaign
 
@@ -24,9 +24,12 @@ def test_terminal_only(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.M
     with terminal_progress(2) as progress:
         assert progress is not None
         progress("gel", last := analysis.iterations[-1])
+        progress._bar.refresh()
+        progress("gel", ChainRecord(150, 1.02, 812.3))
     out, err = capsys.readouterr()
     assert out == ""
     assert f"gel iteration 5: J {last.cost:.4g}, χ²/K {last.chi2_per_observation:.3g}, step 0" in err
+    assert "gel chain of 150 steps: R-hat 1.020, 812 independent draws" in err
     assert "0/2" in err
     assert "\x1b[3" in err  # colours
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,7 @@ def test_interrupted_in_the_chain(tmp_path, monkeypatch):
     assert len(state.refinement.chain.samples) == 40
     run_campaign(config, resume=True)
     assert looks == [20, 40, 60, 80]
+    assert re.findall(r"set0: chain, +(\d+) steps  R-hat", (out / "run.log").read_text()) == ["20", "40", "60", "80"]
     assert_same_results(out, tmp_path / "quiet")
 
 
