@@ -8,6 +8,7 @@ from scipy.stats import multivariate_normal, norm
 
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.state import Parameter
+from en4dvar_bubble.study import set_evidence as evidence_module
 from en4dvar_bubble.study.set_evidence import DRAWS, ENOUGH, MOST_ROUNDS, set_evidence
 
 
@@ -37,6 +38,13 @@ class Linear(Runs):
     def model(self, x, s):
         return x @ self.H[s].T
 
+    def exact(self, mean, std):
+        """ln p(y) of every set, as set_evidence counts it."""
+        covariances = self.H @ np.diag(std**2) @ self.H.transpose(0, 2, 1) + 0.09 * np.eye(5)
+        densities = [multivariate_normal(h @ mean, c) for h, c in zip(self.H, covariances, strict=True)]
+        logs = [density.logpdf(y) for density, y in zip(densities, self.values, strict=True)]
+        return np.array(logs) + 5 * np.log(0.3 * np.sqrt(2 * np.pi))
+
 
 class Spiked(Runs):
     """L = exp(−½|x − 1|²/0.01²) + 0.6 exp(−½|x + 1|²/0.4²): J is lowest in the first, the probability in the second."""
@@ -57,13 +65,30 @@ class Spiked(Runs):
 def test_linear_sets_weak_and_sharp():
     runs, mean, std = Linear(), np.array([0.5, -0.5, 0.2, 0.0]), np.array([0.8, 1.2, 0.9, 0.3])
     found = set_evidence(runs, prior_of(mean, std), seed=1)
-    for s, h in enumerate(runs.H):
-        density = multivariate_normal(h @ mean, h @ np.diag(std**2) @ h.T + 0.09 * np.eye(5)).logpdf(runs.values[s])
-        assert found.log[s] - 5 * np.log(0.3 * np.sqrt(2 * np.pi)) == pytest.approx(density, abs=0.25), s
+    assert found.log == pytest.approx(runs.exact(mean, std), abs=0.25)
     assert np.all(found.effective >= ENOUGH)
     assert runs.count[0] < runs.count[-1] <= MOST_ROUNDS * DRAWS  # the weak one was done sooner
     again = set_evidence(Linear(), prior_of(mean, std), seed=1)
     assert np.array_equal(found.log, again.log)
+
+
+def test_too_few_effective_draws_are_drawn_again(monkeypatch):
+    monkeypatch.setattr(evidence_module, "MOST_ROUNDS", 8)
+    monkeypatch.setattr(evidence_module, "DRAWS", 120)
+    mean, std = np.zeros(4), np.ones(4)
+    monkeypatch.setattr(evidence_module, "TOO_FEW", 0.0)
+    once = set_evidence(Linear(), prior_of(mean, std), seed=1)
+    monkeypatch.setattr(evidence_module, "TOO_FEW", 100.0)
+    runs = Linear()
+    found = set_evidence(runs, prior_of(mean, std), seed=1)
+    again = once.effective < 100
+    assert 0 < again.sum() < 6
+    assert np.array_equal(runs.count > 8 * 120, again)
+    assert np.array_equal(found.log[~again], once.log[~again])
+    assert np.all(found.effective[again] > once.effective[again])
+    exact = runs.exact(mean, std)
+    assert found.log[again] == pytest.approx(exact[again], abs=0.4)
+    assert np.max(np.abs(found.log - exact)) < np.max(np.abs(once.log - exact))
 
 
 def test_the_wide_mode_counts_not_the_lowest_spike():
