@@ -121,7 +121,8 @@ ROOT = Path(__file__).resolve().parents[2]
 WITH_EXAMPLES = [
     path.relative_to(root).with_suffix("").as_posix().replace("/", ".")
     for root in (ROOT, ROOT / "models")
-    for path in sorted(root.glob("en4dvar*/**/*.py"))
+    for package in sorted(root.glob("en4dvar*/__init__.py"))
+    for path in sorted(package.parent.rglob("*.py"))
     if ">>> " in path.read_text(encoding="utf-8")
 ]
 

@@ -6,6 +6,7 @@ Needs the package index; run by .ci/run. ``pytest tests/packaging -m long``
 from __future__ import annotations
 
 import email
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -26,11 +27,21 @@ def call(*words: object, folder: Path) -> str:
     return done.stdout
 
 
+def made_here(folder: str, names: list[str]) -> list[str]:
+    """What is no part of the project: outputs, environments, caches."""
+    outputs = {"runs", "site", "build", "dist", "venv", ".venv"} if Path(folder) == ROOT else set()
+    return [n for n in names if n in outputs or n == "__pycache__" or n.endswith((".egg-info", "_cache"))]
+
+
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> dict[str, Path]:
-    """The sdist made from the tree, and the wheel made from the sdist."""
-    folder = tmp_path_factory.mktemp("dist")
-    call(sys.executable, "-m", "build", "--outdir", folder, ROOT, folder=folder)
+    """The sdist made from the tree, and the wheel made from the sdist.
+
+    Of a copy: making an sdist puts a tree of its own into this one for a while, in which other tests would look around.
+    """
+    folder, tree = tmp_path_factory.mktemp("dist"), tmp_path_factory.mktemp("copy") / "tree"
+    shutil.copytree(ROOT, tree, ignore=made_here)
+    call(sys.executable, "-m", "build", "--outdir", folder, tree, folder=folder)
     (wheel,), (sdist,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
     return {"wheel": wheel, "sdist": sdist}
 
