@@ -27,9 +27,10 @@ def report(run_dir: Path, datasets: tuple[str, ...]) -> None:
     Example:
       en4dvar report runs/quickstart
     """
+    from en4dvar.executor import available_cores
     from en4dvar.runs.runner import report as write_report
 
-    click.echo(f"report: {write_report(run_dir, datasets)}")
+    click.echo(f"report: {write_report(run_dir, datasets, available_cores())}")
 
 
 @click.command()

@@ -59,6 +59,7 @@ def run(
             raise click.UsageError("a twin experiment takes no --scheduler: its cycles are too short to be sent away")
         _run_twin(loaded, force, resume)
         return
+    from en4dvar.executor import available_cores
     from en4dvar.inputs.build import data_files, inverse_plan
     from en4dvar.runs.progress import terminal_progress
     from en4dvar.runs.runner import execute
@@ -66,7 +67,10 @@ def run(
     words = command_words()
     with terminal_progress(len(data_files(inverse_plan(loaded)))) as progress:
         try:
-            campaign = execute(loaded, force=force, resume=resume, progress=progress, command=shlex.join(words))
+            campaign = execute(
+                loaded, force=force, resume=resume, progress=progress, command=shlex.join(words),
+                report_workers=loaded.execution.workers or available_cores(),
+            )  # fmt: skip
         except KeyboardInterrupt as interrupt:
             raise _to_continue(interrupt) from None
     _tell(campaign, with_report=not no_report)

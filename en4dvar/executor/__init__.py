@@ -21,6 +21,7 @@ __all__ = [
     "ThreadsExecutor",
     "TimeLimitError",
     "WorkerLostError",
+    "available_cores",
     "choose_executor",
     "cut",
     "describe",
@@ -28,6 +29,11 @@ __all__ = [
     "one_blas_thread",
     "run_chunk",
 ]
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def make_executor(model: ForwardModel, workers: int = 1) -> Executor:
@@ -57,8 +63,7 @@ def choose_executor(
     if kind == "serial":
         return SerialExecutor()
     if workers is None and address is None:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        workers = cores if kind or model.compiled else 1
+        workers = available_cores() if kind or model.compiled else 1
     if kind == "dask" or address is not None:
         from en4dvar.executor.dask import DaskExecutor
 

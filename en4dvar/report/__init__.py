@@ -16,6 +16,7 @@ from urllib.parse import quote
 
 from en4dvar.commands.hints import suggest
 from en4dvar.errors import OutputError
+from en4dvar.executor import ProcessesExecutor, SerialExecutor, WorkerLostError
 from en4dvar.honesty import Caution
 from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import Entry, overview_figures, render_overview
@@ -27,14 +28,16 @@ from en4dvar.storage.store import ParameterSummary, Result, load_result
 
 Summarised = tuple[str, Iterable[ParameterSummary], Iterable[Caution]]
 PAGES = 40  # data sets of a campaign with a page from the start
+SHARE = 4  # pages that are worth the start of a process
 COPIES = 12  # data sets of a campaign up to which figures are also kept as PDF and PNG
 
 
-def write_report(run_dir: str | Path, datasets: Sequence[str] = ()) -> Path:
+def write_report(run_dir: str | Path, datasets: Sequence[str] = (), workers: int = 1) -> Path:
     """Write the report of a run and return the path of ``report.html``.
 
     Reads ``datasets/*.nc`` where the run has several data sets, else ``posterior.nc``. ``datasets`` are names of data
-    sets of a campaign: their pages, with figures as PDF and PNG, are written and the overview links to them.
+    sets of a campaign: their pages, with figures as PDF and PNG, are written and the overview links to them. Pages of a
+    campaign are drawn by up to ``workers`` processes, each with its share of :data:`SHARE` or more.
 
     Raises
     ------
@@ -51,7 +54,7 @@ def write_report(run_dir: str | Path, datasets: Sequence[str] = ()) -> Path:
     entries = [Entry.of(load_result(path), path.stem) for path in paths]
     failures = failed_datasets(run_dir / "posterior.nc")
     write_text(run_dir / "summary.csv", summary_csv(((e.name, e.summary, e.cautions) for e in entries), failures))
-    return _write_campaign(run_dir, entries, failures, _asked(run_dir, entries, datasets))
+    return _write_campaign(run_dir, entries, failures, _asked(run_dir, entries, datasets), workers)
 
 
 def summary_csv(summaries: Iterable[Summarised], failures: Mapping[str, str]) -> str:
@@ -83,24 +86,37 @@ def _asked(run_dir: Path, entries: Sequence[Entry], names: Sequence[str]) -> fro
 
 
 def _write_campaign(
-    run_dir: Path, entries: Sequence[Entry], failures: Mapping[str, str], asked: frozenset[str]
+    run_dir: Path, entries: Sequence[Entry], failures: Mapping[str, str], asked: frozenset[str], workers: int
 ) -> Path:
     folder = _folder(run_dir / "pages")
     first = {e.stem for e in sorted(entries, key=lambda e: -e.gravity)[:PAGES]}
     paged = [e for e in entries if e.stem in asked | first or (folder / f"{e.stem}.html").is_file()]
+    calls: list[tuple[Path, str, str | None, list[tuple[str, str]]]] = []
     for before, entry, after in zip([None, *paged[:-1]], paged, [*paged[1:], None], strict=True):
         neighbours = (("← ", before), ("→ ", after))
         trail = [("All data sets", "../report.html")]
         trail += [(f"{arrow}{e.name}", quote(f"{e.stem}.html")) for arrow, e in neighbours if e is not None]
-        result = load_result(run_dir / "datasets" / f"{entry.stem}.nc")
         copies = f"{entry.stem}_" if len(entries) <= COPIES or entry.stem in asked else None
-        _write_set(folder / f"{entry.stem}.html", result, copies, trail)
+        calls.append((run_dir, entry.stem, copies, trail))
+    workers = min(workers, len(calls) // SHARE)
+    with ProcessesExecutor(workers) if workers > 1 else SerialExecutor() as executor:
+        for i, value in executor.map(_write_page, calls):
+            if isinstance(value, WorkerLostError):
+                _write_page(*calls[i])
+            elif isinstance(value, Exception):
+                raise value
     figures = overview_figures(entries)
     _folder(run_dir / "figures")
     for name, _, figure in figures:
         save_figure(figure, run_dir / "figures", name)
     pages = {e.stem: quote(f"pages/{e.stem}.html") for e in paged}
     return write_text(run_dir / "report.html", render_overview(entries, pages, failures, figures))
+
+
+def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:
+    """The page of one data set of a campaign."""
+    result = load_result(run_dir / "datasets" / f"{stem}.nc")
+    _write_set(run_dir / "pages" / f"{stem}.html", result, copies, trail)
 
 
 def _write_set(path: Path, result: Result, copies: str | None, trail: Sequence[tuple[str, str]] = ()) -> Path:

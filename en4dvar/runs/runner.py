@@ -86,8 +86,12 @@ def execute(
     resume: bool = False,
     progress: Progress | None = None,
     command: str = "",
+    report_workers: int = 1,
 ) -> Campaign:
-    """Assimilate the data sets of ``config`` and write its run directory; arguments and errors as in :func:`run`."""
+    """Assimilate the data sets of ``config`` and write its run directory; arguments and errors as in :func:`run`.
+
+    ``report_workers``: processes that draw the report. They import the main script, which must guard what it does then.
+    """
     if force and resume:
         raise ConfigError("force replaces a run, resume continues it; give one of them")
     files = data_files(inverse_plan(config))
@@ -116,7 +120,7 @@ def execute(
                 _prepare(work, resume)
                 prepared = True
                 work.work(executor)
-                _finish(work)
+                _finish(work, report_workers)
                 log.write("done")
             except (KeyboardInterrupt, ExecutorError, OutputError) as error:
                 if isinstance(error, OutputError) and not prepared:
@@ -129,8 +133,10 @@ def execute(
         return Campaign(directory.path, work.outcomes(), tuple(work.notices))
 
 
-def report(path: str | Path, datasets: Sequence[str] = ()) -> Path:
+def report(path: str | Path, datasets: Sequence[str] = (), workers: int = 1) -> Path:
     """Write (again) the report of a run from its netCDF; ``datasets`` of a campaign get a page in any case.
+
+    ``workers``: processes that draw it.
 
     Raises :class:`OutputError`.
     """
@@ -139,7 +145,7 @@ def report(path: str | Path, datasets: Sequence[str] = ()) -> Path:
             from en4dvar.runs.twin_run import report_twin
 
             return report_twin(directory)
-        return _report(directory, datasets)
+        return _report(directory, datasets, workers)
 
 
 def _require_one_usable(config: Config, files: Mapping[str, Path]) -> None:
@@ -211,7 +217,7 @@ def _has_failed(work: Worklist, d: Dataset, earlier: Identity) -> bool:
     return record is not None and bool(record.failure)
 
 
-def _finish(work: Worklist) -> None:
+def _finish(work: Worklist, report_workers: int) -> None:
     """The campaign's file and the report."""
     directory = work.directory
     good = {d.name: directory.work / d.file for d in work.sets if not work.ended[d.name].failure}
@@ -220,7 +226,7 @@ def _finish(work: Worklist) -> None:
         longest = max(work.ended[name].n_observations for name in good)
         save_campaign(directory.work / "posterior.nc", good, longest, work.attributes, failures)
     if good and work.config.report:
-        _report(directory)
+        _report(directory, workers=report_workers)
     else:
         write_text(
             directory.claim("summary.csv"),
@@ -228,11 +234,11 @@ def _finish(work: Worklist) -> None:
         )
 
 
-def _report(directory: RunDirectory, datasets: Sequence[str] = ()) -> Path:
+def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int = 1) -> Path:
     directory.claim("report.html", "summary.csv")
     before = {folder: directory.listing(folder) for folder in ("figures", "pages")}
     try:
-        return write_report(directory.work, datasets)
+        return write_report(directory.work, datasets, workers)
     finally:
         for folder, files in before.items():
             directory.claim_folder(folder, files)

@@ -20,6 +20,7 @@ from PIL import Image
 from en4dvar import report
 from en4dvar.diagnostics import chi2_interval
 from en4dvar.errors import OutputError
+from en4dvar.executor import SerialExecutor, WorkerLostError
 from en4dvar.honesty import Caution
 from en4dvar.report import write_report
 from en4dvar.report.figures import all_figures
@@ -229,6 +230,41 @@ def test_large_campaign_gets_pages_on_demand(campaign_dir, tmp_path, monkeypatch
     assert not (tmp_path / "figures" / "one_posterior.pdf").exists()
     with pytest.raises(OutputError, match="no data set 'tow'; did you mean 'two'"):
         write_report(tmp_path, ["tow"])
+
+
+def contents(run):
+    return {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*.*") if p.is_file()}
+
+
+def test_processes_draw_the_same_pages(campaign_dir, tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "SHARE", 1)
+    monkeypatch.setattr(report, "COPIES", 0)
+    one, two = tmp_path / "one", tmp_path / "two"
+    for run in (one, two):
+        shutil.copytree(campaign_dir / "datasets", run / "datasets")
+    write_report(one)
+    monkeypatch.setattr(report, "_write_set", None)  # this process draws no page
+    write_report(two, workers=2)
+    assert contents(one) == contents(two)
+    (two / "pages" / "two.html").unlink()
+    (two / "pages" / "two.html").mkdir()
+    with pytest.raises(OutputError, match=r"two\.html"):
+        write_report(two, workers=2)
+
+
+def test_the_page_of_a_process_that_dies_is_drawn_here(campaign_dir, tmp_path, monkeypatch):
+    class Deadly(SerialExecutor):
+        def __init__(self, workers):
+            assert workers == 2
+
+        def map(self, function, calls, hear=None):
+            return ((i, WorkerLostError("killed") if i == 1 else function(*call)) for i, call in enumerate(calls))
+
+    shutil.copytree(campaign_dir / "datasets", tmp_path / "datasets")
+    for name, value in {"SHARE": 1, "COPIES": 0, "all_figures": first_figure, "ProcessesExecutor": Deadly}.items():
+        monkeypatch.setattr(report, name, value)
+    write_report(tmp_path, workers=2)
+    assert len(list((tmp_path / "pages").iterdir())) == 3
 
 
 def test_overview_of_many_data_sets_stays_small(analysis):
