@@ -34,25 +34,26 @@ def advance(
     Comput. 16, 239; Goodman & Weare (2010), Commun. Appl. Math. Comput. Sci. 5, 65.
     """
     count, n = x.shape
-    x, costs = x.copy(), costs.copy()
-    spread = others.std(axis=0)
-    uniform = random.random((moves, 6, count))
-    jitter = JITTER * spread * (2 * random.random((moves, count, n)) - 1)
-    first = (uniform[:, 0] * len(others)).astype(int)
-    second = (first + 1 + (uniform[:, 1] * (len(others) - 1)).astype(int)) % len(others)
-    length = np.where(uniform[:, 2] < LEAPS, 1.0, 2.38 / np.sqrt(2 * n))[..., None]
-    stretched = uniform[:, 3] < STRETCHES
-    stretch = 0.5 * (1 + uniform[:, 4]) ** 2  # density ∝ 1/√s on [½, 2]
-    threshold = np.log1p(-uniform[:, 5]) - np.where(stretched, (n - 1) * np.log(stretch), 0.0)
+    x, costs, others = x.T.copy(), costs.copy(), others.T.copy()  # coordinates in rows: long inner loops
+    spread = others.std(axis=1)[:, None, None]
+    uniform = random.random((6, moves, count))
+    jitter = JITTER * spread * (2 * random.random((n, moves, count)) - 1)
+    n_others = others.shape[1]
+    first = (uniform[0] * n_others).astype(int)
+    second = (first + 1 + (uniform[1] * (n_others - 1)).astype(int)) % n_others
+    length = np.where(uniform[2] < LEAPS, 1.0, 2.38 / np.sqrt(2 * n))
+    stretched = uniform[3] < STRETCHES
+    stretch = 0.5 * (1 + uniform[4]) ** 2  # density ∝ 1/√s on [½, 2]
+    threshold = np.log1p(-uniform[5]) - np.where(stretched, (n - 1) * np.log(stretch), 0.0)
     # either is affine in x, so that everything but x is known beforehand: x + leap, or anchor + stretch (x − anchor)
-    anchor = others[first]
-    leap = length * (anchor - others[second]) + jitter
-    factor = np.where(stretched, stretch, 1.0)[..., None]
-    offset = np.where(stretched[..., None], (1 - factor) * anchor, leap)
+    anchor = others.take(first, axis=1)
+    leap = length * (anchor - others.take(second, axis=1)) + jitter
+    factor = np.where(stretched, stretch, 1.0)
+    offset = np.where(stretched, (1 - factor) * anchor, leap)
     for move in range(moves):
-        proposed = factor[move] * x + offset[move]
-        new = cost(proposed)
+        proposed = factor[move] * x + offset[:, move]
+        new = cost(proposed.T)
         accepted = threshold[move] < costs - new
-        np.copyto(x, proposed, where=accepted[:, None])
+        np.copyto(x, proposed, where=accepted)
         np.copyto(costs, new, where=accepted)
-    return x, costs
+    return np.ascontiguousarray(x.T), costs
