@@ -33,7 +33,7 @@ FEWEST_RUNS, MOST_RUNS = 96, 512  # of one fit
 CEILING = 20.0  # above the lowest J_o of the runs
 RIDGE = 1e-9  # relative: decides where the runs leave a coefficient open
 WALKERS = 300
-SCATTERED, SETTLED = 4, 7  # rounds of the walkers before the second fit, after it
+SCATTERED, SETTLED = 6, 10  # rounds of the walkers before the second fit, after it
 PER_ROUND = 10  # moves in a round
 
 Run = Callable[[Array], Forecast]

@@ -129,7 +129,11 @@ def nothing_cleared(monkeypatch):
 
 
 def test_shift_and_ratio_are_those_of_the_posterior(nothing_cleared):
-    """Against the posterior on a grid: the shift within 0.1 posterior standard deviations, the ratio within 15 %."""
+    """Against the posterior on a grid, in units of its standard deviation.
+
+    The walk's own random error is 0.04 (shift) and 4 % (ratio) from seed to seed, so that the mean of twelve tells a
+    systematic one of 0.05; no single run is off by five of them.
+    """
     problem = skewed()
     axes = [m + s * np.linspace(-6, 6, 121) for m, s in zip(problem.prior.mean, problem.prior.std, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -137,14 +141,18 @@ def test_shift_and_ratio_are_those_of_the_posterior(nothing_cleared):
     p /= p.sum()
     mean = p @ grid
     std = np.sqrt(p @ (grid - mean) ** 2)
-    for seed in range(3):
+    shifts, ratios = [], []
+    for seed in range(12):
         analysis = assimilate(problem, AssimilationSettings(members=24), seed)
         x = problem.prior.from_physical(analysis.posterior)
         ratio = x.std(axis=0, ddof=1) / std
         shape = analysis.shape
-        assert shape["mean_shift"] == pytest.approx(np.max(np.abs(x.mean(axis=0) - mean) / std), abs=0.1)
-        assert shape["spread_ratio"] == pytest.approx(ratio[np.argmax(np.abs(np.log(ratio)))], rel=0.15)
+        shifts.append(shape["mean_shift"] - np.max(np.abs(x.mean(axis=0) - mean) / std))
+        ratios.append(np.log(shape["spread_ratio"] / ratio[np.argmax(np.abs(np.log(ratio)))]))
         assert shape["emulator_fit"] > 0.8
+    for errors in (shifts, ratios):
+        assert abs(np.mean(errors)) < 0.05
+        assert np.max(np.abs(errors)) < 0.2
 
 
 def test_the_emulator_is_for_cheap_models_unless_asked_for(nothing_cleared):
