@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from en4dvar import diagnostics as diag
 from en4dvar.cycling.mda import assimilate_once
+from en4dvar.descent.record import Taken, make_records, worse
 from en4dvar.descent.start import choose_start
 from en4dvar.descent.weight_space import Local, WeightSpace
 from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, has_noise_scale, log_posterior
@@ -19,7 +20,7 @@ from en4dvar.honesty.checks import down_weighted
 from en4dvar.inputs.units import convert
 from en4dvar.likelihood import error_std, log_likelihood, robust_weights, whitened_residual
 from en4dvar.noise_scale import mean_beyond_mode
-from en4dvar.problem import Analysis, AssimilationSettings, ChainRecord, InverseProblem, IterationRecord, Record
+from en4dvar.problem import Analysis, AssimilationSettings, InverseProblem, IterationRecord, Progress, Record
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.shape import examine_shape, guide
 from en4dvar.schemes import Step, Weights
@@ -29,7 +30,6 @@ from en4dvar.state import Array
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 
 GRID_POINTS = 200  # M, of the plotting grid
-Progress = Callable[[str, Record], None]
 
 
 def assimilate(
@@ -83,22 +83,6 @@ class Refinement:
 
     chain: mcmc.ChainState
     forward_runs: int
-
-
-@dataclass(frozen=True)
-class Taken:
-    """A step as it was taken: from where, the transform (N, N) there, and how far."""
-
-    at: Local
-    step: Step
-    transform: Array
-    step_length: float
-
-
-def worse(worst: tuple[str, ...], at: Local) -> tuple[str, ...]:
-    """Of two lists of failures, so far the worst and those of the members there, the one with more."""
-    here = at.failures
-    return max(worst, here, key=lambda failures: sum(map(bool, failures))) if any(here) or not worst else worst
 
 
 @dataclass(frozen=True)
@@ -240,10 +224,9 @@ class _Run:
             worst_loss = worse(worst_loss, at)
             taken.append(Taken(at, step, step.transform, move.step_length))
             weights = Weights(move.w, step.transform)
-        records = self.records(0, taken) if taken else []
-        if self.progress is not None:
-            for record in records:
-                self.progress(self.problem.observations.name, record)
+        records = make_records(self.space, 0, taken)
+        for record in records:
+            self.tell(record)
         return LoopState(
             Weights(start.w, weights.T), self.space.forward_runs, start.warnings, tuple(records), worst_loss
         )
@@ -283,15 +266,13 @@ class _Run:
             if self.on_iteration is not None:
                 self.on_iteration(replace(self.latest, refinement=Refinement(chain, space.forward_runs)))
 
-        def look(record: ChainRecord) -> None:
-            if self.progress is not None:
-                self.progress(self.problem.observations.name, record)
-
         emulated = guide(space, posterior, self.seed)  # made again after an interruption, from the same runs
         if earlier is not None:
             space.forward_runs = earlier.forward_runs
         resume = earlier.chain if earlier else None
-        chain = mcmc.sample(log_density, posterior, self.seed, resume=resume, keep=keep, look=look, emulated=emulated)
+        chain = mcmc.sample(
+            log_density, posterior, self.seed, resume=resume, keep=keep, look=self.tell, emulated=emulated
+        )
         warnings = () if chain.converged else (caution("chain-not-converged", chain.warning()),)
         return chain.thin(len(posterior), self.settings.sampling == "exact"), chain.summary(), warnings
 
@@ -322,9 +303,8 @@ class _Run:
                         stop = "no decrease possible along the step"
                         converged = step.predicted_decrease <= self.small(total)
             taken = Taken(at, step, step.transform, move.step_length if move else 0.0)
-            records += self.records(len(records), [taken])
-            if self.progress is not None:
-                self.progress(self.problem.observations.name, records[-1])
+            records += make_records(space, len(records), [taken])
+            self.tell(records[-1])
             if stop:
                 return _Outcome(weights, step.transform, step, total, converged, stop, tuple(records), worst_loss)
             if move is None:  # a regression over a narrower ensemble may still show the way down
@@ -350,9 +330,8 @@ class _Run:
             step = self.require_step(at, f"forecast of iteration {len(records) + 1}")
             worst_loss = worse(worst_loss, at)
             done = len(records) == count
-            records += self.records(len(records), [Taken(at, step, weights.T, 0.0 if done else 1.0)])
-            if self.progress is not None:
-                self.progress(self.problem.observations.name, records[-1])
+            records += make_records(space, len(records), [Taken(at, step, weights.T, 0.0 if done else 1.0)])
+            self.tell(records[-1])
             if done:
                 ending = f"{count} assimilations"
                 return _Outcome(weights, weights.T, step, at.cost, True, ending, tuple(records), worst_loss)
@@ -367,38 +346,9 @@ class _Run:
         """A decrease of J that counts as none; below J = 1 it is absolute, for there J has no more to tell."""
         return self.settings.cost_tolerance * max(total, 1.0)
 
-    def records(self, first: int, taken: Sequence[Taken]) -> list[IterationRecord]:
-        """Of iterations in a row; ``first`` is the number of the first."""
-        space, observations = self.space, self.problem.observations
-        w = np.array([each.at.weights.w for each in taken])[:, None]
-        members = w + np.array([each.transform for each in taken])
-        ensembles = space.control(np.concatenate([members, w], axis=1))
-        physical = self.problem.prior.to_physical(ensembles)
-        centres = [each.at.central for each in taken]
-        predictions = np.array([run.predictions[0] for run in centres])
-        rates = [run.rates[0] for run in centres if run.rates is not None]
-        scales = [run.noise_scale[0] for run in centres if run.noise_scale is not None]
-        chi2 = diag.chi2_per_observation(
-            observations, predictions, np.array(rates) if rates else None, np.array(scales) if scales else None
-        ).tolist()
-        spreads = diag.spread(ensembles[:, :-1], space.prior_variance).tolist()
-        return [
-            IterationRecord(
-                iteration=first + i,
-                cost=each.at.cost,
-                background=each.at.background,
-                observation=each.at.observation,
-                step_norm=each.step.norm,
-                step_length=each.step_length,
-                chi2_per_observation=chi2[i],
-                dfs=diag.dfs(each.step.hessian.singular_values, len(space.members)),
-                spread=spreads[i],
-                active=each.at.active,
-                members=physical[i, :-1],
-                centre=physical[i, -1],
-            )
-            for i, each in enumerate(taken)
-        ]
+    def tell(self, record: Record) -> None:
+        if self.progress is not None:
+            self.progress(self.problem.observations.name, record)
 
     def require_step(self, at: Local, stage: str) -> Step:
         """The step from there, or an error where the members lost do not allow one."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
@@ -116,6 +116,7 @@ class ChainRecord:
 
 
 Record = IterationRecord | ChainRecord
+Progress = Callable[[str, Record], None]  # what hears of them, with the name of the data set
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from typing import Any
 from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.executor import Executor
 from en4dvar.honesty import Caution
-from en4dvar.problem import AssimilationSettings, InverseProblem, IterationRecord, Record
-from en4dvar.runs.progress import Progress
+from en4dvar.problem import AssimilationSettings, InverseProblem, IterationRecord, Progress, Record
 from en4dvar.storage.checkpoint import Keeper
 from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import to_bytes

@@ -15,7 +15,6 @@ from en4dvar.errors import OutputError
 from en4dvar.problem import ChainRecord, Record
 from en4dvar.runs.interrupt import Interrupted
 
-Progress = Callable[[str, Record], None]
 TYPICAL_ITERATIONS = 8.0
 LONGEST_NAME = 24  # of a data set in the live line
 WIDE = 110  # columns of a terminal that has room for a bar

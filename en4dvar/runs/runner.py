@@ -11,10 +11,11 @@ from en4dvar.config import Config, load_config
 from en4dvar.errors import ConfigError, DataError, Fault, OutputError
 from en4dvar.executor import ExecutorError, choose_executor, one_blas_thread
 from en4dvar.inputs.build import build_one, data_files, inverse_plan
+from en4dvar.problem import Progress
 from en4dvar.report import summary_csv, write_report
 from en4dvar.runs.campaign import Campaign
 from en4dvar.runs.interrupt import Interrupted, terminate_as_interrupt
-from en4dvar.runs.progress import Progress, RunLog
+from en4dvar.runs.progress import RunLog
 from en4dvar.runs.rundir import Mode, RunDirectory
 from en4dvar.runs.worklist import Dataset, Done, Worklist, datasets
 from en4dvar.storage.campaign_file import save_campaign

@@ -245,6 +245,7 @@ def test_processes_draw_the_same_pages(campaign_dir, tmp_path, monkeypatch):
     write_report(one)
     monkeypatch.setattr(report, "_write_set", None)  # this process draws no page
     write_report(two, workers=2)
+    assert len(list((two / "pages").iterdir())) == 3
     assert contents(one) == contents(two)
     (two / "pages" / "two.html").unlink()
     (two / "pages" / "two.html").mkdir()
