@@ -127,8 +127,8 @@ class ProcessesExecutor(Executor):
                 i, call = item
                 try:
                     todo.append((i, bytes(ForkingPickler.dumps((function, call, hear is not None)))))
-                except Exception as error:  # it cannot be sent
-                    answers.append((i, error))
+                except Exception as error:
+                    answers.append((i, _unsendable(error)))
 
         def hand_over() -> None:
             while todo and crew.idle:
@@ -219,12 +219,17 @@ def _serve(pipe: Connection, limits: Limits) -> None:
             message = pipe.recv_bytes()
         except (EOFError, OSError):
             return
+        value: Any
         try:
             function, call, listening = pickle.loads(message)
-            value: Any = function(*call, *([tell] if listening else []))
         except Exception as error:
-            error.add_note(f"in a worker process:\n{traceback.format_exc()}")
-            value = error
+            value = _unsendable(error)
+        else:
+            try:
+                value = function(*call, *([tell] if listening else []))
+            except Exception as error:
+                error.add_note(f"in a worker process:\n{traceback.format_exc()}")
+                value = error
         try:
             answer = bytes(ForkingPickler.dumps(value))
         except Exception as error:  # of the value or of an exception with something in it that stays here
@@ -234,6 +239,14 @@ def _serve(pipe: Connection, limits: Limits) -> None:
             pipe.send_bytes(ANSWER + answer)
         except OSError:
             return
+
+
+def _unsendable(error: Exception) -> TypeError:
+    """What a call is told that cannot be pickled here, or not be made again in a worker."""
+    return TypeError(
+        f"cannot be sent to a worker process ({describe(error)}); models and functions must be defined in a module "
+        "that workers can import, not in a notebook or session, or run with the executor serial or threads"
+    )
 
 
 def prepare_worker(limits: Limits = NO_LIMITS) -> None:

@@ -3,8 +3,10 @@
 import contextlib
 import os
 import signal
+import sys
 import time
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -130,6 +132,20 @@ def test_what_cannot_be_sent_is_told():
     assert "pickle" in str(found[0])
     assert "ValueError: ('with something in it'" in str(found[1])
     assert "pickle" in str(found[2])
+    assert "in a module that workers can import" in str(found[2])
+
+
+@pytest.mark.fault("worker-killed")
+def test_what_workers_cannot_import_is_told(monkeypatch):
+    """As a model of a notebook, whose main module workers do not have."""
+    there = ModuleType("only_here")
+    exec("class Model:\n    pass", there.__dict__)
+    monkeypatch.setitem(sys.modules, "only_here", there)
+    with ProcessesExecutor(1) as executor:
+        (((_, value)),) = executor.map(str, [(there.Model(),)])
+    assert isinstance(value, TypeError)
+    assert "No module named 'only_here'" in str(value)
+    assert "in a module that workers can import" in str(value)
 
 
 @pytest.mark.fault("worker-killed")
