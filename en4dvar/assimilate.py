@@ -10,7 +10,7 @@ import numpy as np
 from en4dvar import diagnostics as diag
 from en4dvar.cycling.mda import assimilate_once
 from en4dvar.descent.record import Taken, make_records, worse
-from en4dvar.descent.start import choose_start
+from en4dvar.descent.start import Comparison, choose_start
 from en4dvar.descent.weight_space import Local, WeightSpace
 from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, has_noise_scale, log_posterior
 from en4dvar.errors import ConfigError, TooFewMembersError
@@ -39,7 +39,7 @@ def assimilate(
     executor: Executor | None = None,
     progress: Progress | None = None,
     resume: LoopState | None = None,
-    on_iteration: Callable[[LoopState], None] | None = None,
+    keep: Callable[[Callable[[], LoopState]], None] | None = None,
 ) -> Analysis:
     """Estimate the parameters of one data set.
 
@@ -47,24 +47,26 @@ def assimilate(
     ----------
     seed: of the prior ensemble; the same seed gives the same bits for any executor.
     executor: where members run; default in this process.
-    progress: called with the name of the data set and the record of each iteration and each look at the chain.
+    progress: called with the name of the data set and the record of each round of the start, each iteration and each
+        look at the chain.
     resume: where an earlier call with the same arguments was interrupted; the result has the same bits as without.
-    on_iteration: called with the state that the next iteration starts from.
+    keep: called before each round of the start and each iteration, and at each look at the chain, with a function that
+        gives the state to resume from.
 
     Raises
     ------
     ConfigError: the problem is not complete. TooFewMembersError: too few members survive a forecast.
     """
     with one_blas_thread():
-        return _Run(problem, settings, seed, executor or SerialExecutor(), progress, on_iteration).analysis(resume)
+        return _Run(problem, settings, seed, executor or SerialExecutor(), progress, keep).analysis(resume)
 
 
 @dataclass(frozen=True)
 class LoopState:
     """All that the rest of the iterations depends on, besides the problem, the settings and the seed.
 
-    ``worst_loss`` (N,) reasons of failure in the iteration that lost most members, or empty. ``refinement`` is there
-    once the iterations are done and the Markov chain is under way.
+    ``worst_loss`` (N,) reasons of failure in the iteration that lost most members, or empty. ``comparison`` is there
+    until the start is chosen, ``refinement`` once the iterations are done and the Markov chain is under way.
     """
 
     weights: Weights
@@ -74,7 +76,15 @@ class LoopState:
     worst_loss: tuple[str, ...] = ()
     stop_reason: str = ""
     converged: bool = False
+    comparison: Comparison | None = None
     refinement: Refinement | None = None
+
+    @property
+    def reached(self) -> str:
+        """How far it has got, in words."""
+        if self.comparison is not None:
+            return f"after {self.comparison.rounds} rounds of the start"
+        return f"after {len(self.records)} iterations"
 
 
 @dataclass(frozen=True)
@@ -109,11 +119,11 @@ class _Run:
         seed: int,
         executor: Executor,
         progress: Progress | None,
-        on_iteration: Callable[[LoopState], None] | None,
+        keep: Callable[[Callable[[], LoopState]], None] | None,
     ):
         self.fixed_parameters = check_problem(problem)
         self.problem, self.settings, self.seed = problem, settings, seed
-        self.progress, self.on_iteration = progress, on_iteration
+        self.progress, self.keep = progress, keep
         self.mda = ESMDA(settings.mda_coefficients, settings.mda_form) if settings.scheme == "es-mda" else None
         if self.mda and (has_noise_scale(problem) or problem.observations.huber is not None):
             raise ConfigError("es-mda takes Gaussian errors of known std: neither sigma nor a robust cost; use en4dvar")
@@ -127,7 +137,7 @@ class _Run:
         space = self.space
         prior_run = space.forecast(np.vstack([space.members, space.mean]), grid)
         self.require_members(prior_run[:-1].failures, "prior forecast")
-        state = resume or self.start(prior_run)
+        state = self.start(prior_run, resume) if resume is None or resume.comparison else resume
         space.forward_runs = state.forward_runs
         end = self.assimilate_repeatedly(state, self.mda) if self.mda else self.iterate(state)
 
@@ -213,23 +223,23 @@ class _Run:
             ),
         )
 
-    def start(self, prior_run: Forecast) -> LoopState:
+    def start(self, prior_run: Forecast, resume: LoopState | None) -> LoopState:
+        space, prior = self.space, Weights.prior(len(self.space.members))
         if self.mda:
-            return LoopState(Weights.prior(len(self.space.members)), self.space.forward_runs)
-        start, weights = choose_start(self.space, prior_run), self.space.scheme.init(len(self.space.members))
-        taken: list[Taken] = []
-        worst_loss: tuple[str, ...] = ()
-        for at, move in start.path:
-            step = self.require_step(at, f"forecast of iteration {len(taken) + 1}")
-            worst_loss = worse(worst_loss, at)
-            taken.append(Taken(at, step, step.transform, move.step_length))
-            weights = Weights(move.w, step.transform)
-        records = make_records(self.space, 0, taken)
-        for record in records:
+            return LoopState(prior, space.forward_runs)
+        if resume is not None:
+            space.forward_runs = resume.forward_runs
+
+        def keep(comparison: Callable[[], Comparison]) -> None:
+            if self.keep is not None:
+                self.keep(lambda: LoopState(prior, space.forward_runs, comparison=comparison()))
+
+        start = choose_start(space, prior_run, resume.comparison if resume else None, keep, self.tell)
+        history = start.history
+        for record in history.records:
             self.tell(record)
-        return LoopState(
-            Weights(start.w, weights.T), self.space.forward_runs, start.warnings, tuple(records), worst_loss
-        )
+        weights = Weights(start.w, history.transform)
+        return LoopState(weights, space.forward_runs, start.warnings, history.records, history.worst_loss)
 
     def robust(
         self, prediction: Array, rate: Array | None, scale: Array | None
@@ -263,8 +273,8 @@ class _Run:
             return log_posterior(self.problem, x, space.executor)
 
         def keep(chain: mcmc.ChainState) -> None:
-            if self.on_iteration is not None:
-                self.on_iteration(replace(self.latest, refinement=Refinement(chain, space.forward_runs)))
+            if self.keep is not None:
+                self.keep(lambda: replace(self.latest, refinement=Refinement(chain, space.forward_runs)))
 
         emulated = guide(space, posterior, self.seed)  # made again after an interruption, from the same runs
         if earlier is not None:
@@ -281,12 +291,12 @@ class _Run:
         weights, records, worst_loss = state.weights, list(state.records), state.worst_loss
         stop, converged = state.stop_reason, state.converged
         while True:
-            if self.on_iteration is not None:
+            if self.keep is not None:
                 self.latest = replace(
                     state, weights=weights, forward_runs=space.forward_runs, records=tuple(records),
                     worst_loss=worst_loss, stop_reason=stop, converged=converged,
                 )  # fmt: skip
-                self.on_iteration(self.latest)
+                self.keep(lambda: self.latest)
             (at,) = space.linearise([weights])
             step, total = self.require_step(at, f"forecast of iteration {len(records) + 1}"), at.cost
             worst_loss = worse(worst_loss, at)
@@ -320,12 +330,12 @@ class _Run:
         space, count = self.space, len(scheme.coefficients)
         weights, records, worst_loss = state.weights, list(state.records), state.worst_loss
         while True:
-            if self.on_iteration is not None:
+            if self.keep is not None:
                 self.latest = replace(
                     state, weights=weights, forward_runs=space.forward_runs, records=tuple(records),
                     worst_loss=worst_loss,
                 )  # fmt: skip
-                self.on_iteration(self.latest)
+                self.keep(lambda: self.latest)
             (at,) = space.linearise([weights])
             step = self.require_step(at, f"forecast of iteration {len(records) + 1}")
             worst_loss = worse(worst_loss, at)

@@ -53,7 +53,9 @@ def chi2_per_observation(
     """
     v = whitened_residual(observations, predictions, rates, noise_scale)
     squares = v * v if observations.huber is None else v * v * robust_weights(observations, v)
-    return np.asarray(np.add.reduce(squares[..., observations.used], axis=-1) / (len(observations.used) or math.nan))
+    return np.asarray(
+        np.add.reduce(squares.take(observations.used, axis=-1), axis=-1) / (len(observations.used) or math.nan)
+    )
 
 
 def nrmse(values: Array, predictions: Array) -> float:

@@ -115,7 +115,18 @@ class ChainRecord:
     effective: float
 
 
-Record = IterationRecord | ChainRecord
+@dataclass(frozen=True)
+class StartRecord:
+    """Where the descents stand that decide where the iterations start: rounds of moves, J of each descent, and how
+    many are under way. The moves of the lowest become the first iterations.
+    """
+
+    rounds: int
+    costs: tuple[float, ...]
+    active: int
+
+
+Record = IterationRecord | StartRecord | ChainRecord
 Progress = Callable[[str, Record], None]  # what hears of them, with the name of the data set
 
 

@@ -100,6 +100,15 @@ class Waits(Oscillator):
             time.sleep(0.001)
 
 
+class WaitsTwice(Waits):
+    """Call number 5, in the search for a start, waits for a file of that name with the suffix ``.start``."""
+
+    def trajectories(self, x, times):
+        if getattr(self.calls, "n", 0) == 4:
+            self.wait(Path(os.environ["EN4DVAR_TEST_FLAG"]).with_suffix(".start"))
+        return super().trajectories(x, times)
+
+
 class WaitsAndDies(Waits):
     """Kills its process there, the first of all."""
 
@@ -108,4 +117,5 @@ class WaitsAndDies(Waits):
         died = flag.with_suffix(".died")
         if not died.exists():
             died.touch()
+            time.sleep(0.5)  # the flag may be another data set's: what this one has to tell is sent by now
             os.kill(os.getpid(), signal.SIGKILL)

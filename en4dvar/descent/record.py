@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar import diagnostics as diag
+from en4dvar.descent.step_control import Move
 from en4dvar.descent.weight_space import Local, WeightSpace
 from en4dvar.problem import IterationRecord
 from en4dvar.schemes import Step
@@ -38,15 +39,16 @@ def make_records(space: WeightSpace, first: int, taken: Sequence[Taken]) -> list
     ensembles = space.control(np.concatenate([members, w], axis=1))
     physical = space.problem.prior.to_physical(ensembles)
     centres = [each.at.central for each in taken]
-    predictions = np.array([run.predictions[0] for run in centres])
-    rates = [run.rates[0] for run in centres if run.rates is not None]
-    scales = [run.noise_scale[0] for run in centres if run.noise_scale is not None]
+    # one row each (B, 1, K): a record has the same bits whichever others are made with it
+    predictions = np.array([run.predictions for run in centres])
+    rates = [run.rates for run in centres if run.rates is not None]
+    scales = [run.noise_scale for run in centres if run.noise_scale is not None]
     chi2 = diag.chi2_per_observation(
         space.problem.observations,
         predictions,
         np.array(rates) if rates else None,
         np.array(scales) if scales else None,
-    ).tolist()
+    )[:, 0].tolist()
     spreads = diag.spread(ensembles[:, :-1], space.prior_variance).tolist()
     return [
         IterationRecord(
@@ -65,3 +67,21 @@ def make_records(space: WeightSpace, first: int, taken: Sequence[Taken]) -> list
         )
         for i, each in enumerate(taken)
     ]
+
+
+@dataclass(frozen=True)
+class History:
+    """What is kept of iterations that are done: the transform (N, N) of the last, the records, and the worst loss."""
+
+    transform: Array
+    records: tuple[IterationRecord, ...] = ()
+    worst_loss: tuple[str, ...] = ()
+
+    def after(self, space: WeightSpace, path: Sequence[tuple[Local, Step, Move]]) -> History:
+        """With the moves that followed, each with where it starts and the step there."""
+        transform, worst_loss = self.transform, self.worst_loss
+        taken = []
+        for at, step, move in path:
+            transform, worst_loss = step.transform, worse(worst_loss, at)
+            taken.append(Taken(at, step, transform, move.step_length))
+        return History(transform, (*self.records, *make_records(space, len(self.records), taken)), worst_loss)

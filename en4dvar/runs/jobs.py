@@ -66,9 +66,7 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
     ------
     TooFewMembersError: the ensemble is lost. OutputError: a checkpoint cannot be written.
     """
-    analysis = assimilate(
-        job.problem, job.settings, job.seed, executor, progress, job.resume, on_iteration=_checkpoints(job)
-    )
+    analysis = assimilate(job.problem, job.settings, job.seed, executor, progress, job.resume, keep=_checkpoints(job))
     outcome = "converged" if analysis.converged else "not converged"
     return Estimate(
         content=to_bytes(build_groups(analysis, job.attributes)),
@@ -128,14 +126,14 @@ class _Teller:
             self._sent = time.monotonic()
 
 
-def _checkpoints(job: Job) -> Callable[[LoopState], None]:
+def _checkpoints(job: Job) -> Callable[[Callable[[], LoopState]], None]:
     path = job.checkpoint if job.checkpoint is not None and job.checkpoint.parent.is_dir() else None
     keeper = None if path is None else Keeper(path, job.fingerprint, job.checkpoint_every)
 
-    def keep(state: LoopState) -> None:
+    def keep(now: Callable[[], LoopState]) -> None:
         if job.stop is not None and job.stop.is_set():
             raise StoppedError
         if keeper is not None:
-            keeper.keep(lambda: state)
+            keeper.keep(now)
 
     return keep

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from en4dvar.errors import OutputError
-from en4dvar.problem import ChainRecord, Record
+from en4dvar.problem import ChainRecord, Record, StartRecord
 from en4dvar.runs.interrupt import Interrupted
 
 TYPICAL_ITERATIONS = 8.0
@@ -21,7 +21,12 @@ WIDE = 110  # columns of a terminal that has room for a bar
 
 
 def describe(name: str, record: Record) -> str:
-    """One iteration in one line: J and its terms, step, fit, information, members alive; or how far a chain has got."""
+    """An iteration in one line: J and its terms, step, fit, information, members alive; or where start or chain are."""
+    if isinstance(record, StartRecord):
+        return (
+            f"{name}: start, round {record.rounds:2d}  lowest J {min(record.costs):.6g}  "
+            f"of {len(record.costs)} descents  under way {record.active}"
+        )
     if isinstance(record, ChainRecord):
         return (
             f"{name}: chain, {record.steps:4d} steps  R-hat {record.r_hat:.3f}  "
@@ -81,7 +86,7 @@ class LiveProgress:
 
     def __call__(self, name: str, record: Record) -> None:
         if not isinstance(record, ChainRecord):
-            self._open[name] = record.iteration
+            self._open[name] = record.rounds if isinstance(record, StartRecord) else record.iteration
         self._show(_short(name, record))
 
     def begin(self, done: int) -> None:
@@ -164,6 +169,8 @@ def cycle_progress(cycles: int) -> Iterator[Callable[[int], None] | None]:
 
 def _short(name: str, record: Record) -> str:
     known = name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
+    if isinstance(record, StartRecord):
+        return f"{known} start, round {record.rounds} of {len(record.costs)} descents: lowest J {min(record.costs):.4g}"
     if isinstance(record, ChainRecord):
         return (
             f"{known} chain of {record.steps} steps: R-hat {record.r_hat:.3f}, {record.effective:.0f} independent draws"

@@ -15,7 +15,7 @@ from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, ThreadsExecutor
 from en4dvar.honesty import Caution
 from en4dvar.inputs.build import build_one
-from en4dvar.problem import IterationRecord, Progress, Record
+from en4dvar.problem import ChainRecord, Progress, Record, StartRecord
 from en4dvar.runs.campaign import DatasetOutcome, file_names
 from en4dvar.runs.jobs import Estimate, Job, News, estimate, estimate_and_tell
 from en4dvar.runs.progress import LiveProgress, RunLog, describe
@@ -78,7 +78,7 @@ class Worklist:
     notices: list[str] = field(default_factory=list)
     ended: dict[str, Done] = field(default_factory=dict)
     stop: threading.Event = field(default_factory=threading.Event)
-    told: dict[str, int] = field(default_factory=dict)  # data set at work → its last iteration
+    told: dict[str, tuple[int, int]] = field(default_factory=dict)  # data set at work → its last round, iteration
 
     def outcomes(self) -> tuple[DatasetOutcome, ...]:
         """What came of each data set, in order."""
@@ -178,7 +178,7 @@ class Worklist:
         except CheckpointError as error:
             self.notice(f"{error}; {d.name} is estimated from the start")
         if resume is not None:
-            self.log.write(f"{d.name}: continued after {len(resume.records)} iterations")
+            self.log.write(f"{d.name}: continued {resume.reached}")
         return Job(
             problem=build_one(self.config, d.name, d.source),
             settings=self.config.assimilation,
@@ -192,10 +192,11 @@ class Worklist:
         )
 
     def _tell(self, name: str, record: Record) -> None:
-        if isinstance(record, IterationRecord):
-            if record.iteration <= self.told.get(name, -1):
+        if not isinstance(record, ChainRecord):
+            place = (0, record.rounds) if isinstance(record, StartRecord) else (1, record.iteration)
+            if place <= self.told.get(name, (0, 0)):
                 self.log.write(f"{name}: its worker was lost; another one repeats it")
-            self.told[name] = record.iteration
+            self.told[name] = place
         self.log.write(describe(name, record))
         if self.progress is not None:
             self.progress(name, record)

@@ -8,7 +8,7 @@ from toy_config import csv_text, write_toy
 
 from en4dvar.config import load_config
 from en4dvar.errors import OutputError
-from en4dvar.problem import Analysis, ChainRecord
+from en4dvar.problem import Analysis, ChainRecord, StartRecord
 from en4dvar.runs.progress import RunLog, describe, terminal_progress, time_left
 from en4dvar.runs.runner import run_campaign
 
@@ -26,9 +26,12 @@ def test_terminal_only(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.M
         progress("gel", last := analysis.iterations[-1])
         progress._bar.refresh()
         progress("gel", ChainRecord(150, 1.02, 812.3))
+        progress._bar.refresh()
+        progress("gel", StartRecord(3, (14.25, 11.5), 1))
     out, err = capsys.readouterr()
     assert out == ""
     assert f"gel iteration 5: J {last.cost:.4g}, χ²/K {last.chi2_per_observation:.3g}, step 0" in err
+    assert "gel start, round 3 of 2 descents: lowest J 11.5" in err
     assert "gel chain of 150 steps: R-hat 1.020, 812 independent draws" in err
     assert "0/2" in err
     assert "\x1b[3" in err  # colours
@@ -77,8 +80,12 @@ def test_iterations_of_data_sets_side_by_side_are_seen(tmp_path: Path, monkeypat
         campaign = run_campaign(config, progress=progress)
         assert progress._open == {}
         assert len(progress._lengths) == 3
+    log = (tmp_path / "run" / "run.log").read_text()
     iterations = [one.iterations.sizes["iteration"] for one in campaign]
-    assert len(told) == 1 + sum(iterations) + 3  # begin, each iteration, each end
+    assert log.count(": iteration ") == sum(iterations)
+    rounds = log.count(": start, ")
+    assert rounds >= 3
+    assert len(told) == 1 + rounds + sum(iterations) + 3  # begin, each round and iteration, each end
     assert told[-1] == ("", 3)
 
 

@@ -9,7 +9,7 @@ from toys import Decay, Vectorised, Wave, make_problem
 
 from en4dvar.assimilate import assimilate, cost, log_posterior
 from en4dvar.prior import PriorTerm
-from en4dvar.problem import AssimilationSettings
+from en4dvar.problem import AssimilationSettings, StartRecord
 
 CONTROLS = ("line-search", "levenberg-marquardt", "full")
 
@@ -113,8 +113,12 @@ def test_progress_and_forward_runs_are_reported():
     problem = make_problem(Counting(), [1.5, 1.2])
     seen = []
     analysis = assimilate(problem, AssimilationSettings(members=16), 1, progress=lambda *args: seen.append(args))
-    assert [name for name, _ in seen] == ["toy"] * len(analysis.iterations)
-    assert [record for _, record in seen] == list(analysis.iterations)
+    rounds = [record for _, record in seen if isinstance(record, StartRecord)]
+    assert [name for name, _ in seen] == ["toy"] * (len(rounds) + len(analysis.iterations))
+    assert [record for _, record in seen[len(rounds) :]] == list(analysis.iterations)
+    assert [record.rounds for record in rounds] == list(range(1, len(rounds) + 1))
+    assert all(len(record.costs) == 2 and record.active <= 2 for record in rounds)
+    assert np.isclose(min(rounds[-1].costs), [record.cost for record in analysis.iterations], rtol=1e-12).any()
     assert analysis.forward_runs == problem.model.runs
     single = assimilate(problem, AssimilationSettings(members=16, starts=1), 1)
     assert single.forward_runs == problem.model.runs - analysis.forward_runs

@@ -6,6 +6,7 @@ import pytest
 from run_files import assert_same_results, configuration, make_campaign
 
 from en4dvar.executor import choose_executor
+from en4dvar.problem import StartRecord
 from en4dvar.runs.runner import run_campaign
 
 
@@ -17,6 +18,10 @@ class Listener:
 
     def __call__(self, name, record):
         lines = log(self.out)
+        if isinstance(record, StartRecord):
+            assert f"{name}: start, round {record.rounds:2d}  lowest J " in lines[-1]
+            self.flag.with_suffix(".start").touch()
+            return
         if not self.heard:
             assert any(f"{name}: iteration {record.iteration:2d}  J " in line for line in lines)
             assert not any(f"{name}: converged" in line for line in lines)
@@ -43,7 +48,7 @@ def iterations(lines, name):
 @pytest.mark.parametrize("kind", ["threads", "processes", "dask"])
 def test_an_iteration_is_told_before_its_data_set_ends(quiet, tmp_path, monkeypatch, kind):
     monkeypatch.setenv("EN4DVAR_TEST_FLAG", str(tmp_path / "heard"))
-    path, out = make_campaign(tmp_path, 3, "execution_models:Waits"), tmp_path / "run"
+    path, out = make_campaign(tmp_path, 3, "execution_models:WaitsTwice"), tmp_path / "run"
     listener = Listener(out, tmp_path / "heard")
     campaign = run_campaign(configuration(path, out, executor=kind, workers=2), progress=listener)
     assert campaign.exit_code == 0

@@ -87,7 +87,7 @@ def test_resumed_assimilation_has_the_same_bits():
     problem = make_problem(Wave(), [1.0, 0.8])
     states = []
     settings = AssimilationSettings(scheme="es-mda", members=20)
-    whole = assimilate(problem, settings, 5, on_iteration=states.append)
+    whole = assimilate(problem, settings, 5, keep=lambda state: states.append(state()))
     assert len(states) == 5
     for state in states[1:]:
         assert_same_bits(assimilate(problem, settings, 5, resume=state), whole)
