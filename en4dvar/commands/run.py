@@ -65,14 +65,14 @@ def run(
     from en4dvar.runs.runner import execute
 
     words = command_words()
-    with terminal_progress(len(data_files(inverse_plan(loaded)))) as progress:
-        try:
+    try:
+        with terminal_progress(len(data_files(inverse_plan(loaded)))) as progress:
             campaign = execute(
                 loaded, force=force, resume=resume, progress=progress, command=shlex.join(words),
                 report_workers=loaded.execution.workers or available_cores(),
             )  # fmt: skip
-        except KeyboardInterrupt as interrupt:
-            raise _to_continue(interrupt) from None
+    except KeyboardInterrupt as interrupt:
+        raise _to_continue(interrupt) from None
     _tell(campaign, with_report=not no_report)
 
 
@@ -100,6 +100,10 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
 
 
 def _to_continue(interrupt: KeyboardInterrupt) -> Failed:
+    from en4dvar.runs.interrupt import Interrupted
+
+    if not isinstance(interrupt, Interrupted):
+        return Failed(f"interrupted before the run began\nto run it: {shlex.join(command_words())}", 130)
     again = shlex.join([*(w for w in command_words() if w not in ("--force", "--resume")), "--resume"])
     return Failed(f"{interrupt}\nto continue: {again}", 130)
 
@@ -108,11 +112,11 @@ def _run_twin(config: TwinConfig, force: bool, resume: bool) -> None:
     from en4dvar.runs.progress import cycle_progress
     from en4dvar.runs.twin_run import run_twin, scores_table
 
-    with cycle_progress(config.experiment.cycles) as on_cycle:
-        try:
+    try:
+        with cycle_progress(config.experiment.cycles) as on_cycle:
             result = run_twin(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
-        except KeyboardInterrupt as interrupt:
-            raise _to_continue(interrupt) from None
+    except KeyboardInterrupt as interrupt:
+        raise _to_continue(interrupt) from None
     click.echo(scores_table(result))
     if result.run.failures:
         lost = f"{len(result.run.failures)} of {config.experiment.members} members lost"

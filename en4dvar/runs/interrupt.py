@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 
 class Interrupted(KeyboardInterrupt):
-    """An interrupt, with what was kept."""
+    """An interrupt of a run that has begun and can be resumed, with what was kept."""
 
 
 @contextmanager
@@ -28,3 +28,14 @@ def terminate_as_interrupt() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def tell_interrupt(kept: Callable[[], str]) -> Iterator[None]:
+    """Within, an interrupt that nobody has put into words becomes :class:`Interrupted`, with what is ``kept`` then."""
+    try:
+        yield
+    except Interrupted:
+        raise
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted; {kept()}") from None

@@ -66,11 +66,15 @@ class RunLog:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        with suppress(OutputError, OSError):  # on a full disk: the reason that ended the run is told all the same
-            if value is not None:
-                self.write(str(value) if isinstance(value, Interrupted) else f"failed: {type(value).__name__}: {value}")
-        with suppress(OSError):
-            self._file.close()
+        try:
+            with suppress(OutputError, OSError):  # on a full disk: the reason that ended the run is told all the same
+                if isinstance(value, KeyboardInterrupt):
+                    self.write(str(value) if isinstance(value, Interrupted) else "interrupted")
+                elif value is not None:
+                    self.write(f"failed: {type(value).__name__}: {value}")
+        finally:
+            with suppress(OSError):
+                self._file.close()
 
 
 class LiveProgress:

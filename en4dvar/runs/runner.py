@@ -14,7 +14,7 @@ from en4dvar.inputs.build import build_one, data_files, inverse_plan
 from en4dvar.problem import Progress
 from en4dvar.report import summary_csv, write_report
 from en4dvar.runs.campaign import Campaign
-from en4dvar.runs.interrupt import Interrupted, terminate_as_interrupt
+from en4dvar.runs.interrupt import Interrupted, tell_interrupt, terminate_as_interrupt
 from en4dvar.runs.progress import RunLog
 from en4dvar.runs.rundir import Mode, RunDirectory
 from en4dvar.runs.worklist import Dataset, Done, Worklist, datasets
@@ -99,6 +99,7 @@ def execute(
     _require_one_usable(config, files)
     execution = config.execution
     mode: Mode = "force" if force else "resume" if resume else "new"
+    ended: Mapping[str, Done] = {}
     with (
         one_blas_thread(),
         terminate_as_interrupt(),
@@ -106,6 +107,7 @@ def execute(
             config.model, execution.executor, execution.workers, execution.address, execution.limits
         ) as executor,
         RunDirectory.open(config.directory, mode) as directory,
+        tell_interrupt(lambda: _kept(directory, ended, len(files), resume)),
     ):
         who = identity(config.resolved, config.model, files)
         attributes = {
@@ -116,7 +118,7 @@ def execute(
         with RunLog(directory.work / "run.log", append=resume) as log:
             log.write(attributes["history"])
             work = Worklist(config, who, datasets(files), directory, log, attributes, progress)
-            prepared = False
+            ended, prepared = work.ended, False
             try:
                 _prepare(work, resume)
                 prepared = True
@@ -129,7 +131,7 @@ def execute(
                 work.stop.set()
                 with suppress(KeyboardInterrupt):  # of an impatient user: on to the next step
                     executor.kill()
-                raise _interrupted(work, error) from error
+                raise _interrupted(error, directory, _kept(directory, ended, len(files), resume)) from error
         directory.publish()
         return Campaign(directory.path, work.outcomes(), tuple(work.notices))
 
@@ -195,12 +197,17 @@ def _prepare(work: Worklist, resume: bool) -> None:
         work.log.write(f"resumed: {len(work.ended)} of {len(work.sets)} data sets are done")
 
 
-def _interrupted(work: Worklist, error: BaseException) -> BaseException:
+def _kept(directory: RunDirectory, ended: Mapping[str, Done], n_sets: int, resume: bool) -> str:
+    """What the user has of a run that was stopped."""
+    if resume and not ended:  # stopped, perhaps, before it was read what had been done
+        return f"what {directory.path} holds is kept"
+    return f"{len(ended)} of {n_sets} data sets are done and kept in {directory.path}"
+
+
+def _interrupted(error: BaseException, directory: RunDirectory, kept: str) -> BaseException:
     """The error as the user should see it: with what was kept, and what to do."""
-    path = work.directory.path
-    kept = f"{len(work.ended)} of {len(work.sets)} data sets are done and kept in {path}"
-    if gone := not work.directory.work.is_dir():
-        kept = f"the run directory {path} was removed or renamed while the run was at work"
+    if gone := not directory.work.is_dir():
+        kept = f"the run directory {directory.path} was removed or renamed while the run was at work"
     if isinstance(error, KeyboardInterrupt):
         return Interrupted(f"interrupted; {kept}")
     advice = "" if gone else "; give --resume to continue"

@@ -12,7 +12,7 @@ from en4dvar.cycling.sequential import SequentialState
 from en4dvar.cycling.twin import TwinResult, conduct
 from en4dvar.errors import ConfigError, OutputError
 from en4dvar.executor import make_executor
-from en4dvar.runs.interrupt import Interrupted, terminate_as_interrupt
+from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
 from en4dvar.runs.progress import RunLog
 from en4dvar.runs.rundir import Mode, RunDirectory
 from en4dvar.storage.checkpoint import FOLDER, CheckpointError, Keeper, digest, read_checkpoint, write_checkpoint
@@ -57,6 +57,7 @@ def run_twin(
     with (
         terminate_as_interrupt(),
         RunDirectory.open(config.directory, mode) as directory,
+        tell_interrupt(lambda: f"the cycles up to the last checkpoint are kept in {directory.path}"),
         RunLog(directory.work / "run.log", append=resume) as log,
     ):
         attributes = {
@@ -133,11 +134,8 @@ def _conduct(
         latest[:] = [now]
         keeper.keep(now)
 
-    try:
-        with make_executor(experiment.model, config.execution.workers) as executor:
-            result = conduct(experiment, config.seed, executor, on_cycle, state, keep)
-    except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; the cycles up to the last checkpoint are kept in {directory.path}") from None
+    with make_executor(experiment.model, config.execution.workers) as executor:
+        result = conduct(experiment, config.seed, executor, on_cycle, state, keep)
     for last in latest:
         keeper.write(last())
     return result

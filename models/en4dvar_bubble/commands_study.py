@@ -47,6 +47,7 @@ def sweep(
     from en4dvar.config import load_config
     from en4dvar.inputs.build import build
     from en4dvar.inputs.units import UnitError, parse_quantity
+    from en4dvar.runs.interrupt import tell_interrupt
     from en4dvar.storage.files import write_text
     from en4dvar_bubble.study.summary import sweep_csv, sweep_text
     from en4dvar_bubble.study.sweep import SweepSettings, prepare_folder, refinement_size, run_sweep
@@ -66,11 +67,11 @@ def sweep(
     readings = b"".join(p.observations.times.tobytes() + p.observations.values.tobytes() for p in problems)
     key = hashlib.sha256(f"{[c.resolved for c in loaded]}{chosen}".encode() + readings).hexdigest()
     chunks = prepare_folder(folder / "chunks", key, "force" if force else "resume" if resume else "new")
-    with _bar(trajectories + refinement_size(chosen, len(problems))) as progress:
-        try:
-            result = run_sweep(problems, chosen, loaded[0].seed, workers or _cores(), chunks, progress)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(_to_continue(f"finished chunks are kept in {chunks}")) from None
+    with (
+        tell_interrupt(lambda: _to_continue(f"finished chunks are kept in {chunks}")),
+        _bar(trajectories + refinement_size(chosen, len(problems))) as progress,
+    ):
+        result = run_sweep(problems, chosen, loaded[0].seed, workers or _cores(), chunks, progress)
     write_text(folder / "sweep.csv", sweep_csv(result))
     click.echo(sweep_text(result))
     click.echo(f"best fits: {folder / 'sweep.csv'}")
@@ -94,7 +95,7 @@ def study(
     Example:
       en4dvar study configs/agarose_study.yaml
     """
-    from en4dvar.runs.interrupt import terminate_as_interrupt
+    from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
     from en4dvar.runs.rundir import RunDirectory
     from en4dvar_bubble.study.keep import Keep
     from en4dvar_bubble.study.report import write_study
@@ -108,13 +109,11 @@ def study(
     with (
         terminate_as_interrupt(),
         RunDirectory.open(folder, "force" if force else "resume" if resume else "new") as directory,
+        tell_interrupt(lambda: _to_continue(f"finished parts are kept in {folder}")),
     ):
-        try:
-            keep = Keep.open(directory, plan)
-            result = run_study(plan, workers or _cores(), lambda message: click.echo(message, err=True), keep)
-            page = write_study(result, directory.work)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(_to_continue(f"finished parts are kept in {folder}")) from None
+        keep = Keep.open(directory, plan)
+        result = run_study(plan, workers or _cores(), lambda message: click.echo(message, err=True), keep)
+        page = write_study(result, directory.work)
         files = (p for p in directory.work.rglob("*") if p.is_file() and not p.name.startswith("."))
         directory.claim(*sorted(p.relative_to(directory.work).as_posix() for p in files))
         directory.publish()
@@ -125,7 +124,7 @@ def study(
 
 def _to_continue(kept: str) -> str:
     words = [word for word in sys.argv[1:] if word not in ("--force", "--resume")]
-    return f"interrupted; {kept}\nto continue: {shlex.join(['en4dvar', *words, '--resume'])}"
+    return f"{kept}\nto continue: {shlex.join(['en4dvar', *words, '--resume'])}"
 
 
 def _overrides(settings: tuple[str, ...], data: str | None) -> dict[str, Any]:

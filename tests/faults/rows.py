@@ -44,6 +44,8 @@ ROWS = tuple(
         ("interrupt", "Ctrl-C (SIGINT) or the time limit of a batch system (SIGTERM)",
          "interrupted; {n} of {all} data sets are done and kept in {run}\nto continue: en4dvar run {words} --resume",
          "130", DONE),
+        ("interrupt-early", "the same before the run directory is there",
+         "interrupted before the run began\nto run it: en4dvar run {words}", "130", "everything; nothing is begun"),
         ("disk-full", "the disk is full",
          "{file}: cannot be written: No space left on device; {n} of {all} data sets are done and kept in {run}; "
          "give --resume to continue", "2", f"{DONE}; no half-written file"),
