@@ -34,6 +34,8 @@ TOPIC = "en4dvar"  # of events that calls tell; one for all runs, for a schedule
 CONNECT_TIMEOUT = 15.0  # s
 NO_WORKER_TIMEOUT = 60.0  # s without any worker before the run is given up
 POLL = 2.0  # s
+GATHER = 15.0  # s to fetch a value before it is asked whether there are workers; begun again then
+FOREVER = "10000 days"  # dask would close the nanny of a worker that is not there 15 s after one of its deaths
 CLOSE_TIMEOUT = 10.0  # s; workers end by themselves when their scheduler is gone
 KILL_TIMEOUT = 0.5  # s for a worker of this machine to end by itself when it is killed
 
@@ -55,6 +57,7 @@ class DaskExecutor(Executor):
 
     def __init__(self, workers: int | None = None, address: str | None = None, limits: Limits = NO_LIMITS):
         try:
+            import dask.config
             import distributed
         except ImportError:
             raise ExecutorError("the dask executor needs the extra: pip install 'en4dvar[distributed]'") from None
@@ -63,6 +66,8 @@ class DaskExecutor(Executor):
         self._client: Client | None = None
         self._listening: dict[str, News] = {}  # for what the calls of a map tell
         self._maps = itertools.count()
+        self._seen = time.monotonic()  # when there was a worker
+        self._configured = contextlib.ExitStack()
         for name in (
             "distributed.client",
             "distributed.comm",
@@ -73,6 +78,7 @@ class DaskExecutor(Executor):
             logging.getLogger(name).setLevel(logging.CRITICAL)  # what they tell of lost connections, we tell once
         try:
             if address is None:
+                self._configured.enter_context(dask.config.set({"distributed.deploy.lost-worker-timeout": FOREVER}))
                 self._cluster = distributed.LocalCluster(
                     n_workers=workers or 1,
                     threads_per_worker=1,
@@ -147,37 +153,49 @@ class DaskExecutor(Executor):
 
     def _next(self, news: News, hear: Hear | None) -> Future:
         """The next future that ends. Raises :class:`ExecutorError` where the cluster is gone."""
-        last_worker = time.monotonic()
+        self._seen = time.monotonic()
         while True:
             try:
                 item = news.get(timeout=POLL)
-                if not isinstance(item, tuple):
-                    return item
-                if hear:
-                    hear(*item)
             except queue.Empty:
-                if self._client is None or self._client.status != "running":
-                    raise self._lost() from None
-                if self._client.scheduler_info()["workers"]:
-                    last_worker = time.monotonic()
-                elif time.monotonic() - last_worker > NO_WORKER_TIMEOUT:
-                    reason = f"has had no worker for {NO_WORKER_TIMEOUT:.0f} s"
-                    raise ExecutorError(f"dask scheduler {self._address or ''}: {reason}") from None
+                self._require_worker()
+                continue
+            if not isinstance(item, tuple):
+                return item
+            self._seen = time.monotonic()
+            if hear:
+                hear(*item)
 
     def _value(self, future: Future) -> Any:
-        """What the call gave or raised. Waits where the value was lost with its worker and is computed again."""
+        """What the call gave or raised. Waits where the value was lost with its worker and is computed again.
+
+        Raises :class:`ExecutorError` where the cluster is gone.
+        """
         from distributed import CancelledError, KilledWorker
 
-        try:
-            return future.result()
-        except KilledWorker:
-            return WorkerLostError(self._limits.death)
-        except CancelledError:
-            raise self._lost() from None
-        except Exception as error:
-            if future.status == "error":  # the call's own
-                return error
-            raise self._lost() from error
+        self._seen = time.monotonic()
+        while True:
+            try:
+                return future.result(timeout=GATHER)
+            except CancelledError:
+                raise self._lost() from None
+            except Exception as error:
+                if future.status == "error":
+                    own = future.exception()
+                    return WorkerLostError(self._limits.death) if isinstance(own, KilledWorker) else own
+                if not isinstance(error, TimeoutError):
+                    raise self._lost() from error
+            self._require_worker()
+
+    def _require_worker(self) -> None:
+        """Raises :class:`ExecutorError` where the cluster is gone, or has had no worker for too long."""
+        if self._client is None or self._client.status != "running":
+            raise self._lost()
+        if self._client.scheduler_info()["workers"]:
+            self._seen = time.monotonic()
+        elif time.monotonic() - self._seen > NO_WORKER_TIMEOUT:
+            reason = f"has had no worker for {NO_WORKER_TIMEOUT:.0f} s"
+            raise ExecutorError(f"dask scheduler {self._address or 'of this machine'}: {reason}")
 
     def _lost(self) -> ExecutorError:
         return ExecutorError(f"lost the connection to the dask scheduler {self._address or 'of this machine'}")
@@ -191,6 +209,7 @@ class DaskExecutor(Executor):
         with contextlib.suppress(TimeoutError):
             if cluster is not None:
                 cluster.close(timeout=CLOSE_TIMEOUT)
+        self._configured.close()
 
     def kill(self) -> None:
         cluster = self._cluster

@@ -79,6 +79,9 @@ ROWS = tuple(
         ("scheduler-lost", "the dask scheduler is lost",
          "lost the connection to the dask scheduler {address}; {n} of {all} data sets are done and kept in {run}; "
          "give --resume to continue", "1", DONE),
+        ("no-worker", "the dask cluster has no worker left for a minute",
+         "dask scheduler {address}: has had no worker for {time} s; {n} of {all} data sets are done and kept in {run}; "
+         "give --resume to continue", "1", DONE),
         ("model-raises", "the forward model raises an exception", "ArithmeticError: no such oscillation", "0",
          "all other members; the member is lost, its reason in the result"),
         ("model-nan", "it returns NaN", "non-finite state", "0", "the same"),

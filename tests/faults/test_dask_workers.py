@@ -1,0 +1,79 @@
+"""Workers of a dask cluster that die and come again, or do not."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import dask
+import pytest
+from distributed import LocalCluster
+from run_files import assert_same_results, configuration, make_campaign
+
+from en4dvar.executor import ExecutorError
+from en4dvar.executor import dask as dask_executor
+from en4dvar.executor.dask import DaskExecutor
+from en4dvar.runs.runner import run_campaign
+
+
+@pytest.fixture
+def cluster():
+    """A running one of one worker, which nobody starts again once its nanny is closed."""
+    with LocalCluster(n_workers=1, threads_per_worker=1, memory_limit=0, dashboard_address=":0") as cluster:
+        yield cluster
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    monkeypatch.setattr(dask_executor, "NO_WORKER_TIMEOUT", 2.0)
+    monkeypatch.setattr(dask_executor, "GATHER", 1.0)
+    monkeypatch.setattr(dask_executor, "POLL", 0.5)
+
+
+def end_workers(cluster):
+    for nanny in list(cluster.workers.values()):
+        cluster.sync(nanny.close, timeout=0.5)
+
+
+def square(number):
+    return number**2
+
+
+def dies_at_first(flag, number):
+    if not Path(flag).exists():
+        Path(flag).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def test_a_worker_that_is_slow_to_come_again_is_waited_for(tmp_path, monkeypatch):
+    """Dask closes what starts workers again where one is not there some time after a death: here before it can be."""
+    monkeypatch.setattr(dask_executor, "NO_WORKER_TIMEOUT", 20.0)
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": "10ms"}):
+        with DaskExecutor(1) as executor:
+            assert list(executor.map(dies_at_first, [(tmp_path / "flag", 7)])) == [(0, 7)]
+        assert dask.config.get("distributed.deploy.lost-worker-timeout") == "10ms"
+
+
+def test_a_value_lost_with_the_last_worker_is_not_waited_for_without_end(cluster, impatient):
+    with DaskExecutor(address=cluster.scheduler_address) as executor:
+        calls = executor.map(square, [(3,), (4,)])
+        next(calls)
+        time.sleep(1.0)  # the second has ended by now, but its value is still the worker's
+        end_workers(cluster)
+        with pytest.raises(ExecutorError, match="has had no worker for 2 s"):
+            next(calls)
+
+
+@pytest.mark.fault("no-worker")
+def test_without_any_worker_the_run_ends_and_can_be_resumed(tmp_path, cluster, impatient):
+    path, out = make_campaign(tmp_path, 3, "execution_models:Slow"), tmp_path / "run"
+    assert run_campaign(configuration(path, tmp_path / "quiet", executor="serial")).exit_code == 0
+    config = configuration(path, out, address=cluster.scheduler_address)
+    with pytest.raises(ExecutorError) as lost:
+        run_campaign(config, progress=lambda *_: end_workers(cluster))
+    told = str(lost.value)
+    assert told.startswith(f"dask scheduler {cluster.scheduler_address}: has had no worker for 2 s; ")
+    assert told.endswith(f"of 3 data sets are done and kept in {out}; give --resume to continue")
+    assert run_campaign(configuration(path, out, executor="serial"), resume=True).exit_code == 0
+    assert_same_results(out, tmp_path / "quiet")
