@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from matplotlib import style
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 
 from en4dvar.storage.files import atomic_path
@@ -94,10 +96,13 @@ def _settle(figure: Figure) -> None:
 def save_figure(figure: Figure, folder: Path, name: str) -> None:
     """``folder/name.pdf`` (vectors) and ``folder/name.png`` (200 dots an inch), undated, each by atomic rename."""
     _settle(figure)
+    dots = figure.dpi  # to the canvases directly: ``savefig`` would draw all of it twice, once for the layout
     with atomic_path(folder / f"{name}.pdf") as partial:
-        figure.savefig(partial, format="pdf", metadata={"CreationDate": None})
+        FigureCanvasPdf(figure).print_pdf(partial, metadata={"CreationDate": None})
+    figure.dpi = 200
     with atomic_path(folder / f"{name}.png") as partial:
-        figure.savefig(partial, format="png", dpi=200, metadata={"Software": None})
+        FigureCanvasAgg(figure).print_png(partial, metadata={"Software": None})
+    figure.dpi = dots
 
 
 @styled
