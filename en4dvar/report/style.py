@@ -96,13 +96,15 @@ def _settle(figure: Figure) -> None:
 def save_figure(figure: Figure, folder: Path, name: str) -> None:
     """``folder/name.pdf`` (vectors) and ``folder/name.png`` (200 dots an inch), undated, each by atomic rename."""
     _settle(figure)
-    dots = figure.dpi  # to the canvases directly: ``savefig`` would draw all of it twice, once for the layout
+    # to the canvases directly: ``savefig`` would draw all of it once more, for a layout that is settled
     with atomic_path(folder / f"{name}.pdf") as partial:
         FigureCanvasPdf(figure).print_pdf(partial, metadata={"CreationDate": None})
-    figure.dpi = 200
-    with atomic_path(folder / f"{name}.png") as partial:
-        FigureCanvasAgg(figure).print_png(partial, metadata={"Software": None})
-    figure.dpi = dots
+    dots, figure.dpi = figure.dpi, 200
+    try:
+        with atomic_path(folder / f"{name}.png") as partial:
+            FigureCanvasAgg(figure).print_png(partial, metadata={"Software": None})
+    finally:
+        figure.dpi = dots
 
 
 @styled

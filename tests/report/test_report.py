@@ -142,6 +142,7 @@ def test_figures_are_drawn_as_pdf_and_png(reported):
     for name in FIGURES:
         assert (reported / "figures" / f"{name}.pdf").read_bytes().startswith(b"%PDF")
         with Image.open(reported / "figures" / f"{name}.png") as image:
+            assert image.info["dpi"] == pytest.approx((200, 200), abs=0.01)
             pixels = np.asarray(image.convert("RGB"), dtype=float)
         assert pixels.std() > 10, name
         assert np.unique(pixels.reshape(-1, 3), axis=0).shape[0] > 20, name
