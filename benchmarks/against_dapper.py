@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 
 from en4dvar.cycling.sequential import SequentialSettings, Series, run_sequential
-from en4dvar.ensemble.inflation import Inflation
 from en4dvar.prior import member_stream
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
+from en4dvar.schemes.inflation import Inflation
 from en4dvar_lorenz import Lorenz63, Lorenz96
 from en4dvar_lorenz.lorenz63 import Lorenz63Settings
 from en4dvar_lorenz.lorenz96 import Lorenz96Settings

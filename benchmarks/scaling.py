@@ -27,12 +27,12 @@ import numpy as np
 import en4dvar.runs.jobs
 import en4dvar_bubble
 from en4dvar.config import Config, load_config
+from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.ensemble.members import Reading
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, ThreadsExecutor, one_blas_thread
-from en4dvar.inputs.build import build_one, data_files, inverse_plan
+from en4dvar.files import write_bytes
 from en4dvar.runs.jobs import Job, estimate
 from en4dvar.runs.runner import run_campaign
-from en4dvar.storage.files import write_bytes
 from en4dvar_bubble.model import BubbleModel
 
 ROOT = Path(__file__).resolve().parents[1]

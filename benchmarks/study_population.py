@@ -19,12 +19,12 @@ import numpy as np
 
 from en4dvar.assimilate import assimilate
 from en4dvar.config import load_config
+from en4dvar.config.build import build
 from en4dvar.config.document import read_document
 from en4dvar.config.synthetic import resolve_campaign
 from en4dvar.executor import ThreadsExecutor
-from en4dvar.inputs.build import build
-from en4dvar.inputs.synthetic import draw_campaign
 from en4dvar.observations import Observations
+from en4dvar.runs.synthetic import draw_campaign
 from en4dvar_bubble.study.measured import FOLDER, POPULATION_HEAD
 from en4dvar_bubble.study.population import estimate_population
 from en4dvar_bubble.study.run import POPULATION

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from en4dvar.config import load_config
+from en4dvar.config.build import build
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.inputs.build import build
 from en4dvar.observations import Observations
 from en4dvar.problem import InverseProblem
 from en4dvar_bubble.study.evidence import probability

@@ -13,13 +13,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from en4dvar.analysis import Analysis as Analysis
+    from en4dvar.batch import Batch as Batch
     from en4dvar.config import Config as Config
     from en4dvar.config import TwinConfig as TwinConfig
     from en4dvar.config import load_config as load_config
     from en4dvar.config import load_twin as load_twin
-    from en4dvar.ensemble.batch import Batch as Batch
-    from en4dvar.ensemble.simulation import Simulation as Simulation
-    from en4dvar.ensemble.simulation import simulate as simulate
+    from en4dvar.descent.preview import Preview as Preview
+    from en4dvar.descent.preview import preview as preview
     from en4dvar.errors import ConfigError as ConfigError
     from en4dvar.errors import DataError as DataError
     from en4dvar.errors import En4dvarError as En4dvarError
@@ -30,48 +31,49 @@ if TYPE_CHECKING:
     from en4dvar.forward import Observable as Observable
     from en4dvar.forward import StateField as StateField
     from en4dvar.forward import Trajectory as Trajectory
-    from en4dvar.inputs.units import Quantity as Quantity
     from en4dvar.observations import Observations as Observations
     from en4dvar.prior import Prior as Prior
     from en4dvar.prior import PriorTerm as PriorTerm
-    from en4dvar.problem import Analysis as Analysis
     from en4dvar.problem import AssimilationSettings as AssimilationSettings
     from en4dvar.problem import InverseProblem as InverseProblem
+    from en4dvar.report.compare import Comparison as Comparison
+    from en4dvar.report.compare import compare_runs as compare_runs
+    from en4dvar.report.export import export_table as export_table
+    from en4dvar.report.result import Result as Result
+    from en4dvar.report.result import load_result as load_result
     from en4dvar.runs.campaign import Campaign as Campaign
-    from en4dvar.runs.checks import Preview as Preview
-    from en4dvar.runs.checks import preview as preview
     from en4dvar.runs.checks import validate as validate
     from en4dvar.runs.runner import run as run
     from en4dvar.runs.runner import run_campaign as run_campaign
+    from en4dvar.runs.runner import write_report as write_report
+    from en4dvar.runs.simulation import Simulation as Simulation
+    from en4dvar.runs.simulation import simulate as simulate
     from en4dvar.runs.twin_run import run_twin as run_twin
     from en4dvar.state import Field as Field
     from en4dvar.state import Parameter as Parameter
     from en4dvar.state import StateLayout as StateLayout
-    from en4dvar.storage.compare import Comparison as Comparison
-    from en4dvar.storage.compare import compare_runs as compare_runs
-    from en4dvar.storage.export import export_table as export_table
-    from en4dvar.storage.export import write_report as write_report
-    from en4dvar.storage.store import Result as Result
-    from en4dvar.storage.store import load_result as load_result
+    from en4dvar.units import Quantity as Quantity
 
 _HOME = {
-    "ensemble.batch": ("Batch",),
+    "batch": ("Batch",),
     "runs.campaign": ("Campaign",),
-    "runs.checks": ("Preview", "preview", "validate"),
-    "storage.compare": ("Comparison", "compare_runs"),
+    "descent.preview": ("Preview", "preview"),
+    "runs.checks": ("validate",),
+    "report.compare": ("Comparison", "compare_runs"),
     "config": ("Config", "TwinConfig", "load_config", "load_twin"),
     "errors": ("ConfigError", "DataError", "En4dvarError", "OutputError", "TooFewMembersError"),
-    "storage.export": ("export_table", "write_report"),
+    "report.export": ("export_table",),
     "forward": ("Failure", "ForwardModel", "Observable", "StateField", "Trajectory"),
     "observations": ("Observations",),
     "prior": ("Prior", "PriorTerm"),
-    "problem": ("Analysis", "AssimilationSettings", "InverseProblem"),
-    "runs.runner": ("run", "run_campaign"),
-    "ensemble.simulation": ("Simulation", "simulate"),
+    "analysis": ("Analysis",),
+    "problem": ("AssimilationSettings", "InverseProblem"),
+    "runs.runner": ("run", "run_campaign", "write_report"),
+    "runs.simulation": ("Simulation", "simulate"),
     "state": ("Field", "Parameter", "StateLayout"),
-    "storage.store": ("Result", "load_result"),
+    "report.result": ("Result", "load_result"),
     "runs.twin_run": ("run_twin",),
-    "inputs.units": ("Quantity",),
+    "units": ("Quantity",),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 

@@ -8,24 +8,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar import diagnostics as diag
-from en4dvar.cycling.mda import assimilate_once
+from en4dvar.analysis import Analysis, IterationRecord, Progress, Record
+from en4dvar.descent.mda import assimilate_once
+from en4dvar.descent.noise_scale import mean_beyond_mode
 from en4dvar.descent.record import Taken, make_records, worse
 from en4dvar.descent.start import Comparison, choose_start
 from en4dvar.descent.weight_space import Local, WeightSpace
-from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, has_noise_scale, log_posterior
+from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, log_posterior
 from en4dvar.errors import ConfigError, TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.honesty import Caution, Ending, caution, examine
 from en4dvar.honesty.checks import down_weighted
-from en4dvar.inputs.units import convert
 from en4dvar.likelihood import error_std, log_likelihood, robust_weights, whitened_residual
-from en4dvar.noise_scale import mean_beyond_mode
-from en4dvar.problem import Analysis, AssimilationSettings, InverseProblem, IterationRecord, Progress, Record
+from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.shape import examine_shape, guide
 from en4dvar.schemes import Step, Weights
 from en4dvar.schemes.esmda import ESMDA
 from en4dvar.state import Array
+from en4dvar.units import convert
 
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 
@@ -125,7 +126,7 @@ class _Run:
         self.problem, self.settings, self.seed = problem, settings, seed
         self.progress, self.keep = progress, keep
         self.mda = ESMDA(settings.mda_coefficients, settings.mda_form) if settings.scheme == "es-mda" else None
-        if self.mda and (has_noise_scale(problem) or problem.observations.huber is not None):
+        if self.mda and (problem.has_noise_scale or problem.observations.huber is not None):
             raise ConfigError("es-mda takes Gaussian errors of known std: neither sigma nor a robust cost; use en4dvar")
         if self.mda:  # step and J of its ensembles are regressed over them
             settings = replace(settings, linearisation="transform")

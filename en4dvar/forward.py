@@ -67,7 +67,7 @@ class ObservationOperator(Protocol):
     """H: maps a trajectory to predictions (Ny,), one per observation time.
 
     One with an attribute ``batched = True`` gives, by the same expression, (N, Ny) for a
-    :class:`~en4dvar.ensemble.batch.Batch`, whose fields have members as their first axis.
+    :class:`~en4dvar.batch.Batch`, whose fields have members as their first axis.
     """
 
     def __call__(self, trajectory: Trajectory) -> Array: ...

@@ -1,20 +1,15 @@
-"""What goes into :func:`en4dvar.assimilate.assimilate` and what comes out of it, for one data set."""
+"""What is asked of an assimilation: the inverse problem of one data set, and the settings of the scheme."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-import numpy as np
-
-from en4dvar.forward import ForwardModel, Observable, ValidityLimit
+from en4dvar.forward import ForwardModel, Observable
 from en4dvar.observations import Observations
-from en4dvar.state import Array, Parameter
-
-if TYPE_CHECKING:
-    from en4dvar.honesty import Caution
-    from en4dvar.prior import Prior
+from en4dvar.prior import Prior
+from en4dvar.state import NOISE_SCALE, Parameter
 
 
 @dataclass(frozen=True)
@@ -47,6 +42,12 @@ class InverseProblem:
     fixed: Mapping[str, float] = field(default_factory=dict)
     perturbations: tuple[StatePerturbation, ...] = ()
 
+    @property
+    def has_noise_scale(self) -> bool:
+        """Whether ``sigma`` is given and scales the observation errors (rather than being the model's own)."""
+        given = NOISE_SCALE.name in self.prior.names or NOISE_SCALE.name in self.fixed
+        return given and all(p.name != NOISE_SCALE.name for p in self.model.parameters)
+
 
 @dataclass(frozen=True)
 class AssimilationSettings:
@@ -77,103 +78,3 @@ class AssimilationSettings:
     emulator: Literal["auto", "on", "off"] = "auto"
     mda_coefficients: tuple[float, ...] = (4.0, 4.0, 4.0, 4.0)
     mda_form: Literal["perturbed", "square-root"] = "perturbed"
-
-
-@dataclass(frozen=True)
-class IterationRecord:
-    """Diagnostics of one iteration (glossary of the field). Parameters are physical, SI.
-
-    ``cost = background + observation`` is J of the central trajectory at the iterate that *starts* the iteration;
-    the last record is the accepted end point. ``step_norm`` is the undamped step there in posterior standard
-    deviations, ``step_length`` the accepted fraction of it (0: no move). ``members`` (N, n) is the ensemble that the
-    scheme's weights and transform describe at that iterate. ``active`` counts the members whose forecast
-    succeeded; it is N where fewer runs gave the tangent and none failed.
-    """
-
-    iteration: int
-    cost: float
-    background: float
-    observation: float
-    step_norm: float
-    step_length: float
-    chi2_per_observation: float
-    dfs: float
-    spread: float
-    active: int
-    members: Array
-    centre: Array
-
-
-@dataclass(frozen=True)
-class ChainRecord:
-    """Where a Markov chain stands (``refine: mcmc``): steps so far, the largest split R-hat of any parameter, and the
-    smallest effective sample size.
-    """
-
-    steps: int
-    r_hat: float
-    effective: float
-
-
-@dataclass(frozen=True)
-class StartRecord:
-    """Where the descents stand that decide where the iterations start: rounds of moves, J of each descent, and how
-    many are under way. The moves of the lowest become the first iterations.
-    """
-
-    rounds: int
-    costs: tuple[float, ...]
-    active: int
-
-
-Record = IterationRecord | StartRecord | ChainRecord
-Progress = Callable[[str, Record], None]  # what hears of them, with the name of the data set
-
-
-@dataclass(frozen=True)
-class Analysis:
-    """The outcome for one data set: arrays only, members in order, physical SI values, NaN where a member failed.
-
-    Shapes: N members, n estimated parameters, K observations, M points of the plotting grid.
-    """
-
-    name: str
-    parameters: tuple[Parameter, ...]
-    fixed: Mapping[str, float]
-    fixed_parameters: tuple[Parameter, ...]
-    observable: Observable
-    observations: Observations
-    time_unit: str
-    time_display_unit: str
-    prior: Array  # (N, n)
-    posterior: Array  # (N, n)
-    centre: Array  # (n,) the minimum of J
-    prior_predictions: Array  # (N, K) noise-free H(F(x))
-    posterior_predictions: Array  # (N, K)
-    centre_predictions: Array  # (K,)
-    error_std: Array  # (K,) total observation-error std at the centre, timing error included
-    log_likelihood: Array  # (N, K) of the posterior members
-    trajectory_times: Array  # (M,) on the clock of the observations (member i is seen at t + t_s,i)
-    prior_trajectories: Array  # (N, M) observable along the path
-    posterior_trajectories: Array  # (N, M)
-    prior_failures: tuple[str, ...]  # (N,) reason, "" where the member is alive
-    posterior_failures: tuple[str, ...]  # (N,)
-    iterations: tuple[IterationRecord, ...]
-    dfs_per_parameter: Array  # (n,) 1 - posterior variance / prior variance, in transformed space
-    converged: bool
-    stop_reason: str
-    forward_runs: int
-    seed: int
-    settings: AssimilationSettings
-    cautions: tuple[Caution, ...] = ()  # why not to trust the posterior, the worst first
-    log_evidence: float = float("nan")  # ln p(y), Laplace approximation
-    shape: Mapping[str, float] = field(default_factory=dict)  # how Gaussian the posterior is (en4dvar.sampling.shape)
-    huber_weight: Array | None = None  # (K,) weights of the robust cost at the centre, where there is one
-    refinement: Mapping[str, float] = field(default_factory=dict)  # summary of the Markov chain, if any
-    limits: tuple[ValidityLimit, ...] = ()  # V of the model
-    extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) reached by the posterior members
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """The words of the cautions."""
-        return tuple(c.words for c in self.cautions)

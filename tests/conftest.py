@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from en4dvar.analysis import Analysis, IterationRecord
 from en4dvar.forward import Observable, StateField
 from en4dvar.honesty import caution
 from en4dvar.observations import Observations
-from en4dvar.problem import Analysis, AssimilationSettings, IterationRecord
+from en4dvar.problem import AssimilationSettings
 from en4dvar.state import TIME_SHIFT, Array, Parameter
 
 FAILED = 3

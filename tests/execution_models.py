@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from toy_models import Oscillator
 
-from en4dvar.ensemble.batch import Batch
+from en4dvar.batch import Batch
 
 
 class Slow(Oscillator):

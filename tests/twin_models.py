@@ -8,7 +8,7 @@ import time
 import numpy as np
 from pydantic import BaseModel
 
-from en4dvar.ensemble.batch import Batch
+from en4dvar.batch import Batch
 from en4dvar.forward import ForwardModel, Observable, StateField
 from en4dvar.state import Field, StateLayout
 

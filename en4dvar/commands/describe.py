@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
 from en4dvar.config import Config
-from en4dvar.inputs.units import convert
+from en4dvar.descent.preview import Preview
 from en4dvar.problem import InverseProblem
 from en4dvar.state import Parameter
-
-if TYPE_CHECKING:
-    from en4dvar.runs.checks import Preview
-    from en4dvar.storage.store import ParameterSummary
-
-
-def table(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of cells as aligned columns; the first row is the header."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+from en4dvar.tables import table
+from en4dvar.units import convert
 
 
 def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
@@ -58,17 +49,6 @@ def _seconds(value: float) -> str:
         if value < limit:
             return f"{float(f'{value / size:.2g}'):g} {unit}"
     return f"{value / 3600:.2g} h"
-
-
-def results_table(summaries: Mapping[str, Iterable[ParameterSummary]]) -> str:
-    """Posterior mean, std and 5/50/95 % of every parameter (data set → its rows), in display units."""
-    header = ("data set", "parameter", "unit", "mean", "std", "5 %", "50 %", "95 %")
-    rows = [
-        (name, row.name, row.unit, *(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q50, row.q95)))
-        for name, summary in summaries.items()
-        for row in summary
-    ]
-    return table([header, *rows])
 
 
 def _data_row(problem: InverseProblem) -> tuple[str, ...]:

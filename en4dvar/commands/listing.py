@@ -5,9 +5,9 @@ from __future__ import annotations
 from importlib.metadata import entry_points
 from typing import Any
 
-from en4dvar.commands.describe import table
 from en4dvar.config.models import GROUP, build_model, find_model, settings_of
 from en4dvar.errors import En4dvarError
+from en4dvar.tables import table
 
 
 def model_listing() -> str:

@@ -32,7 +32,7 @@ def schema(out: Path | None) -> None:
       en4dvar schema --out en4dvar.schema.json
     """
     from en4dvar.config.json_schema import schema_text
-    from en4dvar.storage.files import write_text
+    from en4dvar.files import write_text
 
     if out is None:
         click.echo(schema_text(), nl=False)

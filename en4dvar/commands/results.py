@@ -28,7 +28,7 @@ def report(run_dir: Path, datasets: tuple[str, ...]) -> None:
       en4dvar report runs/quickstart
     """
     from en4dvar.executor import available_cores
-    from en4dvar.runs.runner import report as write_report
+    from en4dvar.runs.runner import write_report
 
     click.echo(f"report: {write_report(run_dir, datasets, available_cores())}")
 
@@ -46,7 +46,7 @@ def compare(run_dirs: tuple[Path, ...], out: Path | None, no_report: bool) -> No
     Example:
       en4dvar compare runs/neo_hookean runs/quadratic
     """
-    from en4dvar.storage.compare import compare_runs, comparison_table, estimates_table
+    from en4dvar.report.compare import compare_runs, comparison_table, estimates_table
 
     comparison = compare_runs(run_dirs)
     if len(comparison.estimates) <= MOST_ROWS:
@@ -79,8 +79,8 @@ def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
       en4dvar export runs/quickstart --latex --out table.tex
     """
     from en4dvar.errors import OutputError
-    from en4dvar.storage.export import export_table, posterior_file
-    from en4dvar.storage.files import write_text
+    from en4dvar.files import write_text
+    from en4dvar.report.export import export_table, posterior_file
 
     if kind == "netcdf":
         path = posterior_file(run_dir)

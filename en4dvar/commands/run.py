@@ -59,8 +59,8 @@ def run(
             raise click.UsageError("a twin experiment takes no --scheduler: its cycles are too short to be sent away")
         _run_twin(loaded, force, resume)
         return
+    from en4dvar.config.build import data_files, inverse_plan
     from en4dvar.executor import available_cores
-    from en4dvar.inputs.build import data_files, inverse_plan
     from en4dvar.runs.progress import terminal_progress
     from en4dvar.runs.runner import execute
 
@@ -78,7 +78,7 @@ def run(
 
 def _tell(campaign: Campaign, with_report: bool) -> None:
     """The posterior on standard output, warnings on standard error. Raises :class:`Failed` where a data set has."""
-    from en4dvar.commands.describe import results_table
+    from en4dvar.storage.store import results_table
 
     if len(campaign) <= MOST_TOLD:
         click.echo(results_table({o.name: o.summary for o in campaign.outcomes if not o.failure}))

@@ -42,9 +42,9 @@ def simulate(
         _simulate_campaign(config, settings, out, seed, force)
         return
     loaded = load(config, data, settings)
-    from en4dvar.ensemble.simulation import noise_level, parse_times, simulate, to_csv
     from en4dvar.errors import OutputError
-    from en4dvar.storage.files import write_text
+    from en4dvar.files import write_text
+    from en4dvar.runs.simulation import noise_level, parse_times, simulate, to_csv
 
     if out is not None and out.exists() and not force:
         raise OutputError(f"{out}: exists; give --force to replace it")
@@ -70,7 +70,7 @@ def _has_campaign(config: str) -> bool:
 def _simulate_campaign(config: str, settings: tuple[str, ...], out: Path | None, seed: int | None, force: bool) -> None:
     from en4dvar.config.document import override, read_document
     from en4dvar.config.synthetic import relocated, resolve_campaign
-    from en4dvar.inputs.synthetic import draw_campaign, write_campaign
+    from en4dvar.runs.synthetic import draw_campaign, write_campaign
 
     changes = overrides(None, settings, seed=seed)
     plan = resolve_campaign(override(read_document(Path(config)), changes), Path(config).resolve().parent)

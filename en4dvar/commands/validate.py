@@ -12,8 +12,8 @@ from en4dvar.commands.common import config_options, overrides
 
 if TYPE_CHECKING:
     from en4dvar.config import Config
+    from en4dvar.descent.preview import Preview
     from en4dvar.problem import InverseProblem
-    from en4dvar.runs.checks import Preview
 
 
 @click.command()
@@ -40,8 +40,8 @@ def validate(config: str, data: str | None, settings: tuple[str, ...], plot: boo
         click.echo(twin_summary(loaded))
         return
     from en4dvar.commands.describe import cost_summary, problem_summary
-    from en4dvar.inputs.build import build
-    from en4dvar.runs.checks import preview
+    from en4dvar.config.build import build
+    from en4dvar.descent.preview import preview
 
     problems = build(loaded)
     click.echo(problem_summary(loaded, problems))

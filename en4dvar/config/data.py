@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from en4dvar.commands.hints import suggest
 from en4dvar.config import schema
 from en4dvar.config.document import Document
 from en4dvar.config.observation_error import ErrorPlan, Spread, parse_spread, read_error
 from en4dvar.config.validate import check
 from en4dvar.errors import Fault
 from en4dvar.forward import ForwardModel, Observable
+from en4dvar.hints import suggest
 from en4dvar.inputs.readers import Column, Format, Step
 from en4dvar.inputs.text_table import Decimal
-from en4dvar.inputs.units import UnitError, convert, parse_quantity
 from en4dvar.inputs.window import Instant, parse_instant
+from en4dvar.units import UnitError, convert, parse_quantity
 
 __all__ = ["DataPlan", "Spread", "parse_spread", "read_data"]
 

@@ -15,8 +15,8 @@ from typing import Any
 
 import yaml
 
-from en4dvar.commands.hints import no_such_file
 from en4dvar.errors import ConfigError, Fault
+from en4dvar.hints import no_such_file
 
 Key = tuple[str | int, ...]
 Mark = tuple[int, int]  # line and column, from 1

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from en4dvar.commands.hints import suggest
 from en4dvar.config import schema
 from en4dvar.config.document import Document
 from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel
-from en4dvar.inputs.units import UnitError, parse_quantity
+from en4dvar.hints import suggest
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import StatePerturbation
 from en4dvar.state import Field, Parameter
+from en4dvar.units import UnitError, parse_quantity
 
 Perturbed = tuple[PriorTerm, StatePerturbation]
 

@@ -20,9 +20,9 @@ from en4dvar.config.parameters import Entry, Fixed, read_parameters
 from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel, Observable
-from en4dvar.inputs.units import UnitError, parse_quantity
 from en4dvar.problem import AssimilationSettings
 from en4dvar.state import Array
+from en4dvar.units import UnitError, parse_quantity
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from en4dvar.commands.hints import suggest
 from en4dvar.config.document import Document
 from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, En4dvarError, Fault
 from en4dvar.forward import ForwardModel, StateField
+from en4dvar.hints import suggest
 
 GROUP = "en4dvar.models"
 

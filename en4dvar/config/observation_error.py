@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from en4dvar.commands.hints import suggest
 from en4dvar.config import schema
 from en4dvar.config.document import Document
 from en4dvar.config.validate import check
 from en4dvar.errors import Fault
 from en4dvar.forward import ForwardModel, Observable
+from en4dvar.hints import suggest
 from en4dvar.inputs.readers import Matrix
-from en4dvar.inputs.units import UnitError, convert, parse_quantity
+from en4dvar.units import UnitError, convert, parse_quantity
 
 _RELATIVE = re.compile(r"(.*%)\s+of\s+(?:the\s+)?maximum")
 HUBER = 1.345  # 95 % efficiency where the errors are Gaussian after all: Huber (1981), Robust Statistics

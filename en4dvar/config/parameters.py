@@ -7,15 +7,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-from en4dvar.commands.hints import suggest
 from en4dvar.config import schema
 from en4dvar.config.document import Document
 from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel
-from en4dvar.inputs.units import UnitError, convert, parse_quantity
+from en4dvar.hints import suggest
 from en4dvar.prior import PriorTerm
 from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Parameter
+from en4dvar.units import UnitError, convert, parse_quantity
 
 _PERCENT = re.compile(r"([^%]*)%")
 _RECIPES = {

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, get_type_hints
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
 from en4dvar.executor.limits import Limits, parse_bytes
-from en4dvar.inputs.units import Quantity, parse_unit
 from en4dvar.problem import AssimilationSettings
+from en4dvar.units import Quantity, parse_unit
 
 QuantityText = str | int | float
 Name = Annotated[str, Field(pattern=r"^\w[\w.+ -]*$", max_length=100)]

@@ -18,8 +18,8 @@ from en4dvar.config.schema import QuantityText, Section
 from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel, Observable
-from en4dvar.inputs.units import UnitError, parse_quantity
 from en4dvar.prior import PriorTerm
+from en4dvar.units import UnitError, parse_quantity
 
 
 class Group(Section):

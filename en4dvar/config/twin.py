@@ -12,7 +12,6 @@ import numpy as np
 import yaml
 from pydantic import Field, model_validator
 
-from en4dvar.commands.hints import suggest
 from en4dvar.config import schema
 from en4dvar.config.document import Document
 from en4dvar.config.models import read_model
@@ -22,16 +21,17 @@ from en4dvar.config.validate import check
 from en4dvar.cycling.sequential import SequentialSettings
 from en4dvar.cycling.series import root_of_correlation
 from en4dvar.cycling.twin import TwinExperiment
-from en4dvar.ensemble.inflation import Inflation
-from en4dvar.ensemble.localisation import Localisation
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.forward import ForwardModel
+from en4dvar.hints import suggest
 from en4dvar.inputs.readers import Matrix, read_covariance
-from en4dvar.inputs.units import UnitError, parse_quantity
 from en4dvar.prior import Prior
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
+from en4dvar.schemes.inflation import Inflation
+from en4dvar.schemes.localisation import Localisation
 from en4dvar.state import Array
+from en4dvar.units import UnitError, parse_quantity
 
 
 class Twin(Section):

@@ -7,9 +7,9 @@ from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from en4dvar.commands.hints import suggest
 from en4dvar.config.document import Document
 from en4dvar.errors import Fault
+from en4dvar.hints import suggest
 
 M = TypeVar("M", bound=BaseModel)
 

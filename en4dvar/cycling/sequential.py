@@ -16,17 +16,17 @@ from typing import Protocol
 
 import numpy as np
 
+from en4dvar.batch import Batch
+from en4dvar.cycling.moments import Moments, MomentsRecorder
+from en4dvar.cycling.rotation import Rotations, rotate
 from en4dvar.cycling.series import Series
-from en4dvar.ensemble.batch import Batch
-from en4dvar.ensemble.inflation import Inflation
 from en4dvar.ensemble.linalg import centre
-from en4dvar.ensemble.localisation import Localisation
-from en4dvar.ensemble.moments import Moments, MomentsRecorder
-from en4dvar.ensemble.rotation import Rotations, rotate
 from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.forward import Failure, ForwardModel, Observable, Trajectory
 from en4dvar.schemes import Evaluation, FullStep, Weights
+from en4dvar.schemes.inflation import Inflation
+from en4dvar.schemes.localisation import Localisation
 from en4dvar.state import Array
 
 NO_INFLATION = Inflation()
@@ -51,7 +51,7 @@ class SequentialScheme(Protocol):
 class SequentialSettings:
     """How the loop treats the ensemble of ``scheme``; ``localisation`` only with a filter (lag 0).
 
-    ``rotation``: every analysis is turned by a random mean-preserving rotation (:mod:`en4dvar.ensemble.rotation`).
+    ``rotation``: every analysis is turned by a random mean-preserving rotation (:mod:`en4dvar.cycling.rotation`).
     """
 
     scheme: SequentialScheme

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from en4dvar.cycling.moments import Moments
 from en4dvar.cycling.sequential import (
     SequentialResult,
     SequentialSettings,
@@ -24,7 +25,6 @@ from en4dvar.cycling.sequential import (
     run_sequential,
 )
 from en4dvar.cycling.series import Series, root_of_correlation
-from en4dvar.ensemble.moments import Moments
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.forward import Failure, ForwardModel, Observable

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar import diagnostics as diag
+from en4dvar.analysis import IterationRecord
 from en4dvar.descent.step_control import Move
 from en4dvar.descent.weight_space import Local, WeightSpace
-from en4dvar.problem import IterationRecord
 from en4dvar.schemes import Step
 from en4dvar.state import Array
 

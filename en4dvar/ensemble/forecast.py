@@ -66,7 +66,7 @@ class Composite:
         self.problem, self.executor = problem, executor or SerialExecutor()
         self._initial_states = InitialStates(problem)
         self._reading = {limits: _reading(problem, limits) for limits in (False, True)}
-        self._scaled = has_noise_scale(problem)
+        self._scaled = problem.has_noise_scale
 
     def __call__(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
         """Run control vectors ``x`` (B, n; transformed) through F and H.
@@ -107,12 +107,6 @@ def forecast(
 ) -> Forecast:
     """:class:`Composite` of a problem, called once."""
     return Composite(problem, executor)(x, extra_times)
-
-
-def has_noise_scale(problem: InverseProblem) -> bool:
-    """Whether ``sigma`` is given and scales the observation errors (rather than being the model's own)."""
-    given = NOISE_SCALE.name in problem.prior.names or NOISE_SCALE.name in problem.fixed
-    return given and all(p.name != NOISE_SCALE.name for p in problem.model.parameters)
 
 
 def cost(problem: InverseProblem, x: Array, executor: Executor | None = None) -> Array:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.ensemble.batch import Batch
+from en4dvar.batch import Batch
 from en4dvar.executor import Outcome, describe
 from en4dvar.forward import Failure
 from en4dvar.prior import Prior
@@ -105,7 +105,7 @@ def _without(failures: list[str]) -> Indices:
 class Reading:
     """What is read from a path: ``quantities`` (T,) each, H and, where it is needed, its rate; ``largest`` by name.
 
-    ``batched``: the quantities take a :class:`~en4dvar.ensemble.batch.Batch` as well and give (B, T).
+    ``batched``: the quantities take a :class:`~en4dvar.batch.Batch` as well and give (B, T).
     """
 
     quantities: tuple[Callable[[Any], Array], ...]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from en4dvar.ensemble.batch import Batch
+from en4dvar.batch import Batch
 from en4dvar.executor.limits import TimeLimitError, has_time_limit, within_time_limit
 from en4dvar.forward import Failure, ForwardModel, Trajectory
 from en4dvar.state import Array

@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from en4dvar.diagnostics import common_reasons
 from en4dvar.honesty.caution import Caution, caution
-from en4dvar.inputs.units import convert
 from en4dvar.prior import Prior
 from en4dvar.state import Array
+from en4dvar.units import convert
 
 MANY = 0.1  # share of members whose loss is serious
 SEPARATED = 3.0  # standard deviations of the rank sum beyond which a parameter tells lost members from others

@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.commands.hints import no_such_file, suggest
 from en4dvar.errors import DataError
+from en4dvar.hints import no_such_file, suggest
 from en4dvar.inputs.matfile import mat_vectors
 from en4dvar.inputs.text_table import (
     Decimal,
@@ -28,8 +28,8 @@ from en4dvar.inputs.text_table import (
     read_header,
     second_header,
 )
-from en4dvar.inputs.units import convert
 from en4dvar.state import Array
+from en4dvar.units import convert
 
 Format = Literal["csv", "mat"]
 SUFFIXES: Mapping[str, Format] = {".csv": "csv", ".txt": "csv", ".dat": "csv", ".tsv": "csv", ".mat": "mat"}

@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 
 from en4dvar.errors import DataError
-from en4dvar.inputs.units import UnitError, parse_quantity
 from en4dvar.state import Array
+from en4dvar.units import UnitError, parse_quantity
 
 _MINIMUM = re.compile(r"minimum(?:\s+(\d+))?")
 

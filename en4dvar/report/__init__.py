@@ -14,17 +14,17 @@ from dataclasses import fields
 from pathlib import Path
 from urllib.parse import quote
 
-from en4dvar.commands.hints import suggest
 from en4dvar.errors import OutputError
 from en4dvar.executor import ProcessesExecutor, SerialExecutor, WorkerLostError
+from en4dvar.files import write_text
+from en4dvar.hints import suggest
 from en4dvar.honesty import Caution
 from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import Entry, overview_figures, render_overview
 from en4dvar.report.page import make_section, render_set
 from en4dvar.report.style import save_figure
 from en4dvar.storage.campaign_file import failed_datasets
-from en4dvar.storage.files import write_text
-from en4dvar.storage.store import ParameterSummary, Result, load_result
+from en4dvar.storage.store import ParameterSummary, StoredResult, load_stored
 
 Summarised = tuple[str, Iterable[ParameterSummary], Iterable[Caution]]
 PAGES = 40  # data sets of a campaign with a page from the start
@@ -32,7 +32,7 @@ SHARE = 4  # pages that are worth the start of a process
 COPIES = 12  # data sets of a campaign up to which figures are also kept as PDF and PNG
 
 
-def write_report(run_dir: str | Path, datasets: Sequence[str] = (), workers: int = 1) -> Path:
+def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int = 1) -> Path:
     """Write the report of a run and return the path of ``report.html``.
 
     Reads ``datasets/*.nc`` where the run has several data sets, else ``posterior.nc``. ``datasets`` are names of data
@@ -48,10 +48,10 @@ def write_report(run_dir: str | Path, datasets: Sequence[str] = (), workers: int
         raise OutputError(f"{run_dir}: no such run directory")
     paths = sorted((run_dir / "datasets").glob("*.nc"))
     if not paths:
-        result = load_result(run_dir / "posterior.nc")
+        result = load_stored(run_dir / "posterior.nc")
         write_text(run_dir / "summary.csv", summary_csv([(result.name, result.summary(), result.cautions)], {}))
         return _write_set(run_dir / "report.html", result, copies="")
-    entries = [Entry.of(load_result(path), path.stem) for path in paths]
+    entries = [Entry.of(load_stored(path), path.stem) for path in paths]
     failures = failed_datasets(run_dir / "posterior.nc")
     write_text(run_dir / "summary.csv", summary_csv(((e.name, e.summary, e.cautions) for e in entries), failures))
     return _write_campaign(run_dir, entries, failures, _asked(run_dir, entries, datasets), workers)
@@ -115,11 +115,11 @@ def _write_campaign(
 
 def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:
     """The page of one data set of a campaign."""
-    result = load_result(run_dir / "datasets" / f"{stem}.nc")
+    result = load_stored(run_dir / "datasets" / f"{stem}.nc")
     _write_set(run_dir / "pages" / f"{stem}.html", result, copies, trail)
 
 
-def _write_set(path: Path, result: Result, copies: str | None, trail: Sequence[tuple[str, str]] = ()) -> Path:
+def _write_set(path: Path, result: StoredResult, copies: str | None, trail: Sequence[tuple[str, str]] = ()) -> Path:
     """The page of one data set; ``copies``: prefix of its figures as PDF and PNG in ``figures/``, None for none."""
     figures = list(all_figures(result))
     if copies is not None:

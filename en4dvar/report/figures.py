@@ -1,4 +1,4 @@
-"""The figures of a report, each a pure function Result → Figure in display units, readable at column width (8.5 cm)."""
+"""The figures of a report: pure functions from a stored result to a figure in display units, 8.5 cm wide."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from en4dvar.inputs.units import convert
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, styled
 from en4dvar.report.text import plus_minus, pretty_unit, with_unit
 from en4dvar.state import Array
-from en4dvar.storage.store import Result
+from en4dvar.storage.store import StoredResult
+from en4dvar.units import convert
 
 MAX_PAIRS = 6
 
 
 @styled
-def histograms(result: Result) -> Figure:
+def histograms(result: StoredResult) -> Figure:
     """Posterior over prior, one panel a parameter scaled to its peak. Bar: 5–95 %, ticks: members, line: centre."""
     rows = result.summary()
     figure, panels = _panels(len(rows), height=3.6 / 2.54)
@@ -39,7 +39,7 @@ def histograms(result: Result) -> Figure:
 
 
 @styled
-def history(result: Result) -> Figure:
+def history(result: StoredResult) -> Figure:
     """Data ± std, prior and posterior predictive bands (50 and 90 %), the centre; below, residuals over their std."""
     name = result.observable
     variable = result.observed_data[name]
@@ -77,7 +77,7 @@ def history(result: Result) -> Figure:
 
 
 @styled
-def cost(result: Result) -> Figure:
+def cost(result: StoredResult) -> Figure:
     """J and its two terms over the iterations; logarithmic where J falls by more than a factor of 20."""
     steps = result.iterations["iteration"].values
     figure = Figure(figsize=(COLUMN, 5.4 / 2.54), layout="constrained")
@@ -100,7 +100,7 @@ def cost(result: Result) -> Figure:
 
 
 @styled
-def traces(result: Result) -> Figure:
+def traces(result: StoredResult) -> Figure:
     """Each parameter over the iterations: mean ± std of the ensemble the iterate describes, and its centre."""
     rows = result.summary()
     steps = result.iterations["iteration"].values
@@ -121,7 +121,7 @@ def traces(result: Result) -> Figure:
 
 
 @styled
-def pairs(result: Result) -> Figure:
+def pairs(result: StoredResult) -> Figure:
     """Posterior members of every pair of parameters; above the diagonal their correlation."""
     rows = result.summary()
     n = len(rows)
@@ -141,7 +141,7 @@ def pairs(result: Result) -> Figure:
     return figure
 
 
-def all_figures(result: Result) -> Iterator[tuple[str, str, Figure]]:
+def all_figures(result: StoredResult) -> Iterator[tuple[str, str, Figure]]:
     """(file name, caption, figure) of everything that the result has enough members for."""
     yield (
         "posterior",
@@ -195,13 +195,13 @@ def _display(values: Any, attrs: Mapping[Any, Any]) -> Array:
     return convert(np.asarray(values, dtype=float), attrs["units"], attrs["display_units"])
 
 
-def _shown(result: Result, coordinate: str, group: str = "observed_data") -> Array:
+def _shown(result: StoredResult, coordinate: str, group: str = "observed_data") -> Array:
     variable = result.dataset(group)[coordinate]
     return _display(variable.values, variable.attrs)
 
 
 def _band(
-    ax: Axes, result: Result, group: str, levels: tuple[float, float], colour: str, alpha: float, label: str
+    ax: Axes, result: StoredResult, group: str, levels: tuple[float, float], colour: str, alpha: float, label: str
 ) -> None:
     path = result.dataset(group)[f"{result.observable}_path"]
     values = _display(path.values[0], path.attrs)
@@ -219,7 +219,7 @@ def _data_range(data: Array, std: Array) -> tuple[float, float]:
     return low - 0.12 * (high - low), high + 0.25 * (high - low)
 
 
-def _alive(result: Result, name: str) -> Array:
+def _alive(result: StoredResult, name: str) -> Array:
     return result.members("posterior", name)
 
 

@@ -1,4 +1,4 @@
-"""Posteriors of several runs over each other, as figure and page, from what :mod:`en4dvar.storage.compare` has read."""
+"""Posteriors of several runs over each other, as figure and page, from what :mod:`en4dvar.report.compare` has read."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from en4dvar.errors import OutputError
-from en4dvar.inputs.units import UnitError, convert
+from en4dvar.files import write_text
+from en4dvar.report.compare import Comparison, Estimate, ModelScore
 from en4dvar.report.html import render
 from en4dvar.report.style import COLUMN, LIGHT, inline_svg, save_figure, styled
 from en4dvar.report.text import number_like, plain_number, plus_minus, pretty_unit, symbol_html, with_unit
 from en4dvar.state import Array
-from en4dvar.storage.compare import Comparison, Estimate, ModelScore
-from en4dvar.storage.files import write_text
+from en4dvar.units import UnitError, convert
 
 COLOURS = (LIGHT["posterior"], LIGHT["centre"], LIGHT["background"], "#cc79a7", "#b58900", LIGHT["muted"])
 CAPTION = (

@@ -16,7 +16,7 @@ from en4dvar.honesty.caution import SEVERITIES, worst_first
 from en4dvar.report.html import render
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, inline_svg, styled
 from en4dvar.report.text import number_like, plain_number, plus_minus, pretty_unit, symbol_html, with_unit
-from en4dvar.storage.store import ParameterSummary, Result
+from en4dvar.storage.store import ParameterSummary, StoredResult
 
 NAMED = 40  # data sets whose names fit below a figure
 
@@ -33,7 +33,7 @@ class Entry:
     about: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, result: Result, stem: str) -> Entry:
+    def of(cls, result: StoredResult, stem: str) -> Entry:
         """``stem``: name of the file without suffix."""
         stats = result.sample_stats.attrs
         keys = ("n_observations", "chi2_per_observation", "nrmse", "dfs", "n_active", "n_members")

@@ -12,7 +12,6 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from en4dvar.diagnostics import chi2_interval
-from en4dvar.inputs.units import convert
 from en4dvar.report.html import render
 from en4dvar.report.style import inline_svg
 from en4dvar.report.text import (
@@ -25,7 +24,8 @@ from en4dvar.report.text import (
     words_for,
 )
 from en4dvar.storage.groups import ITERATION_SCALARS
-from en4dvar.storage.store import ParameterSummary, Result
+from en4dvar.storage.store import ParameterSummary, StoredResult
+from en4dvar.units import convert
 
 PROVENANCE = (
     "history", "date_created", "seed", "data_source", "git_commit", "configuration_file", "configuration_git_commit",
@@ -38,7 +38,7 @@ class Section:
     """One data set on the page: ``figures`` are (identifier, caption, SVG)."""
 
     anchor: str
-    result: Result
+    result: StoredResult
     figures: Sequence[tuple[str, str, Markup]]
 
     @property
@@ -154,7 +154,7 @@ def judge_chi2(chi2: float, n_observations: int, dfs: float) -> tuple[str, bool]
     return f"misfit agrees with the stated noise; {expected}", False
 
 
-def make_section(result: Result, anchor: str, figures: Sequence[tuple[str, str, Figure]]) -> Section:
+def make_section(result: StoredResult, anchor: str, figures: Sequence[tuple[str, str, Figure]]) -> Section:
     """A section with its figures (name, caption, Figure) drawn as inline SVG."""
 
     def draw(name: str, caption: str, figure: Figure) -> tuple[str, str, Markup]:

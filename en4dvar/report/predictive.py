@@ -8,11 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from en4dvar.inputs.units import convert
+from en4dvar.descent.preview import Preview
 from en4dvar.report.style import COLUMN, LIGHT, styled
 from en4dvar.report.text import with_unit
-from en4dvar.runs.checks import Preview
 from en4dvar.state import Array
+from en4dvar.units import convert
 
 PANELS = 6
 COLUMNS = 2

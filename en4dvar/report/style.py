@@ -18,7 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 
-from en4dvar.storage.files import atomic_path
+from en4dvar.files import atomic_path
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -12,11 +12,11 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from en4dvar.errors import OutputError
+from en4dvar.files import write_text
 from en4dvar.report.html import render
 from en4dvar.report.page import PROVENANCE
 from en4dvar.report.style import COLUMN, LIGHT, inline_svg, save_figure, styled
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
-from en4dvar.storage.files import write_text
 from en4dvar.storage.seal import check_seal
 from en4dvar.storage.twin_file import MEAN
 

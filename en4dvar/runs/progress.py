@@ -11,8 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from en4dvar.analysis import ChainRecord, Record, StartRecord
 from en4dvar.errors import OutputError
-from en4dvar.problem import ChainRecord, Record, StartRecord
 from en4dvar.runs.interrupt import Interrupted
 
 TYPICAL_ITERATIONS = 8.0

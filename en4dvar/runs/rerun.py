@@ -13,17 +13,17 @@ import numpy as np
 import xarray as xr
 
 from en4dvar.assimilate import assimilate
+from en4dvar.config.build import problem_of
 from en4dvar.config.document import parse_document
 from en4dvar.config.load import resolve
 from en4dvar.errors import OutputError
 from en4dvar.executor import choose_executor, one_blas_thread
-from en4dvar.inputs.build import problem_of
 from en4dvar.observations import Observations
+from en4dvar.report.result import Result, load_result
 from en4dvar.storage.campaign_file import failed_datasets
 from en4dvar.storage.checkpoint import file_digest
 from en4dvar.storage.fingerprint import Identity, identity
 from en4dvar.storage.provenance import provenance
-from en4dvar.storage.store import Result, load_result
 
 SURROUNDINGS = ("python_version", "package_versions", "platform", "cpu", "git_commit")
 _HUBER, _SCALAR = "huber_threshold", "scalar_"

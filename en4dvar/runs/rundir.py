@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Literal
 
 from en4dvar.errors import OutputError
+from en4dvar.files import write_text
 from en4dvar.runs.lock import LOCK, locked
-from en4dvar.storage.files import write_text
 
 LISTING = ".en4dvar-files"
 NEXT = ".en4dvar-next"
@@ -25,7 +25,7 @@ COMPLETE = ".en4dvar-complete"
 OLD = ".en4dvar-old"
 FIXED = ("config.yaml", "config.resolved.yaml", "posterior.nc", "twin.nc", "run.log", "report.html", "summary.csv")
 FOLDERS = ("datasets", "figures", "checkpoints")
-_PARTIAL = re.compile(r"\..+\.\d+\.tmp")  # of en4dvar.storage.files, left by a process that was killed
+_PARTIAL = re.compile(r"\..+\.\d+\.tmp")  # of en4dvar.files, left by a process that was killed
 
 Mode = Literal["new", "force", "resume", "report"]
 

@@ -7,12 +7,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from en4dvar.analysis import Progress
 from en4dvar.config import Config, load_config
+from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.errors import ConfigError, DataError, Fault, OutputError
 from en4dvar.executor import ExecutorError, choose_executor, one_blas_thread
-from en4dvar.inputs.build import build_one, data_files, inverse_plan
-from en4dvar.problem import Progress
-from en4dvar.report import summary_csv, write_report
+from en4dvar.files import write_text
+from en4dvar.report import summary_csv, write_pages
+from en4dvar.report.result import Result
 from en4dvar.runs.campaign import Campaign
 from en4dvar.runs.interrupt import Interrupted, tell_interrupt, terminate_as_interrupt
 from en4dvar.runs.progress import RunLog
@@ -20,10 +22,8 @@ from en4dvar.runs.rundir import Mode, RunDirectory
 from en4dvar.runs.worklist import Dataset, Done, Worklist, datasets
 from en4dvar.storage.campaign_file import save_campaign
 from en4dvar.storage.checkpoint import FOLDER, CheckpointError, read_checkpoint, write_checkpoint
-from en4dvar.storage.files import write_text
 from en4dvar.storage.fingerprint import Identity, identity
 from en4dvar.storage.provenance import provenance
-from en4dvar.storage.store import Result
 
 IDENTITY = f"{FOLDER}/run"
 
@@ -136,7 +136,7 @@ def execute(
         return Campaign(directory.path, work.outcomes(), tuple(work.notices))
 
 
-def report(path: str | Path, datasets: Sequence[str] = (), workers: int = 1) -> Path:
+def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 1) -> Path:
     """Write (again) the report of a run from its netCDF; ``datasets`` of a campaign get a page in any case.
 
     ``workers``: processes that draw it.
@@ -246,7 +246,7 @@ def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int 
     directory.claim("report.html", "summary.csv")
     before = {folder: directory.listing(folder) for folder in ("figures", "pages")}
     try:
-        return write_report(directory.work, datasets, workers)
+        return write_pages(directory.work, datasets, workers)
     finally:
         for folder, files in before.items():
             directory.claim_folder(folder, files)

@@ -6,21 +6,21 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from en4dvar.commands.describe import table
 from en4dvar.config import TwinConfig, load_twin
 from en4dvar.cycling.sequential import SequentialState
 from en4dvar.cycling.twin import TwinResult, conduct
 from en4dvar.errors import ConfigError, OutputError
 from en4dvar.executor import make_executor
+from en4dvar.files import atomic_path, write_text
 from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
 from en4dvar.runs.progress import RunLog
 from en4dvar.runs.rundir import Mode, RunDirectory
 from en4dvar.storage.checkpoint import FOLDER, CheckpointError, Keeper, digest, read_checkpoint, write_checkpoint
-from en4dvar.storage.files import atomic_path, write_text
 from en4dvar.storage.fingerprint import Identity, identity
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.seal import seal_file
 from en4dvar.storage.twin_file import dataset, summary_csv
+from en4dvar.tables import table
 
 IDENTITY, STATE = f"{FOLDER}/run", f"{FOLDER}/twin.cycle"
 

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from en4dvar.analysis import ChainRecord
 from en4dvar.errors import ConfigError, En4dvarError
-from en4dvar.problem import ChainRecord
 from en4dvar.sampling.walkers import Emulated, advance
 from en4dvar.state import Array
 

@@ -20,7 +20,7 @@ import netCDF4
 import numpy as np
 
 from en4dvar.errors import OutputError
-from en4dvar.storage.files import atomic_path
+from en4dvar.files import atomic_path
 from en4dvar.storage.seal import check_seal, seal_file
 
 GROUPS = (

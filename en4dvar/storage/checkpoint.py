@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from en4dvar.errors import OutputError
+from en4dvar.files import atomic_path
 from en4dvar.storage.codec import decode, encode
-from en4dvar.storage.files import atomic_path
 
 D = TypeVar("D")
 FORMAT = "en4dvar-checkpoint"

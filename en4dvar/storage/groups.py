@@ -1,4 +1,4 @@
-"""The groups of a result file: an :class:`~en4dvar.problem.Analysis` laid out in the ArviZ schema.
+"""The groups of a result file: an :class:`~en4dvar.analysis.Analysis` laid out in the ArviZ schema.
 
 Every value is SI with ``units`` and ``long_name``; ``display_units`` and ``symbol`` tell tables and figures how to
 show it. Members are draws of one chain, in order. Whatever a report needs is put here once, so that nothing downstream
@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.analysis import Analysis
 from en4dvar.diagnostics import nrmse
-from en4dvar.problem import Analysis
 from en4dvar.state import Array, Parameter
 from en4dvar.storage.netcdf import Group, Variable
 

@@ -14,7 +14,7 @@ PACKAGES = ("en4dvar", "numpy", "scipy", "numba", "xarray", "netCDF4", "pydantic
 
 
 def provenance(config_text: str, config_path: str | Path | None = None, command: str = "") -> dict[str, str]:
-    """ACDD and provenance attributes for :meth:`en4dvar.storage.store.Result.from_analysis`.
+    """ACDD and provenance attributes for :meth:`en4dvar.report.result.Result.from_analysis`.
 
     Parameters
     ----------

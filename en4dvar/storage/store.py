@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import xarray as xr
 
+from en4dvar.analysis import Analysis
 from en4dvar.errors import OutputError
+from en4dvar.files import write_bytes
 from en4dvar.honesty import Caution
-from en4dvar.inputs.units import convert
-from en4dvar.problem import Analysis
 from en4dvar.state import Array, Parameter
-from en4dvar.storage.files import write_bytes
 from en4dvar.storage.groups import about, active_members, build_groups
 from en4dvar.storage.netcdf import to_bytes, tree_of
 from en4dvar.storage.seal import check_seal
+from en4dvar.tables import table
+from en4dvar.units import convert
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
 GROUPS = ("prior", "posterior", "posterior_predictive", "observed_data", "sample_stats", "iterations")
 
@@ -71,7 +71,7 @@ class ParameterSummary:
 
 
 def summarise(analysis: Analysis) -> tuple[ParameterSummary, ...]:
-    """:meth:`Result.summary` without the detour through a tree."""
+    """:meth:`StoredResult.summary` without the detour through a tree."""
     alive = active_members(analysis.posterior_failures)
 
     def row(j: int, p: Parameter) -> ParameterSummary:
@@ -83,8 +83,19 @@ def summarise(analysis: Analysis) -> tuple[ParameterSummary, ...]:
     return tuple(row(j, p) for j, p in enumerate(analysis.parameters))
 
 
+def results_table(summaries: Mapping[str, Iterable[ParameterSummary]]) -> str:
+    """Posterior mean, std and 5/50/95 % of every parameter (data set → its rows), in display units."""
+    header = ("data set", "parameter", "unit", "mean", "std", "5 %", "50 %", "95 %")
+    rows = [
+        (name, row.name, row.unit, *(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q50, row.q95)))
+        for name, summary in summaries.items()
+        for row in summary
+    ]
+    return table([header, *rows])
+
+
 @dataclass(frozen=True)
-class Result:
+class StoredResult:
     """The posterior ensemble of one data set with everything that led to it: a thin view of ``tree``.
 
     Values are SI; members are draws of one chain; a failed member is NaN and ``sample_stats.active`` is False there.
@@ -93,7 +104,7 @@ class Result:
     tree: xr.DataTree
 
     @classmethod
-    def from_analysis(cls, analysis: Analysis, attributes: Mapping[str, Any]) -> Result:
+    def from_analysis(cls, analysis: Analysis, attributes: Mapping[str, Any]) -> Self:
         """Lay out an analysis; ``attributes`` (see :func:`en4dvar.storage.provenance.provenance`) join the root's."""
         return cls(tree_of(build_groups(analysis, attributes)))
 
@@ -171,28 +182,8 @@ class Result:
         """Posterior members as rows (index ``draw``), parameters as columns, SI; NaN where a member failed."""
         return self.posterior.isel(chain=0, drop=True).to_dataframe()
 
-    def plot_histograms(self) -> Figure:
-        """Posterior over prior, one panel a parameter, in display units; a matplotlib figure, shown by a notebook."""
-        from en4dvar.report.figures import histograms
-
-        return histograms(self)
-
-    def plot_history(self) -> Figure:
-        """Data, prior and posterior predictive bands and the residuals of the centre, in display units."""
-        from en4dvar.report.figures import history
-
-        return history(self)
-
-    def plot_pairs(self) -> Figure:
-        """Posterior members of every pair of parameters with their correlation, in display units."""
-        from en4dvar.report.figures import pairs
-
-        return pairs(self)
-
     def __str__(self) -> str:
         """The summary as a table (display units), how the fit ended, and the warnings."""
-        from en4dvar.commands.describe import results_table
-
         s = self.sample_stats.attrs
         ended = f"{'converged' if s['converged'] else 'not converged'}: {s['stop_reason']}"
         fit = f"chi2/K {s['chi2_per_observation']:.3g}, NRMSE {s['nrmse']:.3g}, DFS {s['dfs']:.3g}"
@@ -211,12 +202,12 @@ def _moments(values: Array) -> tuple[float, float]:
     return float(values.mean()), float(values.std(ddof=1))
 
 
-def save(result: Result, path: str | Path) -> Path:
+def save(result: StoredResult, path: str | Path) -> Path:
     """Write ``path`` (NETCDF4); it appears complete or not at all. Raises :class:`OutputError`."""
     return write_bytes(path, to_bytes(result.tree))
 
 
-def load_result(path: str | Path) -> Result:
+def load_stored(path: str | Path) -> StoredResult:
     """Read a file of :func:`save` into memory and close it.
 
     Raises
@@ -234,4 +225,4 @@ def load_result(path: str | Path) -> Result:
     missing = [group for group in GROUPS if f"/{group}" not in nodes]
     if missing:
         raise OutputError(f"{path}: not a result of en4dvar: no group {', '.join(missing)}")
-    return Result(xr.DataTree.from_dict(nodes))
+    return StoredResult(xr.DataTree.from_dict(nodes))

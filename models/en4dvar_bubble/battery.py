@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.commands.hints import suggest
 from en4dvar.errors import En4dvarError
-from en4dvar.inputs.units import parse_unit
+from en4dvar.hints import suggest
 from en4dvar.state import Array
+from en4dvar.units import parse_unit
 from en4dvar_bubble.laws.base import GRID, ConstitutiveLaw
 from en4dvar_bubble.laws.response import Cycle, respond
 from en4dvar_bubble.laws.tabulate import differentiate

@@ -71,7 +71,7 @@ def _check(chosen: Sequence[ConstitutiveLaw]) -> list[str]:
 
 
 def _description(law: ConstitutiveLaw, in_full: bool) -> str:
-    from en4dvar.commands.describe import table
+    from en4dvar.tables import table
 
     rows = [
         (f"  {p.name}", p.unit, f"{p.bounds[0]:g} … {p.bounds[1]:g}", p.transform, p.label, p.source)

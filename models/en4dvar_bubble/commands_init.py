@@ -61,7 +61,7 @@ def init(
         return
     from en4dvar.config.json_schema import schema_text
     from en4dvar.errors import OutputError
-    from en4dvar.storage.files import write_text
+    from en4dvar.files import write_text
     from en4dvar_bubble.starter.config import propose_config, run_name
     from en4dvar_bubble.starter.page import SCHEMA_FILE, Source, yaml_text
     from en4dvar_bubble.starter.proposal import starter
@@ -87,7 +87,7 @@ def init(
 
 def _write_example(name: str, force: bool) -> None:
     from en4dvar.config.json_schema import schema_text
-    from en4dvar.storage.files import write_text
+    from en4dvar.files import write_text
     from en4dvar_bubble.examples import write_example
     from en4dvar_bubble.starter.page import SCHEMA_FILE
 
@@ -110,8 +110,8 @@ class _Asked:
 
 def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
     """Columns and units for ``propose_config``: by option, by a telling name, or asked for."""
-    from en4dvar.inputs.build import find_files
-    from en4dvar.inputs.units import convert
+    from en4dvar.config.build import find_files
+    from en4dvar.units import convert
 
     first, contents, decimal = _first_with_columns(list(find_files(Path.cwd(), [data]).values()))
     shown = {name: f"{len(v)} values, {_range(v)}" for name, v in contents.columns.items()}
@@ -206,7 +206,7 @@ def _ask_column(what: str, shown: Mapping[str, str]) -> str:
 
 
 def _ask_unit(column: str | None, shown: Mapping[str, str], dimension: str, examples: str) -> str:
-    from en4dvar.inputs.units import UnitError, convert
+    from en4dvar.units import UnitError, convert
 
     while True:
         unit = str(click.prompt(f"Unit of {column} ({shown.get(str(column), '')}), e.g. {examples}", err=True))

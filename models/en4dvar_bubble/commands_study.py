@@ -45,10 +45,10 @@ def sweep(
     import hashlib
 
     from en4dvar.config import load_config
-    from en4dvar.inputs.build import build
-    from en4dvar.inputs.units import UnitError, parse_quantity
+    from en4dvar.config.build import build
+    from en4dvar.files import write_text
     from en4dvar.runs.interrupt import tell_interrupt
-    from en4dvar.storage.files import write_text
+    from en4dvar.units import UnitError, parse_quantity
     from en4dvar_bubble.study.summary import sweep_csv, sweep_text
     from en4dvar_bubble.study.sweep import SweepSettings, prepare_folder, refinement_size, run_sweep
 

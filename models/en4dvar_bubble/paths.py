@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from en4dvar.ensemble.batch import Batch
+from en4dvar.batch import Batch
 from en4dvar.forward import Failure, Trajectory
 from en4dvar.state import Array, StateLayout
 from en4dvar_bubble.laws.base import GRID

@@ -16,10 +16,10 @@ from pydantic import (
     model_validator,
 )
 
-from en4dvar.commands.hints import suggest
 from en4dvar.errors import ConfigError
-from en4dvar.inputs.units import Quantity, parse_quantity
+from en4dvar.hints import suggest
 from en4dvar.state import Parameter
+from en4dvar.units import Quantity, parse_quantity
 from en4dvar_bubble.driving import Reading
 from en4dvar_bubble.driving.settings import DrivingSettings, Histotripsy, with_kind
 from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, get_law

@@ -20,10 +20,11 @@ import pytest
 from en4dvar import report
 from en4dvar.honesty import caution
 from en4dvar.report import overlay, write_report
+from en4dvar.report.compare import compare_runs
 from en4dvar.report.figures import all_figures
-from en4dvar.storage.compare import compare_runs
+from en4dvar.report.result import Result
 from en4dvar.storage.provenance import provenance
-from en4dvar.storage.store import Result, save
+from en4dvar.storage.store import save
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (

@@ -16,8 +16,8 @@ from en4dvar.cli import main
 from en4dvar.commands.run import _tell
 from en4dvar.config import load_config
 from en4dvar.honesty import caution
+from en4dvar.report.result import load_result
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
-from en4dvar.storage.store import load_result
 
 
 def call(*arguments: str | Path) -> Result:

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from en4dvar.analysis import Analysis
 from en4dvar.cli import main
-from en4dvar.problem import Analysis
-from en4dvar.storage.export import escaped, export_table, latex_unit
-from en4dvar.storage.store import Result as Posterior
-from en4dvar.storage.store import load_result, save
+from en4dvar.report.export import escaped, export_table, latex_unit
+from en4dvar.report.result import Result as Posterior
+from en4dvar.report.result import load_result
+from en4dvar.storage.store import save
 
 
 def call(*arguments: str | Path) -> Result:

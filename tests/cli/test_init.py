@@ -14,10 +14,10 @@ from scipy.io import savemat
 
 from en4dvar.cli import main
 from en4dvar.config import Config, load_config, resolve
+from en4dvar.config.build import build
 from en4dvar.config.document import parse_document, read_document
 from en4dvar.errors import DataError
-from en4dvar.inputs.build import build
-from en4dvar.storage.store import load_result
+from en4dvar.report.result import load_result
 from en4dvar_bubble import commands_init
 from en4dvar_bubble.laws import REGISTRY
 from en4dvar_bubble.starter.look import RAYLEIGH, lobe, look, noise

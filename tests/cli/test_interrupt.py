@@ -19,7 +19,7 @@ model: {name: lorenz96, size: 12}
 twin: {cycles: 5, burn_in: 1, interval: 0.05, error: {x_std: 1}, initial_std: {x: 0.1}}
 assimilation: {scheme: etkf, members: 15, inflation: 1.02}
 """
-EARLY = ("en4dvar.inputs.build.data_files", "en4dvar.runs.runner.build_one", "en4dvar.runs.runner.choose_executor")
+EARLY = ("en4dvar.config.build.data_files", "en4dvar.runs.runner.build_one", "en4dvar.runs.runner.choose_executor")
 BEGUN = (
     *(f"en4dvar.runs.runner.{step}" for step in ("identity", "provenance", "RunLog.write", "datasets")),
     *(f"en4dvar.runs.runner.{step}" for step in ("write_checkpoint", "summary_csv", "RunDirectory.publish")),

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from toy_config import csv_text, write_toy
 
+from en4dvar.analysis import Analysis, ChainRecord, StartRecord
 from en4dvar.config import load_config
 from en4dvar.errors import OutputError
-from en4dvar.problem import Analysis, ChainRecord, StartRecord
 from en4dvar.runs.progress import RunLog, describe, terminal_progress, time_left
 from en4dvar.runs.runner import run_campaign
 

@@ -26,14 +26,14 @@ def test_cli_and_package_import_nothing_heavy() -> None:
 
 
 def test_units_and_errors_need_no_pydantic() -> None:
-    assert not loaded("import en4dvar.inputs.units, en4dvar.errors").intersection({"pydantic", "numba", "scipy"})
+    assert not loaded("import en4dvar.units, en4dvar.errors").intersection({"pydantic", "numba", "scipy"})
 
 
 def test_public_names() -> None:
     names = [n for n in dir(en4dvar) if not n.startswith("__")]
     assert {"run", "load_config", "load_result", "Parameter", "ForwardModel"} <= set(names)
     import_module("en4dvar.runs.runner")  # a submodule must not take the place of a public name
-    import_module("en4dvar.ensemble.simulation")
+    import_module("en4dvar.runs.simulation")
     for name in names:
         value = getattr(en4dvar, name)
         assert not isinstance(value, types.ModuleType)

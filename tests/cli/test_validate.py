@@ -13,9 +13,10 @@ from toy_config import csv_text, write_toy
 import en4dvar
 from en4dvar.cli import main
 from en4dvar.config import load_config
-from en4dvar.inputs.build import build
+from en4dvar.config.build import build
+from en4dvar.descent.preview import preview
 from en4dvar.report.predictive import prior_predictive
-from en4dvar.runs.checks import preview, validate
+from en4dvar.runs.checks import validate
 
 ROOT = Path(__file__).resolve().parents[2]
 

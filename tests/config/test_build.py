@@ -8,8 +8,8 @@ from scipy.io import savemat
 from toy_config import csv_text, write_toy
 
 from en4dvar.config import load_config
+from en4dvar.config.build import build
 from en4dvar.errors import ConfigError, DataError
-from en4dvar.inputs.build import build
 
 
 def test_one_problem(tmp_path: Path) -> None:

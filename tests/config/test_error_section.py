@@ -9,10 +9,10 @@ from toy_config import csv_text, write_toy
 
 from en4dvar.cli import main
 from en4dvar.config import load_config
+from en4dvar.config.build import build
 from en4dvar.errors import ConfigError, DataError
-from en4dvar.inputs.build import build
+from en4dvar.report.result import load_result
 from en4dvar.storage.fingerprint import identity
-from en4dvar.storage.store import load_result
 
 ERROR = "position_std: 2 um"
 CORRELATED = (ERROR, "position_std: 2 um, correlation_time: 20 ms, time_std: 10 us")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, Field, ValidationError
 
-from en4dvar.inputs.units import Quantity, UnitError, convert, parse_quantity, parse_unit
+from en4dvar.units import Quantity, UnitError, convert, parse_quantity, parse_unit
 
 
 @pytest.mark.parametrize(

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from toys import Decay, Toy, Wave, make_problem
 
+from en4dvar.analysis import IterationRecord
 from en4dvar.assimilate import assimilate
 from en4dvar.descent.step_control import Point, Tangent, Trials, acceleration, line_search, run_searches
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.linalg import Hessian
 from en4dvar.executor import SerialExecutor
 from en4dvar.prior import PriorTerm
-from en4dvar.problem import AssimilationSettings, IterationRecord
+from en4dvar.problem import AssimilationSettings
 from en4dvar.schemes import Step, Weights
 from en4dvar.state import Parameter
 

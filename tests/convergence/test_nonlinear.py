@@ -7,9 +7,10 @@ import pytest
 from scipy.optimize import minimize
 from toys import Decay, Vectorised, Wave, make_problem
 
+from en4dvar.analysis import StartRecord
 from en4dvar.assimilate import assimilate, cost, log_posterior
 from en4dvar.prior import PriorTerm
-from en4dvar.problem import AssimilationSettings, StartRecord
+from en4dvar.problem import AssimilationSettings
 
 CONTROLS = ("line-search", "levenberg-marquardt", "full")
 

@@ -7,7 +7,8 @@ import re
 import pytest
 from doc_pages import ROOT, blocks
 
-from en4dvar.storage.store import Result, save
+from en4dvar.report.result import Result
+from en4dvar.storage.store import save
 
 PAGE = ROOT / "docs" / "reference_netcdf.md"
 

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from toys import Vectorised, make_problem
 
 from en4dvar.assimilate import assimilate, log_posterior
-from en4dvar.noise_scale import log_derivatives, scale_skewness
+from en4dvar.descent.noise_scale import log_derivatives, scale_skewness
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings
 from en4dvar.state import NOISE_SCALE

@@ -10,10 +10,10 @@ from run_files import configuration, make_campaign, run_cli
 from toy_config import csv_text
 
 from en4dvar.errors import DataError, TooFewMembersError
+from en4dvar.report.result import load_result
 from en4dvar.runs.campaign import Campaign, DatasetOutcome, file_names
 from en4dvar.runs.runner import report, run_campaign
 from en4dvar.storage.campaign_file import GROUPS
-from en4dvar.storage.store import load_result
 
 
 @pytest.fixture(scope="module")

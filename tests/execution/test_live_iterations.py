@@ -5,8 +5,8 @@ import re
 import pytest
 from run_files import assert_same_results, configuration, make_campaign
 
+from en4dvar.analysis import StartRecord
 from en4dvar.executor import choose_executor
-from en4dvar.problem import StartRecord
 from en4dvar.runs.runner import run_campaign
 
 

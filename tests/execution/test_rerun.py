@@ -5,9 +5,10 @@ from run_files import configuration, make_campaign, run_cli
 from toy_config import write_toy
 
 from en4dvar.errors import OutputError
+from en4dvar.report.result import load_result
 from en4dvar.runs.rerun import rerun
 from en4dvar.runs.runner import run, run_campaign
-from en4dvar.storage.store import load_result, save
+from en4dvar.storage.store import save
 
 
 @pytest.fixture

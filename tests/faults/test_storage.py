@@ -12,8 +12,8 @@ from rows import row
 from run_files import assert_same_results, configuration, interrupt, make_campaign, run_cli
 
 from en4dvar.errors import OutputError
+from en4dvar.report.result import load_result
 from en4dvar.runs.runner import report, run_campaign
-from en4dvar.storage.store import load_result
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ from en4dvar.config.document import read_document
 from en4dvar.config.synthetic import resolve_campaign
 from en4dvar.errors import ConfigError, DataError, En4dvarError
 from en4dvar.inputs.readers import Column, Matrix, Step, read_contents, read_covariance, read_series
-from en4dvar.inputs.units import UnitError, parse_quantity
+from en4dvar.report.result import load_result
 from en4dvar.runs.checks import validate
-from en4dvar.storage.store import load_result
+from en4dvar.units import UnitError, parse_quantity
 
 TIME, RADIUS = Column("t_us", "us", "s"), Column("R_um", "um", "m")
 LEAK = re.compile(r"Traceback|object at 0x|<class |NoneType|KeyError|AttributeError|not subscriptable")

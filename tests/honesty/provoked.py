@@ -7,10 +7,11 @@ from dataclasses import replace
 
 from toys import Decay, Fragile, Toy, Vectorised, Wave, make_problem
 
+from en4dvar.analysis import Analysis
 from en4dvar.assimilate import assimilate
 from en4dvar.forward import ValidityLimit
 from en4dvar.prior import PriorTerm
-from en4dvar.problem import Analysis, AssimilationSettings, InverseProblem
+from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.state import Parameter
 
 TWO = ("a", "b")

@@ -9,7 +9,7 @@ from honesty.provoked import decay_experiments, linear_experiments
 
 from en4dvar.assimilate import assimilate
 from en4dvar.config import load_config
-from en4dvar.inputs.build import build
+from en4dvar.config.build import build
 from en4dvar.problem import AssimilationSettings
 
 QUICKSTART = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"

@@ -13,8 +13,9 @@ from toy_config import csv_text, write_toy
 from toys import make_problem
 
 from en4dvar.honesty import CATALOGUE
+from en4dvar.report.result import Result, load_result
 from en4dvar.runs.runner import run_campaign
-from en4dvar.storage.store import Result, load_result, save
+from en4dvar.storage.store import save
 
 
 @pytest.fixture(scope="module")

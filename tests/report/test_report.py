@@ -22,12 +22,13 @@ from en4dvar.diagnostics import chi2_interval
 from en4dvar.errors import OutputError
 from en4dvar.executor import SerialExecutor, WorkerLostError
 from en4dvar.honesty import Caution
-from en4dvar.report import write_report
 from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import Entry, overview_figures, render_overview
 from en4dvar.report.page import judge_chi2
+from en4dvar.report.result import Result
+from en4dvar.runs.runner import write_report
 from en4dvar.storage.provenance import provenance
-from en4dvar.storage.store import Result, save
+from en4dvar.storage.store import save
 
 FIGURES = ("posterior", "history", "cost", "iterations", "pairs")
 VOID = {"meta", "link", "br", "img", "path", "use"}

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from en4dvar.cycling.moments import BLOCK, MomentsRecorder
+from en4dvar.cycling.rotation import Rotations, reflections, rotate
 from en4dvar.cycling.sequential import SequentialSettings
-from en4dvar.ensemble.inflation import Inflation, relaxation
 from en4dvar.ensemble.linalg import GRAM_LIMIT, Hessian, apply_weights, centre
-from en4dvar.ensemble.localisation import Localisation, distances, gaspari_cohn
-from en4dvar.ensemble.moments import BLOCK, MomentsRecorder
 from en4dvar.ensemble.near_prior import NearPrior
-from en4dvar.ensemble.rotation import Rotations, reflections, rotate
 from en4dvar.schemes import Evaluation, Weights, gauss_newton
 from en4dvar.schemes.ienks import IEnKS
+from en4dvar.schemes.inflation import Inflation, relaxation
+from en4dvar.schemes.localisation import Localisation, distances, gaspari_cohn
 
 RNG = np.random.default_rng
 

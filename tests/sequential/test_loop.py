@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from en4dvar.cycling.sequential import SequentialSettings, Series, run_sequential
-from en4dvar.ensemble.localisation import Localisation
 from en4dvar.errors import TooFewMembersError
 from en4dvar.forward import Failure, ForwardModel, Observable, StateField
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
+from en4dvar.schemes.localisation import Localisation
 from en4dvar.state import Field, StateLayout
 
 

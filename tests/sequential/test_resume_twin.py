@@ -14,16 +14,16 @@ from run_files import kill_after_writes, resumed_until_done, run_cli
 from twin_models import Ring
 
 from en4dvar.config import load_twin
+from en4dvar.cycling.moments import Moments
 from en4dvar.cycling.sequential import SequentialSettings, SequentialState, run_sequential
 from en4dvar.cycling.series import Series
-from en4dvar.ensemble.inflation import Inflation
-from en4dvar.ensemble.moments import Moments
 from en4dvar.errors import OutputError
 from en4dvar.forward import Failure
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.twin_run import run_twin
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
+from en4dvar.schemes.inflation import Inflation
 from en4dvar.storage.codec import decode, encode
 
 YAML = """\

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from en4dvar.cli import main
 from en4dvar.config import load_twin
-from en4dvar.storage.store import load_result
+from en4dvar.report.result import load_result
 
 PAGE = (Path(__file__).parents[2] / "docs" / "tutorial_own_forward_model.md").read_text(encoding="utf-8")
 FILES = dict(re.findall(r"```(?:python|yaml)\n# ([\w.]+)\n(.*?)```", PAGE, re.S))

@@ -11,13 +11,13 @@ import pytest
 from en4dvar.config import load_twin
 from en4dvar.cycling.sequential import SequentialSettings, run_sequential
 from en4dvar.cycling.twin import TwinExperiment, TwinResult, conduct, initial_ensemble, observe_truth
-from en4dvar.ensemble.inflation import Inflation
 from en4dvar.errors import En4dvarError
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.forward import ForwardModel, Observable, StateField
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
+from en4dvar.schemes.inflation import Inflation
 from en4dvar.state import Field, Parameter, StateLayout
 from en4dvar_lorenz import Lorenz63, Lorenz96
 from en4dvar_lorenz.lorenz63 import Lorenz63Settings

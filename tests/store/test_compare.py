@@ -14,9 +14,10 @@ from en4dvar.cli import main
 from en4dvar.errors import OutputError
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.report.compare import ALL, compare_runs, comparison_table, model_probabilities
 from en4dvar.report.overlay import overlay
-from en4dvar.storage.compare import ALL, compare_runs, comparison_table, model_probabilities
-from en4dvar.storage.store import Result, save
+from en4dvar.report.result import Result
+from en4dvar.storage.store import save
 
 
 def run_dir(path, names, seeds=(1,), std=0.1, wide=1.0):

@@ -11,9 +11,10 @@ import pytest
 import xarray as xr
 
 from en4dvar.errors import OutputError
+from en4dvar.report.result import Result, load_result
 from en4dvar.storage.provenance import git_commit, provenance
 from en4dvar.storage.seal import sealed
-from en4dvar.storage.store import Result, load_result, save
+from en4dvar.storage.store import save
 
 FAILED = 3
 GROUPS = {

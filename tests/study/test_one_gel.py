@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from en4dvar.config import load_config
-from en4dvar.inputs.build import build
+from en4dvar.config.build import build
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm, member_stream
 from en4dvar.state import Parameter

@@ -10,9 +10,9 @@ import pytest
 from scipy.stats import halfnorm, multivariate_normal, norm
 
 from en4dvar.config import load_config
+from en4dvar.config.build import build
 from en4dvar.ensemble.forecast import cost
 from en4dvar.errors import ConfigError
-from en4dvar.inputs.build import build
 from en4dvar.prior import Prior, PriorTerm, member_stream
 from en4dvar.state import Parameter
 from en4dvar_bubble.study.effort import Effort

@@ -14,8 +14,8 @@ import pytest
 from click.testing import CliRunner
 
 from en4dvar.config import load_config
+from en4dvar.config.build import build
 from en4dvar.errors import ConfigError, DataError, OutputError
-from en4dvar.inputs.build import build
 from en4dvar.observations import Observations
 from en4dvar_bubble.commands_study import sweep as sweep_command
 from en4dvar_bubble.study.nearest import best_over_shifts, targets

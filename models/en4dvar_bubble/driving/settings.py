@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from en4dvar.errors import En4dvarError
-from en4dvar.inputs.units import Quantity, convert
+from en4dvar.units import Quantity, convert
 from en4dvar_bubble.driving import pulses
 from en4dvar_bubble.driving.base import Driving
 from en4dvar_bubble.driving.tabulated import from_file

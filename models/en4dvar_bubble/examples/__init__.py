@@ -7,7 +7,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from en4dvar.errors import OutputError
-from en4dvar.storage.files import write_text
+from en4dvar.files import write_text
 
 EXAMPLES = ("quickstart",)
 

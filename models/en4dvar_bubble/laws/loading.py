@@ -11,8 +11,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from en4dvar.commands.hints import no_such_file, suggest
 from en4dvar.errors import ConfigError
+from en4dvar.hints import no_such_file, suggest
 from en4dvar_bubble.laws.base import FILE_MODULE, REGISTRY, ConstitutiveLaw, FileReference
 from en4dvar_bubble.laws.validity import check_law
 

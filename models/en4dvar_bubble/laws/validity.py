@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.commands.hints import suggest
 from en4dvar.errors import ConfigError
+from en4dvar.hints import suggest
 from en4dvar.state import Array, Parameter
 from en4dvar_bubble.laws.base import ConstitutiveLaw
 from en4dvar_bubble.laws.memory import MemoryVariable

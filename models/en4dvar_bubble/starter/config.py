@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from en4dvar.config import resolve
+from en4dvar.config.build import build_one, find_files
 from en4dvar.config.document import parse_document
 from en4dvar.errors import ConfigError, DataError
-from en4dvar.inputs.build import build_one, find_files
 from en4dvar.inputs.readers import Column, Step, read_series
 from en4dvar.inputs.text_table import Decimal
-from en4dvar.inputs.units import UnitError, parse_quantity, parse_unit
 from en4dvar.state import Array
+from en4dvar.units import UnitError, parse_quantity, parse_unit
 from en4dvar_bubble.starter.look import Start
 from en4dvar_bubble.starter.page import Source, yaml_text
 from en4dvar_bubble.starter.proposal import Proposal, propose

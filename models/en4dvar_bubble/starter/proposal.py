@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.errors import DataError
-from en4dvar.inputs.units import convert
 from en4dvar.state import Array, Parameter
+from en4dvar.units import convert
 from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.laws.parameters import R0, R_EQ, R_MAX
 from en4dvar_bubble.model import BubbleModel

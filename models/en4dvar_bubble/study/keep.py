@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 
 import yaml
 
+from en4dvar.config.build import data_files, inverse_plan
 from en4dvar.errors import OutputError
-from en4dvar.inputs.build import data_files, inverse_plan
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.storage.checkpoint import FOLDER, CheckpointError, digest, read_checkpoint, write_checkpoint
 from en4dvar.storage.fingerprint import Identity, identity

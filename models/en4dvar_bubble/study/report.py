@@ -10,8 +10,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from en4dvar.errors import OutputError
+from en4dvar.files import write_bytes, write_text
 from en4dvar.report.style import COLUMN, DARK, LIGHT, css_variables, inline_svg, save_figure
-from en4dvar.storage.files import write_bytes, write_text
 from en4dvar_bubble.study import measured, tables
 from en4dvar_bubble.study.evidence import DECISIVE, MISFIT, probability, verdict
 from en4dvar_bubble.study.figures import all_figures

@@ -11,14 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
+from en4dvar.analysis import Analysis
 from en4dvar.assimilate import assimilate
+from en4dvar.config.build import build
 from en4dvar.diagnostics import nrmse
 from en4dvar.errors import DataError
 from en4dvar.executor import make_executor
-from en4dvar.inputs.build import build
 from en4dvar.likelihood import log_normalisation
 from en4dvar.prior import Prior
-from en4dvar.problem import Analysis, InverseProblem
+from en4dvar.problem import InverseProblem
 from en4dvar.state import Array
 from en4dvar_bubble.study.evidence import Comparison, compare_laws
 from en4dvar_bubble.study.keep import Keep

@@ -13,7 +13,7 @@ from en4dvar.config.document import Document, override, read_document
 from en4dvar.config.schema import Name, QuantityText, Section
 from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, Fault
-from en4dvar.inputs.units import UnitError, parse_quantity
+from en4dvar.units import UnitError, parse_quantity
 from en4dvar_bubble.study.effort import Effort
 from en4dvar_bubble.study.paper import Model
 from en4dvar_bubble.study.sweep import SweepSettings

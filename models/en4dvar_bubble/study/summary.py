@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 
-from en4dvar.inputs.units import convert
+from en4dvar.units import convert
 from en4dvar_bubble.study.sweep import SweepResult
 
 

@@ -19,11 +19,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from en4dvar.errors import ConfigError, DataError, OutputError
+from en4dvar.files import atomic_path, write_text
 from en4dvar.forward import ForwardModel
 from en4dvar.prior import member_stream
 from en4dvar.problem import InverseProblem
 from en4dvar.state import TIME_SHIFT, Array, Parameter
-from en4dvar.storage.files import atomic_path, write_text
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.study.nearest import Targets, best_over_shifts, targets
 

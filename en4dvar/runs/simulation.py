@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar.config import Config, time_grid
+from en4dvar.config.build import data_files, read_observations, resolve_parameters
 from en4dvar.config.data import parse_spread
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import run_chunk
 from en4dvar.forward import Failure
-from en4dvar.inputs.build import data_files, read_observations, resolve_parameters
 from en4dvar.inputs.readers import Column
-from en4dvar.inputs.units import UnitError, convert
 from en4dvar.state import TIME_SHIFT, Array
+from en4dvar.units import UnitError, convert
 
 
 @dataclass(frozen=True)

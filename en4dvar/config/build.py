@@ -17,14 +17,14 @@ from en4dvar.config.data import DataPlan
 from en4dvar.config.parameters import Fixed, Uncertain, located
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.errors import ConfigError, DataError, Fault
+from en4dvar.files import readable
 from en4dvar.inputs.readers import SUFFIXES, Column, read_covariance, read_series
-from en4dvar.inputs.units import UnitError, convert
 from en4dvar.inputs.window import select
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.state import Array
-from en4dvar.storage.files import readable
+from en4dvar.units import UnitError, convert
 
 
 def build(config: Config) -> tuple[InverseProblem, ...]:

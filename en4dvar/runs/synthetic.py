@@ -19,11 +19,11 @@ from en4dvar.config.synthetic import CampaignPlan, GroupPlan
 from en4dvar.diagnostics import nrmse
 from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import run_chunk
+from en4dvar.files import write_text
 from en4dvar.forward import Failure
-from en4dvar.inputs.units import convert
 from en4dvar.prior import member_stream
 from en4dvar.state import TIME_SHIFT, Array
-from en4dvar.storage.files import write_text
+from en4dvar.units import convert
 
 ATTEMPTS = 100  # truths that cannot be integrated, or yield too few readings, are drawn again so often
 TRUTH = "truth.csv"

@@ -16,7 +16,7 @@ import numpy as np
 
 from en4dvar.errors import OutputError
 from en4dvar.state import Array
-from en4dvar.storage.store import ParameterSummary, Result, load_result
+from en4dvar.storage.store import ParameterSummary, StoredResult, load_stored
 
 UNDECIDABLE = 1.0  # difference of log-evidence
 ALL = "all data sets"
@@ -123,7 +123,7 @@ def compare_runs(runs: Sequence[str | Path]) -> Comparison:
     return Comparison(tuple(scores), estimates)
 
 
-def _difference(results: Mapping[str, Mapping[str, Result]]) -> str:
+def _difference(results: Mapping[str, Mapping[str, StoredResult]]) -> str:
     """Why the evidences of the runs do not compare; empty where all of them used the same data."""
     first, *others = results
     for name in others:
@@ -148,7 +148,7 @@ def model_probabilities(log_evidence: Array) -> Array:
 
 def comparison_table(comparison: Comparison) -> str:
     """What the terminal shows: one row a model and data set, and the verdict on each data set."""
-    from en4dvar.commands.describe import table
+    from en4dvar.tables import table
 
     header = ("data set", "run", "log-evidence", "difference", "probability", "chi2/K", "DFS", "p_WAIC", "NRMSE")
     rows = [
@@ -173,7 +173,7 @@ def comparison_table(comparison: Comparison) -> str:
 
 def estimates_table(comparison: Comparison) -> str:
     """Posterior mean, std and 5–95 % of every parameter, runs below each other, in display units."""
-    from en4dvar.commands.describe import table
+    from en4dvar.tables import table
 
     header = ("parameter", "unit", "data set", "run", "mean", "std", "5 %", "95 %")
     rows = [
@@ -198,14 +198,14 @@ def _labels(runs: Sequence[Path]) -> list[str]:
     return labels
 
 
-def _results(run: Path) -> dict[str, Result]:
+def _results(run: Path) -> dict[str, StoredResult]:
     """Data set → result of a run directory."""
     files = sorted((run / "datasets").glob("*.nc")) or [run / "posterior.nc"]
-    results = [load_result(file) for file in files]
+    results = [load_stored(file) for file in files]
     return {result.name: result for result in results}
 
 
-def _same_data(a: Result, b: Result) -> bool:
+def _same_data(a: StoredResult, b: StoredResult) -> bool:
     left, right = a.observed_data, b.observed_data
     if a.observable != b.observable or left.sizes["time"] != right.sizes["time"]:
         return False
@@ -219,7 +219,7 @@ def _same_data(a: Result, b: Result) -> bool:
     return all(np.allclose(left[n].values, right[n].values, rtol=1e-12, atol=0) for n in names)
 
 
-def _score(run: str, dataset: str, result: Result) -> ModelScore:
+def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:
     stats = result.sample_stats.attrs
     likelihood = result.dataset("log_likelihood")[result.observable].values[0]
     alive = result.sample_stats["active"].values.ravel().astype(bool)

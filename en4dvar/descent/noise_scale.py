@@ -20,7 +20,6 @@ import math
 
 import numpy as np
 
-from en4dvar.ensemble.forecast import has_noise_scale
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.state import NOISE_SCALE, Array
@@ -32,7 +31,7 @@ def mean_beyond_mode(problem: InverseProblem, mode: Array, posterior: Array, dfs
     ``posterior`` (N, n) are members whose covariance is C, ``dfs`` = tr (M + U) C; all in transformed space.
     """
     prior, name = problem.prior, NOISE_SCALE.name
-    if name not in prior.names or not has_noise_scale(problem):
+    if name not in prior.names or not problem.has_noise_scale:
         return np.zeros(len(mode))
     column = prior.names.index(name)
     anomalies = posterior - posterior.mean(axis=0)

@@ -1,4 +1,4 @@
-"""Tables of a run for other programs: CSV of summary or members, LaTeX for a paper; its report once more.
+"""Tables of a run for other programs: CSV of summary or members, LaTeX for a paper.
 
 netCDF needs no export: ``posterior.nc`` follows the ArviZ schema as it is.
 """
@@ -8,15 +8,16 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from en4dvar.errors import OutputError
+from en4dvar.report import summary_csv
 from en4dvar.report.text import number_like
-from en4dvar.storage.store import ParameterSummary, Result, load_result
+from en4dvar.storage.store import ParameterSummary, StoredResult, load_stored
 
 Kind = Literal["csv", "latex", "members"]
 _ESCAPES = {c: f"\\{c}" for c in "#$%&_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
@@ -39,25 +40,7 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
         return _members_csv(results(run_dir))
     if kind == "latex":
         return _latex([(r.name, r.summary()) for r in results(run_dir)])
-    from en4dvar.report import summary_csv
-
     return summary_csv(((r.name, r.summary(), r.cautions) for r in results(run_dir)), {})
-
-
-def write_report(run_dir: str | Path, datasets: Sequence[str] = ()) -> Path:
-    """Write the report of a run again from its netCDF files; returns the path of ``report.html``.
-
-    Parameters
-    ----------
-    datasets: of a campaign, data sets that get a page of their own in any case.
-
-    Raises
-    ------
-    OutputError: there is nothing to read, the directory is in use or cannot be written.
-    """
-    from en4dvar.runs.runner import report
-
-    return report(run_dir, datasets)
 
 
 def posterior_file(run_dir: str | Path) -> Path:
@@ -68,13 +51,13 @@ def posterior_file(run_dir: str | Path) -> Path:
     return path
 
 
-def results(run_dir: str | Path) -> Iterator[Result]:
+def results(run_dir: str | Path) -> Iterator[StoredResult]:
     """The posteriors of a run directory, one after the other. Raises :class:`OutputError`."""
     files = sorted((Path(run_dir) / "datasets").glob("*.nc")) or [posterior_file(run_dir)]
-    return (load_result(file) for file in files)
+    return (load_stored(file) for file in files)
 
 
-def _members_csv(found: Iterator[Result]) -> str:
+def _members_csv(found: Iterator[StoredResult]) -> str:
     """Living members; the header is that of the first data set, columns missing elsewhere stay empty."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -1,0 +1,139 @@
+"""Imports only point down: the order of the layers, and no circles between files."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# From the ground up. A file imports from its own layer and from those before it, type-checking imports included.
+# The modules of one line are a layer together; a package is a layer by itself.
+LAYERS = (
+    ("errors",),
+    ("state", "hints", "files", "tables"),
+    ("units", "prior", "forward", "observations"),
+    ("batch", "likelihood", "problem"),
+    ("diagnostics",),
+    ("executor",),
+    ("ensemble",),
+    ("honesty",),
+    ("analysis",),
+    ("schemes",),
+    ("descent",),
+    ("cycling",),
+    ("sampling",),
+    ("assimilate",),
+    ("inputs",),
+    ("config",),
+    ("storage",),
+    ("report",),
+    ("runs",),
+    ("commands",),
+    ("cli",),
+)
+FLOOR = {name: floor for floor, layer in enumerate(LAYERS) for name in layer}
+
+
+def modules(top: Path) -> dict[str, Path]:
+    """Dotted name → file of every module below a folder that lies on the import path."""
+    found = {}
+    for path in sorted(top.rglob("*.py")):
+        parts = path.relative_to(top.parent).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def imports(source: str, known: dict[str, Path]) -> set[str]:
+    """The modules of ``known`` that a file imports, at any depth of nesting and in any branch."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            submodules = {f"{node.module}.{alias.name}" for alias in node.names}
+            inside = submodules & known.keys()
+            found |= inside
+            if inside != submodules:
+                found.add(node.module)
+    return found & known.keys()
+
+
+def graph(top: Path) -> dict[str, set[str]]:
+    known = modules(top)
+    return {name: imports(path.read_text(encoding="utf-8"), known) - {name} for name, path in known.items()}
+
+
+def upward(arrows: dict[str, set[str]]) -> list[str]:
+    """Imports of the framework that do not point down."""
+    floor = {name: FLOOR[name.split(".")[1]] for name in arrows if "." in name}
+    return [
+        f"{name} -> {target}"
+        for name in floor
+        for target in sorted(arrows[name])
+        if target not in floor or floor[target] > floor[name]
+    ]
+
+
+def circle(arrows: dict[str, set[str]]) -> list[str]:
+    """Modules that import each other, directly or not: what is left when those are taken away, again and again, that
+    import none of the others or that none of the others imports.
+    """
+    left = {name: set(targets) for name, targets in arrows.items()}
+    while True:
+        imported = set().union(*left.values()) if left else set()
+        kept = {name for name, targets in left.items() if targets & left.keys() and name in imported}
+        if kept == left.keys():
+            return sorted(left)
+        left = {name: left[name] & kept for name in kept}
+
+
+def test_imports_of_the_framework_point_down():
+    assert upward(graph(ROOT / "en4dvar")) == []
+
+
+def test_no_layer_is_left_over():
+    present = {name.split(".")[1] for name in modules(ROOT / "en4dvar") if "." in name}
+    assert present == set(FLOOR)
+
+
+@pytest.mark.parametrize("package", ["en4dvar", *(p.name for p in sorted((ROOT / "models").glob("en4dvar_l*")))])
+def test_no_files_import_each_other_in_a_circle(package):
+    top = ROOT / package if package == "en4dvar" else ROOT / "models" / package
+    arrows = graph(top)
+    arrows.pop(package, None)  # the package's face, which only hands names on
+    assert circle(arrows) == []
+
+
+def test_only_the_command_line_imports_the_commands():
+    importers = {
+        name
+        for name, targets in graph(ROOT / "en4dvar").items()
+        if any(target.startswith("en4dvar.commands") for target in targets)
+    }
+    assert {name for name in importers if not name.startswith(("en4dvar.commands", "en4dvar.cli"))} == set()
+
+
+def test_an_upward_import_would_be_seen():
+    arrows = graph(ROOT / "en4dvar")
+    arrows["en4dvar.prior"] = arrows["en4dvar.prior"] | {"en4dvar.config.load"}
+    assert upward(arrows) == ["en4dvar.prior -> en4dvar.config.load"]
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "from en4dvar.config import load",
+        "import en4dvar.config.load",
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from en4dvar.config.load import Config",
+        "def f():\n    from en4dvar.config.load import Config",
+    ],
+)
+def test_every_kind_of_import_would_be_seen(source):
+    assert imports(source, modules(ROOT / "en4dvar")) == {"en4dvar.config.load"}
+
+
+def test_a_circle_would_be_seen():
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}, "e": set()}) == ["a", "b", "c"]
