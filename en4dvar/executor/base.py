@@ -14,8 +14,9 @@ from en4dvar.forward import Failure, ForwardModel
 from en4dvar.state import Array
 
 T = TypeVar("T")
-Hear = Callable[[int, Any], None]
-ATTEMPTS_ALONE = 2  # before a call is held responsible for the death of its worker
+Call = tuple[Any, ...]
+Tell = Callable[[Any], None]  # what a call says while it runs: a message
+Hear = Callable[[int, Any], None]  # who hears it: index of the call, message
 
 
 class WorkerLostError(Exception):
@@ -33,7 +34,7 @@ class Executor(ABC):
 
     @abstractmethod
     def map(
-        self, function: Callable[..., T], calls: Iterable[tuple[Any, ...]], hear: Hear | None = None
+        self, function: Callable[..., T], calls: Iterable[Call], hear: Hear | None = None
     ) -> Iterator[tuple[int, T | Exception]]:
         """``function(*call)`` of every call, as they end: (index of the call, value or what it raised).
 

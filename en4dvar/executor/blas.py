@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import functools
 import threading
-from contextlib import AbstractContextManager
-from typing import Any, ClassVar
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+_changing = threading.Lock()
+_held = False  # the limit belongs to the process: while one context holds it, those of any thread have nothing to do
 
 
 @functools.cache
@@ -15,36 +19,31 @@ def _controller() -> Any:
     return ThreadpoolController()  # looks through every loaded library: once is enough
 
 
-class OneThread(AbstractContextManager[None]):
-    """The limit belongs to the process: while one context holds it, others, of any thread, have nothing to do."""
-
-    _lock: ClassVar[threading.Lock] = threading.Lock()
-    _held: ClassVar[bool] = False
-
-    def __enter__(self) -> None:
-        self._limit: Any = None
-        with OneThread._lock:
-            if not OneThread._held:
-                self._limit = _controller().limit(limits=1, user_api="blas")
-                self._limit.__enter__()
-                OneThread._held = True
-
-    def __exit__(self, *error: object) -> None:
-        if self._limit is not None:
-            with OneThread._lock:
-                self._limit.__exit__(None, None, None)
-                OneThread._held = False
-
-
-def one_blas_thread() -> OneThread:
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
     """Context in which BLAS uses one thread.
 
     Where several threads enter, one context around all of them must stay open.
     """
-    return OneThread()
+    global _held
+    limit = None
+    with _changing:
+        if not _held:
+            limit = _controller().limit(limits=1, user_api="blas")
+            _held = True
+    try:
+        yield
+    finally:
+        if limit is not None:
+            with _changing:
+                limit.restore_original_limits()
+                _held = False
 
 
 @functools.cache
 def one_blas_thread_for_good() -> None:
     """For processes that serve nothing else."""
-    one_blas_thread().__enter__()
+    global _held
+    with _changing:
+        _controller().limit(limits=1, user_api="blas")
+        _held = True

@@ -18,17 +18,16 @@ import pickle
 import queue
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from en4dvar.executor.base import Executor, ExecutorError, Hear, T, WorkerLostError
+from en4dvar.executor.base import Call, ExecutorError, Hear, T, Tell, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
+from en4dvar.executor.futures import Events, FuturesExecutor
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster
-
-    News = queue.SimpleQueue[Future | tuple[int, Any]]  # calls that ended; what they tell
 
 TOPIC = "en4dvar"  # of events that calls tell; one for all runs, for a scheduler keeps the last events of each
 CONNECT_TIMEOUT = 15.0  # s
@@ -40,7 +39,7 @@ CLOSE_TIMEOUT = 10.0  # s; workers end by themselves when their scheduler is gon
 KILL_TIMEOUT = 0.5  # s for a worker of this machine to end by itself when it is killed
 
 
-class DaskExecutor(Executor):
+class DaskExecutor(FuturesExecutor):
     """Calls as tasks of dask.distributed.
 
     Parameters
@@ -64,8 +63,8 @@ class DaskExecutor(Executor):
         self._address, self._limits = address, limits
         self._cluster: LocalCluster | None = None
         self._client: Client | None = None
-        self._listening: dict[str, News] = {}  # for what the calls of a map tell
-        self._maps = itertools.count()
+        self._listening: dict[str, Tell] = {}  # for what calls tell, by their keys
+        self._calls = itertools.count()
         self._seen = time.monotonic()  # when there was a worker
         self._configured = contextlib.ExitStack()
         for name in (
@@ -100,71 +99,55 @@ class DaskExecutor(Executor):
             raise ExecutorError(f"dask scheduler {address or ''}: {message} ({error})") from None
 
     def map(
-        self, function: Callable[..., T], calls: Iterable[tuple[Any, ...]], hear: Hear | None = None
+        self, function: Callable[..., T], calls: Iterable[Call], hear: Hear | None = None
     ) -> Iterator[tuple[int, T | Exception]]:
-        news: News = queue.SimpleQueue()
-        name = f"{getattr(self._client, 'id', '')}-{next(self._maps)}"
-        if hear:
-            self._listening[name] = news
-        pending: dict[Any, tuple[int, tuple[Any, ...], Future]] = {}
-        following = enumerate(calls)
-        suspects: list[tuple[int, tuple[Any, ...]]] = []  # repeated when nothing else is under way
+        under_way: dict[int, Call] = {}
+        suspects: list[tuple[int, Call]] = []
 
-        def submit(i: int, call: tuple[Any, ...]) -> None:
-            future = self._submit(function, call, (name, i) if hear else None)
-            pending[future.key] = i, call, future
-            future.add_done_callback(news.put)
+        def remembered() -> Iterator[Call]:
+            for i, call in enumerate(calls):
+                under_way[i] = call
+                yield call
 
-        def ended() -> tuple[int, tuple[Any, ...], Any]:
-            future = self._next(news, hear)
-            i, call, _ = pending.pop(future.key)
-            return i, call, self._value(future)
-
-        try:
-            while True:
-                for i, call in itertools.islice(following, max(0, 2 * self.workers - len(pending))):
-                    submit(i, call)
-                if not pending:
-                    break
-                i, call, value = ended()
-                if isinstance(value, WorkerLostError):
-                    suspects.append((i, call))
-                else:
-                    yield i, value
-            for i, call in suspects:  # several workers died under it; calls around it may have been the reason
-                submit(i, call)
-                *_, value = ended()
+        for i, value in super().map(function, remembered(), hear):
+            call = under_way.pop(i)
+            if isinstance(value, WorkerLostError):
+                suspects.append((i, call))
+            else:
                 yield i, value
-        finally:
-            self._listening.pop(name, None)
-            for _, _, future in pending.values():
-                future.release()
+        for i, call in suspects:  # several workers died under it; calls around it may have been the reason
+            alone = None if hear is None else _heard_as(i, hear)
+            for _, value in super().map(function, [call], alone):
+                yield i, value
 
-    def _submit(self, function: Callable[..., T], call: tuple[Any, ...], listener: tuple[str, int] | None) -> Future:
+    def _submit(self, function: Callable[..., T], call: Call, tell: Tell | None) -> Future:
         if self._client is None or self._client.status != "running":
             raise self._lost()
-        return self._client.submit(_on_worker, self._limits, function, call, listener, pure=False)
+        key = f"en4dvar-{self._client.id}-{next(self._calls)}"
+        if tell:
+            self._listening[key] = tell
+        listener = key if tell else None
+        return self._client.submit(_on_worker, self._limits, function, call, listener, key=key, pure=False)
 
-    def _told(self, event: tuple[float, tuple[str, int, bytes]]) -> None:
+    def _told(self, event: tuple[float, tuple[str, bytes]]) -> None:
         """What a call tells, in dask's thread; calls of other runs tell it too."""
-        name, i, message = event[1]
-        if (news := self._listening.get(name)) is not None:
-            news.put((i, pickle.loads(message)))
+        key, message = event[1]
+        if (tell := self._listening.get(key)) is not None:
+            tell(pickle.loads(message))
 
-    def _next(self, news: News, hear: Hear | None) -> Future:
-        """The next future that ends. Raises :class:`ExecutorError` where the cluster is gone."""
+    def _next(self, events: Events) -> Any:
+        """Raises :class:`ExecutorError` where the cluster is gone."""
         self._seen = time.monotonic()
         while True:
             try:
-                item = news.get(timeout=POLL)
+                return events.get(timeout=POLL)
             except queue.Empty:
                 self._require_worker()
-                continue
-            if not isinstance(item, tuple):
-                return item
-            self._seen = time.monotonic()
-            if hear:
-                hear(*item)
+
+    def _give_up(self, futures: Collection[Future]) -> None:
+        for future in futures:
+            self._listening.pop(str(future.key), None)
+            future.release()
 
     def _value(self, future: Future) -> Any:
         """What the call gave or raised. Waits where the value was lost with its worker and is computed again.
@@ -173,6 +156,7 @@ class DaskExecutor(Executor):
         """
         from distributed import CancelledError, KilledWorker
 
+        self._listening.pop(str(future.key), None)
         self._seen = time.monotonic()
         while True:
             try:
@@ -228,9 +212,12 @@ def dask_setup(_: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _on_worker(
-    limits: Limits, function: Callable[..., T], call: tuple[Any, ...], listener: tuple[str, int] | None
-) -> T:
+def _heard_as(i: int, hear: Hear) -> Hear:
+    """What any call tells, heard as of call ``i``."""
+    return lambda _, message: hear(i, message)
+
+
+def _on_worker(limits: Limits, function: Callable[..., T], call: Call, listener: str | None) -> T:
     one_blas_thread_for_good()
     apply_limits(limits)
     if listener is None:
@@ -238,4 +225,4 @@ def _on_worker(
     from distributed import get_worker
 
     worker = get_worker()
-    return function(*call, lambda message: worker.log_event(TOPIC, (*listener, pickle.dumps(message))))
+    return function(*call, lambda message: worker.log_event(TOPIC, (listener, pickle.dumps(message))))

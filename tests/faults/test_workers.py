@@ -49,17 +49,17 @@ def slow(number):
 @pytest.fixture
 def reads_late(monkeypatch):
     """Within, a worker has filled its pipe, and is dead before the first byte is read."""
-    ready = ProcessesExecutor._ready
+    answer = _Worker.answer
 
-    def late(executor):
-        found = ready(executor)
+    def late(worker, tell=None):
+        worker.pipe.poll(None)
         time.sleep(1.0)
-        return found
+        return answer(worker, tell)
 
     @contextlib.contextmanager
     def within():
         with monkeypatch.context() as patch:
-            patch.setattr(ProcessesExecutor, "_ready", late)
+            patch.setattr(_Worker, "answer", late)
             yield
 
     return within
@@ -98,7 +98,7 @@ def test_only_the_calls_of_killed_workers_are_repeated():
         for i, value in executor.map(slow, [(j,) for j in range(60)]):
             found.append((i, value))
             if len(found) in (10, 30):
-                executor._crew.busy[0].process.kill()
+                [*executor._busy, *executor._idle][0].process.kill()
         assert sorted(found) == [(j, j) for j in range(60)]
 
 
@@ -175,7 +175,7 @@ def test_interrupted_workers_are_gone_at_once():
     calls = executor.map(time.sleep, [(0,), (600,), (600,)])
     next(calls)
     begin = time.monotonic()
-    processes = [worker.process for worker in executor._crew]
+    processes = [worker.process for worker in (*executor._idle, *executor._busy)]
     executor.kill()
     calls.close()
     assert time.monotonic() - begin < 20

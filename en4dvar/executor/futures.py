@@ -1,0 +1,95 @@
+"""What executors have in common whose calls run elsewhere and end as futures: in threads, processes, a cluster."""
+
+from __future__ import annotations
+
+import itertools
+import queue
+from abc import abstractmethod
+from collections.abc import Callable, Collection, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from en4dvar.executor.base import Call, Executor, Hear, T, Tell
+
+Events = queue.SimpleQueue[Any]  # futures that ended, and (index, message) of what calls tell
+
+
+class FuturesExecutor(Executor):
+    """Keeps two calls a worker under way; what they tell and their ends arrive in one queue, in order.
+
+    A future is anything with ``add_done_callback``.
+    """
+
+    def map(
+        self, function: Callable[..., T], calls: Iterable[Call], hear: Hear | None = None
+    ) -> Iterator[tuple[int, T | Exception]]:
+        events: Events = queue.SimpleQueue()
+        following = enumerate(calls)
+        pending: dict[Any, int] = {}
+
+        def telling(i: int) -> Tell:
+            return lambda message: events.put((i, message))
+
+        try:
+            while True:
+                for i, call in itertools.islice(following, max(0, 2 * self.workers - len(pending))):
+                    future = self._submit(function, call, telling(i) if hear else None)
+                    pending[future] = i
+                    future.add_done_callback(events.put)
+                if not pending:
+                    return
+                event = self._next(events)
+                if isinstance(event, tuple):
+                    if hear:
+                        hear(*event)
+                    continue
+                i = pending.pop(event)
+                yield i, self._value(event)
+        finally:
+            self._give_up(pending)
+
+    @abstractmethod
+    def _submit(self, function: Callable[..., T], call: Call, tell: Tell | None) -> Any:
+        """The future of ``function(*call)``, or of ``function(*call, tell)``."""
+
+    def _next(self, events: Events) -> Any:
+        """Waits for the next event."""
+        return events.get()
+
+    @abstractmethod
+    def _value(self, future: Any) -> Any:
+        """What the call of a future that ended gave or raised."""
+
+    @abstractmethod
+    def _give_up(self, futures: Collection[Any]) -> None:
+        """Nobody waits any more for what these calls give."""
+
+
+class PoolExecutor(FuturesExecutor):
+    """Calls in threads of this process, which are started at first use and live until :meth:`close`."""
+
+    def __init__(self, workers: int):
+        if workers < 1:
+            raise ValueError(f"workers must be at least 1, not {workers}")
+        self.workers = workers
+        self._pool: ThreadPoolExecutor | None = None
+
+    def _submit(self, function: Callable[..., T], call: Call, tell: Tell | None) -> Future[T]:
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(self.workers, thread_name_prefix="en4dvar")
+        return self._pool.submit(function, *call, *([tell] if tell else []))
+
+    def _value(self, future: Future[T]) -> T | Exception:
+        try:
+            return future.result()
+        except Exception as error:
+            return error
+
+    def _give_up(self, futures: Collection[Future[Any]]) -> None:
+        for future in futures:
+            future.cancel()
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+            self._pool = None
