@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from en4dvar.analysis import IterationRecord, Progress, Record
@@ -16,44 +15,59 @@ from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.executor import Executor
 from en4dvar.honesty import Caution
 from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.storage.checkpoint import Keeper
+from en4dvar.storage.checkpoint import Keeper, digest
 from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import to_bytes
 from en4dvar.storage.store import ParameterSummary, summarise
 
-TELL_EVERY = 0.1  # s; a worker sends no more often what its iterations have to tell
-News = tuple[tuple[str, Record], ...]
+SEND_EVERY = 0.1  # s; a worker sends the records of its iterations no more often
+Records = tuple[tuple[str, Record], ...]  # each with the name of its data set
 
 
 @dataclass(frozen=True)
 class Job:
     """Everything that the estimate of one data set needs; picklable, so that it can be made anywhere.
 
-    ``attributes`` go into the file. ``checkpoint`` is where the state of the iterations is kept, at most every
-    ``checkpoint_every`` seconds; a worker that does not see that folder keeps none. ``resume`` is where to start.
-    ``stop`` gives the job up after the iteration under way (within one process only).
+    ``attributes`` go into the file. ``keeper`` keeps the state of the iterations; a worker that does not see its folder
+    keeps none. ``resume`` is where to start. ``stop`` gives the job up after the iteration under way (within one
+    process only).
     """
 
     problem: InverseProblem
     settings: AssimilationSettings
     seed: int
     attributes: Mapping[str, Any]
-    fingerprint: str = ""
-    checkpoint: Path | None = None
-    checkpoint_every: float = 0.0
+    keeper: Keeper | None = None
     resume: LoopState | None = None
     stop: threading.Event | None = None
+
+    def keep(self, state: Callable[[], LoopState]) -> None:
+        """Keep the state of the iterations. Raises :class:`StoppedError` where the job was given up."""
+        if self.stop is not None and self.stop.is_set():
+            raise StoppedError
+        if self.keeper is not None and self.keeper.path.parent.is_dir():
+            self.keeper.keep(state)
+
+
+@dataclass(frozen=True)
+class Done:
+    """How a data set ended: SHA-256 of its netCDF file, or the reason of its failure."""
+
+    sha256: str
+    failure: str = ""
+    exit_code: int = 0
+    warnings: tuple[Caution, ...] = ()
+    n_observations: int = 0
+    summary: tuple[ParameterSummary, ...] = ()
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """``content`` is the netCDF file; ``ending`` how the iterations ended."""
+    """``content`` is the netCDF file; ``ending`` tells how the iterations ended."""
 
     content: bytes
     ending: str
-    summary: tuple[ParameterSummary, ...]
-    warnings: tuple[Caution, ...]
-    n_observations: int
+    done: Done
 
 
 class StoppedError(Exception):
@@ -67,30 +81,34 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
     ------
     TooFewMembersError: the ensemble is lost. OutputError: a checkpoint cannot be written.
     """
-    analysis = assimilate(job.problem, job.settings, job.seed, executor, progress, job.resume, keep=_checkpoints(job))
+    analysis = assimilate(job.problem, job.settings, job.seed, executor, progress, job.resume, keep=job.keep)
+    content = to_bytes(build_groups(analysis, job.attributes))
     outcome = "converged" if analysis.converged else "not converged"
     return Estimate(
-        content=to_bytes(build_groups(analysis, job.attributes)),
-        summary=summarise(analysis),
+        content=content,
         ending=f"{outcome}: {analysis.stop_reason}; {analysis.forward_runs} forward runs",
-        warnings=analysis.cautions,
-        n_observations=len(analysis.observations),
+        done=Done(
+            digest(content),
+            warnings=analysis.cautions,
+            n_observations=len(analysis.observations),
+            summary=summarise(analysis),
+        ),
     )
 
 
-def estimate_and_tell(job: Job, tell: Callable[[News], None]) -> Estimate:
-    """As :func:`estimate`, on a worker: ``tell`` gets the iterations, without their members, as they end."""
-    teller = _Teller(tell)
+def estimate_and_tell(job: Job, tell: Callable[[Records], None]) -> Estimate:
+    """As :func:`estimate`, on a worker: ``tell`` gets the records, without their members, as iterations end."""
+    sender = _Sender(tell)
     try:
-        return estimate(job, None, teller)
+        return estimate(job, None, sender)
     finally:
-        teller.close()
+        sender.close()
 
 
-class _Teller:
-    """Passes iterations on at once, or, where the last message is too young, as soon as it is old enough."""
+class _Sender:
+    """Sends records at once, or, where the last message is too young, as soon as it is old enough."""
 
-    def __init__(self, tell: Callable[[News], None]):
+    def __init__(self, tell: Callable[[Records], None]):
         self._tell, self._lock = tell, threading.Lock()
         self._waiting: list[tuple[str, Record]] = []
         self._sent = -math.inf
@@ -101,7 +119,7 @@ class _Teller:
             record = replace(record, members=record.members[:0])
         with self._lock:
             self._waiting.append((name, record))
-            rest = self._sent + TELL_EVERY - time.monotonic()
+            rest = self._sent + SEND_EVERY - time.monotonic()
             if rest <= 0:
                 self._send()
             elif self._timer is None:
@@ -125,16 +143,3 @@ class _Teller:
             self._tell(tuple(self._waiting))
             self._waiting.clear()
             self._sent = time.monotonic()
-
-
-def _checkpoints(job: Job) -> Callable[[Callable[[], LoopState]], None]:
-    path = job.checkpoint if job.checkpoint is not None and job.checkpoint.parent.is_dir() else None
-    keeper = None if path is None else Keeper(path, job.fingerprint, job.checkpoint_every)
-
-    def keep(now: Callable[[], LoopState]) -> None:
-        if job.stop is not None and job.stop.is_set():
-            raise StoppedError
-        if keeper is not None:
-            keeper.keep(now)
-
-    return keep

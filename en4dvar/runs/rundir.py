@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -48,15 +48,12 @@ class RunDirectory:
             written, or holds a foreign file where the run would write its own.
         """
         path = Path(path)
-        missing = not path.is_dir()
-        if mode in ("resume", "report") and missing:
+        if mode in ("resume", "report") and not path.is_dir():
             raise OutputError(f"{path}: no such run directory")
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be used as run directory: {error.strerror or error}") from None
-        with locked(path):
+        with ExitStack() as held:
             try:
+                path.mkdir(parents=True, exist_ok=True)
+                held.enter_context(locked(path))
                 directory = cls(path, _prepare(path, mode))
             except OSError as error:
                 raise OutputError(f"{path}: cannot be used as run directory: {error.strerror or error}") from None
@@ -64,10 +61,9 @@ class RunDirectory:
 
     def claim(self, *names: str) -> Path:
         """List files (relative names) as written by this run; returns the path of the last one."""
-        known = self.files()
+        known = _listed(self.work)
         if set(names) - set(known):
-            listed = dict.fromkeys([*known, *names])
-            write_text(self.work / LISTING, "".join(f"{name}\n" for name in listed))
+            _list(self.work, dict.fromkeys([*known, *names]))
         return self.work / names[-1] if names else self.work
 
     def folder(self, name: str) -> Path:
@@ -78,13 +74,17 @@ class RunDirectory:
             raise OutputError(f"{self.work / name}: cannot be created: {error.strerror}") from None
         return self.work / name
 
-    def claim_folder(self, name: str, before: frozenset[Path]) -> None:
-        """List the files of folder ``name`` that were not there ``before``."""
-        self.claim(*sorted(p.relative_to(self.work).as_posix() for p in self.listing(name) - before))
+    @contextmanager
+    def claiming(self, *folders: str) -> Iterator[None]:
+        """List the files that appear in ``folders`` within, also where that fails."""
+        before = self._inside(folders)
+        try:
+            yield
+        finally:
+            self.claim(*sorted(p.relative_to(self.work).as_posix() for p in self._inside(folders) - before))
 
-    def listing(self, name: str) -> frozenset[Path]:
-        """The files of folder ``name`` now."""
-        return frozenset(p for p in (self.work / name).glob("*") if p.is_file())
+    def _inside(self, folders: Iterable[str]) -> set[Path]:
+        return {p for folder in folders for p in (self.work / folder).glob("*") if p.is_file()}
 
     def remove(self, name: str) -> None:
         """Remove a file if it is there. Raises :class:`OutputError`."""
@@ -93,14 +93,9 @@ class RunDirectory:
         except OSError as error:
             raise OutputError(f"{self.work / name}: cannot be removed: {error.strerror}") from None
 
-    def files(self) -> tuple[str, ...]:
-        """Relative names of the files that a run wrote."""
-        return _listed(self.work)
-
     def publish(self) -> None:
         """The run is complete: where it replaces an earlier one, take its place. Raises :class:`OutputError`."""
-        there = [name for name in self.files() if (self.work / name).exists()]
-        write_text(self.work / LISTING, "".join(f"{name}\n" for name in there))
+        _list(self.work, [name for name in _listed(self.work) if (self.work / name).exists()])
         if self.work != self.path:
             write_text(self.work / COMPLETE, "")
             try:
@@ -138,7 +133,7 @@ def _prepare(path: Path, mode: Mode) -> Path:
     if any((path / name).exists() for name in listed):
         work = following
         work.mkdir()
-    write_text(work / LISTING, "")
+    _list(work, ())
     return work
 
 
@@ -151,7 +146,7 @@ def _replace_earlier_run(path: Path) -> None:
         if (following / name).exists():
             (path / name).parent.mkdir(parents=True, exist_ok=True)
             (following / name).replace(path / name)
-    write_text(path / LISTING, "".join(f"{name}\n" for name in names))
+    _list(path, names)
     following.rename(path / OLD)  # at once: half of this folder would look like an interrupted run
     _remove_folder(path / OLD)
 
@@ -177,6 +172,10 @@ def _remove_partial(work: Path) -> None:
         for file in folder.glob(".*.tmp"):
             if _PARTIAL.fullmatch(file.name):
                 file.unlink()
+
+
+def _list(work: Path, names: Iterable[str]) -> None:
+    write_text(work / LISTING, "".join(f"{name}\n" for name in names))
 
 
 def _listed(work: Path) -> tuple[str, ...]:

@@ -15,8 +15,9 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 from en4dvar.errors import OutputError
 from en4dvar.files import atomic_path
@@ -45,6 +46,7 @@ def write_checkpoint(path: Path, fingerprint: str, content: object) -> None:
         partial.write_bytes(f"{head}\n".encode("ascii") + payload)
 
 
+@dataclass
 class Keeper:
     """Keeps the latest state of a computation in a file, flushed to the disk: neither a kill nor a loss of power takes
     more than what was done since.
@@ -53,14 +55,17 @@ class Keeper:
     ``every`` 0 each one is.
     """
 
-    SHARE = 0.05
+    path: Path
+    fingerprint: str
+    every: float
+    _next: float | None = None  # on this machine's clock, so that it is set where states are kept
 
-    def __init__(self, path: Path, fingerprint: str, every: float):
-        self.path, self.fingerprint, self.every = path, fingerprint, every
-        self._next = time.monotonic() + every
+    SHARE: ClassVar[float] = 0.05
 
     def keep(self, state: Callable[[], object]) -> None:
         """Write what ``state`` gives where the time has come. Raises :class:`OutputError`."""
+        if self._next is None:
+            self._next = time.monotonic() + self.every
         if time.monotonic() >= self._next:
             self.write(state())
 

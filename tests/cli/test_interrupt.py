@@ -21,9 +21,9 @@ assimilation: {scheme: etkf, members: 15, inflation: 1.02}
 """
 EARLY = ("en4dvar.config.build.data_files", "en4dvar.runs.runner.build_one", "en4dvar.runs.runner.choose_executor")
 BEGUN = (
-    *(f"en4dvar.runs.runner.{step}" for step in ("identity", "provenance", "RunLog.write", "datasets")),
-    *(f"en4dvar.runs.runner.{step}" for step in ("write_checkpoint", "summary_csv", "RunDirectory.publish")),
-    *(f"en4dvar.runs.twin_run.{step}" for step in ("provenance", "conduct", "RunDirectory.publish")),
+    *(f"en4dvar.runs.session.{step}" for step in ("identity", "provenance", "RunLog.write", "write_checkpoint")),
+    *(f"en4dvar.runs.runner.{step}" for step in ("datasets", "summary_csv", "RunDirectory.publish")),
+    *(f"en4dvar.runs.twin_run.{step}" for step in ("dataset", "conduct", "RunDirectory.publish")),
 )
 pytestmark = pytest.mark.parametrize("before", ["", "--force", "--resume"])  # a first run, or one after another
 
