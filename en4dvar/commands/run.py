@@ -62,12 +62,12 @@ def run(
     from en4dvar.config.build import data_files, inverse_plan
     from en4dvar.executor import available_cores
     from en4dvar.runs.progress import terminal_progress
-    from en4dvar.runs.runner import execute
+    from en4dvar.runs.runner import run_campaign
 
     words = command_words()
     try:
         with terminal_progress(len(data_files(inverse_plan(loaded)))) as progress:
-            campaign = execute(
+            campaign = run_campaign(
                 loaded, force=force, resume=resume, progress=progress, command=shlex.join(words),
                 report_workers=loaded.execution.workers or available_cores(),
             )  # fmt: skip

@@ -19,17 +19,19 @@ _LONGEST = 120  # bytes; file systems allow 255, and temporary names are longer
 
 @dataclass(frozen=True)
 class DatasetOutcome:
-    """``file`` is the posterior's netCDF, or None where ``failure`` says why there is none.
+    """``file`` is the posterior's netCDF, with its ``sha256``, or None where ``failure`` says why there is none.
 
     ``exit_code`` is that of the failure (1, 2 or 3), 0 where there is none.
     """
 
     name: str
-    file: Path | None
+    file: Path | None = None
     failure: str = ""
     exit_code: int = 0
     warnings: tuple[Caution, ...] = ()
     summary: tuple[ParameterSummary, ...] = ()
+    n_observations: int = 0
+    sha256: str = ""
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,12 @@ from typing import Any
 from en4dvar.analysis import IterationRecord, Progress, Record
 from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.executor import Executor
-from en4dvar.honesty import Caution
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.runs.campaign import DatasetOutcome
 from en4dvar.storage.checkpoint import Keeper, digest
 from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import to_bytes
-from en4dvar.storage.store import ParameterSummary, summarise
+from en4dvar.storage.store import summarise
 
 SEND_EVERY = 0.1  # s; a worker sends the records of its iterations no more often
 Records = tuple[tuple[str, Record], ...]  # each with the name of its data set
@@ -50,24 +50,12 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Done:
-    """How a data set ended: SHA-256 of its netCDF file, or the reason of its failure."""
-
-    sha256: str
-    failure: str = ""
-    exit_code: int = 0
-    warnings: tuple[Caution, ...] = ()
-    n_observations: int = 0
-    summary: tuple[ParameterSummary, ...] = ()
-
-
-@dataclass(frozen=True)
 class Estimate:
     """``content`` is the netCDF file; ``ending`` tells how the iterations ended."""
 
     content: bytes
     ending: str
-    done: Done
+    outcome: DatasetOutcome
 
 
 class StoppedError(Exception):
@@ -83,17 +71,15 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
     """
     analysis = assimilate(job.problem, job.settings, job.seed, executor, progress, job.resume, keep=job.keep)
     content = to_bytes(build_groups(analysis, job.attributes))
-    outcome = "converged" if analysis.converged else "not converged"
-    return Estimate(
-        content=content,
-        ending=f"{outcome}: {analysis.stop_reason}; {analysis.forward_runs} forward runs",
-        done=Done(
-            digest(content),
-            warnings=analysis.cautions,
-            n_observations=len(analysis.observations),
-            summary=summarise(analysis),
-        ),
+    outcome = DatasetOutcome(
+        analysis.name,
+        warnings=analysis.cautions,
+        summary=summarise(analysis),
+        n_observations=len(analysis.observations),
+        sha256=digest(content),
     )
+    converged = "converged" if analysis.converged else "not converged"
+    return Estimate(content, f"{converged}: {analysis.stop_reason}; {analysis.forward_runs} forward runs", outcome)
 
 
 def estimate_and_tell(job: Job, tell: Callable[[Records], None]) -> Estimate:

@@ -29,26 +29,22 @@ def locked(directory: Path) -> Iterator[None]:
 
     Raises
     ------
-    OutputError: another run holds it (says which process on which machine), or the directory cannot be written.
+    OutputError: another run holds it (says which process on which machine). OSError: the directory cannot be written.
     """
     file = _acquire(directory)
     try:
         yield
     finally:
-        with suppress(OSError):  # the directory may have been removed, and made again by another run
-            if os.path.samestat(os.fstat(file.fileno()), (directory / LOCK).stat()):
+        if _is_at(file, directory / LOCK):
+            with suppress(OSError):
                 (directory / LOCK).unlink()
         file.close()
 
 
 def _acquire(directory: Path) -> IO[str]:
-    path = directory / LOCK
-    patience = time.monotonic() + PATIENCE
+    path, patience = directory / LOCK, time.monotonic() + PATIENCE
     while True:
-        try:
-            file = path.open("a+", encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"{directory}: cannot be used as run directory: {error.strerror or error}") from None
+        file = path.open("a+", encoding="utf-8")
         try:
             _lock(file)
         except OSError as error:
@@ -56,22 +52,25 @@ def _acquire(directory: Path) -> IO[str]:
                 file.seek(0)
                 owner = file.read().strip() or _OTHER
                 file.close()
-                if _is_dead(owner) and time.monotonic() < patience:
-                    time.sleep(0.02)
-                    continue
-                raise OutputError(
-                    f"{directory}: in use by {owner}; wait for it to end, or give another --out"
-                ) from None
-        try:
-            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                break
-        except FileNotFoundError:
-            pass
+                if not _is_dead(owner) or time.monotonic() > patience:
+                    advice = "wait for it to end, or give another --out"
+                    raise OutputError(f"{directory}: in use by {owner}; {advice}") from None
+                time.sleep(0.02)
+                continue
+        if _is_at(file, path):
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+            file.flush()
+            return file
         file.close()  # the run before removed the file between our opening and locking it
-    file.truncate(0)
-    file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-    file.flush()
-    return file
+
+
+def _is_at(file: IO[str], path: Path) -> bool:
+    """Whether the open file is the one at ``path``, which another run may have removed, and made again."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except OSError:
+        return False
 
 
 def _is_dead(owner: str) -> bool:

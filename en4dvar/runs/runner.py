@@ -15,9 +15,8 @@ from en4dvar.executor import Executor, choose_executor, one_blas_thread
 from en4dvar.files import write_text
 from en4dvar.report import summary_csv, write_pages
 from en4dvar.report.result import Result
-from en4dvar.runs.campaign import Campaign
+from en4dvar.runs.campaign import Campaign, DatasetOutcome
 from en4dvar.runs.interrupt import terminate_as_interrupt
-from en4dvar.runs.jobs import Done
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.runs.session import directory_mode, session
 from en4dvar.runs.worklist import Worklist, datasets
@@ -54,7 +53,7 @@ def run(
     found = len(data_files(inverse_plan(config)))
     if found != 1:
         raise ConfigError(f"data.path names {found} data sets; use run_campaign, or name one")
-    (result,) = execute(config, force=force, resume=resume, progress=progress, command=command)
+    (result,) = run_campaign(config, force=force, resume=resume, progress=progress, command=command)
     return result
 
 
@@ -66,33 +65,20 @@ def run_campaign(
     resume: bool = False,
     progress: Progress | None = None,
     command: str = "",
+    report_workers: int = 1,
 ) -> Campaign:
     """As :func:`run`, for any number of data sets, each estimated by itself.
 
     A data set that cannot be read or loses its ensemble does not end the campaign: it is named with its reason in
     ``Campaign.failures``, in ``summary.csv`` and in the log.
-    """
-    config = _loaded(config, overrides)
-    return execute(config, force=force, resume=resume, progress=progress, command=command)
-
-
-def execute(
-    config: Config,
-    *,
-    force: bool = False,
-    resume: bool = False,
-    progress: Progress | None = None,
-    command: str = "",
-    report_workers: int = 1,
-) -> Campaign:
-    """Assimilate the data sets of ``config`` and write its run directory; arguments and errors as in :func:`run`.
 
     ``report_workers``: processes that draw the report. They import the main script, which must guard what it does then.
     """
+    config = _loaded(config, overrides)
     mode = directory_mode(force, resume)
     files = data_files(inverse_plan(config))
     _require_one_usable(config, files)
-    ended: dict[str, Done] = {}
+    ended: dict[str, DatasetOutcome] = {}
 
     def kept() -> str:
         if resume and not ended:  # stopped, perhaps, before it was read what had been done

@@ -6,7 +6,7 @@ import threading
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from en4dvar.analysis import ChainRecord, Progress, Record, StartRecord
@@ -17,7 +17,7 @@ from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
 from en4dvar.files import readable, write_bytes
 from en4dvar.runs.campaign import DatasetOutcome, file_names
-from en4dvar.runs.jobs import Done, Estimate, Job, Records, estimate, estimate_and_tell
+from en4dvar.runs.jobs import Estimate, Job, Records, estimate, estimate_and_tell
 from en4dvar.runs.progress import LiveProgress, describe
 from en4dvar.runs.session import Session
 from en4dvar.storage.checkpoint import FOLDER, CheckpointError, Keeper, file_digest, read_checkpoint, write_checkpoint
@@ -61,7 +61,7 @@ class Worklist:
         run: Session,
         sets: tuple[Dataset, ...],
         progress: Progress | None,
-        ended: dict[str, Done],
+        ended: dict[str, DatasetOutcome],
     ):
         self.config, self.run, self.sets, self.progress, self.ended = config, run, sets, progress, ended
         self.stop = threading.Event()
@@ -69,18 +69,8 @@ class Worklist:
 
     def outcomes(self) -> tuple[DatasetOutcome, ...]:
         """What came of each data set, in order."""
-        return tuple(
-            DatasetOutcome(
-                d.name,
-                None if done.failure else self.run.directory.path / d.file,
-                done.failure,
-                done.exit_code,
-                done.warnings,
-                done.summary,
-            )
-            for d in self.sets
-            if (done := self.ended.get(d.name)) is not None
-        )
+        folder, ended = self.run.directory.path, [(d, self.ended[d.name]) for d in self.sets if d.name in self.ended]
+        return tuple(one if one.failure else replace(one, file=folder / d.file) for d, one in ended)
 
     def failed_earlier(self) -> dict[str, str]:
         """The data sets that have failed in the run that is resumed, and the records of it."""
@@ -89,7 +79,7 @@ class Worklist:
         for d in self.sets:
             if earlier is not None and d.name in earlier.content:
                 with suppress(CheckpointError):
-                    done = read_checkpoint(self.run.directory.work / d.done, earlier.of_dataset(d.name), Done)
+                    done = read_checkpoint(self.run.directory.work / d.done, earlier.of_dataset(d.name), DatasetOutcome)
                     if done is not None and done.failure:
                         failed[d.name] = d.done
         return failed
@@ -98,7 +88,7 @@ class Worklist:
         """Take over what an earlier run finished; what cannot be trusted is estimated again."""
         directory = self.run.directory
         for d in self.sets:
-            done = self.run.restore(d.done, self._fingerprint(d), Done, f"{d.name} is estimated again")
+            done = self.run.restore(d.done, self._fingerprint(d), DatasetOutcome, f"{d.name} is estimated again")
             if done is None:
                 continue
             if file_digest(directory.work / d.file) == done.sha256:
@@ -182,10 +172,10 @@ class Worklist:
             self.progress(name, record)
 
     def _keep(self, d: Dataset, value: Estimate) -> None:
-        warnings = [f"{warning.severity}: {warning}" for warning in value.done.warnings]
+        warnings = [f"{warning.severity}: {warning}" for warning in value.outcome.warnings]
         self.run.log.write("\n".join(f"{d.name}: {line}" for line in (value.ending, *warnings)))
         write_bytes(self.run.directory.work / d.file, value.content)
-        self._end(d, value.done)
+        self._end(d, value.outcome)
 
     def _fail(self, d: Dataset, error: Exception) -> None:
         if isinstance(error, OutputError | ExecutorError):
@@ -197,12 +187,13 @@ class Worklist:
             self.run.log.write("".join(traceback.format_exception(error)))
         if len(self.sets) == 1:
             raise error
-        self._end(d, Done("", reason, error.exit_code if isinstance(error, En4dvarError) else 1))
+        exit_code = error.exit_code if isinstance(error, En4dvarError) else 1
+        self._end(d, DatasetOutcome(d.name, failure=reason, exit_code=exit_code))
 
-    def _end(self, d: Dataset, done: Done) -> None:
-        write_checkpoint(self.run.directory.work / d.done, self._fingerprint(d), done)
+    def _end(self, d: Dataset, outcome: DatasetOutcome) -> None:
+        write_checkpoint(self.run.directory.work / d.done, self._fingerprint(d), outcome)
         self.run.directory.remove(d.iteration)
-        self.ended[d.name] = done
+        self.ended[d.name] = outcome
         self._reached.pop(d.name, None)
         if isinstance(self.progress, LiveProgress):
             self.progress.ended(d.name, len(self.ended))
