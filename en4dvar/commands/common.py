@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 import click
 
 if TYPE_CHECKING:
-    from en4dvar.config import Config, TwinConfig
-
-F = Callable[..., Any]
+    from en4dvar.config import Config
 
 
 class Failed(click.ClickException):
@@ -27,51 +28,82 @@ class Failed(click.ClickException):
         click.echo(self.message, file=file, err=file is None)
 
 
-def config_options(command: F) -> F:
-    """The argument CONFIG with --data and --set."""
-    for decorate in (
-        click.option(
-            "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a value, e.g. assimilation.members=96."
-        ),
-        click.option("--data", metavar="FILE", help="Data file, folder or pattern instead of data.path."),
-        click.argument("config", type=click.Path()),
-    ):
-        command = decorate(command)
-    return command
+@dataclass(frozen=True)
+class Source:
+    """The configuration that a command was given: its file, and what --data and --set change in it."""
+
+    path: Path
+    data: str | None
+    settings: tuple[str, ...]
+
+    def load(self) -> Config:
+        """The configuration of an estimation. Raises :class:`ConfigError`."""
+        from en4dvar.config import load_config
+
+        return load_config(self.path, self.overrides())
+
+    def overrides(self, **special: Any) -> dict[str, Any]:
+        """Dotted keys → values of --set and --data; ``special`` are further keys, left out where None."""
+        found: dict[str, Any] = {}
+        for item in self.settings:
+            key, equals, value = item.partition("=")
+            if not equals:
+                raise click.BadParameter(f"{item!r} is not KEY=VALUE", param_hint="--set")
+            found[key.strip()] = value
+        # A path on the command line is relative to the shell's folder, one in the file to the file's.
+        special["data.path"] = [str(Path(self.data).absolute())] if self.data else None
+        return found | {key: value for key, value in special.items() if value is not None}
 
 
-def load(config: str, data: str | None, settings: tuple[str, ...]) -> Config:
-    """The configuration of an estimation. Raises :class:`ConfigError`."""
-    from en4dvar.config import load_config
+def config_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The argument CONFIG with --data and --set, which the command gets as one :class:`Source`."""
 
-    return load_config(config, overrides(data, settings))
+    @click.argument("config", type=click.Path(path_type=Path))
+    @click.option("--data", metavar="FILE", help="Data file, folder or pattern instead of data.path.")
+    @click.option(
+        "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a value, e.g. assimilation.members=96."
+    )
+    @functools.wraps(command)
+    def with_source(config: Path, data: str | None, settings: tuple[str, ...], **options: Any) -> Any:
+        return command(Source(config, data, settings), **options)
 
-
-def load_any(config: str, data: str | None, settings: tuple[str, ...], **special: Any) -> Config | TwinConfig:
-    """As :func:`load`, or a twin experiment. Raises :class:`ConfigError`."""
-    from en4dvar.config import load_any as load
-
-    return load(config, overrides(data, settings, **special))
-
-
-def overrides(data: str | None, settings: tuple[str, ...], **special: Any) -> dict[str, Any]:
-    """``--set`` and ``--data`` as dotted keys → values; ``special`` are further keys, left out where None."""
-    found: dict[str, Any] = {}
-    for item in settings:
-        key, equals, value = item.partition("=")
-        if not equals:
-            raise click.BadParameter(f"{item!r} is not KEY=VALUE", param_hint="--set")
-        found[key.strip()] = value
-    # A path on the command line is relative to the shell's folder, one in the file to the file's.
-    special["data.path"] = [str(Path(data).absolute())] if data else None
-    return found | {key: value for key, value in special.items() if value is not None}
+    return with_source
 
 
-def command_words() -> list[str]:
-    """What the user typed, word by word, with the program's name as it is installed."""
-    return ["en4dvar", *sys.argv[1:]]
+def refuse_to_replace(out: Path | None, force: bool) -> None:
+    """Raise :class:`OutputError` where ``out`` exists and is not to be replaced."""
+    from en4dvar.errors import OutputError
+
+    if out is not None and out.exists() and not force:
+        raise OutputError(f"{out}: exists; give --force to replace it")
 
 
-def command_line() -> str:
-    """What the user typed, for the history of a file."""
-    return shlex.join(command_words())
+def deliver(text: str, out: Path | None, what: str) -> None:
+    """Write to the file ``out`` and say ``what`` is there, or print. Raises :class:`OutputError`."""
+    from en4dvar.files import write_text
+
+    if out is None:
+        click.echo(text, nl=False)
+    elif what:
+        click.echo(f"{what}: {write_text(out, text)}")
+    else:
+        write_text(out, text)
+
+
+def command_line(without: tuple[str, ...] = (), also: tuple[str, ...] = ()) -> str:
+    """What the user typed, with the program's name as it is installed; some words left out, others added."""
+    return shlex.join(["en4dvar", *(word for word in sys.argv[1:] if word not in without), *also])
+
+
+@contextmanager
+def continuable() -> Iterator[None]:
+    """Within, an interrupt says what is kept of the run and what to type next."""
+    from en4dvar.runs.interrupt import Interrupted
+
+    try:
+        yield
+    except Interrupted as interrupt:
+        again = command_line(without=("--force", "--resume"), also=("--resume",))
+        raise Failed(f"{interrupt}\nto continue: {again}", 130) from None
+    except KeyboardInterrupt:
+        raise Failed(f"interrupted before the run began\nto run it: {command_line()}", 130) from None

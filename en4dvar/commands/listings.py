@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from en4dvar.commands.common import deliver
+
 
 @click.command()
 def models() -> None:
@@ -32,9 +34,5 @@ def schema(out: Path | None) -> None:
       en4dvar schema --out en4dvar.schema.json
     """
     from en4dvar.config.json_schema import schema_text
-    from en4dvar.files import write_text
 
-    if out is None:
-        click.echo(schema_text(), nl=False)
-    else:
-        click.echo(f"schema: {write_text(out, schema_text())}")
+    deliver(schema_text(), out, "schema")

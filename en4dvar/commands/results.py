@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from en4dvar.commands.common import Failed
+from en4dvar.commands.common import Failed, deliver, refuse_to_replace
 
 MOST_ROWS = 60  # of estimates on the terminal
 LONGEST = 120  # name of the folder of a comparison
@@ -78,8 +78,6 @@ def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
     Example:
       en4dvar export runs/quickstart --latex --out table.tex
     """
-    from en4dvar.errors import OutputError
-    from en4dvar.files import write_text
     from en4dvar.report.export import export_table, posterior_file
 
     if kind == "netcdf":
@@ -87,12 +85,8 @@ def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
         click.echo(f"{path} follows the ArviZ schema as it is: arviz.from_netcdf({str(path)!r}); nothing to export")
         return
     text = export_table(run_dir, kind)  # type: ignore[arg-type]
-    if out is None:
-        click.echo(text, nl=False)
-        return
-    if out.exists() and not force:
-        raise OutputError(f"{out}: exists; give --force to replace it")
-    click.echo(f"table: {write_text(out, text)}")
+    refuse_to_replace(out, force)
+    deliver(text, out, "table")
 
 
 @click.command()

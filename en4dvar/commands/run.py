@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from en4dvar.commands.common import Failed, command_line, command_words, config_options, load_any
+from en4dvar.commands.common import Failed, Source, command_line, config_options, continuable
 
 if TYPE_CHECKING:
-    from en4dvar.config import TwinConfig
+    from en4dvar.config import Config, TwinConfig
     from en4dvar.runs.campaign import Campaign
 
 MOST_TOLD = 30  # data sets, warnings and failures on the terminal; all of them are in the run directory
@@ -26,9 +25,7 @@ MOST_TOLD = 30  # data sets, warnings and failures on the terminal; all of them 
 @click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
 @click.option("--scheduler", metavar="ADDRESS", help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786.")
 def run(
-    config: str,
-    data: str | None,
-    settings: tuple[str, ...],
+    source: Source,
     out: Path | None,
     force: bool,
     resume: bool,
@@ -45,35 +42,35 @@ def run(
     Example:
       en4dvar run configs/quickstart.yaml --out runs/first --set assimilation.members=96
     """
+    from en4dvar.config import TwinConfig, load_any
+
     special = {
         "output.directory": str(out) if out else None,
         "output.report": False if no_report else None,
         "execution.workers": workers,
         "execution.address": scheduler,
     }
-    loaded = load_any(config, data, settings, **special)
-    from en4dvar.config import TwinConfig
+    config = load_any(source.path, source.overrides(**special))
+    if not isinstance(config, TwinConfig):
+        _estimate(config, force, resume)
+    elif scheduler:
+        raise click.UsageError("a twin experiment takes no --scheduler: its cycles are too short to be sent away")
+    else:
+        _conduct(config, force, resume)
 
-    if isinstance(loaded, TwinConfig):
-        if scheduler:
-            raise click.UsageError("a twin experiment takes no --scheduler: its cycles are too short to be sent away")
-        _run_twin(loaded, force, resume)
-        return
+
+def _estimate(config: Config, force: bool, resume: bool) -> None:
     from en4dvar.config.build import data_files, inverse_plan
     from en4dvar.executor import available_cores
     from en4dvar.runs.progress import terminal_progress
     from en4dvar.runs.runner import run_campaign
 
-    words = command_words()
-    try:
-        with terminal_progress(len(data_files(inverse_plan(loaded)))) as progress:
-            campaign = run_campaign(
-                loaded, force=force, resume=resume, progress=progress, command=shlex.join(words),
-                report_workers=loaded.execution.workers or available_cores(),
-            )  # fmt: skip
-    except KeyboardInterrupt as interrupt:
-        raise _to_continue(interrupt) from None
-    _tell(campaign, with_report=not no_report)
+    with continuable(), terminal_progress(len(data_files(inverse_plan(config)))) as progress:
+        campaign = run_campaign(
+            config, force=force, resume=resume, progress=progress, command=command_line(),
+            report_workers=config.execution.workers or available_cores(),
+        )  # fmt: skip
+    _tell(campaign, with_report=config.report)
 
 
 def _tell(campaign: Campaign, with_report: bool) -> None:
@@ -99,24 +96,12 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
         raise Failed("\n".join([head, *reasons[:MOST_TOLD], *more]), campaign.exit_code)
 
 
-def _to_continue(interrupt: KeyboardInterrupt) -> Failed:
-    from en4dvar.runs.interrupt import Interrupted
-
-    if not isinstance(interrupt, Interrupted):
-        return Failed(f"interrupted before the run began\nto run it: {shlex.join(command_words())}", 130)
-    again = shlex.join([*(w for w in command_words() if w not in ("--force", "--resume")), "--resume"])
-    return Failed(f"{interrupt}\nto continue: {again}", 130)
-
-
-def _run_twin(config: TwinConfig, force: bool, resume: bool) -> None:
+def _conduct(config: TwinConfig, force: bool, resume: bool) -> None:
     from en4dvar.runs.progress import cycle_progress
     from en4dvar.runs.twin_run import run_twin, scores_table
 
-    try:
-        with cycle_progress(config.experiment.cycles) as on_cycle:
-            result = run_twin(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
-    except KeyboardInterrupt as interrupt:
-        raise _to_continue(interrupt) from None
+    with continuable(), cycle_progress(config.experiment.cycles) as on_cycle:
+        result = run_twin(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
     click.echo(scores_table(result))
     if result.run.failures:
         lost = f"{len(result.run.failures)} of {config.experiment.members} members lost"

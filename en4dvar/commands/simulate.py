@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from en4dvar.commands.common import command_line, config_options, load, overrides
+from en4dvar.commands.common import Source, command_line, config_options, deliver, refuse_to_replace
 
 
 @click.command()
@@ -17,9 +17,7 @@ from en4dvar.commands.common import command_line, config_options, load, override
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the noise; default the configuration's.")
 @click.option("--force", is_flag=True, help="Replace the file given by --out.")
 def simulate(
-    config: str,
-    data: str | None,
-    settings: tuple[str, ...],
+    source: Source,
     out: Path | None,
     times: str | None,
     noise: str | None,
@@ -36,44 +34,30 @@ def simulate(
       en4dvar simulate configs/quickstart.yaml --set parameters.G='0.5 kPa' \\
           --times '0 us:60 us:1 us' --noise '1.4 um' --out synthetic.csv
     """
-    if _has_campaign(config):
-        if data or times or noise:
-            raise click.UsageError("--data, --times and --noise do not apply to a configuration with a 'campaign:'")
-        _simulate_campaign(config, settings, out, seed, force)
-        return
-    loaded = load(config, data, settings)
-    from en4dvar.errors import OutputError
-    from en4dvar.files import write_text
+    from en4dvar.config.document import read_document
     from en4dvar.runs.simulation import noise_level, parse_times, simulate, to_csv
 
-    if out is not None and out.exists() and not force:
-        raise OutputError(f"{out}: exists; give --force to replace it")
-    instants = parse_times(times, loaded.model.time_unit) if times else None
-    simulation = simulate(loaded, instants)
+    if "campaign" in read_document(source.path).data:
+        if source.data or times or noise:
+            raise click.UsageError("--data, --times and --noise do not apply to a configuration with a 'campaign:'")
+        _simulate_campaign(source, out, seed, force)
+        return
+    config = source.load()
+    refuse_to_replace(out, force)
+    simulation = simulate(config, parse_times(times, config.model.time_unit) if times else None)
     if noise:
-        simulation = simulation.with_noise(
-            noise_level(noise, loaded, simulation), loaded.seed if seed is None else seed
-        )
-    text = to_csv(simulation, loaded, command_line())
-    if out is None:
-        click.echo(text, nl=False)
-    else:
-        write_text(out, text)
+        level = noise_level(noise, config, simulation)
+        simulation = simulation.with_noise(level, config.seed if seed is None else seed)
+    deliver(to_csv(simulation, config, command_line()), out, "")
 
 
-def _has_campaign(config: str) -> bool:
-    from en4dvar.config.document import read_document
-
-    return "campaign" in read_document(Path(config)).data
-
-
-def _simulate_campaign(config: str, settings: tuple[str, ...], out: Path | None, seed: int | None, force: bool) -> None:
+def _simulate_campaign(source: Source, out: Path | None, seed: int | None, force: bool) -> None:
     from en4dvar.config.document import override, read_document
     from en4dvar.config.synthetic import relocated, resolve_campaign
     from en4dvar.runs.synthetic import draw_campaign, write_campaign
 
-    changes = overrides(None, settings, seed=seed)
-    plan = resolve_campaign(override(read_document(Path(config)), changes), Path(config).resolve().parent)
+    document = override(read_document(source.path), source.overrides(seed=seed))
+    plan = resolve_campaign(document, source.path.resolve().parent)
     plan = relocated(plan, out) if out else plan
     sets = draw_campaign(plan)
     truth = write_campaign(plan, sets, command_line(), force)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from en4dvar.commands.common import config_options, overrides
+from en4dvar.commands.common import Source, config_options
 
 if TYPE_CHECKING:
     from en4dvar.config import Config
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 @click.command()
 @config_options
 @click.option("--plot", is_flag=True, help="Draw the prior predictive over the data (PNG and PDF).")
-def validate(config: str, data: str | None, settings: tuple[str, ...], plot: bool) -> None:
+def validate(source: Source, plot: bool) -> None:
     """Check a configuration and its data; tell what would be estimated and what it costs.
 
     Every fault is told at once, with file, line and column. The cost comes from running prior members for a moment.
@@ -31,7 +31,7 @@ def validate(config: str, data: str | None, settings: tuple[str, ...], plot: boo
     from en4dvar.config import TwinConfig
     from en4dvar.runs.checks import validate as check
 
-    loaded = check(config, overrides(data, settings))
+    loaded = check(source.path, source.overrides())
     if isinstance(loaded, TwinConfig):
         from en4dvar.runs.twin_run import twin_summary
 
