@@ -18,10 +18,10 @@ import pickle
 import queue
 import signal
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
-from en4dvar.executor.base import Call, ExecutorError, Hear, T, Tell, WorkerLostError
+from en4dvar.executor.base import Call, ExecutorError, T, Tell, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
 from en4dvar.executor.futures import Events, FuturesExecutor
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
@@ -97,28 +97,6 @@ class DaskExecutor(FuturesExecutor):
             self.kill()
             message = "has no worker; start some with: dask worker" if connected else "cannot be reached"
             raise ExecutorError(f"dask scheduler {address or ''}: {message} ({error})") from None
-
-    def map(
-        self, function: Callable[..., T], calls: Iterable[Call], hear: Hear | None = None
-    ) -> Iterator[tuple[int, T | Exception]]:
-        under_way: dict[int, Call] = {}
-        suspects: list[tuple[int, Call]] = []
-
-        def remembered() -> Iterator[Call]:
-            for i, call in enumerate(calls):
-                under_way[i] = call
-                yield call
-
-        for i, value in super().map(function, remembered(), hear):
-            call = under_way.pop(i)
-            if isinstance(value, WorkerLostError):
-                suspects.append((i, call))
-            else:
-                yield i, value
-        for i, call in suspects:  # several workers died under it; calls around it may have been the reason
-            alone = None if hear is None else _heard_as(i, hear)
-            for _, value in super().map(function, [call], alone):
-                yield i, value
 
     def _submit(self, function: Callable[..., T], call: Call, tell: Tell | None) -> Future:
         if self._client is None or self._client.status != "running":
@@ -210,11 +188,6 @@ class DaskExecutor(FuturesExecutor):
 def dask_setup(_: Any) -> None:
     """In a worker of this machine: Ctrl-C is the main process's business."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _heard_as(i: int, hear: Hear) -> Hear:
-    """What any call tells, heard as of call ``i``."""
-    return lambda _, message: hear(i, message)
 
 
 def _on_worker(limits: Limits, function: Callable[..., T], call: Call, listener: str | None) -> T:

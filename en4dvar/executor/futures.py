@@ -5,11 +5,12 @@ from __future__ import annotations
 import itertools
 import queue
 from abc import abstractmethod
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-from en4dvar.executor.base import Call, Executor, Hear, T, Tell
+from en4dvar.executor.base import Call, Executor, Hear, T, Tell, WorkerLostError
 
 Events = queue.SimpleQueue[Any]  # futures that ended, and (index, message) of what calls tell
 
@@ -17,25 +18,32 @@ Events = queue.SimpleQueue[Any]  # futures that ended, and (index, message) of w
 class FuturesExecutor(Executor):
     """Keeps two calls a worker under way; what they tell and their ends arrive in one queue, in order.
 
-    A future is anything with ``add_done_callback``.
+    A future is anything with ``add_done_callback``. A call whose worker died is repeated when nothing else is under
+    way, for calls around it may have been the reason; after ``attempts`` it is held responsible.
     """
+
+    attempts = 2
 
     def map(
         self, function: Callable[..., T], calls: Iterable[Call], hear: Hear | None = None
     ) -> Iterator[tuple[int, T | Exception]]:
         events: Events = queue.SimpleQueue()
         following = enumerate(calls)
-        pending: dict[Any, int] = {}
+        pending: dict[Any, tuple[int, Call]] = {}
+        lost: deque[tuple[int, Call]] = deque()
+        deaths: Counter[int] = Counter()
 
-        def telling(i: int) -> Tell:
-            return lambda message: events.put((i, message))
+        def submit(i: int, call: Call) -> None:
+            future = self._submit(function, call, (lambda message: events.put((i, message))) if hear else None)
+            pending[future] = i, call
+            future.add_done_callback(events.put)
 
         try:
             while True:
                 for i, call in itertools.islice(following, max(0, 2 * self.workers - len(pending))):
-                    future = self._submit(function, call, telling(i) if hear else None)
-                    pending[future] = i
-                    future.add_done_callback(events.put)
+                    submit(i, call)
+                if not pending and lost:
+                    submit(*lost.popleft())
                 if not pending:
                     return
                 event = self._next(events)
@@ -43,8 +51,14 @@ class FuturesExecutor(Executor):
                     if hear:
                         hear(*event)
                     continue
-                i = pending.pop(event)
-                yield i, self._value(event)
+                i, call = pending.pop(event)
+                value = self._value(event)
+                if isinstance(value, WorkerLostError):
+                    deaths[i] += 1
+                    if deaths[i] < self.attempts:
+                        lost.append((i, call))
+                        continue
+                yield i, value
         finally:
             self._give_up(pending)
 

@@ -27,7 +27,6 @@ from en4dvar.executor.chunks import describe
 from en4dvar.executor.futures import PoolExecutor
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
 
-ATTEMPTS = 3  # workers that a call may cost before it is held responsible for their death
 CLOSE_TIMEOUT = 10.0  # s for a worker to end by itself
 MOST_STILLBORN = 8  # workers in a row that end before they have begun
 ANSWER, TOLD = b"a", b"t"  # what a worker sends begins with one of them
@@ -84,6 +83,8 @@ class ProcessesExecutor(PoolExecutor):
     They are started at first use and live until :meth:`close`.
     """
 
+    attempts = 3
+
     def __init__(self, workers: int, limits: Limits = NO_LIMITS):
         super().__init__(workers)
         self.limits = limits
@@ -104,18 +105,18 @@ class ProcessesExecutor(PoolExecutor):
         return super()._submit(self._on_worker, (message, tell, self._given_up), None)
 
     def _on_worker(self, message: bytes, tell: Tell | None, given_up: int) -> Any:
-        """Have a worker answer ``message``, and another one where it dies. In a thread of the pool."""
-        for _ in range(ATTEMPTS):
-            worker = self._take(given_up)
-            worker.send(message)
-            try:
-                value = worker.answer(tell)
-            except _DeadError:
-                self._bury(worker)
-            else:
-                self._put_back(worker)
-                return value
-        raise WorkerLostError(self.limits.death)
+        """Have a worker answer ``message``; in a thread of the pool."""
+        worker = self._take(given_up)
+        worker.send(message)
+        try:
+            value = worker.answer(tell)
+        except _DeadError:
+            self._bury(worker)
+            raise WorkerLostError(self.limits.death) from None
+        with self._changing:
+            self._busy.remove(worker)
+            self._idle.append(worker)
+        return value
 
     def _take(self, given_up: int) -> _Worker:
         """A worker that is ready, now a busy one. Raises :class:`ExecutorError` where none can be started."""
@@ -141,11 +142,6 @@ class ProcessesExecutor(PoolExecutor):
             else:
                 self._stillborn = 0
                 return worker
-
-    def _put_back(self, worker: _Worker) -> None:
-        with self._changing:
-            self._busy.remove(worker)
-            self._idle.append(worker)
 
     def _bury(self, worker: _Worker) -> None:
         worker.process.kill()  # it may have closed its pipe only
