@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import ctypes
 import faulthandler
+import functools
 import os
 import re
 import signal
@@ -165,12 +166,7 @@ def _watch(deadline: float | None) -> None:
             faulthandler.dump_traceback_later(left, exit=True, file=_nowhere())
 
 
+@functools.cache
 def _nowhere() -> int:
     """A file that the traceback of the dying process goes to."""
-    global _sink
-    if _sink is None:
-        _sink = os.open(os.devnull, os.O_WRONLY)
-    return _sink
-
-
-_sink: int | None = None
+    return os.open(os.devnull, os.O_WRONLY)
