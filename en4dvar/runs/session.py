@@ -49,10 +49,7 @@ class Session:
 
         ``retried``: data sets, whose data files may differ, and the records of their failure, which are removed.
 
-        Raises
-        ------
-        OutputError: the configuration, the data or the software are not those of the run to be resumed (says what has
-            changed), or the directory cannot be written.
+        Raises :class:`OutputError`: the run is not the same (says what has changed), the directory cannot be written.
         """
         directory, config, retried = self.directory, self.config, retried or {}
         directory.folder(FOLDER)
@@ -97,16 +94,12 @@ def session(
 ) -> Iterator[Session]:
     """Hold the run directory of ``config`` and its log, and put the result in place where the block ends well.
 
-    Parameters
-    ----------
-    data: name of each data set → its file.
-    command: what the user typed.
-    kept: says what the user has of a run that is stopped.
+    ``data``: name of each data set → its file; ``command``: what the user typed; ``kept``: says what the user has of a
+    run that is stopped, which becomes part of the last words of an interrupt and of errors that a resumed run survives.
 
     Raises
     ------
-    OutputError: as :meth:`RunDirectory.open`; also of the block, as :class:`ExecutorError`, with what is kept and how
-        to continue. Interrupted: the block was.
+    OutputError: as :meth:`RunDirectory.open`. Interrupted: the block was.
     """
     model = config.experiment.model if isinstance(config, TwinConfig) else config.model
     resumed = mode == "resume"

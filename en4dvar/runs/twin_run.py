@@ -31,20 +31,9 @@ def run_twin(
     on_cycle: Callable[[int], None] | None = None,
     command: str = "",
 ) -> TwinResult:
-    """Conduct a twin experiment and write its run directory.
+    """Conduct a twin experiment and write its run directory; arguments and errors as of :func:`en4dvar.run`.
 
-    Parameters
-    ----------
-    config: a loaded configuration, or the path of a YAML file. overrides: of dotted keys, when it is a path.
-    force: replace the files of an earlier run in the same directory.
-    resume: continue an interrupted run in the same directory, to the same bits.
-    on_cycle: called with the number of each cycle, from 0.
-    command: what the user typed, for the file's history.
-
-    Raises
-    ------
-    ConfigError, OutputError: before anything is computed; also where a changed run cannot be resumed.
-    TooFewMembersError: the ensemble is lost. Interrupted: Ctrl-C or SIGTERM.
+    ``on_cycle`` is called with the number of each cycle, from 0.
     """
     if not isinstance(config, TwinConfig):
         config = load_twin(config, overrides)

@@ -116,6 +116,17 @@ def test_only_the_command_line_imports_the_commands():
     assert {name for name in importers if not name.startswith(("en4dvar.commands", "en4dvar.cli"))} == set()
 
 
+def test_applications_import_the_commands_only_for_commands_of_their_own():
+    """The one exception to what may be imported from above: options and messages of the command line are shared."""
+    known = modules(ROOT / "en4dvar")
+    for package in (p for p in (ROOT / "models").iterdir() if p.is_dir()):
+        for path in package.rglob("*.py"):
+            if any(
+                target.startswith("en4dvar.commands") for target in imports(path.read_text(encoding="utf-8"), known)
+            ):
+                assert path.name.startswith("commands"), path
+
+
 def test_an_upward_import_would_be_seen():
     arrows = graph(ROOT / "en4dvar")
     arrows["en4dvar.prior"] = arrows["en4dvar.prior"] | {"en4dvar.config.load"}
