@@ -121,9 +121,8 @@ def test_applications_import_the_commands_only_for_commands_of_their_own():
     known = modules(ROOT / "en4dvar")
     for package in (p for p in (ROOT / "models").iterdir() if p.is_dir()):
         for path in package.rglob("*.py"):
-            if any(
-                target.startswith("en4dvar.commands") for target in imports(path.read_text(encoding="utf-8"), known)
-            ):
+            used = imports(path.read_text(encoding="utf-8"), known)
+            if any(target.startswith("en4dvar.commands") for target in used):
                 assert path.name.startswith("commands"), path
 
 
