@@ -3,6 +3,7 @@
 import random
 import re
 import signal
+import time
 
 import pytest
 from execution_models import Stops
@@ -199,17 +200,24 @@ def test_signals_leave_a_run_that_says_how_to_continue(tmp_path, number):
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["serial", "threads", "processes"])
 def test_killed_at_random_moments(tmp_path, kind):
-    """SIGKILL at 20 random moments of a run, each followed by a resume that may be killed as well."""
+    """SIGKILL at 20 random moments of a run, each followed by a resume that may be killed as well.
+
+    The moments are parts of what a whole run takes here and now; later ones from kill to kill, for a busy machine.
+    """
     path = make_campaign(tmp_path, 4, "execution_models:Slow")
     words = ("run", path, "--no-report", "--set", f"execution.executor={kind}", "--set", "execution.checkpoint_every=0")
     pause = {"EN4DVAR_TEST_PAUSE": 0.01}
+    began = time.monotonic()
     quiet = run_cli(*words, "--out", tmp_path / "quiet", **pause)
     assert quiet.returncode == 0, quiet.stderr
+    whole = time.monotonic() - began
     draw, kills, finished = random.Random(1), 0, 0
     while kills < 20 or finished == 0:
-        out, resume = tmp_path / f"run{finished}", ()
+        out, resume, longest = tmp_path / f"run{finished}", (), 1.2 * whole
         while True:
-            code, told = run_and_signal(signal.SIGKILL, draw.uniform(0.4, 3.5), *words, *resume, "--out", out, **pause)
+            moment = draw.uniform(0.2, 1.0) * longest
+            longest *= 1.1
+            code, told = run_and_signal(signal.SIGKILL, moment, *words, *resume, "--out", out, **pause)
             assert code in (0, -signal.SIGKILL), told
             if code == 0:
                 break
