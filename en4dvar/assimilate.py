@@ -9,6 +9,7 @@ import numpy as np
 
 from en4dvar import diagnostics as diag
 from en4dvar.analysis import Analysis, IterationRecord, Progress, Record
+from en4dvar.caution import Caution, caution
 from en4dvar.descent.mda import assimilate_once
 from en4dvar.descent.noise_scale import mean_beyond_mode
 from en4dvar.descent.record import Taken, make_records, worse
@@ -17,8 +18,7 @@ from en4dvar.descent.weight_space import Local, WeightSpace
 from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, log_posterior
 from en4dvar.errors import ConfigError, TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
-from en4dvar.honesty import Caution, Ending, caution, examine
-from en4dvar.honesty.checks import down_weighted
+from en4dvar.honesty import ControlEnsembles, examine
 from en4dvar.likelihood import error_std, log_likelihood, robust_weights, whitened_residual
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.sampling import mcmc
@@ -26,7 +26,6 @@ from en4dvar.sampling.shape import examine_shape, guide
 from en4dvar.schemes import Step, Weights
 from en4dvar.schemes.esmda import ESMDA
 from en4dvar.state import Array
-from en4dvar.units import convert
 
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 
@@ -155,21 +154,14 @@ class _Run:
             None if last.rates is None else last.rates[0],
             None if last.noise_scale is None else last.noise_scale[0],
         )
-        huber, huber_warnings = self.robust(last.predictions[0], *at_centre)
-        per_parameter = diag.dfs_per_parameter(space.prior_variance, posterior)
         costs = self.costs(ends, final)
         shape = {} if refinement else examine_shape(space, posterior, mode, costs[:-1], self.seed)
-        record = end.records[-1]
         prior = problem.prior
-        return Analysis(
-            name=observations.name,
-            parameters=prior.parameters,
-            fixed=problem.fixed,
+        analysis = Analysis(
+            problem=problem,
+            settings=self.settings,
+            seed=self.seed,
             fixed_parameters=self.fixed_parameters,
-            observable=problem.observable,
-            observations=observations,
-            time_unit=problem.model.time_unit,
-            time_display_unit=problem.model.time_display_unit,
             prior=prior.to_physical(space.members),
             posterior=prior.to_physical(posterior),
             centre=prior.to_physical(mode),
@@ -184,45 +176,21 @@ class _Run:
             prior_failures=prior_run.failures[:-1],
             posterior_failures=after.failures,
             iterations=end.records,
-            dfs_per_parameter=per_parameter,
+            dfs_per_parameter=diag.dfs_per_parameter(space.prior_variance, posterior),
             converged=end.converged,
             stop_reason=end.reason,
             forward_runs=space.forward_runs,
-            seed=self.seed,
-            settings=self.settings,
             shape=shape,
-            huber_weight=huber,
+            huber_weight=self.robust_weights(last.predictions[0], *at_centre),
             refinement=refinement,
             log_evidence=diag.log_evidence(
                 end.cost, end.step.hessian.singular_values, len(space.members), observations
             ),
-            limits=problem.model.validity,
             extremes=after.extremes,
-            cautions=examine(
-                Ending(
-                    prior=prior,
-                    members=space.members,
-                    posterior=posterior,
-                    mode=mode,
-                    costs=costs[:-1],
-                    cost=float(costs[-1]),
-                    converged=end.converged,
-                    stop_reason=end.reason,
-                    step_norm=record.step_norm,
-                    chi2=record.chi2_per_observation * len(observations.used),
-                    n_weighted=len(observations.used),
-                    dfs=record.dfs,
-                    dfs_per_parameter=per_parameter,
-                    prior_failures=prior_run.failures[:-1],
-                    worst_loss=end.worst_loss,
-                    posterior_failures=after.failures,
-                    shape=shape,
-                    limits=problem.model.validity,
-                    extremes=after.extremes,
-                    found=(*state.warnings, *refine_warnings, *huber_warnings),
-                )
-            ),
         )
+        control = ControlEnsembles(space.members, posterior, mode, costs[:-1], float(costs[-1]))
+        found = (*state.warnings, *refine_warnings)
+        return replace(analysis, cautions=examine(analysis, control, end.worst_loss, found))
 
     def start(self, prior_run: Forecast, resume: LoopState | None) -> LoopState:
         space, prior = self.space, Weights.prior(len(self.space.members))
@@ -242,16 +210,12 @@ class _Run:
         weights = Weights(start.w, history.transform)
         return LoopState(weights, space.forward_runs, start.warnings, history.records, history.worst_loss)
 
-    def robust(
-        self, prediction: Array, rate: Array | None, scale: Array | None
-    ) -> tuple[Array | None, tuple[Caution, ...]]:
-        """Huber's weights (K,) at the centre and words for those below one; None with Gaussian errors."""
-        observations, model = self.problem.observations, self.problem.model
+    def robust_weights(self, prediction: Array, rate: Array | None, scale: Array | None) -> Array | None:
+        """Huber's weights (K,) at the centre; None with Gaussian errors."""
+        observations = self.problem.observations
         if observations.huber is None:
-            return None, ()
-        weights = robust_weights(observations, whitened_residual(observations, prediction, rate, scale))
-        times = convert(observations.times, model.time_unit, model.time_display_unit)
-        return weights, down_weighted(weights, times, model.time_display_unit, observations.huber)
+            return None
+        return robust_weights(observations, whitened_residual(observations, prediction, rate, scale))
 
     def costs(self, members: Array, run: Forecast) -> Array:
         """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""

@@ -15,11 +15,11 @@ import numpy as np
 
 from en4dvar import diagnostics as diag
 from en4dvar.analysis import StartRecord
+from en4dvar.caution import Caution, caution
 from en4dvar.descent.record import History
 from en4dvar.descent.step_control import Move
 from en4dvar.descent.weight_space import Local, WeightSpace
 from en4dvar.ensemble.forecast import Forecast
-from en4dvar.honesty import Caution, caution
 from en4dvar.schemes import Step, Weights
 from en4dvar.state import Array
 

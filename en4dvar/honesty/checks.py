@@ -1,4 +1,4 @@
-"""Single checks: pure functions of arrays, each silent where there is nothing to say."""
+"""Single checks: pure functions, each silent where there is nothing to say."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from statistics import median
 
 import numpy as np
 
+from en4dvar.analysis import Analysis
+from en4dvar.caution import Caution, caution
 from en4dvar.diagnostics import HARDLY_INFORMED, chi2_interval
 from en4dvar.forward import ValidityLimit
-from en4dvar.honesty.caution import Caution, caution
 from en4dvar.prior import Prior
 from en4dvar.state import Array
+from en4dvar.units import convert
 
 SAME_DIRECTION = 1e-8  # relative singular value below which anomalies do not span a direction
 NEAR = 0.05  # of the width of an interval
@@ -26,20 +28,12 @@ def rank(prior: Prior, members: Array, posterior: Array) -> tuple[Caution, ...]:
     n = members.shape[1]
     spanned = _rank(members.tobytes(), prior.std.tobytes())
     if spanned < n:
-        return (
-            caution(
-                "rank-deficient",
-                f"the {len(members)} prior members span {spanned} of {n} directions: the posterior cannot move in the "
-                "others and its spread there is zero",
-            ),
-        )
+        words = f"the {len(members)} prior members span {spanned} of {n} directions"
+        words = f"{words}: the posterior cannot move in the others and its spread there is zero"
+        return (caution("rank-deficient", words),)
     if len(posterior) <= n:
-        return (
-            caution(
-                "rank-deficient",
-                f"{len(posterior)} members of the posterior are alive, too few for the covariance of {n} parameters",
-            ),
-        )
+        words = f"{len(posterior)} members of the posterior are alive, too few for the covariance of {n} parameters"
+        return (caution("rank-deficient", words),)
     return ()
 
 
@@ -54,28 +48,21 @@ def fit(chi2: float, n_observations: int, total_dfs: float) -> tuple[Caution, ..
     if not chi2 <= high:
         return (caution("misfit", f"{words}: the model does not explain the data within the stated observation error"),)
     if chi2 < low:
-        return (
-            caution(
-                "overstated-error", f"{words}: the stated observation error is larger than the scatter of the data"
-            ),
-        )
+        words = f"{words}: the stated observation error is larger than the scatter of the data"
+        return (caution("overstated-error", words),)
     return ()
 
 
-def conflict(prior: Prior, mode: Array) -> tuple[Caution, ...]:
-    """A posterior mode (n,) far from the prior: 2 J_b beyond the 99.95 % point of χ²_n."""
-    z = (mode - prior.mean) / prior.std
+def conflict(prior: Prior, centre: Array) -> tuple[Caution, ...]:
+    """A posterior centre (n,) far from the prior: 2 J_b beyond the 99.95 % point of χ²_n."""
+    z = (centre - prior.mean) / prior.std
     if float(z @ z) <= chi2_interval(len(z))[1]:
         return ()
     worst = np.argsort(-np.abs(z))
     names = prior.names
     listed = ", ".join(f"{names[j]} by {z[j]:+.1f}" for j in worst if abs(z[j]) > 2) or f"{names[worst[0]]} most"
-    return (
-        caution(
-            "prior-conflict",
-            f"prior and data conflict: the minimum lies far from the prior mean ({listed} prior standard deviations)",
-        ),
-    )
+    words = f"prior and data conflict: the minimum lies far from the prior mean ({listed} prior standard deviations)"
+    return (caution("prior-conflict", words),)
 
 
 def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[str]) -> tuple[Caution, ...]:
@@ -113,14 +100,12 @@ def validity(limits: Sequence[ValidityLimit], extremes: Array) -> tuple[Caution,
         beyond = reached > limit.value
         if np.mean(beyond) > BEYOND:
             unit = "" if limit.unit == "1" else f" {limit.unit}"
-            found.append(
-                caution(
-                    "model-validity",
-                    f"{beyond.sum()} of {len(reached)} posterior members leave the model's validity: {limit.label} "
-                    f"reaches {np.max(reached):.3g}{unit} (median {median(reached.tolist()):.3g}), the limit is "
-                    f"{limit.value:g}{unit}",
-                )
+            words = (
+                f"{beyond.sum()} of {len(reached)} posterior members leave the model's validity: {limit.label} reaches "
+                f"{np.max(reached):.3g}{unit} (median {median(reached.tolist()):.3g}), the limit is "
+                f"{limit.value:g}{unit}"
             )
+            found.append(caution("model-validity", words))
     return tuple(found)
 
 
@@ -136,21 +121,21 @@ def information(names: Sequence[str], per_parameter: Array) -> tuple[Caution, ..
     )
 
 
-def down_weighted(weights: Array, times: Array, unit: str, threshold: float, most: int = 6) -> tuple[Caution, ...]:
-    """Observations that a robust cost counts less; weights and times (K,), ``unit`` of the times."""
-    lighter = np.flatnonzero(weights < 1)
-    if not len(lighter):
+def down_weighted(analysis: Analysis, most: int = 6) -> tuple[Caution, ...]:
+    """Observations that a robust cost counts less; ``most`` of them are listed."""
+    weights, observations, model = analysis.huber_weight, analysis.problem.observations, analysis.problem.model
+    lighter = np.flatnonzero(weights < 1) if weights is not None else np.empty(0)
+    if weights is None or not len(lighter):
         return ()
+    times = convert(observations.times, model.time_unit, model.time_display_unit)
     worst = lighter[np.argsort(weights[lighter], kind="stable")]
-    listed = ", ".join(f"{times[k]:.4g} {unit} (weight {weights[k]:.2g})" for k in worst[:most])
+    listed = ", ".join(f"{times[k]:.4g} {model.time_display_unit} (weight {weights[k]:.2g})" for k in worst[:most])
     more = f" and {len(worst) - most} more" if len(worst) > most else ""
-    return (
-        caution(
-            "down-weighted",
-            f"{len(worst)} of {len(weights)} observations lie beyond {threshold:g} standard deviations and were "
-            f"down-weighted (Huber): {listed}{more}",
-        ),
+    words = (
+        f"{len(worst)} of {len(weights)} observations lie beyond {observations.huber:g} standard deviations and were "
+        f"down-weighted (Huber): {listed}{more}"
     )
+    return (caution("down-weighted", words),)
 
 
 @lru_cache(maxsize=4)  # the data sets of a campaign share their prior members

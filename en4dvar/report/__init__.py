@@ -14,11 +14,11 @@ from dataclasses import fields
 from pathlib import Path
 from urllib.parse import quote
 
+from en4dvar.caution import Caution
 from en4dvar.errors import OutputError
 from en4dvar.executor import ProcessesExecutor, SerialExecutor, WorkerLostError
 from en4dvar.files import write_text
 from en4dvar.hints import suggest
-from en4dvar.honesty import Caution
 from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import Entry, overview_figures, render_overview
 from en4dvar.report.page import make_section, render_set

@@ -11,8 +11,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from en4dvar.honesty import Caution
-from en4dvar.honesty.caution import SEVERITIES, worst_first
+from en4dvar.caution import SEVERITIES, Caution, worst_first
 from en4dvar.report.html import render
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, inline_svg, styled
 from en4dvar.report.text import number_like, plain_number, plus_minus, pretty_unit, symbol_html, with_unit

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from en4dvar.caution import Caution
 from en4dvar.errors import TooFewMembersError
-from en4dvar.honesty import Caution
 from en4dvar.report.result import Result, load_result
 from en4dvar.storage.store import ParameterSummary
 

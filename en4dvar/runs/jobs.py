@@ -13,8 +13,8 @@ from typing import Any
 
 from en4dvar.analysis import IterationRecord, Progress, Record
 from en4dvar.assimilate import LoopState, assimilate
+from en4dvar.caution import Caution
 from en4dvar.executor import Executor
-from en4dvar.honesty import Caution
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.storage.checkpoint import Keeper
 from en4dvar.storage.groups import build_groups

@@ -11,12 +11,12 @@ from typing import Any
 
 from en4dvar.analysis import ChainRecord, Progress, Record, StartRecord
 from en4dvar.assimilate import LoopState
+from en4dvar.caution import Caution
 from en4dvar.config import Config
 from en4dvar.config.build import build_one
 from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, ThreadsExecutor
 from en4dvar.files import readable, write_bytes
-from en4dvar.honesty import Caution
 from en4dvar.runs.campaign import DatasetOutcome, file_names
 from en4dvar.runs.jobs import Estimate, Job, News, estimate, estimate_and_tell
 from en4dvar.runs.progress import LiveProgress, RunLog, describe

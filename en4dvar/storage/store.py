@@ -11,11 +11,12 @@ import numpy as np
 import xarray as xr
 
 from en4dvar.analysis import Analysis
+from en4dvar.caution import Caution
+from en4dvar.diagnostics import active_members
 from en4dvar.errors import OutputError
 from en4dvar.files import write_bytes
-from en4dvar.honesty import Caution
 from en4dvar.state import Array, Parameter
-from en4dvar.storage.groups import about, active_members, build_groups
+from en4dvar.storage.groups import about, build_groups
 from en4dvar.storage.netcdf import to_bytes, tree_of
 from en4dvar.storage.seal import check_seal
 from en4dvar.tables import table
