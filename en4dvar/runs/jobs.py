@@ -19,7 +19,7 @@ from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.storage.checkpoint import Keeper
 from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import to_bytes
-from en4dvar.storage.store import ParameterSummary, summarise
+from en4dvar.summary import ParameterSummary, summarise
 
 TELL_EVERY = 0.1  # s; a worker sends no more often what its iterations have to tell
 News = tuple[tuple[str, Record], ...]

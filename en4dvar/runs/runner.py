@@ -13,7 +13,7 @@ from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.errors import ConfigError, DataError, Fault, OutputError
 from en4dvar.executor import ExecutorError, choose_executor, one_blas_thread
 from en4dvar.files import write_text
-from en4dvar.report import summary_csv, write_pages
+from en4dvar.report import write_pages
 from en4dvar.report.result import Result
 from en4dvar.runs.campaign import Campaign
 from en4dvar.runs.interrupt import Interrupted, tell_interrupt, terminate_as_interrupt
@@ -24,6 +24,7 @@ from en4dvar.storage.campaign_file import save_campaign
 from en4dvar.storage.checkpoint import FOLDER, CheckpointError, read_checkpoint, write_checkpoint
 from en4dvar.storage.fingerprint import Identity, identity
 from en4dvar.storage.provenance import provenance
+from en4dvar.summary import summary_csv
 
 IDENTITY = f"{FOLDER}/run"
 

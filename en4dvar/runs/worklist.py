@@ -23,7 +23,7 @@ from en4dvar.runs.progress import LiveProgress, RunLog, describe
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.storage.checkpoint import FOLDER, CheckpointError, digest, file_digest, read_checkpoint, write_checkpoint
 from en4dvar.storage.fingerprint import Identity
-from en4dvar.storage.store import ParameterSummary
+from en4dvar.summary import ParameterSummary
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ LAYERS = (
     ("executor",),
     ("ensemble",),
     ("analysis",),
-    ("honesty",),
+    ("honesty", "summary"),
     ("schemes",),
     ("descent",),
     ("cycling",),

@@ -12,7 +12,7 @@ from toy_config import csv_text
 from en4dvar.errors import DataError, TooFewMembersError
 from en4dvar.report.result import load_result
 from en4dvar.runs.campaign import Campaign, DatasetOutcome, file_names
-from en4dvar.runs.runner import report, run_campaign
+from en4dvar.runs.runner import run_campaign, write_report
 from en4dvar.storage.campaign_file import GROUPS
 
 
@@ -111,7 +111,7 @@ def test_arviz_reads_every_group(campaign):
 
 
 def test_report_names_the_failures(campaign):
-    html = report(campaign.directory).read_text()
+    html = write_report(campaign.directory).read_text()
     assert "3 data sets without a posterior" in html
     assert "ArithmeticError: too large" in html
 

@@ -13,7 +13,7 @@ from run_files import assert_same_results, configuration, interrupt, make_campai
 
 from en4dvar.errors import OutputError
 from en4dvar.report.result import load_result
-from en4dvar.runs.runner import report, run_campaign
+from en4dvar.runs.runner import run_campaign, write_report
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +175,7 @@ def test_a_damaged_result_is_named_and_not_read(quiet, tmp_path, damage, name):
         if damage is older:
             break
     with pytest.raises(OutputError, match=r"datasets/set0\.nc: "):
-        report(tmp_path / "run")
+        write_report(tmp_path / "run")
     campaign = run_campaign(configuration(quiet[0], tmp_path / "run", executor="serial"), resume=True)
     assert [n for n in campaign.notices if "set0.nc: missing or changed since it was written" in n]
     assert_same_results(tmp_path / "run", run)

@@ -9,7 +9,7 @@ import xarray as xr
 from en4dvar.report.result import Result
 from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import groups_of, to_bytes, tree_of
-from en4dvar.storage.store import summarise
+from en4dvar.summary import summarise
 
 
 def test_file_of_the_groups_is_the_file_of_their_tree(analysis):
