@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,26 +24,22 @@ from en4dvar.report.text import (
     words_for,
 )
 from en4dvar.storage.groups import ITERATION_SCALARS
-from en4dvar.storage.store import ParameterSummary, StoredResult
+from en4dvar.storage.store import StoredResult
+from en4dvar.summary import ParameterSummary
 from en4dvar.units import convert
 
 PROVENANCE = (
     "history", "date_created", "seed", "data_source", "git_commit", "configuration_file", "configuration_git_commit",
     "package_versions", "python_version", "platform", "cpu", "institution", "references", "Conventions",
 )  # fmt: skip
+ANCHOR = "d0"  # begins the identifiers of figures, which are addresses
 
 
 @dataclass(frozen=True)
-class Section:
-    """One data set on the page: ``figures`` are (identifier, caption, SVG)."""
+class Page:
+    """What the template asks of a result."""
 
-    anchor: str
     result: StoredResult
-    figures: Sequence[tuple[str, str, Markup]]
-
-    @property
-    def name(self) -> str:
-        return self.result.name
 
     @property
     def stats(self) -> dict[Any, Any]:
@@ -58,19 +54,15 @@ class Section:
     def verdicts(self) -> list[tuple[str, str, str, bool]]:
         """(quantity, value, in plain words, needs attention) for the tiles on top."""
         s = self.stats
-        alive, members = int(s["n_active"]), int(s["n_members"])
-        chi2_words, chi2_odd = judge_chi2(float(s["chi2_per_observation"]), int(s["n_weighted"]), float(s["dfs"]))
-        nrmse = float(s["nrmse"])
+        alive, members, n_estimated = int(s["n_active"]), int(s["n_members"]), len(self.result.posterior.data_vars)
+        chi2, dfs, nrmse = (float(s[key]) for key in ("chi2_per_observation", "dfs", "nrmse"))
+        chi2_words, chi2_odd = judge_chi2(chi2, int(s["n_weighted"]), dfs)
+        informed = f"of {n_estimated} parameters determined by the data"
         ended = "by its own criterion" if s["converged"] else "not converged"
         return [
             ("Fit, NRMSE", number_like(nrmse, 0.01), "1 is perfect, 0 is no better than a constant", not nrmse >= 0.9),
-            ("χ² per observation", plain_number(float(s["chi2_per_observation"]), 3), chi2_words, chi2_odd),
-            (
-                "Information, DFS",
-                plain_number(float(s["dfs"]), 3),
-                f"of {len(self.result.posterior.data_vars)} parameters determined by the data",
-                False,
-            ),
+            ("χ² per observation", plain_number(chi2, 3), chi2_words, chi2_odd),
+            ("Information, DFS", plain_number(dfs, 3), informed, False),
             ("Members alive", f"{alive} of {members}", "of the posterior ensemble", alive < members),
             ("Iterations", str(s["n_iterations"]), f"{ended}: {s['stop_reason']}", not s["converged"]),
         ]
@@ -84,27 +76,25 @@ class Section:
     @property
     def fixed(self) -> list[tuple[Markup, str, str, str]]:
         """(symbol, label, value, unit) of the values held fixed."""
-        shown = []
+        rows = []
         for variable in self.result.dataset("constant_data").data_vars.values():
             a = variable.attrs
             unit = a.get("display_units", a["units"])
             value = convert(float(variable), a["units"], unit)
-            shown.append((symbol_html(a["symbol"]), a["long_name"], plain_number(value, 6), pretty_unit(unit)))
-        return shown
+            rows.append((symbol_html(a["symbol"]), a["long_name"], plain_number(value, 6), pretty_unit(unit)))
+        return rows
 
     @property
     def iterations(self) -> list[list[str]]:
         """One line an iteration: index, J, terms, step, χ²/Ky, DFS, spread, members."""
         table = self.result.iterations
         keys = [key for key in ITERATION_SCALARS if key != "active"]
-        return [
-            [
-                str(int(table["iteration"][i])),
-                *(plain_number(float(table[key][i])) for key in keys),
-                str(int(table["active"][i])),
-            ]
-            for i in range(table.sizes["iteration"])
+        columns = [
+            [str(int(i)) for i in table["iteration"]],
+            *([plain_number(float(value)) for value in table[key]] for key in keys),
+            [str(int(n)) for n in table["active"]],
         ]
+        return [list(line) for line in zip(*columns, strict=True)]
 
     @property
     def settings(self) -> list[tuple[str, str]]:
@@ -116,12 +106,12 @@ class Section:
 
     @property
     def provenance(self) -> list[tuple[str, str]]:
-        attrs = self.result.attributes
-        return [(key.replace("_", " "), str(attrs[key])) for key in PROVENANCE if str(attrs.get(key, ""))]
+        return provenance_rows(self.result.attributes)
 
-    @property
-    def configuration(self) -> str:
-        return str(self.result.attributes.get("configuration", ""))
+
+def provenance_rows(attributes: Mapping[Any, Any]) -> list[tuple[str, str]]:
+    """(what, value) of what a file says of its origin."""
+    return [(key.replace("_", " "), str(attributes[key])) for key in PROVENANCE if str(attributes.get(key, ""))]
 
 
 def _row(row: ParameterSummary) -> dict[str, Any]:
@@ -154,18 +144,17 @@ def judge_chi2(chi2: float, n_observations: int, dfs: float) -> tuple[str, bool]
     return f"misfit agrees with the stated noise; {expected}", False
 
 
-def make_section(result: StoredResult, anchor: str, figures: Sequence[tuple[str, str, Figure]]) -> Section:
-    """A section with its figures (name, caption, Figure) drawn as inline SVG."""
-
-    def draw(name: str, caption: str, figure: Figure) -> tuple[str, str, Markup]:
-        return name, caption, Markup(inline_svg(figure, f"{anchor}-{name}", caption))
-
-    return Section(anchor, result, [draw(*figure) for figure in figures])
-
-
-def render_set(section: Section, trail: Sequence[tuple[str, str]] = (), copies: bool = True) -> str:
+def render_set(
+    result: StoredResult,
+    figures: Iterable[tuple[str, str, Figure]],
+    trail: Sequence[tuple[str, str]] = (),
+    copies: bool = True,
+) -> str:
     """The page of one data set as HTML text.
 
-    ``trail``: links (words, address) above it; ``copies``: whether its figures are also kept as PDF and PNG.
+    ``figures``: (name, caption, figure); ``trail``: links (words, address) above them all; ``copies``: whether the
+    figures are also kept as PDF and PNG.
     """
-    return render("set.html.j2", title=section.name, s=section, trail=trail, copies=copies)
+    drawn = [(name, caption, inline_svg(figure, f"{ANCHOR}-{name}", caption)) for name, caption, figure in figures]
+    page = Page(result)
+    return render("set.html.j2", title=result.name, s=page, figures=drawn, anchor=ANCHOR, trail=trail, copies=copies)

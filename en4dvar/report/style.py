@@ -13,12 +13,16 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
+import numpy as np
+from markupsafe import Markup
 from matplotlib import style
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 
 from en4dvar.files import atomic_path
+from en4dvar.state import Array
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -84,6 +88,29 @@ def styled(draw: Callable[P, T]) -> Callable[P, T]:
     return inside
 
 
+def panels(n: int, width: float, row_height: float, above: float = 0.0) -> tuple[Figure, list[Axes]]:
+    """A figure with ``n`` axes in up to two columns; inches, ``above`` is left for a legend."""
+    columns = min(2, n)
+    rows = -(-n // columns)
+    figure = Figure(figsize=(width, rows * row_height + above), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for ax in axes[n:]:
+        ax.remove()
+    return figure, axes[:n]
+
+
+def scaled_histogram(ax: Axes, values: Array, colour: str, alpha: float, lw: float = 0.8) -> None:
+    """Scaled to its peak; values that do not differ are a line."""
+    if values.size < 2 or np.ptp(values) == 0:
+        for value in values[:1]:
+            ax.axvline(value, ymax=0.85, color=colour, alpha=alpha, lw=2)
+        return
+    bins = int(np.clip(np.ceil(2 * values.size ** (1 / 3)), 6, 30))  # Rice's rule
+    counts, edges = np.histogram(values, bins)
+    ax.stairs(counts / counts.max(), edges, fill=True, color=colour, alpha=alpha)
+    ax.stairs(counts / counts.max(), edges, color=colour, lw=lw)
+
+
 def _settle(figure: Figure) -> None:
     """Compute the layout once; constrained layout would do it again for every format."""
     engine = figure.get_layout_engine()
@@ -108,7 +135,7 @@ def save_figure(figure: Figure, folder: Path, name: str) -> None:
 
 
 @styled
-def inline_svg(figure: Figure, name: str, description: str) -> str:
+def inline_svg(figure: Figure, name: str, description: str) -> Markup:
     """The figure as an ``<svg>`` element: identifiers unique by ``name``, colours as CSS variables, no addresses."""
     _settle(figure)
     buffer = io.StringIO()
@@ -123,7 +150,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     width, height = figure.get_size_inches()
     label = description.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     head = f'<svg role="img" aria-label="{label}" viewBox="0 0 {width * 72:g} {height * 72:g}"'
-    return re.sub(r"^<svg[^>]*", head, svg, count=1)
+    return Markup(re.sub(r"^<svg[^>]*", head, svg, count=1))
 
 
 def css_variables(palette: dict[str, str]) -> str:

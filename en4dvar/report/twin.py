@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from en4dvar.errors import OutputError
-from en4dvar.files import write_text
+from en4dvar.files import make_folder, write_text
 from en4dvar.report.html import render
-from en4dvar.report.page import PROVENANCE
+from en4dvar.report.page import provenance_rows
 from en4dvar.report.style import COLUMN, LIGHT, inline_svg, save_figure, styled
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
 from en4dvar.storage.seal import check_seal
@@ -36,15 +35,11 @@ def write_twin_report(run_dir: Path) -> Path:
             data = file.load()
     except (OSError, ValueError) as error:
         raise OutputError(f"{run_dir / 'twin.nc'}: not a readable result: {error}") from None
-    folder = run_dir / "figures"
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be created: {error.strerror}") from None
+    folder = make_folder(run_dir / "figures")
     drawn = []
     for name, caption, figure in twin_figures(data):
         save_figure(figure, folder, name)
-        drawn.append((name, caption, Markup(inline_svg(figure, name, caption))))
+        drawn.append((name, caption, inline_svg(figure, name, caption)))
     a = data.attrs
     return write_text(
         run_dir / "report.html",
@@ -56,9 +51,9 @@ def write_twin_report(run_dir: Path) -> Path:
             scores=_scores(data),
             unit=_unit(data),
             figures=drawn,
-            warnings=[line for line in str(a.get("warnings", "")).split("\n") if line],
-            lost=[reason for reason in str(a["members_lost_why"]).split("\n") if reason],
-            provenance=[(key.replace("_", " "), str(a[key])) for key in PROVENANCE if str(a.get(key, ""))],
+            warnings=_lines(a.get("warnings", "")),
+            lost=_lines(a["members_lost_why"]),
+            provenance=provenance_rows(a),
             configuration=str(a["configuration_resolved"]),
         ),
     )
@@ -120,6 +115,10 @@ def errors(data: xr.Dataset) -> Figure:
     figure.legend(*ax.get_legend_handles_labels(), loc="outside upper right", ncols=2)
     ax.set_xlabel(with_unit("time", str(data["time"].attrs["units"])))
     return figure
+
+
+def _lines(text: object) -> list[str]:
+    return [line for line in str(text).split("\n") if line]
 
 
 def _kinds(data: xr.Dataset) -> list[str]:

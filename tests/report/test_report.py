@@ -25,7 +25,7 @@ from en4dvar.executor import SerialExecutor, WorkerLostError
 from en4dvar.prior import Prior
 from en4dvar.report import write_pages
 from en4dvar.report.figures import all_figures
-from en4dvar.report.overview import Entry, overview_figures, render_overview
+from en4dvar.report.overview import SetSummary, overview_figures, render_overview
 from en4dvar.report.page import judge_chi2
 from en4dvar.report.result import Result
 from en4dvar.storage.provenance import provenance
@@ -277,9 +277,9 @@ def test_the_page_of_a_process_that_dies_is_drawn_here(campaign_dir, tmp_path, m
 
 
 def test_overview_of_many_data_sets_stays_small(analysis):
-    one = Entry.of(Result.from_analysis(analysis, provenance("name: test\n")), "set")
-    entries = [replace(one, name=f"set {i:04d}", stem=f"set_{i:04d}") for i in range(2000)]
-    html = render_overview(entries, {}, {}, overview_figures(entries))
+    one = SetSummary.of(Result.from_analysis(analysis, provenance("name: test\n")), "set")
+    sets = [replace(one, name=f"set {i:04d}", stem=f"set_{i:04d}") for i in range(2000)]
+    html = render_overview(sets, {}, {}, overview_figures(sets))
     assert len(html.encode()) < 3e6
     assert html.count("<tr>") == 2001
 
