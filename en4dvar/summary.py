@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.analysis import Analysis
-from en4dvar.caution import Caution
+from en4dvar.caution import Caution, codes
 from en4dvar.diagnostics import active_members
 from en4dvar.state import Array, Parameter
 from en4dvar.tables import csv_text, table
@@ -88,8 +88,8 @@ def summary_csv(
     columns = [f.name for f in fields(ParameterSummary) if f.name not in ("label", "symbol")]
     lines: list[list[object]] = [["dataset", *columns, "failure", "warnings"]]
     for name, summary, cautions in summaries:
-        codes = " ".join(dict.fromkeys(c.code for c in cautions))
-        lines += [[name, *(getattr(row, column) for column in columns), "", codes] for row in summary]
+        warned = " ".join(codes(cautions))
+        lines += [[name, *(getattr(row, column) for column in columns), "", warned] for row in summary]
     lines += [[name, *("" for _ in columns), reason, ""] for name, reason in failures.items()]
     return csv_text(lines)
 

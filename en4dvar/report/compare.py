@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from en4dvar.errors import OutputError
+from en4dvar.report.text import fixed
 from en4dvar.state import Array
 from en4dvar.storage.store import StoredResult, load_stored, result_files
 from en4dvar.summary import ParameterSummary
@@ -43,14 +44,6 @@ class ModelScore:
     dfs: float
     effective_parameters: float
     nrmse: float
-
-    @property
-    def difference_text(self) -> str:
-        return f"{self.difference:.2f}" if np.isfinite(self.difference) else "–"
-
-    @property
-    def probability_text(self) -> str:
-        return f"{self.probability:.3f}" if np.isfinite(self.probability) else "–"
 
 
 @dataclass(frozen=True)
@@ -164,8 +157,8 @@ def comparison_table(comparison: Comparison) -> str:
             s.dataset,
             s.run,
             f"{s.log_evidence:.2f}",
-            s.difference_text,
-            s.probability_text,
+            fixed(s.difference, 2),
+            fixed(s.probability, 3),
             f"{s.chi2_per_observation:.3g}",
             f"{s.dfs:.2f}",
             f"{s.effective_parameters:.2f}",

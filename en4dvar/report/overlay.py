@@ -16,7 +16,7 @@ from en4dvar.files import make_folder, write_text
 from en4dvar.report.compare import Comparison, Estimate, ModelScore
 from en4dvar.report.html import render
 from en4dvar.report.style import COLUMN, LIGHT, inline_svg, panels, save_figure, scaled_histogram, styled
-from en4dvar.report.text import number_like, plain_number, plus_minus, pretty_unit, symbol_html, with_unit
+from en4dvar.report.text import with_unit
 from en4dvar.state import Array
 from en4dvar.tables import csv_text
 from en4dvar.units import UnitError, convert
@@ -86,41 +86,10 @@ def write_comparison(comparison: Comparison, out: str | Path) -> Path:
         caption=CAPTION,
         incomparable=comparison.incomparable,
         verdicts=[(name, comparison.verdict(name)) for name in comparison.datasets],
-        estimates=[_estimate_row(e) for e in comparison.by_parameter],
-        scores=[_score_row(s) for s in comparison.scores],
+        estimates=comparison.by_parameter,
+        scores=comparison.scores,
     )
     return write_text(out / "compare.html", page)
-
-
-def _estimate_row(e: Estimate) -> dict[str, object]:
-    row = e.summary
-    return {
-        "symbol": symbol_html(row.symbol),
-        "label": row.label,
-        "unit": pretty_unit(row.unit),
-        "dataset": e.dataset,
-        "run": e.run,
-        "value": row.mean,
-        "posterior": plus_minus(row.mean, row.std),
-        "interval": f"{number_like(row.q05, row.std)} … {number_like(row.q95, row.std)}",
-        "dfs": f"{100 * row.dfs:.0f} %" if np.isfinite(row.dfs) else "–",
-    }
-
-
-def _score_row(s: ModelScore) -> dict[str, object]:
-    return {
-        "dataset": s.dataset,
-        "run": s.run,
-        "numbers": [
-            (s.log_evidence, plain_number(s.log_evidence, 6)),
-            (s.difference, s.difference_text),
-            (s.probability, s.probability_text),
-            (s.chi2_per_observation, plain_number(s.chi2_per_observation, 3)),
-            (s.dfs, plain_number(s.dfs, 3)),
-            (s.effective_parameters, plain_number(s.effective_parameters, 3)),
-            (s.nrmse, f"{s.nrmse:.4f}"),
-        ],
-    }
 
 
 def _estimates_csv(comparison: Comparison) -> str:

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from en4dvar.caution import SEVERITIES, Caution, worst_first
+from en4dvar.caution import SEVERITIES, Caution, codes, worst_first
 from en4dvar.report.html import render
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, inline_svg, styled
-from en4dvar.report.text import number_like, plain_number, plus_minus, pretty_unit, symbol_html, with_unit
+from en4dvar.report.text import number_like, pretty_unit, symbol_html, with_unit
 from en4dvar.storage.store import StoredResult
 from en4dvar.summary import ParameterSummary
 
@@ -53,6 +53,10 @@ class SetSummary:
         order: tuple[str, ...] = ("", *reversed(SEVERITIES))
         return 100 * order.index(self.worst) + len(self.cautions)
 
+    @property
+    def codes(self) -> str:
+        return ", ".join(codes(self.cautions))
+
 
 def render_overview(
     sets: Sequence[SetSummary],
@@ -65,16 +69,16 @@ def render_overview(
     ``pages``: stem of a data set → address of its page, for those that have one; ``failures``: name of a data set
     without a posterior → reason; ``figures``: (name, caption, figure).
     """
-    parameters = _parameters(sets)
     return render(
         "campaign.html.j2",
         sortable=True,
         title=f"{len(sets)} data sets",
         created=sets[0].about.get("date_created", ""),
         configuration=sets[0].about.get("configuration", ""),
-        parameters=[_parameter(name, sets) for name in parameters],
+        parameters=[_parameter(name, sets) for name in _parameters(sets)],
         failures=failures,
-        sets=[_row(one, parameters, pages.get(one.stem, "")) for one in sets],
+        sets=sets,
+        pages=pages,
         without_page=sum(1 for one in sets if one.stem not in pages),
         warned=sum(1 for one in sets if one.cautions),
         tally=_tally(sets),
@@ -147,24 +151,6 @@ def _parameter(name: str, sets: Sequence[SetSummary]) -> dict[str, Any]:
         "median": number_like(float(median), precision),
         "low": number_like(float(low), precision),
         "high": number_like(float(high), precision),
-    }
-
-
-def _row(one: SetSummary, parameters: Sequence[str], page: str) -> dict[str, Any]:
-    rows = [one.rows.get(name) for name in parameters]
-    s = one.scalars
-    return {
-        "name": one.name,
-        "page": page,
-        "estimates": [(repr(row.mean), plus_minus(row.mean, row.std)) if row else ("", "") for row in rows],
-        "scalars": [
-            (repr(s["n_observations"]), f"{s['n_observations']:.0f}"),
-            *((repr(s[key]), plain_number(s[key], 3)) for key in ("chi2_per_observation", "nrmse", "dfs")),
-            (repr(s["n_active"]), f"{s['n_active']:.0f} of {s['n_members']:.0f}"),
-        ],
-        "gravity": one.gravity,
-        "worst": one.worst,
-        "codes": ", ".join(dict.fromkeys(c.code for c in one.cautions)),
     }
 
 

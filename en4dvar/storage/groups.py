@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.analysis import Analysis
+from en4dvar.caution import codes
 from en4dvar.diagnostics import active_members, nrmse
 from en4dvar.state import Array, Parameter
 from en4dvar.storage.netcdf import Group, Variable
@@ -212,7 +213,7 @@ def _scalars(a: Analysis) -> dict[str, Any]:
         "converged": a.converged,
         "stop_reason": a.stop_reason,
         "forward_runs": a.forward_runs,
-        "warning_codes": " ".join(dict.fromkeys(c.code for c in a.cautions)),
+        "warning_codes": " ".join(codes(a.cautions)),
         **a.shape,
         **a.refinement,
     }
