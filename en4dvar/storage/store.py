@@ -14,11 +14,11 @@ import xarray as xr
 from en4dvar.analysis import Analysis
 from en4dvar.caution import Caution
 from en4dvar.errors import OutputError
-from en4dvar.files import write_bytes
+from en4dvar.files import atomic_path
 from en4dvar.state import Array, Parameter
 from en4dvar.storage.groups import build_groups
-from en4dvar.storage.netcdf import to_bytes, tree_of
-from en4dvar.storage.seal import check_seal
+from en4dvar.storage.netcdf import tree_of
+from en4dvar.storage.seal import check_seal, seal_file
 from en4dvar.summary import ParameterSummary, living, results_table
 
 if TYPE_CHECKING:
@@ -135,8 +135,11 @@ class StoredResult:
 
 
 def save(result: StoredResult, path: str | Path) -> Path:
-    """Write ``path`` (NETCDF4); it appears complete or not at all. Raises :class:`OutputError`."""
-    return write_bytes(path, to_bytes(result.tree))
+    """Write ``path`` (NETCDF4) through xarray; it appears complete or not at all. Raises :class:`OutputError`."""
+    with atomic_path(path) as partial:
+        result.tree.to_netcdf(partial, engine="netcdf4")
+        seal_file(partial)
+    return Path(path)
 
 
 def result_files(run_dir: Path) -> list[Path]:
