@@ -70,37 +70,38 @@ def examine(
     )
 
 
-def unfinished(analysis: Analysis) -> tuple[Caution, ...]:
+def unfinished(analysis: Analysis) -> checks.Findings:
     """Iterations that stopped before their own criterion; a note where the next step would have been short.
 
     A gradient regressed over the ensemble need not vanish where J is smallest, so that variant often ends like this.
     """
     if analysis.converged:
-        return ()
+        return
     step_norm = analysis.iterations[-1].step_norm  # of the next step, had there been one
     words = f"not converged: {analysis.stop_reason}"
-    if not step_norm <= SHORT_STEP:
-        return (caution("not-converged", words),)
-    words = f"{words}; the next step would be {step_norm:.2g} posterior standard deviations"
-    advice = "no action is needed where this is little to you; else start again from another seed"
-    return (replace(caution("not-converged", words, "note"), advice=advice),)
+    if step_norm <= SHORT_STEP:
+        words = f"{words}; the next step would be {step_norm:.2g} posterior standard deviations"
+        advice = "no action is needed where this is little to you; else start again from another seed"
+        yield replace(caution("not-converged", words, "note"), advice=advice)
+    else:
+        yield caution("not-converged", words)
 
 
-def collapse(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool_]) -> tuple[Caution, ...]:
+def collapse(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool_]) -> checks.Findings:
     """A spread far below what J allows: for a Gaussian posterior 2 (J − J_min) of its members is χ²_n, with mean n.
 
     The lowest J met, of a member or of the centre, stands for the minimum.
     """
     alive = alive & np.isfinite(control.costs)
     if alive.sum() < 2:
-        return ()
+        return
     narrow = control.posterior[alive].std(axis=0) <= NO_SPREAD * prior.std
     if narrow.any():
         names = ", ".join(name for name, no_spread in zip(prior.names, narrow, strict=True) if no_spread)
-        return (caution("ensemble-collapse", f"the ensemble has collapsed: all members have the same {names}"),)
+        yield caution("ensemble-collapse", f"the ensemble has collapsed: all members have the same {names}")
+        return
     lowest = min(control.centre_cost, float(control.costs[alive].min()))
     allowed = float(np.mean(2 * (control.costs[alive] - lowest))) / len(control.centre)
-    if allowed >= COLLAPSED:
-        return ()
-    words = f"its spread is about {math.sqrt(allowed):.2g} of what the data and the prior allow"
-    return (caution("ensemble-collapse", f"the ensemble has collapsed: {words}"),)
+    if allowed < COLLAPSED:
+        words = f"its spread is about {math.sqrt(allowed):.2g} of what the data and the prior allow"
+        yield caution("ensemble-collapse", f"the ensemble has collapsed: {words}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -21,18 +21,18 @@ MOST_NAMED = 3
 Mask = npt.NDArray[np.bool_]
 
 
-def loss(stage: str, failures: Sequence[str], prior: Prior, members: Array | None = None) -> tuple[Caution, ...]:
+def loss(stage: str, failures: Sequence[str], prior: Prior, members: Array | None = None) -> Iterator[Caution]:
     """The members (N,) that failed in a forecast; ``failures`` are reasons, "" for members alive.
 
     ``members`` (N, n), transformed, are where they were run, if that tells anything.
     """
     lost = ~active_members(failures)
     if not lost.any():
-        return ()
+        return
     words = f"{lost.sum()} of {len(lost)} members failed in the {stage}: {common_reasons(failures)}"
     if members is not None:
         words = f"{words}; {where_lost(prior, members, lost)}"
-    return (caution("members-lost", words, "serious" if lost.mean() > MANY else None),)
+    yield caution("members-lost", words, "serious" if lost.mean() > MANY else None)
 
 
 def where_lost(prior: Prior, members: Array, lost: Mask) -> str:

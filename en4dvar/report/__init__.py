@@ -17,10 +17,10 @@ from en4dvar.files import make_folder, write_text
 from en4dvar.hints import suggest
 from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import SetSummary, overview_figures, render_overview
-from en4dvar.report.page import render_set
-from en4dvar.report.style import save_figure
+from en4dvar.report.page import IDENTIFIERS, render_set
+from en4dvar.report.style import draw
 from en4dvar.storage.campaign_file import failed_datasets
-from en4dvar.storage.store import StoredResult, load_stored, result_files
+from en4dvar.storage.store import load_stored, result_files
 from en4dvar.summary import summary_csv
 
 PAGES = 40  # data sets of a campaign with a page from the start
@@ -46,7 +46,8 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     if files == [whole]:
         result = load_stored(whole)
         write_text(run_dir / "summary.csv", summary_csv([(result.name, result.summary(), result.cautions)], {}))
-        return _write_set(run_dir / "report.html", result, copies="")
+        figures = draw(all_figures(result), run_dir / "figures", identifiers=IDENTIFIERS)
+        return write_text(run_dir / "report.html", render_set(result, figures))
     sets = [SetSummary.of(load_stored(path), path.stem) for path in files]
     failures = failed_datasets(whole)
     write_text(run_dir / "summary.csv", summary_csv(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
@@ -82,25 +83,14 @@ def _write_campaign(
                 _write_page(*calls[i])
             elif isinstance(value, Exception):
                 raise value
-    figures = overview_figures(sets)
-    make_folder(run_dir / "figures")
-    for name, _, figure in figures:
-        save_figure(figure, run_dir / "figures", name)
+    figures = draw(overview_figures(sets), run_dir / "figures")
     pages = {s.stem: quote(f"pages/{s.stem}.html") for s in paged}
     return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures))
 
 
 def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:
-    """The page of one data set of a campaign."""
+    """The page of one data set of a campaign; ``copies``: prefix of its figures as PDF and PNG, None for none."""
     result = load_stored(run_dir / "datasets" / f"{stem}.nc")
-    _write_set(run_dir / "pages" / f"{stem}.html", result, copies, trail)
-
-
-def _write_set(path: Path, result: StoredResult, copies: str | None, trail: Sequence[tuple[str, str]] = ()) -> Path:
-    """The page of one data set; ``copies``: prefix of its figures as PDF and PNG in ``figures/``, None for none."""
-    figures = list(all_figures(result))
-    if copies is not None:
-        folder = make_folder((path.parent if path.name == "report.html" else path.parent.parent) / "figures")
-        for name, _, figure in figures:
-            save_figure(figure, folder, f"{copies}{name}")
-    return write_text(path, render_set(result, figures, trail, copies is not None))
+    folder = None if copies is None else run_dir / "figures"
+    figures = draw(all_figures(result), folder, copies or "", IDENTIFIERS)
+    write_text(run_dir / "pages" / f"{stem}.html", render_set(result, figures, trail, copies is not None))

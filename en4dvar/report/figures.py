@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from en4dvar.report.style import COLUMN, LIGHT, PAGE, panels, scaled_histogram, styled
+from en4dvar.report.style import COLUMN, LIGHT, PAGE, Captioned, panels, scaled_histogram, styled
 from en4dvar.report.text import plus_minus, pretty_unit, with_unit
 from en4dvar.state import Array
 from en4dvar.storage.store import StoredResult
@@ -139,8 +139,8 @@ def pairs(result: StoredResult) -> Figure:
     return figure
 
 
-def all_figures(result: StoredResult) -> Iterator[tuple[str, str, Figure]]:
-    """(file name, caption, figure) of everything that the result has enough members for."""
+def all_figures(result: StoredResult) -> Iterator[Captioned]:
+    """Everything that the result has enough members for."""
     yield (
         "posterior",
         "Posterior (blue) over prior (grey), each scaled to its peak. Bar: 5–95 % of the posterior; ticks: members; "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from en4dvar.caution import SEVERITIES, Caution, codes, worst_first
 from en4dvar.report.html import render
-from en4dvar.report.style import COLUMN, LIGHT, PAGE, inline_svg, styled
+from en4dvar.report.style import COLUMN, LIGHT, PAGE, Captioned, Drawing, styled
 from en4dvar.report.text import number_like, pretty_unit, symbol_html, with_unit
 from en4dvar.storage.store import StoredResult
 from en4dvar.summary import ParameterSummary
@@ -62,12 +62,12 @@ def render_overview(
     sets: Sequence[SetSummary],
     pages: Mapping[str, str],
     failures: Mapping[str, str],
-    figures: Iterable[tuple[str, str, Figure]],
+    figures: Sequence[Drawing],
 ) -> str:
     """The page as HTML.
 
     ``pages``: stem of a data set → address of its page, for those that have one; ``failures``: name of a data set
-    without a posterior → reason; ``figures``: (name, caption, figure).
+    without a posterior → reason.
     """
     return render(
         "campaign.html.j2",
@@ -82,7 +82,7 @@ def render_overview(
         without_page=sum(1 for one in sets if one.stem not in pages),
         warned=sum(1 for one in sets if one.cautions),
         tally=_tally(sets),
-        figures=[(name, caption, inline_svg(figure, name, caption)) for name, caption, figure in figures],
+        figures=figures,
     )
 
 
@@ -122,8 +122,7 @@ def estimates(sets: Sequence[SetSummary]) -> Figure:
     return figure
 
 
-def overview_figures(sets: Sequence[SetSummary]) -> list[tuple[str, str, Figure]]:
-    """(name, caption, figure) of the overview."""
+def overview_figures(sets: Sequence[SetSummary]) -> list[Captioned]:
     caption = (
         "Each data set by itself: posterior mean and 5–95 % (blue), prior mean ± std (grey band; of the first data set "
         "where priors depend on the data). Orange rings: posteriors with serious warnings."

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
-
-from matplotlib.figure import Figure
 
 from en4dvar.diagnostics import chi2_interval
 from en4dvar.report.html import render
-from en4dvar.report.style import inline_svg
+from en4dvar.report.style import Drawing
 from en4dvar.report.text import number_like, plain_number
 from en4dvar.storage.groups import ITERATION_SCALARS
 from en4dvar.storage.store import StoredResult
@@ -21,19 +19,15 @@ PROVENANCE = (
     "history", "date_created", "seed", "data_source", "git_commit", "configuration_file", "configuration_git_commit",
     "package_versions", "python_version", "platform", "cpu", "institution", "references", "Conventions",
 )  # fmt: skip
-ANCHOR = "d0"  # begins the identifiers of figures, which are addresses
+IDENTIFIERS = "d0-"  # begin those of figures, which are addresses
 
 
 def render_set(
-    result: StoredResult,
-    figures: Iterable[tuple[str, str, Figure]],
-    trail: Sequence[tuple[str, str]] = (),
-    copies: bool = True,
+    result: StoredResult, figures: Sequence[Drawing], trail: Sequence[tuple[str, str]] = (), copies: bool = True
 ) -> str:
     """The page of one data set as HTML text.
 
-    ``figures``: (name, caption, figure); ``trail``: links (words, address) above them all; ``copies``: whether the
-    figures are also kept as PDF and PNG.
+    ``trail``: links (words, address) above it; ``copies``: whether the figures are also kept as PDF and PNG.
     """
     attributes, reasons = result.attributes, result.sample_stats["failure_reason"].values.ravel()
     return render(
@@ -47,8 +41,8 @@ def render_set(
         rows=result.summary(),
         cautions=result.cautions,
         tiles=_tiles(result),
-        anchor=ANCHOR,
-        figures=[(name, words, inline_svg(figure, f"{ANCHOR}-{name}", words)) for name, words, figure in figures],
+        identifiers=IDENTIFIERS,
+        figures=figures,
         lost=[(i, str(reason)) for i, reason in enumerate(reasons) if reason],
         iterations=_iterations(result),
         fixed_values=_fixed(result),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import wraps
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -21,11 +21,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 
-from en4dvar.files import atomic_path
+from en4dvar.files import atomic_path, make_folder
 from en4dvar.state import Array
 
 P = ParamSpec("P")
 T = TypeVar("T")
+Captioned = tuple[str, str, Figure]  # name, caption
+Drawing = tuple[str, str, Markup]  # name, caption, SVG
 
 LIGHT = {
     "paper": "#ffffff",
@@ -151,6 +153,19 @@ def inline_svg(figure: Figure, name: str, description: str) -> Markup:
     label = description.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     head = f'<svg role="img" aria-label="{label}" viewBox="0 0 {width * 72:g} {height * 72:g}"'
     return Markup(re.sub(r"^<svg[^>]*", head, svg, count=1))
+
+
+def draw(figures: Iterable[Captioned], folder: Path | None, copies: str = "", identifiers: str = "") -> list[Drawing]:
+    """Figures as a page shows them; ``folder`` is where PDF and PNG are kept, if anywhere.
+
+    ``copies`` begins the names of these files, ``identifiers`` those of the elements of the drawings.
+    """
+    drawings = []
+    for name, caption, figure in figures:
+        if folder is not None:
+            save_figure(figure, make_folder(folder), f"{copies}{name}")
+        drawings.append((name, caption, inline_svg(figure, f"{identifiers}{name}", caption)))
+    return drawings
 
 
 def css_variables(palette: dict[str, str]) -> str:

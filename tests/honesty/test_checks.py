@@ -38,9 +38,9 @@ def gaussian(shrunk: float = 1.0) -> tuple[Analysis, ControlEnsembles]:
     return analysis, ControlEnsembles(members, posterior, np.zeros(2), 0.5 * np.sum(posterior**2, axis=1), 0.0)
 
 
-def collapsed(shrunk: float = 1.0, alive: int = 48) -> tuple[Caution, ...]:
+def collapsed(shrunk: float = 1.0, alive: int = 48) -> list[Caution]:
     analysis, control = gaussian(shrunk)
-    return collapse(analysis.problem.prior, control, np.arange(48) >= 48 - alive)
+    return list(collapse(analysis.problem.prior, control, np.arange(48) >= 48 - alive))
 
 
 def test_a_gaussian_end_is_silent():
@@ -56,7 +56,7 @@ def test_collapse_is_a_spread_below_a_third_of_what_the_cost_allows(shrunk, told
 
 
 def test_members_that_failed_do_not_count_as_spread():
-    assert collapsed(alive=1) == ()  # nothing to tell it from
+    assert collapsed(alive=1) == []  # nothing to tell it from
     analysis, control = gaussian()
     found = examine(replace(analysis, posterior_failures=("gone",) * 47 + ("",)), control)
     assert "rank-deficient" in {c.code for c in found}
@@ -112,7 +112,7 @@ def test_a_normal_prior_cut_by_a_bound_counts_the_members_beyond_it():
     failures = ["" if v >= 0 else "a outside [0, inf] m" for v in after[:, 0]]
     (found,) = at_bound(problem.prior, x, after, failures)
     assert "pile up at its lower bound (0 m)" in found.words
-    assert at_bound(problem.prior, x, x, [""] * 48) == ()
+    assert list(at_bound(problem.prior, x, x, [""] * 48)) == []
 
 
 def test_an_interior_posterior_does_not_pile_up():
@@ -126,11 +126,11 @@ def test_an_interior_posterior_does_not_pile_up():
 def test_a_tenth_of_the_members_may_leave_the_validity(beyond, told):
     limit = ValidityLimit("speed", 3.0, "m/s", "speed of the wall")
     reached = np.where(np.arange(40) < beyond, 3.5, 2.0)[:, None]
-    found = validity((limit,), reached)
+    found = list(validity((limit,), reached))
     assert [c.code for c in found] == ["model-validity"] * told
     if told:
         assert "speed of the wall reaches 3.5 m/s (median 2), the limit is 3 m/s" in found[0].words
-    assert validity((), np.empty((40, 0))) == ()
+    assert list(validity((), np.empty((40, 0)))) == []
 
 
 def test_iterations_that_end_next_to_their_criterion_are_a_note_without_alarm():

@@ -28,6 +28,7 @@ from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import SetSummary, overview_figures, render_overview
 from en4dvar.report.page import judge_chi2
 from en4dvar.report.result import Result
+from en4dvar.report.style import draw
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.store import save
 
@@ -279,7 +280,7 @@ def test_the_page_of_a_process_that_dies_is_drawn_here(campaign_dir, tmp_path, m
 def test_overview_of_many_data_sets_stays_small(analysis):
     one = SetSummary.of(Result.from_analysis(analysis, provenance("name: test\n")), "set")
     sets = [replace(one, name=f"set {i:04d}", stem=f"set_{i:04d}") for i in range(2000)]
-    html = render_overview(sets, {}, {}, overview_figures(sets))
+    html = render_overview(sets, {}, {}, draw(overview_figures(sets), None))
     assert len(html.encode()) < 3e6
     assert html.count("<tr>") == 2001
 
