@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from en4dvar.errors import OutputError
+from en4dvar.observations import Observations
 from en4dvar.report.text import fixed
 from en4dvar.state import Array
 from en4dvar.storage.store import StoredResult, load_stored, result_files
@@ -198,22 +199,17 @@ def _results(run: Path) -> dict[str, StoredResult]:
 
 
 def _same_data(a: StoredResult, b: StoredResult) -> bool:
-    ours, theirs = _stated(a), _stated(b)
-    return ours.keys() == theirs.keys() and all(
-        np.shape(ours[key]) == np.shape(theirs[key]) and np.allclose(ours[key], theirs[key], rtol=1e-12, atol=0)
-        for key in ours
+    ours, theirs = _stated(a.observations()), _stated(b.observations())
+    return (a.observable, ours.keys()) == (b.observable, theirs.keys()) and all(
+        ours[key].shape == theirs[key].shape and np.allclose(ours[key], theirs[key], rtol=1e-12, atol=0) for key in ours
     )
 
 
-def _stated(result: StoredResult) -> dict[str, Array]:
+def _stated(o: Observations) -> dict[str, Array]:
     """The observations and everything that is stated about their errors."""
-    data, y = result.observed_data, result.observable
-    stated = {n: data[n].values for n in ("time", y, f"{y}_reading_std", "time_std", "weights")}
-    if (correlation := f"{y}_correlation") in data:
-        stated[correlation] = data[correlation].values
-    if (threshold := "huber_threshold") in data.attrs:
-        stated[threshold] = np.asarray(data.attrs[threshold])
-    return stated
+    values = (o.times, o.values, o.std, o.time_std, o.weights, o.correlation, o.huber)
+    names = ("times", "values", "std", "time_std", "weights", "correlation", "huber")
+    return {name: np.asarray(value) for name, value in zip(names, values, strict=True) if value is not None}
 
 
 def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:

@@ -27,6 +27,7 @@ REFERENCES = (
     "layout: ArviZ InferenceData schema"
 )
 MEMBER = ("chain", "draw")
+HUBER, SCALAR = "huber_threshold", "scalar_"  # attributes of the observed data; scalars are a prefix and their name
 Variables = dict[str, Variable]
 
 
@@ -147,7 +148,7 @@ def _observed(a: Analysis) -> tuple[Variables, dict[str, Any]]:
         "weights": _variable("time", obs.weights, "1", "weight of the observation in the cost"),
         **{f"{name}_{key}": variable for key, variable in noise.items()},
     }
-    scalars = {f"scalar_{key}": value for key, value in obs.scalars.items()}
+    scalars = {f"{SCALAR}{key}": value for key, value in obs.scalars.items()}
     return variables, {"name": obs.name, "data_source": obs.source, **scalars, **thresholds}
 
 
@@ -160,7 +161,7 @@ def _noise(a: Analysis) -> tuple[Variables, dict[str, float]]:
     if a.huber_weight is not None:
         text = "weight of the observation in the robust cost at its minimum"
         variables["huber_weight"] = _variable("time", a.huber_weight, "1", text)
-    return variables, {} if obs.huber is None else {"huber_threshold": obs.huber}
+    return variables, {} if obs.huber is None else {HUBER: obs.huber}
 
 
 def _constants(a: Analysis) -> Variables:

@@ -15,8 +15,9 @@ from en4dvar.analysis import Analysis
 from en4dvar.caution import Caution
 from en4dvar.errors import OutputError
 from en4dvar.files import atomic_path
+from en4dvar.observations import Observations
 from en4dvar.state import Array, Parameter
-from en4dvar.storage.groups import build_groups
+from en4dvar.storage.groups import HUBER, SCALAR, build_groups
 from en4dvar.storage.netcdf import tree_of
 from en4dvar.storage.seal import check_seal, seal_file
 from en4dvar.summary import ParameterSummary, living, results_table
@@ -94,6 +95,23 @@ class StoredResult:
     def dataset(self, group: str) -> xr.Dataset:
         """A group of the file, e.g. ``"prior_predictive"``."""
         return self.tree.children[group].to_dataset()
+
+    def observations(self) -> Observations:
+        """The observations (y, t, R) that the result was estimated from, to the bit."""
+        data, name = self.observed_data, self.observable
+        correlation, attributes = f"{name}_correlation", {str(key): value for key, value in data.attrs.items()}
+        return Observations(
+            times=data["time"].values,
+            values=data[name].values,
+            std=data[f"{name}_reading_std"].values,
+            time_std=data["time_std"].values,
+            weights=data["weights"].values,
+            name=self.name,
+            source=str(attributes["data_source"]),
+            scalars={k.removeprefix(SCALAR): float(v) for k, v in attributes.items() if k.startswith(SCALAR)},
+            correlation=data[correlation].values if correlation in data else None,
+            huber=float(attributes[HUBER]) if HUBER in attributes else None,
+        )
 
     def members(self, group: str, name: str) -> Array:
         """(N',) finite values of a parameter in ``group`` (prior or posterior), display unit, members in order."""
