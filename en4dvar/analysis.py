@@ -96,7 +96,7 @@ class Analysis:
     cautions: tuple[Caution, ...] = ()  # why not to trust the posterior, the worst first
     log_evidence: float = float("nan")  # ln p(y), Laplace approximation
     shape: Mapping[str, float] = field(default_factory=dict)  # how Gaussian the posterior is (en4dvar.sampling.shape)
-    huber_weight: Array | None = None  # (K,) weights of the robust cost at the centre, where there is one
+    down_weights: Array | None = None  # (K,) of observations in a robust cost, at the centre; None with Gaussian errors
     refinement: Mapping[str, float] = field(default_factory=dict)  # summary of the Markov chain, if any
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) of the model's limits, by the posterior
 

@@ -62,7 +62,7 @@ class AssimilationSettings:
     ``mda_coefficients``, scaled so that Σ 1/α = 1, and ``mda_form`` (see :mod:`en4dvar.schemes.esmda`).
     """
 
-    scheme: Literal["en4dvar", "es-mda"] = "en4dvar"
+    scheme: Literal["en4dvar", "es-mda", "etkf", "denkf", "enkf-n"] = "en4dvar"
     members: int = 48
     sampling: Literal["exact", "random"] = "exact"
     linearisation: Literal["bundle", "transform"] = "bundle"

@@ -12,6 +12,7 @@ import pytest
 from en4dvar.analysis import Analysis, IterationRecord
 from en4dvar.caution import caution
 from en4dvar.forward import ForwardModel, Observable, StateField
+from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
@@ -89,7 +90,7 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
         problem=InverseProblem(
             Bounce(),
             OBSERVABLE,
-            Observations(times, values, std, np.zeros(40), np.ones(40), "A_E2_synthetic", "made/up.csv", {"Req": 4e-5}),
+            Observations(times, values, noise_of(std), np.ones(40), "A_E2_synthetic", "made/up.csv", {"Req": 4e-5}),
             Prior(tuple(map(PriorTerm.normal, PARAMETERS, MEAN, SCALE))),
             {"p_inf": 101325.0},
         ),

@@ -19,18 +19,17 @@ from en4dvar.config.parameters import Fixed, Uncertain, read_parameters
 from en4dvar.config.schema import QuantityText, Section
 from en4dvar.config.validate import check
 from en4dvar.cycling.sequential import SequentialSettings
-from en4dvar.cycling.series import root_of_correlation
 from en4dvar.cycling.twin import TwinExperiment
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.forward import ForwardModel
 from en4dvar.hints import suggest
 from en4dvar.inputs.readers import Matrix, read_covariance
+from en4dvar.noise import Correlation
 from en4dvar.prior import Prior
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import Localisation
-from en4dvar.state import Array
 from en4dvar.units import UnitError, parse_quantity
 
 
@@ -260,15 +259,13 @@ def _quantities(
     return values
 
 
-def _correlation(file: str, document: Document, faults: list[Fault]) -> Array | None:
+def _correlation(file: str, document: Document, faults: list[Fault]) -> Correlation | None:
     """The correlation matrix of the observation errors, or None with a fault appended."""
     try:
-        correlation = read_covariance(Matrix(Path(file).expanduser(), "1", "1"))
-        root_of_correlation(correlation, len(correlation))
+        return Correlation(read_covariance(Matrix(Path(file).expanduser(), "1", "1")))
     except (DataError, ValueError) as error:
         faults.append(document.fault(("twin", "error_correlation"), str(error)))
         return None
-    return correlation
 
 
 def _localisation(

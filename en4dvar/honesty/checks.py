@@ -115,7 +115,7 @@ def information(names: Sequence[str], per_parameter: Array) -> Findings:
 
 def down_weighted(analysis: Analysis, most: int = 6) -> Findings:
     """Observations that a robust cost counts less; ``most`` of them are listed."""
-    weights, observations, model = analysis.huber_weight, analysis.problem.observations, analysis.problem.model
+    weights, observations, model = analysis.down_weights, analysis.problem.observations, analysis.problem.model
     if weights is None or not np.any(weights < 1):
         return
     lighter = np.flatnonzero(weights < 1)
@@ -124,8 +124,8 @@ def down_weighted(analysis: Analysis, most: int = 6) -> Findings:
     listed = ", ".join(f"{times[k]:.4g} {model.time_display_unit} (weight {weights[k]:.2g})" for k in worst[:most])
     more = f" and {len(worst) - most} more" if len(worst) > most else ""
     words = (
-        f"{len(worst)} of {len(weights)} observations lie beyond {observations.huber:g} standard deviations and were "
-        f"down-weighted (Huber): {listed}{more}"
+        f"{len(worst)} of {len(weights)} observations lie beyond {observations.noise.counts_within:g} standard "
+        f"deviations and were down-weighted (Huber): {listed}{more}"
     )
     yield caution("down-weighted", words)
 

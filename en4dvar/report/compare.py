@@ -207,9 +207,15 @@ def _same_data(a: StoredResult, b: StoredResult) -> bool:
 
 def _stated(o: Observations) -> dict[str, Array]:
     """The observations and everything that is stated about their errors."""
-    values = (o.times, o.values, o.std, o.time_std, o.weights, o.correlation, o.huber)
-    names = ("times", "values", "std", "time_std", "weights", "correlation", "huber")
-    return {name: np.asarray(value) for name, value in zip(names, values, strict=True) if value is not None}
+    return {
+        "times": o.times,
+        "values": o.values,
+        "weights": o.weights,
+        "std": o.noise.std,
+        "time_std": o.noise.time_std,
+        **{name: matrix for name, (matrix, _) in o.noise.matrices().items()},
+        **{name: np.asarray(number) for name, number in o.noise.attributes().items()},
+    }
 
 
 def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:

@@ -27,7 +27,7 @@ REFERENCES = (
     "layout: ArviZ InferenceData schema"
 )
 MEMBER = ("chain", "draw")
-HUBER, SCALAR = "huber_threshold", "scalar_"  # attributes of the observed data; scalars are a prefix and their name
+SCALAR = "scalar_"  # begins the attribute of a number found beside the data
 Variables = dict[str, Variable]
 
 
@@ -139,29 +139,20 @@ def _predictive(a: Analysis, predictions: Array, paths: Array) -> Variables:
 def _observed(a: Analysis) -> tuple[Variables, dict[str, Any]]:
     """Variables and attributes of the data and of what is stated about their errors."""
     name, obs = a.problem.observable.name, a.observations
-    noise, thresholds = _noise(a)
     variables = {
         name: _observable(a, ("time",), obs.values, "observed"),
         f"{name}_std": _observable(a, ("time",), a.error_std, "observation-error std, timing error included"),
         f"{name}_reading_std": _observable(a, ("time",), obs.std, "observation-error std of the reading alone"),
-        "time_std": _time(a, "time", obs.time_std, "std of the observation times"),
+        "time_std": _time(a, "time", obs.noise.time_std, "std of the observation times"),
         "weights": _variable("time", obs.weights, "1", "weight of the observation in the cost"),
-        **{f"{name}_{key}": variable for key, variable in noise.items()},
     }
+    for key, (matrix, words) in obs.noise.matrices().items():
+        variables[f"{name}_{key}"] = _variable(("time", "time_column"), matrix, "1", words)
+    if a.down_weights is not None:
+        words = "weight of the observation in the robust cost at its minimum"
+        variables[f"{name}_huber_weight"] = _variable("time", a.down_weights, "1", words)
     scalars = {f"{SCALAR}{key}": value for key, value in obs.scalars.items()}
-    return variables, {"name": obs.name, "data_source": obs.source, **scalars, **thresholds}
-
-
-def _noise(a: Analysis) -> tuple[Variables, dict[str, float]]:
-    """Variables and attributes of errors that are correlated, or whose cost is robust; empty for others."""
-    obs, variables = a.observations, {}
-    if obs.correlation is not None:
-        text = "correlation of the observation errors"
-        variables["correlation"] = _variable(("time", "time_column"), obs.correlation, "1", text)
-    if a.huber_weight is not None:
-        text = "weight of the observation in the robust cost at its minimum"
-        variables["huber_weight"] = _variable("time", a.huber_weight, "1", text)
-    return variables, {} if obs.huber is None else {HUBER: obs.huber}
+    return variables, {"name": obs.name, "data_source": obs.source, **scalars, **obs.noise.attributes()}
 
 
 def _constants(a: Analysis) -> Variables:

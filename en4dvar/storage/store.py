@@ -15,9 +15,10 @@ from en4dvar.analysis import Analysis
 from en4dvar.caution import Caution
 from en4dvar.errors import OutputError
 from en4dvar.files import atomic_path
+from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.state import Array, Parameter
-from en4dvar.storage.groups import HUBER, SCALAR, build_groups
+from en4dvar.storage.groups import SCALAR, build_groups
 from en4dvar.storage.netcdf import tree_of
 from en4dvar.storage.seal import check_seal, seal_file
 from en4dvar.summary import ParameterSummary, living, results_table
@@ -103,14 +104,16 @@ class StoredResult:
         return Observations(
             times=data["time"].values,
             values=data[name].values,
-            std=data[f"{name}_reading_std"].values,
-            time_std=data["time_std"].values,
+            noise=noise_of(
+                data[f"{name}_reading_std"].values,
+                data["time_std"].values,
+                data[correlation].values if correlation in data else None,
+                float(attributes["huber_threshold"]) if "huber_threshold" in attributes else None,
+            ),
             weights=data["weights"].values,
             name=self.name,
             source=str(attributes["data_source"]),
             scalars={k.removeprefix(SCALAR): float(v) for k, v in attributes.items() if k.startswith(SCALAR)},
-            correlation=data[correlation].values if correlation in data else None,
-            huber=float(attributes[HUBER]) if HUBER in attributes else None,
         )
 
     def members(self, group: str, name: str) -> Array:
