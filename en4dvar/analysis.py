@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from en4dvar.forward import Observable, ValidityLimit
-from en4dvar.honesty import Caution
+from en4dvar.caution import Caution
 from en4dvar.observations import Observations
-from en4dvar.problem import AssimilationSettings
+from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.state import Array, Parameter
 
 
@@ -67,19 +66,15 @@ Progress = Callable[[str, Record], None]  # what hears of them, with the name of
 
 @dataclass(frozen=True)
 class Analysis:
-    """The outcome for one data set: arrays only, members in order, physical SI values, NaN where a member failed.
+    """The outcome for one data set: members in order, physical SI values, NaN where a member failed.
 
     Shapes: N members, n estimated parameters, K observations, M points of the plotting grid.
     """
 
-    name: str
-    parameters: tuple[Parameter, ...]
-    fixed: Mapping[str, float]
-    fixed_parameters: tuple[Parameter, ...]
-    observable: Observable
-    observations: Observations
-    time_unit: str
-    time_display_unit: str
+    problem: InverseProblem
+    settings: AssimilationSettings
+    seed: int
+    fixed_parameters: tuple[Parameter, ...]  # what ``problem.fixed`` holds values of
     prior: Array  # (N, n)
     posterior: Array  # (N, n)
     centre: Array  # (n,) the minimum of J
@@ -98,15 +93,26 @@ class Analysis:
     converged: bool
     stop_reason: str
     forward_runs: int
-    seed: int
-    settings: AssimilationSettings
     cautions: tuple[Caution, ...] = ()  # why not to trust the posterior, the worst first
     log_evidence: float = float("nan")  # ln p(y), Laplace approximation
     shape: Mapping[str, float] = field(default_factory=dict)  # how Gaussian the posterior is (en4dvar.sampling.shape)
-    huber_weight: Array | None = None  # (K,) weights of the robust cost at the centre, where there is one
+    down_weights: Array | None = None  # (K,) of observations in a robust cost, at the centre; None with Gaussian errors
     refinement: Mapping[str, float] = field(default_factory=dict)  # summary of the Markov chain, if any
-    limits: tuple[ValidityLimit, ...] = ()  # V of the model
-    extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) reached by the posterior members
+    extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) of the model's limits, by the posterior
+
+    @property
+    def observations(self) -> Observations:
+        return self.problem.observations
+
+    @property
+    def name(self) -> str:
+        """Of the data set."""
+        return self.observations.name
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """What was estimated, (n,)."""
+        return self.problem.prior.parameters
 
     @property
     def warnings(self) -> tuple[str, ...]:

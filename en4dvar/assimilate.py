@@ -9,6 +9,7 @@ import numpy as np
 
 from en4dvar import diagnostics as diag
 from en4dvar.analysis import Analysis, Progress, Record
+from en4dvar.caution import Caution, caution
 from en4dvar.descent.loop import iterate
 from en4dvar.descent.noise_scale import mean_beyond_mode
 from en4dvar.descent.start import StartState, choose_start
@@ -17,8 +18,7 @@ from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, log_posterior
 from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
-from en4dvar.honesty import Caution, Ending, caution, examine
-from en4dvar.honesty.checks import down_weighted
+from en4dvar.honesty import ControlEnsembles, examine
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.shape import examine_shape, guide
@@ -26,7 +26,6 @@ from en4dvar.schemes import window_scheme
 from en4dvar.schemes.base import Weights
 from en4dvar.schemes.en4dvar import En4DVar
 from en4dvar.state import Array
-from en4dvar.units import convert
 
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 
@@ -138,22 +137,15 @@ class _Assimilation:
         else:  # the last ensemble that was run is the posterior
             after, last = descent.iterate.members, descent.iterate.central
         space.require_members(after.failures, "posterior forecast")
-        down_weights, huber_warnings = self.robust(last)
-        per_parameter = diag.dfs_per_parameter(space.prior_variance, posterior)
         costs = self.costs(ends[:-1], after)
         centre_cost = float(self.costs(ends[-1:], last)[0])
         shape = {} if refinement else examine_shape(space, posterior, mode, costs, self.seed)
-        record = descent.records[-1]
         observations, prior = problem.observations, problem.prior
-        return Analysis(
-            name=observations.name,
-            parameters=prior.parameters,
-            fixed=problem.fixed,
+        analysis = Analysis(
+            problem=problem,
+            settings=self.settings,
+            seed=self.seed,
             fixed_parameters=self.fixed_parameters,
-            observable=problem.observable,
-            observations=observations,
-            time_unit=problem.model.time_unit,
-            time_display_unit=problem.model.time_display_unit,
             prior=prior.to_physical(space.members),
             posterior=prior.to_physical(posterior),
             centre=prior.to_physical(mode),
@@ -168,45 +160,21 @@ class _Assimilation:
             prior_failures=prior_run.failures[:-1],
             posterior_failures=after.failures,
             iterations=descent.records,
-            dfs_per_parameter=per_parameter,
+            dfs_per_parameter=diag.dfs_per_parameter(space.prior_variance, posterior),
             converged=descent.converged,
             stop_reason=descent.stop,
             forward_runs=space.forward_runs,
-            seed=self.seed,
-            settings=self.settings,
             shape=shape,
-            huber_weight=down_weights,
+            down_weights=observations.noise.down_weights(observations.values, last.predicted[0]),
             refinement=refinement,
             log_evidence=diag.log_evidence(
                 descent.iterate.cost, descent.newton.hessian.singular_values, len(space.members), observations
             ),
-            limits=problem.model.validity,
             extremes=after.extremes,
-            cautions=examine(
-                Ending(
-                    prior=prior,
-                    members=space.members,
-                    posterior=posterior,
-                    mode=mode,
-                    costs=costs,
-                    cost=centre_cost,
-                    converged=descent.converged,
-                    stop_reason=descent.stop,
-                    step_norm=record.step_norm,
-                    chi2=record.chi2_per_observation * len(observations.used),
-                    n_weighted=len(observations.used),
-                    dfs=record.dfs,
-                    dfs_per_parameter=per_parameter,
-                    prior_failures=prior_run.failures[:-1],
-                    worst_loss=descent.worst_loss,
-                    posterior_failures=after.failures,
-                    shape=shape,
-                    limits=problem.model.validity,
-                    extremes=after.extremes,
-                    found=(*start.warnings, *refine_warnings, *huber_warnings),
-                )
-            ),
         )
+        control = ControlEnsembles(space.members, posterior, mode, costs, centre_cost)
+        found = (*start.warnings, *refine_warnings)
+        return replace(analysis, cautions=examine(analysis, control, descent.worst_loss, found))
 
     def start(self, prior_run: Forecast, resume: LoopState | None) -> LoopState:
         """The state from which the iterations go on."""
@@ -268,15 +236,6 @@ class _Assimilation:
         )
         warnings = () if chain.converged else (caution("chain-not-converged", chain.warning()),)
         return chain.thin(len(posterior), self.settings.sampling == "exact"), chain.summary(), warnings
-
-    def robust(self, centre: Forecast) -> tuple[Array | None, tuple[Caution, ...]]:
-        """What the observations count (K,) at the centre, and words for those that do not count in full."""
-        observations, model = self.problem.observations, self.problem.model
-        weights = observations.noise.down_weights(observations.values, centre.predicted[0])
-        if weights is None:
-            return None, ()
-        times = convert(observations.times, model.time_unit, model.time_display_unit)
-        return weights, down_weighted(weights, times, model.time_display_unit, observations.noise.counts_within)
 
     def costs(self, members: Array, run: Forecast) -> Array:
         """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.observations import Observations
 from en4dvar.state import Array
@@ -78,15 +79,15 @@ def effective_share(log_weights: Array) -> float:
     return float(weights.sum() ** 2 / np.sum(weights**2) / len(weights))
 
 
-def gaussianity(members: Array, mode: Array, costs: Array) -> dict[str, float]:
+def gaussianity(members: Array, centre: Array, costs: Array) -> dict[str, float]:
     """How well the posterior ensemble, as a Gaussian, agrees with the posterior at its own members.
 
-    ``members`` (N, n) and their Gaussian's centre ``mode`` (n,), transformed; ``costs`` J (N,) of the members. With log
+    ``members`` (N, n) and the ``centre`` (n,) of their Gaussian, transformed; ``costs`` J (N,) of the members. With log
     weights ½ z² − J, z the distance in the ensemble's covariance, the :func:`effective_share` of the weights is 1 for a
     Gaussian posterior. NaN with fewer members alive than n + 2.
     """
     alive = np.isfinite(costs)
-    anomalies = members - mode
+    anomalies = members - centre
     if int(alive.sum()) < members.shape[1] + 2:
         return {"gaussian_fit": math.nan}
     about_mean = members - np.add.reduce(members, axis=0) / len(members)
@@ -119,6 +120,11 @@ def shape_warnings(shape: Mapping[str, float]) -> tuple[str, ...]:
         f"the posterior is far from Gaussian (effective share of members {shape['gaussian_fit']:.2f}): mean and spread "
         "of the ensemble may be off by more than they say",
     )
+
+
+def active_members(failures: Sequence[str]) -> npt.NDArray[np.bool_]:
+    """(N,) True where no reason of failure is given."""
+    return np.array([reason == "" for reason in failures], dtype=bool)
 
 
 def common_reasons(failures: Sequence[str], most: int = 3) -> str:

@@ -50,6 +50,16 @@ def write_bytes(path: str | Path, content: bytes) -> Path:
     return Path(path)
 
 
+def make_folder(path: str | Path) -> Path:
+    """The folder, made where it is missing. Raises :class:`OutputError`."""
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be created: {error.strerror}") from None
+    return path
+
+
 def readable(text: object) -> str:
     r"""Text that can be written as UTF-8; bytes of a file's name that are not are shown as ``\udcfc``."""
     return str(text).encode("utf-8", "backslashreplace").decode("utf-8")

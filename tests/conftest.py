@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from en4dvar.analysis import Analysis, IterationRecord
-from en4dvar.forward import Observable, StateField
-from en4dvar.honesty import caution
+from en4dvar.caution import caution
+from en4dvar.forward import ForwardModel, Observable, StateField
 from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
-from en4dvar.problem import AssimilationSettings
-from en4dvar.state import TIME_SHIFT, Array, Parameter
+from en4dvar.prior import Prior, PriorTerm
+from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.state import TIME_SHIFT, Array, Field, Parameter, StateLayout
 
 FAILED = 3
 
@@ -26,10 +27,24 @@ PARAMETERS = (
     TIME_SHIFT,
 )
 FIXED = (Parameter("p_inf", "Pa", label="far-field pressure", symbol=r"$p_\infty$", display_unit="kPa"),)
+OBSERVABLE = Observable("R", "m", StateField("R"), "$R$", "um", "bubble radius")
 MEAN = np.array([2500.0, 0.09, 40e-6, 0.0])
 PRIOR_RELATIVE = np.array([0.4, 0.5, 0.2, 1.0])
 SCALE = np.array([2500.0, 0.09, 40e-6, 0.4e-6])
 SHRINK = np.array([0.12, 0.25, 0.97, 0.6])
+
+
+class Bounce(ForwardModel):
+    """What an analysis knows of its model; it is never run."""
+
+    parameters, layout, observables = (*PARAMETERS[:3], *FIXED), StateLayout((Field("R", unit="m"),)), (OBSERVABLE,)
+    time_display_unit = "us"
+
+    def initial_state(self, theta):
+        raise NotImplementedError
+
+    def step(self, x, t0, t1):
+        raise NotImplementedError
 
 
 def _path(theta: Array, times: Array) -> Array:
@@ -52,7 +67,6 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
     times, grid = np.linspace(2e-6, 80e-6, 40), np.linspace(0.0, 85e-6, 200)
     std = np.full(40, 4e-6)
     values = _path(truth[None], times)[0] + std * rng.standard_normal(40)
-    observable = Observable("R", "m", StateField("R"), "$R$", "um", "bubble radius")
     posterior = ensemble(SHRINK, truth)
     predictions = _path(posterior, times)
     for rows in (posterior, predictions):
@@ -73,16 +87,16 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
         )  # fmt: skip
     failures = tuple("collapse too violent" if i == FAILED else "" for i in range(n_members))
     analysis = Analysis(
-        name="A_E2_synthetic",
-        parameters=PARAMETERS,
-        fixed={"p_inf": 101325.0},
-        fixed_parameters=FIXED,
-        observable=observable,
-        observations=Observations(
-            times, values, noise_of(std), np.ones(40), "A_E2_synthetic", "made/up.csv", {"Req": 4e-5}
+        problem=InverseProblem(
+            Bounce(),
+            OBSERVABLE,
+            Observations(times, values, noise_of(std), np.ones(40), "A_E2_synthetic", "made/up.csv", {"Req": 4e-5}),
+            Prior(tuple(map(PriorTerm.normal, PARAMETERS, MEAN, SCALE))),
+            {"p_inf": 101325.0},
         ),
-        time_unit="s",
-        time_display_unit="us",
+        settings=AssimilationSettings(members=n_members),
+        seed=11,
+        fixed_parameters=FIXED,
         prior=prior,
         posterior=posterior,
         centre=truth,
@@ -101,11 +115,20 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
         converged=True,
         stop_reason="step norm below 1e-3",
         forward_runs=6 * n_members,
-        seed=11,
-        settings=AssimilationSettings(members=n_members),
         cautions=(caution("members-lost", "1 of 24 members failed in the posterior forecast: collapse too violent"),),
     )
     return replace(analysis, **changes)
+
+
+@pytest.fixture(scope="session")
+def renamed() -> Callable[[Analysis, str], Analysis]:
+    """``renamed(analysis, name)``: as if the data set had that name."""
+
+    def rename(analysis: Analysis, name: str) -> Analysis:
+        problem = analysis.problem
+        return replace(analysis, problem=replace(problem, observations=replace(problem.observations, name=name)))
+
+    return rename
 
 
 @pytest.fixture(scope="session")

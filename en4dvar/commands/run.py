@@ -75,7 +75,7 @@ def _estimate(config: Config, force: bool, resume: bool) -> None:
 
 def _tell(campaign: Campaign, with_report: bool) -> None:
     """The posterior on standard output, warnings on standard error. Raises :class:`Failed` where a data set has."""
-    from en4dvar.storage.store import results_table
+    from en4dvar.summary import results_table
 
     if len(campaign) <= MOST_TOLD:
         click.echo(results_table({o.name: o.summary for o in campaign.outcomes if not o.failure}))

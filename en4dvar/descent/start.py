@@ -15,12 +15,12 @@ import numpy as np
 
 from en4dvar import diagnostics as diag
 from en4dvar.analysis import Record, StartRecord
+from en4dvar.caution import Caution, caution
 from en4dvar.descent.loop import iterate
 from en4dvar.descent.step_control import Move
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.ensemble.forecast import Forecast
-from en4dvar.honesty import Caution, caution
 from en4dvar.schemes.base import Scheme, Weights
 from en4dvar.schemes.en4dvar import En4DVar
 

@@ -1,49 +1,44 @@
-"""Single checks: pure functions of arrays, each silent where there is nothing to say."""
+"""Single checks: pure functions, each silent where there is nothing to say."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from statistics import median
 
 import numpy as np
 
+from en4dvar.analysis import Analysis
+from en4dvar.caution import Caution, caution
 from en4dvar.diagnostics import HARDLY_INFORMED, chi2_interval
 from en4dvar.forward import ValidityLimit
-from en4dvar.honesty.caution import Caution, caution
 from en4dvar.prior import Prior
 from en4dvar.state import Array
+from en4dvar.units import convert
 
 SAME_DIRECTION = 1e-8  # relative singular value below which anomalies do not span a direction
 NEAR = 0.05  # of the width of an interval
 PILED_UP = 0.2  # share of members near a bound
 BEYOND = 0.1  # share of members beyond a limit of the model
+Findings = Iterator[Caution]
 
 
-def rank(prior: Prior, members: Array, posterior: Array) -> tuple[Caution, ...]:
+def rank(prior: Prior, members: Array, posterior: Array) -> Findings:
     """Ensembles (N, n), (N', n) whose anomalies span fewer directions than there are parameters."""
     n = members.shape[1]
     spanned = _rank(members.tobytes(), prior.std.tobytes())
     if spanned < n:
-        return (
-            caution(
-                "rank-deficient",
-                f"the {len(members)} prior members span {spanned} of {n} directions: the posterior cannot move in the "
-                "others and its spread there is zero",
-            ),
+        words = f"the {len(members)} prior members span {spanned} of {n} directions"
+        yield caution(
+            "rank-deficient", f"{words}: the posterior cannot move in the others and its spread there is zero"
         )
-    if len(posterior) <= n:
-        return (
-            caution(
-                "rank-deficient",
-                f"{len(posterior)} members of the posterior are alive, too few for the covariance of {n} parameters",
-            ),
-        )
-    return ()
+    elif len(posterior) <= n:
+        words = f"{len(posterior)} members of the posterior are alive, too few for the covariance of {n} parameters"
+        yield caution("rank-deficient", words)
 
 
-def fit(chi2: float, n_observations: int, total_dfs: float) -> tuple[Caution, ...]:
+def fit(chi2: float, n_observations: int, total_dfs: float) -> Findings:
     """A residual χ² (the sum over the observations) that R does not explain.
 
     At the minimum its expectation is K − DFS, not K (Talagrand 1999): the fit has absorbed DFS of the noise.
@@ -52,39 +47,30 @@ def fit(chi2: float, n_observations: int, total_dfs: float) -> tuple[Caution, ..
     low, high = chi2_interval(degrees)
     words = f"χ² of the residuals is {chi2:.3g} where about {degrees:.3g} is expected"
     if not chi2 <= high:
-        return (caution("misfit", f"{words}: the model does not explain the data within the stated observation error"),)
-    if chi2 < low:
-        return (
-            caution(
-                "overstated-error", f"{words}: the stated observation error is larger than the scatter of the data"
-            ),
-        )
-    return ()
+        yield caution("misfit", f"{words}: the model does not explain the data within the stated observation error")
+    elif chi2 < low:
+        words = f"{words}: the stated observation error is larger than the scatter of the data"
+        yield caution("overstated-error", words)
 
 
-def conflict(prior: Prior, mode: Array) -> tuple[Caution, ...]:
-    """A posterior mode (n,) far from the prior: 2 J_b beyond the 99.95 % point of χ²_n."""
-    z = (mode - prior.mean) / prior.std
+def conflict(prior: Prior, centre: Array) -> Findings:
+    """A posterior centre (n,) far from the prior: 2 J_b beyond the 99.95 % point of χ²_n."""
+    z = (centre - prior.mean) / prior.std
     if float(z @ z) <= chi2_interval(len(z))[1]:
-        return ()
+        return
     worst = np.argsort(-np.abs(z))
     names = prior.names
     listed = ", ".join(f"{names[j]} by {z[j]:+.1f}" for j in worst if abs(z[j]) > 2) or f"{names[worst[0]]} most"
-    return (
-        caution(
-            "prior-conflict",
-            f"prior and data conflict: the minimum lies far from the prior mean ({listed} prior standard deviations)",
-        ),
-    )
+    words = f"prior and data conflict: the minimum lies far from the prior mean ({listed} prior standard deviations)"
+    yield caution("prior-conflict", words)
 
 
-def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[str]) -> tuple[Caution, ...]:
+def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[str]) -> Findings:
     """Posterior members that pile up at a bound: within 5 % of the interval's width (of a half-line's, the prior std).
 
     Members that failed because the parameter left its bounds count as piled up. A lognormal has no bound to pile up
     at: zero is infinitely far in ln θ. The prior's own share near the bound is no finding, three times it is.
     """
-    found = []
     for j, (term, parameter) in enumerate(zip(prior.terms, prior.parameters, strict=True)):
         low, high = term.bounds if term.transform == "logit" else parameter.bounds
         if term.transform == "lognormal":
@@ -102,55 +88,46 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
             usual = float(np.mean(sign * (before - bound) <= NEAR * width))
             if share >= PILED_UP and share > 3 * usual:
                 words = f"{share:.0%} of the posterior members of {parameter.name} pile up at its {side} bound"
-                found.append(caution("at-bound", f"{words} ({bound:g} {parameter.unit})".replace(" 1)", ")")))
-    return tuple(found)
+                yield caution("at-bound", f"{words} ({bound:g} {parameter.unit})".replace(" 1)", ")"))
 
 
-def validity(limits: Sequence[ValidityLimit], extremes: Array) -> tuple[Caution, ...]:
+def validity(limits: Sequence[ValidityLimit], extremes: Array) -> Findings:
     """Posterior members (N, V) whose path leaves what the model's equations assume."""
-    found = []
     for limit, reached in zip(limits, extremes.T, strict=True) if extremes.size else ():
         beyond = reached > limit.value
         if np.mean(beyond) > BEYOND:
             unit = "" if limit.unit == "1" else f" {limit.unit}"
-            found.append(
-                caution(
-                    "model-validity",
-                    f"{beyond.sum()} of {len(reached)} posterior members leave the model's validity: {limit.label} "
-                    f"reaches {np.max(reached):.3g}{unit} (median {median(reached.tolist()):.3g}), the limit is "
-                    f"{limit.value:g}{unit}",
-                )
+            words = (
+                f"{beyond.sum()} of {len(reached)} posterior members leave the model's validity: {limit.label} reaches "
+                f"{np.max(reached):.3g}{unit} (median {median(reached.tolist()):.3g}), the limit is "
+                f"{limit.value:g}{unit}"
             )
-    return tuple(found)
+            yield caution("model-validity", words)
 
 
-def information(names: Sequence[str], per_parameter: Array) -> tuple[Caution, ...]:
+def information(names: Sequence[str], per_parameter: Array) -> Findings:
     """Parameters the data hardly constrain; ``per_parameter`` (n,) is 1 − posterior over prior variance."""
-    return tuple(
-        caution(
-            "not-informed",
-            f"{name} is hardly informed by the data (DFS {value:.2f}): its posterior is close to its prior",
-        )
-        for name, value in zip(names, per_parameter, strict=True)
-        if value < HARDLY_INFORMED
-    )
+    for name, value in zip(names, per_parameter, strict=True):
+        if value < HARDLY_INFORMED:
+            words = f"{name} is hardly informed by the data (DFS {value:.2f}): its posterior is close to its prior"
+            yield caution("not-informed", words)
 
 
-def down_weighted(weights: Array, times: Array, unit: str, threshold: float, most: int = 6) -> tuple[Caution, ...]:
-    """Observations that a robust cost counts less; weights and times (K,), ``unit`` of the times."""
+def down_weighted(analysis: Analysis, most: int = 6) -> Findings:
+    """Observations that a robust cost counts less; ``most`` of them are listed."""
+    weights, observations, model = analysis.down_weights, analysis.problem.observations, analysis.problem.model
+    if weights is None or not np.any(weights < 1):
+        return
     lighter = np.flatnonzero(weights < 1)
-    if not len(lighter):
-        return ()
+    times = convert(observations.times, model.time_unit, model.time_display_unit)
     worst = lighter[np.argsort(weights[lighter], kind="stable")]
-    listed = ", ".join(f"{times[k]:.4g} {unit} (weight {weights[k]:.2g})" for k in worst[:most])
+    listed = ", ".join(f"{times[k]:.4g} {model.time_display_unit} (weight {weights[k]:.2g})" for k in worst[:most])
     more = f" and {len(worst) - most} more" if len(worst) > most else ""
-    return (
-        caution(
-            "down-weighted",
-            f"{len(worst)} of {len(weights)} observations lie beyond {threshold:g} standard deviations and were "
-            f"down-weighted (Huber): {listed}{more}",
-        ),
+    words = (
+        f"{len(worst)} of {len(weights)} observations lie beyond {observations.noise.counts_within:g} standard "
+        f"deviations and were down-weighted (Huber): {listed}{more}"
     )
+    yield caution("down-weighted", words)
 
 
 @lru_cache(maxsize=4)  # the data sets of a campaign share their prior members

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.diagnostics import common_reasons
-from en4dvar.honesty.caution import Caution, caution
+from en4dvar.caution import Caution, caution
+from en4dvar.diagnostics import active_members, common_reasons
 from en4dvar.prior import Prior
 from en4dvar.state import Array
 from en4dvar.units import convert
@@ -21,18 +21,18 @@ MOST_NAMED = 3
 Mask = npt.NDArray[np.bool_]
 
 
-def loss(stage: str, failures: Sequence[str], prior: Prior, members: Array | None = None) -> tuple[Caution, ...]:
+def loss(stage: str, failures: Sequence[str], prior: Prior, members: Array | None = None) -> Iterator[Caution]:
     """The members (N,) that failed in a forecast; ``failures`` are reasons, "" for members alive.
 
     ``members`` (N, n), transformed, are where they were run, if that tells anything.
     """
-    lost = np.array([bool(reason) for reason in failures], dtype=bool)
+    lost = ~active_members(failures)
     if not lost.any():
-        return ()
+        return
     words = f"{lost.sum()} of {len(lost)} members failed in the {stage}: {common_reasons(failures)}"
     if members is not None:
         words = f"{words}; {where_lost(prior, members, lost)}"
-    return (caution("members-lost", words, "serious" if lost.mean() > MANY else None),)
+    yield caution("members-lost", words, "serious" if lost.mean() > MANY else None)
 
 
 def where_lost(prior: Prior, members: Array, lost: Mask) -> str:
@@ -65,13 +65,13 @@ def where_lost(prior: Prior, members: Array, lost: Mask) -> str:
 
 
 def _one_by_one(prior: Prior, members: Array) -> str:
-    told = []
+    described = []
     for row in members:
         z = (row - prior.mean) / prior.std
         far = [j for j in np.argsort(-np.abs(z)) if abs(z[j]) > FAR][:MOST_NAMED]
         places = ", ".join(f"{prior.names[j]} = {_shown(prior, j, row[j])} ({z[j]:+.1f} prior std)" for j in far)
-        told.append(f"at {places}" if places else "near the centre of the prior")
-    return f"lost {' and '.join(dict.fromkeys(told))}"
+        described.append(f"at {places}" if places else "near the centre of the prior")
+    return f"lost {' and '.join(dict.fromkeys(described))}"
 
 
 def _rank_score(values: Array, lost: Mask) -> float:

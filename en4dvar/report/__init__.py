@@ -7,26 +7,22 @@ the worst warned of get theirs at once and the others when they are asked for by
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
 from en4dvar.errors import OutputError
 from en4dvar.executor import ProcessesExecutor, SerialExecutor, WorkerLostError
-from en4dvar.files import write_text
+from en4dvar.files import make_folder, write_text
 from en4dvar.hints import suggest
-from en4dvar.honesty import Caution
 from en4dvar.report.figures import all_figures
-from en4dvar.report.overview import Entry, overview_figures, render_overview
-from en4dvar.report.page import make_section, render_set
-from en4dvar.report.style import save_figure
+from en4dvar.report.overview import SetSummary, overview_figures, render_overview
+from en4dvar.report.page import IDENTIFIERS, render_set
+from en4dvar.report.style import draw
 from en4dvar.storage.campaign_file import failed_datasets
-from en4dvar.storage.store import ParameterSummary, StoredResult, load_stored
+from en4dvar.storage.store import load_stored, result_files
+from en4dvar.summary import summary_csv
 
-Summarised = tuple[str, Iterable[ParameterSummary], Iterable[Caution]]
 PAGES = 40  # data sets of a campaign with a page from the start
 SHARE = 4  # pages that are worth the start of a process
 COPIES = 12  # data sets of a campaign up to which figures are also kept as PDF and PNG
@@ -46,39 +42,21 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     run_dir = Path(run_dir)
     if not run_dir.is_dir():
         raise OutputError(f"{run_dir}: no such run directory")
-    paths = sorted((run_dir / "datasets").glob("*.nc"))
-    if not paths:
-        result = load_stored(run_dir / "posterior.nc")
+    files, whole = result_files(run_dir), run_dir / "posterior.nc"
+    if files == [whole]:
+        result = load_stored(whole)
         write_text(run_dir / "summary.csv", summary_csv([(result.name, result.summary(), result.cautions)], {}))
-        return _write_set(run_dir / "report.html", result, copies="")
-    entries = [Entry.of(load_stored(path), path.stem) for path in paths]
-    failures = failed_datasets(run_dir / "posterior.nc")
-    write_text(run_dir / "summary.csv", summary_csv(((e.name, e.summary, e.cautions) for e in entries), failures))
-    return _write_campaign(run_dir, entries, failures, _asked(run_dir, entries, datasets), workers)
+        figures = draw(all_figures(result), run_dir / "figures", identifiers=IDENTIFIERS)
+        return write_text(run_dir / "report.html", render_set(result, figures))
+    sets = [SetSummary.of(load_stored(path), path.stem) for path in files]
+    failures = failed_datasets(whole)
+    write_text(run_dir / "summary.csv", summary_csv(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
+    return _write_campaign(run_dir, sets, failures, _asked(run_dir, sets, datasets), workers)
 
 
-def summary_csv(summaries: Iterable[Summarised], failures: Mapping[str, str]) -> str:
-    """One line a data set and parameter, in display units, every digit kept; one line a data set that failed.
-
-    ``summaries``: (name of the data set, its rows, its warnings: column ``warnings`` holds their codes);
-    ``failures``: name of the data set → reason, column ``failure``.
-    """
-    columns = [f.name for f in fields(ParameterSummary) if f.name not in ("label", "symbol")]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["dataset", *columns, "failure", "warnings"])
-    for name, summary, cautions in summaries:
-        codes = " ".join(dict.fromkeys(c.code for c in cautions))
-        for row in summary:
-            writer.writerow([name, *(getattr(row, column) for column in columns), "", codes])
-    for name, reason in failures.items():
-        writer.writerow([name, *("" for _ in columns), reason, ""])
-    return text.getvalue()
-
-
-def _asked(run_dir: Path, entries: Sequence[Entry], names: Sequence[str]) -> frozenset[str]:
+def _asked(run_dir: Path, sets: Sequence[SetSummary], names: Sequence[str]) -> frozenset[str]:
     """Stems of the data sets asked for."""
-    stems = {entry.name: entry.stem for entry in entries}
+    stems = {s.name: s.stem for s in sets}
     for name in names:
         if name not in stems:
             raise OutputError(f"{run_dir}: no data set {name!r}{suggest(name, stems)}")
@@ -86,18 +64,18 @@ def _asked(run_dir: Path, entries: Sequence[Entry], names: Sequence[str]) -> fro
 
 
 def _write_campaign(
-    run_dir: Path, entries: Sequence[Entry], failures: Mapping[str, str], asked: frozenset[str], workers: int
+    run_dir: Path, sets: Sequence[SetSummary], failures: Mapping[str, str], asked: frozenset[str], workers: int
 ) -> Path:
-    folder = _folder(run_dir / "pages")
-    first = {e.stem for e in sorted(entries, key=lambda e: -e.gravity)[:PAGES]}
-    paged = [e for e in entries if e.stem in asked | first or (folder / f"{e.stem}.html").is_file()]
+    folder = make_folder(run_dir / "pages")
+    first = {s.stem for s in sorted(sets, key=lambda s: -s.gravity)[:PAGES]}
+    paged = [s for s in sets if s.stem in asked | first or (folder / f"{s.stem}.html").is_file()]
     calls: list[tuple[Path, str, str | None, list[tuple[str, str]]]] = []
-    for before, entry, after in zip([None, *paged[:-1]], paged, [*paged[1:], None], strict=True):
+    for before, one, after in zip([None, *paged[:-1]], paged, [*paged[1:], None], strict=True):
         neighbours = (("← ", before), ("→ ", after))
         trail = [("All data sets", "../report.html")]
-        trail += [(f"{arrow}{e.name}", quote(f"{e.stem}.html")) for arrow, e in neighbours if e is not None]
-        copies = f"{entry.stem}_" if len(entries) <= COPIES or entry.stem in asked else None
-        calls.append((run_dir, entry.stem, copies, trail))
+        trail += [(f"{arrow}{s.name}", quote(f"{s.stem}.html")) for arrow, s in neighbours if s is not None]
+        copies = f"{one.stem}_" if len(sets) <= COPIES or one.stem in asked else None
+        calls.append((run_dir, one.stem, copies, trail))
     workers = min(workers, len(calls) // SHARE)
     with ProcessesExecutor(workers) if workers > 1 else SerialExecutor() as executor:
         for i, value in executor.map(_write_page, calls):
@@ -105,33 +83,14 @@ def _write_campaign(
                 _write_page(*calls[i])
             elif isinstance(value, Exception):
                 raise value
-    figures = overview_figures(entries)
-    _folder(run_dir / "figures")
-    for name, _, figure in figures:
-        save_figure(figure, run_dir / "figures", name)
-    pages = {e.stem: quote(f"pages/{e.stem}.html") for e in paged}
-    return write_text(run_dir / "report.html", render_overview(entries, pages, failures, figures))
+    figures = draw(overview_figures(sets), run_dir / "figures")
+    pages = {s.stem: quote(f"pages/{s.stem}.html") for s in paged}
+    return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures))
 
 
 def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:
-    """The page of one data set of a campaign."""
+    """The page of one data set of a campaign; ``copies``: prefix of its figures as PDF and PNG, None for none."""
     result = load_stored(run_dir / "datasets" / f"{stem}.nc")
-    _write_set(run_dir / "pages" / f"{stem}.html", result, copies, trail)
-
-
-def _write_set(path: Path, result: StoredResult, copies: str | None, trail: Sequence[tuple[str, str]] = ()) -> Path:
-    """The page of one data set; ``copies``: prefix of its figures as PDF and PNG in ``figures/``, None for none."""
-    figures = list(all_figures(result))
-    if copies is not None:
-        folder = _folder((path.parent if path.name == "report.html" else path.parent.parent) / "figures")
-        for name, _, figure in figures:
-            save_figure(figure, folder, f"{copies}{name}")
-    return write_text(path, render_set(make_section(result, "d0", figures), trail, copies is not None))
-
-
-def _folder(folder: Path) -> Path:
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be created: {error.strerror}") from None
-    return folder
+    folder = None if copies is None else run_dir / "figures"
+    figures = draw(all_figures(result), folder, copies or "", IDENTIFIERS)
+    write_text(run_dir / "pages" / f"{stem}.html", render_set(result, figures, trail, copies is not None))

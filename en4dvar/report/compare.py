@@ -15,8 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from en4dvar.errors import OutputError
+from en4dvar.observations import Observations
+from en4dvar.report.text import fixed
 from en4dvar.state import Array
-from en4dvar.storage.store import ParameterSummary, StoredResult, load_stored
+from en4dvar.storage.store import StoredResult, load_stored, result_files
+from en4dvar.summary import ParameterSummary
+from en4dvar.tables import table
 
 UNDECIDABLE = 1.0  # difference of log-evidence
 ALL = "all data sets"
@@ -73,6 +77,11 @@ class Comparison:
         """Names of the parameters of all runs, in order of appearance."""
         return tuple(dict.fromkeys(estimate.summary.name for estimate in self.estimates))
 
+    @property
+    def by_parameter(self) -> tuple[Estimate, ...]:
+        """The estimates, those of one parameter below each other."""
+        return tuple(e for name in self.parameters for e in self.estimates if e.summary.name == name)
+
     def of(self, dataset: str) -> tuple[ModelScore, ...]:
         """The scores of one data set, or of :data:`ALL` together, runs in the order given."""
         return tuple(score for score in self.scores if score.dataset == dataset)
@@ -101,34 +110,29 @@ def compare_runs(runs: Sequence[str | Path]) -> Comparison:
     """
     if len(runs) < 2:
         raise OutputError("compare needs at least two run directories")
-    names = _labels([Path(run) for run in runs])
-    results = {name: _results(Path(run)) for name, run in zip(names, runs, strict=True)}
-    reason = _difference(results)
+    paths = [Path(run) for run in runs]
+    results = {name: _results(path) for name, path in zip(_labels(paths), paths, strict=True)}
+    datasets = list(dict.fromkeys(dataset for held in results.values() for dataset in held))
+    pairs = [(name, d, held[d]) for d in datasets for name, held in results.items() if d in held]
     estimates = tuple(
         Estimate(name, dataset, row, result.members("posterior", row.name))
-        for dataset in dict.fromkeys(d for held in results.values() for d in held)
-        for name in names
-        if (result := results[name].get(dataset)) is not None
+        for name, dataset, result in pairs
         for row in result.summary()
     )
-    if reason:
-        scores = [_score(name, dataset, result) for name in names for dataset, result in results[name].items()]
+    if reason := _difference(results):
+        scores = [_score(name, dataset, result) for name, held in results.items() for dataset, result in held.items()]
         return Comparison(tuple(scores), estimates, reason)
-    scores = []
-    first = results[names[0]]
-    for dataset in first:
-        scores += _ranked([_score(name, dataset, results[name][dataset]) for name in names])
-    if len(first) > 1:
-        scores += _ranked([_total(name, [s for s in scores if s.run == name]) for name in names])
-    return Comparison(tuple(scores), estimates)
+    of_each = [_ranked([_score(*pair) for pair in pairs if pair[1] == dataset]) for dataset in datasets]
+    if len(datasets) > 1:
+        of_each.append(_ranked([_total(run) for run in zip(*of_each, strict=True)]))
+    return Comparison(tuple(score for ranked in of_each for score in ranked), estimates)
 
 
 def _difference(results: Mapping[str, Mapping[str, StoredResult]]) -> str:
     """Why the evidences of the runs do not compare; empty where all of them used the same data."""
     first, *others = results
     for name in others:
-        if set(results[name]) != set(results[first]):
-            odd = sorted(set(results[name]) ^ set(results[first]))
+        if odd := sorted(set(results[name]) ^ set(results[first])):
             more = f" and {len(odd) - 3} more" if len(odd) > 3 else ""
             return f"{name} and {first} hold different data sets: {', '.join(odd[:3])}{more}"
         for dataset, result in results[name].items():
@@ -148,16 +152,14 @@ def model_probabilities(log_evidence: Array) -> Array:
 
 def comparison_table(comparison: Comparison) -> str:
     """What the terminal shows: one row a model and data set, and the verdict on each data set."""
-    from en4dvar.tables import table
-
     header = ("data set", "run", "log-evidence", "difference", "probability", "chi2/K", "DFS", "p_WAIC", "NRMSE")
     rows = [
         (
             s.dataset,
             s.run,
             f"{s.log_evidence:.2f}",
-            f"{s.difference:.2f}" if np.isfinite(s.difference) else "–",
-            f"{s.probability:.3f}" if np.isfinite(s.probability) else "–",
+            fixed(s.difference, 2),
+            fixed(s.probability, 3),
             f"{s.chi2_per_observation:.3g}",
             f"{s.dfs:.2f}",
             f"{s.effective_parameters:.2f}",
@@ -173,20 +175,13 @@ def comparison_table(comparison: Comparison) -> str:
 
 def estimates_table(comparison: Comparison) -> str:
     """Posterior mean, std and 5–95 % of every parameter, runs below each other, in display units."""
-    from en4dvar.tables import table
-
     header = ("parameter", "unit", "data set", "run", "mean", "std", "5 %", "95 %")
     rows = [
-        (e.summary.name, e.summary.unit, e.dataset, e.run, *(f"{v:.4g}" for v in _shown(e.summary)))
-        for name in comparison.parameters
-        for e in comparison.estimates
-        if e.summary.name == name
+        (row.name, row.unit, e.dataset, e.run, *(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q95)))
+        for e in comparison.by_parameter
+        for row in [e.summary]
     ]
     return table([header, *rows])
-
-
-def _shown(row: ParameterSummary) -> tuple[float, ...]:
-    return row.mean, row.std, row.q05, row.q95
 
 
 def _labels(runs: Sequence[Path]) -> list[str]:
@@ -200,54 +195,55 @@ def _labels(runs: Sequence[Path]) -> list[str]:
 
 def _results(run: Path) -> dict[str, StoredResult]:
     """Data set → result of a run directory."""
-    files = sorted((run / "datasets").glob("*.nc")) or [run / "posterior.nc"]
-    results = [load_stored(file) for file in files]
-    return {result.name: result for result in results}
+    return {result.name: result for result in map(load_stored, result_files(run))}
 
 
 def _same_data(a: StoredResult, b: StoredResult) -> bool:
-    left, right = a.observed_data, b.observed_data
-    if a.observable != b.observable or left.sizes["time"] != right.sizes["time"]:
-        return False
-    names = ["time", a.observable, f"{a.observable}_reading_std", "time_std", "weights"]
-    further = f"{a.observable}_correlation"
-    if (further in left) != (further in right) or left.attrs.get("huber_threshold") != right.attrs.get(
-        "huber_threshold"
-    ):
-        return False
-    names += [further] if further in left else []
-    return all(np.allclose(left[n].values, right[n].values, rtol=1e-12, atol=0) for n in names)
+    ours, theirs = _stated(a.observations()), _stated(b.observations())
+    return (a.observable, ours.keys()) == (b.observable, theirs.keys()) and all(
+        ours[key].shape == theirs[key].shape and np.allclose(ours[key], theirs[key], rtol=1e-12, atol=0) for key in ours
+    )
+
+
+def _stated(o: Observations) -> dict[str, Array]:
+    """The observations and everything that is stated about their errors."""
+    return {
+        "times": o.times,
+        "values": o.values,
+        "weights": o.weights,
+        "std": o.noise.std,
+        "time_std": o.noise.time_std,
+        **{name: matrix for name, (matrix, _) in o.noise.matrices().items()},
+        **{name: np.asarray(number) for name, number in o.noise.attributes().items()},
+    }
 
 
 def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:
     stats = result.sample_stats.attrs
     likelihood = result.dataset("log_likelihood")[result.observable].values[0]
-    alive = result.sample_stats["active"].values.ravel().astype(bool)
     return ModelScore(
         run,
         dataset,
-        float(stats["log_evidence"]),
-        float("nan"),
-        float("nan"),
-        float(stats["chi2_per_observation"]),
-        float(stats["dfs"]),
-        float(np.sum(np.var(likelihood[alive], axis=0, ddof=1))),
-        float(stats["nrmse"]),
+        log_evidence=float(stats["log_evidence"]),
+        difference=float("nan"),
+        probability=float("nan"),
+        chi2_per_observation=float(stats["chi2_per_observation"]),
+        dfs=float(stats["dfs"]),
+        effective_parameters=float(np.sum(np.var(likelihood[result.alive], axis=0, ddof=1))),
+        nrmse=float(stats["nrmse"]),
     )
 
 
-def _total(run: str, scores: Sequence[ModelScore]) -> ModelScore:
-    """Sums of evidence, DFS and effective parameters; means of the measures of fit."""
-    return ModelScore(
-        run,
-        ALL,
-        sum(s.log_evidence for s in scores),
-        0.0,
-        0.0,
-        float(np.mean([s.chi2_per_observation for s in scores])),
-        sum(s.dfs for s in scores),
-        sum(s.effective_parameters for s in scores),
-        float(np.mean([s.nrmse for s in scores])),
+def _total(scores: Sequence[ModelScore]) -> ModelScore:
+    """Of one run: sums of evidence, DFS and effective parameters; means of the measures of fit."""
+    return replace(
+        scores[0],
+        dataset=ALL,
+        log_evidence=sum(s.log_evidence for s in scores),
+        chi2_per_observation=float(np.mean([s.chi2_per_observation for s in scores])),
+        dfs=sum(s.dfs for s in scores),
+        effective_parameters=sum(s.effective_parameters for s in scores),
+        nrmse=float(np.mean([s.nrmse for s in scores])),
     )
 
 

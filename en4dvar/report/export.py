@@ -5,19 +5,18 @@ netCDF needs no export: ``posterior.nc`` follows the ArviZ schema as it is.
 
 from __future__ import annotations
 
-import csv
-import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from en4dvar.errors import OutputError
-from en4dvar.report import summary_csv
 from en4dvar.report.text import number_like
-from en4dvar.storage.store import ParameterSummary, StoredResult, load_stored
+from en4dvar.storage.store import StoredResult, load_stored, result_files
+from en4dvar.summary import ParameterSummary, summary_csv
+from en4dvar.tables import csv_text
 
 Kind = Literal["csv", "latex", "members"]
 _ESCAPES = {c: f"\\{c}" for c in "#$%&_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
@@ -36,11 +35,15 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
     ------
     OutputError: the directory holds no results.
     """
+    files = result_files(Path(run_dir))
+    if not files[0].is_file():
+        posterior_file(run_dir)  # says what is missing
+    results = map(load_stored, files)  # one is in memory at a time
     if kind == "members":
-        return _members_csv(results(run_dir))
+        return _members_csv(results)
     if kind == "latex":
-        return _latex([(r.name, r.summary()) for r in results(run_dir)])
-    return summary_csv(((r.name, r.summary(), r.cautions) for r in results(run_dir)), {})
+        return _latex([(r.name, r.summary()) for r in results])
+    return summary_csv(((r.name, r.summary(), r.cautions) for r in results), {})
 
 
 def posterior_file(run_dir: str | Path) -> Path:
@@ -51,27 +54,19 @@ def posterior_file(run_dir: str | Path) -> Path:
     return path
 
 
-def results(run_dir: str | Path) -> Iterator[StoredResult]:
-    """The posteriors of a run directory, one after the other. Raises :class:`OutputError`."""
-    files = sorted((Path(run_dir) / "datasets").glob("*.nc")) or [posterior_file(run_dir)]
-    return (load_stored(file) for file in files)
-
-
-def _members_csv(found: Iterator[StoredResult]) -> str:
+def _members_csv(results: Iterable[StoredResult]) -> str:
     """Living members; the header is that of the first data set, columns missing elsewhere stay empty."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
+    lines: list[list[object]] = []
     names: list[str] = []
-    for result in found:
-        rows = result.summary()
-        if not names:
+    for result in results:
+        if not lines:
+            rows = result.summary()
             names = [row.name for row in rows]
-            writer.writerow(["dataset", "member", *(f"{r.name} ({r.unit})" if r.unit != "1" else r.name for r in rows)])
-        alive = np.flatnonzero(result.sample_stats["active"].values.ravel().astype(bool))
-        values = {row.name: result.members("posterior", row.name) for row in rows}
-        for i, member in enumerate(alive):
-            writer.writerow([result.name, member, *(values[n][i] if n in values else "" for n in names)])
-    return text.getvalue()
+            lines.append(["dataset", "member", *(f"{r.name} ({r.unit})" if r.unit != "1" else r.name for r in rows)])
+        values = {name: result.members("posterior", name) for name in names if name in result.posterior}
+        for i, member in enumerate(np.flatnonzero(result.alive)):
+            lines.append([result.name, member, *(values[n][i] if n in values else "" for n in names)])
+    return csv_text(lines)
 
 
 def _latex(found: list[tuple[str, tuple[ParameterSummary, ...]]]) -> str:

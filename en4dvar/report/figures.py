@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
+import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from en4dvar.report.style import COLUMN, LIGHT, PAGE, styled
+from en4dvar.report.style import COLUMN, LIGHT, PAGE, Captioned, panels, scaled_histogram, styled
 from en4dvar.report.text import plus_minus, pretty_unit, with_unit
 from en4dvar.state import Array
 from en4dvar.storage.store import StoredResult
@@ -23,11 +23,11 @@ MAX_PAIRS = 6
 def histograms(result: StoredResult) -> Figure:
     """Posterior over prior, one panel a parameter scaled to its peak. Bar: 5–95 %, ticks: members, line: centre."""
     rows = result.summary()
-    figure, panels = _panels(len(rows), height=3.6 / 2.54)
-    for ax, row in zip(panels, rows, strict=True):
+    figure, axes = panels(len(rows), COLUMN, 3.6 / 2.54)
+    for ax, row in zip(axes, rows, strict=True):
         prior, posterior = result.members("prior", row.name), result.members("posterior", row.name)
-        _histogram(ax, prior, "prior", alpha=0.35)
-        _histogram(ax, posterior, "posterior", alpha=0.6)
+        scaled_histogram(ax, prior, LIGHT["prior"], alpha=0.35)
+        scaled_histogram(ax, posterior, LIGHT["posterior"], alpha=0.6)
         ax.plot(posterior, np.full(posterior.shape, -0.06), "|", color=LIGHT["posterior"], ms=3, mew=0.5)
         ax.plot([row.q05, row.q95], [1.07, 1.07], color=LIGHT["posterior"], lw=2, solid_capstyle="butt")
         ax.axvline(row.centre, ymax=0.85, color=LIGHT["centre"], lw=0.9, ls="--")
@@ -42,10 +42,9 @@ def histograms(result: StoredResult) -> Figure:
 def history(result: StoredResult) -> Figure:
     """Data ± std, prior and posterior predictive bands (50 and 90 %), the centre; below, residuals over their std."""
     name = result.observable
-    variable = result.observed_data[name]
-    time, data = _shown(result, "time"), _display(variable.values, variable.attrs)
-    std = _display(result.observed_data[f"{name}_std"].values, variable.attrs)
-    centre = _display(result.sample_stats[f"{name}_centre"].values, variable.attrs)
+    observed = result.observed_data
+    time, data, std = (_shown(observed[key]) for key in ("time", name, f"{name}_std"))
+    centre = _shown(result.sample_stats[f"{name}_centre"])
     figure = Figure(figsize=(COLUMN, 9.5 / 2.54), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
     _band(top, result, "prior_predictive", (0.05, 0.95), "prior", 0.28, "prior 90 %")
@@ -54,7 +53,7 @@ def history(result: StoredResult) -> Figure:
     size = 2.2 if len(time) <= 150 else 1.2
     top.errorbar(time, data, std, fmt="o", ms=size, lw=0.6, color=LIGHT["ink"], label="data ± std", zorder=4)
     top.plot(time, centre, lw=0.9, color=LIGHT["centre"], label="centre", zorder=3)
-    attrs = variable.attrs
+    attrs = observed[name].attrs
     label = str(attrs["long_name"]).removesuffix(", observed")
     label = label if label == attrs["symbol"] else f"{label} {attrs['symbol']}"
     top.set_ylabel(with_unit(label, attrs["display_units"]))
@@ -72,7 +71,7 @@ def history(result: StoredResult) -> Figure:
         bottom.set_yticks([-2, 0, 2])
     else:
         bottom.yaxis.set_major_locator(MaxNLocator(4))
-    bottom.set_xlabel(with_unit("time", result.observed_data["time"].attrs["display_units"]))
+    bottom.set_xlabel(with_unit("time", observed["time"].attrs["display_units"]))
     return figure
 
 
@@ -104,10 +103,9 @@ def traces(result: StoredResult) -> Figure:
     """Each parameter over the iterations: mean ± std of the ensemble the iterate describes, and its centre."""
     rows = result.summary()
     steps = result.iterations["iteration"].values
-    figure, panels = _panels(len(rows), height=3.4 / 2.54)
-    for ax, row in zip(panels, rows, strict=True):
-        members = _display(result.iterations[row.name].values, result.iterations[row.name].attrs)
-        centre = _display(result.iterations[f"{row.name}_centre"].values, result.iterations[row.name].attrs)
+    figure, axes = panels(len(rows), COLUMN, 3.4 / 2.54)
+    for ax, row in zip(axes, rows, strict=True):
+        members, centre = (_shown(result.iterations[key]) for key in (row.name, f"{row.name}_centre"))
         alive = np.isfinite(members).all(axis=0)
         if alive.sum() > 1:
             mean, std = members[:, alive].mean(axis=1), members[:, alive].std(axis=1, ddof=1)
@@ -125,7 +123,7 @@ def pairs(result: StoredResult) -> Figure:
     """Posterior members of every pair of parameters; above the diagonal their correlation."""
     rows = result.summary()
     n = len(rows)
-    values = {row.name: _alive(result, row.name) for row in rows}
+    values = {row.name: result.members("posterior", row.name) for row in rows}
     side = max(COLUMN, min(PAGE, n * 2.7 / 2.54))
     figure = Figure(figsize=(side, side), layout="constrained")
     grid = figure.subplots(n, n, squeeze=False)
@@ -141,8 +139,8 @@ def pairs(result: StoredResult) -> Figure:
     return figure
 
 
-def all_figures(result: StoredResult) -> Iterator[tuple[str, str, Figure]]:
-    """(file name, caption, figure) of everything that the result has enough members for."""
+def all_figures(result: StoredResult) -> Iterator[Captioned]:
+    """Everything that the result has enough members for."""
     yield (
         "posterior",
         "Posterior (blue) over prior (grey), each scaled to its peak. Bar: 5–95 % of the posterior; ticks: members; "
@@ -158,29 +156,8 @@ def all_figures(result: StoredResult) -> Iterator[tuple[str, str, Figure]]:
     )
     yield "cost", "The cost J and its two terms at the iterate that starts each iteration.", cost(result)
     yield "iterations", "Parameters over the iterations: ensemble mean ± std (blue), centre (dashed).", traces(result)
-    if 2 <= len(result.summary()) <= MAX_PAIRS and _alive(result, result.summary()[0].name).size > 2:
+    if 2 <= len(result.posterior.data_vars) <= MAX_PAIRS and result.alive.sum() > 2:
         yield "pairs", "Posterior members in pairs of parameters; above the diagonal the correlation.", pairs(result)
-
-
-def _panels(n: int, height: float) -> tuple[Figure, list[Axes]]:
-    """``n`` axes in two columns at column width; surplus axes removed."""
-    rows = -(-n // 2)
-    figure = Figure(figsize=(COLUMN, rows * height), layout="constrained")
-    grid = figure.subplots(rows, 2 if n > 1 else 1, squeeze=False).ravel()
-    for ax in grid[n:]:
-        ax.remove()
-    return figure, list(grid[:n])
-
-
-def _histogram(ax: Axes, values: Array, colour: str, alpha: float) -> None:
-    if values.size < 2 or np.ptp(values) == 0:
-        for value in values[:1]:
-            ax.axvline(value, ymax=0.85, color=LIGHT[colour], alpha=alpha, lw=2)
-        return
-    bins = int(np.clip(np.ceil(2 * values.size ** (1 / 3)), 6, 30))  # Rice's rule
-    counts, edges = np.histogram(values, bins)
-    ax.stairs(counts / counts.max(), edges, fill=True, color=LIGHT[colour], alpha=alpha)
-    ax.stairs(counts / counts.max(), edges, color=LIGHT[colour], lw=0.8)
 
 
 def _reach(prior: Array, posterior: Array) -> tuple[float | None, float | None]:
@@ -191,25 +168,21 @@ def _reach(prior: Array, posterior: Array) -> tuple[float | None, float | None]:
     return (low - margin, high + margin) if margin > 0 else (None, None)
 
 
-def _display(values: Any, attrs: Mapping[Any, Any]) -> Array:
-    return convert(np.asarray(values, dtype=float), attrs["units"], attrs["display_units"])
-
-
-def _shown(result: StoredResult, coordinate: str, group: str = "observed_data") -> Array:
-    variable = result.dataset(group)[coordinate]
-    return _display(variable.values, variable.attrs)
+def _shown(variable: xr.DataArray) -> Array:
+    """The values in the variable's display unit."""
+    values = np.asarray(variable.values, dtype=float)
+    return convert(values, variable.attrs["units"], variable.attrs["display_units"])
 
 
 def _band(
     ax: Axes, result: StoredResult, group: str, levels: tuple[float, float], colour: str, alpha: float, label: str
 ) -> None:
-    path = result.dataset(group)[f"{result.observable}_path"]
-    values = _display(path.values[0], path.attrs)
+    values = _shown(result.dataset(group)[f"{result.observable}_path"][0])
     seen = np.isfinite(values).any(axis=0)
     if not seen.any():
         return
     low, high = np.nanquantile(values[:, seen], levels, axis=0)
-    time = _shown(result, "path_time", group)[seen]
+    time = _shown(result.dataset(group)["path_time"])[seen]
     ax.fill_between(time, low, high, color=LIGHT[colour], alpha=alpha, lw=0, label=label)
 
 
@@ -219,15 +192,11 @@ def _data_range(data: Array, std: Array) -> tuple[float, float]:
     return low - 0.12 * (high - low), high + 0.25 * (high - low)
 
 
-def _alive(result: StoredResult, name: str) -> Array:
-    return result.members("posterior", name)
-
-
 def _pair(ax: Axes, i: int, j: int, x: Array, y: Array) -> None:
     ax.xaxis.set_major_locator(MaxNLocator(2))
     ax.yaxis.set_major_locator(MaxNLocator(3))
     if i == j:
-        _histogram(ax, x, "posterior", alpha=0.6)
+        scaled_histogram(ax, x, LIGHT["posterior"], alpha=0.6)
         ax.set_yticks([])
         ax.spines["left"].set_visible(False)
     elif i > j:

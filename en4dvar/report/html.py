@@ -11,7 +11,13 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from en4dvar.report import text
 from en4dvar.report.style import DARK, LIGHT, css_variables
+
+WRITERS = (  # what templates call
+    text.fixed, text.informed_words, text.number_like, text.percent, text.plain_number, text.plus_minus,
+    text.pretty_unit, text.symbol_html,
+)  # fmt: skip
 
 
 def render(template: str, *, sortable: bool = False, **content: Any) -> str:
@@ -28,13 +34,15 @@ def render(template: str, *, sortable: bool = False, **content: Any) -> str:
 
 @cache
 def _environment() -> Environment:
-    return Environment(
+    environment = Environment(
         loader=PackageLoader("en4dvar.report", "."),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.globals |= {write.__name__: write for write in WRITERS}
+    return environment
 
 
 @cache

@@ -3,43 +3,44 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from en4dvar.honesty import Caution
-from en4dvar.honesty.caution import SEVERITIES, worst_first
+from en4dvar.caution import SEVERITIES, Caution, codes, worst_first
 from en4dvar.report.html import render
-from en4dvar.report.style import COLUMN, LIGHT, PAGE, inline_svg, styled
-from en4dvar.report.text import number_like, plain_number, plus_minus, pretty_unit, symbol_html, with_unit
-from en4dvar.storage.store import ParameterSummary, StoredResult
+from en4dvar.report.style import COLUMN, LIGHT, PAGE, Captioned, Drawing, styled
+from en4dvar.report.text import number_like, pretty_unit, symbol_html, with_unit
+from en4dvar.storage.store import StoredResult
+from en4dvar.summary import ParameterSummary
 
 NAMED = 40  # data sets whose names fit below a figure
 
 
 @dataclass(frozen=True)
-class Entry:
-    """What the overview keeps of one data set: its rows, the scalars of its fit, its warnings."""
+class SetSummary:
+    """What the overview keeps of one data set: a row a parameter, the scalars of its fit, its warnings."""
 
     name: str
     stem: str
-    summary: tuple[ParameterSummary, ...]
+    rows: Mapping[str, ParameterSummary]
     cautions: tuple[Caution, ...]
     scalars: Mapping[str, float]
     about: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, result: StoredResult, stem: str) -> Entry:
+    def of(cls, result: StoredResult, stem: str) -> SetSummary:
         """``stem``: name of the file without suffix."""
         stats = result.sample_stats.attrs
         keys = ("n_observations", "chi2_per_observation", "nrmse", "dfs", "n_active", "n_members")
         about = {key: str(result.attributes.get(key, "")) for key in ("date_created", "configuration")}
         scalars = {key: float(stats[key]) for key in keys}
-        return cls(result.name, stem, result.summary(), result.cautions, scalars, about)
+        rows = {row.name: row for row in result.summary()}
+        return cls(result.name, stem, rows, result.cautions, scalars, about)
 
     @property
     def worst(self) -> str:
@@ -50,59 +51,59 @@ class Entry:
     def gravity(self) -> int:
         """Sorts by warnings: 0 none; then the worst severity counts most, the number of warnings within it."""
         order: tuple[str, ...] = ("", *reversed(SEVERITIES))
-        rank = order.index(self.worst) if self.worst in order else 1
-        return 100 * rank + len(self.cautions)
+        return 100 * order.index(self.worst) + len(self.cautions)
 
-    def of_parameter(self, name: str) -> ParameterSummary | None:
-        return next((row for row in self.summary if row.name == name), None)
+    @property
+    def codes(self) -> str:
+        return ", ".join(codes(self.cautions))
 
 
 def render_overview(
-    entries: Sequence[Entry],
+    sets: Sequence[SetSummary],
     pages: Mapping[str, str],
     failures: Mapping[str, str],
-    figures: Iterable[tuple[str, str, Figure]],
+    figures: Sequence[Drawing],
 ) -> str:
     """The page as HTML.
 
     ``pages``: stem of a data set → address of its page, for those that have one; ``failures``: name of a data set
-    without a posterior → reason; ``figures``: (name, caption, figure).
+    without a posterior → reason.
     """
-    parameters = _parameters(entries)
     return render(
         "campaign.html.j2",
         sortable=True,
-        title=f"{len(entries)} data sets",
-        created=entries[0].about.get("date_created", ""),
-        configuration=entries[0].about.get("configuration", ""),
-        parameters=[_parameter(name, entries) for name in parameters],
+        title=f"{len(sets)} data sets",
+        created=sets[0].about.get("date_created", ""),
+        configuration=sets[0].about.get("configuration", ""),
+        parameters=[_parameter(name, sets) for name in _parameters(sets)],
         failures=failures,
-        sets=[_row(entry, parameters, pages.get(entry.stem, "")) for entry in entries],
-        without_page=sum(1 for entry in entries if entry.stem not in pages),
-        warned=sum(1 for entry in entries if entry.cautions),
-        tally=_tally(entries),
-        figures=[(name, caption, Markup(inline_svg(figure, name, caption))) for name, caption, figure in figures],
+        sets=sets,
+        pages=pages,
+        without_page=sum(1 for one in sets if one.stem not in pages),
+        warned=sum(1 for one in sets if one.cautions),
+        tally=_tally(sets),
+        figures=figures,
     )
 
 
 @styled
-def estimates(entries: Sequence[Entry]) -> Figure:
+def estimates(sets: Sequence[SetSummary]) -> Figure:
     """Mean and 5–95 % of every data set, one panel a parameter; with many data sets sorted by the mean, as a band."""
-    names = _parameters(entries)
-    few = len(entries) <= NAMED
+    names = _parameters(sets)
+    few = len(sets) <= NAMED
     width = PAGE if few else COLUMN
     figure = Figure(figsize=(width, len(names) * 3.0 / 2.54 + (2.0 / 2.54 if few else 0)), layout="constrained")
     panels = figure.subplots(len(names), 1, squeeze=False, sharex=few).ravel()
     for ax, name in zip(panels, names, strict=True):
-        rows = [row for entry in entries if (row := entry.of_parameter(name)) is not None]
+        x = np.array([i for i, one in enumerate(sets) if name in one.rows])
+        rows = [sets[i].rows[name] for i in x]
         mean, low, high = (np.array([getattr(row, key) for row in rows]) for key in ("mean", "q05", "q95"))
-        x = np.array([i for i, entry in enumerate(entries) if entry.of_parameter(name) is not None])
         prior = rows[0].prior_mean + np.array([-1.0, 1.0]) * rows[0].prior_std
         ax.axhspan(*prior, color=LIGHT["prior"], alpha=0.2, lw=0)
         if few:
             ax.vlines(x, low, high, color=LIGHT["posterior"], lw=1.4, alpha=0.6)
             ax.plot(x, mean, "o", ms=3, color=LIGHT["posterior"])
-            warned = np.array([entries[i].worst == "serious" for i in x], dtype=bool)
+            warned = np.array([sets[i].worst == "serious" for i in x], dtype=bool)
             ax.plot(x[warned], mean[warned], "o", ms=5.5, mfc="none", mew=0.9, color=LIGHT["centre"])
         else:
             order = np.argsort(mean)
@@ -116,29 +117,28 @@ def estimates(entries: Sequence[Entry]) -> Figure:
             ax.set_ylim(min(reach) - margin, max(reach) + margin)
         ax.set_ylabel(with_unit(rows[0].symbol, rows[0].unit))
     if few:
-        panels[-1].set_xlim(-0.6, len(entries) - 0.4)
-        panels[-1].set_xticks(range(len(entries)), [_plain(entry.name) for entry in entries], rotation=90)
+        panels[-1].set_xlim(-0.6, len(sets) - 0.4)
+        panels[-1].set_xticks(range(len(sets)), [_plain(one.name) for one in sets], rotation=90)
     return figure
 
 
-def overview_figures(entries: Sequence[Entry]) -> list[tuple[str, str, Figure]]:
-    """(name, caption, figure) of the overview."""
+def overview_figures(sets: Sequence[SetSummary]) -> list[Captioned]:
     caption = (
         "Each data set by itself: posterior mean and 5–95 % (blue), prior mean ± std (grey band; of the first data set "
         "where priors depend on the data). Orange rings: posteriors with serious warnings."
-        if len(entries) <= NAMED
+        if len(sets) <= NAMED
         else "Data sets sorted by the posterior mean, with 5–95 % (blue); prior mean ± std (grey band; of the first "
         "data set where priors depend on the data)."
     )
-    return [("estimates", caption, estimates(entries))]
+    return [("estimates", caption, estimates(sets))]
 
 
-def _parameters(entries: Sequence[Entry]) -> list[str]:
-    return list(dict.fromkeys(row.name for entry in entries for row in entry.summary))
+def _parameters(sets: Sequence[SetSummary]) -> list[str]:
+    return list(dict.fromkeys(name for one in sets for name in one.rows))
 
 
-def _parameter(name: str, entries: Sequence[Entry]) -> dict[str, Any]:
-    rows = [row for entry in entries if (row := entry.of_parameter(name)) is not None]
+def _parameter(name: str, sets: Sequence[SetSummary]) -> dict[str, Any]:
+    rows = [one.rows[name] for one in sets if name in one.rows]
     means = np.array([row.mean for row in rows if math.isfinite(row.mean)])
     low, median, high = np.quantile(means, (0.25, 0.5, 0.75)) if means.size else (math.nan,) * 3
     precision = float(np.nanmedian([row.std for row in rows])) if means.size else math.nan
@@ -153,41 +153,23 @@ def _parameter(name: str, entries: Sequence[Entry]) -> dict[str, Any]:
     }
 
 
-def _row(entry: Entry, parameters: Sequence[str], page: str) -> dict[str, Any]:
-    rows = [entry.of_parameter(name) for name in parameters]
-    s = entry.scalars
-    return {
-        "name": entry.name,
-        "page": page,
-        "estimates": [(repr(row.mean), plus_minus(row.mean, row.std)) if row else ("", "") for row in rows],
-        "scalars": [
-            (repr(s["n_observations"]), f"{s['n_observations']:.0f}"),
-            *((repr(s[key]), plain_number(s[key], 3)) for key in ("chi2_per_observation", "nrmse", "dfs")),
-            (repr(s["n_active"]), f"{s['n_active']:.0f} of {s['n_members']:.0f}"),
-        ],
-        "gravity": entry.gravity,
-        "worst": entry.worst,
-        "codes": ", ".join(dict.fromkeys(c.code for c in entry.cautions)),
-    }
-
-
-def _tally(entries: Sequence[Entry]) -> list[dict[str, Any]]:
+def _tally(sets: Sequence[SetSummary]) -> list[dict[str, Any]]:
     """One line a code: in how many data sets, with the words of the first of them."""
-    found: dict[tuple[str, str], list[tuple[str, Caution]]] = {}
-    for c in worst_first(tuple(c for entry in entries for c in entry.cautions)):
-        found.setdefault((c.severity, c.code), [])
-    for entry in entries:
-        for key in dict.fromkeys((c.severity, c.code) for c in entry.cautions):
-            found[key].append((entry.name, next(c for c in entry.cautions if (c.severity, c.code) == key)))
+    count: Counter[tuple[str, str]] = Counter()
+    first: dict[tuple[str, str], tuple[Caution, str]] = {}
+    for one in sets:
+        count.update({(c.severity, c.code) for c in one.cautions})
+        for c in one.cautions:
+            first.setdefault((c.severity, c.code), (c, one.name))
     return [
         {
-            "severity": severity,
-            "code": code,
-            "count": len(where),
-            "example": f"e.g. {where[0][0]}: {where[0][1].words}",
-            "advice": where[0][1].advice,
+            "severity": c.severity,
+            "code": c.code,
+            "count": count[c.severity, c.code],
+            "example": f"e.g. {first[c.severity, c.code][1]}: {c.words}",
+            "advice": c.advice,
         }
-        for (severity, code), where in found.items()
+        for c in worst_first(tuple(c for c, _ in first.values()))
     ]
 
 

@@ -4,141 +4,68 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
-
-from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from en4dvar.diagnostics import chi2_interval
 from en4dvar.report.html import render
-from en4dvar.report.style import inline_svg
-from en4dvar.report.text import (
-    DFS_WORDS,
-    number_like,
-    plain_number,
-    plus_minus,
-    pretty_unit,
-    symbol_html,
-    words_for,
-)
+from en4dvar.report.style import Drawing
+from en4dvar.report.text import number_like, plain_number
 from en4dvar.storage.groups import ITERATION_SCALARS
-from en4dvar.storage.store import ParameterSummary, StoredResult
+from en4dvar.storage.store import StoredResult
 from en4dvar.units import convert
 
 PROVENANCE = (
     "history", "date_created", "seed", "data_source", "git_commit", "configuration_file", "configuration_git_commit",
     "package_versions", "python_version", "platform", "cpu", "institution", "references", "Conventions",
 )  # fmt: skip
+IDENTIFIERS = "d0-"  # begin those of figures, which are addresses
 
 
-@dataclass(frozen=True)
-class Section:
-    """One data set on the page: ``figures`` are (identifier, caption, SVG)."""
+def render_set(
+    result: StoredResult, figures: Sequence[Drawing], trail: Sequence[tuple[str, str]] = (), copies: bool = True
+) -> str:
+    """The page of one data set as HTML text.
 
-    anchor: str
-    result: StoredResult
-    figures: Sequence[tuple[str, str, Markup]]
-
-    @property
-    def name(self) -> str:
-        return self.result.name
-
-    @property
-    def stats(self) -> dict[Any, Any]:
-        return self.result.sample_stats.attrs
-
-    @property
-    def rows(self) -> list[dict[str, Any]]:
-        """The table of parameters, as text."""
-        return [_row(row) for row in self.result.summary()]
-
-    @property
-    def verdicts(self) -> list[tuple[str, str, str, bool]]:
-        """(quantity, value, in plain words, needs attention) for the tiles on top."""
-        s = self.stats
-        alive, members = int(s["n_active"]), int(s["n_members"])
-        chi2_words, chi2_odd = judge_chi2(float(s["chi2_per_observation"]), int(s["n_weighted"]), float(s["dfs"]))
-        nrmse = float(s["nrmse"])
-        ended = "by its own criterion" if s["converged"] else "not converged"
-        return [
-            ("Fit, NRMSE", number_like(nrmse, 0.01), "1 is perfect, 0 is no better than a constant", not nrmse >= 0.9),
-            ("χ² per observation", plain_number(float(s["chi2_per_observation"]), 3), chi2_words, chi2_odd),
-            (
-                "Information, DFS",
-                plain_number(float(s["dfs"]), 3),
-                f"of {len(self.result.posterior.data_vars)} parameters determined by the data",
-                False,
-            ),
-            ("Members alive", f"{alive} of {members}", "of the posterior ensemble", alive < members),
-            ("Iterations", str(s["n_iterations"]), f"{ended}: {s['stop_reason']}", not s["converged"]),
-        ]
-
-    @property
-    def failures(self) -> list[tuple[int, str]]:
-        """(member, reason) of every member that did not survive."""
-        reasons = self.result.sample_stats["failure_reason"].values.ravel()
-        return [(i, str(reason)) for i, reason in enumerate(reasons) if reason]
-
-    @property
-    def fixed(self) -> list[tuple[Markup, str, str, str]]:
-        """(symbol, label, value, unit) of the values held fixed."""
-        shown = []
-        for variable in self.result.dataset("constant_data").data_vars.values():
-            a = variable.attrs
-            unit = a.get("display_units", a["units"])
-            value = convert(float(variable), a["units"], unit)
-            shown.append((symbol_html(a["symbol"]), a["long_name"], plain_number(value, 6), pretty_unit(unit)))
-        return shown
-
-    @property
-    def iterations(self) -> list[list[str]]:
-        """One line an iteration: index, J, terms, step, χ²/Ky, DFS, spread, members."""
-        table = self.result.iterations
-        keys = [key for key in ITERATION_SCALARS if key != "active"]
-        return [
-            [
-                str(int(table["iteration"][i])),
-                *(plain_number(float(table[key][i])) for key in keys),
-                str(int(table["active"][i])),
-            ]
-            for i in range(table.sizes["iteration"])
-        ]
-
-    @property
-    def settings(self) -> list[tuple[str, str]]:
-        """The scheme's settings and how observations are weighted."""
-        given = json.loads(str(self.result.attributes["assimilation_settings"]))
-        weights = self.result.observed_data["weights"].values
-        total = f"{len(weights)} observations, weights sum to {plain_number(float(weights.sum()))}"
-        return [*((key.replace("_", " "), str(value)) for key, value in given.items()), ("observations", total)]
-
-    @property
-    def provenance(self) -> list[tuple[str, str]]:
-        attrs = self.result.attributes
-        return [(key.replace("_", " "), str(attrs[key])) for key in PROVENANCE if str(attrs.get(key, ""))]
-
-    @property
-    def configuration(self) -> str:
-        return str(self.result.attributes.get("configuration", ""))
+    ``trail``: links (words, address) above it; ``copies``: whether the figures are also kept as PDF and PNG.
+    """
+    attributes, reasons = result.attributes, result.sample_stats["failure_reason"].values.ravel()
+    return render(
+        "set.html.j2",
+        title=result.name,
+        trail=trail,
+        copies=copies,
+        created=attributes.get("date_created", ""),
+        configuration=str(attributes.get("configuration", "")),
+        stats=result.sample_stats.attrs,
+        rows=result.summary(),
+        cautions=result.cautions,
+        tiles=_tiles(result),
+        identifiers=IDENTIFIERS,
+        figures=figures,
+        lost=[(i, str(reason)) for i, reason in enumerate(reasons) if reason],
+        iterations=_iterations(result),
+        fixed_values=_fixed(result),
+        settings=_settings(result),
+        provenance=provenance_rows(attributes),
+    )
 
 
-def _row(row: ParameterSummary) -> dict[str, Any]:
-    return {
-        "symbol": symbol_html(row.symbol),
-        "label": row.label,
-        "unit": pretty_unit(row.unit),
-        "prior": plus_minus(row.prior_mean, row.prior_std),
-        "posterior": plus_minus(row.mean, row.std),
-        "mean": number_like(row.mean, row.std),
-        "std": number_like(row.std, row.std),
-        "quantiles": [number_like(q, row.std) for q in (row.q05, row.q50, row.q95)],
-        "centre": number_like(row.centre, row.std),
-        "dfs": f"{100 * row.dfs:.0f} %" if math.isfinite(row.dfs) else "–",
-        "share": min(max(row.dfs, 0.0), 1.0) if math.isfinite(row.dfs) else 0.0,
-        "hint": words_for(row.dfs, DFS_WORDS),
-    }
+def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
+    """(quantity, value, in plain words, needs attention) for the tiles on top."""
+    s = result.sample_stats.attrs
+    alive, members, n_estimated = int(s["n_active"]), int(s["n_members"]), len(result.posterior.data_vars)
+    chi2, dfs, nrmse = (float(s[key]) for key in ("chi2_per_observation", "dfs", "nrmse"))
+    chi2_words, chi2_odd = judge_chi2(chi2, int(s["n_weighted"]), dfs)
+    informed = f"of {n_estimated} parameters determined by the data"
+    ended = "by its own criterion" if s["converged"] else "not converged"
+    return [
+        ("Fit, NRMSE", number_like(nrmse, 0.01), "1 is perfect, 0 is no better than a constant", not nrmse >= 0.9),
+        ("χ² per observation", plain_number(chi2, 3), chi2_words, chi2_odd),
+        ("Information, DFS", plain_number(dfs, 3), informed, False),
+        ("Members alive", f"{alive} of {members}", "of the posterior ensemble", alive < members),
+        ("Iterations", str(s["n_iterations"]), f"{ended}: {s['stop_reason']}", not s["converged"]),
+    ]
 
 
 def judge_chi2(chi2: float, n_observations: int, dfs: float) -> tuple[str, bool]:
@@ -154,18 +81,36 @@ def judge_chi2(chi2: float, n_observations: int, dfs: float) -> tuple[str, bool]
     return f"misfit agrees with the stated noise; {expected}", False
 
 
-def make_section(result: StoredResult, anchor: str, figures: Sequence[tuple[str, str, Figure]]) -> Section:
-    """A section with its figures (name, caption, Figure) drawn as inline SVG."""
+def _fixed(result: StoredResult) -> list[tuple[str, str, float, str]]:
+    """(symbol, label, value, unit) of the values held fixed."""
+    rows = []
+    for variable in result.dataset("constant_data").data_vars.values():
+        a = variable.attrs
+        unit = a.get("display_units", a["units"])
+        rows.append((a["symbol"], a["long_name"], convert(float(variable), a["units"], unit), unit))
+    return rows
 
-    def draw(name: str, caption: str, figure: Figure) -> tuple[str, str, Markup]:
-        return name, caption, Markup(inline_svg(figure, f"{anchor}-{name}", caption))
 
-    return Section(anchor, result, [draw(*figure) for figure in figures])
+def _iterations(result: StoredResult) -> list[tuple[str, ...]]:
+    """One line an iteration: index, J, terms, step, χ²/Ky, DFS, spread, members."""
+    table = result.iterations
+    diagnostics = [key for key in ITERATION_SCALARS if key != "active"]
+    columns = [
+        [str(int(i)) for i in table["iteration"]],
+        *([plain_number(float(value)) for value in table[key]] for key in diagnostics),
+        [str(int(n)) for n in table["active"]],
+    ]
+    return list(zip(*columns, strict=True))
 
 
-def render_set(section: Section, trail: Sequence[tuple[str, str]] = (), copies: bool = True) -> str:
-    """The page of one data set as HTML text.
+def _settings(result: StoredResult) -> list[tuple[str, str]]:
+    """The scheme's settings and how observations are weighted."""
+    given = json.loads(str(result.attributes["assimilation_settings"]))
+    weights = result.observed_data["weights"].values
+    total = f"{len(weights)} observations, weights sum to {plain_number(float(weights.sum()))}"
+    return [*((key.replace("_", " "), str(value)) for key, value in given.items()), ("observations", total)]
 
-    ``trail``: links (words, address) above it; ``copies``: whether its figures are also kept as PDF and PNG.
-    """
-    return render("set.html.j2", title=section.name, s=section, trail=trail, copies=copies)
+
+def provenance_rows(attributes: Mapping[Any, Any]) -> list[tuple[str, str]]:
+    """(what, value) of what a file says of its origin."""
+    return [(key.replace("_", " "), str(attributes[key])) for key in PROVENANCE if str(attributes.get(key, ""))]

@@ -9,13 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from en4dvar.descent.preview import Preview
-from en4dvar.report.style import COLUMN, LIGHT, styled
+from en4dvar.report.style import COLUMN, LIGHT, panels, styled
 from en4dvar.report.text import with_unit
-from en4dvar.state import Array
 from en4dvar.units import convert
 
 PANELS = 6
-COLUMNS = 2
 
 
 @styled
@@ -25,44 +23,30 @@ def prior_predictive(previews: Sequence[Preview]) -> Figure:
     In display units; at most :data:`PANELS` data sets are drawn.
     """
     shown = previews[:PANELS]
-    columns = min(COLUMNS, len(shown))
-    rows = -(-len(shown) // columns)
-    figure = Figure(figsize=(COLUMN * columns, 6.5 / 2.54 * rows), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax in grid[len(shown) :]:
-        ax.remove()
-    for ax, one in zip(grid, shown, strict=False):
+    figure, axes = panels(len(shown), COLUMN * min(2, len(shown)), 6.5 / 2.54)
+    for ax, one in zip(axes, shown, strict=True):
         _panel(ax, one, titled=len(shown) > 1)
-    handles, labels = grid[0].get_legend_handles_labels()
+    handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=4)
     return figure
 
 
 def _panel(ax: Axes, one: Preview, titled: bool) -> None:
-    problem, y, observable = one.problem, one.problem.observations, one.problem.observable
-    model = problem.model
-
-    def clock(values: Array) -> Array:
-        return convert(values, model.time_unit, model.time_display_unit)
-
-    def shown(values: Array) -> Array:
-        return convert(values, observable.unit, observable.display_unit)
-
-    paths = shown(one.run.path[one.run.active])
-    time = clock(one.grid)
+    model, y, observable = one.problem.model, one.problem.observations, one.problem.observable
+    unit, shown_unit = observable.unit, observable.display_unit
+    grid, times = (convert(t, model.time_unit, model.time_display_unit) for t in (one.grid, y.times))
+    paths, data, std = (convert(v, unit, shown_unit) for v in (one.run.path[one.run.active], y.values, y.std))
     if len(paths) > 1:
         for (low, high), alpha, label in (((0.05, 0.95), 0.3, "prior 90 %"), ((0.25, 0.75), 0.45, "50 %")):
             edges = np.quantile(paths, (low, high), axis=0)
-            ax.fill_between(time, *edges, color=LIGHT["prior"], alpha=alpha, lw=0, label=label)
-        ax.plot(time, np.median(paths, axis=0), color=LIGHT["prior"], lw=0.9, label="median")
-    data, std = shown(y.values), shown(y.std)
+            ax.fill_between(grid, *edges, color=LIGHT["prior"], alpha=alpha, lw=0, label=label)
+        ax.plot(grid, np.median(paths, axis=0), color=LIGHT["prior"], lw=0.9, label="median")
     size = 2.2 if len(y) <= 150 else 1.2
-    ink = LIGHT["ink"]
-    ax.errorbar(clock(y.times), data, std, fmt="o", ms=size, lw=0.6, color=ink, label="data ± std", zorder=4)
-    label = (
-        observable.label if observable.label == observable.symbol else f"{observable.label} {_math(observable.symbol)}"
-    )
-    ax.set(xlabel=with_unit("time", model.time_display_unit), ylabel=with_unit(label, observable.display_unit))
+    ax.errorbar(times, data, std, fmt="o", ms=size, lw=0.6, color=LIGHT["ink"], label="data ± std", zorder=4)
+    label = observable.label
+    if label != observable.symbol:
+        label = f"{label} {_math(observable.symbol)}"
+    ax.set(xlabel=with_unit("time", model.time_display_unit), ylabel=with_unit(label, shown_unit))
     top = max(float(data.max()), float(np.quantile(paths, 0.95)) if len(paths) else 0.0)
     low = min(float(data.min()), float(np.quantile(paths, 0.05)) if len(paths) else 0.0)
     ax.set_ylim(low - 0.05 * (top - low), top + 0.08 * (top - low))

@@ -8,20 +8,26 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import wraps
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
+import numpy as np
+from markupsafe import Markup
 from matplotlib import style
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 
-from en4dvar.files import atomic_path
+from en4dvar.files import atomic_path, make_folder
+from en4dvar.state import Array
 
 P = ParamSpec("P")
 T = TypeVar("T")
+Captioned = tuple[str, str, Figure]  # name, caption
+Drawing = tuple[str, str, Markup]  # name, caption, SVG
 
 LIGHT = {
     "paper": "#ffffff",
@@ -84,6 +90,29 @@ def styled(draw: Callable[P, T]) -> Callable[P, T]:
     return inside
 
 
+def panels(n: int, width: float, row_height: float, above: float = 0.0) -> tuple[Figure, list[Axes]]:
+    """A figure with ``n`` axes in up to two columns; inches, ``above`` is left for a legend."""
+    columns = min(2, n)
+    rows = -(-n // columns)
+    figure = Figure(figsize=(width, rows * row_height + above), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for ax in axes[n:]:
+        ax.remove()
+    return figure, axes[:n]
+
+
+def scaled_histogram(ax: Axes, values: Array, colour: str, alpha: float, lw: float = 0.8) -> None:
+    """Scaled to its peak; values that do not differ are a line."""
+    if values.size < 2 or np.ptp(values) == 0:
+        for value in values[:1]:
+            ax.axvline(value, ymax=0.85, color=colour, alpha=alpha, lw=2)
+        return
+    bins = int(np.clip(np.ceil(2 * values.size ** (1 / 3)), 6, 30))  # Rice's rule
+    counts, edges = np.histogram(values, bins)
+    ax.stairs(counts / counts.max(), edges, fill=True, color=colour, alpha=alpha)
+    ax.stairs(counts / counts.max(), edges, color=colour, lw=lw)
+
+
 def _settle(figure: Figure) -> None:
     """Compute the layout once; constrained layout would do it again for every format."""
     engine = figure.get_layout_engine()
@@ -108,7 +137,7 @@ def save_figure(figure: Figure, folder: Path, name: str) -> None:
 
 
 @styled
-def inline_svg(figure: Figure, name: str, description: str) -> str:
+def inline_svg(figure: Figure, name: str, description: str) -> Markup:
     """The figure as an ``<svg>`` element: identifiers unique by ``name``, colours as CSS variables, no addresses."""
     _settle(figure)
     buffer = io.StringIO()
@@ -123,7 +152,20 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     width, height = figure.get_size_inches()
     label = description.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     head = f'<svg role="img" aria-label="{label}" viewBox="0 0 {width * 72:g} {height * 72:g}"'
-    return re.sub(r"^<svg[^>]*", head, svg, count=1)
+    return Markup(re.sub(r"^<svg[^>]*", head, svg, count=1))
+
+
+def draw(figures: Iterable[Captioned], folder: Path | None, copies: str = "", identifiers: str = "") -> list[Drawing]:
+    """Figures as a page shows them; ``folder`` is where PDF and PNG are kept, if anywhere.
+
+    ``copies`` begins the names of these files, ``identifiers`` those of the elements of the drawings.
+    """
+    drawings = []
+    for name, caption, figure in figures:
+        if folder is not None:
+            save_figure(figure, make_folder(folder), f"{copies}{name}")
+        drawings.append((name, caption, inline_svg(figure, f"{identifiers}{name}", caption)))
+    return drawings
 
 
 def css_variables(palette: dict[str, str]) -> str:

@@ -16,8 +16,7 @@ _NAMES = (
 )
 _GREEK = dict(zip(_NAMES.split(), "αβγδεζηθκλμνξρστφχψωπ∞ΓΔΘΛΣΦΨΩ", strict=True))
 
-Words = tuple[tuple[float, str], ...]
-DFS_WORDS: Words = (
+DFS_WORDS = (
     (HARDLY_INFORMED, "data say nothing"),
     (0.5, "weakly informed"),
     (0.9, "informed"),
@@ -80,9 +79,19 @@ def plus_minus(mean: float, std: float) -> str:
     return f"{number_like(mean, std)} ± {number_like(std, std)}"
 
 
-def words_for(value: float, words: Words) -> str:
-    """The phrase of the first limit above ``value``; empty for NaN."""
-    return next((phrase for limit, phrase in words if value < limit or limit == math.inf), "") if value == value else ""
+def informed_words(dfs: float) -> str:
+    """What the DFS share of a parameter means; empty for NaN."""
+    return next((phrase for limit, phrase in DFS_WORDS if dfs < limit or limit == math.inf), "") if dfs == dfs else ""
+
+
+def percent(share: float) -> str:
+    """``0.123`` → ``"12 %"``; an en dash for NaN."""
+    return f"{100 * share:.0f} %" if math.isfinite(share) else "–"
+
+
+def fixed(value: float, places: int) -> str:
+    """A number of so many decimals; an en dash for NaN."""
+    return f"{value:.{places}f}" if math.isfinite(value) else "–"
 
 
 def symbol_html(symbol: str) -> Markup:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from markupsafe import Markup
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from en4dvar.errors import OutputError
 from en4dvar.files import write_text
 from en4dvar.report.html import render
-from en4dvar.report.page import PROVENANCE
-from en4dvar.report.style import COLUMN, LIGHT, inline_svg, save_figure, styled
+from en4dvar.report.page import provenance_rows
+from en4dvar.report.style import COLUMN, LIGHT, Captioned, draw, styled
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
 from en4dvar.storage.seal import check_seal
 from en4dvar.storage.twin_file import MEAN
@@ -36,36 +36,25 @@ def write_twin_report(run_dir: Path) -> Path:
             data = file.load()
     except (OSError, ValueError) as error:
         raise OutputError(f"{run_dir / 'twin.nc'}: not a readable result: {error}") from None
-    folder = run_dir / "figures"
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be created: {error.strerror}") from None
-    drawn = []
-    for name, caption, figure in twin_figures(data):
-        save_figure(figure, folder, name)
-        drawn.append((name, caption, Markup(inline_svg(figure, name, caption))))
     a = data.attrs
-    return write_text(
-        run_dir / "report.html",
-        render(
-            "twin.html.j2",
-            title=str(a["name"]),
-            created=str(a.get("date_created", "")),
-            facts=_facts(data),
-            scores=_scores(data),
-            unit=_unit(data),
-            figures=drawn,
-            warnings=[line for line in str(a.get("warnings", "")).split("\n") if line],
-            lost=[reason for reason in str(a["members_lost_why"]).split("\n") if reason],
-            provenance=[(key.replace("_", " "), str(a[key])) for key in PROVENANCE if str(a.get(key, ""))],
-            configuration=str(a["configuration_resolved"]),
-        ),
+    page = render(
+        "twin.html.j2",
+        title=str(a["name"]),
+        created=str(a.get("date_created", "")),
+        facts=_facts(data),
+        scores=_scores(data),
+        unit=_unit(data),
+        figures=draw(twin_figures(data), run_dir / "figures"),
+        warnings=_lines(a.get("warnings", "")),
+        lost=_lines(a["members_lost_why"]),
+        provenance=provenance_rows(a),
+        configuration=str(a["configuration_resolved"]),
     )
+    return write_text(run_dir / "report.html", page)
 
 
-def twin_figures(data: xr.Dataset) -> Iterator[tuple[str, str, Figure]]:
-    """(name, caption, figure) of each figure."""
+def twin_figures(data: xr.Dataset) -> Iterator[Captioned]:
+    """Each figure with its caption."""
     burn_in = int(data.attrs["burn_in"])
     words = " The first cycles, shaded, do not count in the averages." if burn_in else ""
     yield "scores", f"RMSE against the truth (line) and spread (dashed) of each estimate in time.{words}", scores(data)
@@ -76,11 +65,9 @@ def twin_figures(data: xr.Dataset) -> Iterator[tuple[str, str, Figure]]:
 @styled
 def scores(data: xr.Dataset) -> Figure:
     """RMSE and spread in time, one panel an estimate, averages after the burn-in as thin lines."""
-    kinds = _kinds(data)
-    figure = Figure(figsize=(COLUMN, (1.2 + 3.0 * len(kinds)) / 2.54), layout="constrained")
-    time = data["time"].values
-    panels = figure.subplots(len(kinds), 1, sharex=True, squeeze=False)[:, 0]
-    for ax, kind in zip(panels, kinds, strict=True):
+    kinds, time = _kinds(data), data["time"].values
+    figure, stack = _stack(len(kinds), 3.0)
+    for ax, kind in zip(stack, kinds, strict=True):
         colour = LIGHT[COLOURS[kind]]
         rmse, spread = data[f"{kind}_rmse"], data[f"{kind}_spread"]
         ax.plot(time, rmse, color=colour, lw=0.7, label="RMSE")
@@ -91,10 +78,7 @@ def scores(data: xr.Dataset) -> Figure:
         ax.set_title(f"{kind}: RMSE {plain_number(float(rmse.attrs[MEAN]), 3)}", loc="left")
         ax.set_ylim(0, _upper(rmse.values, spread.values))
         ax.set_ylabel(with_unit("error", _unit(data)))
-        ax.margins(x=0)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
-    panels[-1].set_xlabel(with_unit("time", str(data["time"].attrs["units"])))
-    return figure
+    return _labelled(figure, stack, data)
 
 
 @styled
@@ -105,10 +89,9 @@ def errors(data: xr.Dataset) -> Figure:
     inside = np.mean(np.abs(error[burn_in:]) <= 2 * std[burn_in:], axis=0)
     varied = np.flatnonzero(std.max(axis=0) > 1e-9 * np.abs(data["truth"].values).max(axis=0))  # not what is held fixed
     chosen = np.unique([*varied[: SHOWN - 1], varied[-1]])  # the last is an estimated parameter, if there is one
-    count = len(chosen)
-    figure = Figure(figsize=(COLUMN, (1.2 + 2.6 * count) / 2.54), layout="constrained")
+    figure, stack = _stack(len(chosen), 2.6)
     time = data["time"].values[-LAST:]
-    for i, ax in zip(chosen, figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0], strict=True):
+    for i, ax in zip(chosen, stack, strict=True):
         width = 2 * std[-LAST:, i]
         ax.fill_between(time, -width, width, color=LIGHT["posterior"], alpha=0.25, lw=0, label="± 2 std")
         ax.axhline(0, color=LIGHT["muted"], lw=0.5)
@@ -116,10 +99,25 @@ def errors(data: xr.Dataset) -> Figure:
         name = str(data["state"].values[i])
         ax.set_title(f"{name}: {100 * inside[i]:.0f} % within 2 std", loc="left")
         ax.set_ylabel(with_unit("error", str(data["units"].values[i])))
+    return _labelled(figure, stack, data)
+
+
+def _stack(n: int, height: float) -> tuple[Figure, Sequence[Axes]]:
+    """``n`` axes below each other, of a height in cm, under room for a legend."""
+    figure = Figure(figsize=(COLUMN, (1.2 + height * n) / 2.54), layout="constrained")
+    return figure, list(figure.subplots(n, 1, sharex=True, squeeze=False)[:, 0])
+
+
+def _labelled(figure: Figure, stack: Sequence[Axes], data: xr.Dataset) -> Figure:
+    for ax in stack:
         ax.margins(x=0)
-    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper right", ncols=2)
-    ax.set_xlabel(with_unit("time", str(data["time"].attrs["units"])))
+    figure.legend(*stack[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
+    stack[-1].set_xlabel(with_unit("time", str(data["time"].attrs["units"])))
     return figure
+
+
+def _lines(text: object) -> list[str]:
+    return [line for line in str(text).split("\n") if line]
 
 
 def _kinds(data: xr.Dataset) -> list[str]:

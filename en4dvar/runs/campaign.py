@@ -8,10 +8,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from en4dvar.caution import Caution
 from en4dvar.errors import TooFewMembersError
-from en4dvar.honesty import Caution
 from en4dvar.report.result import Result, load_result
-from en4dvar.storage.store import ParameterSummary
+from en4dvar.summary import ParameterSummary
 
 _RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")  # names of devices on Windows
 _LONGEST = 120  # bytes; file systems allow 255, and temporary names are longer

@@ -18,7 +18,7 @@ from en4dvar.runs.campaign import DatasetOutcome
 from en4dvar.storage.checkpoint import Keeper, digest
 from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import to_bytes
-from en4dvar.storage.store import summarise
+from en4dvar.summary import summarise
 
 SEND_EVERY = 0.1  # s; a worker sends the records of its iterations no more often
 Records = tuple[tuple[str, Record], ...]  # each with the name of its data set

@@ -18,8 +18,6 @@ from en4dvar.config.document import parse_document
 from en4dvar.config.load import resolve
 from en4dvar.errors import OutputError
 from en4dvar.executor import choose_executor, one_blas_thread
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
 from en4dvar.report.result import Result, load_result
 from en4dvar.storage.campaign_file import failed_datasets
 from en4dvar.storage.checkpoint import file_digest
@@ -27,7 +25,6 @@ from en4dvar.storage.fingerprint import Identity, identity
 from en4dvar.storage.provenance import provenance
 
 SURROUNDINGS = ("python_version", "package_versions", "platform", "cpu", "git_commit")
-_HUBER, _SCALAR = "huber_threshold", "scalar_"
 
 
 @dataclass(frozen=True)
@@ -93,7 +90,7 @@ def rerun(run_dir: str | Path, workers: int | None = None) -> Rerun:
     with one_blas_thread(), choose_executor(config.model, None, workers) as executor:
         for file in files:
             recorded = load_result(file)
-            problem = problem_of(config, recorded_observations(recorded))
+            problem = problem_of(config, recorded.observations())
             analysis = assimilate(problem, config.assimilation, int(recorded.attributes["seed"]), executor)
             again = Result.from_analysis(analysis, {})
             variables, differ = differences(recorded, again)
@@ -105,30 +102,6 @@ def rerun(run_dir: str | Path, workers: int | None = None) -> Rerun:
         ),
         tuple(f"{key.replace('_', ' ')}: {was[key]} → {now[key]}" for key in SURROUNDINGS if was[key] != now[key]),
         failed_datasets(campaign) if files != [campaign] else {},
-    )
-
-
-def recorded_observations(result: Result) -> Observations:
-    """The observations (y, t, R) that a result was estimated from, to the bit."""
-    data, name = result.observed_data, result.observable
-    correlation = f"{name}_correlation"
-    return Observations(
-        times=data["time"].values,
-        values=data[name].values,
-        noise=noise_of(
-            data[f"{name}_reading_std"].values,
-            data["time_std"].values,
-            data[correlation].values if correlation in data else None,
-            float(data.attrs[_HUBER]) if _HUBER in data.attrs else None,
-        ),
-        weights=data["weights"].values,
-        name=result.name,
-        source=str(data.attrs["data_source"]),
-        scalars={
-            str(key).removeprefix(_SCALAR): float(value)
-            for key, value in data.attrs.items()
-            if str(key).startswith(_SCALAR)
-        },
     )
 
 

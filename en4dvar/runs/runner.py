@@ -13,7 +13,7 @@ from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.executor import Executor, choose_executor, one_blas_thread
 from en4dvar.files import write_text
-from en4dvar.report import summary_csv, write_pages
+from en4dvar.report import write_pages
 from en4dvar.report.result import Result
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
 from en4dvar.runs.interrupt import terminate_as_interrupt
@@ -21,6 +21,7 @@ from en4dvar.runs.rundir import RunDirectory
 from en4dvar.runs.session import directory_mode, session
 from en4dvar.runs.worklist import Worklist, datasets
 from en4dvar.storage.campaign_file import save_campaign
+from en4dvar.summary import summary_csv
 
 
 def run(

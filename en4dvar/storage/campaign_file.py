@@ -12,7 +12,7 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -93,29 +93,39 @@ def _define(target: netCDF4.Dataset, first: netCDF4.Dataset, n_datasets: int, n_
     for name in GROUPS:
         source, group = first[name], target.createGroup(name)
         group.createDimension("dataset", n_datasets)
-        dims = {d for variable in _kept(source) for d in variable.dimensions}
-        for d in sorted(dims):
-            group.createDimension(_renamed(d), n_observations if d in RENAMED else len(source.dimensions[d]))
-        names = group.createVariable("dataset", str, ("dataset",))
-        names.setncatts({"units": "1", "long_name": "data set"})
-        for variable in _kept(source):
-            scattered = variable.name not in variable.dimensions or variable.name == "time"
-            shape = tuple(map(_renamed, variable.dimensions))
-            kind = str if variable.dtype is str else variable.dtype
-            fill = np.nan if variable.dtype is not str and variable.dtype.kind == "f" and scattered else None
-            made = group.createVariable(
-                variable.name, kind, ("dataset", *shape) if scattered else shape, fill_value=fill
-            )
-            made.setncatts({k: variable.getncattr(k) for k in variable.ncattrs() if k != "_FillValue"})
-            made.set_auto_maskandscale(False)
-            if not scattered:
+        kept = [v for v in source.variables.values() if not LEFT_OUT & {*v.dimensions, v.name}]
+        for dim in sorted({dim for variable in kept for dim in variable.dimensions}):
+            size = n_observations if dim in RENAMED else len(source.dimensions[dim])
+            group.createDimension(RENAMED.get(dim, dim), size)
+        _create(group, "dataset", str, ("dataset",), {"units": "1", "long_name": "data set"})
+        for variable in kept:
+            own = variable.name not in variable.dimensions or variable.name == "time"  # of each data set
+            dims = tuple(RENAMED.get(dim, dim) for dim in variable.dimensions)
+            attributes = {k: variable.getncattr(k) for k in variable.ncattrs() if k != "_FillValue"}
+            made = _create(group, variable.name, variable.dtype, ("dataset", *dims) if own else dims, attributes, own)
+            if not own:
                 made[...] = variable[...]
         for key in source.ncattrs():
-            kind = str if isinstance(source.getncattr(key), str) else np.float64
-            made = group.createVariable(
-                _free(group, key), kind, ("dataset",), fill_value=None if kind is str else np.nan
-            )
-            made.setncatts({"units": "1", "long_name": key.replace("_", " "), "attribute": key})
+            variable_name = f"{key}_total" if key in group.variables else key  # a parameter's share keeps its name
+            kind = str if isinstance(source.getncattr(key), str) else np.dtype(float)
+            about = {"units": "1", "long_name": key.replace("_", " "), "attribute": key}
+            _create(group, variable_name, kind, ("dataset",), about, padded=True)
+
+
+def _create(
+    group: netCDF4.Group,
+    name: str,
+    kind: Any,
+    dims: tuple[str, ...],
+    attributes: Mapping[str, Any],
+    padded: bool = False,
+) -> netCDF4.Variable:
+    """A variable; where it is ``padded``, floats that are missing are NaN."""
+    fill = np.nan if padded and kind is not str and kind.kind == "f" else None
+    made = group.createVariable(name, kind, dims, fill_value=fill)
+    made.setncatts(attributes)
+    made.set_auto_maskandscale(False)
+    return made
 
 
 def _copy(group: netCDF4.Group, source: netCDF4.Group, i: int) -> None:
@@ -129,20 +139,4 @@ def _copy(group: netCDF4.Group, source: netCDF4.Group, i: int) -> None:
                 variable[i] = source.getncattr(key)
         elif variable.name in source.variables:
             values = source[variable.name][...]
-            if values.ndim:
-                variable[(i, *(slice(n) for n in values.shape))] = values
-            else:
-                variable[i] = values
-
-
-def _kept(group: netCDF4.Group) -> Sequence[netCDF4.Variable]:
-    return [v for v in group.variables.values() if not LEFT_OUT & {*v.dimensions, v.name}]
-
-
-def _renamed(dimension: str) -> str:
-    return RENAMED.get(dimension, dimension)
-
-
-def _free(group: netCDF4.Group, key: str) -> str:
-    """Name of the variable for an attribute; that of a parameter's share stays with the share."""
-    return f"{key}_total" if key in group.variables else key
+            variable[(i, *(slice(n) for n in np.shape(values)))] = values

@@ -13,7 +13,6 @@ import os
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ import yaml
 
 from en4dvar.forward import ForwardModel
 from en4dvar.storage.checkpoint import digest, file_digest
+from en4dvar.storage.provenance import package_versions
 
 PACKAGES = ("en4dvar", "numpy", "scipy", "numba", "llvmlite")
 _NO_NUMBERS = ("execution", "output")
@@ -56,15 +56,10 @@ def identity(resolved: str, model: ForwardModel, data: Mapping[str, Path]) -> Id
     """The identity of a run of the resolved configuration (YAML) on ``data`` (name → file)."""
     content = yaml.safe_load(resolved)
     settings = {key: value for key, value in content.items() if key not in _NO_NUMBERS}
-    software: dict[str, str] = {"python": f"{sys.version_info.major}.{sys.version_info.minor}"}
-    for name in PACKAGES:
-        try:
-            software[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
+    software = {"python": f"{sys.version_info.major}.{sys.version_info.minor}", **package_versions(PACKAGES)}
     errors = (content.get("data") or {}).get("error", {})
-    sources = {"en4dvar": source_digest("en4dvar"), **_model_sources(model, content["model"])}
-    sources |= {str(path): file_digest(path) for path in _paths(errors)}
+    sources = {"en4dvar": source_digest("en4dvar"), **_packages_of(model)}
+    sources |= {str(path): file_digest(path) for path in _paths([content["model"], errors])}
     text = yaml.safe_dump(
         {**settings, "software": software, "sources": sources}, sort_keys=False, allow_unicode=True, width=120
     )
@@ -81,15 +76,10 @@ def source_digest(module: str) -> str:
     return file_digest(Path(getattr(top, "__file__", None) or ""))
 
 
-def _model_sources(model: ForwardModel, section: Mapping[str, Any]) -> dict[str, str]:
-    sources = {}
-    for kind in type(model).__mro__:
-        top = kind.__module__.partition(".")[0]
-        if top not in ("en4dvar", "builtins", "abc", "typing") and inspect.getmodule(kind):
-            sources[top] = source_digest(top)
-    for path in _paths(section):
-        sources[str(path)] = file_digest(path)
-    return sources
+def _packages_of(model: ForwardModel) -> dict[str, str]:
+    """Top-level package (or module) → digest of what defines the model's class and its bases outside the framework."""
+    tops = (kind.__module__.partition(".")[0] for kind in type(model).__mro__ if inspect.getmodule(kind))
+    return {top: source_digest(top) for top in tops if top not in ("en4dvar", "builtins", "abc", "typing")}
 
 
 def _paths(value: Any) -> Iterator[Path]:

@@ -36,7 +36,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Group:
-    """Variables and coordinates by name."""
+    """Variables, and coordinates of its dimensions, by name."""
 
     variables: Mapping[str, Variable] = field(default_factory=dict)
     coords: Mapping[str, Variable] = field(default_factory=dict)
@@ -66,24 +66,8 @@ def tree_of(groups: Groups) -> xr.DataTree:
     return xr.DataTree.from_dict({path: dataset(group) for path, group in groups.items()})
 
 
-def groups_of(tree: xr.DataTree) -> dict[str, Group]:
-    """The reverse of :func:`tree_of`."""
-
-    def plain(v: xr.Variable) -> Variable:
-        attributes = {str(key): value for key, value in v.attrs.items()}
-        return Variable(tuple(map(str, v.dims)), v.values, attributes, "_FillValue" not in v.encoding)
-
-    def group(dataset: xr.Dataset) -> Group:
-        coords = {str(name): plain(dataset.variables[name]) for name in dataset.coords}
-        variables = {str(name): plain(dataset.variables[name]) for name in dataset.data_vars}
-        return Group(variables, coords, {str(key): value for key, value in dataset.attrs.items()})
-
-    return {node.path: group(node.to_dataset(inherit=False)) for node in tree.subtree}
-
-
-def to_bytes(content: xr.DataTree | Groups) -> bytes:
-    """The file of a tree or of groups; its last line seals it."""
-    groups = groups_of(content) if isinstance(content, xr.DataTree) else content
+def to_bytes(groups: Groups) -> bytes:
+    """The file of the groups; its last line seals it."""
     with _LOCK:
         file = netCDF4.Dataset("in-memory.nc", "w", format="NETCDF4", memory=_INITIAL_SIZE)
         try:
@@ -101,17 +85,10 @@ def _define(file: netCDF4.Dataset, path: str, content: Group) -> Iterator[tuple[
     """Define a group; yields its variables with the values to be written."""
     group = file if path == "/" else file.createGroup(path)
     group.setncatts(dict(content.attrs))
-    sizes = content.sizes
-    for name, size in sizes.items():
+    for name, size in content.sizes.items():
         group.createDimension(name, size)
-    scattered = {name: set(c.dims) for name, c in content.coords.items() if name not in sizes}
-    unused = set(scattered)
     for name, variable in (*content.variables.items(), *content.coords.items()):
         values, attributes = variable.values, dict(variable.attrs)
-        along = {c for c, dims in scattered.items() if dims <= set(variable.dims)} if name in content.variables else ()
-        if along:
-            unused -= set(along)
-            attributes["coordinates"] = " ".join(sorted(along))
         if values.dtype == bool:
             values, attributes["dtype"] = values.astype(np.int8), "bool"
         kind = str if values.dtype.kind in "OU" else values.dtype
@@ -120,5 +97,3 @@ def _define(file: netCDF4.Dataset, path: str, content: Group) -> Iterator[tuple[
         target.set_auto_maskandscale(False)
         target.setncatts(attributes)
         yield target, values.astype(object) if kind is str else values
-    if unused:
-        group.setncattr("coordinates", " ".join(sorted(unused)))

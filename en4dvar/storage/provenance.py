@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
-import sys
+from collections.abc import Iterable
+from contextlib import suppress
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -25,30 +26,28 @@ def provenance(config_text: str, config_path: str | Path | None = None, command:
     Nothing here fails: what cannot be found out (no git, an installed package) is left as an empty string.
     """
     now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-    version = package_versions().get("en4dvar", "unknown")
+    versions = package_versions(PACKAGES)
     return {
         "date_created": now,
-        "history": f"{now} {command or 'en4dvar'} (en4dvar {version})",
+        "history": f"{now} {command or 'en4dvar'} (en4dvar {versions.get('en4dvar', 'unknown')})",
         "institution": os.environ.get("EN4DVAR_INSTITUTION", ""),
         "configuration": config_text,
         "configuration_file": Path(config_path).name if config_path else "",
         "configuration_git_commit": git_commit(Path(config_path)) if config_path else "",
         "git_commit": git_commit(Path(__file__)),
-        "package_versions": ", ".join(f"{name} {v}" for name, v in package_versions().items()),
+        "package_versions": ", ".join(f"{name} {v}" for name, v in versions.items()),
         "python_version": platform.python_version(),
         "platform": f"{platform.system()} {platform.release()} {platform.machine()}",
         "cpu": f"{cpu_model()}, {os.cpu_count()} logical cores",
     }
 
 
-def package_versions() -> dict[str, str]:
-    """Installed versions of the packages that take part in a result."""
+def package_versions(names: Iterable[str]) -> dict[str, str]:
+    """Versions of those packages that are installed."""
     versions = {}
-    for name in PACKAGES:
-        try:
+    for name in names:
+        with suppress(metadata.PackageNotFoundError):
             versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
     return versions
 
 
@@ -74,11 +73,8 @@ def _git(folder: Path, *arguments: str) -> str:
 
 def cpu_model() -> str:
     """Name of the processor, as the operating system tells it."""
-    if sys.platform == "linux":
-        try:
-            for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-                if line.startswith("model name"):
-                    return line.partition(":")[2].strip()
-        except OSError:
-            pass
+    with suppress(OSError):  # /proc is Linux's
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()

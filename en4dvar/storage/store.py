@@ -2,96 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 from en4dvar.analysis import Analysis
+from en4dvar.caution import Caution
 from en4dvar.errors import OutputError
-from en4dvar.files import write_bytes
-from en4dvar.honesty import Caution
+from en4dvar.files import atomic_path
+from en4dvar.noise import noise_of
+from en4dvar.observations import Observations
 from en4dvar.state import Array, Parameter
-from en4dvar.storage.groups import about, active_members, build_groups
-from en4dvar.storage.netcdf import to_bytes, tree_of
-from en4dvar.storage.seal import check_seal
-from en4dvar.tables import table
-from en4dvar.units import convert
+from en4dvar.storage.groups import SCALAR, build_groups
+from en4dvar.storage.netcdf import tree_of
+from en4dvar.storage.seal import check_seal, seal_file
+from en4dvar.summary import ParameterSummary, living, results_table
 
 if TYPE_CHECKING:
     import pandas as pd
 
 GROUPS = ("prior", "posterior", "posterior_predictive", "observed_data", "sample_stats", "iterations")
-
-
-@dataclass(frozen=True)
-class ParameterSummary:
-    """One row of the summary table; all values in ``unit``, the display unit."""
-
-    name: str
-    label: str
-    symbol: str
-    unit: str
-    prior_mean: float
-    prior_std: float
-    mean: float
-    std: float
-    q05: float
-    q50: float
-    q95: float
-    centre: float
-    dfs: float
-
-    @classmethod
-    def of(
-        cls, name: str, about: Mapping[Any, Any], prior: Array, posterior: Array, centre: float, dfs: float
-    ) -> ParameterSummary:
-        """Of members (N',) that are alive, display unit; the centre is SI. ``about``: attributes of the variable."""
-        prior_mean, prior_std = _moments(prior)
-        mean, std = _moments(posterior)
-        q05, q50, q95 = np.quantile(posterior, (0.05, 0.5, 0.95)) if posterior.size else (np.nan,) * 3
-        return cls(
-            name=name,
-            label=about["long_name"],
-            symbol=about["symbol"],
-            unit=about["display_units"],
-            prior_mean=prior_mean,
-            prior_std=prior_std,
-            mean=mean,
-            std=std,
-            q05=float(q05),
-            q50=float(q50),
-            q95=float(q95),
-            centre=convert(centre, about["units"], about["display_units"]),
-            dfs=dfs,
-        )
-
-
-def summarise(analysis: Analysis) -> tuple[ParameterSummary, ...]:
-    """:meth:`StoredResult.summary` without the detour through a tree."""
-    alive = active_members(analysis.posterior_failures)
-
-    def row(j: int, p: Parameter) -> ParameterSummary:
-        prior = _living(analysis.prior[:, j], True, p.unit, p.display_unit)
-        posterior = _living(analysis.posterior[:, j], alive, p.unit, p.display_unit)
-        centre, dfs = float(analysis.centre[j]), float(analysis.dfs_per_parameter[j])
-        return ParameterSummary.of(p.name, about(p), prior, posterior, centre, dfs)
-
-    return tuple(row(j, p) for j, p in enumerate(analysis.parameters))
-
-
-def results_table(summaries: Mapping[str, Iterable[ParameterSummary]]) -> str:
-    """Posterior mean, std and 5/50/95 % of every parameter (data set → its rows), in display units."""
-    header = ("data set", "parameter", "unit", "mean", "std", "5 %", "50 %", "95 %")
-    rows = [
-        (name, row.name, row.unit, *(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q50, row.q95)))
-        for name, summary in summaries.items()
-        for row in summary
-    ]
-    return table([header, *rows])
 
 
 @dataclass(frozen=True)
@@ -162,21 +97,50 @@ class StoredResult:
         """A group of the file, e.g. ``"prior_predictive"``."""
         return self.tree.children[group].to_dataset()
 
+    def observations(self) -> Observations:
+        """The observations (y, t, R) that the result was estimated from, to the bit."""
+        data, name = self.observed_data, self.observable
+        correlation, attributes = f"{name}_correlation", {str(key): value for key, value in data.attrs.items()}
+        return Observations(
+            times=data["time"].values,
+            values=data[name].values,
+            noise=noise_of(
+                data[f"{name}_reading_std"].values,
+                data["time_std"].values,
+                data[correlation].values if correlation in data else None,
+                float(attributes["huber_threshold"]) if "huber_threshold" in attributes else None,
+            ),
+            weights=data["weights"].values,
+            name=self.name,
+            source=str(attributes["data_source"]),
+            scalars={k.removeprefix(SCALAR): float(v) for k, v in attributes.items() if k.startswith(SCALAR)},
+        )
+
     def members(self, group: str, name: str) -> Array:
         """(N',) finite values of a parameter in ``group`` (prior or posterior), display unit, members in order."""
-        variable = self.dataset(group)[name]
-        values = np.asarray(variable.values, dtype=float).ravel()
-        alive = self.sample_stats["active"].values.ravel() if group == "posterior" else True
-        return _living(values, alive, variable.attrs["units"], variable.attrs["display_units"])
+        values = np.asarray(self.dataset(group)[name].values, dtype=float).ravel()
+        return living(values, self.alive if group == "posterior" else True, self._parameter(name))
+
+    @property
+    def alive(self) -> npt.NDArray[np.bool_]:
+        """(N,) the members that survived the posterior forecast."""
+        return np.asarray(self.sample_stats["active"].values.ravel(), dtype=bool)
 
     def summary(self) -> tuple[ParameterSummary, ...]:
-        """One row a parameter: prior, mean, std (N−1), 5/50/95 %, centre, DFS; NaN where too few members live."""
-        return tuple(self._summarise(str(name)) for name in self.posterior.data_vars)
+        """One row a parameter, as of :func:`~en4dvar.summary.summarise`."""
 
-    def _summarise(self, name: str) -> ParameterSummary:
-        about, at = self.posterior[name].attrs, self.sample_stats.sel(parameter=name)
-        prior, posterior = self.members("prior", name), self.members("posterior", name)
-        return ParameterSummary.of(name, about, prior, posterior, float(at["centre"]), float(at["dfs"]))
+        def row(name: str) -> ParameterSummary:
+            prior, posterior = self.members("prior", name), self.members("posterior", name)
+            at = self.sample_stats.sel(parameter=name)
+            return ParameterSummary.of(self._parameter(name), prior, posterior, float(at["centre"]), float(at["dfs"]))
+
+        return tuple(row(str(name)) for name in self.posterior.data_vars)
+
+    def _parameter(self, name: str) -> Parameter:
+        about = self.posterior[name].attrs
+        return Parameter(
+            name, about["units"], label=about["long_name"], symbol=about["symbol"], display_unit=about["display_units"]
+        )
 
     def to_dataframe(self) -> pd.DataFrame:
         """Posterior members as rows (index ``draw``), parameters as columns, SI; NaN where a member failed."""
@@ -191,20 +155,17 @@ class StoredResult:
         return "\n".join([*parts, *(f"{caution.kind}: {caution.words}" for caution in self.cautions)])
 
 
-def _living(values: Array, alive: Any, unit: str, display_unit: str) -> Array:
-    """Finite values (N,) of members alive, in the display unit."""
-    return np.asarray(convert(values[np.isfinite(values) & alive], unit, display_unit))
-
-
-def _moments(values: Array) -> tuple[float, float]:
-    if values.size < 2:
-        return (float(values[0]) if values.size else np.nan), np.nan
-    return float(values.mean()), float(values.std(ddof=1))
-
-
 def save(result: StoredResult, path: str | Path) -> Path:
-    """Write ``path`` (NETCDF4); it appears complete or not at all. Raises :class:`OutputError`."""
-    return write_bytes(path, to_bytes(result.tree))
+    """Write ``path`` (NETCDF4) through xarray; it appears complete or not at all. Raises :class:`OutputError`."""
+    with atomic_path(path) as partial:
+        result.tree.to_netcdf(partial, engine="netcdf4")
+        seal_file(partial)
+    return Path(path)
+
+
+def result_files(run_dir: Path) -> list[Path]:
+    """The files of a run directory's data sets, by name; of a single one ``posterior.nc``, which need not exist."""
+    return sorted((run_dir / "datasets").glob("*.nc")) or [run_dir / "posterior.nc"]
 
 
 def load_stored(path: str | Path) -> StoredResult:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,21 +9,20 @@ import numpy as np
 import xarray as xr
 
 from en4dvar.cycling.twin import TwinResult
+from en4dvar.tables import csv_text
 
 MEAN = "mean_after_burn_in"  # attribute of the scores
 
 
 def summary_csv(result: TwinResult) -> str:
     """RMSE, spread and iterations, averaged after the burn-in, as CSV."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["estimate", "rmse", "spread", "cycles", "forecasts_per_cycle"])
     counted = slice(result.experiment.burn_in, None)
-    forecasts = float(np.mean(result.run.iterations[counted]))
+    forecasts = f"{np.mean(result.run.iterations[counted]):.4g}"
+    lines = [["estimate", "rmse", "spread", "cycles", "forecasts_per_cycle"]]
     for name, score in result.scores.items():
-        cycles = int(np.isfinite(score.rmse[counted]).sum())
-        writer.writerow([name, f"{score.mean_rmse:.6g}", f"{score.mean_spread:.6g}", cycles, f"{forecasts:.4g}"])
-    return text.getvalue()
+        cycles = str(np.isfinite(score.rmse[counted]).sum())
+        lines.append([name, f"{score.mean_rmse:.6g}", f"{score.mean_spread:.6g}", cycles, forecasts])
+    return csv_text(lines)
 
 
 def dataset(result: TwinResult, attributes: Mapping[str, Any]) -> xr.Dataset:
@@ -43,22 +40,16 @@ def dataset(result: TwinResult, attributes: Mapping[str, Any]) -> xr.Dataset:
     }
     run = result.run
     for kind, moments in (("forecast", run.forecast), ("analysis", run.analysis), ("smoothed", run.smoothed)):
-        if kind in result.scores:
-            score = result.scores[kind]
-            variables |= {
-                f"{kind}_mean": (along, moments.mean, {"long_name": f"mean of the {kind} ensemble"}),
-                f"{kind}_std": (along, moments.std, {"long_name": f"standard deviation of the {kind} ensemble"}),
-                f"{kind}_rmse": (
-                    "time",
-                    score.rmse,
-                    {"long_name": f"RMSE of the {kind} mean", "units": unit, MEAN: score.mean_rmse},
-                ),
-                f"{kind}_spread": (
-                    "time",
-                    score.spread,
-                    {"long_name": f"spread of the {kind}", "units": unit, MEAN: score.mean_spread},
-                ),
-            }
+        if (score := result.scores.get(kind)) is None:
+            continue
+        rmse = {"long_name": f"RMSE of the {kind} mean", "units": unit, MEAN: score.mean_rmse}
+        spread = {"long_name": f"spread of the {kind}", "units": unit, MEAN: score.mean_spread}
+        variables |= {
+            f"{kind}_mean": (along, moments.mean, {"long_name": f"mean of the {kind} ensemble"}),
+            f"{kind}_std": (along, moments.std, {"long_name": f"standard deviation of the {kind} ensemble"}),
+            f"{kind}_rmse": ("time", score.rmse, rmse),
+            f"{kind}_spread": ("time", score.spread, spread),
+        }
     if result.series.correlation is not None:
         text = {"long_name": "correlation of the observation errors", "units": "1"}
         variables["observation_correlation"] = (

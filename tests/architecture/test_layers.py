@@ -13,14 +13,14 @@ ROOT = Path(__file__).resolve().parents[2]
 # The modules of one line are a layer together; a package is a layer by itself.
 LAYERS = (
     ("errors",),
-    ("state", "hints", "files", "tables"),
+    ("state", "hints", "files", "tables", "caution"),
     ("units", "prior", "forward", "noise"),
     ("batch", "observations"),
     ("problem", "diagnostics"),
     ("executor",),
     ("ensemble",),
-    ("honesty",),
     ("analysis",),
+    ("honesty", "summary"),
     ("schemes",),
     ("descent",),
     ("cycling",),

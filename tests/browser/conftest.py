@@ -18,8 +18,8 @@ from typing import Any
 import pytest
 
 from en4dvar import report
-from en4dvar.honesty import caution
-from en4dvar.report import overlay, write_pages
+from en4dvar.caution import caution
+from en4dvar.report import overlay, style, write_pages
 from en4dvar.report.compare import compare_runs
 from en4dvar.report.figures import all_figures
 from en4dvar.report.result import Result
@@ -86,15 +86,15 @@ def opened(browser: Any) -> Iterator[Any]:
 
 
 @pytest.fixture(scope="session")
-def pages(analysis: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def pages(analysis: Any, renamed: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Kind of page → its file. One data set of the campaign has a name made to break out of the page."""
     with pytest.MonkeyPatch.context() as patch:  # the PDF and PNG copies of the figures are no part of a page
-        patch.setattr(report, "save_figure", lambda *_: None)
+        patch.setattr(style, "save_figure", lambda *_: None)
         patch.setattr(overlay, "save_figure", lambda *_: None)
-        return _write_pages(analysis, tmp_path_factory.mktemp("pages"))
+        return _write_pages(analysis, renamed, tmp_path_factory.mktemp("pages"))
 
 
-def _write_pages(analysis: Any, folder: Path) -> dict[str, Path]:
+def _write_pages(analysis: Any, renamed: Any, folder: Path) -> dict[str, Path]:
     found = {}
     notes = (caution("misfit", f"bad {EVIL}"), *analysis.cautions, caution("not-informed", "mu is hardly informed"))
     single = replace(analysis, cautions=notes, log_evidence=-100.0)
@@ -109,7 +109,7 @@ def _write_pages(analysis: Any, folder: Path) -> dict[str, Path]:
     campaign = folder / "campaign"
     (campaign / "datasets").mkdir(parents=True)
     for i, (stem, name) in enumerate((("b", "beta"), ("a", "alpha"), ("c", EVIL))):
-        one = replace(calm, name=name, posterior=(1 + 0.2 * i) * calm.posterior, cautions=notes[:i])
+        one = replace(renamed(calm, name), posterior=(1 + 0.2 * i) * calm.posterior, cautions=notes[:i])
         save(Result.from_analysis(one, provenance("name: test\n")), campaign / "datasets" / f"{stem}.nc")
     with pytest.MonkeyPatch.context() as patch:  # two figures on each page tell as much as five
         patch.setattr(report, "all_figures", lambda result: islice(all_figures(result), 2))

@@ -21,7 +21,7 @@ def test_collapse_exceeds_it_and_the_growth_before_does_not():
     assert growth < 0.2
     assert collapse > 3
     assert np.max(np.abs(path["Rdot"])) / model.medium.c < 0.5 * collapse  # its peak is between the observations
-    assert validity(model.validity, np.full((4, 1), growth)) == ()
+    assert list(validity(model.validity, np.full((4, 1), growth))) == []
     (found,) = validity(model.validity, np.full((4, 1), collapse))
     assert "Mach number of the bubble wall reaches" in found.words
 

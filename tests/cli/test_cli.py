@@ -12,10 +12,10 @@ import xarray as xr
 from click.testing import CliRunner, Result
 from toy_config import YAML, csv_text, write_toy
 
+from en4dvar.caution import caution
 from en4dvar.cli import main
 from en4dvar.commands.run import _tell
 from en4dvar.config import load_config
-from en4dvar.honesty import caution
 from en4dvar.report.result import load_result
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
 

@@ -31,11 +31,13 @@ def one(tmp_path_factory: pytest.TempPathFactory, analysis: Analysis) -> Path:
 
 
 @pytest.fixture(scope="module")
-def two(tmp_path_factory: pytest.TempPathFactory, make_analysis: Callable[..., Analysis]) -> Path:
+def two(
+    tmp_path_factory: pytest.TempPathFactory, analysis: Analysis, renamed: Callable[[Analysis, str], Analysis]
+) -> Path:
     folder = tmp_path_factory.mktemp("two")
     (folder / "datasets").mkdir()
     for name in ("a_1", "b&2"):
-        save(Posterior.from_analysis(make_analysis(name=name), {}), folder / "datasets" / f"{name[0]}.nc")
+        save(Posterior.from_analysis(renamed(analysis, name), {}), folder / "datasets" / f"{name[0]}.nc")
     return folder
 
 

@@ -256,10 +256,10 @@ def test_an_outlier_leaves_the_robust_posterior_where_it_was():
     assert all(b <= a for a, b in pairwise(costs))
     assert not any("does not explain" in words for words in robust.warnings)
     assert any("does not explain" in words for words in gaussian.warnings)
-    assert robust.huber_weight is not None
-    assert np.argmin(robust.huber_weight) == 3
-    assert robust.huber_weight[3] < 0.1
-    assert gaussian.huber_weight is None
+    assert robust.down_weights is not None
+    assert np.argmin(robust.down_weights) == 3
+    assert robust.down_weights[3] < 0.1
+    assert gaussian.down_weights is None
     (words,) = [w for w in robust.warnings if "down-weighted" in w]
     assert f"{plain.observations.times[3]:.4g} s (weight 0.0" in words.partition("(Huber): ")[2][:25]
 

@@ -10,8 +10,10 @@ import pytest
 from honesty.provoked import TWO, bounded, linear, run
 from toys import Fragile, make_problem
 
+from en4dvar.analysis import Analysis
+from en4dvar.caution import CATALOGUE, Caution
 from en4dvar.forward import ValidityLimit
-from en4dvar.honesty import CATALOGUE, Ending, examine
+from en4dvar.honesty import ControlEnsembles, examine
 from en4dvar.honesty.checks import at_bound, rank, validity
 from en4dvar.honesty.examine import collapse
 from en4dvar.honesty.lost import loss, where_lost
@@ -22,35 +24,43 @@ G, R0 = Parameter("G", "Pa", bounds=(0.0, np.inf), display_unit="kPa"), Paramete
 PRIOR = Prior((PriorTerm.lognormal(G, 1000.0, 0.5), PriorTerm.normal(R0, 1e-6, 1e-7)))
 
 
-def gaussian_ending(shrunk: float = 1.0) -> Ending:
+ENDED = run(linear(k=12))
+
+
+def gaussian(shrunk: float = 1.0) -> tuple[Analysis, ControlEnsembles]:
     """The exact end of a linear problem with J = ½|x|², its ensemble made narrower."""
     prior = Prior(tuple(PriorTerm.normal(Parameter(name, "m"), 0.0, 1.0) for name in TWO))
     members = prior.sample(48, 3, "exact")
     posterior = shrunk * members
-    return Ending(
-        prior=prior, members=members, posterior=posterior, mode=np.zeros(2), costs=0.5 * np.sum(posterior**2, axis=1),
-        cost=0.0, converged=True, stop_reason="", step_norm=0.0, chi2=10.0, n_weighted=12, dfs=2.0,
-        dfs_per_parameter=np.ones(2),        prior_failures=("",) * 48, worst_loss=(), posterior_failures=("",) * 48,
-    )  # fmt: skip
+    last = replace(ENDED.iterations[-1], step_norm=0.0, chi2_per_observation=10.0 / 12, dfs=2.0)
+    problem = replace(ENDED.problem, prior=prior)
+    analysis = replace(ENDED, problem=problem, iterations=(last,), dfs_per_parameter=np.ones(2), shape={})
+    return analysis, ControlEnsembles(members, posterior, np.zeros(2), 0.5 * np.sum(posterior**2, axis=1), 0.0)
+
+
+def collapsed(shrunk: float = 1.0, alive: int = 48) -> list[Caution]:
+    analysis, control = gaussian(shrunk)
+    return list(collapse(analysis.problem.prior, control, np.arange(48) >= 48 - alive))
 
 
 def test_a_gaussian_end_is_silent():
-    assert examine(gaussian_ending()) == ()
+    assert examine(*gaussian()) == ()
 
 
 @pytest.mark.parametrize(("shrunk", "told"), [(1.5, False), (0.4, False), (0.3, True), (1e-3, True), (0.0, True)])
 def test_collapse_is_a_spread_below_a_third_of_what_the_cost_allows(shrunk, told):
-    found = collapse(gaussian_ending(shrunk))
+    found = collapsed(shrunk)
     assert [c.code for c in found] == ["ensemble-collapse"] * told
     if shrunk == 0.3:
         assert "its spread is about 0.3 of what the data and the prior allow" in found[0].words
 
 
 def test_members_that_failed_do_not_count_as_spread():
-    end = gaussian_ending()
-    failures = ("gone",) * 47 + ("",)
-    assert collapse(replace(end, posterior_failures=failures)) == ()  # nothing to tell it from
-    assert [c.code for c in rank(end.prior, end.members, end.posterior[-1:])] == ["rank-deficient"]
+    assert collapsed(alive=1) == []  # nothing to tell it from
+    analysis, control = gaussian()
+    found = examine(replace(analysis, posterior_failures=("gone",) * 47 + ("",)), control)
+    assert "rank-deficient" in {c.code for c in found}
+    assert [c.code for c in rank(PRIOR, control.prior, control.posterior[-1:])] == ["rank-deficient"]
 
 
 def test_where_lost_names_the_parameters_that_tell_and_their_edges():
@@ -102,7 +112,7 @@ def test_a_normal_prior_cut_by_a_bound_counts_the_members_beyond_it():
     failures = ["" if v >= 0 else "a outside [0, inf] m" for v in after[:, 0]]
     (found,) = at_bound(problem.prior, x, after, failures)
     assert "pile up at its lower bound (0 m)" in found.words
-    assert at_bound(problem.prior, x, x, [""] * 48) == ()
+    assert list(at_bound(problem.prior, x, x, [""] * 48)) == []
 
 
 def test_an_interior_posterior_does_not_pile_up():
@@ -116,18 +126,23 @@ def test_an_interior_posterior_does_not_pile_up():
 def test_a_tenth_of_the_members_may_leave_the_validity(beyond, told):
     limit = ValidityLimit("speed", 3.0, "m/s", "speed of the wall")
     reached = np.where(np.arange(40) < beyond, 3.5, 2.0)[:, None]
-    found = validity((limit,), reached)
+    found = list(validity((limit,), reached))
     assert [c.code for c in found] == ["model-validity"] * told
     if told:
         assert "speed of the wall reaches 3.5 m/s (median 2), the limit is 3 m/s" in found[0].words
-    assert validity((), np.empty((40, 0))) == ()
+    assert list(validity((), np.empty((40, 0)))) == []
 
 
 def test_iterations_that_end_next_to_their_criterion_are_a_note_without_alarm():
-    end = replace(gaussian_ending(), converged=False, stop_reason="no decrease possible along the step")
-    (near,) = examine(replace(end, step_norm=0.05))
-    (far,) = examine(replace(end, step_norm=0.6))
-    (unknown,) = examine(replace(end, step_norm=np.nan))
+    analysis, control = gaussian()
+
+    def ended(step_norm: float) -> Caution:
+        last = replace(analysis.iterations[-1], step_norm=step_norm)
+        reason = "no decrease possible along the step"
+        (found,) = examine(replace(analysis, converged=False, stop_reason=reason, iterations=(last,)), control)
+        return found
+
+    near, far, unknown = ended(0.05), ended(0.6), ended(np.nan)
     assert (near.code, near.severity) == ("not-converged", "note")
     assert near.advice.startswith("no action is needed")
     assert (far.severity, unknown.severity) == ("serious", "serious")

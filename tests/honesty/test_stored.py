@@ -12,7 +12,7 @@ from run_files import configuration, make_campaign, run_cli
 from toy_config import csv_text, write_toy
 from toys import make_problem
 
-from en4dvar.honesty import CATALOGUE
+from en4dvar.caution import CATALOGUE
 from en4dvar.report.result import Result, load_result
 from en4dvar.runs.runner import run_campaign
 from en4dvar.storage.store import save

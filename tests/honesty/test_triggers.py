@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 from honesty.provoked import PROVOKED, chain_not_converged
 
-from en4dvar.honesty import CATALOGUE, Caution, caution
-from en4dvar.honesty.caution import SEVERITIES
+from en4dvar.caution import CATALOGUE, SEVERITIES, Caution, caution
 from en4dvar.sampling import mcmc
 
 

@@ -18,15 +18,17 @@ import pytest
 from PIL import Image
 
 from en4dvar import report
+from en4dvar.caution import Caution
 from en4dvar.diagnostics import chi2_interval
 from en4dvar.errors import OutputError
 from en4dvar.executor import SerialExecutor, WorkerLostError
-from en4dvar.honesty import Caution
+from en4dvar.prior import Prior
 from en4dvar.report import write_pages
 from en4dvar.report.figures import all_figures
-from en4dvar.report.overview import Entry, overview_figures, render_overview
+from en4dvar.report.overview import SetSummary, overview_figures, render_overview
 from en4dvar.report.page import judge_chi2
 from en4dvar.report.result import Result
+from en4dvar.report.style import draw
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.store import save
 
@@ -127,12 +129,17 @@ def test_colours_follow_the_scheme(html):
     assert literal == set(), "a colour that stays the same in the dark scheme"
 
 
-def test_strings_of_data_and_configuration_are_escaped(write_run, analysis):
+def with_parameters(analysis, *parameters):
+    """The analysis as if its parameters were these."""
+    terms = tuple(replace(t, parameter=p) for t, p in zip(analysis.problem.prior.terms, parameters, strict=False))
+    return replace(analysis, problem=replace(analysis.problem, prior=Prior(terms)))
+
+
+def test_strings_of_data_and_configuration_are_escaped(write_run, analysis, renamed):
     evil = "<script>alert(1)</script>"
-    parameters = (replace(analysis.parameters[0], label=evil), *analysis.parameters[1:])
-    bad = replace(
-        analysis, name=evil, cautions=(Caution(evil, "serious", evil, evil),), stop_reason=evil, parameters=parameters
-    )
+    bad = replace(analysis, cautions=(Caution(evil, "serious", evil, evil),), stop_reason=evil)
+    first, *others = analysis.parameters
+    bad = renamed(with_parameters(bad, replace(first, label=evil), *others), evil)
     html = write_pages(write_run(bad, config=f"name: '{evil}'\n")).read_text(encoding="utf-8")
     assert evil not in html
     assert html.count("&lt;script&gt;alert(1)") >= 5
@@ -170,12 +177,12 @@ def test_summary_table(reported, analysis):
 
 
 @pytest.fixture(scope="module")
-def campaign_dir(analysis, tmp_path_factory):
+def campaign_dir(analysis, renamed, tmp_path_factory):
     """The report of three data sets, one with a name that must be escaped and quoted."""
     folder = tmp_path_factory.mktemp("campaign")
     (folder / "datasets").mkdir()
     for name, file in (("one", "one"), ("two", "two"), ("<script>alert('é')</script>", "é 100%")):
-        result = Result.from_analysis(replace(analysis, name=name), provenance("name: test\n"))
+        result = Result.from_analysis(renamed(analysis, name), provenance("name: test\n"))
         save(result, folder / "datasets" / f"{file}.nc")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "COPIES", 0)
@@ -271,9 +278,9 @@ def test_the_page_of_a_process_that_dies_is_drawn_here(campaign_dir, tmp_path, m
 
 
 def test_overview_of_many_data_sets_stays_small(analysis):
-    one = Entry.of(Result.from_analysis(analysis, provenance("name: test\n")), "set")
-    entries = [replace(one, name=f"set {i:04d}", stem=f"set_{i:04d}") for i in range(2000)]
-    html = render_overview(entries, {}, {}, overview_figures(entries))
+    one = SetSummary.of(Result.from_analysis(analysis, provenance("name: test\n")), "set")
+    sets = [replace(one, name=f"set {i:04d}", stem=f"set_{i:04d}") for i in range(2000)]
+    html = render_overview(sets, {}, {}, draw(overview_figures(sets), None))
     assert len(html.encode()) < 3e6
     assert html.count("<tr>") == 2001
 
@@ -300,8 +307,7 @@ def test_lost_ensemble_still_gets_a_report(write_run, make_analysis, survivors):
 
 def test_single_parameter_has_no_pairs(write_run, analysis):
     one = replace(
-        analysis,
-        parameters=analysis.parameters[:1],
+        with_parameters(analysis, analysis.parameters[0]),
         prior=analysis.prior[:, :1],
         posterior=analysis.posterior[:, :1],
         centre=analysis.centre[:1],

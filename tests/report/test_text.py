@@ -36,7 +36,7 @@ def test_plus_minus(mean, std, shown):
      (0.95, "determined by the data"), (1.0, "determined by the data"), (float("nan"), "")],
 )  # fmt: skip
 def test_share_in_words(dfs, phrase):
-    assert text.words_for(dfs, text.DFS_WORDS) == phrase
+    assert text.informed_words(dfs) == phrase
 
 
 @pytest.mark.parametrize(

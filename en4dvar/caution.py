@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -87,3 +88,8 @@ def worst_first(cautions: tuple[Caution, ...]) -> tuple[Caution, ...]:
     """Sorted by severity, otherwise in the order given."""
     order: dict[str, int] = {severity: i for i, severity in enumerate(SEVERITIES)}
     return tuple(sorted(cautions, key=lambda c: order.get(c.severity, len(order))))
+
+
+def codes(cautions: Iterable[Caution]) -> tuple[str, ...]:
+    """The codes, each once."""
+    return tuple(dict.fromkeys(c.code for c in cautions))

@@ -1,0 +1,100 @@
+"""A posterior in a few numbers, in display units: for the terminal, ``summary.csv`` and the pages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.analysis import Analysis
+from en4dvar.caution import Caution, codes
+from en4dvar.diagnostics import active_members
+from en4dvar.state import Array, Parameter
+from en4dvar.tables import csv_text, table
+from en4dvar.units import convert
+
+
+@dataclass(frozen=True)
+class ParameterSummary:
+    """One row of the summary table; all values in ``unit``, the display unit."""
+
+    name: str
+    label: str
+    symbol: str
+    unit: str
+    prior_mean: float
+    prior_std: float
+    mean: float
+    std: float
+    q05: float
+    q50: float
+    q95: float
+    centre: float
+    dfs: float
+
+    @classmethod
+    def of(cls, p: Parameter, prior: Array, posterior: Array, centre: float, dfs: float) -> ParameterSummary:
+        """Of members (N',) that are alive, in the display unit; the centre is SI."""
+        prior_mean, prior_std = _moments(prior)
+        mean, std = _moments(posterior)
+        q05, q50, q95 = map(float, np.quantile(posterior, (0.05, 0.5, 0.95)) if posterior.size else (np.nan,) * 3)
+        centre = convert(centre, p.unit, p.display_unit)
+        return cls(
+            p.name, p.label, p.symbol, p.display_unit, prior_mean, prior_std, mean, std, q05, q50, q95, centre, dfs
+        )
+
+
+def living(values: Array, alive: npt.NDArray[np.bool_] | bool, p: Parameter) -> Array:
+    """Finite values (N',) of members alive, in the display unit."""
+    return np.asarray(convert(values[np.isfinite(values) & alive], p.unit, p.display_unit))
+
+
+def summarise(a: Analysis) -> tuple[ParameterSummary, ...]:
+    """One row a parameter: prior, mean, std (N−1), 5/50/95 %, centre, DFS; NaN where too few members live."""
+    alive = active_members(a.posterior_failures)
+    return tuple(
+        ParameterSummary.of(
+            p,
+            living(a.prior[:, j], True, p),
+            living(a.posterior[:, j], alive, p),
+            float(a.centre[j]),
+            float(a.dfs_per_parameter[j]),
+        )
+        for j, p in enumerate(a.parameters)
+    )
+
+
+def results_table(summaries: Mapping[str, Iterable[ParameterSummary]]) -> str:
+    """Posterior mean, std and 5/50/95 % of every parameter (data set → its rows)."""
+    header = ("data set", "parameter", "unit", "mean", "std", "5 %", "50 %", "95 %")
+    rows = [
+        (name, row.name, row.unit, *(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q50, row.q95)))
+        for name, summary in summaries.items()
+        for row in summary
+    ]
+    return table([header, *rows])
+
+
+def summary_csv(
+    summaries: Iterable[tuple[str, Iterable[ParameterSummary], Iterable[Caution]]], failures: Mapping[str, str]
+) -> str:
+    """One line a data set and parameter, every digit kept; one line a data set that failed.
+
+    ``summaries``: (name of the data set, its rows, its warnings: column ``warnings`` holds their codes);
+    ``failures``: name of the data set → reason, column ``failure``.
+    """
+    columns = [f.name for f in fields(ParameterSummary) if f.name not in ("label", "symbol")]
+    lines: list[list[object]] = [["dataset", *columns, "failure", "warnings"]]
+    for name, summary, cautions in summaries:
+        warned = " ".join(codes(cautions))
+        lines += [[name, *(getattr(row, column) for column in columns), "", warned] for row in summary]
+    lines += [[name, *("" for _ in columns), reason, ""] for name, reason in failures.items()]
+    return csv_text(lines)
+
+
+def _moments(values: Array) -> tuple[float, float]:
+    if values.size < 2:
+        return (float(values[0]) if values.size else np.nan), np.nan
+    return float(values.mean()), float(values.std(ddof=1))
