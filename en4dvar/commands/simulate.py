@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -69,12 +70,12 @@ def _has_campaign(config: str) -> bool:
 
 def _simulate_campaign(config: str, settings: tuple[str, ...], out: Path | None, seed: int | None, force: bool) -> None:
     from en4dvar.config.document import override, read_document
-    from en4dvar.config.synthetic import relocated, resolve_campaign
+    from en4dvar.config.synthetic import resolve_campaign
     from en4dvar.runs.synthetic import draw_campaign, write_campaign
 
     changes = overrides(None, settings, seed=seed)
     plan = resolve_campaign(override(read_document(Path(config)), changes), Path(config).resolve().parent)
-    plan = relocated(plan, out) if out else plan
+    plan = replace(plan, directory=out) if out else plan
     sets = draw_campaign(plan)
     truth = write_campaign(plan, sets, command_line(), force)
     fits = [s.nrmse for s in sets]

@@ -2,27 +2,77 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
-from en4dvar.config import schema
-from en4dvar.config.document import Document
-from en4dvar.config.validate import check
+from pydantic import Discriminator, Field, Tag
+
+from en4dvar.config.context import ByName, Context, Made, Spread, parse_spread, subject_unit, unit_of
+from en4dvar.config.schema import Section
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel
 from en4dvar.hints import suggest
 from en4dvar.prior import PriorTerm
 from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Parameter
-from en4dvar.units import UnitError, convert, parse_quantity
+from en4dvar.units import parse_quantity
 
-_PERCENT = re.compile(r"([^%]*)%")
 _RECIPES = {
     "normal": "mean and std",
     "lognormal": "median and log_std, or mean and std",
     "logit": "lower, upper, median and logit_std",
 }
+
+
+def _bounded(text: Any, parameter: Parameter) -> float:
+    """A value in the parameter's unit. Raises :class:`ConfigError`, :class:`UnitError`."""
+    low, high = parameter.bounds
+    value = parse_quantity(text, parameter.unit)
+    if not low <= value <= high:
+        raise ConfigError(f"{text} is outside the bounds [{low:g}, {high:g}] {parameter.unit}")
+    return value
+
+
+def _value(text: Any, context: Any) -> float:
+    return _bounded(text, context["subject"])
+
+
+def _location(text: Any, context: Any) -> float | Literal["maximum"]:
+    return "maximum" if text == "maximum" else _value(text, context)
+
+
+def _spread(text: Any, context: Context) -> Spread:
+    return parse_spread(text, subject_unit(context))
+
+
+class Prior(Section):
+    """A prior by name; locations and spreads carry the parameter's unit, a ``%`` spread is relative to the location."""
+
+    prior: Literal["normal", "lognormal", "logit"]
+    """Shape: normal (mean, std), lognormal (median and log_std, or mean and std), logit (lower, upper, median, …)."""
+    mean: Annotated[float | Literal["maximum"] | None, Made(_location, needs="subject")] = None
+    """Mean with its unit, or ``maximum``: the largest observation of the window."""
+    median: Annotated[float | Literal["maximum"] | None, Made(_location, needs="subject")] = None
+    """Median with its unit, or ``maximum``: the largest observation of the window."""
+    std: Annotated[Spread | None, Made(_spread, needs="subject")] = None
+    """Standard deviation with its unit, or in % of the mean."""
+    log_std: Annotated[float, Field(gt=0)] | None = None
+    """Standard deviation of the natural logarithm: 0.3 is about 30 %, 0.7 a factor of two."""
+    logit_std: Annotated[float, Field(gt=0)] | None = None
+    """Standard deviation of the logit between ``lower`` and ``upper``."""
+    lower: Annotated[float | None, Made(_value, needs="subject")] = None
+    """Lower bound with its unit; never reached."""
+    upper: Annotated[float | None, Made(_value, needs="subject")] = None
+    """Upper bound with its unit; never reached."""
+
+
+class FromFile(Section):
+    """A value fixed at a scalar that the data file holds."""
+
+    from_file: Annotated[str, Field(min_length=1)]
+    """Name of a scalar in the data file, e.g. Req."""
+    unit: Annotated[str, unit_of(subject_unit, needs="subject")]
+    """Unit of that scalar in the file."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +99,7 @@ class Scalar:
             raise ConfigError(
                 f"{source}: no scalar {self.name!r} for {self.parameter.name}{suggest(self.name, scalars)}"
             )
-        return _quantity(f"{scalars[self.name]!r} {self.unit}", self.parameter)
+        return _bounded(f"{scalars[self.name]!r} {self.unit}", self.parameter)
 
 
 @dataclass(frozen=True)
@@ -57,7 +107,7 @@ class Uncertain:
     """A parameter with a prior; ``maximum`` as a location is the observed maximum in the window."""
 
     parameter: Parameter
-    spec: schema.Prior
+    spec: Prior
 
     @property
     def needs_data(self) -> bool:
@@ -65,76 +115,96 @@ class Uncertain:
 
     def term(self, maximum: float | None = None) -> PriorTerm:
         """The prior; ``maximum`` is in the parameter's unit. Raises :class:`ConfigError`, its path the faulty key."""
+        try:
+            return self._term(self._location("mean", maximum), self._location("median", maximum))
+        except ConfigError as error:
+            own = f"prior of {self.parameter.name}: "
+            raise ConfigError([replace(f, message=f.message.removeprefix(own)) for f in error.problems]) from None
+
+    def _term(self, mean: float, median: float) -> PriorTerm:
         spec, parameter = self.spec, self.parameter
-        given = frozenset(spec.model_fields_set - {"prior"})
-        mean, median = self._location("mean", maximum), self._location("median", maximum)
+        given = spec.model_fields_set - {"prior"}
         if spec.prior == "normal" and given == {"mean", "std"}:
-            return PriorTerm.normal(parameter, mean, self._spread(mean))
+            return PriorTerm.normal(parameter, mean, self._std(mean))
         if spec.prior == "lognormal" and given == {"mean", "std"}:
-            return PriorTerm.lognormal_moments(parameter, mean, self._spread(mean))
+            return PriorTerm.lognormal_moments(parameter, mean, self._std(mean))
         if spec.prior == "lognormal" and given == {"median", "log_std"} and spec.log_std is not None:
             return PriorTerm.lognormal(parameter, median, spec.log_std)
         if spec.prior == "logit" and given == {"lower", "upper", "median", "logit_std"} and spec.logit_std is not None:
-            bounds = self._location("lower", maximum), self._location("upper", maximum)
-            return PriorTerm.logit(parameter, bounds, median, spec.logit_std)
+            return PriorTerm.logit(parameter, (spec.lower or 0.0, spec.upper or 0.0), median, spec.logit_std)
         takes, has = _RECIPES[spec.prior], ", ".join(sorted(given)) or "none of these"
         raise ConfigError(f"a {spec.prior} prior takes {takes}; given: {has}")
 
-    def _location(self, key: str, maximum: float | None) -> float:
-        value = getattr(self.spec, key)
-        if value is None:
-            return 0.0
-        if value == "maximum":
-            if maximum is None:
-                raise ConfigError([Fault("'maximum' is known only from the data, and there are none", key)])
-            return maximum
-        return _quantity(value, self.parameter, key)
+    def _location(self, key: Literal["mean", "median"], maximum: float | None) -> float:
+        value: float | Literal["maximum"] | None = getattr(self.spec, key)
+        if value != "maximum":
+            return value or 0.0
+        if maximum is None:
+            raise ConfigError([Fault("'maximum' is known only from the data, and there are none", key)])
+        return maximum
 
-    def _spread(self, mean: float) -> float:
-        text = self.spec.std
-        percent = _PERCENT.fullmatch(str(text))
-        try:
-            std = 0.01 * parse_quantity(percent[1], "1") * abs(mean) if percent else None
-            std = parse_quantity(text or 0, self.parameter.unit) if std is None else std
-        except UnitError as error:
-            raise ConfigError([Fault(str(error), "std")]) from None
-        if percent and mean == 0:
-            unit = self.parameter.unit
-            raise ConfigError([Fault(f"{text} is relative to the mean, which is zero; give it in {unit}", "std")])
-        if not std > 0:
-            raise ConfigError([Fault(f"must be positive, not {text}", "std")])
-        return std
+    def _std(self, mean: float) -> float:
+        std = self.spec.std
+        if std is None:
+            return 0.0
+        if std.relative and mean == 0:
+            message = f"{100 * std.value:g} % is relative to the mean, which is zero; give it in {self.parameter.unit}"
+            raise ConfigError([Fault(message, "std")])
+        return std.absolute(mean)
 
 
 Entry = Fixed | Scalar | Uncertain
 
 
-def read_parameters(
-    raw: Mapping[str, Any], model: ForwardModel, document: Document, faults: list[Fault]
-) -> tuple[Entry, ...]:
-    """One entry for every parameter of the model, in its order, then t_s and sigma if given. Faults are appended."""
+def _fixed(text: Any, context: Any) -> Fixed:
+    return Fixed(context["subject"], _value(text, context))
+
+
+def _scalar(given: FromFile, context: Any) -> Scalar:
+    return Scalar(context["subject"], given.from_file, given.unit)
+
+
+def _uncertain(given: Prior, context: Any) -> Uncertain:
+    entry = Uncertain(context["subject"], given)
+    if not entry.needs_data:
+        entry.term()
+    elif given.prior != "logit":
+        entry.term(maximum=1.0)  # the other values do not wait for the data
+    return entry
+
+
+def _kind(given: Any) -> str:
+    if not isinstance(given, dict):
+        return "a quantity"
+    return "a scalar" if "from_file" in given else "a prior"
+
+
+ENTRY = Annotated[
+    Annotated[Fixed, Made(_fixed, needs="subject"), Tag("a quantity")]
+    | Annotated[Uncertain, Made(_uncertain, Prior, needs="subject"), Tag("a prior")]
+    | Annotated[Scalar, Made(_scalar, FromFile, needs="subject"), Tag("a scalar")],
+    Discriminator(_kind),
+]
+
+
+def _parameters(model: ForwardModel) -> dict[str, Parameter]:
+    """Those of the model, then the time shift and the noise scale; a model's own sigma goes before."""
     shift = replace(TIME_SHIFT, unit=model.time_unit, display_unit=model.time_display_unit)
-    known = {p.name: p for p in (shift, NOISE_SCALE, *model.parameters)}  # a model's own sigma goes before
-    known = {p.name: known[p.name] for p in (*model.parameters, shift, NOISE_SCALE)}
-    defaults: Mapping[str, float] = getattr(model, "defaults", {})
-    for name in raw:
-        if name not in known:
-            faults.append(
-                document.fault(("parameters", name), f"unknown parameter {name!r}{suggest(name, known)}", at_key=True)
-            )
-    entries: list[Entry] = []
-    for name, parameter in known.items():
-        if name in raw:
-            entry = _entry(raw[name], parameter, document, faults)
-            entries += [entry] if entry else []
-        elif name in defaults:
-            entries.append(Fixed(parameter, defaults[name]))
-        elif parameter not in (shift, NOISE_SCALE):
-            faults.append(document.fault(("parameters", name), _missing(parameter)))
-    return tuple(entries)
+    own = {p.name: p for p in model.parameters}
+    return own | {p.name: p for p in (shift, NOISE_SCALE) if p.name not in own}
 
 
-def _missing(parameter: Parameter) -> str:
+def _defaults(model: ForwardModel) -> Mapping[str, float]:
+    return getattr(model, "defaults", {})
+
+
+def _unknown(name: str, known: Mapping[str, Parameter], model: ForwardModel) -> str:
+    return f"unknown parameter {name!r}{suggest(name, known)}"
+
+
+def _missing(name: str, parameter: Parameter, model: ForwardModel) -> str | None:
+    if name in _defaults(model) or parameter not in model.parameters:
+        return None
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
     return (
         f"{parameter.label} {parameter.name!r} (unit {parameter.unit}) has neither a prior nor a value; "
@@ -142,46 +212,21 @@ def _missing(parameter: Parameter) -> str:
     )
 
 
-def _entry(raw: Any, parameter: Parameter, document: Document, faults: list[Fault]) -> Entry | None:
-    path = ("parameters", parameter.name)
-    try:
-        if not isinstance(raw, dict):
-            return Fixed(parameter, _quantity(raw, parameter))
-        if "from_file" in raw:
-            scalar = check(schema.FromFile, raw, path, document, faults)
-            if scalar is None:
-                return None
-            convert(1.0, scalar.unit, parameter.unit)
-            return Scalar(parameter, scalar.from_file, scalar.unit)
-        prior = check(schema.Prior, raw, path, document, faults)
-        if prior is None:
-            return None
-        entry = Uncertain(parameter, prior)
-        if not entry.needs_data:
-            entry.term()
-        elif prior.prior != "logit":
-            entry.term(maximum=1.0)  # the other values do not wait for the data
-        return entry
-    except ConfigError as error:
-        faults += [located(document, path, fault) for fault in error.problems]
-    except UnitError as error:
-        faults.append(document.fault(path, str(error)))
-    return None
+def entries(without_data: str = "") -> Made:
+    """One entry for every parameter of the model, in its order, then t_s and sigma if given.
 
+    ``without_data``: what the file is, where it names no data from which a value could come.
+    """
 
-def located(document: Document, path: tuple[str, ...], fault: Fault) -> Fault:
-    """A fault whose path is a key inside the parameter at ``path``, placed in the file."""
-    message = fault.message.removeprefix(f"prior of {path[-1]}: ")
-    return document.fault((*path, fault.path) if fault.path else path, message)
+    def complete(given: Mapping[str, Entry], context: Any) -> tuple[Entry, ...]:
+        waiting = [name for name, entry in given.items() if entry.needs_data]
+        if without_data and waiting:
+            message = f"{without_data} has no data file to take a value from"
+            raise ConfigError([Fault(message, name) for name in waiting])
+        model = context["model"]
+        found = {name: Fixed(p, _defaults(model)[name]) for name, p in _parameters(model).items()
+                 if name in _defaults(model)}  # fmt: skip
+        return tuple({**found, **given}[name] for name in _parameters(model) if name in found or name in given)
 
-
-def _quantity(value: str | float, parameter: Parameter, key: str = "") -> float:
-    """A value in the parameter's unit and inside its bounds. Raises :class:`ConfigError` with the path ``key``."""
-    low, high = parameter.bounds
-    try:
-        number = parse_quantity(value, parameter.unit)
-    except UnitError as error:
-        raise ConfigError([Fault(str(error), key)]) from None
-    if not low <= number <= high:
-        raise ConfigError([Fault(f"{value} is outside the bounds [{low:g}, {high:g}] {parameter.unit}", key)])
-    return number
+    named = ByName(_parameters, _unknown, _missing, definition="parameter")
+    return Made(complete, Annotated[dict[str, ENTRY], named], needs="model")

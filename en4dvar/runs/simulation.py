@@ -9,7 +9,7 @@ import numpy as np
 
 from en4dvar.config import Config, time_grid
 from en4dvar.config.build import data_files, read_observations, resolve_parameters
-from en4dvar.config.data import parse_spread
+from en4dvar.config.data import parse_error_std
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import run_chunk
 from en4dvar.forward import Failure
@@ -68,7 +68,7 @@ def parse_times(text: str, unit: str) -> Array:
 
 def noise_level(text: str, config: Config, simulation: Simulation) -> float:
     """``"1.4 um"`` or ``"1 % of maximum"`` in the observable's unit. Raises :class:`UnitError`."""
-    spread = parse_spread(text, config.observable.unit)
+    spread = parse_error_std(text, config.observable.unit)
     if not spread.value > 0:
         raise UnitError(f"the noise must be positive, not {text}")
     return spread.absolute(float(simulation.values.max()))
@@ -94,8 +94,9 @@ def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:
     time = Column(f"t_{model.time_display_unit}", model.time_display_unit, model.time_unit)
     value = Column(f"{observable.name}_{observable.display_unit}", observable.display_unit, observable.unit)
     if config.data is not None:
-        time = config.data.time if isinstance(config.data.time, Column) else time
-        value = config.data.value
+        columns = config.data.columns
+        time = columns.time if isinstance(columns.time, Column) else time
+        value = columns.observable
     units = {entry.parameter.name: entry.parameter.unit for entry in config.parameters}
     truth = ", ".join(f"{name} = {v:.9g} {units[name]}" for name, v in simulation.theta.items())
     lines = [*(f"# {line}" for line in comment.splitlines()), f"# parameters: {truth}"]
