@@ -1,56 +1,93 @@
 """Fields whose meaning depends on the model: what the file gives becomes what the program needs while it is validated.
 
-The validation context holds what is known of the model. Where its section is at fault, what depends on it stays None:
-the fault of the model is told, and everything else is still checked.
+What is known of the model is the validation context. Where the model's own section is at fault, it is asked for what it
+does not know, and whatever needs that stays unread; everything else is still checked.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypedDict, get_args
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
+from pydantic import AfterValidator, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
 from en4dvar.config.validate import Faults
 from en4dvar.errors import ConfigError
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.hints import suggest
-from en4dvar.state import Field, Parameter
 from en4dvar.units import convert, parse_quantity, parse_unit
 
+T = TypeVar("T")
 PLACEHOLDER = "<observable>"
 
 
-class Context(TypedDict, total=False):
-    """``model``: of the file, None where it is at fault; ``units``: it, or the same with default settings.
+class Unknown(Exception):
+    """Something of the model that its faulty section does not tell."""
 
-    ``observable``: that of the data. ``subject``: what the entry of a section by name is about, e.g. a parameter.
+
+@dataclass
+class Context:
+    """``built``: the model of the file, None where it is at fault; then ``default`` is it with default settings.
+
+    ``observed``: what the data hold. ``subject``: what the entry of a section by name is about, e.g. a parameter.
     """
 
     base: Path
-    model: ForwardModel | None
-    units: ForwardModel | None
-    observable: Observable | None
-    subject: Parameter | Field | Observable
+    built: ForwardModel | None = None
+    default: ForwardModel | None = None
+    observed: Observable | None = None
+    subject: Any = None
+
+    @property
+    def model(self) -> ForwardModel:
+        """The model of the file. Raises :class:`Unknown`."""
+        return _known(self.built)
+
+    @property
+    def units(self) -> ForwardModel:
+        """A model with the units and observables of the file's. Raises :class:`Unknown`."""
+        return _known(self.built or self.default)
+
+    @property
+    def observable(self) -> Observable:
+        """What the data hold. Raises :class:`Unknown`."""
+        return _known(self.observed)
 
 
-Need = Literal["model", "units", "observable", "subject", "base"]
+def _known(thing: T | None) -> T:
+    if thing is None:
+        raise Unknown
+    return thing
+
+
+Unit = Callable[[Context], str]
+
+
+def time_unit(context: Context) -> str:
+    return context.units.time_unit
+
+
+def observable_unit(context: Context) -> str:
+    return context.observable.unit
+
+
+def subject_unit(context: Context) -> str:
+    return str(context.subject.unit)
 
 
 @dataclass(frozen=True)
 class Made:
-    """Pydantic annotation: the file gives a ``given``, and the field holds ``make(it, context)``.
+    """Pydantic annotation: the file gives a ``given``, and the field holds ``make(it, context)``, None if unknown.
 
-    It holds None where the context lacks what ``make`` needs. A :class:`ConfigError` of ``make`` is told at the path
-    that its faults have below the field.
+    A :class:`ConfigError` of ``make`` is told at the path that its faults have below the field.
     """
 
-    make: Callable[[Any, Any], Any]
+    make: Callable[[Any, Context], Any]
     given: Any = Any
-    needs: Need = "units"
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.with_info_after_validator_function(self._make, handler.generate_schema(self.given))
@@ -58,40 +95,13 @@ class Made:
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         return {"type": ["string", "number"]} if self.given is Any else handler(schema)
 
-    def _make(self, value: Any, info: ValidationInfo) -> Any:
-        context = info.context or {}
-        if context.get(self.needs) is None:
-            return None
-        faults, made = Faults(), None
-        with faults.at():
-            made = self.make(value, context)
-        faults.tell()
-        return made
+    def _make(self, value: Any, info: Any) -> Any:
+        with Faults() as faults, faults.at(), suppress(Unknown):
+            return self.make(value, info.context)
+        return None
 
 
-def time_unit(context: Context) -> str:
-    """The unit of the model's clock."""
-    return context["units"].time_unit  # type: ignore[union-attr]
-
-
-def observable_unit(context: Context) -> str:
-    """The unit of the observable that the data hold."""
-    return context["observable"].unit  # type: ignore[union-attr]
-
-
-def subject_unit(context: Context) -> str:
-    """The unit of what an entry is about."""
-    return context["subject"].unit
-
-
-def no_unit(context: Context) -> str:
-    """That of a ratio."""
-    return "1"
-
-
-def quantity(
-    unit: Callable[[Context], str], sign: Literal["", "positive", "not negative"] = "", needs: Need = "units"
-) -> Made:
+def quantity(unit: Unit, sign: Literal["", "positive", "not negative"] = "") -> Made:
     """A number in ``unit``, given with a unit of its own."""
 
     def read(text: Any, context: Context) -> float:
@@ -100,7 +110,15 @@ def quantity(
             require_sign(value, sign, text)
         return value
 
-    return Made(read, needs=needs)
+    return Made(read)
+
+
+def require_sign(value: float, sign: Literal["positive", "not negative"], text: object) -> None:
+    """Raises :class:`ConfigError` for a value of another sign."""
+    if sign == "positive" and not value > 0:
+        raise ConfigError(f"must be positive, not {text}")
+    if value < 0:
+        raise ConfigError(f"must not be negative, not {text}")
 
 
 @dataclass(frozen=True)
@@ -123,83 +141,71 @@ def parse_spread(text: Any, unit: str) -> Spread:
     return spread
 
 
-def require_sign(value: float, sign: Literal["positive", "not negative"], text: object) -> None:
-    """Raises :class:`ConfigError` for a value of another sign."""
-    if sign == "positive" and not value > 0:
-        raise ConfigError(f"must be positive, not {text}")
-    if value < 0:
-        raise ConfigError(f"must not be negative, not {text}")
-
-
-def _known_unit(unit: str) -> str:
-    parse_unit(unit)
-    return unit
-
-
-def unit_of(target: Callable[[Context], str], needs: Need = "units") -> Made:
+def unit_of(target: Unit) -> Made:
     """The text of a unit that can be converted to ``target``."""
+
+    def known(unit: str) -> str:
+        parse_unit(unit)
+        return unit
 
     def fits(unit: str, context: Context) -> str:
         convert(1.0, unit, target(context))
         return unit
 
-    return Made(fits, Annotated[str, AfterValidator(_known_unit)], needs)
+    return Made(fits, Annotated[str, AfterValidator(known)])
 
 
-def _nothing_missing(name: str, subject: Any, model: ForwardModel) -> None:
-    return None
-
-
-def _unknown_key(name: str, known: Mapping[str, Any], model: ForwardModel) -> str:
-    return f"unknown key {name!r}{suggest(name, known)}"
-
-
-@dataclass(frozen=True)
 class ByName:
-    """Pydantic annotation of a dict: one entry a name that the model knows, read with the thing named as ``subject``.
+    """Pydantic annotation of a dict with an ``entry`` a name that the model knows, read with it as the ``subject``.
 
-    ``unknown`` words a name that the model does not know, ``missing`` one that is not given and has to be; ``some``: one
-    at least has to be given.
+    ``some``: at least one has to be given.
     """
 
-    known: Callable[[ForwardModel], Mapping[str, Any]]
-    unknown: Callable[[str, Mapping[str, Any], ForwardModel], str] = _unknown_key
-    missing: Callable[[str, Any, ForwardModel], str | None] = _nothing_missing
-    some: bool = False
-    definition: str = ""  # of an entry in the JSON schema
+    def __init__(self, entry: Any, known: Callable[[ForwardModel], Mapping[str, Any]], some: bool = False):
+        self.entry, self.known, self.some = entry, known, some
+
+    def unknown(self, name: str, model: ForwardModel) -> str:
+        """What is wrong with a name that the model does not know."""
+        return f"unknown key {name!r}{suggest(name, self.known(model))}"
+
+    def missing(self, name: str, model: ForwardModel) -> str:
+        """What is wrong where a name is not given; nothing where it may be left out."""
+        return ""
+
+    def result(self, entries: dict[str, Any], model: ForwardModel) -> Any:
+        """What the field holds. Raises :class:`ConfigError`, its paths the names of entries."""
+        return entries
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        entry = handler.generate_schema(get_args(source)[1])
-        return core_schema.with_info_wrap_validator_function(self._read, entry)
+        return core_schema.with_info_wrap_validator_function(self._read, handler.generate_schema(self.entry))
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         found = handler(core_schema.dict_schema(core_schema.str_schema(), schema["schema"]))
-        if self.definition:
-            found["additionalProperties"] = {"x-definition": self.definition}
         return found | {"minProperties": 1} if self.some else found
 
-    def _read(self, given: Any, read_entry: Callable[[Any], Any], info: ValidationInfo) -> dict[str, Any]:
+    def _read(self, given: Any, read_entry: Callable[[Any], Any], info: Any) -> Any:
         if not isinstance(given, dict):
             raise PydanticKnownError("dict_type")
-        context: Any = info.context or {}
-        model = context.get("model")
+        context: Context = info.context
+        model, entries = context.built, {}
         if model is None:
-            return {}
-        known, faults, entries = self.known(model), Faults(), {}
-        if self.some and not given:
-            faults.add((), f"give at least one of: {', '.join(known)}")
-        for name, value in given.items():
-            if name not in known:
-                faults.add((name,), self.unknown(name, known, model), at_key=True)
-                continue
-            context["subject"] = known[name]
-            with faults.at(name):
-                entries[name] = read_entry(value)
-        for name in known:
-            if name not in given and (words := self.missing(name, known[name], model)):
-                faults.add((name,), words)
-        faults.tell()
-        return entries
+            return None
+        known = self.known(model)
+        with Faults() as faults:
+            if self.some and not given:
+                faults.add((), f"give at least one of: {', '.join(known)}")
+            for name, value in given.items():
+                context.subject = known.get(name)
+                if name not in known:
+                    faults.add((name,), self.unknown(name, model), at_key=True)
+                    continue
+                with faults.at(name):
+                    entries[name] = read_entry(value)
+            for name in known:
+                if name not in given and (words := self.missing(name, model)):
+                    faults.add((name,), words)
+        with Faults() as faults, faults.at():
+            return self.result(entries, model)
 
 
 @dataclass(frozen=True)
@@ -211,22 +217,20 @@ class OfObservable:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         declared = [field.alias or name for name, field in source.model_fields.items()]
 
-        def read(given: Any, validate: Callable[[Any], Any], info: ValidationInfo) -> Any:
-            observable = (info.context or {}).get("observable")
+        def read(given: Any, validate: Callable[[Any], Any], info: Any) -> Any:
+            observable = info.context.observed
             if not isinstance(given, dict):
                 return validate(given)
             if observable is None:  # told elsewhere
                 return validate({key: value for key, value in given.items() if key in declared})
             names = {key: key.replace(PLACEHOLDER, observable.name) for key in declared}
             keys = {written: key for key, written in names.items()}
-            faults = Faults(names)
-            for key in given:
-                if key not in keys:
-                    faults.add((key,), f"unknown {self.what} {key!r}{suggest(key, keys)}", at_key=True)
-            with faults.at(schema=source):
-                section = validate({keys[key]: value for key, value in given.items() if key in keys})
-            faults.tell()
-            return section
+            with Faults(names) as faults:
+                for key in given:
+                    if key not in keys:
+                        faults.add((key,), f"unknown {self.what} {key!r}{suggest(key, keys)}", at_key=True)
+                with faults.at(schema=source):
+                    return validate({keys[key]: value for key, value in given.items() if key in keys})
 
         return core_schema.with_info_wrap_validator_function(read, handler(source))
 

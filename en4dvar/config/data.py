@@ -16,7 +16,6 @@ from en4dvar.config.context import (
     Made,
     OfObservable,
     Spread,
-    no_unit,
     observable_unit,
     quantity,
     require_sign,
@@ -49,7 +48,7 @@ class ValueColumn(Section):
 
     name: Annotated[str, Field(min_length=1)]
     """Header of the column (CSV) or name of the field (.mat)."""
-    unit: Annotated[str, unit_of(observable_unit, needs="observable")]
+    unit: Annotated[str, unit_of(observable_unit)]
     """Unit of the numbers in the file, e.g. um; required, never guessed."""
 
 
@@ -89,29 +88,31 @@ def _times(given: TimeColumn, context: Context) -> Column | Step:
         raise ConfigError([Fault(str(error), "step")]) from None
 
 
-def _values(given: ValueColumn, context: Context) -> Column:
-    return Column(given.name, given.unit, observable_unit(context))
+def _told_elsewhere() -> Any:
+    """In place of a column that is not given: a fault says so."""
+
+
+_VALUES = Made(lambda given, context: Column(given.name, given.unit, observable_unit(context)), ValueColumn)
 
 
 class Columns(Section):
     """Which columns hold the time and the observable, each with its unit."""
 
     model_config = ConfigDict(json_schema_extra={"required": ["time"]}, populate_by_name=False)
-    time: Annotated[Column | Step, Made(_times, TimeColumn)] = Field(None)
+    time: Annotated[Column | Step, Made(_times, TimeColumn)] = Field(default_factory=_told_elsewhere)
     """Observation times."""
-    observable: Annotated[Column, Made(_values, ValueColumn, needs="observable")] = Field(None, alias=PLACEHOLDER)
+    observable: Annotated[Column, _VALUES] = Field(default_factory=_told_elsewhere, alias=PLACEHOLDER)
     """The observable."""
 
     @classmethod
     def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        if given.get("time") is None and (model := context.get("units")):
-            unit = model.time_unit
+        if given.get("time") is None:
+            unit = time_unit(context)
             faults.add(("time",), f"required: {{name: <column>, unit: {unit}}}, or {{step: <quantity>}}")
 
 
 def _instant(text: Any, context: Context) -> Instant:
-    chosen, model = context.get("observable"), context["units"]
-    possible = (chosen,) if chosen else model.observables if model else ()
+    possible = (context.observed,) if context.observed else context.units.observables
     symbols = {word for observable in possible for word in (observable.symbol.strip("$"), observable.name)}
     return parse_instant(text, time_unit(context), symbols)
 
@@ -144,12 +145,12 @@ class CovarianceFile(Section):
 
     path: Annotated[str, Field(min_length=1)]
     """CSV file, relative to the configuration's folder; one row an observation of the window or of the series."""
-    unit: Annotated[str, unit_of(_square, needs="observable")]
+    unit: Annotated[str, unit_of(_square)]
     """Unit of the covariances, the observable's squared, e.g. um^2."""
 
 
 def _matrix(given: CovarianceFile, context: Context) -> Matrix:
-    return Matrix(context["base"] / Path(given.path).expanduser(), given.unit, _square(context))
+    return Matrix(context.base / Path(given.path).expanduser(), given.unit, _square(context))
 
 
 def parse_error_std(text: Any, unit: str) -> Spread:
@@ -175,17 +176,17 @@ class Error(Section):
     """Observation errors: a std or a whole covariance, errors of the times, a correlation, a robust cost."""
 
     model_config = ConfigDict(populate_by_name=False)
-    std: Annotated[Spread | None, Made(_error_std, needs="observable")] = Field(None, alias=f"{PLACEHOLDER}_std")
+    std: Annotated[Spread | None, Made(_error_std)] = Field(None, alias=f"{PLACEHOLDER}_std")
     """Std of the observation error: a quantity, or e.g. '1 % of maximum'."""
     time_std: Annotated[float, quantity(time_unit, "not negative")] = 0.0
     """Std of the observation times: adds (rate × time_std)²."""
     correlation_time: Annotated[float | None, quantity(time_unit, "positive")] = None
     """Errors are correlated as exp(−|Δt|/τ)."""
-    covariance: Annotated[Matrix | None, Made(_matrix, CovarianceFile, needs="observable")] = None
+    covariance: Annotated[Matrix | None, Made(_matrix, CovarianceFile)] = None
     """File of the whole R."""
     robust: Literal["huber"] | None = None
     """Robust cost: readings far off count less."""
-    threshold: Annotated[float, quantity(no_unit, "positive")] = HUBER
+    threshold: Annotated[float, quantity(lambda c: "1", "positive")] = HUBER
     """Threshold of the robust cost in std."""
 
     @classmethod
@@ -201,7 +202,7 @@ class Error(Section):
                 faults.add((name,), f"not together with {other}: {reason}", at_key=True)
         if "threshold" in given and "robust" not in given:
             faults.add(("threshold",), "is that of the robust cost; write robust: huber as well", at_key=True)
-        if context.get("observable") and not given.keys() & {std, "covariance"}:
+        if context.observed and not given.keys() & {std, "covariance"}:
             faults.add((std,), "required: the standard deviation of the observation error")
 
     @property
@@ -226,13 +227,13 @@ def _not_empty(path: str | tuple[str, ...]) -> str | tuple[str, ...]:
 
 
 def _files(given: str | tuple[str, ...], context: Context) -> Files:
-    return Files(context["base"], (given,) if isinstance(given, str) else given)
+    return Files(context.base, (given,) if isinstance(given, str) else given)
 
 
 class Data(Section):
     """Where the observations are, what they mean and how well they are known; in the model's units."""
 
-    path: Annotated[Files, Made(_files, Annotated[str | tuple[str, ...], AfterValidator(_not_empty)], needs="base")]
+    path: Annotated[Files, Made(_files, Annotated[str | tuple[str, ...], AfterValidator(_not_empty)])]
     """A data file, a folder, a pattern such as data/*.csv, or a list of them; relative to this file's folder."""
     format: Format | None = None
     """Format of the files; default: by their suffix."""
@@ -249,10 +250,10 @@ class Data(Section):
 
     @classmethod
     def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        columns, model = given.get("columns"), context.get("units")
-        if not isinstance(columns, dict) or model is None or context.get("observable"):
+        columns = given.get("columns")
+        if not isinstance(columns, dict) or context.observed:
             return
-        roles = ["time", *(observable.name for observable in model.observables)]
+        roles = ["time", *(observable.name for observable in context.units.observables)]
         for name in columns:
             if name not in roles:
                 faults.add(("columns", name), f"unknown column role {name!r}{suggest(name, roles)}", at_key=True)

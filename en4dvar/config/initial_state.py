@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
-from en4dvar.config.context import ByName, Context, Made, parse_spread
+from en4dvar.config.context import ByName, Made, parse_spread
 from en4dvar.config.schema import Section
 from en4dvar.forward import ForwardModel
 from en4dvar.hints import suggest
@@ -38,14 +37,10 @@ def perturbation(field: Field, std: str | float) -> Perturbed:
     return Perturbed(PriorTerm.normal(parameter, 0.0, spread.value), StatePerturbation(parameter, field.name))
 
 
-def _perturbed(text: Any, context: Any) -> Perturbed:
-    return perturbation(context["subject"], text)
-
-
 class InitialSpread(Section):
     """Spread of the initial value of a state field: in its unit (added), or in ``%`` (a factor)."""
 
-    std: Annotated[Perturbed, Made(_perturbed, needs="subject")]
+    std: Annotated[Perturbed, Made(lambda text, context: perturbation(context.subject, text))]
     """Standard deviation: in the field's unit (added to it), or in % (a factor)."""
 
 
@@ -55,14 +50,16 @@ def dynamic_fields(model: ForwardModel) -> dict[str, Field]:
     return {f.name: f for f in model.layout if f.name not in constant}
 
 
-def _unknown(name: str, known: Mapping[str, Field], model: ForwardModel) -> str:
-    if name in {p.name for p in model.parameters}:
-        return f"{name} is a parameter: give it a prior in parameters"
-    return f"unknown field {name!r} of the state{suggest(name, known)}"
+class PerturbedFields(ByName):
+    """Prior and perturbation of each field named, in the order of the file."""
 
+    def __init__(self) -> None:
+        super().__init__(InitialSpread, dynamic_fields)
 
-def _together(given: Mapping[str, InitialSpread], context: Context) -> tuple[Perturbed, ...]:
-    return tuple(spread.std for spread in given.values())
+    def unknown(self, name: str, model: ForwardModel) -> str:
+        if name in {p.name for p in model.parameters}:
+            return f"{name} is a parameter: give it a prior in parameters"
+        return f"unknown field {name!r} of the state{suggest(name, dynamic_fields(model))}"
 
-
-PERTURBED = Made(_together, Annotated[dict[str, InitialSpread], ByName(dynamic_fields, _unknown)], needs="model")
+    def result(self, entries: dict[str, InitialSpread], model: ForwardModel) -> tuple[Perturbed, ...]:
+        return tuple(spread.std for spread in entries.values())

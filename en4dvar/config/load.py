@@ -15,10 +15,10 @@ from pydantic import Field
 from en4dvar.config.context import Context, Made, time_unit
 from en4dvar.config.data import Data
 from en4dvar.config.document import Document, override, read_document
-from en4dvar.config.initial_state import PERTURBED, Perturbed
+from en4dvar.config.initial_state import Perturbed, PerturbedFields
 from en4dvar.config.models import read_model
-from en4dvar.config.parameters import Entry, Fixed, entries
-from en4dvar.config.schema import Assimilation, Execution, ModelSection, Name, Output, QuantityText, Section
+from en4dvar.config.parameters import Entries, Entry, Fixed
+from en4dvar.config.schema import Assimilation, Execution, File, Output, QuantityText, Section
 from en4dvar.config.validate import Faults, check
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel, Observable
@@ -61,20 +61,14 @@ class Simulate(Section):
     """Instants of the synthetic observations."""
 
 
-class Estimation(Section):
-    """A configuration with data: what is estimated from which observations, and how."""
+class Estimation(File):
+    """What is estimated from which observations, and how."""
 
-    name: Name
-    """Name of the run; its results go to runs/<name>."""
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Seed of every random number; the same seed gives the same bits on any machine and number of workers."""
     data: Data | None = None
     """Where the observations are, what they mean and how well they are known."""
-    model: ModelSection
-    """The forward model: its ``name`` (see ``en4dvar models``) and its settings."""
-    parameters: Annotated[tuple[Entry, ...], entries()]
+    parameters: Annotated[tuple[Entry, ...], Entries()]
     """For each parameter a prior (estimated), a quantity (fixed), or a scalar of the data file (fixed)."""
-    initial_state: Annotated[tuple[Perturbed, ...], PERTURBED] | None = None
+    initial_state: Annotated[tuple[Perturbed, ...], PerturbedFields()] | None = None
     """Fields of the initial state that are uncertain, each with its ``std``."""
     assimilation: Assimilation = Assimilation()
     """Scheme, ensemble size and stopping rules; the defaults are the recommended ones."""
@@ -140,18 +134,17 @@ def resolve(document: Document, base: Path) -> Config:
     if "twin" in document.data:
         raise ConfigError([document.fault(("twin",), "a twin experiment: it can be run and validated", at_key=True)])
     read = read_file(Estimation, document, base)
-    file, options = read.file, read.file.assimilation.model_dump()
-    weights = options.pop("weights")
+    file = read.file
     return Config(
         document=document,
         name=file.name,
         seed=file.seed,
         model=read.model,
-        observable=read.context.get("observable") or read.model.observables[0],
+        observable=read.context.observed or read.model.observables[0],
         parameters=file.parameters,
         data=file.data,
-        assimilation=AssimilationSettings(**options),
-        weights=weights,
+        assimilation=file.assimilation.settings,
+        weights=file.assimilation.weights,
         execution=file.execution,
         report=file.output.report,
         directory=file.output.directory or Path("runs") / file.name,
@@ -197,15 +190,17 @@ def read_file(kind: type[S], document: Document, base: Path) -> Read[S]:
 
 
 def context_of(document: Document, base: Path, model: ForwardModel | None) -> Context:
-    """What is known of the model, or, where its settings are at fault, of the same model with default settings."""
+    """What is known of the model; where its settings are at fault, units are those of default settings."""
     section, data = document.data.get("model"), document.data.get("data")
-    units = model
-    if units is None and isinstance(section, dict):
-        default = read_model({"name": section.get("name")}, base, document, [])
-        units = default[0] if default else None
+    context = Context(base, model)
+    if model is None and isinstance(section, dict):
+        found = read_model({"name": section.get("name")}, base, document, [])
+        context.default = found[0] if found else None
     columns = data.get("columns") if isinstance(data, dict) else None
-    named = [o for o in (units.observables if units else ()) if isinstance(columns, dict) and o.name in columns]
-    return {"base": base, "model": model, "units": units, "observable": named[0] if len(named) == 1 else None}
+    if isinstance(columns, dict) and (units := context.built or context.default):
+        named = [observable for observable in units.observables if observable.name in columns]
+        context.observed = named[0] if len(named) == 1 else None
+    return context
 
 
 def in_order(faults: Iterable[Fault]) -> list[Fault]:

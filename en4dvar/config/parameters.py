@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import Discriminator, Field, GetJsonSchemaHandler, Tag
 
 from en4dvar.config.context import ByName, Context, Made, Spread, parse_spread, subject_unit, unit_of
 from en4dvar.config.schema import Section
@@ -33,16 +33,11 @@ def _bounded(text: Any, parameter: Parameter) -> float:
     return value
 
 
-def _value(text: Any, context: Any) -> float:
-    return _bounded(text, context["subject"])
-
-
-def _location(text: Any, context: Any) -> float | Literal["maximum"]:
-    return "maximum" if text == "maximum" else _value(text, context)
-
-
-def _spread(text: Any, context: Context) -> Spread:
-    return parse_spread(text, subject_unit(context))
+Value = Annotated[float | None, Made(lambda text, context: _bounded(text, context.subject))]
+Location = Annotated[
+    float | Literal["maximum"] | None,
+    Made(lambda text, context: text if text == "maximum" else _bounded(text, context.subject)),
+]
 
 
 class Prior(Section):
@@ -50,19 +45,19 @@ class Prior(Section):
 
     prior: Literal["normal", "lognormal", "logit"]
     """Shape: normal (mean, std), lognormal (median and log_std, or mean and std), logit (lower, upper, median, …)."""
-    mean: Annotated[float | Literal["maximum"] | None, Made(_location, needs="subject")] = None
+    mean: Location = None
     """Mean with its unit, or ``maximum``: the largest observation of the window."""
-    median: Annotated[float | Literal["maximum"] | None, Made(_location, needs="subject")] = None
+    median: Location = None
     """Median with its unit, or ``maximum``: the largest observation of the window."""
-    std: Annotated[Spread | None, Made(_spread, needs="subject")] = None
+    std: Annotated[Spread | None, Made(lambda text, context: parse_spread(text, subject_unit(context)))] = None
     """Standard deviation with its unit, or in % of the mean."""
     log_std: Annotated[float, Field(gt=0)] | None = None
     """Standard deviation of the natural logarithm: 0.3 is about 30 %, 0.7 a factor of two."""
     logit_std: Annotated[float, Field(gt=0)] | None = None
     """Standard deviation of the logit between ``lower`` and ``upper``."""
-    lower: Annotated[float | None, Made(_value, needs="subject")] = None
+    lower: Value = None
     """Lower bound with its unit; never reached."""
-    upper: Annotated[float | None, Made(_value, needs="subject")] = None
+    upper: Value = None
     """Upper bound with its unit; never reached."""
 
 
@@ -71,7 +66,7 @@ class FromFile(Section):
 
     from_file: Annotated[str, Field(min_length=1)]
     """Name of a scalar in the data file, e.g. Req."""
-    unit: Annotated[str, unit_of(subject_unit, needs="subject")]
+    unit: Annotated[str, unit_of(subject_unit)]
     """Unit of that scalar in the file."""
 
 
@@ -156,16 +151,16 @@ class Uncertain:
 Entry = Fixed | Scalar | Uncertain
 
 
-def _fixed(text: Any, context: Any) -> Fixed:
-    return Fixed(context["subject"], _value(text, context))
+def _fixed(text: Any, context: Context) -> Fixed:
+    return Fixed(context.subject, _bounded(text, context.subject))
 
 
-def _scalar(given: FromFile, context: Any) -> Scalar:
-    return Scalar(context["subject"], given.from_file, given.unit)
+def _scalar(given: FromFile, context: Context) -> Scalar:
+    return Scalar(context.subject, given.from_file, given.unit)
 
 
-def _uncertain(given: Prior, context: Any) -> Uncertain:
-    entry = Uncertain(context["subject"], given)
+def _uncertain(given: Prior, context: Context) -> Uncertain:
+    entry = Uncertain(context.subject, given)
     if not entry.needs_data:
         entry.term()
     elif given.prior != "logit":
@@ -180,9 +175,9 @@ def _kind(given: Any) -> str:
 
 
 ENTRY = Annotated[
-    Annotated[Fixed, Made(_fixed, needs="subject"), Tag("a quantity")]
-    | Annotated[Uncertain, Made(_uncertain, Prior, needs="subject"), Tag("a prior")]
-    | Annotated[Scalar, Made(_scalar, FromFile, needs="subject"), Tag("a scalar")],
+    Annotated[Fixed, Made(_fixed), Tag("a quantity")]
+    | Annotated[Uncertain, Made(_uncertain, Prior), Tag("a prior")]
+    | Annotated[Scalar, Made(_scalar, FromFile), Tag("a scalar")],
     Discriminator(_kind),
 ]
 
@@ -198,35 +193,37 @@ def _defaults(model: ForwardModel) -> Mapping[str, float]:
     return getattr(model, "defaults", {})
 
 
-def _unknown(name: str, known: Mapping[str, Parameter], model: ForwardModel) -> str:
-    return f"unknown parameter {name!r}{suggest(name, known)}"
-
-
-def _missing(name: str, parameter: Parameter, model: ForwardModel) -> str | None:
-    if name in _defaults(model) or parameter not in model.parameters:
-        return None
-    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-    return (
-        f"{parameter.label} {parameter.name!r} (unit {parameter.unit}) has neither a prior nor a value; "
-        f"write e.g. '{parameter.name}: {{prior: normal, mean: 1{unit}, std: 0.1{unit}}}' or a fixed quantity"
-    )
-
-
-def entries(without_data: str = "") -> Made:
+class Entries(ByName):
     """One entry for every parameter of the model, in its order, then t_s and sigma if given.
 
-    ``without_data``: what the file is, where it names no data from which a value could come.
+    ``kind``: what the file is, where it names no data from which a value could come.
     """
 
-    def complete(given: Mapping[str, Entry], context: Any) -> tuple[Entry, ...]:
-        waiting = [name for name, entry in given.items() if entry.needs_data]
-        if without_data and waiting:
-            message = f"{without_data} has no data file to take a value from"
-            raise ConfigError([Fault(message, name) for name in waiting])
-        model = context["model"]
-        found = {name: Fixed(p, _defaults(model)[name]) for name, p in _parameters(model).items()
-                 if name in _defaults(model)}  # fmt: skip
-        return tuple({**found, **given}[name] for name in _parameters(model) if name in found or name in given)
+    def __init__(self, kind: str = ""):
+        super().__init__(ENTRY, _parameters)
+        self.kind = kind
 
-    named = ByName(_parameters, _unknown, _missing, definition="parameter")
-    return Made(complete, Annotated[dict[str, ENTRY], named], needs="model")
+    def unknown(self, name: str, model: ForwardModel) -> str:
+        return f"unknown parameter {name!r}{suggest(name, _parameters(model))}"
+
+    def missing(self, name: str, model: ForwardModel) -> str:
+        parameter = _parameters(model)[name]
+        if name in _defaults(model) or parameter not in model.parameters:
+            return ""
+        unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+        return (
+            f"{parameter.label} {parameter.name!r} (unit {parameter.unit}) has neither a prior nor a value; "
+            f"write e.g. '{parameter.name}: {{prior: normal, mean: 1{unit}, std: 0.1{unit}}}' or a fixed quantity"
+        )
+
+    def result(self, entries: dict[str, Entry], model: ForwardModel) -> tuple[Entry, ...]:
+        if self.kind and (waiting := [name for name, entry in entries.items() if entry.needs_data]):
+            message = f"{self.kind} has no data file to take a value from"
+            raise ConfigError([Fault(message, name) for name in waiting])
+        known = _parameters(model)
+        found: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in _defaults(model).items()}
+        found |= entries
+        return tuple(found[name] for name in known if name in found)
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"type": "object", "additionalProperties": {"x-definition": "parameter"}}

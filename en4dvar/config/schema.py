@@ -6,8 +6,9 @@ the JSON schema and the reference of keys follow from that.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_type_hints
 
@@ -17,14 +18,13 @@ from pydantic import (
     ConfigDict,
     Field,
     ModelWrapValidatorHandler,
-    ValidationInfo,
     WithJsonSchema,
     create_model,
     model_validator,
 )
 from pydantic_core import from_json, to_json
 
-from en4dvar.config.context import Context
+from en4dvar.config.context import Context, Unknown
 from en4dvar.config.validate import Faults
 from en4dvar.executor.limits import Limits, parse_bytes
 from en4dvar.problem import AssimilationSettings
@@ -32,7 +32,6 @@ from en4dvar.units import Quantity
 
 QuantityText = str | int | float
 Name = Annotated[str, Field(pattern=r"^\w[\w.+ -]*$", max_length=100)]
-ModelSection = Annotated[dict[str, Any], WithJsonSchema({"x-definition": "model"})]  # read by config.models
 
 
 class Section(BaseModel):
@@ -51,22 +50,21 @@ class Section(BaseModel):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _with_rules(cls, given: Any, validate: ModelWrapValidatorHandler[Self], info: ValidationInfo) -> Self:
-        faults = Faults()
-        with faults.at(schema=cls):
-            section = validate(given)
-        if isinstance(given, dict):
-            cls.rules(given, info.context or {}, faults)
-        faults.tell()
-        return section
+    def _with_rules(cls, given: Any, validate: ModelWrapValidatorHandler[Self], info: Any) -> Self:
+        with Faults() as faults:
+            if isinstance(given, dict):
+                with suppress(Unknown):
+                    cls.rules(given, info.context, faults)
+            with faults.at(schema=cls):
+                return validate(given)
 
     def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """The section as it was given, what was left out filled in with defaults; plain data."""
-        fields = {field.alias or name: (name, field) for name, field in type(self).model_fields.items()}
-        if not fields.keys() >= given.keys():  # keys named after something of the model
+        keys = {field.alias or name: (name, field) for name, field in type(self).model_fields.items()}
+        if not keys.keys() >= given.keys():  # keys named after something of the model
             return _plain(given)
         written: dict[str, Any] = {}
-        for key, (name, field) in fields.items():
+        for key, (name, field) in keys.items():
             value = getattr(self, name)
             text = given[key] if key in given else field.get_default(call_default_factory=True)
             if isinstance(value, Section):
@@ -81,25 +79,39 @@ def _plain(value: Any) -> Any:
     return from_json(to_json(value))
 
 
-def fields_of(kind: Any) -> dict[str, Any]:
-    """The fields of a dataclass for ``create_model``.
-
-    A field is declared there as ``members: Annotated[int, Ge(3), "Ensemble size N."] = 48``.
-    """
+def section_of(kind: Any, base: type[Section] = Section) -> Any:
+    """``base`` with the fields of a dataclass, declared there as ``members: Annotated[int, Ge(3), "Size N."] = 48``."""
     hints = get_type_hints(kind, include_extras=True)
-    return {
-        field.name: (hints[field.name], Field(field.default, description=_words(hints[field.name])))
-        for field in dataclasses.fields(kind)
-    }
-
-
-def _words(hint: Any) -> str | None:
-    return next((text for text in getattr(hint, "__metadata__", ()) if isinstance(text, str)), None)
+    declared: dict[str, Any] = {}
+    for field in fields(kind):
+        words = [text for text in getattr(hints[field.name], "__metadata__", ()) if isinstance(text, str)]
+        declared[field.name] = (hints[field.name], Field(field.default, description=" ".join(words) or None))
+    return create_model(kind.__name__, __base__=base, **declared)
 
 
 def _size(text: str) -> str:
     parse_bytes(text)
     return text
+
+
+class Output(Section):
+    """Where results go."""
+
+    directory: Path | None = None
+    """Run directory; default runs/<name>, relative to the current directory."""
+    report: bool = True
+    """Write the figures and report.html."""
+
+
+class File(Section):
+    """A whole file."""
+
+    name: Name
+    """Name of the run; its results go to runs/<name>."""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Seed of every random number; the same seed gives the same bits on any machine and number of workers."""
+    model: Annotated[dict[str, Any], WithJsonSchema({"x-definition": "model"})]  # see config.models
+    """The forward model: its ``name`` (see ``en4dvar models``) and its settings."""
 
 
 class Execution(Section):
@@ -138,22 +150,16 @@ class Execution(Section):
         return self
 
 
-class Output(Section):
-    """Where results go."""
-
-    directory: Path | None = None
-    """Run directory; default runs/<name>, relative to the current directory."""
-    report: bool = True
-    """Write the figures and report.html."""
+_Settings: Any = section_of(AssimilationSettings)
 
 
-Assimilation = create_model(
-    "Assimilation",
-    __base__=Section,
-    **fields_of(AssimilationSettings),
-    weights=(
-        Literal["sum", "mean"],
-        Field("sum", description="sum: every observation counts (the Bayesian posterior); mean: β = 1/K, as in the "
-              "published code."),
-    ),
-)  # fmt: skip
+class Assimilation(_Settings):
+    """The settings of the scheme, declared at :class:`AssimilationSettings`, and how observations count."""
+
+    weights: Literal["sum", "mean"] = "sum"
+    """sum: every observation counts (the Bayesian posterior); mean: β = 1/K, as in the published code."""
+
+    @property
+    def settings(self) -> AssimilationSettings:
+        """What the scheme takes."""
+        return AssimilationSettings(**{field.name: getattr(self, field.name) for field in fields(AssimilationSettings)})

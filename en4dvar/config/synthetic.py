@@ -12,8 +12,8 @@ from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapVa
 from en4dvar.config.context import Context, Made, quantity, time_unit
 from en4dvar.config.document import Document
 from en4dvar.config.load import read_file
-from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
-from en4dvar.config.schema import ModelSection, Name, Section
+from en4dvar.config.parameters import Entries, Entry, Fixed, Uncertain
+from en4dvar.config.schema import File, Name, Section
 from en4dvar.config.validate import Faults
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.prior import PriorTerm
@@ -25,7 +25,7 @@ class Group(Section):
 
     datasets: Annotated[int, Field(ge=1, le=999)]
     """How many data sets."""
-    parameters: Annotated[tuple[Entry, ...], entries("a campaign")]
+    parameters: Annotated[tuple[Entry, ...], Entries("a campaign")]
     """What their truths are drawn from: a prior (drawn for each) or a quantity (common to all)."""
 
     @property
@@ -60,21 +60,17 @@ End = Annotated[float, Made(_end)]
 Interval = Annotated[tuple[End, End], WrapValidator(_ascending)]
 
 
-def _observed(context: Any) -> str:
-    return context["units"].observables[0].unit
-
-
 def _below(directory: str, context: Context) -> Path:
-    base = Path(os.path.abspath(context["base"]))  # a link may lead elsewhere, the configuration may not
+    base = Path(os.path.abspath(context.base))  # a link may lead elsewhere, the configuration may not
     if base not in Path(os.path.abspath(base / directory)).parents:
         raise ValueError(f"must be a folder below {base}")
-    return context["base"] / directory
+    return context.base / directory
 
 
 class Campaign(Section):
     """How the truths are observed, in the model's units. Pairs are the ends of uniform distributions."""
 
-    directory: Annotated[Path, Made(_below, Annotated[str, Field(min_length=1)], needs="base")]
+    directory: Annotated[Path, Made(_below, Annotated[str, Field(min_length=1)])]
     """Folder of the data files, relative to the configuration's."""
     first: Interval
     """Instant of the first reading."""
@@ -86,7 +82,7 @@ class Campaign(Section):
     """Largest number of readings."""
     fewest: Annotated[int, Field(ge=3)] = 5
     """Data sets with fewer readings are drawn again."""
-    noise: Annotated[float, quantity(_observed, "positive")]
+    noise: Annotated[float, quantity(lambda context: context.units.observables[0].unit, "positive")]
     """Std of the error of a reading, in the observable's unit."""
     time_shift: Interval = (0.0, 0.0)
     """t_s: a reading told at t was taken at t + t_s."""
@@ -95,22 +91,18 @@ class Campaign(Section):
 
     @model_validator(mode="after")
     def _after_time_zero(self) -> Self:
-        faults, first, shift = Faults(), self.first[0], self.time_shift[0]
-        if None not in (first, shift) and first + shift < 0:
-            faults.add(("first",), "the first reading could be taken before time zero")
-        faults.tell()
+        first, shift = self.first[0], self.time_shift[0]
+        with Faults() as faults:
+            if None not in (first, shift) and first + shift < 0:
+                faults.add(("first",), "the first reading could be taken before time zero")
         return self
 
 
-class CampaignFile(Section):
-    """The whole file; ``model`` is as for an estimation."""
+class CampaignFile(File):
+    """A synthetic campaign: what is drawn, and how it is observed."""
 
     name: Name
     """Name of the campaign."""
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Seed of truths and readings."""
-    model: ModelSection
-    """The forward model: its ``name`` (see ``en4dvar models``) and its settings."""
     campaign: Campaign
     """How truths are drawn and observed."""
 

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, create_model, model_validator
+from pydantic import Field, model_validator
 
 from en4dvar.config.context import ByName, Context, Made, quantity, subject_unit, time_unit
 from en4dvar.config.document import Document
 from en4dvar.config.initial_state import dynamic_fields
 from en4dvar.config.load import read_file
-from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
-from en4dvar.config.schema import ModelSection, Name, Output, Section, fields_of
+from en4dvar.config.parameters import Entries, Entry, Fixed, Uncertain
+from en4dvar.config.schema import File, Output, Section, section_of
 from en4dvar.config.validate import Faults
 from en4dvar.cycling.sequential import SequentialSettings
 from en4dvar.cycling.series import root_of_correlation
@@ -31,7 +31,7 @@ from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import Localisation
 from en4dvar.state import Array
 
-Std = Annotated[float, quantity(subject_unit, "positive", needs="subject")]
+STD = Annotated[float, quantity(subject_unit, "positive")]
 
 
 def _errors(model: ForwardModel) -> dict[str, Observable]:
@@ -40,7 +40,7 @@ def _errors(model: ForwardModel) -> dict[str, Observable]:
 
 def _correlation(path: str, context: Context) -> tuple[str, Array]:
     """The absolute path and the matrix."""
-    file = (context["base"] / path).absolute()
+    file = (context.base / path).absolute()
     try:
         correlation = read_covariance(Matrix(file.expanduser(), "1", "1"))
         root_of_correlation(correlation, len(correlation))
@@ -58,14 +58,14 @@ class Twin(Section):
     """Cycles at the beginning that no score counts."""
     interval: Annotated[float, quantity(time_unit, "positive")]
     """Time between two observations, in the model's unit of time."""
-    error: Annotated[dict[str, Std], ByName(_errors, some=True)]
+    error: Annotated[dict[str, float], ByName(STD, _errors, some=True)]
     """Std of the observation errors, by observable: ``<observable>_std``."""
-    error_correlation: (
-        Annotated[tuple[str, Array], Made(_correlation, Annotated[str, Field(min_length=1)], needs="base")] | None
-    ) = None
+    error_correlation: Annotated[tuple[str, Array], Made(_correlation, Annotated[str, Field(min_length=1)])] | None = (
+        None
+    )
     """CSV file of the correlation of the errors at one instant, full or block diagonal, one row an observation, without
     header; relative to the configuration's folder. Default: independent errors."""
-    initial_std: Annotated[dict[str, Std], ByName(dynamic_fields, some=True)]
+    initial_std: Annotated[dict[str, float], ByName(STD, dynamic_fields, some=True)]
     """Std of the initial ensemble, by field of the state."""
 
     @model_validator(mode="after")
@@ -109,11 +109,11 @@ class _Scheme(Section):
     """Ensemble size N."""
 
 
-_Iterations: Any = create_model("_Iterations", __base__=_Scheme, **fields_of(IEnKS))
+_Iterations: Any = section_of(IEnKS, _Scheme)
 OF_IENKS = tuple(field.name for field in fields(IEnKS))
 
 
-class Sequential(_Iterations):  # type: ignore[misc]
+class Sequential(_Iterations):
     """The scheme and what it does to the ensemble."""
 
     inflation: Annotated[float, Field(gt=0)] = 1.0
@@ -155,16 +155,10 @@ class Workers(Section):
     """Seconds between two checkpoints, 0: one after every cycle. Each holds the moments of all cycles done."""
 
 
-class TwinFile(Section):
-    """The whole file; ``model`` and ``parameters`` are as for an estimation."""
+class TwinFile(File):
+    """A twin experiment; ``model`` and ``parameters`` are as for an estimation."""
 
-    name: Name
-    """Name of the run; its results go to runs/<name>."""
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Seed of truth, observations and ensemble."""
-    model: ModelSection
-    """The forward model: its ``name`` (see ``en4dvar models``) and its settings."""
-    parameters: Annotated[tuple[Entry, ...], entries("a twin experiment")] = Field({}, validate_default=True)
+    parameters: Annotated[tuple[Entry, ...], Entries("a twin experiment")] = Field({}, validate_default=True)
     """Parameters to estimate (a prior) or to change from the model's default (a quantity)."""
     twin: Twin
     """How the truth is made and observed."""
@@ -177,14 +171,14 @@ class TwinFile(Section):
 
     @classmethod
     def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        units = {field.unit for field in dynamic_fields(model).values()} if (model := context.get("model")) else set()
+        twin, assimilation = given.get("twin"), given.get("assimilation")
+        correlated = isinstance(twin, dict) and twin.get("error_correlation") is not None
+        if correlated and isinstance(assimilation, dict) and assimilation.get("localisation"):
+            message = "needs observations with independent errors, but twin.error_correlation is given"
+            faults.add(("assimilation", "localisation"), message)
+        units = {field.unit for field in dynamic_fields(context.model).values()}
         if len(units) > 1:
             faults.add(("model",), f"RMSE and spread need one unit, but the state has {', '.join(sorted(units))}")
-        twin, assimilation = given.get("twin"), given.get("assimilation")
-        if isinstance(twin, dict) and isinstance(assimilation, dict):
-            if twin.get("error_correlation") is not None and assimilation.get("localisation"):
-                message = "needs observations with independent errors, but twin.error_correlation is given"
-                faults.add(("assimilation", "localisation"), message)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar, get_args
+from typing import Any, Self, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -33,15 +33,16 @@ def check(
     path: Sequence[str | int],
     document: Document,
     faults: list[Fault],
-    context: Mapping[str, Any] | None = None,
+    context: Any = None,
 ) -> M | None:
     """Validate ``value``, found at ``path``; every fault is appended to ``faults`` and None returned."""
     try:
-        return schema.model_validate(value, context=dict(context or {}))
+        return schema.model_validate(value, context=context)
     except ValidationError as error:
-        found = [document.fault(_written(told, path, document), told.message, at_key=told.at_key)
-                 for told in _tell(error, schema)]  # fmt: skip
-        faults += dict.fromkeys(found)
+        for told in _tell(error, schema):
+            fault = document.fault(_written(told, path, document), told.message, at_key=told.at_key)
+            if fault not in faults:
+                faults.append(fault)
     return None
 
 
@@ -56,7 +57,7 @@ class _Told:
 
 
 class Faults:
-    """Faults that a validator of ours finds, told to pydantic together, each with its place below the value.
+    """Faults that a validator of ours finds, each with its place below the value; told to pydantic on leaving.
 
     ``names``: declared → as the file has it, where a key is named after something else.
     """
@@ -90,9 +91,11 @@ class Faults:
             for fault in error.problems:
                 self._add(_Told((*place, fault.path) if fault.path else place, fault.message, absent=fault.path))
 
-    def tell(self) -> None:
-        """Raises what was found, if anything."""
-        if self._lines:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        if self._lines and error is None:
             raise ValidationError.from_exception_data("faults", self._lines)
 
 
@@ -102,9 +105,8 @@ def _tell(error: ValidationError, schema: type[BaseModel]) -> Iterator[_Told]:
         if kind == "fault":
             yield _Told(place, **context)
         elif kind == "union_tag_invalid":
-            choices = [c.strip("' ") for c in context["expected_tags"].split(", ")]
             name = context["discriminator"].strip("'")
-            yield _Told((*place, name), _not_one_of(context["tag"], choices), absent=name)
+            yield _Told((*place, name), _not_one_of(context["tag"], context["expected_tags"]), absent=name)
         elif kind == "extra_forbidden":
             hint = suggest(place[-1], sorted(_known(schema, place[:-1])))
             yield _Told(place, f"unknown key {str(place[-1])!r}{hint}", at_key=True)
@@ -126,16 +128,15 @@ def _message(item: Any) -> str:
     if kind in ("value_error", "assertion_error"):
         return str(context["error"])
     if kind in ("literal_error", "enum"):
-        return _not_one_of(
-            item["input"], [c.strip("' ") for c in context["expected"].replace(" or ", ", ").split(", ")]
-        )
+        return _not_one_of(item["input"], context["expected"].replace(" or ", ", "))
     if kind == "too_short":
         return f"give at least {context['min_length']}, not {item['input']!r}"
     message = _MESSAGES.get(kind, item["msg"].replace("Input should be", "should be"))
     return message if kind == "missing" else f"{message}, not {item['input']!r}"
 
 
-def _not_one_of(given: object, choices: Sequence[str]) -> str:
+def _not_one_of(given: object, expected: str) -> str:
+    choices = [choice.strip("' ") for choice in expected.split(", ")]
     hint = suggest(given, choices)
     few = f"one of {', '.join(choices)}" if len(choices) > 1 else choices[0]
     return f"{given!r} is not {few}" + (hint if hint.startswith("; did") else "")

@@ -57,8 +57,8 @@ def _data_faults(path: Path, overrides: Mapping[str, Any] | None) -> Iterator[Fa
         return
     context = context_of(document, path.resolve().parent, None)
     section = document.data.get("data")
-    plan = check(Data, section, ("data",), document, [], context) if context["units"] else None
-    if plan is not None:
+    plan = check(Data, section, ("data",), document, [], context)
+    if plan is not None and context.default is not None:
         yield from _file_faults(document, plan, lambda name, file: read_observations(plan, file, name))
 
 

@@ -90,20 +90,21 @@ def _forward(config: Config, theta: Mapping[str, float], times: Array) -> Array:
 
 def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:
     """The simulation as a CSV file with the columns and units of ``data.columns`` (else in display units)."""
-    model, observable = config.model, config.observable
+    model, observable, data = config.model, config.observable, config.data
     time = Column(f"t_{model.time_display_unit}", model.time_display_unit, model.time_unit)
     value = Column(f"{observable.name}_{observable.display_unit}", observable.display_unit, observable.unit)
-    if config.data is not None:
-        columns = config.data.columns
-        time = columns.time if isinstance(columns.time, Column) else time
-        value = columns.observable
+    if data is not None:
+        time = data.columns.time if isinstance(data.columns.time, Column) else time
+        value = data.columns.observable
     units = {entry.parameter.name: entry.parameter.unit for entry in config.parameters}
     truth = ", ".join(f"{name} = {v:.9g} {units[name]}" for name, v in simulation.theta.items())
-    lines = [*(f"# {line}" for line in comment.splitlines()), f"# parameters: {truth}"]
-    lines += [f"# {time.name} in {time.unit}, {value.name} in {value.unit}", f"{time.name},{value.name}"]
-    columns = (
-        convert(simulation.times, time.target, time.unit),
-        convert(simulation.values, value.target, value.unit),
-    )
-    lines += [f"{t:.9g},{v:.9g}" for t, v in zip(*columns, strict=True)]
+    times = convert(simulation.times, time.target, time.unit)
+    values = convert(simulation.values, value.target, value.unit)
+    lines = [
+        *(f"# {line}" for line in comment.splitlines()),
+        f"# parameters: {truth}",
+        f"# {time.name} in {time.unit}, {value.name} in {value.unit}",
+        f"{time.name},{value.name}",
+        *(f"{t:.9g},{v:.9g}" for t, v in zip(times, values, strict=True)),
+    ]
     return "\n".join(lines) + "\n"
