@@ -88,10 +88,6 @@ def _times(given: TimeColumn, context: Context) -> Column | Step:
         raise ConfigError([Fault(str(error), "step")]) from None
 
 
-def _told_elsewhere() -> Any:
-    """In place of a column that is not given: a fault says so."""
-
-
 _VALUES = Made(lambda given, context: Column(given.name, given.unit, observable_unit(context)), ValueColumn)
 
 
@@ -99,9 +95,9 @@ class Columns(Section):
     """Which columns hold the time and the observable, each with its unit."""
 
     model_config = ConfigDict(json_schema_extra={"required": ["time"]}, populate_by_name=False)
-    time: Annotated[Column | Step, Made(_times, TimeColumn)] = Field(default_factory=_told_elsewhere)
+    time: Annotated[Column | Step, Made(_times, TimeColumn)] = None  # type: ignore[assignment]  # told by a rule
     """Observation times."""
-    observable: Annotated[Column, _VALUES] = Field(default_factory=_told_elsewhere, alias=PLACEHOLDER)
+    observable: Annotated[Column, _VALUES, Field(alias=PLACEHOLDER)] = None  # type: ignore[assignment]  # the same
     """The observable."""
 
     @classmethod

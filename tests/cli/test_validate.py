@@ -122,8 +122,8 @@ def test_a_prior_far_from_the_data_and_lost_members_are_told(tmp_path: Path) -> 
 def test_a_slow_model_is_not_run_in_full_unasked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = load_config(write_toy(tmp_path))
     (problem,) = build(config)
-    monkeypatch.setattr("en4dvar.runs.checks.LONGEST", 0.0)
-    monkeypatch.setattr("en4dvar.runs.checks.ENOUGH", 0.0)
+    monkeypatch.setattr("en4dvar.descent.preview.LONGEST", 0.0)
+    monkeypatch.setattr("en4dvar.descent.preview.ENOUGH", 0.0)
     assert len(preview(problem, config.assimilation, 3).run.failures) == 1
     assert len(preview(problem, config.assimilation, 3, whole=True).run.failures) == 8
 
