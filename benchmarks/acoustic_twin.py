@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.ensemble.forecast import forecast
+from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
@@ -53,18 +54,20 @@ def make_twin(seed: int, of: Prior, *, truths: Prior | None = None, std: float =
     while True:
         truth = truths.mean + truths.std * rng.standard_normal(len(truths.names))
         times = 5.6e-6 + np.cumsum(rng.uniform(1.25e-6, 1.75e-6, 60))
-        design = Observations(times, np.ones(60), np.full(60, std), np.full(60, time_std), np.ones(60))
+        design = Observations(times, np.ones(60), noise_of(np.full(60, std), np.full(60, time_std)), np.ones(60))
         run = forecast(InverseProblem(MODEL, MODEL.observables[0], design, of), truth[None])
         noise = rng.standard_normal((2, 60))
         if run.failures[0]:
             continue
         values = run.predictions[0] + std * noise[0]
-        if run.rates is not None:
-            values += time_std * run.rates[0] * noise[1]
+        if run.predicted.rates is not None:
+            values += time_std * run.predicted.rates[0] * noise[1]
         last = np.flatnonzero(values < STOP * np.maximum.accumulate(values))
         count = last[0] + 1 if len(last) else 60
         if count >= FEWEST:
             break
     ones = np.ones(count)
-    observed = Observations(times[:count], values[:count], std * ones, time_std * ones, ones, name=f"twin{seed:04d}")
+    observed = Observations(
+        times[:count], values[:count], noise_of(std * ones, time_std * ones), ones, name=f"twin{seed:04d}"
+    )
     return Twin(InverseProblem(MODEL, MODEL.observables[0], observed, of), truth)

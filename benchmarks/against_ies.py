@@ -19,7 +19,7 @@ from collections.abc import Callable
 import numpy as np
 
 from en4dvar.ensemble.linalg import centre
-from en4dvar.schemes import Evaluation, Weights
+from en4dvar.schemes.base import Evaluation, Weights
 from en4dvar.schemes.esmda import ESMDA
 
 COEFFICIENTS = (9.333, 7.0, 4.0, 2.0)
@@ -32,12 +32,12 @@ def ours(x: np.ndarray, g: np.ndarray, y: np.ndarray, std: np.ndarray, draw: Dra
     mean, anomalies = centre(x)
     weights = Weights.prior(len(x))
     members = x
-    for a, alpha in enumerate(scheme.inflations):
+    for a in range(scheme.passes):
         predictions, noise = members @ g.T, draw(a)
         began = time.perf_counter()
         reference, spread = centre(predictions)
         evaluation = Evaluation((y - reference) / std, (spread / std).T)
-        weights = scheme.update(weights, evaluation, float(alpha), noise)
+        weights = scheme.advance(weights, evaluation, a, lambda _, noise=noise: noise).weights
         members = mean + weights.rows @ anomalies
         spent += time.perf_counter() - began
     return members, spent

@@ -20,7 +20,7 @@ from collections.abc import Callable
 import numpy as np
 
 from en4dvar.ensemble.linalg import apply_weights
-from en4dvar.schemes import Evaluation, Weights
+from en4dvar.schemes.base import Evaluation, Runs, Weights, gauss_newton
 from en4dvar.schemes.etkf import ETKF
 
 
@@ -49,9 +49,9 @@ def main() -> None:
 
     def analyse(out: np.ndarray | None = None) -> np.ndarray:
         weights = Weights.prior(n_members)
-        reference, spread = scheme.linearise(weights, ensemble[:, seen])
-        step = scheme.step(weights, Evaluation(y - reference, spread.T))
-        return apply_weights(ensemble, step.direction + step.transform, out)
+        reference, spread = scheme.linearise(weights, Runs(ensemble[:, seen]))
+        step = gauss_newton(weights.w, Evaluation(y - reference, spread.T))
+        return apply_weights(ensemble, step.weights.rows, out)
 
     peaks = []
     for out in (None, ensemble):

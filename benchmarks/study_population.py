@@ -23,6 +23,7 @@ from en4dvar.config.build import build
 from en4dvar.config.document import read_document
 from en4dvar.config.synthetic import resolve_campaign
 from en4dvar.executor import ThreadsExecutor
+from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.runs.synthetic import draw_campaign
 from en4dvar_bubble.study.measured import FOLDER, POPULATION_HEAD
@@ -47,7 +48,7 @@ def campaign(key: str, seed: int) -> list[list[object]]:
     problems = []
     for s in sets:
         ones = np.ones(len(s.times))
-        observed = Observations(s.times, s.values, only.noise * ones, 0 * ones, ones, name=s.name)
+        observed = Observations(s.times, s.values, noise_of(only.noise * ones), ones, name=s.name)
         problems.append(replace(base, observations=observed))
     with ThreadsExecutor(THREADS) as executor:
         analyses = [assimilate(p, config.assimilation, config.seed, executor) for p in problems]

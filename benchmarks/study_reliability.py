@@ -21,6 +21,7 @@ import numpy as np
 from en4dvar.config import load_config
 from en4dvar.config.build import build
 from en4dvar.ensemble.forecast import forecast
+from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.problem import InverseProblem
 from en4dvar_bubble.study.evidence import probability
@@ -71,14 +72,14 @@ def draw(base: InverseProblem, experiment: Experiment, rng: np.random.Generator)
         gaps = rng.uniform(*experiment.spacing, most - 1)
         times = rng.uniform(4.25e-6, 5.5e-6) + np.cumsum(np.r_[0.0, gaps])
         ones = np.ones(most)
-        run = forecast(replace(base, observations=Observations(times, ones, noise * ones, 0 * ones, ones)), x[None])
+        run = forecast(replace(base, observations=Observations(times, ones, noise_of(noise * ones), ones)), x[None])
         values = run.predictions[0] + noise * rng.standard_normal(most)
         if run.failures[0]:
             continue
         below = np.flatnonzero(values < experiment.stop * np.maximum.accumulate(values))
         k = int(below[0]) + 1 if len(below) else most
         if k >= FEWEST:
-            return Observations(times[:k], values[:k], noise * ones[:k], 0 * ones[:k], ones[:k])
+            return Observations(times[:k], values[:k], noise_of(noise * ones[:k]), ones[:k])
 
 
 def compare(bases: dict[str, InverseProblem], experiment: Experiment, number: int) -> tuple[str, float]:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from en4dvar.forward import Observable as Observable
     from en4dvar.forward import StateField as StateField
     from en4dvar.forward import Trajectory as Trajectory
+    from en4dvar.noise import noise_of as noise_of
     from en4dvar.observations import Observations as Observations
     from en4dvar.prior import Prior as Prior
     from en4dvar.prior import PriorTerm as PriorTerm
@@ -64,6 +65,7 @@ _HOME = {
     "errors": ("ConfigError", "DataError", "En4dvarError", "OutputError", "TooFewMembersError"),
     "report.export": ("export_table",),
     "forward": ("Failure", "ForwardModel", "Observable", "StateField", "Trajectory"),
+    "noise": ("noise_of",),
     "observations": ("Observations",),
     "prior": ("Prior", "PriorTerm"),
     "analysis": ("Analysis",),

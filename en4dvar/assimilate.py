@@ -1,4 +1,4 @@
-"""The only loop: forecast → linearise → step → step control → record, then the posterior and its predictions."""
+"""One data set from its prior ensemble to the posterior and its predictions."""
 
 from __future__ import annotations
 
@@ -8,29 +8,62 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar import diagnostics as diag
-from en4dvar.analysis import Analysis, IterationRecord, Progress, Record
-from en4dvar.descent.mda import assimilate_once
+from en4dvar.analysis import Analysis, Progress, Record
+from en4dvar.descent.loop import iterate
 from en4dvar.descent.noise_scale import mean_beyond_mode
-from en4dvar.descent.record import Taken, make_records, worse
 from en4dvar.descent.start import Comparison, choose_start
-from en4dvar.descent.weight_space import Local, WeightSpace
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, log_posterior
-from en4dvar.errors import ConfigError, TooFewMembersError
+from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.honesty import Caution, Ending, caution, examine
 from en4dvar.honesty.checks import down_weighted
-from en4dvar.likelihood import error_std, log_likelihood, robust_weights, whitened_residual
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.shape import examine_shape, guide
-from en4dvar.schemes import Step, Weights
-from en4dvar.schemes.esmda import ESMDA
+from en4dvar.schemes import window_scheme
+from en4dvar.schemes.base import GaussNewtonStep, Weights
+from en4dvar.schemes.en4dvar import En4DVar
 from en4dvar.state import Array
 from en4dvar.units import convert
 
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 
 GRID_POINTS = 200  # M, of the plotting grid
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """A Markov chain under way, and the forward runs up to there."""
+
+    chain: mcmc.ChainState
+    forward_runs: int
+
+
+@dataclass(frozen=True)
+class LoopState:
+    """All that the rest of an assimilation depends on, besides the problem, the settings and the seed.
+
+    ``comparison`` is there until the start is chosen, ``descent`` from then on, ``refinement`` once the iterations are
+    done and the Markov chain is under way.
+    """
+
+    forward_runs: int
+    comparison: Comparison | None = None
+    descent: Descent | None = None
+    warnings: tuple[Caution, ...] = ()
+    refinement: Refinement | None = None
+
+    @property
+    def reached(self) -> str:
+        """How far it has got, in words."""
+        if self.comparison is not None:
+            return f"after {self.comparison.rounds} rounds of the start"
+        return f"after {self.descent.iteration if self.descent else 0} iterations"
+
+
+Keep = Callable[[Callable[[], LoopState]], None]
 
 
 def assimilate(
@@ -40,7 +73,7 @@ def assimilate(
     executor: Executor | None = None,
     progress: Progress | None = None,
     resume: LoopState | None = None,
-    keep: Callable[[Callable[[], LoopState]], None] | None = None,
+    keep: Keep | None = None,
 ) -> Analysis:
     """Estimate the parameters of one data set.
 
@@ -59,59 +92,11 @@ def assimilate(
     ConfigError: the problem is not complete. TooFewMembersError: too few members survive a forecast.
     """
     with one_blas_thread():
-        return _Run(problem, settings, seed, executor or SerialExecutor(), progress, keep).analysis(resume)
+        return _Assimilation(problem, settings, seed, executor or SerialExecutor(), progress, keep).run(resume)
 
 
-@dataclass(frozen=True)
-class LoopState:
-    """All that the rest of the iterations depends on, besides the problem, the settings and the seed.
-
-    ``worst_loss`` (N,) reasons of failure in the iteration that lost most members, or empty. ``comparison`` is there
-    until the start is chosen, ``refinement`` once the iterations are done and the Markov chain is under way.
-    """
-
-    weights: Weights
-    forward_runs: int
-    warnings: tuple[Caution, ...] = ()
-    records: tuple[IterationRecord, ...] = ()
-    worst_loss: tuple[str, ...] = ()
-    stop_reason: str = ""
-    converged: bool = False
-    comparison: Comparison | None = None
-    refinement: Refinement | None = None
-
-    @property
-    def reached(self) -> str:
-        """How far it has got, in words."""
-        if self.comparison is not None:
-            return f"after {self.comparison.rounds} rounds of the start"
-        return f"after {len(self.records)} iterations"
-
-
-@dataclass(frozen=True)
-class Refinement:
-    """A Markov chain under way, and the forward runs up to there."""
-
-    chain: mcmc.ChainState
-    forward_runs: int
-
-
-@dataclass(frozen=True)
-class _Outcome:
-    """Where the iterations ended."""
-
-    weights: Weights
-    transform: Array
-    step: Step
-    cost: float
-    converged: bool
-    reason: str
-    records: tuple[IterationRecord, ...]
-    worst_loss: tuple[str, ...]
-
-
-class _Run:
-    """One data set: prior forecast, start, iterations, posterior forecast."""
+class _Assimilation:
+    """One data set: prior forecast, start, iterations, refinement, posterior forecast."""
 
     def __init__(
         self,
@@ -120,47 +105,48 @@ class _Run:
         seed: int,
         executor: Executor,
         progress: Progress | None,
-        keep: Callable[[Callable[[], LoopState]], None] | None,
+        keep: Keep | None,
     ):
         self.fixed_parameters = check_problem(problem)
         self.problem, self.settings, self.seed = problem, settings, seed
-        self.progress, self.keep = progress, keep
-        self.mda = ESMDA(settings.mda_coefficients, settings.mda_form) if settings.scheme == "es-mda" else None
-        if self.mda and (problem.has_noise_scale or problem.observations.huber is not None):
-            raise ConfigError("es-mda takes Gaussian errors of known std: neither sigma nor a robust cost; use en4dvar")
-        if self.mda:  # step and J of its ensembles are regressed over them
-            settings = replace(settings, linearisation="transform")
+        self.progress, self._keep = progress, keep
+        self.scheme = window_scheme(settings)
+        robust = np.isfinite(problem.observations.noise.counts_within)
+        if not self.scheme.searches and (problem.has_noise_scale or robust):
+            raise ConfigError(
+                f"{settings.scheme} takes Gaussian errors of known std: neither sigma nor a robust cost; use en4dvar"
+            )
         self.space = WeightSpace(problem, settings, seed, executor)
+        self.grid = np.linspace(problem.observations.times[0], problem.observations.times[-1], GRID_POINTS)
 
-    def analysis(self, resume: LoopState | None) -> Analysis:
-        problem, observations = self.problem, self.problem.observations
-        grid = np.linspace(observations.times[0], observations.times[-1], GRID_POINTS)
-        space = self.space
-        prior_run = space.forecast(np.vstack([space.members, space.mean]), grid)
-        self.require_members(prior_run[:-1].failures, "prior forecast")
-        state = self.start(prior_run, resume) if resume is None or resume.comparison else resume
-        space.forward_runs = state.forward_runs
-        end = self.assimilate_repeatedly(state, self.mda) if self.mda else self.iterate(state)
+    def run(self, resume: LoopState | None) -> Analysis:
+        problem, space, noise = self.problem, self.space, self.problem.observations.noise
+        prior_run = space.forecast(np.vstack([space.members, space.mean]), self.grid)
+        space.require_members(prior_run[:-1].failures, "prior forecast")
+        start = self.start(prior_run, resume) if resume is None or resume.descent is None else resume
+        descent = self.iterate(start, prior_run)
+        assert isinstance(descent.step, GaussNewtonStep)
+        assert descent.at is not None
 
-        both = space.control(np.vstack([end.weights.w + end.transform, end.weights.w]))
-        posterior, mode = both[:-1], both[-1]
-        dfs = diag.dfs(end.step.hessian.singular_values, len(space.members))
-        posterior = posterior + mean_beyond_mode(problem, mode, posterior, dfs)
-        posterior, refinement, refine_warnings = self.refine(posterior, state.refinement)
-        ends = np.vstack([posterior, mode])
-        final = space.forecast(ends, grid)
-        after, last = final[:-1], final[-1:]
-        self.require_members(after.failures, "posterior forecast")
-        at_centre = (
-            None if last.rates is None else last.rates[0],
-            None if last.noise_scale is None else last.noise_scale[0],
-        )
-        huber, huber_warnings = self.robust(last.predictions[0], *at_centre)
+        w, transform = descent.weights.w, descent.step.transform if self.scheme.searches else descent.weights.T
+        ends = space.control(np.vstack([w + transform, w]))
+        posterior, mode = ends[:-1], ends[-1]
+        posterior = posterior + mean_beyond_mode(problem, mode, posterior, descent.records[-1].dfs)
+        posterior, refinement, refine_warnings = self.refine(posterior, start.refinement)
+        if self.scheme.searches or refinement:
+            ends = np.vstack([posterior, mode])
+            final = space.forecast(ends, self.grid)
+            after, last = final[:-1], final[-1:]
+        else:  # the last ensemble that was run is the posterior
+            after, last = descent.at.members, descent.at.central
+        space.require_members(after.failures, "posterior forecast")
+        down_weights, huber_warnings = self.robust(last)
         per_parameter = diag.dfs_per_parameter(space.prior_variance, posterior)
-        costs = self.costs(ends, final)
-        shape = {} if refinement else examine_shape(space, posterior, mode, costs[:-1], self.seed)
-        record = end.records[-1]
-        prior = problem.prior
+        costs = self.costs(ends[:-1], after)
+        centre_cost = float(self.costs(ends[-1:], last)[0])
+        shape = {} if refinement else examine_shape(space, posterior, mode, costs, self.seed)
+        record = descent.records[-1]
+        observations, prior = problem.observations, problem.prior
         return Analysis(
             name=observations.name,
             parameters=prior.parameters,
@@ -176,25 +162,25 @@ class _Run:
             prior_predictions=prior_run.predictions[:-1],
             posterior_predictions=after.predictions,
             centre_predictions=last.predictions[0],
-            error_std=error_std(observations, *at_centre),
-            log_likelihood=log_likelihood(observations, after.predictions, after.rates, after.noise_scale),
-            trajectory_times=grid,
+            error_std=noise.error_std(last.predicted[0]),
+            log_likelihood=observations.log_likelihood(after.predicted),
+            trajectory_times=self.grid,
             prior_trajectories=prior_run.path[:-1],
             posterior_trajectories=after.path,
             prior_failures=prior_run.failures[:-1],
             posterior_failures=after.failures,
-            iterations=end.records,
+            iterations=descent.records,
             dfs_per_parameter=per_parameter,
-            converged=end.converged,
-            stop_reason=end.reason,
+            converged=descent.converged,
+            stop_reason=descent.stop,
             forward_runs=space.forward_runs,
             seed=self.seed,
             settings=self.settings,
             shape=shape,
-            huber_weight=huber,
+            huber_weight=down_weights,
             refinement=refinement,
             log_evidence=diag.log_evidence(
-                end.cost, end.step.hessian.singular_values, len(space.members), observations
+                descent.at.cost, descent.step.hessian.singular_values, len(space.members), observations
             ),
             limits=problem.model.validity,
             extremes=after.extremes,
@@ -204,59 +190,58 @@ class _Run:
                     members=space.members,
                     posterior=posterior,
                     mode=mode,
-                    costs=costs[:-1],
-                    cost=float(costs[-1]),
-                    converged=end.converged,
-                    stop_reason=end.reason,
+                    costs=costs,
+                    cost=centre_cost,
+                    converged=descent.converged,
+                    stop_reason=descent.stop,
                     step_norm=record.step_norm,
                     chi2=record.chi2_per_observation * len(observations.used),
                     n_weighted=len(observations.used),
                     dfs=record.dfs,
                     dfs_per_parameter=per_parameter,
                     prior_failures=prior_run.failures[:-1],
-                    worst_loss=end.worst_loss,
+                    worst_loss=descent.worst_loss,
                     posterior_failures=after.failures,
                     shape=shape,
                     limits=problem.model.validity,
                     extremes=after.extremes,
-                    found=(*state.warnings, *refine_warnings, *huber_warnings),
+                    found=(*start.warnings, *refine_warnings, *huber_warnings),
                 )
             ),
         )
 
     def start(self, prior_run: Forecast, resume: LoopState | None) -> LoopState:
-        space, prior = self.space, Weights.prior(len(self.space.members))
-        if self.mda:
-            return LoopState(prior, space.forward_runs)
+        """The state from which the iterations go on."""
+        space = self.space
+        if not isinstance(self.scheme, En4DVar):
+            return LoopState(space.forward_runs, descent=Descent(Weights.prior(len(space.members))))
         if resume is not None:
             space.forward_runs = resume.forward_runs
 
         def keep(comparison: Callable[[], Comparison]) -> None:
-            if self.keep is not None:
-                self.keep(lambda: LoopState(prior, space.forward_runs, comparison=comparison()))
+            self.keep(lambda: LoopState(space.forward_runs, comparison()))
 
-        start = choose_start(space, prior_run, resume.comparison if resume else None, keep, self.tell)
-        history = start.history
-        for record in history.records:
+        before = resume.comparison if resume else None
+        descent, warnings = choose_start(space, self.scheme, prior_run, self.seed, before, keep, self.tell)
+        for record in descent.records:
             self.tell(record)
-        weights = Weights(start.w, history.transform)
-        return LoopState(weights, space.forward_runs, start.warnings, history.records, history.worst_loss)
+        return LoopState(space.forward_runs, descent=descent, warnings=warnings)
 
-    def robust(
-        self, prediction: Array, rate: Array | None, scale: Array | None
-    ) -> tuple[Array | None, tuple[Caution, ...]]:
-        """Huber's weights (K,) at the centre and words for those below one; None with Gaussian errors."""
-        observations, model = self.problem.observations, self.problem.model
-        if observations.huber is None:
-            return None, ()
-        weights = robust_weights(observations, whitened_residual(observations, prediction, rate, scale))
-        times = convert(observations.times, model.time_unit, model.time_display_unit)
-        return weights, down_weighted(weights, times, model.time_display_unit, observations.huber)
+    def iterate(self, state: LoopState, prior_run: Forecast) -> Descent:
+        """The end of the iterations."""
+        space = self.space
+        space.forward_runs = state.forward_runs
+        assert state.descent is not None
+        descent = state.descent.kept
 
-    def costs(self, members: Array, run: Forecast) -> Array:
-        """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""
-        z = (members - self.problem.prior.mean) / self.problem.prior.std
-        return np.asarray(0.5 * np.sum(z**2, axis=1) + self.space.observation_cost(run))
+        def keep() -> None:
+            kept = LoopState(space.forward_runs, None, descent.kept, state.warnings, state.refinement)
+            self.latest = kept
+            self.keep(lambda: kept)
+
+        window = DataWindow(space, self.seed, keep, self.tell, prior_run, self.grid)
+        iterate(window, self.scheme, [descent])
+        return descent
 
     def refine(
         self, posterior: Array, earlier: Refinement | None
@@ -274,8 +259,7 @@ class _Run:
             return log_posterior(self.problem, x, space.executor)
 
         def keep(chain: mcmc.ChainState) -> None:
-            if self.keep is not None:
-                self.keep(lambda: replace(self.latest, refinement=Refinement(chain, space.forward_runs)))
+            self.keep(lambda: replace(self.latest, refinement=Refinement(chain, space.forward_runs)))
 
         emulated = guide(space, posterior, self.seed)  # made again after an interruption, from the same runs
         if earlier is not None:
@@ -287,92 +271,24 @@ class _Run:
         warnings = () if chain.converged else (caution("chain-not-converged", chain.warning()),)
         return chain.thin(len(posterior), self.settings.sampling == "exact"), chain.summary(), warnings
 
-    def iterate(self, state: LoopState) -> _Outcome:
-        settings, space = self.settings, self.space
-        weights, records, worst_loss = state.weights, list(state.records), state.worst_loss
-        stop, converged = state.stop_reason, state.converged
-        while True:
-            if self.keep is not None:
-                self.latest = replace(
-                    state, weights=weights, forward_runs=space.forward_runs, records=tuple(records),
-                    worst_loss=worst_loss, stop_reason=stop, converged=converged,
-                )  # fmt: skip
-                self.keep(lambda: self.latest)
-            (at,) = space.linearise([weights])
-            step, total = self.require_step(at, f"forecast of iteration {len(records) + 1}"), at.cost
-            worst_loss = worse(worst_loss, at)
+    def robust(self, centre: Forecast) -> tuple[Array | None, tuple[Caution, ...]]:
+        """What the observations count (K,) at the centre, and words for those that do not count in full."""
+        observations, model = self.problem.observations, self.problem.model
+        weights = observations.noise.down_weights(observations.values, centre.predicted[0])
+        if weights is None:
+            return None, ()
+        times = convert(observations.times, model.time_unit, model.time_display_unit)
+        return weights, down_weighted(weights, times, model.time_display_unit, observations.noise.counts_within)
 
-            move, contracted = None, Weights(weights.w, step.transform)
-            if not stop:
-                if step.norm <= settings.step_tolerance:
-                    stop, converged = f"step of {step.norm:.2g} posterior standard deviations", True
-                elif len(records) == settings.max_iterations:
-                    stop = f"iteration limit ({settings.max_iterations}) reached"
-                else:
-                    (move,) = space.search([at])
-                    if move is None and self.same_members(contracted, weights):
-                        stop = "no decrease possible along the step"
-                        converged = step.predicted_decrease <= self.small(total)
-            taken = Taken(at, step, step.transform, move.step_length if move else 0.0)
-            records += make_records(space, len(records), [taken])
-            self.tell(records[-1])
-            if stop:
-                return _Outcome(weights, step.transform, step, total, converged, stop, tuple(records), worst_loss)
-            if move is None:  # a regression over a narrower ensemble may still show the way down
-                weights = contracted
-                continue
-            if total - move.cost <= self.small(total) and step.predicted_decrease <= self.small(total):
-                # one more forecast, to linearise at the end point
-                stop, converged = f"relative decrease of J below {settings.cost_tolerance:g}", True
-            weights = Weights(move.w, step.transform)
+    def costs(self, members: Array, run: Forecast) -> Array:
+        """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""
+        z = (members - self.problem.prior.mean) / self.problem.prior.std
+        return np.asarray(0.5 * np.sum(z**2, axis=1) + self.space.observation_cost(run))
 
-    def assimilate_repeatedly(self, state: LoopState, scheme: ESMDA) -> _Outcome:
-        """ES-MDA: every iteration is one of its assimilations; the last record is the end point."""
-        space, count = self.space, len(scheme.coefficients)
-        weights, records, worst_loss = state.weights, list(state.records), state.worst_loss
-        while True:
-            if self.keep is not None:
-                self.latest = replace(
-                    state, weights=weights, forward_runs=space.forward_runs, records=tuple(records),
-                    worst_loss=worst_loss,
-                )  # fmt: skip
-                self.keep(lambda: self.latest)
-            (at,) = space.linearise([weights])
-            step = self.require_step(at, f"forecast of iteration {len(records) + 1}")
-            worst_loss = worse(worst_loss, at)
-            done = len(records) == count
-            records += make_records(space, len(records), [Taken(at, step, weights.T, 0.0 if done else 1.0)])
-            self.tell(records[-1])
-            if done:
-                ending = f"{count} assimilations"
-                return _Outcome(weights, weights.T, step, at.cost, True, ending, tuple(records), worst_loss)
-            weights = assimilate_once(space, at, scheme, len(records) - 1, self.seed)
-
-    def same_members(self, a: Weights, b: Weights) -> bool:
-        """Whether the scheme would run the same members again, to the step tolerance."""
-        difference = self.space.scheme.member_weights(a) - self.space.scheme.member_weights(b)
-        return bool(np.max(np.abs(difference)) <= self.settings.step_tolerance)
-
-    def small(self, total: float) -> float:
-        """A decrease of J that counts as none; below J = 1 it is absolute, for there J has no more to tell."""
-        return self.settings.cost_tolerance * max(total, 1.0)
+    def keep(self, state: Callable[[], LoopState]) -> None:
+        if self._keep is not None:
+            self._keep(state)
 
     def tell(self, record: Record) -> None:
         if self.progress is not None:
             self.progress(self.problem.observations.name, record)
-
-    def require_step(self, at: Local, stage: str) -> Step:
-        """The step from there, or an error where the members lost do not allow one."""
-        if at.step is None:
-            self.require_members(at.failures, stage)
-            raise TooFewMembersError(f"{self.problem.observations.name}: the centre cannot be run in the {stage}")
-        return at.step
-
-    def require_members(self, failures: tuple[str, ...], stage: str) -> None:
-        """Raise unless enough members are active for a regression on the control vector."""
-        lost, needed = sum(1 for reason in failures if reason), self.space.needed_members
-        if len(failures) - lost < needed:
-            raise TooFewMembersError(
-                f"{self.problem.observations.name}: {lost} of {len(failures)} members failed in the {stage}; "
-                f"at least {needed} must survive. Most frequent reasons: {diag.common_reasons(failures)}"
-            )

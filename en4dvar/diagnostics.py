@@ -9,7 +9,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from en4dvar.likelihood import log_normalisation, robust_weights, whitened_residual
 from en4dvar.observations import Observations
 from en4dvar.state import Array
 
@@ -44,20 +43,6 @@ def spread(members: Array, prior_variance: Array) -> Array:
     return np.sqrt(np.add.reduce(variance / prior_variance, axis=-1) / n)
 
 
-def chi2_per_observation(
-    observations: Observations, predictions: Array, rates: Array | None, noise_scale: Array | None = None
-) -> Array:
-    """(y − m)ᵀR⁻¹(y − m) per observation with β > 0 (…,), for predictions (…, K); NaN where there is none.
-
-    With a robust cost each square has its Huber weight, v ρ'(v), whose expectation under the density of ρ is 1 as well.
-    """
-    v = whitened_residual(observations, predictions, rates, noise_scale)
-    squares = v * v if observations.huber is None else v * v * robust_weights(observations, v)
-    return np.asarray(
-        np.add.reduce(squares.take(observations.used, axis=-1), axis=-1) / (len(observations.used) or math.nan)
-    )
-
-
 def nrmse(values: Array, predictions: Array) -> float:
     """Normalised fit 1 − ‖y − ŷ‖/‖y − ȳ‖ of the rheometry literature: 1 is perfect, 0 is no better than the mean."""
     return float(1 - np.linalg.norm(values - predictions) / np.linalg.norm(values - np.mean(values)))
@@ -71,7 +56,7 @@ def log_evidence(cost: float, singular_values: Array, n_members: int, observatio
     Algorithms, chapter 28.
     """
     log_det = float(np.sum(np.log1p(singular_values**2 / (n_members - 1))))
-    return float(-cost - 0.5 * log_det - log_normalisation(observations))
+    return float(-cost - 0.5 * log_det - observations.log_normalisation())
 
 
 @lru_cache(maxsize=256)  # every start and every examination asks for the same few

@@ -64,9 +64,7 @@ class AssimilationSettings:
     ``min_active_fraction``, only ``mda_coefficients`` and ``mda_form`` (see :mod:`en4dvar.schemes.esmda`).
     """
 
-    scheme: Annotated[
-        Literal["en4dvar", "es-mda"], "en4dvar (iterative ensemble smoother) or es-mda (multiple data assimilation)."
-    ] = "en4dvar"
+    scheme: str = "en4dvar"  # one of those registered in en4dvar.schemes
     members: Annotated[int, Ge(3), "Ensemble size N."] = 48
     sampling: Annotated[
         Literal["exact", "random"],

@@ -12,6 +12,7 @@ import pytest
 from en4dvar.analysis import Analysis, IterationRecord
 from en4dvar.forward import Observable, StateField
 from en4dvar.honesty import caution
+from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.problem import AssimilationSettings
 from en4dvar.state import TIME_SHIFT, Array, Parameter
@@ -78,7 +79,7 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
         fixed_parameters=FIXED,
         observable=observable,
         observations=Observations(
-            times, values, std, np.zeros(40), np.ones(40), "A_E2_synthetic", "made/up.csv", {"Req": 4e-5}
+            times, values, noise_of(std), np.ones(40), "A_E2_synthetic", "made/up.csv", {"Req": 4e-5}
         ),
         time_unit="s",
         time_display_unit="us",

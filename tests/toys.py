@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import numpy as np
 
+from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.forward import Failure, ForwardModel, Observable, StateField, Trajectory
+from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
+from en4dvar.schemes import window_scheme
+from en4dvar.schemes.base import Weights
 from en4dvar.state import Field, Parameter, StateLayout
 
 OBSERVABLE = Observable("y", "m", StateField("y", rate_of="v"))
@@ -116,8 +121,17 @@ class Vectorised(Linear):
 
 def make_observations(times, values, std=0.1, time_std=0.0, weights=1.0, name="toy"):
     k = len(times)
-    full = [np.broadcast_to(np.asarray(v, dtype=float), (k,)).copy() for v in (std, time_std, weights)]
-    return Observations(np.asarray(times, dtype=float), np.asarray(values, dtype=float), *full, name=name)
+    std, time_std, weights = (
+        np.broadcast_to(np.asarray(v, dtype=float), (k,)).copy() for v in (std, time_std, weights)
+    )
+    y = np.asarray(values, dtype=float)
+    return Observations(np.asarray(times, dtype=float), y, noise_of(std, time_std), weights, name=name)
+
+
+def with_noise(observations, **kind):
+    """The same readings with correlated errors, or robust ones."""
+    noise = observations.noise
+    return replace(observations, noise=noise_of(noise.std, noise.time_std, **kind))
 
 
 def make_problem(model, truth, *, std=0.1, time_std=0.0, weights=1.0, seed=1, k=9, prior=None, scale=1.0):
@@ -139,3 +153,14 @@ class Dying(Linear):
         if np.any(x[:, 2] < 0):
             os._exit(3)
         return super().trajectories(x, times)
+
+
+def visit(space, w, scheme=None):
+    """The descent at weights ``w`` of a space: J there and the Gauss–Newton step."""
+    scheme = scheme or window_scheme(space.settings)
+    descent = Descent(Weights(w, np.eye(len(space.members))))
+    window = DataWindow(space, 0, lambda: None, lambda record: None)
+    (runs,) = window.run(scheme, [descent])
+    evaluation = window.whiten(scheme, descent, *scheme.linearise(descent.weights, runs))
+    descent.step = scheme.advance(descent.weights, evaluation, 0, window.draw)
+    return descent

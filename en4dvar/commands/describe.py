@@ -55,10 +55,9 @@ def _data_row(problem: InverseProblem) -> tuple[str, ...]:
     y, model, observable = problem.observations, problem.model, problem.observable
     start, end = (convert(float(t), model.time_unit, model.time_display_unit) for t in y.times[[0, -1]])
     top, std = (convert(float(v), observable.unit, observable.display_unit) for v in (y.values.max(), np.median(y.std)))
-    timing = convert(float(np.median(y.time_std)), model.time_unit, model.time_display_unit)
+    timing = convert(float(np.median(y.noise.time_std)), model.time_unit, model.time_display_unit)
     also = f", {timing:.3g} {model.time_display_unit} in time" if timing else ""
-    also += ", correlated" if y.correlation is not None else ""
-    also += f", robust beyond {y.huber:g} std" if y.huber is not None else ""
+    also += y.noise.words
     unit = observable.display_unit
     window = f"{start:.4g} to {end:.4g} {model.time_display_unit}"
     return y.name, str(len(y)), window, f"{top:.4g} {unit}", f"{std:.3g} {unit}{also}"

@@ -20,6 +20,7 @@ from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.files import readable
 from en4dvar.inputs.readers import SUFFIXES, Column, read_covariance, read_series
 from en4dvar.inputs.window import select
+from en4dvar.noise import Noise, noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
@@ -131,18 +132,14 @@ def read_observations(plan: Data, path: Path, name: str, weights: str = "sum") -
     if times[0] < 0:
         raise DataError(f"{path}: the first observation used lies {-times[0]:g} before time zero; see data.time_zero")
     count = len(times)
-    std, correlation = _errors(plan, times, values, np.arange(len(series.times))[window])
     return Observations(
         times=times,
         values=values,
-        std=std,
-        time_std=np.full(count, plan.error.time_std),
+        noise=_noise(plan, times, values, np.arange(len(series.times))[window]),
         weights=np.full(count, 1.0 if weights == "sum" else 1.0 / count),
         name=name,
         source=readable(path),
         scalars=series.scalars,
-        correlation=correlation,
-        huber=plan.error.huber,
     )
 
 
@@ -155,12 +152,13 @@ def _span(times: Array, plan: Data) -> str:
     return f"; the readings go from {first:g} to {last:g} {column.unit}"
 
 
-def _errors(plan: Data, times: Array, values: Array, samples: npt.NDArray[np.intp]) -> tuple[Array, Array | None]:
-    """std (K,) and correlation (K, K) or None; ``samples`` (K,) are the places of the observations in the series.
+def _noise(plan: Data, times: Array, values: Array, samples: npt.NDArray[np.intp]) -> Noise:
+    """The observation errors; ``samples`` (K,) are the places of the observations in the series.
 
     A covariance file holds one row an observation of the window, or one a usable sample of the whole series.
     """
-    error = plan.error
+    error, correlation = plan.error, None
+    time_std = np.full(len(times), error.time_std)
     if error.covariance is not None:
         covariance = read_covariance(error.covariance)
         if len(covariance) > samples[-1] and len(covariance) != len(times):
@@ -170,13 +168,13 @@ def _errors(plan: Data, times: Array, values: Array, samples: npt.NDArray[np.int
         std = np.sqrt(np.diag(covariance))
         correlation = covariance / np.outer(std, std)
         np.fill_diagonal(correlation, 1.0)
-        return std, correlation
+        return noise_of(std, time_std, correlation)
     if error.std is None:
         raise ConfigError("data.error: neither a std nor a covariance")
     std = np.full(len(times), error.std.absolute(float(values.max())))
-    if error.correlation_time is None:
-        return std, None
-    return std, np.exp(-np.abs(np.subtract.outer(times, times)) / error.correlation_time)
+    if error.correlation_time is not None:
+        correlation = np.exp(-np.abs(np.subtract.outer(times, times)) / error.correlation_time)
+    return noise_of(std, time_std, correlation, error.huber)
 
 
 def resolve_parameters(

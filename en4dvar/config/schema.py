@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_type_hints
 
 from pydantic import (
     AfterValidator,
@@ -28,6 +28,7 @@ from en4dvar.config.context import Context, Unknown
 from en4dvar.config.validate import Faults
 from en4dvar.executor.limits import Limits, parse_bytes
 from en4dvar.problem import AssimilationSettings
+from en4dvar.schemes import ON_A_WINDOW
 from en4dvar.units import Quantity
 
 QuantityText = str | int | float
@@ -79,14 +80,15 @@ def _plain(value: Any) -> Any:
     return from_json(to_json(value))
 
 
-def section_of(kind: Any, base: type[Section] = Section) -> Any:
-    """``base`` with the fields of a dataclass, declared there as ``members: Annotated[int, Ge(3), "Size N."] = 48``."""
-    hints = get_type_hints(kind, include_extras=True)
+def section_of(*kinds: Any, base: type[Section] = Section) -> Any:
+    """``base`` with the fields of dataclasses, declared there as ``members: Annotated[int, Ge(3), "Size."] = 48``."""
     declared: dict[str, Any] = {}
-    for field in fields(kind):
-        words = [text for text in getattr(hints[field.name], "__metadata__", ()) if isinstance(text, str)]
-        declared[field.name] = (hints[field.name], Field(field.default, description=" ".join(words) or None))
-    return create_model(kind.__name__, __base__=base, **declared)
+    for kind in kinds:
+        hints = get_type_hints(kind, include_extras=True)
+        for field in fields(kind):
+            words = [text for text in getattr(hints[field.name], "__metadata__", ()) if isinstance(text, str)]
+            declared[field.name] = (hints[field.name], Field(field.default, description=" ".join(words) or None))
+    return create_model(f"{base.__name__}Of", __base__=base, **declared)
 
 
 def _size(text: str) -> str:
@@ -151,11 +153,18 @@ class Execution(Section):
 
 
 _Settings: Any = section_of(AssimilationSettings)
+if TYPE_CHECKING:
+    OnAWindow = str
+else:
+    OnAWindow = Literal[tuple(ON_A_WINDOW)]
 
 
 class Assimilation(_Settings):
     """The settings of the scheme, declared at :class:`AssimilationSettings`, and how observations count."""
 
+    scheme: OnAWindow = AssimilationSettings.scheme
+    """en4dvar (iterative ensemble smoother), es-mda (multiple data assimilation), or the one analysis of a filter:
+    etkf, denkf (deterministic), enkf-n (finite size)."""
     weights: Literal["sum", "mean"] = "sum"
     """sum: every observation counts (the Bayesian posterior); mean: β = 1/K, as in the published code."""
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, cast
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -19,18 +19,18 @@ from en4dvar.config.parameters import Entries, Entry, Fixed, Uncertain
 from en4dvar.config.schema import File, Output, Section, section_of
 from en4dvar.config.validate import Faults
 from en4dvar.cycling.sequential import SequentialSettings
-from en4dvar.cycling.series import root_of_correlation
 from en4dvar.cycling.twin import TwinExperiment
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.inputs.readers import Matrix, read_covariance
+from en4dvar.noise import Correlation
 from en4dvar.prior import Prior
+from en4dvar.schemes import ON_A_SERIES
 from en4dvar.schemes.etkf import ETKF
-from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import Localisation
-from en4dvar.state import Array
 
+FileName = Annotated[str, Field(min_length=1)]
 STD = Annotated[float, quantity(subject_unit, "positive")]
 
 
@@ -38,15 +38,13 @@ def _errors(model: ForwardModel) -> dict[str, Observable]:
     return {f"{observable.name}_std": observable for observable in model.observables}
 
 
-def _correlation(path: str, context: Context) -> tuple[str, Array]:
+def _correlation(path: str, context: Context) -> tuple[str, Correlation]:
     """The absolute path and the matrix."""
     file = (context.base / path).absolute()
     try:
-        correlation = read_covariance(Matrix(file.expanduser(), "1", "1"))
-        root_of_correlation(correlation, len(correlation))
+        return str(file), Correlation(read_covariance(Matrix(file.expanduser(), "1", "1")))
     except (DataError, ValueError) as error:
         raise ConfigError(str(error)) from None
-    return str(file), correlation
 
 
 class Twin(Section):
@@ -60,9 +58,9 @@ class Twin(Section):
     """Time between two observations, in the model's unit of time."""
     error: Annotated[dict[str, float], ByName(STD, _errors, some=True)]
     """Std of the observation errors, by observable: ``<observable>_std``."""
-    error_correlation: Annotated[tuple[str, Array], Made(_correlation, Annotated[str, Field(min_length=1)])] | None = (
-        None
-    )
+    error_correlation: (
+        Annotated[tuple[str, Correlation], Made(_correlation, Annotated[str, Field(min_length=1)])] | None
+    ) = None
     """CSV file of the correlation of the errors at one instant, full or block diagonal, one row an observation, without
     header; relative to the configuration's folder. Default: independent errors."""
     initial_std: Annotated[dict[str, float], ByName(STD, dynamic_fields, some=True)]
@@ -100,17 +98,24 @@ class Local(Section):
         return self
 
 
-class _Scheme(Section):
-    """The scheme and its ensemble."""
+_KINDS = cast(dict[str, Any], ON_A_SERIES)
+_KEYS = {name: {field.name for field in fields(kind)} for name, kind in _KINDS.items()}
+_FOREIGN = {name: set().union(*_KEYS.values()) - keys for name, keys in _KEYS.items()}  # keys of other schemes
+_FILTERS = [name for name, kind in _KINDS.items() if issubclass(kind, ETKF)]
+if TYPE_CHECKING:
+    OnASeries = str
+else:
+    OnASeries = Literal[tuple(ON_A_SERIES)]
 
-    scheme: Literal["etkf", "ienks"]
-    """etkf (filter) or ienks (sliding-window smoother)."""
+
+class _Scheme(Section):
+    scheme: OnASeries
+    """etkf, denkf (deterministic) or enkf-n (finite size), which are filters, or ienks (sliding-window smoother)."""
     members: Annotated[int, Field(ge=3)]
     """Ensemble size N."""
 
 
-_Iterations: Any = section_of(IEnKS, _Scheme)
-OF_IENKS = tuple(field.name for field in fields(IEnKS))
+_Iterations: Any = section_of(*_KINDS.values(), base=_Scheme)
 
 
 class Sequential(_Iterations):
@@ -123,27 +128,27 @@ class Sequential(_Iterations):
     rotation: bool = False
     """Rotate the ensemble at random after each analysis, mean and covariance kept."""
     localisation: Local | None = None
-    """Gaspari–Cohn taper over the indices of the observed field (etkf only)."""
+    """Gaspari–Cohn taper over the indices of the observed field (filters only)."""
 
     @model_validator(mode="after")
     def _belongs_together(self) -> Self:
-        iterated = self.model_fields_set.intersection(OF_IENKS)
-        if self.scheme == "etkf" and iterated:
-            raise ValueError(f"{', '.join(sorted(iterated))}: only with scheme ienks")
-        if self.scheme == "ienks" and self.localisation:
-            raise ValueError("localisation: only with scheme etkf")
+        others = self.model_fields_set & _FOREIGN[self.scheme]
+        if others:
+            takers = [name for name, keys in _KEYS.items() if keys >= others]
+            raise ValueError(f"{', '.join(sorted(others))}: only with scheme {' or '.join(takers)}")
+        if self.localisation and self.scheme not in _FILTERS:
+            raise ValueError(f"localisation: only with scheme {', '.join(_FILTERS)}")
         return self
 
     def built(self, localisation: Localisation | None) -> SequentialSettings:
         """What the loop needs."""
-        smoother = IEnKS(**{name: getattr(self, name) for name in OF_IENKS})
-        scheme = ETKF() if self.scheme == "etkf" else smoother
+        scheme = _KINDS[self.scheme](**{key: getattr(self, key) for key in _KEYS[self.scheme]})
         return SequentialSettings(scheme, Inflation(self.inflation, self.rtps), self.rotation, localisation)
 
     def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """As given, without what the scheme does not take."""
-        left_out = OF_IENKS if self.scheme == "etkf" else ("localisation",)
-        return {key: value for key, value in super().as_written(given).items() if key not in left_out}
+        written = super().as_written(given)
+        return {key: value for key, value in written.items() if key not in _FOREIGN[self.scheme]}
 
 
 class Workers(Section):

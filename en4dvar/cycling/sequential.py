@@ -1,4 +1,4 @@
-"""Sequential assimilation of a long series: the loop around ETKF and IEnKS.
+"""Sequential assimilation of a long series, cycle by cycle: filters, and smoothers on a sliding window.
 
 The ensemble stands at the start of a window of ``lag`` observation times. A cycle runs it to the newest observation,
 iterates the scheme's weights at the start, inflates, and moves the window on by one (shift 1); a filter is a window
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -20,31 +19,19 @@ from en4dvar.batch import Batch
 from en4dvar.cycling.moments import Moments, MomentsRecorder
 from en4dvar.cycling.rotation import Rotations, rotate
 from en4dvar.cycling.series import Series
+from en4dvar.descent.loop import iterate
 from en4dvar.ensemble.linalg import centre
 from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.forward import Failure, ForwardModel, Observable, Trajectory
-from en4dvar.schemes import Evaluation, FullStep, Weights
+from en4dvar.prior import member_stream
+from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights
+from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import Localisation
 from en4dvar.state import Array
 
 NO_INFLATION = Inflation()
-
-
-class SequentialScheme(Protocol):
-    """What the loop needs of a scheme; see :class:`~en4dvar.schemes.ienks.IEnKS` for the shapes."""
-
-    @property
-    def lag(self) -> int: ...
-    @property
-    def max_iterations(self) -> int: ...
-    @property
-    def tolerance(self) -> float: ...
-    def init(self, n_members: int) -> Weights: ...
-    def spread(self, weights: Weights) -> Array: ...
-    def linearise(self, weights: Weights, predictions: Array) -> tuple[Array, Array]: ...
-    def step(self, weights: Weights, evaluation: Evaluation) -> FullStep: ...
 
 
 @dataclass(frozen=True)
@@ -54,14 +41,14 @@ class SequentialSettings:
     ``rotation``: every analysis is turned by a random mean-preserving rotation (:mod:`en4dvar.cycling.rotation`).
     """
 
-    scheme: SequentialScheme
+    scheme: Scheme
     inflation: Inflation = NO_INFLATION
     rotation: bool = False
     localisation: Localisation | None = None
     min_active_fraction: float = 0.5
 
     def __post_init__(self) -> None:
-        if self.localisation is not None and (self.scheme.lag > 0 or self.scheme.max_iterations > 1):
+        if self.localisation is not None and not isinstance(self.scheme, ETKF):
             raise ValueError("localisation needs a filter that does not iterate (etkf)")
 
 
@@ -130,14 +117,14 @@ def run_sequential(
     if settings.localisation is not None and series.correlation is not None:
         raise ValueError("localisation needs observations with independent errors")
     with one_blas_thread():
-        loop = _Loop(model, tuple(observables), members, series, settings, seed, executor or SerialExecutor(), resume)
+        run = _Run(model, tuple(observables), members, series, settings, seed, executor or SerialExecutor(), resume)
         for cycle in range(resume.cycle if resume else 0, len(series.times)):
-            loop.cycle(cycle)
+            run.cycle(cycle)
             if on_cycle is not None:
                 on_cycle(cycle)
             if keep is not None:
-                keep(loop.state)
-        return loop.result()
+                keep(run.state)
+        return run.result()
 
 
 class _Started(ForwardModel):
@@ -154,18 +141,23 @@ class _Started(ForwardModel):
         return self.model.step(x, self.start + t0, self.start + t1)
 
 
-def propagate(
-    model: ForwardModel, states: Array, start: float, times: Array, executor: Executor
-) -> tuple[Array, list[str]]:
-    """Members (N, n_state) from ``start`` to later ``times`` (K,): (N, K, n_state) and no reasons, or reasons (N,)."""
+class MembersLost(Exception):
+    """Members that failed: ``reasons`` (N,), "" for the others."""
+
+    def __init__(self, reasons: list[str]):
+        self.reasons = reasons
+
+
+def propagate(model: ForwardModel, states: Array, start: float, times: Array, executor: Executor) -> Array:
+    """Members (N, n_state) from ``start`` to later ``times`` (K,): (N, K, n_state). Raises :class:`MembersLost`."""
     mover = model if model.autonomous or start == 0 else _Started(model, start)
     outcomes = executor.trajectories(mover, states, times - start)
     if isinstance(outcomes, Batch) and outcomes.whole:
-        return outcomes.states, []
-    failed = [outcome.reason if isinstance(outcome, Failure) else "" for outcome in outcomes]
-    if any(failed):
-        return np.empty(0), failed
-    return np.array([outcome.states for outcome in outcomes if isinstance(outcome, Trajectory)]), []
+        return outcomes.states
+    reasons = [outcome.reason if isinstance(outcome, Failure) else "" for outcome in outcomes]
+    if any(reasons):
+        raise MembersLost(reasons)
+    return np.array([outcome.states for outcome in outcomes if isinstance(outcome, Trajectory)])
 
 
 def predictions(observables: Sequence[Observable], trajectory: Trajectory) -> Array:
@@ -174,7 +166,7 @@ def predictions(observables: Sequence[Observable], trajectory: Trajectory) -> Ar
     return outputs[0] if len(outputs) == 1 and outputs[0].ndim == 2 else np.column_stack(outputs)
 
 
-class _Loop:
+class _Run:
     """The ensemble (N, n) at the start of the window and what has been recorded."""
 
     def __init__(
@@ -188,7 +180,7 @@ class _Loop:
         executor: Executor,
         resume: SequentialState | None,
     ):
-        self.model, self.observables, self.executor = model, observables, executor
+        self.model, self.observables, self.seed, self.executor = model, observables, seed, executor
         self.series, self.settings, self.scheme = series, settings, settings.scheme
         self.initial_members, size = members.shape
         self.rotations = Rotations(seed, self.initial_members) if settings.rotation else None
@@ -226,7 +218,7 @@ class _Loop:
         if lag == 0:
             (self.ensemble,) = self.run(self.ensemble, [newest])
             self.start = newest
-        mean, anomalies = self.window(k)
+        mean, anomalies = self.analyse(k)
         if self.rotations is not None:
             anomalies = rotate(anomalies, self.rotations.of_cycle(k, len(anomalies)))
         self.ensemble = mean + self.settings.inflation.apply(self.ensemble, anomalies)
@@ -238,42 +230,21 @@ class _Loop:
         self.ensemble, self.start = at[0], next_start
         self.cycles_done = newest
 
-    def window(self, k: int) -> tuple[Array, Array]:
+    def analyse(self, k: int) -> tuple[Array, Array]:
         """Mean and anomalies of the posterior at the start of the window; members lost are dropped from the prior."""
         while True:
-            posterior, failed = self.iterate(k)
-            if posterior is not None:
-                return posterior
-            self.drop(failed)
-            self.ensemble = self.ensemble[[not reason for reason in failed]]
-
-    def iterate(self, k: int) -> tuple[tuple[Array, Array] | None, list[str]]:
-        scheme, newest = self.scheme, k + 1
-        mean, anomalies = centre(self.ensemble)
-        weights = scheme.init(len(anomalies))
-        for iteration in range(1, scheme.max_iterations + 1):
-            spread = scheme.spread(weights)
-            if iteration == 1:  # here w = 0 and the scheme's spread is a multiple of I
-                width = float(spread[0, 0])
-                states, failed = self.forecast(self.ensemble if width == 1 else mean + width * anomalies, [newest])
-            else:
-                states, failed = self.forecast(mean + (weights.w + spread) @ anomalies, [newest])
-            if failed:
-                return None, failed
-            if iteration == 1:
-                self.before.put(k, states[-1], 1 / width)
-            self.iterations[k] = iteration
-            predicted = self.predict(states[-1], newest)
-            if not np.isfinite(predicted).all():
-                return None, ["" if row.all() else "non-finite prediction" for row in np.isfinite(predicted)]
-            evaluation = Evaluation(*self.series.whiten(k, *scheme.linearise(weights, predicted)))
-            if self.settings.localisation is not None:
-                return centre(self.settings.localisation.analysis(self.ensemble, evaluation)), []
-            step = scheme.step(weights, evaluation)
-            weights = step.weights
-            if step.norm <= scheme.tolerance:
-                break
-        return (mean + weights.w @ anomalies, weights.T @ anomalies), []
+            window = _CycleWindow(self, k)
+            descent = _Cycle(Weights.prior(len(self.ensemble)))
+            try:
+                iterate(window, self.scheme, [descent])
+            except MembersLost as lost:
+                self.drop(lost.reasons)
+                self.ensemble = self.ensemble[[not reason for reason in lost.reasons]]
+                continue
+            if window.localised is not None:
+                return centre(window.localised)
+            weights = descent.weights
+            return window.mean + weights.w @ window.anomalies, weights.T @ window.anomalies
 
     def predict(self, states: Array, index: int) -> Array:
         """Predictions (N, p): H acts at one instant, so members stand where it expects times."""
@@ -281,26 +252,24 @@ class _Loop:
             self.observables, Trajectory(np.full(len(states), self.times[index]), states, self.model.layout)
         )
 
-    def forecast(self, states: Array, indices: Sequence[int]) -> tuple[list[Array], list[str]]:
-        """Members at the start of the window → ensembles (N, n) at times of ``indices``, or reasons (N,)."""
+    def forecast(self, states: Array, indices: Sequence[int]) -> list[Array]:
+        """Members at the start of the window → ensembles (N, n) at times of ``indices``, or :class:`MembersLost`."""
         ahead = [i for i in indices if i > self.start]
         if not ahead:
-            return [states] * len(indices), []
+            return [states] * len(indices)
         self.forward_runs += len(states)
         times = np.array([self.times[i] for i in ahead])
-        paths, failed = propagate(self.model, states, self.times[self.start], times, self.executor)
-        if failed:
-            return [], failed
-        return [states] * (len(indices) - len(ahead)) + [paths[:, j] for j in range(len(ahead))], []
+        paths = propagate(self.model, states, self.times[self.start], times, self.executor)
+        return [states] * (len(indices) - len(ahead)) + [paths[:, j] for j in range(len(ahead))]
 
     def run(self, states: Array, indices: Sequence[int]) -> list[Array]:
         """As :meth:`forecast`, again with the survivors where members are lost."""
         while True:
-            ensembles, failed = self.forecast(states, indices)
-            if ensembles:
-                return ensembles
-            self.drop(failed)
-            states = states[[not reason for reason in failed]]
+            try:
+                return self.forecast(states, indices)
+            except MembersLost as lost:
+                self.drop(lost.reasons)
+                states = states[[not reason for reason in lost.reasons]]
 
     def drop(self, failed: Sequence[str]) -> None:
         self.failures += [reason for reason in failed if reason]
@@ -311,3 +280,59 @@ class _Loop:
                 f"{len(self.failures)} of {self.initial_members} members failed, at least {needed} must survive; "
                 f"the last: {self.failures[-1]}"
             )
+
+
+@dataclass
+class _Cycle:
+    """The descent of one cycle."""
+
+    weights: Weights
+    iteration: int = 0
+    step: Step | GaussNewtonStep | None = None
+    ended: bool = False
+
+
+class _CycleWindow:
+    """The window of one cycle: the members at its start, its newest observation."""
+
+    def __init__(self, run: _Run, k: int):
+        self.of, self.k = run, k
+        self.mean, self.anomalies = centre(run.ensemble)
+        self.localised: Array | None = None
+
+    def begin(self, going: Sequence[_Cycle]) -> None:
+        pass  # a cycle is short: what is kept is the ensemble between two
+
+    def run(self, scheme: Scheme, going: Sequence[_Cycle]) -> list[Runs | None]:
+        (descent,) = going
+        rows = scheme.members(descent.weights)
+        if descent.iteration == 0:  # here w = 0 and the members are those of the window, or close to their mean
+            width = float(rows[0, 0])
+            members = self.of.ensemble if width == 1 else self.mean + width * self.anomalies
+        else:
+            members = self.mean + rows @ self.anomalies
+        (states,) = self.of.forecast(members, [self.k + 1])
+        if descent.iteration == 0:
+            self.of.before.put(self.k, states, 1 / width)
+        predicted = self.of.predict(states, self.k + 1)
+        if not np.isfinite(predicted).all():
+            raise MembersLost(["" if row.all() else "non-finite prediction" for row in np.isfinite(predicted)])
+        return [Runs(predicted)]
+
+    def whiten(self, scheme: Scheme, descent: _Cycle, reference: Array, anomalies: Array) -> Evaluation:
+        evaluation = Evaluation(*self.of.series.whiten(self.k, reference, anomalies))
+        if self.of.settings.localisation is not None:
+            self.localised = self.of.settings.localisation.analysis(scheme, self.of.ensemble, evaluation, self.draw)
+        return evaluation
+
+    def draw(self, purpose: str) -> Array:
+        streams = (member_stream(self.of.seed, f"{purpose}, cycle {self.k}", i) for i in range(len(self.anomalies)))
+        return np.stack([stream.standard_normal(self.of.series.values.shape[1]) for stream in streams])
+
+    def move(self, scheme: Scheme, going: Sequence[_Cycle]) -> None:
+        (descent,) = going
+        assert descent.step is not None
+        descent.weights = descent.step.weights
+        descent.ended = scheme.done(descent.iteration, descent.step)
+        descent.iteration += 1
+        self.of.iterations[self.k] = descent.iteration

@@ -24,10 +24,11 @@ from en4dvar.cycling.sequential import (
     predictions,
     run_sequential,
 )
-from en4dvar.cycling.series import Series, root_of_correlation
+from en4dvar.cycling.series import Series
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.forward import Failure, ForwardModel, Observable
+from en4dvar.noise import Correlation
 from en4dvar.prior import Prior, member_stream
 from en4dvar.state import Array
 
@@ -51,7 +52,7 @@ class TwinExperiment:
     error_std: Mapping[str, float]
     initial_std: Mapping[str, float]
     burn_in: int = 0
-    error_correlation: Array | None = None
+    error_correlation: Correlation | None = None
     prior: Prior | None = None
     fixed: Mapping[str, float] = field(default_factory=dict)
 
@@ -151,9 +152,10 @@ def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, Series]
     noise = member_stream(seed, "observation error").standard_normal(exact.shape)
     if experiment.error_correlation is not None:
         try:
-            noise = noise @ root_of_correlation(experiment.error_correlation, len(std)).T
+            experiment.error_correlation.check_size(len(std))
         except ValueError as error:
             raise ConfigError(f"twin.error_correlation: {error}") from None
+        noise = noise @ experiment.error_correlation.root.T
     return outcome.states, Series(times, exact + std * noise, std, experiment.error_correlation)
 
 

@@ -2,7 +2,7 @@ r"""How far the posterior mean lies beyond the mode where the noise scale σ is 
 
 With u = ln σ, v = (y − m)/s and ψ = ρ' the third derivatives of J_o with respect to u and any two directions do not
 vanish on average: a fit uses up degrees of freedom, so that J prefers too small a σ. In the notation of
-:mod:`en4dvar.likelihood`, with the information M = SᵀS of the predictions and U of ln σ, their expectations under
+:mod:`en4dvar.noise`, with the information M = SᵀS of the predictions and U of ln σ, their expectations under
 exp(−ρ) are
 
     ∂²_m ∂_u J = −r_m M,   r_m = E[2ψ' + vψ''] / E[ψ/v],
@@ -15,8 +15,6 @@ lies −½ C tr(C ∇³J) beyond the mode (Tierney & Kadane 1986, J. Am. Stat. A
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
@@ -38,11 +36,11 @@ def mean_beyond_mode(problem: InverseProblem, mode: Array, posterior: Array, dfs
     covariance = anomalies.T @ anomalies[:, column] / (len(posterior) - 1)
     term, x, variance = prior.terms[column], float(mode[column]), float(covariance[column])
     first, second, third = log_derivatives(term, x)
-    ratio, scale_ratio, information = scale_skewness(problem.observations.huber)
-    of_scale = float(problem.observations.weights.sum()) * information * first**2 * variance
+    ratio = problem.observations.noise.scale_skewness()
+    of_scale = float(problem.observations.weights.sum()) * ratio.information * first**2 * variance
     slope = -(x - term.mean) / term.std**2 / first  # of J_o in u: the mode balances it against the prior
     skewness = (
-        first * (ratio * (dfs - of_scale) + scale_ratio * of_scale)
+        first * (ratio.of_predictions * (dfs - of_scale) + ratio.of_scale * of_scale)
         - 3 * second / first * of_scale
         - third * slope * variance
     )
@@ -62,24 +60,3 @@ def log_derivatives(term: PriorTerm, x: float) -> tuple[float, float, float]:
         slopes = slope, slope * (1 - 2 * share), slope * (1 - 6 * share + 6 * share**2)
     a, b, c = (slope / sigma for slope in slopes)
     return a, b - a**2, c - 3 * a * b + 2 * a**3
-
-
-def scale_skewness(huber: float | None) -> tuple[float, float, float]:
-    """(r_m, r_u, information of ln σ in one observation) of Gaussian errors, or of Huber's with threshold ``huber``.
-
-    >>> [round(value, 4) for value in scale_skewness(6.0)]
-    [2.0, 2.0, 2.0]
-    """
-    if huber is None or huber > 8:  # e^{−c²/2} is rounding there
-        return 2.0, 2.0, 2.0
-    from scipy.special import exp1
-
-    c, edge = huber, math.exp(-0.5 * huber**2)
-    inner = math.sqrt(2 * math.pi) * math.erf(c / math.sqrt(2))  # ∫ exp(−v²/2) within the threshold
-    norm = inner + 2 / c * edge
-    slope = inner / norm  # E[ψ']
-    square = (inner - 2 * c * edge) / norm  # E[v²ψ']
-    at_edge = 2 * edge / norm  # E[vψ''] = −c · at_edge, E[v³ψ''] = −c³ · at_edge: ψ' drops to 0 at ±c
-    weight = slope + 2 * c * edge * float(exp1(c * c)) * math.exp(c * c) / norm  # E[ψ/v]
-    information = 1 + square  # E[vψ] = 1
-    return (2 * slope - c * at_edge) / weight, (1 + 3 * square - c**3 * at_edge) / information, information

@@ -11,6 +11,8 @@ from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.forecast import Forecast, forecast
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.schemes import window_scheme
+from en4dvar.schemes.en4dvar import En4DVar
 from en4dvar.state import Array
 
 GRID_POINTS = 200  # of the prior predictive
@@ -79,13 +81,15 @@ def _seconds_per_run(problem: InverseProblem, members: Array, executor: Executor
 def expected_runs(space: WeightSpace) -> int:
     """Forward runs of an estimate with typical numbers of iterations and trials; without a Markov chain.
 
-    Prior and posterior forecast of N members, their mean and mode; ES-MDA: N and the mean for each assimilation and
-    the end; En4D-Var: for each iteration a tangent (of n runs, or N) and a search, ``starts`` descents side by side.
+    A scheme that runs its whole ensemble does so once for each assimilation and once at the end, with the mean. A
+    search takes prior and posterior forecast, and for each iteration a tangent (of n runs, or N) and the trials of the
+    step control, ``starts`` descents side by side.
     """
     settings, n_members = space.settings, len(space.members)
-    ends = 2 * (n_members + 1)
-    if settings.scheme == "es-mda":
-        return ends + (len(settings.mda_coefficients) + 1) * (n_members + 1)
-    tangent = 1 + (space.basis.shape[1] if space.economical else n_members)
-    starts = settings.starts if settings.start == "best-member" and space.economical else 1
-    return ends + starts * min(ITERATIONS, settings.max_iterations) * (tangent + SEARCH)
+    scheme = window_scheme(settings)
+    if not isinstance(scheme, En4DVar):
+        return (scheme.passes + 1) * (n_members + 1)
+    economical = scheme.economical(space.basis)
+    tangent = 1 + (space.basis.shape[1] if economical else n_members)
+    starts = settings.starts if settings.start == "best-member" and economical else 1
+    return 2 * (n_members + 1) + starts * min(ITERATIONS, settings.max_iterations) * (tangent + SEARCH)

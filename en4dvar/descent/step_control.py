@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.schemes import Step
+from en4dvar.schemes.base import GaussNewtonStep
 from en4dvar.state import Array
 
 SUFFICIENT = 1e-4  # Armijo's constant: the fraction of the predicted decrease that must be realised
@@ -49,7 +49,7 @@ class Point:
 
     w: Array
     cost: float
-    step: Step
+    step: GaussNewtonStep
     tangent: Tangent | None = None
 
 
@@ -98,7 +98,7 @@ def line_search(at: Point) -> Search:
     return None
 
 
-def acceleration(step: Step, tangent: Tangent, lengths: Array, predictions: Array) -> Array:
+def acceleration(step: GaussNewtonStep, tangent: Tangent, lengths: Array, predictions: Array) -> Array:
     """Second-order correction δ²w (N,) of the step from predictions (B, K) at ``lengths`` (B,) of it.
 
     With m'' the second derivative of the whitened predictions along the step, from the shortest trial that the model

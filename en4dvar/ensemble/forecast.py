@@ -11,7 +11,7 @@ from en4dvar.ensemble.members import EVERYONE, Indices, InitialStates, Reading, 
 from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.forward import RateOperator
-from en4dvar.likelihood import observation_cost
+from en4dvar.noise import Predicted
 from en4dvar.problem import InverseProblem
 from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Array, Parameter
 
@@ -23,33 +23,31 @@ SAME_INSTANT = 1e-9  # of the window: an extra time this close to an observation
 class Forecast:
     """Predictions of B members; NaN rows where a member failed.
 
-    ``predictions`` (B, K) at the observations, ``rates`` (B, K) of the observable or None where no observation has a
-    timing error, ``path`` (B, M) at the extra times, ``failures`` (B,) reasons, "" for members alive, ``noise_scale``
-    (B,) σ of each member or None where it is neither estimated nor fixed, ``extremes`` (B, V) what the members reached
-    of the model's V limits of validity (empty without extra times).
+    ``predicted`` (B, …) at the observations: predictions (B, K), their rates where an observation has a timing error,
+    the noise scale where there is one; ``path`` (B, M) at the extra times, ``failures`` (B,) reasons, "" for members
+    alive, ``extremes`` (B, V) what the members reached of the model's V limits of validity (empty without extra times).
     """
 
-    predictions: Array
-    rates: Array | None
+    predicted: Predicted
     path: Array
     failures: tuple[str, ...]
-    noise_scale: Array | None = None
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def predictions(self) -> Array:
+        """(B, K) at the observations."""
+        return self.predicted.values
 
     @property
     def active(self) -> Array:
         """(B,) bool."""
         return np.array([not reason for reason in self.failures])
 
+    def __len__(self) -> int:
+        return len(self.failures)
+
     def __getitem__(self, members: slice) -> Forecast:
-        return Forecast(
-            self.predictions[members],
-            None if self.rates is None else self.rates[members],
-            self.path[members],
-            self.failures[members],
-            None if self.noise_scale is None else self.noise_scale[members],
-            self.extremes[members],
-        )
+        return Forecast(self.predicted[members], self.path[members], self.failures[members], self.extremes[members])
 
 
 class Composite:
@@ -92,14 +90,12 @@ class Composite:
             observed[:, alive], extremes[alive] = read
             for i, reason in zip(np.arange(len(x))[alive], reasons, strict=True):
                 failures[i] = reason
-        return Forecast(
+        predicted = Predicted(
             observed[0][:, at_observations],
             observed[1][:, at_observations] if len(observed) > 1 else None,
-            observed[0][:, at_extra],
-            tuple(failures),
             _of_framework(problem, physical, NOISE_SCALE, 1.0) if self._scaled else None,
-            extremes,
         )
+        return Forecast(predicted, observed[0][:, at_extra], tuple(failures), extremes)
 
 
 def forecast(
@@ -115,7 +111,7 @@ def cost(problem: InverseProblem, x: Array, executor: Executor | None = None) ->
     J = ½ Σ_j ((x_j − mean_j)/std_j)² + Σ_k β_k [½ (y_k − m_k)²/s_k² + ln(s_k/std_k)].
     """
     run = forecast(problem, x, executor)
-    observation = observation_cost(problem.observations, run.predictions, run.rates, run.noise_scale)
+    observation = problem.observations.cost(run.predicted)
     with np.errstate(over="ignore"):
         z = (x - problem.prior.mean) / problem.prior.std
         return np.where(run.active, 0.5 * np.sum(z * z, axis=-1) + observation, np.inf)
@@ -159,7 +155,7 @@ def _reading(problem: InverseProblem, limits: bool) -> Reading:
     operator = problem.observable.operator
     largest = tuple(limit.name for limit in problem.model.validity) if limits else ()
     batched = getattr(operator, "batched", False)
-    if not problem.observations.timed:
+    if not problem.observations.noise.timed:
         return Reading((operator,), largest, batched)
     if not isinstance(operator, RateOperator):
         raise ConfigError(

@@ -18,6 +18,7 @@ from en4dvar.config.document import parse_document
 from en4dvar.config.load import resolve
 from en4dvar.errors import OutputError
 from en4dvar.executor import choose_executor, one_blas_thread
+from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.report.result import Result, load_result
 from en4dvar.storage.campaign_file import failed_datasets
@@ -114,8 +115,12 @@ def recorded_observations(result: Result) -> Observations:
     return Observations(
         times=data["time"].values,
         values=data[name].values,
-        std=data[f"{name}_reading_std"].values,
-        time_std=data["time_std"].values,
+        noise=noise_of(
+            data[f"{name}_reading_std"].values,
+            data["time_std"].values,
+            data[correlation].values if correlation in data else None,
+            float(data.attrs[_HUBER]) if _HUBER in data.attrs else None,
+        ),
         weights=data["weights"].values,
         name=result.name,
         source=str(data.attrs["data_source"]),
@@ -124,8 +129,6 @@ def recorded_observations(result: Result) -> Observations:
             for key, value in data.attrs.items()
             if str(key).startswith(_SCALAR)
         },
-        correlation=data[correlation].values if correlation in data else None,
-        huber=float(data.attrs[_HUBER]) if _HUBER in data.attrs else None,
     )
 
 

@@ -14,14 +14,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from en4dvar.diagnostics import effective_share
 from en4dvar.ensemble.forecast import Forecast
-from en4dvar.likelihood import observation_cost
+from en4dvar.noise import Linearisation, Predicted
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior
 from en4dvar.sampling.walkers import advance
@@ -171,8 +170,8 @@ def emulate(
     found = _run(run, prior, observations, coordinates.back(random.standard_normal((count, n))))
     if found is None or len(found[0].x) < 0.75 * count:
         return None
-    runs, columns = found
-    emulator = _fit(prior, observations, coordinates, runs, columns)
+    runs, make = found
+    emulator = _fit(prior, observations, coordinates, runs, make)
     kept, share = runs.x, math.nan
     walkers = kept[random.permutation(len(kept))[:WALKERS]]
     for _ in range(fits - 1):
@@ -184,26 +183,20 @@ def emulate(
         new = found[0]
         share = effective_share(emulator.cost(new.x) - new.costs) * len(new.x) / count  # of the fit without them
         runs = runs.joined(new)
-        emulator = _fit(prior, observations, coordinates, runs, columns)
+        emulator = _fit(prior, observations, coordinates, runs, make)
     settled = emulator.walk(walkers, kept, random, SETTLED)
     ceiling = float(np.min(runs.costs - _prior_cost(prior, runs.x))) + CEILING
     return replace(emulator, ceiling=ceiling, share=share, draws=np.concatenate(settled[SETTLED // 3 :]))
 
 
-def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> tuple[_Runs, tuple[bool, bool]] | None:
-    """Run control vectors (B, n); the survivors, and whether there are rates and noise scales. None: no survivor."""
+def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> tuple[_Runs, Predicted] | None:
+    """Run control vectors (B, n); the survivors, and of what make their outputs are. None: no survivor."""
     found = run(x)
     if not found.active.any():
         return None
-    parts = [found.predictions]
-    if found.rates is not None:
-        parts.append(found.rates)
-    if found.noise_scale is not None:
-        parts.append(np.log(found.noise_scale)[:, None])
-    costs = _prior_cost(prior, x) + observation_cost(observations, found.predictions, found.rates, found.noise_scale)
+    costs = _prior_cost(prior, x) + observations.cost(found.predicted)
     alive = found.active & np.isfinite(costs)
-    columns = (found.rates is not None, found.noise_scale is not None)
-    return _Runs(x[alive], np.hstack(parts)[alive], costs[alive]), columns
+    return _Runs(x[alive], found.predicted.stacked[alive], costs[alive]), found.predicted[:0]
 
 
 def _prior_cost(prior: Prior, x: Array) -> Array:
@@ -211,9 +204,7 @@ def _prior_cost(prior: Prior, x: Array) -> Array:
     return np.asarray(0.5 * (z * z).sum(axis=1))
 
 
-def _fit(
-    prior: Prior, observations: Observations, coordinates: _Coordinates, runs: _Runs, columns: tuple[bool, bool]
-) -> Emulator:
+def _fit(prior: Prior, observations: Observations, coordinates: _Coordinates, runs: _Runs, make: Predicted) -> Emulator:
     """Weighted least squares; a run whose J exceeds the lowest by the width of a posterior, 2n, counts half."""
     n = len(coordinates.centre)
     excess = (runs.costs - runs.costs.min()) / (2 * n)
@@ -225,26 +216,18 @@ def _fit(
     right = (design / scale).T @ (runs.outputs * root_weight[:, None])
     coefficients = (np.linalg.solve(normal, right) / scale[:, None]).T
     of_prior = np.column_stack([coordinates.centre - prior.mean, coordinates.root]) / prior.std[:, None]
-    if any(columns) or observations.huber is not None:
-        observed = partial(_cost_of_outputs, observations, columns)
+    if make.rates is not None or make.noise_scale is not None or math.isfinite(observations.noise.counts_within):
+
+        def observed(outputs: Array) -> Array:
+            return observations.cost(make.unstacked(outputs.T))
+
         return Emulator(coordinates, coefficients, of_prior, observed)
     # R is constant and J_o quadratic: the polynomials can be those of whitened residuals, of which C tell as much as K
-    residuals = -coefficients
-    residuals[:, 0] += observations.values
-    residuals *= (np.sqrt(observations.weights) / observations.std)[:, None]
-    if observations.correlation is not None:
-        residuals = observations.whitening @ residuals  # the weights of correlated errors are all the same
+    d, s = observations.whiten(Linearisation(Predicted(coefficients[:, 0]), coefficients[:, 1:].T))
+    residuals = np.column_stack([d, -s])
     if len(residuals) > residuals.shape[1]:
-        residuals = np.linalg.qr(residuals, mode="r")
+        residuals = np.asarray(np.linalg.qr(residuals, mode="r"))
     return Emulator(coordinates, residuals, of_prior, _half_square)
-
-
-def _cost_of_outputs(observations: Observations, columns: tuple[bool, bool], outputs: Array) -> Array:
-    """J_o (B,) of predictions, rates and ln σ on top of each other (Ky, B)."""
-    k = len(observations.times)
-    has_rates, has_scale = columns
-    rates = outputs[k : 2 * k].T if has_rates else None
-    return observation_cost(observations, outputs[:k].T, rates, np.exp(outputs[-1]) if has_scale else None)
 
 
 def _half_square(residuals: Array) -> Array:

@@ -9,13 +9,14 @@ Sources: Sakov, Oliver & Bertino (2012), Mon. Wea. Rev. 140, 1988; Bocquet & Sak
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from en4dvar.ensemble.linalg import min_norm_fit
-from en4dvar.schemes import Evaluation, Step, Weights, gauss_newton
+from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton
 from en4dvar.state import Array
 
 
@@ -23,24 +24,32 @@ from en4dvar.state import Array
 class En4DVar:
     """The scheme; ``linearisation`` says where its members are run.
 
-    ``bundle``: at w + ε e_i, finite differences about the central prediction (a tangent linearisation).
+    ``bundle``: ε away from w, for finite differences about the central prediction (a tangent linearisation). It needs
+    no more runs than the anomalies have directions: where r = rank X0 < N − 1, members at w + ε' u_j, u_j the columns
+    of the basis, give the same as N members at w + ε e_i, up to O(ε).
     ``transform``: at the rows of 1wᵀ + T, regression about the ensemble mean at posterior spread.
     """
 
     linearisation: Literal["bundle", "transform"] = "bundle"
     epsilon: float = 1e-3
 
-    def init(self, n_members: int) -> Weights:
-        """w = 0, T = I."""
-        return Weights.prior(n_members)
+    passes: ClassVar[int] = 1
+    searches: ClassVar[bool] = True
+    lag: ClassVar[int] = 0
 
-    def member_weights(self, weights: Weights) -> Array:
-        """Rows of 1wᵀ + εI (bundle) or 1wᵀ + T (transform), (N, N)."""
-        return np.asarray(weights.w + self._spread(weights))
+    def economical(self, basis: Array) -> bool:
+        """Whether a tangent takes fewer runs than members."""
+        n_members, rank = basis.shape
+        return self.linearisation == "bundle" and 0 < rank < n_members - 1
 
-    def linearise(
-        self, weights: Weights, basis: Array, predictions: Array, central: Array, active: Array
-    ) -> tuple[Array, Array]:
+    def members(self, weights: Weights, basis: Array | None = None) -> Array:
+        """Rows (r, N) along the directions of the basis where these are few, else those of 1wᵀ + εI or 1wᵀ + T."""
+        if basis is not None and self.economical(basis):
+            return np.asarray(weights.w + self._short(basis) * basis.T)
+        spread = weights.T if self.linearisation == "transform" else self.epsilon * np.eye(len(weights.w))
+        return np.asarray(weights.w + spread)
+
+    def linearise(self, weights: Weights, runs: Runs) -> tuple[Array, Array]:
         """Reference prediction (Ky,) and anomalies Y = T⁻¹(P − p̄) or (P − p_c)/ε, projected on the prior anomalies.
 
         Y = U C, returned as C (r, Ky), the minimum-norm regression of the survivors' predictions on their coordinates.
@@ -48,17 +57,27 @@ class En4DVar:
         nonlinearity along directions that do not move the state. With members lost, their rows follow from the
         survivors, exactly if F and H are linear and the survivors span the control space.
         """
-        coordinates = (self._spread(weights) @ basis)[active]
-        survivors = predictions[active]
+        basis, central, active = runs.basis, runs.central, runs.active
+        if basis is None or central is None or active is None:
+            raise ValueError("en4dvar needs the central run and the basis of one window; on a series use ienks")
+        if len(runs.predictions) < len(weights.w):
+            return central, (runs.predictions - central) / self._short(basis)
+        coordinates = ((self.members(weights) - weights.w) @ basis)[active]
+        survivors = runs.predictions[active]
         if self.linearisation == "bundle":
             return central, min_norm_fit(coordinates, survivors - central)
         design = np.column_stack([np.ones(len(coordinates)), coordinates])
         fit = min_norm_fit(design, survivors - central)
         return central + fit[0], fit[1:]
 
-    def step(self, weights: Weights, evaluation: Evaluation) -> Step:
+    def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> GaussNewtonStep:
         """Gauss–Newton direction and symmetric transform."""
-        return gauss_newton(weights, evaluation)
+        return gauss_newton(weights.w, evaluation)
 
-    def _spread(self, weights: Weights) -> Array:
-        return weights.T if self.linearisation == "transform" else self.epsilon * np.eye(len(weights.w))
+    def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
+        """Not asked: J tells (:mod:`en4dvar.descent.loop`)."""
+        return False
+
+    def _short(self, basis: Array) -> float:
+        """Step along a unit direction of the weights that moves the state by ε prior standard deviations."""
+        return self.epsilon / math.sqrt(len(basis) - 1)

@@ -21,50 +21,50 @@ from typing import Literal
 import numpy as np
 
 from en4dvar.ensemble.linalg import Hessian
-from en4dvar.schemes import Evaluation, Weights
+from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights
+from en4dvar.schemes.etkf import ETKF
 from en4dvar.state import Array
-
-Form = Literal["perturbed", "square-root"]
 
 
 @dataclass(frozen=True)
-class ESMDA:
-    """``coefficients``: α_a relative to each other; :attr:`inflations` are scaled so that Σ 1/α_a = 1.
+class ESMDA(ETKF):
+    """``mda_coefficients``: α_a relative to each other; :attr:`inflations` are scaled so that Σ 1/α_a = 1.
 
     >>> ESMDA((9.333, 7.0, 4.0, 2.0)).inflations.round(2).tolist()
     [9.33, 7.0, 4.0, 2.0]
     """
 
-    coefficients: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
-    form: Form = "perturbed"
+    mda_coefficients: tuple[float, ...] = (4.0, 4.0, 4.0, 4.0)
+    mda_form: Literal["perturbed", "square-root"] = "perturbed"
 
     def __post_init__(self) -> None:
-        if not self.coefficients or not all(alpha > 0 for alpha in self.coefficients):
-            raise ValueError(f"MDA coefficients must be positive, not {self.coefficients}")
+        if not self.mda_coefficients or not all(alpha > 0 for alpha in self.mda_coefficients):
+            raise ValueError(f"MDA coefficients must be positive, not {self.mda_coefficients}")
+
+    @property
+    def passes(self) -> int:  # type: ignore[override]
+        """One an inflation."""
+        return len(self.mda_coefficients)
 
     @property
     def inflations(self) -> Array:
         """α_a, one an assimilation."""
-        alpha = np.array(self.coefficients)
+        alpha = np.array(self.mda_coefficients)
         return np.asarray(alpha * np.sum(1 / alpha))
 
-    def update(self, weights: Weights, evaluation: Evaluation, alpha: float, perturbations: Array) -> Weights:
-        """One assimilation.
-
-        Parameters
-        ----------
-        weights: of the current ensemble. evaluation: d (K',) of its mean prediction and S (K', N) of its predictions,
-            members as they are: per unit of the *current* anomalies.
-        alpha: of this assimilation. perturbations: z (N, K'), standard normal; not read by ``square-root``.
-        """
+    def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
+        """Assimilation number ``iteration``; d is that of the mean prediction, S per unit of the current anomalies."""
+        alpha = float(self.inflations[iteration])
         root = np.sqrt(alpha)
         d, S = evaluation.d / root, evaluation.S / root
         hessian = Hessian.of(S)
-        centre = weights.w + hessian.solve(d @ S) @ weights.T
-        if self.form == "square-root":
-            return Weights(centre, hessian.transform @ weights.T)
+        shift = hessian.solve(d @ S)
+        w, norm = weights.w + shift @ weights.T, hessian.norm(shift)
+        if self.mda_form == "square-root":
+            return Step(Weights(w, hessian.transform @ weights.T), norm)
+        perturbations = draw(f"ES-MDA {iteration}")
         # anomalies of the members' innovations: −S_i of the predictions and the perturbations
         innovations = perturbations - perturbations.mean(axis=0) - S.T
         if len(S) < S.shape[1]:  # the cheaper order of the same product
-            return Weights(centre, weights.T + innovations @ (hessian.solve(S) @ weights.T))
-        return Weights(centre, weights.T + hessian.solve(innovations @ S) @ weights.T)
+            return Step(Weights(w, weights.T + innovations @ (hessian.solve(S) @ weights.T)), norm)
+        return Step(Weights(w, weights.T + hessian.solve(innovations @ S) @ weights.T), norm)

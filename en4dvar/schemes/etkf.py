@@ -14,30 +14,30 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from en4dvar.ensemble.linalg import centre
-from en4dvar.schemes import Evaluation, FullStep, Weights, full_step
+from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton
 from en4dvar.state import Array
 
 
 @dataclass(frozen=True)
 class ETKF:
-    """The filter: a window without length, analysed once."""
+    """The filter: a window without length, analysed once. Filters with another analysis say so in :meth:`advance`."""
 
+    searches: ClassVar[bool] = False
+    passes: ClassVar[int] = 1
     lag: ClassVar[int] = 0
-    max_iterations: ClassVar[int] = 1
-    tolerance: ClassVar[float] = 0.0
 
-    def init(self, n_members: int) -> Weights:
-        """w = 0, T = I."""
-        return Weights.prior(n_members)
-
-    def spread(self, weights: Weights) -> Array:
+    def members(self, weights: Weights, basis: Array | None = None) -> Array:
         """I (N, N): the members are the forecast."""
-        return weights.T
+        return weights.rows
 
-    def linearise(self, weights: Weights, predictions: Array) -> tuple[Array, Array]:
-        """Mean (K',) and anomalies (N, K') of the members' predictions (N, K')."""
-        return centre(predictions)
+    def linearise(self, weights: Weights, runs: Runs) -> tuple[Array, Array]:
+        """Mean (K',) and anomalies (N, K') of the members' predictions."""
+        return centre(runs.predictions)
 
-    def step(self, weights: Weights, evaluation: Evaluation) -> FullStep:
+    def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         """Weights of the analysis, with the symmetric transform."""
-        return full_step(weights, evaluation)
+        return gauss_newton(weights.w, evaluation)
+
+    def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
+        """After the last pass."""
+        return iteration + 1 == self.passes

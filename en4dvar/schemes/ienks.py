@@ -14,13 +14,13 @@ Meteorol. Soc. 140, 1521.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from en4dvar.ensemble.linalg import centre
-from en4dvar.schemes import Evaluation, FullStep, Weights, full_step
+from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton
 from en4dvar.state import Array
 
 
@@ -44,23 +44,29 @@ class IEnKS:
         float, Gt(0), "Iterations end where the step is shorter than this, in posterior standard deviations."
     ] = 0.05
 
-    def init(self, n_members: int) -> Weights:
-        """w = 0, T = I."""
-        return Weights.prior(n_members)
+    passes: ClassVar[int] = 1
+    searches: ClassVar[bool] = False
 
-    def spread(self, weights: Weights) -> Array:
-        """T or εI (N, N): members of the iteration stand at the rows of 1wᵀ + spread."""
-        return weights.T if self.linearisation == "transform" else self.epsilon * np.eye(len(weights.w))
+    def members(self, weights: Weights, basis: Array | None = None) -> Array:
+        """Rows (N, N) of 1wᵀ + T or 1wᵀ + εI."""
+        spread = weights.T if self.linearisation == "transform" else self.epsilon * np.eye(len(weights.w))
+        return np.asarray(weights.w + spread)
 
-    def linearise(self, weights: Weights, predictions: Array) -> tuple[Array, Array]:
-        """Reference prediction p̄ (K',) and anomalies per unit weight Y (N, K') from predictions (N, K')."""
-        mean, anomalies = centre(predictions)
+    def linearise(self, weights: Weights, runs: Runs) -> tuple[Array, Array]:
+        """Mean prediction p̄ (K',) and anomalies per unit weight Y (N, K')."""
+        mean, anomalies = centre(runs.predictions)
         if self.linearisation == "bundle":
             return mean, anomalies / self.epsilon
         if weights.inverse is None:
             return mean, np.asarray(np.linalg.solve(weights.T, anomalies))
         return mean, np.asarray(weights.inverse @ anomalies)
 
-    def step(self, weights: Weights, evaluation: Evaluation) -> FullStep:
+    def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step:
         """Weights after a Gauss–Newton step, with the symmetric transform."""
-        return full_step(weights, evaluation, inverse=self.linearisation == "transform")
+        step = gauss_newton(weights.w, evaluation)
+        inverse = step.hessian.inverse_transform if self.linearisation == "transform" else None
+        return Step(Weights(step.w + step.direction, step.transform, inverse), step.norm)
+
+    def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
+        """After the step below the tolerance, or the last one allowed."""
+        return step.norm <= self.tolerance or iteration + 1 == self.max_iterations

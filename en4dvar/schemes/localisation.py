@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.ensemble.linalg import apply_weights
-from en4dvar.schemes import Evaluation, Weights, gauss_newton
+from en4dvar.schemes.base import Draw, Evaluation, Scheme, Weights
 from en4dvar.state import Array
 
 
@@ -72,17 +72,16 @@ class Localisation:
         squares = sum(distances(x, x, length) ** 2 for x, length in zip(cells, lengths, strict=True))
         return cls([where[i : i + 1] for i in range(len(where))], gaspari_cohn(np.sqrt(squares), radius))
 
-    def analysis(self, ensemble: Array, evaluation: Evaluation) -> Array:
-        """Local analysis (N, n) of members (N, n); one symmetric transform a block."""
+    def analysis(self, scheme: Scheme, ensemble: Array, evaluation: Evaluation, draw: Draw) -> Array:
+        """Local analysis (N, n) of members (N, n) by a filter's scheme, block by block."""
         analysed = ensemble.copy()
-        n_members = len(ensemble)
-        prior = Weights.prior(n_members)
+        prior = Weights.prior(len(ensemble))
         for block, taper in zip(self.blocks, self.taper, strict=True):
             near = taper > 0
             if not near.any():
                 continue
             root = np.sqrt(taper[near])
             local = Evaluation(root * evaluation.d[near], root[:, None] * evaluation.S[near])
-            step = gauss_newton(prior, local)
-            analysed[:, block] = apply_weights(ensemble[:, block], step.direction + step.transform)
+            rows = scheme.advance(prior, local, 0, draw).weights.rows
+            analysed[:, block] = apply_weights(ensemble[:, block], rows)
         return analysed

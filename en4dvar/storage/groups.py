@@ -138,12 +138,10 @@ def _predictive(a: Analysis, predictions: Array, paths: Array) -> Group:
 def _observed(a: Analysis) -> Group:
     name, obs = a.observable.name, a.observations
     scalars = {f"scalar_{key}": value for key, value in obs.scalars.items()}
-    if obs.huber is not None:
-        scalars["huber_threshold"] = obs.huber
+    scalars |= obs.noise.attributes()
     further = {}
-    if obs.correlation is not None:
-        text = "correlation of the observation errors"
-        further[f"{name}_correlation"] = _variable(("time", "time_column"), obs.correlation, "1", text)
+    for key, (matrix, text) in obs.noise.matrices().items():
+        further[f"{name}_{key}"] = _variable(("time", "time_column"), matrix, "1", text)
     if a.huber_weight is not None:
         text = "weight of the observation in the robust cost at its minimum"
         further[f"{name}_huber_weight"] = _variable("time", a.huber_weight, "1", text)
@@ -152,7 +150,7 @@ def _observed(a: Analysis) -> Group:
             name: _observable(a, ("time",), obs.values, "observed"),
             f"{name}_std": _observable(a, ("time",), a.error_std, "observation-error std, timing error included"),
             f"{name}_reading_std": _observable(a, ("time",), obs.std, "observation-error std of the reading alone"),
-            "time_std": _time(a, "time", obs.time_std, "std of the observation times"),
+            "time_std": _time(a, "time", obs.noise.time_std, "std of the observation times"),
             "weights": _variable("time", obs.weights, "1", "weight of the observation in the cost"),
             **further,
         },

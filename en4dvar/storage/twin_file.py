@@ -61,7 +61,11 @@ def dataset(result: TwinResult, attributes: Mapping[str, Any]) -> xr.Dataset:
             }
     if result.series.correlation is not None:
         text = {"long_name": "correlation of the observation errors", "units": "1"}
-        variables["observation_correlation"] = (("observation", "observation_column"), result.series.correlation, text)
+        variables["observation_correlation"] = (
+            ("observation", "observation_column"),
+            result.series.correlation.matrix,
+            text,
+        )
     coordinates = {
         "time": ("time", result.series.times, {"units": model.time_unit, "long_name": "observation time"}),
         "state": ("state", names, {"long_name": "variable of the state"}),

@@ -14,9 +14,9 @@ ROOT = Path(__file__).resolve().parents[2]
 LAYERS = (
     ("errors",),
     ("state", "hints", "files", "tables"),
-    ("units", "prior", "forward", "observations"),
-    ("batch", "likelihood", "problem"),
-    ("diagnostics",),
+    ("units", "prior", "forward", "noise"),
+    ("batch", "observations"),
+    ("problem", "diagnostics"),
     ("executor",),
     ("ensemble",),
     ("honesty",),

@@ -19,7 +19,7 @@ import pytest
 
 from en4dvar import report
 from en4dvar.honesty import caution
-from en4dvar.report import overlay, write_report
+from en4dvar.report import overlay, write_pages
 from en4dvar.report.compare import compare_runs
 from en4dvar.report.figures import all_figures
 from en4dvar.report.result import Result
@@ -103,7 +103,7 @@ def _write_pages(analysis: Any, folder: Path) -> dict[str, Path]:
         run = folder / name
         run.mkdir()
         save(Result.from_analysis(one, provenance("name: test\n")), run / "posterior.nc")
-    found["single"] = write_report(folder / "single")
+    found["single"] = write_pages(folder / "single")
     comparison = compare_runs([folder / "single", folder / "calm"])
     found["compare"] = overlay.write_comparison(comparison, folder / "compare")
     campaign = folder / "campaign"
@@ -113,6 +113,6 @@ def _write_pages(analysis: Any, folder: Path) -> dict[str, Path]:
         save(Result.from_analysis(one, provenance("name: test\n")), campaign / "datasets" / f"{stem}.nc")
     with pytest.MonkeyPatch.context() as patch:  # two figures on each page tell as much as five
         patch.setattr(report, "all_figures", lambda result: islice(all_figures(result), 2))
-        found["campaign"] = write_report(campaign)
+        found["campaign"] = write_pages(campaign)
     found["set"] = campaign / "pages" / "c.html"
     return found

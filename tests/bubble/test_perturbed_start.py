@@ -7,6 +7,7 @@ import pytest
 
 from en4dvar.assimilate import assimilate, forecast
 from en4dvar.config.initial_state import perturbation
+from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
@@ -26,7 +27,7 @@ def laser(values=None):
     G = next(p for p in model.parameters if p.name == "G")
     prior = Prior((PriorTerm.lognormal(G, 3000.0, 0.4), *(term for term, _ in pairs)))
     ones = np.ones(len(TIMES))
-    observations = Observations(TIMES, ones if values is None else values, STD * ones, 0 * ones, ones)
+    observations = Observations(TIMES, ones if values is None else values, noise_of(STD * ones), ones)
     observable = next(o for o in model.observables if o.name == "radius")
     return InverseProblem(model, observable, observations, prior, FIXED, tuple(p for _, p in pairs))
 

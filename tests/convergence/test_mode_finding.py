@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toys import Decay, Toy, Wave, make_problem
+from toys import Decay, Toy, Wave, make_problem, visit
 
 from en4dvar.analysis import IterationRecord
 from en4dvar.assimilate import assimilate
@@ -14,16 +14,22 @@ from en4dvar.ensemble.linalg import Hessian
 from en4dvar.executor import SerialExecutor
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import AssimilationSettings
-from en4dvar.schemes import Step, Weights
+from en4dvar.schemes import window_scheme
+from en4dvar.schemes.base import GaussNewtonStep
 from en4dvar.state import Parameter
 
 
 def where_one_of_the_few_fails(space, at):
     """The same place, had the model said that the first of the few runs failed."""
     run = space.composite
-    lost = replace(at.whole, failures=("lost", *at.whole.failures[1:]))
-    space.composite = lambda x, times: lost if len(x) == len(lost.failures) else run(x, times)
-    (again,) = space.linearise([at.weights])
+    few = len(at.at.members) + 1
+
+    def first_lost(x, times):
+        found = run(x, times)
+        return replace(found, failures=("lost", *found.failures[1:])) if len(x) == few else found
+
+    space.composite = first_lost
+    again = visit(space, at.weights.w)
     space.composite = run
     return again
 
@@ -35,12 +41,13 @@ def test_tangent_of_few_runs_is_the_bundle_of_all_members(time_std):
     for members in (12, 4):  # at N = n + 2 the whole bundle is as cheap, and is run
         for epsilon in (1e-3, 1e-4):
             space = WeightSpace(problem, AssimilationSettings(members=members, epsilon=epsilon), 1, SerialExecutor())
-            assert space.economical
+            scheme = window_scheme(space.settings)
+            assert scheme.economical(space.basis)
             w = space.basis @ np.array([0.1, -0.2])
-            at, whole = (space.linearise([Weights(w, np.eye(members))])[0] for _ in range(2))
-            rows = space.scheme.member_weights(at.weights)
+            at, whole = (visit(space, w) for _ in range(2))
+            rows = scheme.members(at.weights)
             full = where_one_of_the_few_fails(space, at)
-            assert len(full.members.failures) == len(rows) == members
+            assert len(full.at.members.failures) == len(rows) == members
             steps.append(np.linalg.norm(at.step.direction - full.step.direction) / np.linalg.norm(full.step.direction))
             assert np.array_equal(at.step.direction, whole.step.direction)
     assert max(steps[::2]) < 5e-3
@@ -50,7 +57,8 @@ def test_tangent_of_few_runs_is_the_bundle_of_all_members(time_std):
 def test_no_economy_where_the_members_span_no_more_than_their_number():
     problem = make_problem(Decay(), [1.5, 1.2])
     for settings in (AssimilationSettings(members=3), AssimilationSettings(members=12, linearisation="transform")):
-        assert not WeightSpace(problem, settings, 1, SerialExecutor()).economical
+        basis = WeightSpace(problem, settings, 1, SerialExecutor()).basis
+        assert not window_scheme(settings).economical(basis)
 
 
 class Bend(Toy):
@@ -84,7 +92,7 @@ def test_acceleration_is_exact_for_a_parabola():
     scale = rng.uniform(0.5, 2, 6)
     hessian = Hessian.of((y * scale).T)
     gradient = rng.standard_normal(4)
-    step = Step(gradient, hessian, -hessian.solve(gradient))
+    step = GaussNewtonStep(np.zeros(4), gradient, hessian, -hessian.solve(gradient))
     lengths = np.array([1.0, 0.5, 0.25, 0.125])
     predictions = lengths[:, None] * (step.direction @ y) + 0.5 * lengths[:, None] ** 2 * q
     predictions[-1] = np.nan  # the shortest cannot be run: the next one serves
@@ -107,7 +115,7 @@ def test_searches_side_by_side_find_what_each_finds_alone():
     for _ in range(5):
         w, s = rng.standard_normal(3), rng.standard_normal((3, 3))
         hessian, gradient = Hessian.of(s), 4 * (w - 1) ** 3
-        step = Step(gradient, hessian, -20 * hessian.solve(gradient))
+        step = GaussNewtonStep(w, gradient, hessian, -20 * hessian.solve(gradient))
         tangent = Tangent(np.sin(w), np.eye(3), lambda vector: vector, np.eye(3))
         points.append(Point(w, float(try_out(w[None]).costs[0]), step, tangent))
     together = run_searches([line_search(p) for p in points], try_out)

@@ -6,17 +6,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
-from toys import Decay, Linear, Wave, make_observations, make_problem
+from toys import Decay, Linear, Wave, make_observations, make_problem, visit, with_noise
 
 from en4dvar.assimilate import assimilate, forecast, log_posterior
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.linalg import centre
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.executor import SerialExecutor
-from en4dvar.likelihood import Linearisation, log_likelihood, log_normalisation, observation_cost, whiten
+from en4dvar.noise import Linearisation, Predicted
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings
-from en4dvar.schemes import Weights
 from en4dvar.state import NOISE_SCALE
 
 NAMES = ("a", "b", "c")
@@ -34,7 +33,7 @@ def block(k):
 
 
 def with_errors(problem, *, correlation=None, huber=None, values=None, sigma=None):
-    observations = replace(problem.observations, correlation=correlation, huber=huber)
+    observations = with_noise(problem.observations, correlation=correlation, huber=huber)
     if values is not None:
         observations = replace(observations, values=values)
     prior = problem.prior
@@ -96,9 +95,9 @@ def test_log_likelihood_and_cost_differ_by_a_constant(huber, correlated):
     x = problem.prior.sample(8, 1)
     run = forecast(problem, x)
     y = problem.observations
-    total = log_likelihood(y, run.predictions, run.rates, run.noise_scale).sum(axis=1)
+    total = y.log_likelihood(run.predicted).sum(axis=1)
     total += problem.prior.log_density(x) - problem.prior.log_density(problem.prior.mean)
-    assert total == pytest.approx(log_posterior(problem, x) - log_normalisation(y), abs=1e-8)
+    assert total == pytest.approx(log_posterior(problem, x) - y.log_normalisation(), abs=1e-8)
 
 
 @pytest.mark.parametrize("time_std", [0.0, 0.1])
@@ -109,14 +108,14 @@ def test_log_likelihood_sums_to_the_joint_density(time_std, sigma):
     x = problem.prior.sample(5, 1)
     run = forecast(problem, x)
     y = problem.observations
-    terms = log_likelihood(y, run.predictions, run.rates, run.noise_scale)
+    terms = y.log_likelihood(run.predicted)
     for i in range(5):
-        s = np.full(K, 0.1) if run.rates is None else np.hypot(0.1, run.rates[i] * time_std)
+        s = np.full(K, 0.1) if run.predicted.rates is None else np.hypot(0.1, run.predicted.rates[i] * time_std)
         s = s * (1.0 if sigma is None else np.exp(x[i, -1]))
         joint = multivariate_normal(run.predictions[i], np.outer(s, s) * correlation).logpdf(y.values)
         assert terms[i].sum() == pytest.approx(joint, abs=1e-9)
-    costs = observation_cost(y, run.predictions, run.rates, run.noise_scale)
-    assert terms.sum(axis=1) == pytest.approx(-costs - log_normalisation(y), abs=1e-9)
+    costs = y.cost(run.predicted)
+    assert terms.sum(axis=1) == pytest.approx(-costs - y.log_normalisation(), abs=1e-9)
 
 
 CASES = {
@@ -138,8 +137,7 @@ def test_gradient_against_finite_differences(case, time_std, weight, members):
     space = WeightSpace(problem, settings, 3, SerialExecutor())
     n = len(space.members)
     w = space.basis @ np.linspace(0.1, -0.2, space.basis.shape[1])
-    (at,) = space.linearise([Weights(w, np.eye(n))])
-    assert at.step is not None
+    at = visit(space, w)
     h = 1e-5
     moved = np.concatenate([w + h * np.eye(n), w - h * np.eye(n)])
     costs = space.try_out(moved).costs
@@ -151,17 +149,17 @@ def test_gradient_against_finite_differences(case, time_std, weight, members):
 def test_fisher_information_with_correlation_and_scale():
     """SᵀS against the covariance of the score over data drawn from the model (Monte Carlo)."""
     c = exponential(np.array([1.0, 2.0, 3.0]), 1.5)
-    observations = replace(make_observations([1.0, 2.0, 3.0], np.zeros(3), std=0.3, time_std=0.2), correlation=c)
+    observations = with_noise(make_observations([1.0, 2.0, 3.0], np.zeros(3), std=0.3, time_std=0.2), correlation=c)
     rate = np.array([1.0, 2.0, -1.5])
     at = Linearisation(
-        np.zeros(3), np.array([[0.7, -0.4, 1.0], [0.1, 0.0, 0.0]]),
-        rate, np.array([[1.5, 0.8, -1.2], [0.0, 1.0, 0.5]]), 0.3, np.array([0.2, 1.0]),
+        Predicted(np.zeros(3), rate, np.exp(0.3)), np.array([[0.7, -0.4, 1.0], [0.1, 0.0, 0.0]]),
+        np.array([[1.5, 0.8, -1.2], [0.0, 1.0, 0.5]]), np.array([0.2, 1.0]),
     )  # fmt: skip
     s = np.exp(0.3) * np.hypot(0.3, 0.2 * rate)
     draws = (np.linalg.cholesky(c) @ np.random.default_rng(0).standard_normal((3, 20000))).T * s
     scores = []
     for y in draws:
-        d, sensitivity = whiten(replace(observations, values=y), at)
+        d, sensitivity = replace(observations, values=y).whiten(at)
         scores.append(sensitivity.T @ d)
     assert np.mean(scores, axis=0) == pytest.approx(np.zeros(2), abs=0.05)
     assert np.cov(np.array(scores).T) == pytest.approx(sensitivity.T @ sensitivity, rel=0.05, abs=0.05)
@@ -169,15 +167,15 @@ def test_fisher_information_with_correlation_and_scale():
 
 @pytest.mark.parametrize("huber", [None, 1.345])
 def test_information_of_the_noise_scale_is_that_of_the_density(huber):
-    observations = replace(make_observations([1.0, 2.0, 3.0], np.zeros(3), std=1.0), huber=huber)
+    observations = with_noise(make_observations([1.0, 2.0, 3.0], np.zeros(3), std=1.0), huber=huber)
     grid = np.linspace(-40, 40, 80001)
-    at = Linearisation(np.zeros(3), np.zeros((1, 3)), None, None, 0.0, np.ones(1))
-    density = np.exp(log_likelihood(replace(observations, values=np.zeros(3)), np.tile(grid[:, None], 3), None))[:, 0]
+    at = Linearisation(Predicted(np.zeros(3), None, np.array(1.0)), np.zeros((1, 3)), None, np.ones(1))
+    density = np.exp(observations.log_likelihood(Predicted(np.tile(grid[:, None], 3))))[:, 0]
     width = grid[1] - grid[0]
     assert density.sum() * width == pytest.approx(1.0, abs=1e-9)
-    loss = observation_cost(replace(observations, values=np.zeros(3)), np.tile(grid[:, None], 3), None) / 3
+    loss = observations.cost(Predicted(np.tile(grid[:, None], 3))) / 3
     score = grid * np.gradient(loss, grid) - 1
-    _, sensitivity = whiten(observations, at)
+    _, sensitivity = observations.whiten(at)
     assert np.sum(score**2 * density) * width == pytest.approx(float(np.sum(sensitivity**2) / 3), rel=1e-4)
 
 
@@ -229,7 +227,7 @@ def test_fixed_noise_scale_scales_the_errors():
 def test_a_models_own_sigma_is_not_the_noise_scale():
     problem = make_problem(Linear(("sigma",)), [1.0])
     run = forecast(problem, problem.prior.sample(4, 1))
-    assert run.noise_scale is None
+    assert run.predicted.noise_scale is None
     assert run.active.all()
 
 
@@ -285,17 +283,18 @@ def test_robust_posterior_against_quadrature():
 def test_what_cannot_be_combined_is_refused():
     y = make_observations([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], weights=[1.0, 1.0, 0.5])
     c = exponential(y.times, 1.0)
-    for changes, message in (
+    for kind, message in (
         ({"correlation": c}, "one weight for all"),
-        ({"correlation": c[:2, :2], "weights": np.ones(3)}, r"shape \(2, 2\)"),
+        ({"correlation": c[:2, :2], "weights": np.ones(3)}, r"correlation \(2, 2\) does not match 3"),
         ({"correlation": c + np.triu(c, 1), "weights": np.ones(3)}, "symmetric"),
         ({"correlation": 2 * np.eye(3), "weights": np.ones(3)}, "unit diagonal"),
         ({"correlation": np.ones((3, 3)), "weights": np.ones(3)}, "not positive definite"),
         ({"correlation": c, "weights": np.ones(3), "huber": 1.0}, "independent"),
         ({"huber": 0.0}, "threshold"),
     ):
-        with pytest.raises(DataError, match=message):
-            replace(y, **changes)
+        weights = kind.pop("weights", y.weights)
+        with pytest.raises((DataError, ValueError), match=message):
+            with_noise(replace(y, weights=weights), **kind)
     settings = AssimilationSettings(scheme="es-mda", members=8)
     for options in ({"huber": 1.345}, {"sigma": 0.5}):
         with pytest.raises(ConfigError, match="es-mda"):

@@ -11,8 +11,8 @@ from en4dvar.ensemble.forecast import check_problem
 from en4dvar.ensemble.linalg import anomaly_basis, centre
 from en4dvar.errors import ConfigError
 from en4dvar.forward import Observable, StateField
-from en4dvar.likelihood import Linearisation, error_std, log_likelihood, observation_cost, whiten
-from en4dvar.schemes import Evaluation, Weights
+from en4dvar.noise import Linearisation, Predicted
+from en4dvar.schemes.base import Evaluation, Runs, Weights, gauss_newton
 from en4dvar.schemes.en4dvar import En4DVar
 
 
@@ -28,20 +28,18 @@ def test_gradient_of_the_scheme_is_the_gradient_of_j(model, time_std, weights):
 
     def j(weights):
         run = forecast(problem, mean + weights @ anomalies)
-        return 4.5 * np.sum(weights**2, axis=1) + observation_cost(problem.observations, run.predictions, run.rates)
+        return 4.5 * np.sum(weights**2, axis=1) + problem.observations.cost(run.predicted)
 
     # a centred bundle: the mean of two one-sided gradients has an O(ε²) error
     gradients = []
     for epsilon in (1e-5, -1e-5):
         scheme = En4DVar("bundle", epsilon)
         state = Weights(w, np.eye(10))
-        run = forecast(problem, mean + np.vstack([scheme.member_weights(state), w]) @ anomalies)
-        stacked = run.predictions if run.rates is None else np.hstack([run.predictions, run.rates])
-        reference, y = scheme.linearise(state, basis, stacked[:-1], stacked[-1], run.active[:-1])
-        at = Linearisation(reference[:9], y[:, :9])
-        if run.rates is not None:
-            at = Linearisation(reference[:9], y[:, :9], reference[9:], y[:, 9:])
-        gradients.append(scheme.step(state, Evaluation(*whiten(problem.observations, at), basis)).gradient)
+        run = forecast(problem, mean + np.vstack([scheme.members(state), w]) @ anomalies)
+        stacked = run.predicted.stacked
+        reference, y = scheme.linearise(state, Runs(stacked[:-1], stacked[-1], run.active[:-1], basis))
+        at = Linearisation.of_stacked(run.predicted[0], reference, y)
+        gradients.append(gauss_newton(w, Evaluation(*problem.observations.whiten(at), basis)).gradient)
     gradient = np.mean(gradients, axis=0)
     h = 2e-5
     numeric = np.array([np.diff(j(np.stack([w - h * e, w + h * e])))[0] for e in np.eye(10)]) / (2 * h)
@@ -53,15 +51,15 @@ def test_augmented_arrays_carry_the_fisher_information():
     """SᵀS is the expectation of the Hessian of J_o over data drawn at the centre (Monte Carlo over y)."""
     observations = make_observations([1.0, 2.0, 3.0], np.zeros(3), std=0.3, time_std=0.2)
     slope, rate_slope, rate = np.array([0.7, -0.4, 1.0]), np.array([1.5, 0.8, -1.2]), np.array([1.0, 2.0, -1.5])
-    s = error_std(observations, rate)
+    s = observations.noise.error_std(Predicted(np.zeros(3), rate))
     draws = s * np.random.default_rng(0).standard_normal((40000, 3))
 
     def j(a):
-        return observation_cost(replace(observations, values=np.zeros(3)), a * slope - draws, rate + a * rate_slope)
+        return observations.cost(Predicted(a * slope - draws, rate + a * rate_slope))
 
     h = 1e-3
     hessian = np.mean(j(h) - 2 * j(0.0) + j(-h)) / h**2
-    _, sensitivity = whiten(observations, Linearisation(np.zeros(3), slope[None], rate, rate_slope[None]))
+    _, sensitivity = observations.whiten(Linearisation(Predicted(np.zeros(3), rate), slope[None], rate_slope[None]))
     assert hessian == pytest.approx((sensitivity.T @ sensitivity).item(), rel=0.02)
 
 
@@ -69,7 +67,7 @@ def test_log_likelihood_is_a_density_of_the_observation():
     observations = make_observations([1.0, 2.0, 3.0], np.zeros(3), std=[0.1, 0.2, 0.3], time_std=[0.0, 0.1, 0.2])
     grid = np.linspace(-6, 6, 4001)
     predictions = np.tile(grid[:, None], 3)
-    density = np.exp(log_likelihood(observations, predictions, np.full_like(predictions, 2.0)))
+    density = np.exp(observations.log_likelihood(Predicted(predictions, np.full_like(predictions, 2.0))))
     assert density.sum(axis=0) * (grid[1] - grid[0]) == pytest.approx(np.ones(3), abs=1e-12)
     assert (density * grid[:, None] ** 2).sum(axis=0) * (grid[1] - grid[0]) == pytest.approx([0.01, 0.08, 0.25])
 
@@ -78,7 +76,7 @@ def test_cost_is_minus_log_posterior_up_to_a_constant():
     problem = make_problem(Decay(), [1.5, 1.2], time_std=0.05)
     x = problem.prior.sample(7, 1)
     run = forecast(problem, x)
-    full = problem.prior.log_density(x) + log_likelihood(problem.observations, run.predictions, run.rates).sum(axis=1)
+    full = problem.prior.log_density(x) + problem.observations.log_likelihood(run.predicted).sum(axis=1)
     assert np.ptp(full + cost(problem, x)) < 1e-11
     assert np.array_equal(log_posterior(problem, x), -cost(problem, x))
     constant = problem.prior.log_density(problem.prior.mean) - 9 * np.log(0.1 * np.sqrt(2 * np.pi))

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from toys import Vectorised, make_problem
+from toys import Vectorised, make_problem, with_noise
 
 from en4dvar.assimilate import assimilate, log_posterior
-from en4dvar.descent.noise_scale import log_derivatives, scale_skewness
+from en4dvar.descent.noise_scale import log_derivatives
+from en4dvar.noise import noise_of
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings
 from en4dvar.state import NOISE_SCALE
@@ -42,7 +43,7 @@ def test_mean_of_the_noise_scale(huber, transform):
     for seed in range(3):
         base = make_problem(Vectorised(("a",)), [1.0], k=30, seed=seed)
         prior = Prior((*base.prior.terms, TERMS[transform]))
-        problem = replace(base, prior=prior, observations=replace(base.observations, huber=huber))
+        problem = replace(base, prior=prior, observations=with_noise(base.observations, huber=huber))
         analysis = assimilate(problem, AssimilationSettings(members=39), seed)
         x, mode = (prior.from_physical(values) for values in (analysis.posterior, analysis.centre))
         mean, std = summed(problem, mode, x.std(axis=0, ddof=1))
@@ -66,10 +67,10 @@ def test_expectations_under_hubers_density(c):
     slope, edge = mean(lambda v: float(v < c)), 2 * density(c) / norm
     square, weight = mean(lambda v: v * v * (v < c)), mean(lambda v: min(1.0, c / v) if v else 1.0)
     score = mean(lambda v: (v * min(v, c) - 1) ** 2)
-    ratio, scale_ratio, information = scale_skewness(c)
-    assert information == pytest.approx(score, rel=1e-8)  # two forms of the Fisher information
-    assert ratio == pytest.approx((2 * slope - c * edge) / weight, rel=1e-8)
-    assert scale_ratio == pytest.approx((1 + 3 * square - c**3 * edge) / information, rel=1e-8)
+    found = noise_of(np.ones(1), huber=c).scale_skewness()
+    assert found.information == pytest.approx(score, rel=1e-8)  # two forms of the Fisher information
+    assert found.of_predictions == pytest.approx((2 * slope - c * edge) / weight, rel=1e-8)
+    assert found.of_scale == pytest.approx((1 + 3 * square - c**3 * edge) / found.information, rel=1e-8)
 
 
 @pytest.mark.parametrize("transform", TERMS)

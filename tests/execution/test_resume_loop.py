@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from same_bits import assert_same_bits
-from toys import Decay, Wave, make_problem
+from toys import Decay, Wave, make_problem, with_noise
 
 from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.problem import AssimilationSettings
@@ -26,7 +26,7 @@ def test_resumed_from_any_iteration(linearisation, starts):
     settings = AssimilationSettings(members=9, linearisation=linearisation, starts=starts)
     wave = make_problem(Wave(), [1.0, 1.4])
     k = np.arange(len(wave.observations))
-    correlated = replace(wave.observations, correlation=0.3 ** np.abs(k[:, None] - k))
+    correlated = with_noise(wave.observations, correlation=0.3 ** np.abs(k[:, None] - k))
     for problem in (
         make_problem(Decay(), [1.5, 1.2], time_std=0.02), wave, replace(wave, observations=correlated)
     ):  # fmt: skip
@@ -34,7 +34,7 @@ def test_resumed_from_any_iteration(linearisation, starts):
         rounds = [state for state in states if state.comparison]
         iterations = states[len(rounds) :]
         # the moves of the start that was chosen are the first iterations, and part of the first state after it
-        before = len(iterations[0].records)
+        before = len(iterations[0].descent.records)
         assert len(iterations) == len(whole.iterations) - before >= 1
         assert len(rounds) >= before
         assert bool(rounds) == bool(before) == (starts > 1 and linearisation == "bundle")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from toys import Decay, Fragile, Toy, Vectorised, Wave, make_problem
+from toys import Decay, Fragile, Toy, Vectorised, Wave, make_problem, with_noise
 
 from en4dvar.analysis import Analysis
 from en4dvar.assimilate import assimilate
@@ -56,7 +56,7 @@ def outlier() -> InverseProblem:
     problem = linear()
     values = problem.observations.values.copy()
     values[3] += 0.8
-    return replace(problem, observations=replace(problem.observations, values=values, huber=1.5))
+    return replace(problem, observations=with_noise(replace(problem.observations, values=values), huber=1.5))
 
 
 def chain_not_converged() -> Analysis:

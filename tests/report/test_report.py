@@ -22,11 +22,11 @@ from en4dvar.diagnostics import chi2_interval
 from en4dvar.errors import OutputError
 from en4dvar.executor import SerialExecutor, WorkerLostError
 from en4dvar.honesty import Caution
+from en4dvar.report import write_pages
 from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import Entry, overview_figures, render_overview
 from en4dvar.report.page import judge_chi2
 from en4dvar.report.result import Result
-from en4dvar.runs.runner import write_report
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.store import save
 
@@ -54,7 +54,7 @@ def reported(analysis, tmp_path_factory):
     """A run directory with its report, to be read only."""
     folder = tmp_path_factory.mktemp("run")
     save(Result.from_analysis(analysis, provenance("name: test\n")), folder / "posterior.nc")
-    write_report(folder)
+    write_pages(folder)
     return folder
 
 
@@ -133,7 +133,7 @@ def test_strings_of_data_and_configuration_are_escaped(write_run, analysis):
     bad = replace(
         analysis, name=evil, cautions=(Caution(evil, "serious", evil, evil),), stop_reason=evil, parameters=parameters
     )
-    html = write_report(write_run(bad, config=f"name: '{evil}'\n")).read_text(encoding="utf-8")
+    html = write_pages(write_run(bad, config=f"name: '{evil}'\n")).read_text(encoding="utf-8")
     assert evil not in html
     assert html.count("&lt;script&gt;alert(1)") >= 5
     assert "script" not in Page(html).tags
@@ -153,7 +153,7 @@ def test_figures_are_drawn_as_pdf_and_png(reported):
 def test_report_is_the_same_every_time(reported):
     files = sorted(p for p in reported.rglob("*") if p.is_file())
     before = [p.read_bytes() for p in files]
-    write_report(reported)
+    write_pages(reported)
     assert [p.read_bytes() for p in files] == before
     assert sorted(p for p in reported.rglob("*") if p.is_file()) == files
 
@@ -180,7 +180,7 @@ def campaign_dir(analysis, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "COPIES", 0)
         patch.setattr(report, "all_figures", first_figure)
-        write_report(folder)
+        write_pages(folder)
     return folder
 
 
@@ -221,17 +221,17 @@ def test_large_campaign_gets_pages_on_demand(campaign_dir, tmp_path, monkeypatch
     monkeypatch.setattr(report, "all_figures", first_figure)
     monkeypatch.setattr(report, "PAGES", 1)
     monkeypatch.setattr(report, "COPIES", 0)
-    html = write_report(tmp_path).read_text(encoding="utf-8")
+    html = write_pages(tmp_path).read_text(encoding="utf-8")
     assert [p.stem for p in (tmp_path / "pages").iterdir()] == ["one"]
     assert "2 data sets have no page of their own" in html
     assert sorted(p.name for p in (tmp_path / "figures").iterdir()) == ["estimates.pdf", "estimates.png"]
-    html = write_report(tmp_path, ["two"]).read_text(encoding="utf-8")
+    html = write_pages(tmp_path, ["two"]).read_text(encoding="utf-8")
     assert "1 data set has no page of its own" in html
     assert set(Page(html).links) == {"pages/one.html", "pages/two.html"}
     assert (tmp_path / "figures" / "two_posterior.pdf").is_file()
     assert not (tmp_path / "figures" / "one_posterior.pdf").exists()
     with pytest.raises(OutputError, match="no data set 'tow'; did you mean 'two'"):
-        write_report(tmp_path, ["tow"])
+        write_pages(tmp_path, ["tow"])
 
 
 def contents(run):
@@ -244,15 +244,15 @@ def test_processes_draw_the_same_pages(campaign_dir, tmp_path, monkeypatch):
     one, two = tmp_path / "one", tmp_path / "two"
     for run in (one, two):
         shutil.copytree(campaign_dir / "datasets", run / "datasets")
-    write_report(one)
+    write_pages(one)
     monkeypatch.setattr(report, "_write_set", None)  # this process draws no page
-    write_report(two, workers=2)
+    write_pages(two, workers=2)
     assert len(list((two / "pages").iterdir())) == 3
     assert contents(one) == contents(two)
     (two / "pages" / "two.html").unlink()
     (two / "pages" / "two.html").mkdir()
     with pytest.raises(OutputError, match=r"two\.html"):
-        write_report(two, workers=2)
+        write_pages(two, workers=2)
 
 
 def test_the_page_of_a_process_that_dies_is_drawn_here(campaign_dir, tmp_path, monkeypatch):
@@ -266,7 +266,7 @@ def test_the_page_of_a_process_that_dies_is_drawn_here(campaign_dir, tmp_path, m
     shutil.copytree(campaign_dir / "datasets", tmp_path / "datasets")
     for name, value in {"SHARE": 1, "COPIES": 0, "all_figures": first_figure, "ProcessesExecutor": Deadly}.items():
         monkeypatch.setattr(report, name, value)
-    write_report(tmp_path, workers=2)
+    write_pages(tmp_path, workers=2)
     assert len(list((tmp_path / "pages").iterdir())) == 3
 
 
@@ -293,7 +293,7 @@ def test_lost_ensemble_still_gets_a_report(write_run, make_analysis, survivors):
         posterior_trajectories=lose(base.posterior_trajectories),
         posterior_failures=tuple("" if i < survivors else "gone" for i in range(n)),
     )
-    html = write_report(write_run(dead)).read_text(encoding="utf-8")
+    html = write_pages(write_run(dead)).read_text(encoding="utf-8")
     assert f"{survivors} of {n}" in html
     assert "nan" not in "".join(Page(html).text).split()
 
@@ -309,7 +309,7 @@ def test_single_parameter_has_no_pairs(write_run, analysis):
         iterations=tuple(replace(r, members=r.members[:, :1], centre=r.centre[:1]) for r in analysis.iterations),
     )
     run_dir = write_run(one)
-    write_report(run_dir)
+    write_pages(run_dir)
     assert not (run_dir / "figures" / "pairs.pdf").exists()
     assert (run_dir / "figures" / "posterior.pdf").exists()
 
@@ -324,12 +324,12 @@ def test_chi2_in_words(chi2, attention):
 
 def test_nothing_to_report_is_one_clear_error(tmp_path):
     with pytest.raises(OutputError, match="no such run directory"):
-        write_report(tmp_path / "absent")
+        write_pages(tmp_path / "absent")
     with pytest.raises(OutputError, match=r"posterior\.nc: no such file"):
-        write_report(tmp_path)
+        write_pages(tmp_path)
 
 
 def test_unwritable_run_directory_is_one_clear_error(run_dir):
     (run_dir / "figures").write_text("in the way")
     with pytest.raises(OutputError, match="figures: cannot be created"):
-        write_report(run_dir)
+        write_pages(run_dir)

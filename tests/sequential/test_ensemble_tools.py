@@ -10,7 +10,8 @@ from en4dvar.cycling.rotation import Rotations, reflections, rotate
 from en4dvar.cycling.sequential import SequentialSettings
 from en4dvar.ensemble.linalg import GRAM_LIMIT, Hessian, apply_weights, centre
 from en4dvar.ensemble.near_prior import NearPrior
-from en4dvar.schemes import Evaluation, Weights, gauss_newton
+from en4dvar.schemes.base import Evaluation, gauss_newton
+from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation, relaxation
 from en4dvar.schemes.localisation import Localisation, distances, gaspari_cohn
@@ -182,28 +183,28 @@ def evaluation(n_members=6, p=12):
 
 def test_without_taper_the_local_analysis_is_the_global_one():
     ensemble, e = RNG(2).standard_normal((6, 12)), evaluation()
-    step = gauss_newton(Weights.prior(6), e)
+    step = gauss_newton(np.zeros(6), e)
     expected = apply_weights(ensemble, step.direction + step.transform)
     for size in (1, 5, 12):
         blocks = [np.arange(i, min(i + size, 12)) for i in range(0, 12, size)]
         local = Localisation(blocks, np.ones((len(blocks), 12)))
-        assert local.analysis(ensemble, e) == pytest.approx(expected, abs=1e-12)
+        assert local.analysis(ETKF(), ensemble, e, None) == pytest.approx(expected, abs=1e-12)
 
 
 def test_local_analysis_sees_what_is_near():
     positions = np.arange(12.0)
     ensemble, e = RNG(2).standard_normal((6, 12)), evaluation()
     local = Localisation.on_line(positions, positions, radius=1.5, period=12.0)
-    analysed = local.analysis(ensemble, e)
+    analysed = local.analysis(ETKF(), ensemble, e, None)
     far = e.d.copy()
     far[3:10] += 100.0  # 3 or more away from variable 0, around the circle
-    changed = local.analysis(ensemble, Evaluation(far, e.S))
+    changed = local.analysis(ETKF(), ensemble, Evaluation(far, e.S), None)
     assert np.array_equal(changed[:, 0], analysed[:, 0])
     assert np.all(np.abs(changed[:, 1:11] - analysed[:, 1:11]).max(axis=0) > 1e-3)
     # by hand for one variable: error variances divided by the taper
     taper = gaspari_cohn(distances(positions[:1], positions, 12.0), 1.5)[0]
     root = np.sqrt(taper)
-    step = gauss_newton(Weights.prior(6), Evaluation(root * e.d, root[:, None] * e.S))
+    step = gauss_newton(np.zeros(6), Evaluation(root * e.d, root[:, None] * e.S))
     by_hand = apply_weights(ensemble[:, :1], step.direction + step.transform)
     assert analysed[:, :1] == pytest.approx(by_hand, abs=1e-12)
 
@@ -213,7 +214,7 @@ def test_variables_without_position_or_observation_stay():
     local = Localisation.on_line(positions, np.array([0.0, 1.0]), radius=2.0, block_size=2)
     assert [block.tolist() for block in local.blocks] == [[0, 1], [3]]
     ensemble = RNG(2).standard_normal((6, 4))
-    analysed = local.analysis(ensemble, evaluation(p=2))
+    analysed = local.analysis(ETKF(), ensemble, evaluation(p=2), None)
     assert np.array_equal(analysed[:, 2:], ensemble[:, 2:])
     assert not np.allclose(analysed[:, :2], ensemble[:, :2])
 

@@ -9,7 +9,8 @@ from en4dvar.cycling.sequential import SequentialSettings, Series, run_sequentia
 from en4dvar.ensemble.linalg import centre
 from en4dvar.executor import SerialExecutor, ThreadsExecutor
 from en4dvar.forward import Observable
-from en4dvar.schemes import Evaluation, Weights
+from en4dvar.noise import Correlation
+from en4dvar.schemes.base import Evaluation, Runs, Weights
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar_lorenz import Linear, Lorenz63, Lorenz96
@@ -188,8 +189,9 @@ def test_iterations_end_at_a_minimum_of_the_cost():
 
     scheme, weights = IEnKS(1, "bundle", epsilon=1e-5), Weights.prior(5)
     for _ in range(30):
-        reference, spread = scheme.linearise(weights, predict(weights.w + scheme.spread(weights)))
-        weights = scheme.step(weights, Evaluation((value - reference) / np.sqrt(2), spread.T / np.sqrt(2))).weights
+        reference, spread = scheme.linearise(weights, Runs(predict(scheme.members(weights))))
+        evaluation = Evaluation((value - reference) / np.sqrt(2), spread.T / np.sqrt(2))
+        weights = scheme.advance(weights, evaluation, 0, None).weights
     h = 1e-5
     gradient = [(cost(weights.w + h * e) - cost(weights.w - h * e)) / (2 * h) for e in np.eye(5)]
     start_gradient = [(cost(h * e) - cost(-h * e)) / (2 * h) for e in np.eye(5)]
@@ -206,7 +208,7 @@ FULL = np.array([[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]])
 def test_correlated_errors_are_those_of_the_kalman_filter(scheme, correlation):
     model, observed, members, series = linear_twin(12)
     each = STD * np.array([1.0, 0.5, 2.0])
-    series = Series(series.times, series.values, each, correlation)
+    series = Series(series.times, series.values, each, Correlation(correlation))
     result = run_sequential(model, observed, members, series, SequentialSettings(scheme))
     mean, cov = members[:, :8].mean(axis=0), np.cov(members[:, :8].T)
     m, h, r = flow(model, DT), np.eye(8)[SEEN], np.outer(each, each) * correlation

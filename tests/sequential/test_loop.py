@@ -8,6 +8,7 @@ import pytest
 from en4dvar.cycling.sequential import SequentialSettings, Series, run_sequential
 from en4dvar.errors import TooFewMembersError
 from en4dvar.forward import Failure, ForwardModel, Observable, StateField
+from en4dvar.noise import Correlation
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.localisation import Localisation
@@ -149,12 +150,12 @@ def test_bad_series(times, values, std, message):
 )
 def test_bad_correlation(correlation, message):
     with pytest.raises(ValueError, match=message):
-        Series(np.array([1.0]), np.zeros((1, 2)), np.ones(2), correlation)
+        Series(np.array([1.0]), np.zeros((1, 2)), np.ones(2), Correlation(correlation))
 
 
 def test_localisation_needs_independent_errors():
     local = Localisation([np.arange(2)], np.ones((1, 2)))
-    y = Series(np.array([1.0]), np.zeros((1, 2)), np.ones(2), np.eye(2))
+    y = Series(np.array([1.0]), np.zeros((1, 2)), np.ones(2), Correlation(np.eye(2)))
     with pytest.raises(ValueError, match="independent errors"):
         run_sequential(Forced(), Forced.observables, members(), y, SequentialSettings(ETKF(), localisation=local))
 

@@ -14,6 +14,7 @@ from en4dvar.cycling.twin import TwinExperiment, TwinResult, conduct, initial_en
 from en4dvar.errors import En4dvarError
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.forward import ForwardModel, Observable, StateField
+from en4dvar.noise import Correlation
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
@@ -81,7 +82,7 @@ def test_correlated_errors(tmp_path):
     (tmp_path / "twin.yaml").write_text(text)
     config = load_twin(tmp_path / "twin.yaml", {"twin.cycles": 400, "twin.burn_in": 50})
     truth, series = observe_truth(config.experiment, 1)
-    assert np.array_equal(series.correlation, correlation)
+    assert np.array_equal(series.correlation.matrix, correlation)
     errors = (series.values - truth[:, :3]) / series.std
     assert np.corrcoef(errors.T) == pytest.approx(correlation, abs=0.06)
     assert str(tmp_path / "c.csv") in config.resolved
@@ -96,7 +97,7 @@ def test_correlated_errors(tmp_path):
     )
     rmse_blind = np.sqrt(np.mean((blind.analysis.mean - truth)[50:, :3] ** 2, axis=1)).mean()
     assert known.scores["analysis"].mean_rmse < rmse_blind
-    small = replace(config.experiment, error_correlation=np.eye(2))
+    small = replace(config.experiment, error_correlation=Correlation(np.eye(2)))
     with pytest.raises(En4dvarError, match=r"twin\.error_correlation: correlation \(2, 2\) does not match 3"):
         conduct(small, 1)
 

@@ -11,7 +11,6 @@ from scipy.stats import multivariate_normal
 
 from en4dvar.config import load_config
 from en4dvar.config.build import build
-from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm, member_stream
 from en4dvar.state import Parameter
 from en4dvar_bubble.study.one_gel import fit_one_gel
@@ -62,7 +61,7 @@ def test_bubbles_of_one_gel_are_recognised_and_those_of_several_are_not():
     for s, problem in enumerate(base):
         o = problem.observations
         values = exact[s, : len(o)] + o.std * stream.standard_normal(len(o))
-        problems.append(replace(problem, observations=Observations(o.times, values, o.std, o.time_std, o.weights)))
+        problems.append(replace(problem, observations=replace(o, values=values)))
     names, starts = ["G", "alpha", "mu"], np.tile(prior.mean, (1, 4, 1))
     one = fit_one_gel(SetRuns(problems), starts, prior, names)
     assert 0.5 < one.chi2_per_reading < 1.6

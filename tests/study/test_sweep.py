@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from en4dvar.config import load_config
 from en4dvar.config.build import build
 from en4dvar.errors import ConfigError, DataError, OutputError
+from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar_bubble.commands_study import sweep as sweep_command
 from en4dvar_bubble.study.nearest import best_over_shifts, targets
@@ -27,7 +28,7 @@ SMALL = SweepSettings(trajectories=192, chunk=64, step=0.1e-6)
 
 def readings(times, values, name="a"):
     ones = np.ones(len(times))
-    return Observations(np.asarray(times), np.asarray(values), ones, 0 * ones, ones, name=name)
+    return Observations(np.asarray(times), np.asarray(values), noise_of(ones), ones, name=name)
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,6 @@ from en4dvar.config.build import build
 from en4dvar.diagnostics import nrmse
 from en4dvar.errors import DataError
 from en4dvar.executor import make_executor
-from en4dvar.likelihood import log_normalisation
 from en4dvar.prior import Prior
 from en4dvar.problem import InverseProblem
 from en4dvar.state import Array
@@ -53,7 +52,7 @@ class Fit:
         """(S,) ln p(y); by Laplace's approximation where it was not computed."""
         if self.evidence is None:
             return np.array([a.log_evidence for a in self.analyses])
-        return self.evidence.log - np.array([log_normalisation(p.observations) for p in self.problems])
+        return self.evidence.log - np.array([p.observations.log_normalisation() for p in self.problems])
 
     @property
     def prior(self) -> Prior:

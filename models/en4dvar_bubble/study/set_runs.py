@@ -47,7 +47,7 @@ class SetRuns:
             o = p.observations
             if p.model is not first.model or p.prior.terms != first.prior.terms or p.fixed != first.fixed:
                 raise ConfigError(f"{o.name}: a population needs one model, prior and set of fixed values")
-            if np.any(o.time_std > 0) or o.huber is not None or o.correlation is not None or "sigma" in p.prior.names:
+            if not o.noise.plain or "sigma" in p.prior.names:
                 raise ConfigError(f"{o.name}: a population needs independent Gaussian errors of known std")
         self.model, self.prior, self.fixed, self.workers = first.model, first.prior, first.fixed, workers
         shape = len(problems), max(len(p.observations) for p in problems)

@@ -1,0 +1,286 @@
+"""One data set as a window of the loop: its runs, how far a step goes, records, and when a descent has ended.
+
+A scheme that searches minimises J: steps are judged by J of the central run, and none that raises it is accepted. Any
+other takes its steps as they are; J and its Gauss–Newton step, from a regression over the ensemble, are then there for
+the record only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from en4dvar import diagnostics as diag
+from en4dvar.analysis import IterationRecord, Record
+from en4dvar.descent.step_control import STEP_CONTROLS, Move, Point, Tangent, run_searches
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.ensemble.forecast import NO_TIMES, Forecast
+from en4dvar.errors import TooFewMembersError
+from en4dvar.noise import Linearisation, Predicted
+from en4dvar.prior import member_stream
+from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights, gauss_newton
+from en4dvar.schemes.en4dvar import En4DVar
+from en4dvar.state import Array
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """What the runs at the weights of a descent say: ``members`` beside the ``central`` run, J_b and J_o at the centre.
+
+    ``linear`` is the linearisation there, in coordinates of the basis, once it is known.
+    """
+
+    members: Forecast
+    central: Forecast
+    background: float
+    observation: float
+    linear: Linearisation | None = None
+
+    @property
+    def cost(self) -> float:
+        """J = J_b + J_o."""
+        return self.background + self.observation
+
+
+@dataclass
+class Descent:
+    """One descent: where it stands, the records of its iterations, and why it ended.
+
+    ``worst_loss`` are the reasons of failure in the iteration that lost most members, or empty. ``cost`` is J where it
+    was last evaluated. A descent whose ``stop`` is set ends with the next iterate, which is recorded and not left.
+    ``at`` and ``step`` belong to the iteration under way and are not kept.
+    """
+
+    weights: Weights
+    records: tuple[IterationRecord, ...] = ()
+    worst_loss: tuple[str, ...] = ()
+    cost: float = math.inf
+    stop: str = ""
+    converged: bool = False
+    ended: bool = False
+    at: Iterate | None = None
+    step: Step | GaussNewtonStep | None = None
+
+    @property
+    def iteration(self) -> int:
+        """Number of the iteration under way, from 0."""
+        return len(self.records)
+
+    @property
+    def kept(self) -> Descent:
+        """A copy for a checkpoint."""
+        return replace(self, at=None, step=None)
+
+
+class DataWindow:
+    """The window of an estimate: one descent, to the minimum of J or through the passes of a scheme.
+
+    ``first`` is the forecast of the prior members and their mean, which a scheme that runs its whole ensemble does not
+    repeat; with ``grid`` (M,) its last forecast is read along these times as well, so that it is the posterior's.
+    """
+
+    def __init__(
+        self,
+        space: WeightSpace,
+        seed: int,
+        keep: Callable[[], None],
+        tell: Callable[[Record], None],
+        first: Forecast | None = None,
+        grid: Array = NO_TIMES,
+    ):
+        self.space, self.seed, self.keep, self.tell, self.first, self.grid = space, seed, keep, tell, first, grid
+        self.settings, self.observations = space.settings, space.problem.observations
+
+    def begin(self, going: Sequence[Descent]) -> None:
+        self.keep()
+
+    def run(self, scheme: Scheme, going: Sequence[Descent]) -> list[Runs | None]:
+        space = self.space
+        if not scheme.searches:
+            return [self._run_ensemble(scheme, descent) for descent in going]
+        rows = [[*scheme.members(d.weights, space.basis), d.weights.w] for d in going]
+        whole = space.forecast(space.control(np.array([row for each in rows for row in each])))
+        ends = np.cumsum([len(each) for each in rows]).tolist()
+        return [
+            self._arrive(scheme, descent, whole[end - len(each) : end])
+            for descent, each, end in zip(going, rows, ends, strict=True)
+        ]
+
+    def whiten(self, scheme: Scheme, descent: Descent, reference: Array, anomalies: Array) -> Evaluation:
+        """By Fisher scoring; for a scheme that runs its whole ensemble with the R at its mean."""
+        assert descent.at is not None
+        like = descent.at.central.predicted[0]
+        if scheme.searches:
+            return self._evaluation(descent, Linearisation.of_stacked(like, reference, anomalies))
+        mean, k = like.unstacked(reference), like.values.shape[-1]
+        linear = Linearisation(Predicted(mean.values), anomalies[:, :k])
+        noise = self.observations.noise.frozen(mean)
+        return Evaluation(*noise.whiten(self.observations.values, self.observations.weights, linear))
+
+    def draw(self, purpose: str) -> Array:
+        n_members, size = len(self.space.members), len(self.observations)
+        return np.stack([member_stream(self.seed, purpose, i).standard_normal(size) for i in range(n_members)])
+
+    def move(self, scheme: Scheme, going: Sequence[Descent]) -> None:
+        for descent in going:
+            self._require_step(descent)
+            if scheme.searches:
+                self._minimise(scheme, descent)
+            else:
+                self._take(scheme, descent)
+            self.tell(descent.records[-1])
+
+    def search(self, descents: Sequence[Descent]) -> list[Move | None]:
+        """One move of each, by the configured step control; None where no decrease of J is found."""
+        control = STEP_CONTROLS[self.settings.step_control]
+        return run_searches([control(self._point(descent)) for descent in descents], self.space.try_out)
+
+    def record(self, descent: Descent, transform: Array, step_length: float) -> None:
+        """Add the record of an iterate: the ensemble of ``transform`` (N, N) there, and how far it is left."""
+        space, at, step = self.space, descent.at, descent.step
+        assert at is not None
+        assert isinstance(step, GaussNewtonStep)
+        w = descent.weights.w
+        ensemble = space.control(np.concatenate([w + transform, w[None]]))
+        physical = space.problem.prior.to_physical(ensemble)
+        record = IterationRecord(
+            iteration=descent.iteration,
+            cost=at.cost,
+            background=at.background,
+            observation=at.observation,
+            step_norm=step.norm,
+            step_length=step_length,
+            chi2_per_observation=float(self.observations.chi2_per_observation(at.central.predicted)[0]),
+            dfs=diag.dfs(step.hessian.singular_values, len(space.members)),
+            spread=float(diag.spread(ensemble[:-1], space.prior_variance)),
+            active=self._informing(at),
+            members=physical[:-1],
+            centre=physical[-1],
+        )
+        descent.records += (record,)
+        descent.worst_loss = max(descent.worst_loss, at.members.failures, key=lambda lost: sum(map(bool, lost)))
+
+    def small(self, cost: float) -> float:
+        """A decrease of J that counts as none; below J = 1 it is absolute, for there J has no more to tell."""
+        return self.settings.cost_tolerance * max(cost, 1.0)
+
+    def _minimise(self, scheme: Scheme, descent: Descent) -> None:
+        settings, at, step = self.settings, descent.at, descent.step
+        assert at is not None
+        assert isinstance(step, GaussNewtonStep)
+        move, contracted = None, Weights(descent.weights.w, step.transform)
+        if not descent.stop:
+            if step.norm <= settings.step_tolerance:
+                descent.stop, descent.converged = f"step of {step.norm:.2g} posterior standard deviations", True
+            elif descent.iteration == settings.max_iterations:
+                descent.stop = f"iteration limit ({settings.max_iterations}) reached"
+            else:
+                (move,) = self.search([descent])
+                if move is None and self._same_members(scheme, contracted, descent.weights):
+                    descent.stop = "no decrease possible along the step"
+                    descent.converged = step.predicted_decrease <= self.small(at.cost)
+        self.record(descent, step.transform, move.step_length if move else 0.0)
+        descent.ended = bool(descent.stop)
+        if descent.ended:
+            return
+        if move is None:  # a regression over a narrower ensemble may still show the way down
+            descent.weights = contracted
+            return
+        if at.cost - move.cost <= self.small(at.cost) and step.predicted_decrease <= self.small(at.cost):
+            # one more forecast, to linearise at the end point
+            descent.stop, descent.converged = f"relative decrease of J below {settings.cost_tolerance:g}", True
+        descent.weights = Weights(move.w, step.transform)
+
+    def _take(self, scheme: Scheme, descent: Descent) -> None:
+        """The whole step; the iterate after the last one is recorded, too."""
+        taken, descent.step = descent.step, self._regression(descent)
+        self.record(descent, descent.weights.T, 0.0 if descent.stop else 1.0)
+        descent.ended = bool(descent.stop)
+        if descent.ended:
+            return
+        assert taken is not None
+        count = descent.iteration
+        if scheme.done(count - 1, taken):
+            descent.stop, descent.converged = f"{count} assimilations", True
+        basis = self.space.basis  # of the weights of the mean, those that move no parameter are no part of J_b
+        descent.weights = Weights(basis @ (basis.T @ taken.weights.w), taken.weights.T)
+
+    def _run_ensemble(self, scheme: Scheme, descent: Descent) -> Runs | None:
+        space = self.space
+        if descent.iteration == 0 and self.first is not None:
+            run = self.first
+        else:
+            rows = np.array([*scheme.members(descent.weights), descent.weights.w])
+            run = space.forecast(space.control(rows), self.grid if descent.stop else NO_TIMES)
+        runs = self._arrive(scheme, descent, run)
+        if descent.stop or runs is None or runs.active is None or runs.active.all():
+            return None if descent.stop else runs
+        # a failed member takes the prediction that the regression on the survivors gives it
+        zeros = np.zeros(runs.predictions.shape[1])
+        reference, anomalies = En4DVar("transform").linearise(
+            descent.weights, Runs(runs.predictions, zeros, runs.active, space.basis)
+        )
+        regressed = reference + descent.weights.T @ space.basis @ anomalies
+        return Runs(np.where(runs.active[:, None], runs.predictions, regressed))
+
+    def _arrive(self, scheme: Scheme, descent: Descent, run: Forecast) -> Runs | None:
+        """J at the new iterate; what its runs, members and centre, are to the scheme."""
+        space, weights = self.space, descent.weights
+        members, central = run[:-1], run[-1:]
+        if len(members) < len(space.members) and any(members.failures):  # a direction is lost: run all members
+            members = space.forecast(space.control(scheme.members(weights)))
+        background = float(diag.background_cost(weights.w))
+        descent.at = at = Iterate(members, central, background, float(space.observation_cost(central)[0]))
+        descent.cost = at.cost
+        if self._informing(at) < space.needed_members or not math.isfinite(at.cost):
+            return None
+        return Runs(members.predicted.stacked, central.predicted.stacked[0], members.active, space.basis)
+
+    def _informing(self, at: Iterate) -> int:
+        """How many members inform the step: N where fewer runs stand for all."""
+        n_members = len(self.space.members)
+        return n_members if len(at.members) < n_members else int(at.members.active.sum())
+
+    def _evaluation(self, descent: Descent, linear: Linearisation) -> Evaluation:
+        assert descent.at is not None
+        at = descent.at
+        descent.at = Iterate(at.members, at.central, at.background, at.observation, linear)
+        return Evaluation(*self.observations.whiten(linear), self.space.basis)
+
+    def _regression(self, descent: Descent) -> GaussNewtonStep:
+        """The Gauss–Newton step of J that an ensemble that was run as a whole tells."""
+        assert descent.at is not None
+        members, central = descent.at.members.predicted, descent.at.central.predicted
+        runs = Runs(members.stacked, central.stacked[0], descent.at.members.active, self.space.basis)
+        reference, anomalies = En4DVar("transform").linearise(descent.weights, runs)
+        linear = Linearisation.of_stacked(central[0], reference, anomalies)
+        return gauss_newton(descent.weights.w, self._evaluation(descent, linear))
+
+    def _point(self, descent: Descent) -> Point:
+        at, step, tangent = descent.at, descent.step, None
+        assert at is not None
+        assert isinstance(step, GaussNewtonStep)
+        if (linear := at.linear) is not None and self.settings.linearisation == "bundle":
+
+            def precision_times(vectors: Array) -> Array:
+                return self.observations.precision_times(linear.prediction, vectors)
+
+            tangent = Tangent(linear.prediction.values, linear.anomalies, precision_times, self.space.basis)
+        return Point(descent.weights.w, at.cost, step, tangent)
+
+    def _same_members(self, scheme: Scheme, a: Weights, b: Weights) -> bool:
+        """Whether the scheme would run the same members again, to the step tolerance."""
+        return bool(np.max(np.abs(scheme.members(a) - scheme.members(b))) <= self.settings.step_tolerance)
+
+    def _require_step(self, descent: Descent) -> None:
+        """Raise where the members lost do not allow a step."""
+        at = descent.at
+        assert at is not None
+        if descent.step is not None or (descent.stop and self._informing(at) >= self.space.needed_members):
+            return
+        stage = f"forecast of iteration {descent.iteration + 1}"
+        self.space.require_members(at.members.failures, stage)
+        raise TooFewMembersError(f"{self.observations.name}: the centre cannot be run in the {stage}")

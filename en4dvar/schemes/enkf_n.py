@@ -1,0 +1,72 @@
+r"""EnKF-N: the finite-size ensemble Kalman filter, which finds the inflation that sampling errors call for.
+
+Mean and covariance of the forecast are known only from N members. Integrated over what they may be, the prior is a
+Student's t in weight space,
+
+    J(w) = ½ ‖d − Sw‖² + ½ (N+1) ln(ε_N + ‖w‖²),   ε_N = 1 + 1/N,
+
+whose minimum is that of ½ ‖d − Sw‖² + ½ ζ ‖w‖² with the precision ζ that minimises the dual cost
+
+    D(ζ) = ½ dᵀ (I + SSᵀ/ζ)⁻¹ d + ½ ε_N ζ + ½ (N+1) ln((N+1)/ζ) − ½ (N+1),   0 < ζ ≤ (N+1)/ε_N.
+
+The transform is √(N−1) H^{-1/2} with the Hessian of J at its minimum, H = SᵀS + ζ I − 2 ζ²/(N+1) w wᵀ.
+
+Sources: Bocquet (2011), Nonlin. Processes Geophys. 18, 735; dual: Bocquet & Sakov (2012), Nonlin. Processes Geophys.
+19, 383, § 3; Bocquet, Raanes & Hannart (2015), Nonlin. Processes Geophys. 22, 645.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from en4dvar.ensemble.linalg import Hessian
+from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights
+from en4dvar.schemes.etkf import ETKF
+from en4dvar.state import Array
+
+
+@dataclass(frozen=True)
+class EnKFN(ETKF):
+    """The filter; it needs no inflation where the model is right."""
+
+    def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
+        """Weights of the analysis."""
+        n_members = len(weights.w)
+        hessian = Hessian.of(evaluation.S)  # its rows are orthogonal, of lengths σ: SᵀS = rowsᵀ rows
+        squares = hessian.singular_values**2
+        slope = evaluation.d @ evaluation.S
+        # of dᵀd only the part that S can explain, (rows Sᵀd)² / σ⁴ in each direction, depends on ζ
+        informed = squares > np.finfo(float).eps * max(1.0, float(squares.max(initial=0.0)))
+        projected = np.zeros_like(squares)
+        projected[informed] = (hessian.rows[informed] @ slope) ** 2 / squares[informed] ** 2
+        zeta = prior_precision(projected, squares, n_members)
+        damping = zeta / hessian.prior_precision - 1
+        w = hessian.solve(slope, damping=damping)
+        second = hessian.rows.T @ hessian.rows + zeta * np.eye(n_members)
+        second -= 2 * zeta**2 / (n_members + 1) * np.outer(w, w)
+        values, vectors = np.linalg.eigh(second)
+        transform = (vectors * np.sqrt(hessian.prior_precision / values)) @ vectors.T
+        return Step(Weights(w, transform), math.sqrt(max(0.0, float(w @ second @ w))))
+
+
+def prior_precision(projected: Array, squares: Array, n_members: int) -> float:
+    """The minimiser ζ of the dual cost.
+
+    ``projected`` (m,) are the squares of d along the left singular vectors of S, ``squares`` (m,) those of its singular
+    values.
+    """
+    from scipy.optimize import minimize_scalar
+
+    epsilon = 1 + 1 / n_members
+
+    def dual(log_zeta: float) -> float:
+        zeta = math.exp(log_zeta)
+        misfit = float(np.sum(projected * zeta / (zeta + squares)))
+        return 0.5 * (misfit + epsilon * zeta - (n_members + 1) * log_zeta)
+
+    largest = math.log((n_members + 1) / epsilon)
+    found = minimize_scalar(dual, bounds=(largest - 12, largest), method="bounded", options={"xatol": 1e-8})
+    return math.exp(float(found.x))
