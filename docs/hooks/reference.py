@@ -47,9 +47,9 @@ def yaml_page() -> str:
         "## parameters",
         definitions["parameter"]["description"],
         "A prior:",
-        _table(definitions["parameter"]["oneOf"][1], definitions),
+        _table(definitions["parameter"]["anyOf"][1], definitions),
         "A scalar of the data file:",
-        _table(definitions["parameter"]["oneOf"][2], definitions),
+        _table(definitions["parameter"]["anyOf"][2], definitions),
     ]
     for name in models:
         section = definitions[f"model_{name}"]

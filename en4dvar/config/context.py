@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, GetCoreSchemaHandler, GetJsonSchemaHandler
-from pydantic_core import CoreSchema, PydanticKnownError, core_schema
+from pydantic_core import CoreSchema, core_schema
 
 from en4dvar.config.validate import Faults
 from en4dvar.errors import ConfigError
@@ -23,6 +23,7 @@ from en4dvar.units import convert, parse_quantity, parse_unit
 
 T = TypeVar("T")
 PLACEHOLDER = "<observable>"
+TEXT: Mapping[str, Any] = {"type": ["string", "number"]}  # a quantity in the JSON schema
 
 
 class Unknown(Exception):
@@ -79,21 +80,25 @@ def subject_unit(context: Context) -> str:
     return str(context.subject.unit)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Made:
     """Pydantic annotation: the file gives a ``given``, and the field holds ``make(it, context)``, None if unknown.
 
-    A :class:`ConfigError` of ``make`` is told at the path that its faults have below the field.
+    A :class:`ConfigError` of ``make`` is told at the path that its faults have below the field. In the JSON schema the
+    field is ``json``; by default what is given, or a quantity.
     """
 
     make: Callable[[Any, Context], Any]
     given: Any = Any
+    json: Mapping[str, Any] | None = None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.with_info_after_validator_function(self._make, handler.generate_schema(self.given))
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        return {"type": ["string", "number"]} if self.given is Any else handler(schema)
+        if self.json is not None:
+            return dict(self.json)
+        return dict(TEXT) if self.given is Any else handler(schema)
 
     def _make(self, value: Any, info: Any) -> Any:
         with Faults() as faults, faults.at(), suppress(Unknown):
@@ -155,57 +160,28 @@ def unit_of(target: Unit) -> Made:
     return Made(fits, Annotated[str, AfterValidator(known)])
 
 
-class ByName:
-    """Pydantic annotation of a dict with an ``entry`` a name that the model knows, read with it as the ``subject``.
+def read_each(
+    given: Mapping[str, Any],
+    known: Mapping[str, Any],
+    context: Context,
+    faults: Faults,
+    read: Callable[[Any, Context], T],
+    unknown: Callable[[str], str] | None = None,
+) -> dict[str, T]:
+    """What ``read`` makes of each entry of a section whose keys are the names of ``known`` things, its subjects.
 
-    ``some``: at least one has to be given.
+    ``unknown`` words what is wrong with another name.
     """
-
-    def __init__(self, entry: Any, known: Callable[[ForwardModel], Mapping[str, Any]], some: bool = False):
-        self.entry, self.known, self.some = entry, known, some
-
-    def unknown(self, name: str, model: ForwardModel) -> str:
-        """What is wrong with a name that the model does not know."""
-        return f"unknown key {name!r}{suggest(name, self.known(model))}"
-
-    def missing(self, name: str, model: ForwardModel) -> str:
-        """What is wrong where a name is not given; nothing where it may be left out."""
-        return ""
-
-    def result(self, entries: dict[str, Any], model: ForwardModel) -> Any:
-        """What the field holds. Raises :class:`ConfigError`, its paths the names of entries."""
-        return entries
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.with_info_wrap_validator_function(self._read, handler.generate_schema(self.entry))
-
-    def __get_pydantic_json_schema__(self, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        found = handler(core_schema.dict_schema(core_schema.str_schema(), schema["schema"]))
-        return found | {"minProperties": 1} if self.some else found
-
-    def _read(self, given: Any, read_entry: Callable[[Any], Any], info: Any) -> Any:
-        if not isinstance(given, dict):
-            raise PydanticKnownError("dict_type")
-        context: Context = info.context
-        model, entries = context.built, {}
-        if model is None:
-            return None
-        known = self.known(model)
-        with Faults() as faults:
-            if self.some and not given:
-                faults.add((), f"give at least one of: {', '.join(known)}")
-            for name, value in given.items():
-                context.subject = known.get(name)
-                if name not in known:
-                    faults.add((name,), self.unknown(name, model), at_key=True)
-                    continue
-                with faults.at(name):
-                    entries[name] = read_entry(value)
-            for name in known:
-                if name not in given and (words := self.missing(name, model)):
-                    faults.add((name,), words)
-        with Faults() as faults, faults.at():
-            return self.result(entries, model)
+    found: dict[str, T] = {}
+    for name, value in given.items():
+        if name not in known:
+            words = unknown(name) if unknown else f"unknown key {name!r}{suggest(name, known)}"
+            faults.add((name,), words, at_key=True)
+            continue
+        context.subject = known[name]
+        with faults.at(name):
+            found[name] = read(value, context)
+    return found
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from collections.abc import Mapping
+from typing import Annotated, Any, NamedTuple
 
-from en4dvar.config.context import ByName, Made, parse_spread
+from en4dvar.config.context import Context, Made, parse_spread, read_each
 from en4dvar.config.schema import Section
+from en4dvar.config.validate import Faults
 from en4dvar.forward import ForwardModel
 from en4dvar.hints import suggest
 from en4dvar.prior import PriorTerm
@@ -50,16 +52,22 @@ def dynamic_fields(model: ForwardModel) -> dict[str, Field]:
     return {f.name: f for f in model.layout if f.name not in constant}
 
 
-class PerturbedFields(ByName):
-    """Prior and perturbation of each field named, in the order of the file."""
+def _perturbed(given: Mapping[str, Any], context: Context) -> tuple[Perturbed, ...]:
+    """In the order of the file."""
+    fields = dynamic_fields(context.model)
 
-    def __init__(self) -> None:
-        super().__init__(InitialSpread, dynamic_fields)
-
-    def unknown(self, name: str, model: ForwardModel) -> str:
-        if name in {p.name for p in model.parameters}:
+    def unknown(name: str) -> str:
+        if name in {p.name for p in context.model.parameters}:
             return f"{name} is a parameter: give it a prior in parameters"
-        return f"unknown field {name!r} of the state{suggest(name, dynamic_fields(model))}"
+        return f"unknown field {name!r} of the state{suggest(name, fields)}"
 
-    def result(self, entries: dict[str, InitialSpread], model: ForwardModel) -> tuple[Perturbed, ...]:
-        return tuple(spread.std for spread in entries.values())
+    def read(entry: Any, context: Context) -> Perturbed:
+        return InitialSpread.model_validate(entry, context=context).std
+
+    with Faults() as faults:
+        return tuple(read_each(given, fields, context, faults, read, unknown).values())
+
+
+PERTURBED = Made(
+    _perturbed, dict[str, Any], {"type": "object", "additionalProperties": InitialSpread.model_json_schema()}
+)

@@ -15,9 +15,9 @@ from pydantic import Field
 from en4dvar.config.context import Context, Made, time_unit
 from en4dvar.config.data import Data
 from en4dvar.config.document import Document, override, read_document
-from en4dvar.config.initial_state import Perturbed, PerturbedFields
+from en4dvar.config.initial_state import PERTURBED, Perturbed
 from en4dvar.config.models import read_model
-from en4dvar.config.parameters import Entries, Entry, Fixed
+from en4dvar.config.parameters import Entry, Fixed, entries
 from en4dvar.config.schema import Assimilation, Execution, File, Output, QuantityText, Section
 from en4dvar.config.validate import Faults, check
 from en4dvar.errors import ConfigError, Fault
@@ -66,9 +66,9 @@ class Estimation(File):
 
     data: Data | None = None
     """Where the observations are, what they mean and how well they are known."""
-    parameters: Annotated[tuple[Entry, ...], Entries()]
+    parameters: Annotated[tuple[Entry, ...], entries()]
     """For each parameter a prior (estimated), a quantity (fixed), or a scalar of the data file (fixed)."""
-    initial_state: Annotated[tuple[Perturbed, ...], PerturbedFields()] | None = None
+    initial_state: Annotated[tuple[Perturbed, ...], PERTURBED] | None = None
     """Fields of the initial state that are uncertain, each with its ``std``."""
     assimilation: Assimilation = Assimilation()
     """Scheme, ensemble size and stopping rules; the defaults are the recommended ones."""

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Discriminator, Field, GetJsonSchemaHandler, Tag
+from pydantic import Field
 
-from en4dvar.config.context import ByName, Context, Made, Spread, parse_spread, subject_unit, unit_of
+from en4dvar.config.context import Context, Made, Spread, parse_spread, read_each, subject_unit, unit_of
 from en4dvar.config.schema import Section
+from en4dvar.config.validate import Faults
 from en4dvar.errors import ConfigError, Fault
-from en4dvar.forward import ForwardModel
 from en4dvar.hints import suggest
 from en4dvar.prior import PriorTerm
 from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Parameter
@@ -151,79 +151,54 @@ class Uncertain:
 Entry = Fixed | Scalar | Uncertain
 
 
-def _fixed(text: Any, context: Context) -> Fixed:
-    return Fixed(context.subject, _bounded(text, context.subject))
-
-
-def _scalar(given: FromFile, context: Context) -> Scalar:
-    return Scalar(context.subject, given.from_file, given.unit)
-
-
-def _uncertain(given: Prior, context: Context) -> Uncertain:
-    entry = Uncertain(context.subject, given)
+def _entry(given: Any, context: Context) -> Entry:
+    """A quantity, a scalar of the data file, or a prior. Raises :class:`ConfigError`, ``ValueError``."""
+    parameter = context.subject
+    if not isinstance(given, dict):
+        return Fixed(parameter, _bounded(given, parameter))
+    if "from_file" in given:
+        scalar = FromFile.model_validate(given, context=context)
+        return Scalar(parameter, scalar.from_file, scalar.unit)
+    entry = Uncertain(parameter, Prior.model_validate(given, context=context))
     if not entry.needs_data:
         entry.term()
-    elif given.prior != "logit":
+    elif entry.spec.prior != "logit":
         entry.term(maximum=1.0)  # the other values do not wait for the data
     return entry
 
 
-def _kind(given: Any) -> str:
-    if not isinstance(given, dict):
-        return "a quantity"
-    return "a scalar" if "from_file" in given else "a prior"
+def _missing(parameter: Parameter) -> str:
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    return (
+        f"{parameter.label} {parameter.name!r} (unit {parameter.unit}) has neither a prior nor a value; "
+        f"write e.g. '{parameter.name}: {{prior: normal, mean: 1{unit}, std: 0.1{unit}}}' or a fixed quantity"
+    )
 
 
-ENTRY = Annotated[
-    Annotated[Fixed, Made(_fixed), Tag("a quantity")]
-    | Annotated[Uncertain, Made(_uncertain, Prior), Tag("a prior")]
-    | Annotated[Scalar, Made(_scalar, FromFile), Tag("a scalar")],
-    Discriminator(_kind),
-]
-
-
-def _parameters(model: ForwardModel) -> dict[str, Parameter]:
-    """Those of the model, then the time shift and the noise scale; a model's own sigma goes before."""
-    shift = replace(TIME_SHIFT, unit=model.time_unit, display_unit=model.time_display_unit)
-    own = {p.name: p for p in model.parameters}
-    return own | {p.name: p for p in (shift, NOISE_SCALE) if p.name not in own}
-
-
-def _defaults(model: ForwardModel) -> Mapping[str, float]:
-    return getattr(model, "defaults", {})
-
-
-class Entries(ByName):
+def entries(kind: str = "") -> Made:
     """One entry for every parameter of the model, in its order, then t_s and sigma if given.
 
     ``kind``: what the file is, where it names no data from which a value could come.
     """
 
-    def __init__(self, kind: str = ""):
-        super().__init__(ENTRY, _parameters)
-        self.kind = kind
-
-    def unknown(self, name: str, model: ForwardModel) -> str:
-        return f"unknown parameter {name!r}{suggest(name, _parameters(model))}"
-
-    def missing(self, name: str, model: ForwardModel) -> str:
-        parameter = _parameters(model)[name]
-        if name in _defaults(model) or parameter not in model.parameters:
-            return ""
-        unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-        return (
-            f"{parameter.label} {parameter.name!r} (unit {parameter.unit}) has neither a prior nor a value; "
-            f"write e.g. '{parameter.name}: {{prior: normal, mean: 1{unit}, std: 0.1{unit}}}' or a fixed quantity"
-        )
-
-    def result(self, entries: dict[str, Entry], model: ForwardModel) -> tuple[Entry, ...]:
-        if self.kind and (waiting := [name for name, entry in entries.items() if entry.needs_data]):
-            message = f"{self.kind} has no data file to take a value from"
-            raise ConfigError([Fault(message, name) for name in waiting])
-        known = _parameters(model)
-        found: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in _defaults(model).items()}
-        found |= entries
+    def read(given: Mapping[str, Any], context: Context) -> tuple[Entry, ...]:
+        model = context.model
+        shift = replace(TIME_SHIFT, unit=model.time_unit, display_unit=model.time_display_unit)
+        known = {p.name: p for p in model.parameters}  # a model's own sigma goes before
+        known |= {p.name: p for p in (shift, NOISE_SCALE) if p.name not in known}
+        defaults: Mapping[str, float] = getattr(model, "defaults", {})
+        found: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in defaults.items()}
+        with Faults() as faults:
+            found |= read_each(
+                given, known, context, faults, _entry, lambda name: f"unknown parameter {name!r}{suggest(name, known)}"
+            )
+            for name, entry in found.items():
+                if kind and entry.needs_data:
+                    faults.add((name,), f"{kind} has no data file to take a value from")
+            for parameter in model.parameters:
+                if parameter.name not in {**given, **defaults}:
+                    faults.add((parameter.name,), _missing(parameter))
         return tuple(found[name] for name in known if name in found)
 
-    def __get_pydantic_json_schema__(self, schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        return {"type": "object", "additionalProperties": {"x-definition": "parameter"}}
+    json = {"type": "object", "additionalProperties": {"x-definition": "parameter"}}
+    return Made(read, dict[str, Any], json)

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapVa
 from en4dvar.config.context import Context, Made, quantity, time_unit
 from en4dvar.config.document import Document
 from en4dvar.config.load import read_file
-from en4dvar.config.parameters import Entries, Entry, Fixed, Uncertain
+from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.schema import File, Name, Section
 from en4dvar.config.validate import Faults
 from en4dvar.forward import ForwardModel, Observable
@@ -25,7 +25,7 @@ class Group(Section):
 
     datasets: Annotated[int, Field(ge=1, le=999)]
     """How many data sets."""
-    parameters: Annotated[tuple[Entry, ...], Entries("a campaign")]
+    parameters: Annotated[tuple[Entry, ...], entries("a campaign")]
     """What their truths are drawn from: a prior (drawn for each) or a quantity (common to all)."""
 
     @property

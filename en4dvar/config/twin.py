@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Set
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, cast
@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, cast
 import numpy as np
 from pydantic import Field, model_validator
 
-from en4dvar.config.context import ByName, Context, Made, quantity, subject_unit, time_unit
+from en4dvar.config.context import TEXT, Context, Made, quantity, read_each, require_sign, time_unit
 from en4dvar.config.document import Document
 from en4dvar.config.initial_state import dynamic_fields
 from en4dvar.config.load import read_file
-from en4dvar.config.parameters import Entries, Entry, Fixed, Uncertain
+from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.schema import File, Output, Section, section_of
 from en4dvar.config.validate import Faults
 from en4dvar.cycling.sequential import SequentialSettings
@@ -29,13 +29,32 @@ from en4dvar.schemes import ON_A_SERIES
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import Localisation
+from en4dvar.units import parse_quantity
 
 FileName = Annotated[str, Field(min_length=1)]
-STD = Annotated[float, quantity(subject_unit, "positive")]
 
 
 def _errors(model: ForwardModel) -> dict[str, Observable]:
     return {f"{observable.name}_std": observable for observable in model.observables}
+
+
+def _stds(known: Callable[[ForwardModel], Mapping[str, Any]]) -> Made:
+    """Standard deviations by the name of a thing that the model knows."""
+
+    def read(text: Any, context: Context) -> float:
+        std = parse_quantity(text, context.subject.unit)
+        require_sign(std, "positive", text)
+        return std
+
+    def read_all(given: Mapping[str, Any], context: Context) -> dict[str, float]:
+        things = known(context.model)
+        with Faults() as faults:
+            if not given:
+                faults.add((), f"give at least one of: {', '.join(things)}")
+            return read_each(given, things, context, faults, read)
+
+    json = {"type": "object", "minProperties": 1, "additionalProperties": TEXT}
+    return Made(read_all, dict[str, Any], json)
 
 
 def _correlation(path: str, context: Context) -> tuple[str, Correlation]:
@@ -56,14 +75,14 @@ class Twin(Section):
     """Cycles at the beginning that no score counts."""
     interval: Annotated[float, quantity(time_unit, "positive")]
     """Time between two observations, in the model's unit of time."""
-    error: Annotated[dict[str, float], ByName(STD, _errors, some=True)]
+    error: Annotated[dict[str, float], _stds(_errors)]
     """Std of the observation errors, by observable: ``<observable>_std``."""
     error_correlation: (
         Annotated[tuple[str, Correlation], Made(_correlation, Annotated[str, Field(min_length=1)])] | None
     ) = None
     """CSV file of the correlation of the errors at one instant, full or block diagonal, one row an observation, without
     header; relative to the configuration's folder. Default: independent errors."""
-    initial_std: Annotated[dict[str, float], ByName(STD, dynamic_fields, some=True)]
+    initial_std: Annotated[dict[str, float], _stds(dynamic_fields)]
     """Std of the initial ensemble, by field of the state."""
 
     @model_validator(mode="after")
@@ -163,7 +182,7 @@ class Workers(Section):
 class TwinFile(File):
     """A twin experiment; ``model`` and ``parameters`` are as for an estimation."""
 
-    parameters: Annotated[tuple[Entry, ...], Entries("a twin experiment")] = Field({}, validate_default=True)
+    parameters: Annotated[tuple[Entry, ...], entries("a twin experiment")] = Field({}, validate_default=True)
     """Parameters to estimate (a prior) or to change from the model's default (a quantity)."""
     twin: Twin
     """How the truth is made and observed."""

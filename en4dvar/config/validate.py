@@ -48,12 +48,12 @@ def check(
 
 @dataclass(frozen=True)
 class _Told:
-    """What is wrong at ``place``; ``absent``: the last key of it, where that may not be in the file."""
+    """What is wrong at ``place``; ``absent``: its last key may be one that the file lacks."""
 
     place: Place
     message: str
     at_key: bool = False
-    absent: str = ""
+    absent: bool = False
 
 
 class Faults:
@@ -68,14 +68,13 @@ class Faults:
 
     def add(self, place: Place, message: str, *, at_key: bool = False) -> None:
         """A fault at a key, or of a key that is not there."""
-        self._add(_Told(place, message, at_key, absent=str(place[-1]) if place else ""))
+        self._add(_Told(place, message, at_key, absent=bool(place)))
 
     def _add(self, told: _Told) -> None:
         message = told.message
         for declared, written in self._names.items():
             message = message.replace(declared, written)
-        absent = self._names.get(told.absent, told.absent)
-        context = {"message": message, "at_key": told.at_key, "absent": absent}
+        context = {"message": message, "at_key": told.at_key, "absent": told.absent}
         where = tuple(self._names.get(str(part), part) for part in told.place)
         self._lines.append({"type": PydanticCustomError("fault", "{message}", context), "loc": where, "input": None})
 
@@ -89,7 +88,9 @@ class Faults:
                 self._add(replace(told, place=(*place, *told.place)))
         except ConfigError as error:
             for fault in error.problems:
-                self._add(_Told((*place, fault.path) if fault.path else place, fault.message, absent=fault.path))
+                self._add(_Told((*place, fault.path) if fault.path else place, fault.message, absent=bool(fault.path)))
+        except ValueError as error:
+            self._add(_Told(place, str(error)))
 
     def __enter__(self) -> Self:
         return self
@@ -106,19 +107,19 @@ def _tell(error: ValidationError, schema: type[BaseModel]) -> Iterator[_Told]:
             yield _Told(place, **context)
         elif kind == "union_tag_invalid":
             name = context["discriminator"].strip("'")
-            yield _Told((*place, name), _not_one_of(context["tag"], context["expected_tags"]), absent=name)
+            yield _Told((*place, name), _not_one_of(context["tag"], context["expected_tags"]), absent=True)
         elif kind == "extra_forbidden":
             hint = suggest(place[-1], sorted(_known(schema, place[:-1])))
             yield _Told(place, f"unknown key {str(place[-1])!r}{hint}", at_key=True)
         else:
-            yield _Told(place, _message(item), absent=str(place[-1]) if kind == "missing" else "")
+            yield _Told(place, _message(item), absent=kind == "missing")
 
 
 def _written(told: _Told, path: Sequence[str | int], document: Document) -> Place:
     """Pydantic puts names of union branches into the place; the document decides what is a path."""
     real = tuple(path)
     for n, part in enumerate(told.place, 1):
-        if document.has((*real, part)) or (n == len(told.place) and str(part) == told.absent):
+        if document.has((*real, part)) or (told.absent and n == len(told.place)):
             real = (*real, part)
     return real
 
