@@ -11,7 +11,7 @@ from en4dvar import diagnostics as diag
 from en4dvar.analysis import Analysis, Progress, Record
 from en4dvar.descent.loop import iterate
 from en4dvar.descent.noise_scale import mean_beyond_mode
-from en4dvar.descent.start import Comparison, choose_start
+from en4dvar.descent.start import StartState, choose_start
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, log_posterior
@@ -23,7 +23,7 @@ from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.shape import examine_shape, guide
 from en4dvar.schemes import window_scheme
-from en4dvar.schemes.base import GaussNewtonStep, Weights
+from en4dvar.schemes.base import Weights
 from en4dvar.schemes.en4dvar import En4DVar
 from en4dvar.state import Array
 from en4dvar.units import convert
@@ -50,7 +50,7 @@ class LoopState:
     """
 
     forward_runs: int
-    comparison: Comparison | None = None
+    comparison: StartState | None = None
     descent: Descent | None = None
     warnings: tuple[Caution, ...] = ()
     refinement: Refinement | None = None
@@ -125,10 +125,8 @@ class _Assimilation:
         space.require_members(prior_run[:-1].failures, "prior forecast")
         start = self.start(prior_run, resume) if resume is None or resume.descent is None else resume
         descent = self.iterate(start, prior_run)
-        assert isinstance(descent.step, GaussNewtonStep)
-        assert descent.at is not None
 
-        w, transform = descent.weights.w, descent.step.transform if self.scheme.searches else descent.weights.T
+        w, transform = descent.weights.w, descent.newton.transform if self.scheme.searches else descent.weights.T
         ends = space.control(np.vstack([w + transform, w]))
         posterior, mode = ends[:-1], ends[-1]
         posterior = posterior + mean_beyond_mode(problem, mode, posterior, descent.records[-1].dfs)
@@ -138,7 +136,7 @@ class _Assimilation:
             final = space.forecast(ends, self.grid)
             after, last = final[:-1], final[-1:]
         else:  # the last ensemble that was run is the posterior
-            after, last = descent.at.members, descent.at.central
+            after, last = descent.iterate.members, descent.iterate.central
         space.require_members(after.failures, "posterior forecast")
         down_weights, huber_warnings = self.robust(last)
         per_parameter = diag.dfs_per_parameter(space.prior_variance, posterior)
@@ -180,7 +178,7 @@ class _Assimilation:
             huber_weight=down_weights,
             refinement=refinement,
             log_evidence=diag.log_evidence(
-                descent.at.cost, descent.step.hessian.singular_values, len(space.members), observations
+                descent.iterate.cost, descent.newton.hessian.singular_values, len(space.members), observations
             ),
             limits=problem.model.validity,
             extremes=after.extremes,
@@ -218,7 +216,7 @@ class _Assimilation:
         if resume is not None:
             space.forward_runs = resume.forward_runs
 
-        def keep(comparison: Callable[[], Comparison]) -> None:
+        def keep(comparison: Callable[[], StartState]) -> None:
             self.keep(lambda: LoopState(space.forward_runs, comparison()))
 
         before = resume.comparison if resume else None

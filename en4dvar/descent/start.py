@@ -21,7 +21,7 @@ from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.ensemble.forecast import Forecast
 from en4dvar.honesty import Caution, caution
-from en4dvar.schemes.base import GaussNewtonStep, Scheme, Weights
+from en4dvar.schemes.base import Scheme, Weights
 from en4dvar.schemes.en4dvar import En4DVar
 
 ROUGH = 1e-2  # relative decrease of J at which a descent stops that only has to tell basins apart
@@ -29,7 +29,7 @@ SAME = 1.0  # posterior standard deviations between descents that have met
 
 
 @dataclass(frozen=True)
-class Comparison:
+class StartState:
     """All that the rest of a comparison depends on: the descents of this round, the rank by J of the member where the
     first of them started, the rounds of moves so far, and the lowest of the descents before.
     """
@@ -40,11 +40,11 @@ class Comparison:
     lowest: Descent | None = None
 
 
-Keep = Callable[[Callable[[], Comparison]], None]
+Keep = Callable[[Callable[[], StartState]], None]
 
 
 def choose_start(
-    space: WeightSpace, scheme: En4DVar, run: Forecast, seed: int, resume: Comparison | None, keep: Keep,
+    space: WeightSpace, scheme: En4DVar, run: Forecast, seed: int, resume: StartState | None, keep: Keep,
     tell: Callable[[Record], None],
 ) -> tuple[Descent, tuple[Caution, ...]]:  # fmt: skip
     """The descent to go on with, and warnings. ``run``: forecast of the prior members and, last, of their mean.
@@ -69,7 +69,7 @@ def choose_start(
     together = min(space.settings.starts, len(starts))
     if together < 2:
         return Descent(Weights(candidates[best[0]], identity)), warnings
-    comparison = resume or Comparison(lowest=Descent(starts[0]))
+    comparison = resume or StartState(lowest=Descent(starts[0]))
     window = Rounds(space, seed, comparison, keep, tell)
     while window.rank < len(starts):
         if not window.descents:
@@ -96,15 +96,15 @@ def highest_plausible(space: WeightSpace) -> float:
 class Rounds(DataWindow):
     """Descents side by side that only have to tell which gets lowest."""
 
-    def __init__(self, space: WeightSpace, seed: int, before: Comparison, keep: Keep, tell: Callable[[Record], None]):
+    def __init__(self, space: WeightSpace, seed: int, before: StartState, keep: Keep, tell: Callable[[Record], None]):
         super().__init__(space, seed, lambda: keep(self.comparison), tell)
         self.descents, self.rank, self.rounds = [d.kept for d in before.descents], before.first, before.rounds
         self.lowest = before.lowest.kept if before.lowest else Descent(Weights.prior(len(space.members)))
         self.plausible = highest_plausible(space)
 
-    def comparison(self) -> Comparison:
+    def comparison(self) -> StartState:
         """As it is kept."""
-        return Comparison(tuple(d.kept for d in self.descents), self.rank, self.rounds, self.lowest.kept)
+        return StartState(tuple(d.kept for d in self.descents), self.rank, self.rounds, self.lowest.kept)
 
     def move(self, scheme: Scheme, going: Sequence[Descent]) -> None:
         for descent in going:
@@ -123,8 +123,7 @@ class Rounds(DataWindow):
         if move is None:
             descent.ended = True
             return
-        step, before = descent.step, descent.cost
-        assert isinstance(step, GaussNewtonStep)
+        step, before = descent.newton, descent.cost
         self.record(descent, step.transform, move.step_length)
         descent.weights, descent.cost = Weights(move.w, step.transform), move.cost
         rough = max(before - move.cost, step.predicted_decrease) <= ROUGH * max(1.0, move.cost)
@@ -135,8 +134,8 @@ def _end_those_that_met(descents: Sequence[Descent]) -> None:
     """Of descents within ``SAME`` of each other, in the metric of the lower one's Hessian, keep the lower one."""
     order = sorted(descents, key=lambda descent: descent.cost)
     for position, lower in enumerate(order):
-        if lower.ended or not isinstance(lower.step, GaussNewtonStep):
+        if lower.ended:
             continue
         for higher in order[position + 1 :]:
-            if lower.step.hessian.norm(higher.weights.w - lower.weights.w) < SAME:
+            if lower.newton.hessian.norm(higher.weights.w - lower.weights.w) < SAME:
                 higher.ended = True

@@ -70,6 +70,18 @@ class Descent:
         return len(self.records)
 
     @property
+    def newton(self) -> GaussNewtonStep:
+        """The step, of a scheme that searches, or of J for the record."""
+        assert isinstance(self.step, GaussNewtonStep)
+        return self.step
+
+    @property
+    def iterate(self) -> Iterate:
+        """Where it stands, once the runs are there."""
+        assert self.at is not None
+        return self.at
+
+    @property
     def kept(self) -> Descent:
         """A copy for a checkpoint."""
         return replace(self, at=None, step=None)
@@ -111,8 +123,7 @@ class DataWindow:
 
     def whiten(self, scheme: Scheme, descent: Descent, reference: Array, anomalies: Array) -> Evaluation:
         """By Fisher scoring; for a scheme that runs its whole ensemble with the R at its mean."""
-        assert descent.at is not None
-        like = descent.at.central.predicted[0]
+        like = descent.iterate.central.predicted[0]
         if scheme.searches:
             return self._evaluation(descent, Linearisation.of_stacked(like, reference, anomalies))
         mean, k = like.unstacked(reference), like.values.shape[-1]
@@ -140,9 +151,7 @@ class DataWindow:
 
     def record(self, descent: Descent, transform: Array, step_length: float) -> None:
         """Add the record of an iterate: the ensemble of ``transform`` (N, N) there, and how far it is left."""
-        space, at, step = self.space, descent.at, descent.step
-        assert at is not None
-        assert isinstance(step, GaussNewtonStep)
+        space, at, step = self.space, descent.iterate, descent.newton
         w = descent.weights.w
         ensemble = space.control(np.concatenate([w + transform, w[None]]))
         physical = space.problem.prior.to_physical(ensemble)
@@ -168,9 +177,7 @@ class DataWindow:
         return self.settings.cost_tolerance * max(cost, 1.0)
 
     def _minimise(self, scheme: Scheme, descent: Descent) -> None:
-        settings, at, step = self.settings, descent.at, descent.step
-        assert at is not None
-        assert isinstance(step, GaussNewtonStep)
+        settings, at, step = self.settings, descent.iterate, descent.newton
         move, contracted = None, Weights(descent.weights.w, step.transform)
         if not descent.stop:
             if step.norm <= settings.step_tolerance:
@@ -245,31 +252,26 @@ class DataWindow:
         return n_members if len(at.members) < n_members else int(at.members.active.sum())
 
     def _evaluation(self, descent: Descent, linear: Linearisation) -> Evaluation:
-        assert descent.at is not None
-        at = descent.at
-        descent.at = Iterate(at.members, at.central, at.background, at.observation, linear)
+        descent.at = replace(descent.iterate, linear=linear)
         return Evaluation(*self.observations.whiten(linear), self.space.basis)
 
     def _regression(self, descent: Descent) -> GaussNewtonStep:
         """The Gauss–Newton step of J that an ensemble that was run as a whole tells."""
-        assert descent.at is not None
-        members, central = descent.at.members.predicted, descent.at.central.predicted
-        runs = Runs(members.stacked, central.stacked[0], descent.at.members.active, self.space.basis)
+        at = descent.iterate
+        runs = Runs(at.members.predicted.stacked, at.central.predicted.stacked[0], at.members.active, self.space.basis)
         reference, anomalies = En4DVar("transform").linearise(descent.weights, runs)
-        linear = Linearisation.of_stacked(central[0], reference, anomalies)
+        linear = Linearisation.of_stacked(at.central.predicted[0], reference, anomalies)
         return gauss_newton(descent.weights.w, self._evaluation(descent, linear))
 
     def _point(self, descent: Descent) -> Point:
-        at, step, tangent = descent.at, descent.step, None
-        assert at is not None
-        assert isinstance(step, GaussNewtonStep)
+        at, tangent = descent.iterate, None
         if (linear := at.linear) is not None and self.settings.linearisation == "bundle":
 
             def precision_times(vectors: Array) -> Array:
                 return self.observations.precision_times(linear.prediction, vectors)
 
             tangent = Tangent(linear.prediction.values, linear.anomalies, precision_times, self.space.basis)
-        return Point(descent.weights.w, at.cost, step, tangent)
+        return Point(descent.weights.w, at.cost, descent.newton, tangent)
 
     def _same_members(self, scheme: Scheme, a: Weights, b: Weights) -> bool:
         """Whether the scheme would run the same members again, to the step tolerance."""
@@ -277,8 +279,7 @@ class DataWindow:
 
     def _require_step(self, descent: Descent) -> None:
         """Raise where the members lost do not allow a step."""
-        at = descent.at
-        assert at is not None
+        at = descent.iterate
         if descent.step is not None or (descent.stop and self._informing(at) >= self.space.needed_members):
             return
         stage = f"forecast of iteration {descent.iteration + 1}"

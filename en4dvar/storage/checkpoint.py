@@ -24,7 +24,7 @@ from en4dvar.storage.codec import decode, encode
 
 D = TypeVar("D")
 FORMAT = "en4dvar-checkpoint"
-VERSION = "1"
+VERSION = "2"
 FOLDER = "checkpoints"
 
 

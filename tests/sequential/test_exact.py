@@ -219,7 +219,11 @@ def test_correlated_errors_are_those_of_the_kalman_filter(scheme, correlation):
         close(result.analysis.mean[k, :8], mean)
         close(result.analysis.std[k, :8], np.sqrt(np.diag(cov)))
     independent = run_sequential(
-        model, observed, members, Series(series.times, series.values, each, np.eye(3)), SequentialSettings(scheme)
+        model,
+        observed,
+        members,
+        Series(series.times, series.values, each, Correlation(np.eye(3))),
+        SequentialSettings(scheme),
     )
     plain = run_sequential(
         model, observed, members, Series(series.times, series.values, each), SequentialSettings(scheme)

@@ -1,0 +1,88 @@
+"""The analyses of DEnKF and EnKF-N against closed forms and a direct minimisation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from toys import Linear, make_problem
+
+from en4dvar.assimilate import assimilate
+from en4dvar.ensemble.linalg import centre
+from en4dvar.problem import AssimilationSettings
+from en4dvar.schemes.base import Evaluation, Weights
+from en4dvar.schemes.denkf import DEnKF
+from en4dvar.schemes.enkf_n import EnKFN
+from en4dvar.schemes.etkf import ETKF
+
+
+def evaluation(n_members=8, k=5, scale=1.0, seed=0):
+    rng = np.random.default_rng(seed)
+    return Evaluation(2 * rng.standard_normal(k), scale * centre(rng.standard_normal((n_members, k)))[1].T)
+
+
+def analysed(scheme, e):
+    return scheme.advance(Weights.prior(e.S.shape[1]), e, 0, None).weights
+
+
+def test_denkf_moves_anomalies_by_half_the_gain():
+    """X_a = X_f − ½ K H X_f and x_a = x_f + K d for a state of two variables, one of them observed."""
+    rng = np.random.default_rng(3)
+    mean, x = centre(rng.standard_normal((7, 2)))
+    r, y = 0.5, 1.3
+    p = x.T @ x / 6
+    gain = p[:, :1] / (p[0, 0] + r)
+    e = Evaluation(np.array([y - mean[0]]) / np.sqrt(r), x[:, :1].T / np.sqrt(r))
+    weights = analysed(DEnKF(), e)
+    assert mean + weights.w @ x == pytest.approx(mean + gain[:, 0] * (y - mean[0]), abs=1e-13)
+    assert weights.T @ x == pytest.approx(x - 0.5 * x[:, :1] @ gain.T, abs=1e-13)
+
+
+def test_denkf_is_the_etkf_to_first_order():
+    gaps = []
+    for scale in (0.1, 0.05):
+        e = evaluation(scale=scale)
+        gaps.append(np.abs(analysed(DEnKF(), e).T - analysed(ETKF(), e).T).max())
+    assert gaps[0] / gaps[1] == pytest.approx(16, rel=0.1)  # the next order is that of (SᵀS)²
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("k", [3, 20])
+def test_enkf_n_minimises_its_cost(seed, k):
+    e, n = evaluation(k=k, seed=seed), 8
+
+    def cost(w):
+        return 0.5 * np.sum((e.d - e.S @ w) ** 2) + 0.5 * (n + 1) * np.log(1 + 1 / n + w @ w)
+
+    found = analysed(EnKFN(), e)
+    direct = minimize(cost, found.w + 0.1, method="BFGS", options={"gtol": 1e-9})
+    assert cost(found.w) <= direct.fun + 1e-8
+    h = 1e-5
+    gradient = [(cost(found.w + h * u) - cost(found.w - h * u)) / (2 * h) for u in np.eye(n)]
+    assert np.abs(gradient).max() < 1e-5
+    # the transform is the inverse root of the Hessian of that cost
+    hessian = np.array([
+        [(cost(found.w + 1e-3 * (a + b)) - cost(found.w + 1e-3 * (a - b)) - cost(found.w + 1e-3 * (b - a))
+          + cost(found.w - 1e-3 * (a + b))) / 4e-6 for a in np.eye(n)] for b in np.eye(n)
+    ])  # fmt: skip
+    assert found.T @ hessian @ found.T == pytest.approx((n - 1) * np.eye(n), abs=2e-3)
+
+
+def test_without_information_enkf_n_keeps_the_mean():
+    e = Evaluation(np.ones(3), np.zeros((3, 6)))
+    assert analysed(EnKFN(), e).w == pytest.approx(np.zeros(6), abs=1e-12)
+
+
+@pytest.mark.parametrize("scheme", ["etkf", "denkf", "enkf-n"])
+def test_filters_estimate_parameters_too(scheme):
+    """One analysis of a linear model has the mean of the Kalman update, and two ensembles are run with their mean."""
+    truth = np.array([1.0, -0.5, 0.7])
+    problem = make_problem(Linear(("a", "b", "c")), truth)
+    analysis = assimilate(problem, AssimilationSettings(scheme=scheme, members=20), 3)
+    h = np.array([[problem.model.curve(row, t) for row in np.eye(3)] for t in problem.observations.times])
+    mean, cov = analysis.prior.mean(axis=0), np.cov(analysis.prior.T)
+    gain = cov @ h.T @ np.linalg.inv(h @ cov @ h.T + np.diag(problem.observations.std**2))
+    exact = mean + gain @ (problem.observations.values - h @ mean)
+    tolerance = 1e-10 if scheme != "enkf-n" else 0.05  # which allows for the sampling error of the prior
+    assert np.abs(analysis.posterior.mean(axis=0) - exact).max() < tolerance
+    assert analysis.forward_runs == 2 * 21
