@@ -40,14 +40,15 @@ THREADS = int(os.environ.get("THREADS", "2"))
 def campaign(key: str, seed: int) -> list[list[object]]:
     """Rows of the file for one campaign; ``true`` is the mean of the lognormal that the truths were drawn from."""
     plan = resolve_campaign(read_document(CONFIGS / "agarose_twin.yaml"), CONFIGS)
-    (group,) = (g for g in plan.groups if g.name == f"agarose_{key}")
+    group = plan.settings.groups[f"agarose_{key}"]
+    only = plan.settings.model_copy(update={"groups": {f"agarose_{key}": group}})
     config = load_config(CONFIGS / f"agarose_{key}_qlkv.yaml")
     base = build(config)[0]
-    sets = draw_campaign(replace(plan, seed=seed, groups=(group,)))
+    sets = draw_campaign(replace(plan, seed=seed, settings=only))
     problems = []
     for s in sets:
         ones = np.ones(len(s.times))
-        observed = Observations(s.times, s.values, noise_of(plan.noise * ones), ones, name=s.name)
+        observed = Observations(s.times, s.values, noise_of(only.noise * ones), ones, name=s.name)
         problems.append(replace(base, observations=observed))
     with ThreadsExecutor(THREADS) as executor:
         analyses = [assimilate(p, config.assimilation, config.seed, executor) for p in problems]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Gt, Le, MinLen
 
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.observations import Observations
@@ -49,32 +51,63 @@ class InverseProblem:
         return given and all(p.name != NOISE_SCALE.name for p in self.model.parameters)
 
 
+Positive = Annotated[float, Gt(0)]
+
+
 @dataclass(frozen=True)
 class AssimilationSettings:
     """The scheme's settings; defaults are the recommended ones.
 
-    ``step_tolerance`` is a length in posterior standard deviations, √(δwᵀAδw); ``cost_tolerance`` is relative to J,
-    and absolute below J = 1. ``full`` takes the whole step or, where that raises J, none. ``starts`` prior members of
-    lowest J are compared by a descent from each, then others as long as none explains the data (see
-    :mod:`en4dvar.descent.start`). ``emulator`` spends a few hundred more runs on how Gaussian the posterior is, where
-    the members leave it open (see :mod:`en4dvar.sampling.shape`), and on the guidance of ``refine: mcmc``; ``auto``
-    does so with compiled models. ES-MDA reads, besides ``members``, ``sampling`` and ``min_active_fraction``, only
-    ``mda_coefficients``, scaled so that Σ 1/α = 1, and ``mda_form`` (see :mod:`en4dvar.schemes.esmda`).
+    This is the one declaration of the keys of ``assimilation:`` in YAML: type, bounds, description and default of each.
+    ``full`` takes the whole step or, where that raises J, none. The guidance of ``refine: mcmc`` uses the ``emulator``
+    as well (see :mod:`en4dvar.sampling.shape`). ES-MDA reads, besides ``members``, ``sampling`` and
+    ``min_active_fraction``, only ``mda_coefficients`` and ``mda_form`` (see :mod:`en4dvar.schemes.esmda`).
     """
 
-    scheme: Literal["en4dvar", "es-mda", "etkf", "denkf", "enkf-n"] = "en4dvar"
-    members: int = 48
-    sampling: Literal["exact", "random"] = "exact"
-    linearisation: Literal["bundle", "transform"] = "bundle"
-    epsilon: float = 1e-3
-    step_control: Literal["line-search", "levenberg-marquardt", "full"] = "line-search"
-    start: Literal["best-member", "prior-mean"] = "best-member"
-    starts: int = 2
-    max_iterations: int = 30
-    step_tolerance: float = 1e-3
-    cost_tolerance: float = 1e-4
-    min_active_fraction: float = 0.5
-    refine: Literal["none", "mcmc"] = "none"
-    emulator: Literal["auto", "on", "off"] = "auto"
-    mda_coefficients: tuple[float, ...] = (4.0, 4.0, 4.0, 4.0)
-    mda_form: Literal["perturbed", "square-root"] = "perturbed"
+    scheme: str = "en4dvar"  # one of those registered in en4dvar.schemes
+    members: Annotated[int, Ge(3), "Ensemble size N."] = 48
+    sampling: Annotated[
+        Literal["exact", "random"],
+        "Prior ensemble: second-order exact (mean and covariance are the prior's), or random.",
+    ] = "exact"
+    linearisation: Annotated[
+        Literal["bundle", "transform"],
+        "Tangent from runs close to the iterate (bundle), or regression over the ensemble (transform).",
+    ] = "bundle"
+    epsilon: Annotated[float, Gt(0), Le(1), "Size of the bundle, in prior standard deviations."] = 1e-3
+    step_control: Annotated[
+        Literal["line-search", "levenberg-marquardt", "full"], "What keeps J from rising along the iterations."
+    ] = "line-search"
+    start: Annotated[
+        Literal["best-member", "prior-mean"],
+        "Where the iterations start: the prior members of lowest J, or the prior mean.",
+    ] = "best-member"
+    starts: Annotated[
+        int, Ge(1), "How many prior members of lowest J start a descent; others follow while none explains the data."
+    ] = 2
+    max_iterations: Annotated[int, Ge(1), "Iteration limit."] = 30
+    step_tolerance: Annotated[
+        float, Gt(0), "Converged where the step is shorter than this, in posterior standard deviations, √(δwᵀAδw)."
+    ] = 1e-3
+    cost_tolerance: Annotated[
+        float, Gt(0), "Converged where J falls by less than this, relative to J (absolute below J = 1)."
+    ] = 1e-4
+    min_active_fraction: Annotated[
+        float, Gt(0), Le(1), "Fewer surviving members than this share of the ensemble end the run (exit code 3)."
+    ] = 0.5
+    refine: Annotated[
+        Literal["none", "mcmc"],
+        "mcmc: replace the posterior ensemble by draws of a Markov chain (extra 'mcmc').",
+    ] = "none"
+    emulator: Annotated[
+        Literal["auto", "on", "off"],
+        "A few hundred more runs to tell how Gaussian the posterior is: auto (compiled models), on, or off.",
+    ] = "auto"
+    mda_coefficients: Annotated[
+        tuple[Positive, ...],
+        MinLen(1),
+        "Inflation of R in each assimilation of es-mda, scaled so that the inverses sum to one.",
+    ] = (4.0, 4.0, 4.0, 4.0)
+    mda_form: Annotated[
+        Literal["perturbed", "square-root"], "Analysis of es-mda: perturbed observations, or a square root."
+    ] = "perturbed"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -53,12 +54,12 @@ def simulate(
 
 def _simulate_campaign(source: Source, out: Path | None, seed: int | None, force: bool) -> None:
     from en4dvar.config.document import override, read_document
-    from en4dvar.config.synthetic import relocated, resolve_campaign
+    from en4dvar.config.synthetic import resolve_campaign
     from en4dvar.runs.synthetic import draw_campaign, write_campaign
 
     document = override(read_document(source.path), source.overrides(seed=seed))
     plan = resolve_campaign(document, source.path.resolve().parent)
-    plan = relocated(plan, out) if out else plan
+    plan = replace(plan, directory=out) if out else plan
     sets = draw_campaign(plan)
     truth = write_campaign(plan, sets, command_line(), force)
     fits = [s.nrmse for s in sets]

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.config import Config
-from en4dvar.config.data import DataPlan
-from en4dvar.config.parameters import Fixed, Uncertain, located
+from en4dvar.config.data import Data
+from en4dvar.config.parameters import Fixed, Uncertain
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.files import readable
@@ -49,7 +49,7 @@ def build(config: Config) -> tuple[InverseProblem, ...]:
     return tuple(problems)
 
 
-def inverse_plan(config: Config) -> DataPlan:
+def inverse_plan(config: Config) -> Data:
     """How the observations are read. Raises :class:`ConfigError` without data or without anything to estimate."""
     if config.data is None:
         raise ConfigError([Fault("required: where the observations are", "data", config.document.file)])
@@ -66,21 +66,21 @@ def build_one(config: Config, name: str, path: Path) -> InverseProblem:
 def problem_of(config: Config, observations: Observations) -> InverseProblem:
     """The inverse problem of observations, wherever they come from. Raises :class:`ConfigError`."""
     terms, fixed = resolve_parameters(config, observations)
-    terms = (*terms, *(term for term, _ in config.initial_state))
-    perturbations = tuple(perturbation for _, perturbation in config.initial_state)
+    terms = (*terms, *(perturbed.term for perturbed in config.initial_state))
+    perturbations = tuple(perturbed.perturbation for perturbed in config.initial_state)
     problem = InverseProblem(config.model, config.observable, observations, Prior(terms), fixed, perturbations)
     check_problem(problem)
     return problem
 
 
-def data_files(plan: DataPlan) -> dict[str, Path]:
+def data_files(plan: Data) -> dict[str, Path]:
     """Name of the data set → file: the file's stem, made unique by its folders, then by a number.
 
     Raises
     ------
     DataError: no file matches a pattern, or a file is named twice.
     """
-    return find_files(plan.base, plan.paths)
+    return find_files(plan.path.base, plan.path.texts)
 
 
 def find_files(base: Path, texts: Sequence[str]) -> dict[str, Path]:
@@ -116,11 +116,12 @@ def _unique_names(paths: list[Path]) -> list[str]:
     return list(map(readable, names))
 
 
-def read_observations(plan: DataPlan, path: Path, name: str, weights: str = "sum") -> Observations:
+def read_observations(plan: Data, path: Path, name: str, weights: str = "sum") -> Observations:
     """The observations (y, t, R) of one file inside the window. Raises :class:`DataError`."""
-    series = read_series(path, plan.time, plan.value, plan.format, plan.decimal)
+    columns, asked = plan.columns, plan.window
+    series = read_series(path, columns.time, columns.observable, plan.format, plan.decimal)
     try:
-        window = select(series.times, series.values, plan.start, plan.end, plan.prominence)
+        window = select(series.times, series.values, asked.start, asked.end, asked.prominence)
     except DataError as error:
         raise DataError(f"{path}: {error}{_span(series.times, plan)}") from None
     times, values = series.times[window], series.values[window]
@@ -142,15 +143,16 @@ def read_observations(plan: DataPlan, path: Path, name: str, weights: str = "sum
     )
 
 
-def _span(times: Array, plan: DataPlan) -> str:
+def _span(times: Array, plan: Data) -> str:
     """Where the readings are, on the file's clock."""
-    if not isinstance(plan.time, Column):
+    column = plan.columns.time
+    if not isinstance(column, Column):
         return ""
-    first, last = convert(times[[0, -1]], plan.time.target, plan.time.unit)
-    return f"; the readings go from {first:g} to {last:g} {plan.time.unit}"
+    first, last = convert(times[[0, -1]], column.target, column.unit)
+    return f"; the readings go from {first:g} to {last:g} {column.unit}"
 
 
-def _noise(plan: DataPlan, times: Array, values: Array, samples: npt.NDArray[np.intp]) -> Noise:
+def _noise(plan: Data, times: Array, values: Array, samples: npt.NDArray[np.intp]) -> Noise:
     """The observation errors; ``samples`` (K,) are the places of the observations in the series.
 
     A covariance file holds one row an observation of the window, or one a usable sample of the whole series.
@@ -199,7 +201,7 @@ def resolve_parameters(
             else:
                 fixed[entry.parameter.name] = entry.value(observations.scalars, observations.source)
         except ConfigError as error:
-            faults += [located(config.document, path, fault) for fault in error.problems]
+            faults += [config.document.fault((*path, f.path) if f.path else path, f.message) for f in error.problems]
         except UnitError as error:
             faults.append(config.document.fault(path, str(error)))
     if faults:

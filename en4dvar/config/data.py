@@ -1,134 +1,266 @@
-"""The ``data:`` section in the model's units: which columns, which window, which errors."""
+"""The ``data:`` section: which files, columns and window, and how well the observations are known."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self
 
-from en4dvar.config import schema
-from en4dvar.config.document import Document
-from en4dvar.config.observation_error import ErrorPlan, Spread, parse_spread, read_error
-from en4dvar.config.validate import check
-from en4dvar.errors import Fault
-from en4dvar.forward import ForwardModel, Observable
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
+
+from en4dvar.config.context import (
+    PLACEHOLDER,
+    Context,
+    Made,
+    OfObservable,
+    Spread,
+    observable_unit,
+    quantity,
+    require_sign,
+    time_unit,
+    unit_of,
+)
+from en4dvar.config.schema import QuantityText, Section
+from en4dvar.config.validate import Faults
+from en4dvar.errors import ConfigError, Fault
 from en4dvar.hints import suggest
-from en4dvar.inputs.readers import Column, Format, Step
+from en4dvar.inputs.readers import Column, Format, Matrix, Step
 from en4dvar.inputs.text_table import Decimal
 from en4dvar.inputs.window import Instant, parse_instant
-from en4dvar.units import UnitError, convert, parse_quantity
+from en4dvar.units import UnitError, parse_quantity
 
-__all__ = ["DataPlan", "Spread", "parse_spread", "read_data"]
-
-T = TypeVar("T")
+_RELATIVE = re.compile(r"(.*%)\s+of\s+(?:the\s+)?maximum")
+HUBER = 1.345  # 95 % efficiency where the errors are Gaussian after all: Huber (1981), Robust Statistics
 
 
 @dataclass(frozen=True)
-class DataPlan:
-    """How observations are read: everything but the files' content, in the model's units."""
+class Files:
+    """Files, folders and patterns, relative to ``base``."""
 
     base: Path
-    paths: tuple[str, ...]
-    format: Format | None
-    decimal: Decimal
-    observable: Observable
-    time: Column | Step
-    value: Column
-    start: Instant
-    end: Instant
-    prominence: float
-    time_zero: Literal["file", "window"] | float
-    error: ErrorPlan
+    texts: tuple[str, ...]
 
 
-def read_data(
-    raw: schema.Data, base: Path, model: ForwardModel, document: Document, faults: list[Fault]
-) -> DataPlan | None:
-    """The plan, or None with every fault appended."""
-    before = len(faults)
+class ValueColumn(Section):
+    """A column of a CSV file or a field of a ``.mat`` file; the unit is required, never guessed."""
 
-    def attempt(path: tuple[str, ...], parse: Callable[[], T]) -> T | None:
-        try:
-            return parse()
-        except UnitError as error:
-            faults.append(document.fault(("data", *path), str(error)))
-            return None
-
-    unit = model.time_unit
-    observable = _observable(raw.columns, model, document, faults)
-    time = _time(raw.columns.get("time"), unit, document, faults)
-    value = _value(raw.columns, observable, document, faults) if observable else None
-    symbols = (observable.symbol.strip("$"), observable.name) if observable else ()
-    start = attempt(("window", "from"), lambda: parse_instant(raw.window.start, unit, symbols))
-    end = attempt(("window", "to"), lambda: parse_instant(raw.window.end, unit, symbols))
-    prominence = attempt(("window", "prominence"), lambda: parse_quantity(raw.window.prominence, "1"))
-    zero = attempt(("time_zero",), lambda: _time_zero(raw.time_zero, unit))
-    error = read_error(raw.error, base, observable, model, document, faults) if observable else None
-    if prominence is not None and not 0 < prominence < 1:
-        faults.append(document.fault(("data", "window", "prominence"), "must lie between 0 and 100 %"))
-    if len(faults) > before or observable is None or time is None or value is None or error is None:
-        return None
-    if start is None or end is None or prominence is None or zero is None:
-        return None
-    paths = (raw.path,) if isinstance(raw.path, str) else raw.path
-    return DataPlan(base, paths, raw.format, raw.decimal, observable, time, value, start, end, prominence, zero, error)
+    name: Annotated[str, Field(min_length=1)]
+    """Header of the column (CSV) or name of the field (.mat)."""
+    unit: Annotated[str, unit_of(observable_unit)]
+    """Unit of the numbers in the file, e.g. um; required, never guessed."""
 
 
-def _observable(
-    columns: Mapping[str, Any], model: ForwardModel, document: Document, faults: list[Fault]
-) -> Observable | None:
-    known = {o.name: o for o in model.observables}
-    for name in columns:
-        if name != "time" and name not in known:
-            message = f"unknown column role {name!r}{suggest(name, ['time', *known])}"
-            faults.append(document.fault(("data", "columns", name), message, at_key=True))
-            return None
-    chosen = [name for name in columns if name in known]
-    if len(chosen) != 1:
-        faults.append(document.fault(("data", "columns"), f"name the column of one observable of: {', '.join(known)}"))
-        return None
-    return known[chosen[0]]
+class TimeColumn(Section):
+    """Observation times: a column, or a constant step (a scalar of the file, or a quantity such as ``0.63 us``)."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "dependentRequired": {"name": ["unit"]},
+            "oneOf": [{"required": ["name"]}, {"required": ["step"]}],
+        }
+    )
+    name: str | None = None
+    """Column of times; give this or ``step``."""
+    step: QuantityText | None = None
+    """Constant time step: a quantity such as 0.63 us, or the name of a scalar in the file (then with ``unit``)."""
+    unit: Annotated[str | None, unit_of(time_unit)] = None
+    """Unit of the times in the file, e.g. us; required with ``name``, never guessed."""
+
+    @model_validator(mode="after")
+    def _one_of(self) -> Self:
+        if (self.name is None) == (self.step is None):
+            raise ValueError("give either 'name' (a column of times) or 'step' (a constant time step)")
+        if self.name is not None and "unit" not in self.model_fields_set:
+            raise ValueError(f"the unit of column {self.name!r} is missing; write unit: us")
+        return self
 
 
-def _time(raw: Any, unit: str, document: Document, faults: list[Fault]) -> Column | Step | None:
-    path = ("data", "columns", "time")
-    if raw is None:
-        faults.append(document.fault(path, f"required: {{name: <column>, unit: {unit}}}, or {{step: <quantity>}}"))
-        return None
-    column = check(schema.TimeColumn, raw, path, document, faults)
-    if column is None:
-        return None
+def _times(given: TimeColumn, context: Context) -> Column | Step:
+    unit = time_unit(context)
+    if given.unit is not None:
+        named = Column(str(given.name or given.step), given.unit, unit)
+        return named if given.name else Step(named)
     try:
-        if column.unit is not None:
-            convert(1.0, column.unit, unit)
-            named = Column(str(column.name or column.step), column.unit, unit)
-            return named if column.name else Step(named)
-        return Step(value=parse_quantity(column.step or 0, unit))
+        return Step(value=parse_quantity(given.step or 0, unit))
     except UnitError as error:
-        faults.append(document.fault((*path, "unit" if column.unit else "step"), str(error)))
-        return None
+        raise ConfigError([Fault(str(error), "step")]) from None
 
 
-def _value(raw: Mapping[str, Any], observable: Observable, document: Document, faults: list[Fault]) -> Column | None:
-    path = ("data", "columns", observable.name)
-    column = check(schema.Column, raw[observable.name], path, document, faults)
-    if column is None:
-        return None
+_VALUES = Made(lambda given, context: Column(given.name, given.unit, observable_unit(context)), ValueColumn)
+
+
+class Columns(Section):
+    """Which columns hold the time and the observable, each with its unit."""
+
+    model_config = ConfigDict(json_schema_extra={"required": ["time"]}, populate_by_name=False)
+    time: Annotated[Column | Step, Made(_times, TimeColumn)] = None  # type: ignore[assignment]  # told by a rule
+    """Observation times."""
+    observable: Annotated[Column, _VALUES, Field(alias=PLACEHOLDER)] = None  # type: ignore[assignment]  # the same
+    """The observable."""
+
+    @classmethod
+    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        if given.get("time") is None:
+            unit = time_unit(context)
+            faults.add(("time",), f"required: {{name: <column>, unit: {unit}}}, or {{step: <quantity>}}")
+
+
+def _instant(text: Any, context: Context) -> Instant:
+    possible = (context.observed,) if context.observed else context.units.observables
+    symbols = {word for observable in possible for word in (observable.symbol.strip("$"), observable.name)}
+    return parse_instant(text, time_unit(context), symbols)
+
+
+def _prominence(text: Any, context: Context) -> float:
+    value = parse_quantity(text, "1")
+    if not 0 < value < 1:
+        raise ValueError("must lie between 0 and 100 %")
+    return value
+
+
+class Window(Section):
+    """First and last observation used: ``maximum``, ``minimum 2``, a time, or ``start``/``end`` of the file."""
+
+    start: Annotated[Instant, Made(_instant)] = Field("start", alias="from", validate_default=True)
+    """First observation: start, maximum (for the bubble also R_max), minimum N, or a time on the file's clock."""
+    end: Annotated[Instant, Made(_instant)] = Field("end", alias="to", validate_default=True)
+    """Last observation: end, maximum, minimum N (counted from the window's start), or a time on the file's clock."""
+    prominence: Annotated[float, Made(_prominence)] = Field("10 %", validate_default=True)
+    """How deep a minimum must be to count, relative to the range of the series."""
+
+
+def _square(context: Context) -> str:
+    unit = observable_unit(context)
+    return "1" if unit == "1" else f"({unit})*({unit})"
+
+
+class CovarianceFile(Section):
+    """A CSV file of the full matrix R, without header; its unit (e.g. ``um^2``) is required, never guessed."""
+
+    path: Annotated[str, Field(min_length=1)]
+    """CSV file, relative to the configuration's folder; one row an observation of the window or of the series."""
+    unit: Annotated[str, unit_of(_square)]
+    """Unit of the covariances, the observable's squared, e.g. um^2."""
+
+
+def _matrix(given: CovarianceFile, context: Context) -> Matrix:
+    return Matrix(context.base / Path(given.path).expanduser(), given.unit, _square(context))
+
+
+def parse_error_std(text: Any, unit: str) -> Spread:
+    """``"1.4 um"`` or ``"1 % of maximum"``. Raises :class:`UnitError`."""
+    word = str(text).strip()
+    relative = _RELATIVE.fullmatch(word)
+    if relative:
+        return Spread(parse_quantity(relative[1], "1"), relative=True)
     try:
-        convert(1.0, column.unit, observable.unit)
+        return Spread(parse_quantity(text, unit))
     except UnitError as error:
-        faults.append(document.fault((*path, "unit"), str(error)))
-        return None
-    return Column(column.name, column.unit, observable.unit)
+        hint = f"; write '{word} of maximum'" if word.endswith("%") else ""
+        raise UnitError(f"{error}{hint}") from None
 
 
-def _time_zero(value: str | float, unit: str) -> Literal["file", "window"] | float:
-    if value == "file":
-        return "file"
-    if value == "window":
-        return "window"
+def _error_std(text: Any, context: Context) -> Spread:
+    spread = parse_error_std(text, observable_unit(context))
+    require_sign(spread.value, "positive", text)
+    return spread
+
+
+class Error(Section):
+    """Observation errors: a std or a whole covariance, errors of the times, a correlation, a robust cost."""
+
+    model_config = ConfigDict(populate_by_name=False)
+    std: Annotated[Spread | None, Made(_error_std)] = Field(None, alias=f"{PLACEHOLDER}_std")
+    """Std of the observation error: a quantity, or e.g. '1 % of maximum'."""
+    time_std: Annotated[float, quantity(time_unit, "not negative")] = 0.0
+    """Std of the observation times: adds (rate × time_std)²."""
+    correlation_time: Annotated[float | None, quantity(time_unit, "positive")] = None
+    """Errors are correlated as exp(−|Δt|/τ)."""
+    covariance: Annotated[Matrix | None, Made(_matrix, CovarianceFile)] = None
+    """File of the whole R."""
+    robust: Literal["huber"] | None = None
+    """Robust cost: readings far off count less."""
+    threshold: Annotated[float, quantity(lambda c: "1", "positive")] = HUBER
+    """Threshold of the robust cost in std."""
+
+    @classmethod
+    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        std = f"{PLACEHOLDER}_std"
+        for name, other, reason in (
+            ("covariance", std, "the file holds the variances"),
+            ("covariance", "correlation_time", "the file holds the correlations"),
+            ("robust", "correlation_time", "a robust cost needs independent observation errors"),
+            ("robust", "covariance", "a robust cost needs independent observation errors"),
+        ):
+            if name in given and other in given:
+                faults.add((name,), f"not together with {other}: {reason}", at_key=True)
+        if "threshold" in given and "robust" not in given:
+            faults.add(("threshold",), "is that of the robust cost; write robust: huber as well", at_key=True)
+        if context.observed and not given.keys() & {std, "covariance"}:
+            faults.add((std,), "required: the standard deviation of the observation error")
+
+    @property
+    def huber(self) -> float | None:
+        """The threshold of the robust cost, None where the cost is quadratic."""
+        return self.threshold if self.robust else None
+
+
+def _time_zero(text: Any, context: Context) -> Literal["file", "window"] | float:
+    if text in ("file", "window"):
+        return "file" if text == "file" else "window"
     try:
-        return parse_quantity(value, unit)
+        return parse_quantity(text, time_unit(context))
     except UnitError as error:
         raise UnitError(f"write file, window or a time: {error}") from None
+
+
+def _not_empty(path: str | tuple[str, ...]) -> str | tuple[str, ...]:
+    if not path or not all(path):
+        raise ValueError("no file is named")
+    return path
+
+
+def _files(given: str | tuple[str, ...], context: Context) -> Files:
+    return Files(context.base, (given,) if isinstance(given, str) else given)
+
+
+class Data(Section):
+    """Where the observations are, what they mean and how well they are known; in the model's units."""
+
+    path: Annotated[Files, Made(_files, Annotated[str | tuple[str, ...], AfterValidator(_not_empty)])]
+    """A data file, a folder, a pattern such as data/*.csv, or a list of them; relative to this file's folder."""
+    format: Format | None = None
+    """Format of the files; default: by their suffix."""
+    decimal: Decimal = "."
+    """Decimal sign of the numbers in a CSV file."""
+    columns: Annotated[Columns, OfObservable("column role")]
+    """Which columns hold the time and the observable, each with its unit: ``time: {name: t, unit: us}``."""
+    window: Window = Field({}, validate_default=True)
+    """Which observations are used (the assimilation window); default: all."""
+    time_zero: Annotated[Literal["file", "window"] | float, Made(_time_zero)] = Field("file", validate_default=True)
+    """Where the model's clock starts: file (the file's own zero), window (the first observation used), or a time."""
+    error: Annotated[Error, OfObservable()]
+    """Observation errors: ``<observable>_std``, ``time_std``, ``correlation_time``, ``covariance`` or ``robust``."""
+
+    @classmethod
+    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        columns = given.get("columns")
+        if not isinstance(columns, dict) or context.observed:
+            return
+        roles = ["time", *(observable.name for observable in context.units.observables)]
+        for name in columns:
+            if name not in roles:
+                faults.add(("columns", name), f"unknown column role {name!r}{suggest(name, roles)}", at_key=True)
+        if columns.keys() <= set(roles):
+            faults.add(("columns",), f"name the column of one observable of: {', '.join(roles[1:])}")
+
+    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """As given, with absolute paths."""
+        written = super().as_written(given)
+        paths = [str(self.path.base / text) for text in self.path.texts]
+        written["path"] = paths[0] if len(paths) == 1 else paths
+        if self.error.covariance is not None:
+            written["error"]["covariance"]["path"] = str(self.error.covariance.path)
+        return written

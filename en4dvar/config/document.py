@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -49,7 +49,7 @@ class Document:
 
     def fault(self, path: Sequence[str | int], message: str, *, at_key: bool = False) -> Fault:
         """A fault at ``path``, or at its nearest ancestor that is written in the file."""
-        dotted = ".".join(str(p) for p in path)
+        dotted = _dotted(path)
         for n in range(len(path), -1, -1):
             key = tuple(path[:n])
             if key in self.origins:
@@ -83,16 +83,14 @@ def read_document(path: Path) -> Document:
 
 def parse_document(text: str, file: str = "") -> Document:
     """Parse YAML text whose top level is a mapping. Raises :class:`ConfigError`."""
-    keys: dict[Key, Mark] = {}
-    values: dict[Key, Mark] = {}
-    faults: list[Fault] = []
-    data = _parse(text, file, keys, values, faults)
-    if not faults and not isinstance(data, dict):
+    tree = _Tree(file)
+    data = tree.read(text)
+    if not tree.faults and not isinstance(data, dict):
         what = "the file is empty" if data is None else "expected 'key: value' lines at the top level"
-        faults.append(Fault(what, file=file))
-    if faults:
-        raise ConfigError(faults)
-    return Document(data, file, text, keys, values)
+        tree.faults.append(Fault(what, file=file))
+    if tree.faults:
+        raise ConfigError(tree.faults)
+    return Document(data, file, text, tree.keys, tree.values)
 
 
 def override(document: Document, overrides: Mapping[str, Any]) -> Document:
@@ -103,7 +101,9 @@ def override(document: Document, overrides: Mapping[str, Any]) -> Document:
     for dotted, value in overrides.items():
         path, origin = tuple(dotted.split(".")), "--data" if dotted == "data.path" else f"--set {dotted}"
         if isinstance(value, str):
-            value = _parse(value, origin, {}, {}, faults)
+            tree = _Tree(origin)
+            value = tree.read(value)
+            faults += tree.faults
         node = data
         for n, part in enumerate(path[:-1], 1):
             node = node.setdefault(part, {})
@@ -148,54 +148,57 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
-def _parse(text: str, file: str, keys: dict[Key, Mark], values: dict[Key, Mark], faults: list[Fault]) -> Any:
-    loader = None
-    try:
-        loader = _Loader(text)
-        node = loader.get_single_node()
-        return None if node is None else _value(node, (), file, keys, values, faults)
-    except _Refused as error:
-        message, at = error.args
-        faults.append(Fault(message, "", file, at.line + 1, at.column + 1))
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        where = (mark.line + 1, mark.column + 1) if mark else (0, 0)
-        faults.append(Fault(f"not valid YAML: {error.problem or error.context}", "", file, *where))
-    except yaml.YAMLError as error:
-        faults.append(Fault(f"not valid YAML: {str(error).splitlines()[0]}", file=file))
-    except RecursionError:
-        faults.append(Fault("not valid YAML: nested too deeply", file=file))
-    finally:
-        if loader is not None:
-            loader.dispose()
-    return None
+class _Tree:
+    """Plain data from YAML, with the place of every key and value, and what is wrong with it."""
 
+    def __init__(self, file: str):
+        self.file = file
+        self.keys: dict[Key, Mark] = {}
+        self.values: dict[Key, Mark] = {}
+        self.faults: list[Fault] = []
 
-def _value(
-    node: yaml.Node, path: Key, file: str, keys: dict[Key, Mark], values: dict[Key, Mark], faults: list[Fault]
-) -> Any:
-    values[path] = _mark(node)
-    if isinstance(node, yaml.SequenceNode):
-        return [_value(n, (*path, i), file, keys, values, faults) for i, n in enumerate(node.value)]
-    if not isinstance(node, yaml.MappingNode):
-        return _scalar(node)
-    result: dict[str, Any] = {}
-    for name, child, where in _pairs(node):
-        here = (*path, name)
-        if name in result:
-            first = keys[here][0]
-            faults.append(Fault(f"duplicate key {name!r}, first given on line {first}", _dotted(path), file, *where))
-            continue
-        keys[here] = where
-        result[name] = _value(child, here, file, keys, values, faults)
-    return result
+    def read(self, text: str) -> Any:
+        """The data; None where the text has a fault."""
+        loader = None
+        try:
+            loader = _Loader(text)
+            node = loader.get_single_node()
+            return None if node is None else self._value(node, ())
+        except _Refused as error:
+            message, at = error.args
+            self.faults.append(Fault(message, "", self.file, at.line + 1, at.column + 1))
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            where = (mark.line + 1, mark.column + 1) if mark else (0, 0)
+            self.faults.append(Fault(f"not valid YAML: {error.problem or error.context}", "", self.file, *where))
+        except yaml.YAMLError as error:
+            self.faults.append(Fault(f"not valid YAML: {str(error).splitlines()[0]}", file=self.file))
+        except RecursionError:
+            self.faults.append(Fault("not valid YAML: nested too deeply", file=self.file))
+        finally:
+            if loader is not None:
+                loader.dispose()
+        return None
 
-
-def _pairs(node: yaml.MappingNode) -> Iterator[tuple[str, yaml.Node, Mark]]:
-    for key, child in node.value:
-        if not isinstance(key, yaml.ScalarNode):
-            raise _Refused("a key must be a word", key.start_mark)
-        yield str(key.value), child, _mark(key)
+    def _value(self, node: yaml.Node, path: Key) -> Any:
+        self.values[path] = _mark(node)
+        if isinstance(node, yaml.SequenceNode):
+            return [self._value(child, (*path, i)) for i, child in enumerate(node.value)]
+        if not isinstance(node, yaml.MappingNode):
+            return _scalar(node)
+        result: dict[str, Any] = {}
+        for key, child in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise _Refused("a key must be a word", key.start_mark)
+            name, where = str(key.value), _mark(key)
+            here = (*path, name)
+            if name in result:
+                message = f"duplicate key {name!r}, first given on line {self.keys[here][0]}"
+                self.faults.append(Fault(message, _dotted(path), self.file, *where))
+                continue
+            self.keys[here] = where
+            result[name] = self._value(child, here)
+        return result
 
 
 def _scalar(node: Any) -> Any:
@@ -213,5 +216,5 @@ def _mark(node: yaml.Node) -> Mark:
     return node.start_mark.line + 1, node.start_mark.column + 1
 
 
-def _dotted(path: Key) -> str:
-    return ".".join(str(p) for p in path)
+def _dotted(path: Sequence[str | int]) -> str:
+    return ".".join(str(part) for part in path)

@@ -3,42 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
-from en4dvar.config import schema
-from en4dvar.config.document import Document
-from en4dvar.config.validate import check
-from en4dvar.errors import ConfigError, Fault
+from en4dvar.config.context import Context, Made, parse_spread, read_each
+from en4dvar.config.schema import Section
+from en4dvar.config.validate import Faults
 from en4dvar.forward import ForwardModel
 from en4dvar.hints import suggest
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import StatePerturbation
 from en4dvar.state import Field, Parameter
-from en4dvar.units import UnitError, parse_quantity
-
-Perturbed = tuple[PriorTerm, StatePerturbation]
 
 
-def read_initial_state(
-    raw: Mapping[str, Any], model: ForwardModel, document: Document, faults: list[Fault]
-) -> tuple[Perturbed, ...]:
-    """Prior and perturbation of each field named, in the order of the file; faults are appended."""
-    taken = {p.name for p in model.parameters}
-    fields = {f.name: f for f in model.layout if f.name not in taken}
-    found: list[Perturbed] = []
-    for name, given in raw.items():
-        path = ("initial_state", name)
-        if name in taken:
-            faults.append(document.fault(path, f"{name} is a parameter: give it a prior in parameters", at_key=True))
-        elif name not in fields:
-            message = f"unknown field {name!r} of the state{suggest(name, fields)}"
-            faults.append(document.fault(path, message, at_key=True))
-        elif spread := check(schema.InitialSpread, given, path, document, faults):
-            try:
-                found.append(perturbation(fields[name], spread.std))
-            except (UnitError, ConfigError) as error:
-                faults.append(document.fault((*path, "std"), str(error)))
-    return tuple(found)
+class Perturbed(NamedTuple):
+    """What is estimated of a field, and what it does to the initial state."""
+
+    term: PriorTerm
+    perturbation: StatePerturbation
 
 
 def perturbation(field: Field, std: str | float) -> Perturbed:
@@ -48,14 +29,45 @@ def perturbation(field: Field, std: str | float) -> Perturbed:
     ------
     UnitError: a unit that is not the field's. ConfigError: a std that is not positive.
     """
-    name, text = f"initial_{field.name}", str(std).strip()
-    relative = text.endswith("%") and field.unit != "%"
-    value = parse_quantity(text if relative else std, "1" if relative else field.unit)
-    if not value > 0:
-        raise ConfigError(f"must be positive, not {std}")
-    if relative:
+    name, spread = f"initial_{field.name}", parse_spread(std, field.unit)
+    if spread.relative:
         label = f"initial {field.name} relative to the model's"
         parameter = Parameter(name, "1", "lognormal", (0.0, float("inf")), label)
-        return PriorTerm.lognormal(parameter, 1.0, value), StatePerturbation(parameter, field.name, relative=True)
+        term = PriorTerm.lognormal(parameter, 1.0, spread.value)
+        return Perturbed(term, StatePerturbation(parameter, field.name, relative=True))
     parameter = Parameter(name, field.unit, label=f"initial {field.name} beyond the model's")
-    return PriorTerm.normal(parameter, 0.0, value), StatePerturbation(parameter, field.name)
+    return Perturbed(PriorTerm.normal(parameter, 0.0, spread.value), StatePerturbation(parameter, field.name))
+
+
+class InitialSpread(Section):
+    """Spread of the initial value of a state field: in its unit (added), or in ``%`` (a factor)."""
+
+    std: Annotated[Perturbed, Made(lambda text, context: perturbation(context.subject, text))]
+    """Standard deviation: in the field's unit (added to it), or in % (a factor)."""
+
+
+def dynamic_fields(model: ForwardModel) -> dict[str, Field]:
+    """The fields of the state that are no parameters, by name."""
+    constant = {p.name for p in model.parameters}
+    return {f.name: f for f in model.layout if f.name not in constant}
+
+
+def _perturbed(given: Mapping[str, Any], context: Context) -> tuple[Perturbed, ...]:
+    """In the order of the file."""
+    fields = dynamic_fields(context.model)
+
+    def unknown(name: str) -> str:
+        if name in {p.name for p in context.model.parameters}:
+            return f"{name} is a parameter: give it a prior in parameters"
+        return f"unknown field {name!r} of the state{suggest(name, fields)}"
+
+    def read(entry: Any, context: Context) -> Perturbed:
+        return InitialSpread.model_validate(entry, context=context).std
+
+    with Faults() as faults:
+        return tuple(read_each(given, fields, context, faults, read, unknown).values())
+
+
+PERTURBED = Made(
+    _perturbed, dict[str, Any], {"type": "object", "additionalProperties": InitialSpread.model_json_schema()}
+)

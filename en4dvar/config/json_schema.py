@@ -14,16 +14,17 @@ from collections.abc import Iterator
 from importlib.metadata import entry_points
 from typing import Any
 
-from pydantic import BaseModel
-
-from en4dvar.config import schema, synthetic, twin
+from en4dvar.config.context import TEXT
+from en4dvar.config.load import Estimation
 from en4dvar.config.models import GROUP, find_model, settings_of
+from en4dvar.config.parameters import FromFile, Prior
+from en4dvar.config.synthetic import CampaignFile
+from en4dvar.config.twin import TwinFile
 from en4dvar.errors import En4dvarError
 from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Parameter
 
 Json = dict[str, Any]
 KINDS = "en4dvar.schemas"
-_QUANTITY: Json = {"type": ["string", "number"]}
 
 
 def json_schema() -> Json:
@@ -31,21 +32,26 @@ def json_schema() -> Json:
     definitions: Json = {
         "parameter": {
             "description": "A prior (estimated), a quantity (fixed), or a scalar of the data file (fixed).",
-            "anyOf": [_QUANTITY, _of(schema.Prior), _of(schema.FromFile)],
+            "anyOf": [dict(TEXT), *(_of(kind.model_json_schema()) for kind in (Prior, FromFile))],
         },
     }
-    models = dict(_models(definitions))
+    models = list(_models(definitions))
     definitions["model"] = _model_section(models)
-    definitions["estimation"] = _estimation(definitions)
-    definitions["twin"] = _twin(definitions)
-    definitions["campaign"] = _campaign(definitions)
+    for name, kind in (("estimation", Estimation), ("twin", TwinFile), ("campaign", CampaignFile)):
+        definitions[name] = _of(kind.model_json_schema())
+    for name in ("estimation", "twin"):
+        definitions[name]["allOf"] = [
+            _if({"required": ["model"], "properties": {"model": _names(model)}},
+                {"properties": {"parameters": {"$ref": f"#/$defs/parameters_{model}"}}})
+            for model in models
+        ]  # fmt: skip
     kinds = {"twin": "twin", "campaign": "campaign"}
     for entry in entry_points(group=KINDS):
-        definitions[f"{entry.name}_file"] = _of(entry.load())
+        definitions[f"{entry.name}_file"] = _of(entry.load().model_json_schema())
         kinds[entry.name] = f"{entry.name}_file"
     chosen: Json = {"$ref": "#/$defs/estimation"}
     for key, name in reversed(kinds.items()):
-        chosen = {"if": {"required": [key]}, "then": {"$ref": f"#/$defs/{name}"}, "else": chosen}
+        chosen = {**_if({"required": [key]}, {"$ref": f"#/$defs/{name}"}), "else": chosen}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "en4dvar configuration",
@@ -60,11 +66,9 @@ def schema_text() -> str:
     return json.dumps(json_schema(), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _of(model: type[BaseModel]) -> Json:
-    """Schema of one pydantic model, references inside it resolved in place, defaults as a file would write them."""
-    found = model.model_json_schema()
-    inner = found.pop("$defs", {})
-    return _tidy(_resolve(found, inner))
+def _of(found: Json) -> Json:
+    """What pydantic gives, references inside it resolved in place, defaults as a file would write them."""
+    return _tidy(_resolve(found, found.pop("$defs", {})))
 
 
 def _resolve(node: Any, inner: Json) -> Any:
@@ -73,6 +77,8 @@ def _resolve(node: Any, inner: Json) -> Any:
         return [_resolve(item, inner) for item in node]
     if not isinstance(node, dict):
         return node
+    if "x-definition" in node:  # of the whole schema, not of the section
+        return {"$ref": f"#/$defs/{node['x-definition']}", **{k: v for k, v in node.items() if k != "x-definition"}}
     if "$ref" in node:
         target = _resolve(inner[node["$ref"].rpartition("/")[2]], inner)
         return {**target, **{k: _resolve(v, inner) for k, v in node.items() if k != "$ref"}}
@@ -100,21 +106,21 @@ def _tidy(node: Any) -> Any:
     return tidy
 
 
-def _models(definitions: Json) -> Iterator[tuple[str, str]]:
-    """(name, definition) of each registered model; its settings and parameters are added to the definitions."""
+def _models(definitions: Json) -> Iterator[str]:
+    """Name of each registered model; its settings and parameters are added to the definitions."""
     for name in sorted({entry.name for entry in entry_points(group=GROUP)}):
         try:
             kind: Any = find_model(name)
         except En4dvarError:
             continue
-        settings = _of(settings_of(kind))
+        settings = _of(settings_of(kind).model_json_schema())
         settings["properties"] = {
             "name": {"const": name, "description": "Name of the model."},
             **settings["properties"],
         }
         definitions[f"model_{name}"] = settings
         definitions[f"parameters_{name}"] = _parameters(_possible_parameters(kind))
-        yield name, f"model_{name}"
+        yield name
 
 
 def _possible_parameters(kind: Any) -> tuple[Parameter, ...]:
@@ -137,7 +143,7 @@ def _parameters(known: tuple[Parameter, ...]) -> Json:
     }
 
 
-def _model_section(models: dict[str, str]) -> Json:
+def _model_section(models: list[str]) -> Json:
     return {
         "type": "object",
         "required": ["name"],
@@ -147,83 +153,14 @@ def _model_section(models: dict[str, str]) -> Json:
                 "anyOf": [{"enum": sorted(models)}, {"type": "string", "pattern": ":"}],
             }
         },
-        "allOf": [_if_model(name, {"$ref": f"#/$defs/{definition}"}) for name, definition in models.items()],
+        "allOf": [_if(_names(name), {"$ref": f"#/$defs/model_{name}"}) for name in models],
     }
 
 
-def _if_model(name: str, then: Json) -> Json:
-    return {"if": {"properties": {"name": {"const": name}}, "required": ["name"]}, "then": then}
+def _names(model: str) -> Json:
+    """Matches the section of this model."""
+    return {"properties": {"name": {"const": model}}, "required": ["name"]}
 
 
-def _with_sections(whole: type[BaseModel], /, **sections: Json) -> Json:
-    """The schema of a whole file, with sections that are validated by themselves put in their place."""
-    found = _of(whole)
-    for key, section in sections.items():
-        described = {"description": found["properties"][key]["description"]}
-        found["properties"][key] = {**section, **described}
-    return found
-
-
-def _by_model(found: Json, definitions: Json) -> Json:
-    """Parameters are those of the model that the file names."""
-    names = [key.removeprefix("model_") for key in definitions if key.startswith("model_")]
-    found["allOf"] = [
-        {
-            "if": {"required": ["model"], "properties": {"model": _if_model(name, {})["if"]}},
-            "then": {"properties": {"parameters": {"$ref": f"#/$defs/parameters_{name}"}}},
-        }
-        for name in names
-    ]
-    return found
-
-
-def _estimation(definitions: Json) -> Json:
-    data = _of(schema.Data)
-    data["properties"]["columns"] |= {
-        "properties": {"time": {"description": "Observation times.", **_without_text(_of(schema.TimeColumn))}},
-        "required": ["time"],
-        "additionalProperties": {"description": "The observable.", **_without_text(_of(schema.Column))},
-    }
-    std = {"description": "Std of the observation error: a quantity, or e.g. '1 % of maximum'.", **_QUANTITY}
-    data["properties"]["error"] |= {
-        "properties": {
-            "time_std": {"description": "Std of the observation times: adds (rate × time_std)².", **_QUANTITY},
-            "correlation_time": {"description": "Errors are correlated as exp(−|Δt|/τ).", **_QUANTITY},
-            "covariance": {"description": "File of the whole R.", **_without_text(_of(schema.CovarianceFile))},
-            "robust": {"description": "Robust cost: readings far off count less.", "enum": ["huber"]},
-            "threshold": {"description": "Threshold of the robust cost in std.", "type": ["number", "string"]},
-        },
-        "patternProperties": {"^(?!time_std$).*_std$": std},
-        "additionalProperties": False,
-    }
-    found = _with_sections(
-        schema.Schema,
-        data=data,
-        model={"$ref": "#/$defs/model"},
-        parameters={"type": "object", "additionalProperties": {"$ref": "#/$defs/parameter"}},
-        initial_state={"type": "object", "additionalProperties": _of(schema.InitialSpread)},
-        assimilation=_of(schema.Assimilation),
-    )
-    return _by_model(found, definitions)
-
-
-def _twin(definitions: Json) -> Json:
-    found = _with_sections(
-        twin.TwinSchema,
-        model={"$ref": "#/$defs/model"},
-        parameters={"type": "object", "additionalProperties": {"$ref": "#/$defs/parameter"}},
-        twin=_of(twin.Twin),
-        assimilation=_of(twin.Sequential),
-    )
-    return _by_model(found, definitions)
-
-
-def _campaign(definitions: Json) -> Json:
-    section = _of(synthetic.Campaign)
-    (group,) = section["properties"]["groups"]["patternProperties"].values()
-    group["properties"]["parameters"] |= {"additionalProperties": {"$ref": "#/$defs/parameter"}}
-    return _with_sections(synthetic.CampaignSchema, model={"$ref": "#/$defs/model"}, campaign=section)
-
-
-def _without_text(node: Json) -> Json:
-    return {key: value for key, value in node.items() if key != "description"}
+def _if(condition: Json, then: Json) -> Json:
+    return {"if": condition, "then": then}

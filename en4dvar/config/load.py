@@ -2,27 +2,89 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
 import yaml
+from pydantic import Field
 
-from en4dvar.config import schema
-from en4dvar.config.data import DataPlan, read_data
+from en4dvar.config.context import Context, Made, time_unit
+from en4dvar.config.data import Data
 from en4dvar.config.document import Document, override, read_document
-from en4dvar.config.initial_state import Perturbed, read_initial_state
+from en4dvar.config.initial_state import PERTURBED, Perturbed
 from en4dvar.config.models import read_model
-from en4dvar.config.parameters import Entry, Fixed, read_parameters
-from en4dvar.config.validate import check
+from en4dvar.config.parameters import Entry, Fixed, entries
+from en4dvar.config.schema import Assimilation, Execution, File, Output, QuantityText, Section
+from en4dvar.config.validate import Faults, check
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.problem import AssimilationSettings
 from en4dvar.state import Array
 from en4dvar.units import UnitError, parse_quantity
+
+
+def time_grid(start: str | float, end: str | float, step: str | float, unit: str) -> Array:
+    """Instants (K,) from ``start`` to ``end``, both included. Raises :class:`UnitError`."""
+    first = 0.0 if start == "start" else parse_quantity(start, unit)
+    last, width = parse_quantity(end, unit), parse_quantity(step, unit)
+    if not width > 0 or not last > first:
+        raise UnitError(f"no instants from {first:g} to {last:g} {unit} in steps of {width:g} {unit}")
+    count = int(np.floor((last - first) / width * (1 + 1e-9))) + 1
+    if not 3 <= count <= 1_000_000:
+        raise UnitError(f"{count} instants; give between 3 and a million")
+    return np.asarray(first + width * np.arange(count), dtype=float)
+
+
+class Times(Section):
+    """A uniform grid of instants, both ends included."""
+
+    start: Annotated[QuantityText, Field(alias="from")] = "start"
+    """First instant with its unit; start is time zero."""
+    end: Annotated[QuantityText, Field(alias="to")]
+    """Last instant with its unit."""
+    step: QuantityText
+    """Time step with its unit."""
+
+
+def _grid(times: Times, context: Context) -> Array:
+    return time_grid(times.start, times.end, times.step, time_unit(context))
+
+
+class Simulate(Section):
+    """Settings of ``en4dvar simulate``: when the synthetic observations are taken."""
+
+    times: Annotated[Array, Made(_grid, Times)]
+    """Instants of the synthetic observations."""
+
+
+class Estimation(File):
+    """What is estimated from which observations, and how."""
+
+    data: Data | None = None
+    """Where the observations are, what they mean and how well they are known."""
+    parameters: Annotated[tuple[Entry, ...], entries()]
+    """For each parameter a prior (estimated), a quantity (fixed), or a scalar of the data file (fixed)."""
+    initial_state: Annotated[tuple[Perturbed, ...], PERTURBED] | None = None
+    """Fields of the initial state that are uncertain, each with its ``std``."""
+    assimilation: Assimilation = Assimilation()
+    """Scheme, ensemble size and stopping rules; the defaults are the recommended ones."""
+    execution: Execution = Execution()
+    """Where the work is done; never changes the numbers."""
+    output: Output = Output()
+    """Where results go."""
+    simulate: Simulate | None = None
+    """Settings of ``en4dvar simulate``."""
+
+    @classmethod
+    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        section = given.get("assimilation")
+        if isinstance(section, dict) and section.get("refine") == "mcmc" and find_spec("emcee") is None:
+            message = "mcmc needs emcee; install the extra: pip install 'en4dvar[mcmc]'"
+            faults.add(("assimilation", "refine"), message)
 
 
 @dataclass(frozen=True)
@@ -35,10 +97,10 @@ class Config:
     model: ForwardModel
     observable: Observable
     parameters: tuple[Entry, ...]
-    data: DataPlan | None
+    data: Data | None
     assimilation: AssimilationSettings
     weights: Literal["sum", "mean"]
-    execution: schema.Execution
+    execution: Execution
     report: bool
     directory: Path
     simulate_times: Array | None
@@ -71,95 +133,76 @@ def resolve(document: Document, base: Path) -> Config:
     """Validate a document whose relative paths start at ``base``. Raises :class:`ConfigError`."""
     if "twin" in document.data:
         raise ConfigError([document.fault(("twin",), "a twin experiment: it can be run and validated", at_key=True)])
-    faults: list[Fault] = []
-    top = check(schema.Schema, document.data, (), document, faults)
-    model_section = document.data.get("model")
-    found = read_model(model_section, base, document, faults) if isinstance(model_section, dict) else None
-    section = document.data.get("assimilation", {})
-    assimilation = check(schema.Assimilation, section, ("assimilation",), document, faults)
-    if assimilation and assimilation.model_dump()["refine"] == "mcmc" and find_spec("emcee") is None:
-        message = "mcmc needs emcee; install the extra: pip install 'en4dvar[mcmc]'"
-        faults.append(document.fault(("assimilation", "refine"), message))
-    section = document.data.get("data")
-    data = check(schema.Data, section, ("data",), document, faults) if section is not None else None
-    if found is None:
-        raise ConfigError(_unique(faults))
-    model, model_resolved = found
-    raw_parameters = document.data.get("parameters")
-    entries = read_parameters(raw_parameters, model, document, faults) if isinstance(raw_parameters, dict) else ()
-    raw_state = document.data.get("initial_state")
-    perturbed = read_initial_state(raw_state, model, document, faults) if isinstance(raw_state, dict) else ()
-    plan = read_data(data, base, model, document, faults) if data else None
-    times = _grid(top.simulate.times, model.time_unit, document, faults) if top and top.simulate else None
-    if faults or top is None or assimilation is None:
-        raise ConfigError(_unique(faults))
-    options = assimilation.model_dump()
-    weights = options.pop("weights")
+    read = read_file(Estimation, document, base)
+    file = read.file
     return Config(
         document=document,
-        name=top.name,
-        seed=top.seed,
-        model=model,
-        observable=plan.observable if plan else model.observables[0],
-        parameters=entries,
-        data=plan,
-        assimilation=AssimilationSettings(**options),
-        weights=weights,
-        execution=top.execution,
-        report=top.output.report,
-        directory=top.output.directory or Path("runs") / top.name,
-        simulate_times=times,
-        resolved=_resolved(top, base, data, model_resolved, entries, assimilation),
-        initial_state=perturbed,
+        name=file.name,
+        seed=file.seed,
+        model=read.model,
+        observable=read.context.observed or read.model.observables[0],
+        parameters=file.parameters,
+        data=file.data,
+        assimilation=file.assimilation.settings,
+        weights=file.assimilation.weights,
+        execution=file.execution,
+        report=file.output.report,
+        directory=file.output.directory or Path("runs") / file.name,
+        simulate_times=file.simulate.times if file.simulate else None,
+        resolved=read.resolved(file.parameters),
+        initial_state=file.initial_state or (),
     )
 
 
-def time_grid(start: str | float, end: str | float, step: str | float, unit: str) -> Array:
-    """Instants (K,) from ``start`` to ``end``, both included. Raises :class:`UnitError`."""
-    first = 0.0 if start == "start" else parse_quantity(start, unit)
-    last, width = parse_quantity(end, unit), parse_quantity(step, unit)
-    if not width > 0 or not last > first:
-        raise UnitError(f"no instants from {first:g} to {last:g} {unit} in steps of {width:g} {unit}")
-    count = int(np.floor((last - first) / width * (1 + 1e-9))) + 1
-    if not 3 <= count <= 1_000_000:
-        raise UnitError(f"{count} instants; give between 3 and a million")
-    return np.asarray(first + width * np.arange(count), dtype=float)
+S = TypeVar("S", bound=Section)
 
 
-def _grid(times: schema.Times, unit: str, document: Document, faults: list[Fault]) -> Array | None:
-    try:
-        return time_grid(times.start, times.end, times.step, unit)
-    except UnitError as error:
-        faults.append(document.fault(("simulate", "times"), str(error)))
-        return None
+@dataclass(frozen=True)
+class Read(Generic[S]):
+    """A validated file: its sections, the model, and the model's section with its defaults."""
+
+    file: S
+    model: ForwardModel
+    document: Document
+    context: Context
+    model_section: dict[str, Any]
+
+    def resolved(self, parameters: Iterable[Entry]) -> str:
+        """The file with overrides and defaults written out and paths absolute, as YAML that loads again."""
+        content = self.file.as_written(self.document.data)
+        content["model"] = self.model_section
+        for entry in parameters:
+            name, unit = entry.parameter.name, entry.parameter.unit
+            if isinstance(entry, Fixed) and name not in content["parameters"]:
+                content["parameters"][name] = f"{entry.value!r} {unit}" if unit != "1" else entry.value
+        return yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
 
 
-def _unique(faults: list[Fault]) -> list[Fault]:
-    return sorted(dict.fromkeys(faults), key=lambda f: (f.file, f.line, f.column))
+def read_file(kind: type[S], document: Document, base: Path) -> Read[S]:
+    """Validate a document of one kind. Raises :class:`ConfigError`: every fault, in the order of the file."""
+    faults: list[Fault] = []
+    found = read_model(document.data.get("model"), base, document, faults)
+    context = context_of(document, base, found[0] if found else None)
+    file = check(kind, document.data, (), document, faults, context)
+    if file is None or found is None:
+        raise ConfigError(in_order(faults))
+    return Read(file, found[0], document, context, found[1])
 
 
-def _resolved(
-    top: schema.Schema,
-    base: Path,
-    data: schema.Data | None,
-    model: dict[str, Any],
-    entries: tuple[Entry, ...],
-    assimilation: schema.Section,
-) -> str:
-    """The configuration with overrides and defaults written out and paths absolute, as YAML that loads again."""
-    content = top.model_dump(mode="json", by_alias=True, exclude_none=True)
-    content["model"] = model
-    content["assimilation"] = assimilation.model_dump(mode="json")
-    given = top.parameters
-    for entry in entries:
-        if isinstance(entry, Fixed) and entry.parameter.name not in given:
-            unit = entry.parameter.unit
-            content["parameters"][entry.parameter.name] = f"{entry.value!r} {unit}" if unit != "1" else entry.value
-    if data:
-        paths = [data.path] if isinstance(data.path, str) else data.path
-        absolute = [str(base / p) for p in paths]
-        content["data"] = data.model_dump(mode="json", by_alias=True, exclude_none=True)
-        content["data"]["path"] = absolute[0] if len(absolute) == 1 else absolute
-        if isinstance(covariance := content["data"]["error"].get("covariance"), dict):
-            covariance["path"] = str(base / Path(str(covariance["path"])).expanduser())
-    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
+def context_of(document: Document, base: Path, model: ForwardModel | None) -> Context:
+    """What is known of the model; where its settings are at fault, units are those of default settings."""
+    section, data = document.data.get("model"), document.data.get("data")
+    context = Context(base, model)
+    if model is None and isinstance(section, dict):
+        found = read_model({"name": section.get("name")}, base, document, [])
+        context.default = found[0] if found else None
+    columns = data.get("columns") if isinstance(data, dict) else None
+    if isinstance(columns, dict) and (units := context.built or context.default):
+        named = [observable for observable in units.observables if observable.name in columns]
+        context.observed = named[0] if len(named) == 1 else None
+    return context
+
+
+def in_order(faults: Iterable[Fault]) -> list[Fault]:
+    """Each fault once, as the file has them."""
+    return sorted(dict.fromkeys(faults), key=lambda fault: (fault.file, fault.line, fault.column))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -75,12 +74,14 @@ def build_model(kind: type[ForwardModel], settings: BaseModel) -> ForwardModel:
 
 
 def read_model(
-    raw: Mapping[str, Any], base: Path, document: Document, faults: list[Fault]
+    raw: Any, base: Path, document: Document, faults: list[Fault]
 ) -> tuple[ForwardModel, dict[str, Any]] | None:
     """The model and its resolved section (defaults filled in), or None with the faults appended.
 
     Paths in a model's settings are relative to ``base``, given to pydantic as validation context ``{"base": base}``.
     """
+    if not isinstance(raw, dict):
+        return None  # told with the other keys of the file
     name = raw.get("name")
     if not isinstance(name, str):
         faults.append(document.fault(("model", "name"), "name the model, e.g. name: bubble"))

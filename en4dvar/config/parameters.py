@@ -2,27 +2,72 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
-from en4dvar.config import schema
-from en4dvar.config.document import Document
-from en4dvar.config.validate import check
+from pydantic import Field
+
+from en4dvar.config.context import Context, Made, Spread, parse_spread, read_each, subject_unit, unit_of
+from en4dvar.config.schema import Section
+from en4dvar.config.validate import Faults
 from en4dvar.errors import ConfigError, Fault
-from en4dvar.forward import ForwardModel
 from en4dvar.hints import suggest
 from en4dvar.prior import PriorTerm
 from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Parameter
-from en4dvar.units import UnitError, convert, parse_quantity
+from en4dvar.units import parse_quantity
 
-_PERCENT = re.compile(r"([^%]*)%")
 _RECIPES = {
     "normal": "mean and std",
     "lognormal": "median and log_std, or mean and std",
     "logit": "lower, upper, median and logit_std",
 }
+
+
+def _bounded(text: Any, parameter: Parameter) -> float:
+    """A value in the parameter's unit. Raises :class:`ConfigError`, :class:`UnitError`."""
+    low, high = parameter.bounds
+    value = parse_quantity(text, parameter.unit)
+    if not low <= value <= high:
+        raise ConfigError(f"{text} is outside the bounds [{low:g}, {high:g}] {parameter.unit}")
+    return value
+
+
+Value = Annotated[float | None, Made(lambda text, context: _bounded(text, context.subject))]
+Location = Annotated[
+    float | Literal["maximum"] | None,
+    Made(lambda text, context: text if text == "maximum" else _bounded(text, context.subject)),
+]
+
+
+class Prior(Section):
+    """A prior by name; locations and spreads carry the parameter's unit, a ``%`` spread is relative to the location."""
+
+    prior: Literal["normal", "lognormal", "logit"]
+    """Shape: normal (mean, std), lognormal (median and log_std, or mean and std), logit (lower, upper, median, …)."""
+    mean: Location = None
+    """Mean with its unit, or ``maximum``: the largest observation of the window."""
+    median: Location = None
+    """Median with its unit, or ``maximum``: the largest observation of the window."""
+    std: Annotated[Spread | None, Made(lambda text, context: parse_spread(text, subject_unit(context)))] = None
+    """Standard deviation with its unit, or in % of the mean."""
+    log_std: Annotated[float, Field(gt=0)] | None = None
+    """Standard deviation of the natural logarithm: 0.3 is about 30 %, 0.7 a factor of two."""
+    logit_std: Annotated[float, Field(gt=0)] | None = None
+    """Standard deviation of the logit between ``lower`` and ``upper``."""
+    lower: Value = None
+    """Lower bound with its unit; never reached."""
+    upper: Value = None
+    """Upper bound with its unit; never reached."""
+
+
+class FromFile(Section):
+    """A value fixed at a scalar that the data file holds."""
+
+    from_file: Annotated[str, Field(min_length=1)]
+    """Name of a scalar in the data file, e.g. Req."""
+    unit: Annotated[str, unit_of(subject_unit)]
+    """Unit of that scalar in the file."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +94,7 @@ class Scalar:
             raise ConfigError(
                 f"{source}: no scalar {self.name!r} for {self.parameter.name}{suggest(self.name, scalars)}"
             )
-        return _quantity(f"{scalars[self.name]!r} {self.unit}", self.parameter)
+        return _bounded(f"{scalars[self.name]!r} {self.unit}", self.parameter)
 
 
 @dataclass(frozen=True)
@@ -57,7 +102,7 @@ class Uncertain:
     """A parameter with a prior; ``maximum`` as a location is the observed maximum in the window."""
 
     parameter: Parameter
-    spec: schema.Prior
+    spec: Prior
 
     @property
     def needs_data(self) -> bool:
@@ -65,73 +110,61 @@ class Uncertain:
 
     def term(self, maximum: float | None = None) -> PriorTerm:
         """The prior; ``maximum`` is in the parameter's unit. Raises :class:`ConfigError`, its path the faulty key."""
+        try:
+            return self._term(self._location("mean", maximum), self._location("median", maximum))
+        except ConfigError as error:
+            own = f"prior of {self.parameter.name}: "
+            raise ConfigError([replace(f, message=f.message.removeprefix(own)) for f in error.problems]) from None
+
+    def _term(self, mean: float, median: float) -> PriorTerm:
         spec, parameter = self.spec, self.parameter
-        given = frozenset(spec.model_fields_set - {"prior"})
-        mean, median = self._location("mean", maximum), self._location("median", maximum)
+        given = spec.model_fields_set - {"prior"}
         if spec.prior == "normal" and given == {"mean", "std"}:
-            return PriorTerm.normal(parameter, mean, self._spread(mean))
+            return PriorTerm.normal(parameter, mean, self._std(mean))
         if spec.prior == "lognormal" and given == {"mean", "std"}:
-            return PriorTerm.lognormal_moments(parameter, mean, self._spread(mean))
+            return PriorTerm.lognormal_moments(parameter, mean, self._std(mean))
         if spec.prior == "lognormal" and given == {"median", "log_std"} and spec.log_std is not None:
             return PriorTerm.lognormal(parameter, median, spec.log_std)
         if spec.prior == "logit" and given == {"lower", "upper", "median", "logit_std"} and spec.logit_std is not None:
-            bounds = self._location("lower", maximum), self._location("upper", maximum)
-            return PriorTerm.logit(parameter, bounds, median, spec.logit_std)
+            return PriorTerm.logit(parameter, (spec.lower or 0.0, spec.upper or 0.0), median, spec.logit_std)
         takes, has = _RECIPES[spec.prior], ", ".join(sorted(given)) or "none of these"
         raise ConfigError(f"a {spec.prior} prior takes {takes}; given: {has}")
 
-    def _location(self, key: str, maximum: float | None) -> float:
-        value = getattr(self.spec, key)
-        if value is None:
-            return 0.0
-        if value == "maximum":
-            if maximum is None:
-                raise ConfigError([Fault("'maximum' is known only from the data, and there are none", key)])
-            return maximum
-        return _quantity(value, self.parameter, key)
+    def _location(self, key: Literal["mean", "median"], maximum: float | None) -> float:
+        value: float | Literal["maximum"] | None = getattr(self.spec, key)
+        if value != "maximum":
+            return value or 0.0
+        if maximum is None:
+            raise ConfigError([Fault("'maximum' is known only from the data, and there are none", key)])
+        return maximum
 
-    def _spread(self, mean: float) -> float:
-        text = self.spec.std
-        percent = _PERCENT.fullmatch(str(text))
-        try:
-            std = 0.01 * parse_quantity(percent[1], "1") * abs(mean) if percent else None
-            std = parse_quantity(text or 0, self.parameter.unit) if std is None else std
-        except UnitError as error:
-            raise ConfigError([Fault(str(error), "std")]) from None
-        if percent and mean == 0:
-            unit = self.parameter.unit
-            raise ConfigError([Fault(f"{text} is relative to the mean, which is zero; give it in {unit}", "std")])
-        if not std > 0:
-            raise ConfigError([Fault(f"must be positive, not {text}", "std")])
-        return std
+    def _std(self, mean: float) -> float:
+        std = self.spec.std
+        if std is None:
+            return 0.0
+        if std.relative and mean == 0:
+            message = f"{100 * std.value:g} % is relative to the mean, which is zero; give it in {self.parameter.unit}"
+            raise ConfigError([Fault(message, "std")])
+        return std.absolute(mean)
 
 
 Entry = Fixed | Scalar | Uncertain
 
 
-def read_parameters(
-    raw: Mapping[str, Any], model: ForwardModel, document: Document, faults: list[Fault]
-) -> tuple[Entry, ...]:
-    """One entry for every parameter of the model, in its order, then t_s and sigma if given. Faults are appended."""
-    shift = replace(TIME_SHIFT, unit=model.time_unit, display_unit=model.time_display_unit)
-    known = {p.name: p for p in (shift, NOISE_SCALE, *model.parameters)}  # a model's own sigma goes before
-    known = {p.name: known[p.name] for p in (*model.parameters, shift, NOISE_SCALE)}
-    defaults: Mapping[str, float] = getattr(model, "defaults", {})
-    for name in raw:
-        if name not in known:
-            faults.append(
-                document.fault(("parameters", name), f"unknown parameter {name!r}{suggest(name, known)}", at_key=True)
-            )
-    entries: list[Entry] = []
-    for name, parameter in known.items():
-        if name in raw:
-            entry = _entry(raw[name], parameter, document, faults)
-            entries += [entry] if entry else []
-        elif name in defaults:
-            entries.append(Fixed(parameter, defaults[name]))
-        elif parameter not in (shift, NOISE_SCALE):
-            faults.append(document.fault(("parameters", name), _missing(parameter)))
-    return tuple(entries)
+def _entry(given: Any, context: Context) -> Entry:
+    """A quantity, a scalar of the data file, or a prior. Raises :class:`ConfigError`, ``ValueError``."""
+    parameter = context.subject
+    if not isinstance(given, dict):
+        return Fixed(parameter, _bounded(given, parameter))
+    if "from_file" in given:
+        scalar = FromFile.model_validate(given, context=context)
+        return Scalar(parameter, scalar.from_file, scalar.unit)
+    entry = Uncertain(parameter, Prior.model_validate(given, context=context))
+    if not entry.needs_data:
+        entry.term()
+    elif entry.spec.prior != "logit":
+        entry.term(maximum=1.0)  # the other values do not wait for the data
+    return entry
 
 
 def _missing(parameter: Parameter) -> str:
@@ -142,46 +175,30 @@ def _missing(parameter: Parameter) -> str:
     )
 
 
-def _entry(raw: Any, parameter: Parameter, document: Document, faults: list[Fault]) -> Entry | None:
-    path = ("parameters", parameter.name)
-    try:
-        if not isinstance(raw, dict):
-            return Fixed(parameter, _quantity(raw, parameter))
-        if "from_file" in raw:
-            scalar = check(schema.FromFile, raw, path, document, faults)
-            if scalar is None:
-                return None
-            convert(1.0, scalar.unit, parameter.unit)
-            return Scalar(parameter, scalar.from_file, scalar.unit)
-        prior = check(schema.Prior, raw, path, document, faults)
-        if prior is None:
-            return None
-        entry = Uncertain(parameter, prior)
-        if not entry.needs_data:
-            entry.term()
-        elif prior.prior != "logit":
-            entry.term(maximum=1.0)  # the other values do not wait for the data
-        return entry
-    except ConfigError as error:
-        faults += [located(document, path, fault) for fault in error.problems]
-    except UnitError as error:
-        faults.append(document.fault(path, str(error)))
-    return None
+def entries(kind: str = "") -> Made:
+    """One entry for every parameter of the model, in its order, then t_s and sigma if given.
 
+    ``kind``: what the file is, where it names no data from which a value could come.
+    """
 
-def located(document: Document, path: tuple[str, ...], fault: Fault) -> Fault:
-    """A fault whose path is a key inside the parameter at ``path``, placed in the file."""
-    message = fault.message.removeprefix(f"prior of {path[-1]}: ")
-    return document.fault((*path, fault.path) if fault.path else path, message)
+    def read(given: Mapping[str, Any], context: Context) -> tuple[Entry, ...]:
+        model = context.model
+        shift = replace(TIME_SHIFT, unit=model.time_unit, display_unit=model.time_display_unit)
+        known = {p.name: p for p in model.parameters}  # a model's own sigma goes before
+        known |= {p.name: p for p in (shift, NOISE_SCALE) if p.name not in known}
+        defaults: Mapping[str, float] = getattr(model, "defaults", {})
+        found: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in defaults.items()}
+        with Faults() as faults:
+            found |= read_each(
+                given, known, context, faults, _entry, lambda name: f"unknown parameter {name!r}{suggest(name, known)}"
+            )
+            for name, entry in found.items():
+                if kind and entry.needs_data:
+                    faults.add((name,), f"{kind} has no data file to take a value from")
+            for parameter in model.parameters:
+                if parameter.name not in {**given, **defaults}:
+                    faults.add((parameter.name,), _missing(parameter))
+        return tuple(found[name] for name in known if name in found)
 
-
-def _quantity(value: str | float, parameter: Parameter, key: str = "") -> float:
-    """A value in the parameter's unit and inside its bounds. Raises :class:`ConfigError` with the path ``key``."""
-    low, high = parameter.bounds
-    try:
-        number = parse_quantity(value, parameter.unit)
-    except UnitError as error:
-        raise ConfigError([Fault(str(error), key)]) from None
-    if not low <= number <= high:
-        raise ConfigError([Fault(f"{value} is outside the bounds [{low:g}, {high:g}] {parameter.unit}", key)])
-    return number
+    json = {"type": "object", "additionalProperties": {"x-definition": "parameter"}}
+    return Made(read, dict[str, Any], json)

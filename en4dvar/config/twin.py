@@ -3,34 +3,67 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Set
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, cast
 
 import numpy as np
-import yaml
 from pydantic import Field, model_validator
 
-from en4dvar.config import schema
+from en4dvar.config.context import TEXT, Context, Made, quantity, read_each, require_sign, time_unit
 from en4dvar.config.document import Document
-from en4dvar.config.models import read_model
-from en4dvar.config.parameters import Fixed, Uncertain, read_parameters
-from en4dvar.config.schema import QuantityText, Section
-from en4dvar.config.validate import check
+from en4dvar.config.initial_state import dynamic_fields
+from en4dvar.config.load import read_file
+from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
+from en4dvar.config.schema import File, Output, Section, section_of
+from en4dvar.config.validate import Faults
 from en4dvar.cycling.sequential import SequentialSettings
 from en4dvar.cycling.twin import TwinExperiment
 from en4dvar.errors import ConfigError, DataError, Fault
-from en4dvar.forward import ForwardModel
-from en4dvar.hints import suggest
+from en4dvar.forward import ForwardModel, Observable
 from en4dvar.inputs.readers import Matrix, read_covariance
 from en4dvar.noise import Correlation
 from en4dvar.prior import Prior
+from en4dvar.schemes import ON_A_SERIES
 from en4dvar.schemes.etkf import ETKF
-from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import Localisation
-from en4dvar.units import UnitError, parse_quantity
+from en4dvar.units import parse_quantity
+
+FileName = Annotated[str, Field(min_length=1)]
+
+
+def _errors(model: ForwardModel) -> dict[str, Observable]:
+    return {f"{observable.name}_std": observable for observable in model.observables}
+
+
+def _stds(known: Callable[[ForwardModel], Mapping[str, Any]]) -> Made:
+    """Standard deviations by the name of a thing that the model knows."""
+
+    def read(text: Any, context: Context) -> float:
+        std = parse_quantity(text, context.subject.unit)
+        require_sign(std, "positive", text)
+        return std
+
+    def read_all(given: Mapping[str, Any], context: Context) -> dict[str, float]:
+        things = known(context.model)
+        with Faults() as faults:
+            if not given:
+                faults.add((), f"give at least one of: {', '.join(things)}")
+            return read_each(given, things, context, faults, read)
+
+    json = {"type": "object", "minProperties": 1, "additionalProperties": TEXT}
+    return Made(read_all, dict[str, Any], json)
+
+
+def _correlation(path: str, context: Context) -> tuple[str, Correlation]:
+    """The absolute path and the matrix."""
+    file = (context.base / path).absolute()
+    try:
+        return str(file), Correlation(read_covariance(Matrix(file.expanduser(), "1", "1")))
+    except (DataError, ValueError) as error:
+        raise ConfigError(str(error)) from None
 
 
 class Twin(Section):
@@ -40,21 +73,28 @@ class Twin(Section):
     """Number of analyses."""
     burn_in: Annotated[int, Field(ge=0)] = 0
     """Cycles at the beginning that no score counts."""
-    interval: QuantityText
+    interval: Annotated[float, quantity(time_unit, "positive")]
     """Time between two observations, in the model's unit of time."""
-    error: Annotated[dict[str, QuantityText], Field(min_length=1)]
+    error: Annotated[dict[str, float], _stds(_errors)]
     """Std of the observation errors, by observable: ``<observable>_std``."""
-    error_correlation: Annotated[str, Field(min_length=1)] | None = None
+    error_correlation: (
+        Annotated[tuple[str, Correlation], Made(_correlation, Annotated[str, Field(min_length=1)])] | None
+    ) = None
     """CSV file of the correlation of the errors at one instant, full or block diagonal, one row an observation, without
     header; relative to the configuration's folder. Default: independent errors."""
-    initial_std: Annotated[dict[str, QuantityText], Field(min_length=1)]
+    initial_std: Annotated[dict[str, float], _stds(dynamic_fields)]
     """Std of the initial ensemble, by field of the state."""
 
     @model_validator(mode="after")
-    def _something_counts(self) -> Twin:
+    def _something_counts(self) -> Self:
         if self.burn_in >= self.cycles:
             raise ValueError(f"burn_in ({self.burn_in}) leaves none of {self.cycles} cycles")
         return self
+
+    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """As given, with an absolute path."""
+        written = super().as_written(given)
+        return written | ({"error_correlation": self.error_correlation[0]} if self.error_correlation else {})
 
 
 class Local(Section):
@@ -77,23 +117,29 @@ class Local(Section):
         return self
 
 
-class Sequential(Section):
-    """The scheme and what it does to the ensemble."""
+_KINDS = cast(dict[str, Any], ON_A_SERIES)
+_KEYS = {name: {field.name for field in fields(kind)} for name, kind in _KINDS.items()}
+_FOREIGN = {name: set().union(*_KEYS.values()) - keys for name, keys in _KEYS.items()}  # keys of other schemes
+_FILTERS = [name for name, kind in _KINDS.items() if issubclass(kind, ETKF)]
+if TYPE_CHECKING:
+    OnASeries = str
+else:
+    OnASeries = Literal[tuple(ON_A_SERIES)]
 
-    scheme: Literal["etkf", "ienks"]
-    """etkf (filter) or ienks (sliding-window smoother)."""
+
+class _Scheme(Section):
+    scheme: OnASeries
+    """etkf, denkf (deterministic) or enkf-n (finite size), which are filters, or ienks (sliding-window smoother)."""
     members: Annotated[int, Field(ge=3)]
     """Ensemble size N."""
-    lag: Annotated[int, Field(ge=0)] = IEnKS.lag
-    """Length of the smoother's window in cycles; 0 is a filter."""
-    linearisation: Literal["transform", "bundle"] = IEnKS.linearisation
-    """Regression over the ensemble (transform), or tangent from runs close to the iterate (bundle)."""
-    epsilon: Annotated[float, Field(gt=0, le=1)] = IEnKS.epsilon
-    """Size of the bundle: factor on the anomalies."""
-    max_iterations: Annotated[int, Field(ge=1)] = IEnKS.max_iterations
-    """Iteration limit in each cycle."""
-    tolerance: Annotated[float, Field(gt=0)] = IEnKS.tolerance
-    """Iterations end where the step is shorter than this, in posterior standard deviations."""
+
+
+_Iterations: Any = section_of(*_KINDS.values(), base=_Scheme)
+
+
+class Sequential(_Iterations):
+    """The scheme and what it does to the ensemble."""
+
     inflation: Annotated[float, Field(gt=0)] = 1.0
     """Factor on the anomalies after each analysis; 1 is none."""
     rtps: Annotated[float, Field(ge=0, le=1)] = 0.0
@@ -101,22 +147,27 @@ class Sequential(Section):
     rotation: bool = False
     """Rotate the ensemble at random after each analysis, mean and covariance kept."""
     localisation: Local | None = None
-    """Gaspari–Cohn taper over the indices of the observed field (etkf only)."""
+    """Gaspari–Cohn taper over the indices of the observed field (filters only)."""
 
     @model_validator(mode="after")
-    def _belongs_together(self) -> Sequential:
-        iterated = {"lag", "linearisation", "epsilon", "max_iterations", "tolerance"} & self.model_fields_set
-        if self.scheme == "etkf" and iterated:
-            raise ValueError(f"{', '.join(sorted(iterated))}: only with scheme ienks")
-        if self.scheme == "ienks" and self.localisation:
-            raise ValueError("localisation: only with scheme etkf")
+    def _belongs_together(self) -> Self:
+        others = self.model_fields_set & _FOREIGN[self.scheme]
+        if others:
+            takers = [name for name, keys in _KEYS.items() if keys >= others]
+            raise ValueError(f"{', '.join(sorted(others))}: only with scheme {' or '.join(takers)}")
+        if self.localisation and self.scheme not in _FILTERS:
+            raise ValueError(f"localisation: only with scheme {', '.join(_FILTERS)}")
         return self
 
-    @property
-    def built(self) -> ETKF | IEnKS:
-        if self.scheme == "etkf":
-            return ETKF()
-        return IEnKS(self.lag, self.linearisation, self.epsilon, self.max_iterations, self.tolerance)
+    def built(self, localisation: Localisation | None) -> SequentialSettings:
+        """What the loop needs."""
+        scheme = _KINDS[self.scheme](**{key: getattr(self, key) for key in _KEYS[self.scheme]})
+        return SequentialSettings(scheme, Inflation(self.inflation, self.rtps), self.rotation, localisation)
+
+    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """As given, without what the scheme does not take."""
+        written = super().as_written(given)
+        return {key: value for key, value in written.items() if key not in _FOREIGN[self.scheme]}
 
 
 class Workers(Section):
@@ -128,25 +179,30 @@ class Workers(Section):
     """Seconds between two checkpoints, 0: one after every cycle. Each holds the moments of all cycles done."""
 
 
-class TwinSchema(Section):
-    """The whole file; ``model`` and ``parameters`` are as for an estimation and validated by themselves."""
+class TwinFile(File):
+    """A twin experiment; ``model`` and ``parameters`` are as for an estimation."""
 
-    name: schema.Name
-    """Name of the run; its results go to runs/<name>."""
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Seed of truth, observations and ensemble."""
-    model: dict[str, Any]
-    """The forward model: its ``name`` (see ``en4dvar models``) and its settings."""
-    parameters: dict[str, Any] = Field(default_factory=dict)
+    parameters: Annotated[tuple[Entry, ...], entries("a twin experiment")] = Field({}, validate_default=True)
     """Parameters to estimate (a prior) or to change from the model's default (a quantity)."""
-    twin: dict[str, Any]
+    twin: Twin
     """How the truth is made and observed."""
-    assimilation: dict[str, Any]
+    assimilation: Sequential
     """The scheme and what it does to the ensemble."""
     execution: Workers = Workers()
     """Where members are integrated; never changes the numbers."""
-    output: schema.Output = schema.Output()
+    output: Output = Output()
     """Where results go."""
+
+    @classmethod
+    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        twin, assimilation = given.get("twin"), given.get("assimilation")
+        correlated = isinstance(twin, dict) and twin.get("error_correlation") is not None
+        if correlated and isinstance(assimilation, dict) and assimilation.get("localisation"):
+            message = "needs observations with independent errors, but twin.error_correlation is given"
+            faults.add(("assimilation", "localisation"), message)
+        units = {field.unit for field in dynamic_fields(context.model).values()}
+        if len(units) > 1:
+            faults.add(("model",), f"RMSE and spread need one unit, but the state has {', '.join(sorted(units))}")
 
 
 @dataclass(frozen=True)
@@ -171,133 +227,61 @@ class TwinConfig:
 
 def resolve_twin(document: Document, base: Path) -> TwinConfig:
     """Validate a document with a ``twin:`` section. Raises :class:`ConfigError`, every fault at once."""
-    faults: list[Fault] = []
-    data = document.data
-    top = check(TwinSchema, data, (), document, faults)
-    found = read_model(data["model"], base, document, faults) if isinstance(data.get("model"), dict) else None
-    twin = check(Twin, data["twin"], ("twin",), document, faults)
-    settings = check(Sequential, data.get("assimilation", {}), ("assimilation",), document, faults)
-    if top is None or found is None or twin is None or settings is None:
-        raise ConfigError(faults)
-    model, model_resolved = found
-    entries = read_parameters(top.parameters, model, document, faults)
-    for entry in entries:
-        if entry.needs_data:
-            path = ("parameters", entry.parameter.name)
-            faults.append(document.fault(path, "a twin experiment has no data file to take a value from"))
-    interval = _quantities({"interval": twin.interval}, {"interval": model.time_unit}, (), document, faults)
-    error = _quantities(twin.error, {f"{o.name}_std": o.unit for o in model.observables}, ("error",), document, faults)
-    constant = {p.name for p in model.parameters}
-    fields = {f.name: f.unit for f in model.layout if f.name not in constant}
-    initial = _quantities(twin.initial_std, fields, ("initial_std",), document, faults)
-    if len(set(fields.values())) > 1:
-        message = f"RMSE and spread need one unit, but the state has {', '.join(sorted(set(fields.values())))}"
-        faults.append(document.fault(("model",), message))
-    observed = {name.removesuffix("_std"): std for name, std in error.items()}
-    correlation = None
-    if twin.error_correlation is not None:
-        twin = twin.model_copy(update={"error_correlation": str((base / twin.error_correlation).absolute())})
-        correlation = _correlation(str(twin.error_correlation), document, faults)
-        if settings.localisation:
-            message = "needs observations with independent errors, but twin.error_correlation is given"
-            faults.append(document.fault(("assimilation", "localisation"), message))
+    read = read_file(TwinFile, document, base)
+    file, model, twin = read.file, read.model, read.file.twin
+    observed = {name.removesuffix("_std"): std for name, std in twin.error.items()}
     local = None
-    if settings.localisation and not faults:
-        local = _localisation(settings.localisation, model, set(observed), document, faults)
-    if faults:
-        raise ConfigError(faults)
-    terms = tuple(entry.term() for entry in entries if isinstance(entry, Uncertain))
+    if file.assimilation.localisation:
+        try:
+            local = _localisation(file.assimilation.localisation, model, observed.keys())
+        except ConfigError as error:
+            where = ("assimilation", "localisation")
+            raise ConfigError([document.fault((*where, f.path) if f.path else where, f.message)
+                               for f in error.problems]) from None  # fmt: skip
+    terms = tuple(entry.term() for entry in file.parameters if isinstance(entry, Uncertain))
     experiment = TwinExperiment(
         model=model,
-        sequential=SequentialSettings(
-            settings.built, Inflation(settings.inflation, settings.rtps), settings.rotation, local
-        ),
-        members=settings.members,
+        sequential=file.assimilation.built(local),
+        members=file.assimilation.members,
         cycles=twin.cycles,
-        interval=interval["interval"],
+        interval=twin.interval,
         error_std=observed,
-        initial_std=initial,
+        initial_std=twin.initial_std,
         burn_in=twin.burn_in,
-        error_correlation=correlation,
+        error_correlation=twin.error_correlation[1] if twin.error_correlation else None,
         prior=Prior(terms) if terms else None,
-        fixed={entry.parameter.name: entry.value for entry in entries if isinstance(entry, Fixed)},
+        fixed={entry.parameter.name: entry.value for entry in file.parameters if isinstance(entry, Fixed)},
     )
     return TwinConfig(
         document=document,
-        name=top.name,
-        seed=top.seed,
+        name=file.name,
+        seed=file.seed,
         experiment=experiment,
-        scheme=settings.scheme,
-        execution=top.execution,
-        directory=top.output.directory or Path("runs") / top.name,
-        report=top.output.report,
-        resolved=_resolved(top, model_resolved, twin, settings),
+        scheme=file.assimilation.scheme,
+        execution=file.execution,
+        directory=file.output.directory or Path("runs") / file.name,
+        report=file.output.report,
+        resolved=read.resolved(()),
     )
 
 
-def _quantities(
-    given: Mapping[str, QuantityText],
-    units: Mapping[str, str],
-    path: tuple[str, ...],
-    document: Document,
-    faults: list[Fault],
-) -> dict[str, float]:
-    """Positive quantities by name, in ``units``; faults are appended."""
-    values: dict[str, float] = {}
-    for name, text in given.items():
-        where = ("twin", *path, name)
-        if name not in units:
-            faults.append(document.fault(where, f"unknown key {name!r}{suggest(name, units)}", at_key=True))
-            continue
-        try:
-            values[name] = parse_quantity(text, units[name])
-        except UnitError as error:
-            faults.append(document.fault(where, str(error)))
-            continue
-        if not values[name] > 0:
-            faults.append(document.fault(where, f"must be positive, not {text}"))
-    return values
+def _localisation(settings: Local, model: ForwardModel, observed: Set[str]) -> Localisation:
+    """Positions are indices of the one observed field, which fills the state but for the parameters.
 
-
-def _correlation(file: str, document: Document, faults: list[Fault]) -> Correlation | None:
-    """The correlation matrix of the observation errors, or None with a fault appended."""
-    try:
-        return Correlation(read_covariance(Matrix(Path(file).expanduser(), "1", "1")))
-    except (DataError, ValueError) as error:
-        faults.append(document.fault(("twin", "error_correlation"), str(error)))
-        return None
-
-
-def _localisation(
-    settings: Local, model: ForwardModel, observed: set[str], document: Document, faults: list[Fault]
-) -> Localisation | None:
-    """Positions are indices of the one observed field, which fills the state but for the parameters."""
-    constant = {p.name for p in model.parameters}
-    fields = [f for f in model.layout if f.name not in constant]
+    Raises :class:`ConfigError`.
+    """
+    fields = list(dynamic_fields(model).values())
     if len(fields) != 1 or observed != {fields[0].name}:
-        message = "needs a model whose state is one field, and this field observed"
-        faults.append(document.fault(("assimilation", "localisation"), message))
-        return None
+        raise ConfigError("needs a model whose state is one field, and this field observed")
+    (field,) = fields
     if settings.shape:
-        if math.prod(settings.shape) != fields[0].size:
-            message = f"{' x '.join(map(str, settings.shape))} cells, but {fields[0].name} has {fields[0].size}"
-            faults.append(document.fault(("assimilation", "localisation", "shape"), message))
-            return None
-        where = np.arange(model.layout.size)[model.layout[fields[0].name]]
+        if math.prod(settings.shape) != field.size:
+            cells = " x ".join(map(str, settings.shape))
+            raise ConfigError([Fault(f"{cells} cells, but {field.name} has {field.size}", "shape")])
+        where = np.arange(model.layout.size)[model.layout[field.name]]
         return Localisation.on_grid(where, settings.shape, settings.radius, settings.periodic)
-    positions = np.arange(fields[0].size, dtype=float)
+    positions = np.arange(field.size, dtype=float)
     state = np.full(model.layout.size, np.nan)
-    state[model.layout[fields[0].name]] = positions
-    period = float(fields[0].size) if settings.periodic else None
+    state[model.layout[field.name]] = positions
+    period = float(field.size) if settings.periodic else None
     return Localisation.on_line(state, positions, settings.radius, period, settings.block_size)
-
-
-def _resolved(top: TwinSchema, model: dict[str, Any], twin: Twin, settings: Sequential) -> str:
-    """The configuration with overrides and defaults written out, as YAML that loads again."""
-    content = top.model_dump(mode="json", by_alias=True, exclude_none=True)
-    content["model"] = model
-    content["twin"] = twin.model_dump(mode="json")
-    smoother = {"lag", "linearisation", "epsilon", "max_iterations", "tolerance"}
-    left_out = smoother if settings.scheme == "etkf" else {"localisation"}
-    content["assimilation"] = settings.model_dump(mode="json", exclude_none=True, exclude=left_out)
-    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)

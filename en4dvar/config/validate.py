@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeVar, get_args
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, Self, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from en4dvar.config.document import Document
-from en4dvar.errors import Fault
+from en4dvar.errors import ConfigError, Fault
 from en4dvar.hints import suggest
 
 M = TypeVar("M", bound=BaseModel)
+Place = tuple[str | int, ...]
 
+_SECTION = "expected 'key: value' lines"
 _MESSAGES = {
     "missing": "required, but not given",
-    "dict_type": "expected 'key: value' lines",
-    "model_type": "expected 'key: value' lines",
-    "model_attributes_type": "expected 'key: value' lines",
+    "dict_type": _SECTION,
+    "model_type": _SECTION,
+    "model_attributes_type": _SECTION,
     "string_type": "expected text; put it in quotes",
 }
 
@@ -28,38 +33,95 @@ def check(
     path: Sequence[str | int],
     document: Document,
     faults: list[Fault],
-    context: Mapping[str, Any] | None = None,
+    context: Any = None,
 ) -> M | None:
     """Validate ``value``, found at ``path``; every fault is appended to ``faults`` and None returned."""
     try:
-        return schema.model_validate(value, context=dict(context or {}))
+        return schema.model_validate(value, context=context)
     except ValidationError as error:
-        seen: set[Fault] = set()
-        for item in error.errors():
-            fault = _fault(item, schema, tuple(path), document)
-            if fault not in seen:
-                seen.add(fault)
+        for told in _tell(error, schema):
+            fault = document.fault(_written(told, path, document), told.message, at_key=told.at_key)
+            if fault not in faults:
                 faults.append(fault)
     return None
 
 
-def _fault(item: Any, schema: type[BaseModel], path: tuple[str | int, ...], document: Document) -> Fault:
-    kind, loc = item["type"], tuple(item["loc"])
-    # Pydantic puts names of union branches into the location; the document decides what is a path.
-    real: tuple[str | int, ...] = path
-    for n, part in enumerate(loc):
-        if document.has((*real, part)) or (kind == "missing" and n == len(loc) - 1):
+@dataclass(frozen=True)
+class _Told:
+    """What is wrong at ``place``; ``absent``: its last key may be one that the file lacks."""
+
+    place: Place
+    message: str
+    at_key: bool = False
+    absent: bool = False
+
+
+class Faults:
+    """Faults that a validator of ours finds, each with its place below the value; told to pydantic on leaving.
+
+    ``names``: declared → as the file has it, where a key is named after something else.
+    """
+
+    def __init__(self, names: Mapping[str, str] | None = None) -> None:
+        self._names = dict(names or {})
+        self._lines: list[InitErrorDetails] = []
+
+    def add(self, place: Place, message: str, *, at_key: bool = False) -> None:
+        """A fault at a key, or of a key that is not there."""
+        self._add(_Told(place, message, at_key, absent=bool(place)))
+
+    def _add(self, told: _Told) -> None:
+        message = told.message
+        for declared, written in self._names.items():
+            message = message.replace(declared, written)
+        context = {"message": message, "at_key": told.at_key, "absent": told.absent}
+        where = tuple(self._names.get(str(part), part) for part in told.place)
+        self._lines.append({"type": PydanticCustomError("fault", "{message}", context), "loc": where, "input": None})
+
+    @contextmanager
+    def at(self, *place: str | int, schema: type[BaseModel] = BaseModel) -> Iterator[None]:
+        """Collects what is raised inside as faults below ``place``; ``schema`` is what was validated."""
+        try:
+            yield
+        except ValidationError as error:
+            for told in _tell(error, schema):
+                self._add(replace(told, place=(*place, *told.place)))
+        except ConfigError as error:
+            for fault in error.problems:
+                self._add(_Told((*place, fault.path) if fault.path else place, fault.message, absent=bool(fault.path)))
+        except ValueError as error:
+            self._add(_Told(place, str(error)))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        if self._lines and error is None:
+            raise ValidationError.from_exception_data("faults", self._lines)
+
+
+def _tell(error: ValidationError, schema: type[BaseModel]) -> Iterator[_Told]:
+    for item in error.errors(include_url=False):
+        kind, place, context = item["type"], tuple(item["loc"]), item.get("ctx", {})
+        if kind == "fault":
+            yield _Told(place, **context)
+        elif kind == "union_tag_invalid":
+            name = context["discriminator"].strip("'")
+            yield _Told((*place, name), _not_one_of(context["tag"], context["expected_tags"]), absent=True)
+        elif kind == "extra_forbidden":
+            hint = suggest(place[-1], sorted(_known(schema, place[:-1])))
+            yield _Told(place, f"unknown key {str(place[-1])!r}{hint}", at_key=True)
+        else:
+            yield _Told(place, _message(item), absent=kind == "missing")
+
+
+def _written(told: _Told, path: Sequence[str | int], document: Document) -> Place:
+    """Pydantic puts names of union branches into the place; the document decides what is a path."""
+    real = tuple(path)
+    for n, part in enumerate(told.place, 1):
+        if document.has((*real, part)) or (told.absent and n == len(told.place)):
             real = (*real, part)
-    if kind == "union_tag_invalid":
-        choices = [c.strip("' ") for c in item["ctx"]["expected_tags"].split(", ")]
-        name, given = item["ctx"]["discriminator"].strip("'"), item["ctx"]["tag"]
-        message = f"{given!r} is not one of {', '.join(choices)}"
-        hint = suggest(given, choices)
-        return document.fault((*real, name), message + (hint if hint.startswith("; did") else ""))
-    if kind == "extra_forbidden":
-        known = sorted(_known(schema, loc[:-1]))
-        return document.fault(real, f"unknown key {str(loc[-1])!r}{suggest(loc[-1], known)}", at_key=True)
-    return document.fault(real, _message(item))
+    return real
 
 
 def _message(item: Any) -> str:
@@ -67,17 +129,24 @@ def _message(item: Any) -> str:
     if kind in ("value_error", "assertion_error"):
         return str(context["error"])
     if kind in ("literal_error", "enum"):
-        choices = [c.strip("' ") for c in context["expected"].replace(" or ", ", ").split(", ")]
-        hint = suggest(item["input"], choices)
-        return f"{item['input']!r} is not one of {', '.join(choices)}" + (hint if hint.startswith("; did") else "")
+        return _not_one_of(item["input"], context["expected"].replace(" or ", ", "))
+    if kind == "too_short":
+        return f"give at least {context['min_length']}, not {item['input']!r}"
     message = _MESSAGES.get(kind, item["msg"].replace("Input should be", "should be"))
     return message if kind == "missing" else f"{message}, not {item['input']!r}"
 
 
-def _known(schema: type[BaseModel], loc: Sequence[str | int]) -> set[str]:
-    """Keys accepted at ``loc``: fields (or aliases) of the models found by following the annotations."""
+def _not_one_of(given: object, expected: str) -> str:
+    choices = [choice.strip("' ") for choice in expected.split(", ")]
+    hint = suggest(given, choices)
+    few = f"one of {', '.join(choices)}" if len(choices) > 1 else choices[0]
+    return f"{given!r} is not {few}" + (hint if hint.startswith("; did") else "")
+
+
+def _known(schema: type[BaseModel], place: Place) -> set[str]:
+    """Keys accepted at ``place``: fields (or aliases) of the models found by following the annotations."""
     models = [schema]
-    for part in loc:
+    for part in place:
         inner = [f.annotation for m in models for k, f in m.model_fields.items() if part in (k, f.alias)]
         if inner:
             models = [m for annotation in inner for m in _models_in(annotation)]

@@ -7,7 +7,8 @@ scalars collected.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -18,16 +19,7 @@ import numpy.typing as npt
 from en4dvar.errors import DataError
 from en4dvar.hints import no_such_file, suggest
 from en4dvar.inputs.matfile import mat_vectors
-from en4dvar.inputs.text_table import (
-    Decimal,
-    cells_of,
-    delimiter_of,
-    number_in,
-    numbered_lines,
-    position,
-    read_header,
-    second_header,
-)
+from en4dvar.inputs.text_table import Decimal, Table, cells_of, delimiter_of, number_in, numbered_lines
 from en4dvar.state import Array
 from en4dvar.units import convert
 
@@ -81,17 +73,10 @@ def read_series(
     ------
     DataError: the file cannot be used.
     """
-    kind = _kind(path, format)
-    wanted = [c.name for c in (value, time if isinstance(time, Column) else None) if c is not None]
-    lines: list[int] = []
-    scalars: dict[str, float] = {}
-    try:
-        if kind == "csv":
-            columns, lines = _read_csv(path, wanted, decimal)
-        else:
-            columns, scalars = _read_mat(path, wanted)
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror or error}") from None
+    wanted = [c.name for c in (value, time) if isinstance(c, Column)]
+    with _opened(path, format) as kind:
+        table = Table(path, decimal) if kind == "csv" else None
+        columns, scalars = (_of_table(table, wanted), {}) if table else _of_mat(path, wanted)
     values = convert(columns[value.name], value.unit, value.target)
     if isinstance(time, Column):
         times = convert(columns[time.name], time.unit, time.target)
@@ -101,11 +86,12 @@ def read_series(
         raise DataError(f"{path}: {value.name!r} is empty")
     if len(times) != len(values):
         raise DataError(f"{path}: {len(times)} times but {len(values)} values of {value.name!r}")
-    first = int(np.argmax(np.nan_to_num(values) != 0)) if kind == "mat" else 0
+    first = 0 if table else int(np.argmax(np.nan_to_num(values) != 0))
     kept = np.arange(first, len(values))[~(np.isnan(times) | np.isnan(values))[first:]]
     _check(times[kept], values[kept], value.name, path)
     wrong = np.flatnonzero(np.diff(times[kept]) <= 0)
     if len(wrong) and isinstance(time, Column):
+        lines = [line for line, _ in table.rows] if table else []
         _tell_disorder(columns[time.name], kept, int(wrong[0]), time.unit, lines, path)
     return Series(times[kept], values[kept], str(path), scalars)
 
@@ -124,49 +110,37 @@ class Contents:
 
 def read_contents(path: Path, format: Format | None = None, decimal: Decimal = ".") -> Contents:
     """Every column that holds numbers. Raises :class:`DataError`."""
-    kind = _kind(path, format)
-    try:
-        return _mat_contents(path) if kind == "mat" else _csv_contents(path, decimal)
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror or error}") from None
+    with _opened(path, format) as kind:
+        return _mat_contents(path) if kind == "mat" else _csv_contents(Table(path, decimal))
 
 
 def _mat_contents(path: Path) -> Contents:
     vectors, scalars, others = mat_vectors(path)
     columns = {k: np.asarray(v, dtype=float).ravel() for k, v in vectors.items() if v.size > 1}
-    return Contents(
-        columns,
-        scalars,
-        {name: f"{path}: {name} is {kind}; save what is in it as vectors" for name, kind in others.items()},
-    )
+    words = {name: f"{path}: {name} is {kind}; save what is in it as vectors" for name, kind in others.items()}
+    return Contents(columns, scalars, words)
 
 
-def _csv_contents(path: Path, decimal: Decimal) -> Contents:
-    lines = numbered_lines(path)
-    names, delimiter = read_header(path, lines)
-    rows = [(number, cells_of(line, delimiter)) for number, line in lines[1:]]
+def _csv_contents(table: Table) -> Contents:
     columns: dict[str, Array] = {}
     others: dict[str, str] = {}
-    for i, name in enumerate(names):
+    for i, name in enumerate(table.names):
         if not name:  # behind a delimiter that ends every line
             continue
+        if not table.rows:
+            others[name] = f"{table.path}: no line follows the header"
+            continue
         try:
-            numbers = [number_in(row[i] if i < len(row) else "", name, path, n, decimal) for n, row in rows]
+            columns[name] = table.numbers(i, name)
         except DataError as error:
-            others[name] = f"{error}{second_header(rows)}"
-        else:
-            if numbers:
-                columns[name] = np.array(numbers)
-            else:
-                others[name] = f"{path}: no line follows the header"
+            others[name] = str(error)
     return Contents(columns, {}, others)
 
 
 def read_covariance(matrix: Matrix) -> Array:
     """The covariance (K, K) of a CSV file: symmetric, positive variances. Raises :class:`DataError`."""
     path = matrix.path
-    if not path.is_file():
-        raise DataError(f"{path}: is a directory" if path.is_dir() else no_such_file(path))
+    _require_file(path)
     rows: list[list[float]] = []
     delimiter = None
     for number, line in numbered_lines(path):
@@ -193,15 +167,23 @@ def read_covariance(matrix: Matrix) -> Array:
     return np.asarray(convert(0.5 * (values + values.T), matrix.unit, matrix.target))
 
 
-def _kind(path: Path, format: Format | None) -> Format:
-    """The format of a file that is there. Raises :class:`DataError`."""
-    if not path.is_file():
-        raise DataError(f"{path}: is a directory" if path.is_dir() else no_such_file(path))
+@contextmanager
+def _opened(path: Path, format: Format | None) -> Iterator[Format]:
+    """The format of a file that is there. Raises :class:`DataError`, also where reading inside fails."""
+    _require_file(path)
     kind = format or SUFFIXES.get(path.suffix.lower())
     if kind is None:
         hint = "save the sheet as CSV" if path.suffix.lower() in SHEETS else "write format: csv or mat"
         raise DataError(f"{path}: the format cannot be told from the suffix {path.suffix!r}; {hint}")
-    return kind
+    try:
+        yield kind
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror or error}") from None
+
+
+def _require_file(path: Path) -> None:
+    if not path.is_file():
+        raise DataError(f"{path}: is a directory" if path.is_dir() else no_such_file(path))
 
 
 def _check(times: Array, values: Array, name: str, path: Path) -> None:
@@ -239,33 +221,23 @@ def _step(step: Step, scalars: Mapping[str, float], path: Path) -> float:
     return value
 
 
-def _read_csv(path: Path, wanted: Sequence[str], decimal: Decimal) -> tuple[dict[str, Array], list[int]]:
-    """The wanted columns, and the number of the line that each row is on."""
-    lines = numbered_lines(path)
-    names, delimiter = read_header(path, lines)
-    where = {name: position(path, names, name, lines) for name in wanted}
-    rows = [(number, cells_of(line, delimiter)) for number, line in lines[1:]]
-    if not rows:
-        raise DataError(f"{path}: no data: no line follows the header")
-    columns: dict[str, list[float]] = {name: [] for name in wanted}
-    for number, cells in rows:
-        for name, i in where.items():
-            try:
-                columns[name].append(number_in(cells[i] if i < len(cells) else "", name, path, number, decimal))
-            except DataError as error:
-                raise DataError(f"{error}{second_header(rows) if number == rows[0][0] else ''}") from None
-        if any(cells[len(names) :]):
-            raise DataError(f"{path}:{number}: {len(cells)} cells, but the header names {len(names)} columns")
-    return {name: np.array(column, dtype=float) for name, column in columns.items()}, [n for n, _ in rows]
+def _of_table(table: Table, wanted: Sequence[str]) -> dict[str, Array]:
+    where = {name: table.position(name) for name in wanted}
+    if not table.rows:
+        raise DataError(f"{table.path}: no data: no line follows the header")
+    columns = {name: table.numbers(i, name) for name, i in where.items()}
+    for line, cells in table.rows:
+        if any(cells[len(table.names) :]):
+            raise DataError(f"{table.path}:{line}: {len(cells)} cells, but the header names {len(table.names)} columns")
+    return columns
 
 
-def _read_mat(path: Path, wanted: Sequence[str]) -> tuple[dict[str, Array], dict[str, float]]:
+def _of_mat(path: Path, wanted: Sequence[str]) -> tuple[dict[str, Array], dict[str, float]]:
     vectors, scalars, others = mat_vectors(path)
     for name in wanted:
         if name not in vectors:
-            fault = (
-                f"is {others[name]}, not a row or column of real numbers" if name in others else "is not in the file"
-            )
+            kind = others.get(name)
+            fault = f"is {kind}, not a row or column of real numbers" if kind else "is not in the file"
             rest = [f"{k} ({what})" for k, what in others.items() if k != name]
             listed = f"{', '.join(sorted(vectors)) or 'none'}{'; no vectors: ' * bool(rest)}{', '.join(rest)}"
             raise DataError(f"{path}: field {name!r} {fault}; the vectors are: {listed}")

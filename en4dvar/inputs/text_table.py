@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import csv
 import unicodedata
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from en4dvar.errors import DataError
+from en4dvar.state import Array
 
 Decimal = Literal[".", ","]
 COMMENT = ("#", "%", "//")
@@ -38,26 +40,6 @@ def _text(path: Path) -> str:
     raise DataError(f"{path}: not a text file")
 
 
-def read_header(path: Path, lines: Sequence[tuple[int, str]]) -> tuple[list[str], str]:
-    """Names of the columns and what separates them."""
-    if not lines:
-        raise DataError(f"{path}: the file holds no data")
-    delimiter = delimiter_of(lines[0][1])
-    names = cells_of(lines[0][1], delimiter)
-    if all(_is_number(n.replace(",", ".")) for n in names):
-        line = (delimiter or " ").join(("t_us", "R_um", *(f"c{i}" for i in range(3, len(names) + 1)))[: len(names)])
-        raise DataError(
-            f"{path}: the first line must name the columns, but it holds numbers; put a line such as {line!r} above it"
-        )
-    return names, delimiter
-
-
-def second_header(rows: Sequence[tuple[int, list[str]]]) -> str:
-    """What to do about a first row without any number, as one of units is."""
-    words = rows and not any(_is_number(cell.replace(",", ".")) for cell in rows[0][1])
-    return "; if this is no reading, put # before the line" if words else ""
-
-
 def delimiter_of(line: str) -> str:
     """What separates the cells; "" for blanks."""
     delimiter = max((",", ";", "\t"), key=line.count)
@@ -70,14 +52,45 @@ def cells_of(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
 
 
-def position(path: Path, names: list[str], name: str, lines: Sequence[tuple[int, str]]) -> int:
-    alike = [i for i, other in enumerate(names) if _same(other, name)]
-    if len(alike) == 1:
-        return alike[0]
-    fault = "more than one column" if alike else "no column"
-    below = [n for n, line in lines[1:] if any(_same(cell, name) for cell in cells_of(line, delimiter_of(line)))]
-    hint = f"; line {below[0]} names it: put # before the lines above" if below and not alike else ""
-    raise DataError(f"{path}: {fault} {name!r}; the columns are: {', '.join(names)}{hint}")
+class Table:
+    """A CSV file: ``names`` of the columns, and ``rows`` of cells with the numbers of their lines."""
+
+    def __init__(self, path: Path, decimal: Decimal):
+        self.path, self.decimal, lines = path, decimal, numbered_lines(path)
+        if not lines:
+            raise DataError(f"{path}: the file holds no data")
+        (_, header), *self.lines = lines
+        delimiter = delimiter_of(header)
+        self.names = cells_of(header, delimiter)
+        if all(_is_number(name.replace(",", ".")) for name in self.names):
+            proposed = ("t_us", "R_um", *(f"c{i}" for i in range(3, len(self.names) + 1)))[: len(self.names)]
+            raise DataError(
+                f"{path}: the first line must name the columns, but it holds numbers; put a line such as "
+                f"{(delimiter or ' ').join(proposed)!r} above it"
+            )
+        self.rows = [(number, cells_of(line, delimiter)) for number, line in self.lines]
+
+    def position(self, name: str) -> int:
+        """Which column has this name. Raises :class:`DataError`."""
+        alike = [i for i, other in enumerate(self.names) if _same(other, name)]
+        if len(alike) == 1:
+            return alike[0]
+        fault = "more than one column" if alike else "no column"
+        below = [n for n, line in self.lines if any(_same(cell, name) for cell in cells_of(line, delimiter_of(line)))]
+        hint = f"; line {below[0]} names it: put # before the lines above" if below and not alike else ""
+        raise DataError(f"{self.path}: {fault} {name!r}; the columns are: {', '.join(self.names)}{hint}")
+
+    def numbers(self, i: int, name: str) -> Array:
+        """A column as numbers. Raises :class:`DataError`, which tells what to do about a second header."""
+        found: list[float] = []
+        for row, (line, cells) in enumerate(self.rows):
+            try:
+                found.append(number_in(cells[i] if i < len(cells) else "", name, self.path, line, self.decimal))
+            except DataError as error:
+                words = row == 0 and not any(_is_number(cell.replace(",", ".")) for cell in cells)
+                hint = "; if this is no reading, put # before the line" if words else ""
+                raise DataError(f"{error}{hint}") from None
+        return np.array(found, dtype=float)
 
 
 def _same(a: str, b: str) -> bool:

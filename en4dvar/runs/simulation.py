@@ -9,7 +9,7 @@ import numpy as np
 
 from en4dvar.config import Config, time_grid
 from en4dvar.config.build import data_files, read_observations, resolve_parameters
-from en4dvar.config.data import parse_spread
+from en4dvar.config.data import parse_error_std
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import run_chunk
 from en4dvar.forward import Failure
@@ -68,7 +68,7 @@ def parse_times(text: str, unit: str) -> Array:
 
 def noise_level(text: str, config: Config, simulation: Simulation) -> float:
     """``"1.4 um"`` or ``"1 % of maximum"`` in the observable's unit. Raises :class:`UnitError`."""
-    spread = parse_spread(text, config.observable.unit)
+    spread = parse_error_std(text, config.observable.unit)
     if not spread.value > 0:
         raise UnitError(f"the noise must be positive, not {text}")
     return spread.absolute(float(simulation.values.max()))
@@ -90,19 +90,21 @@ def _forward(config: Config, theta: Mapping[str, float], times: Array) -> Array:
 
 def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:
     """The simulation as a CSV file with the columns and units of ``data.columns`` (else in display units)."""
-    model, observable = config.model, config.observable
+    model, observable, data = config.model, config.observable, config.data
     time = Column(f"t_{model.time_display_unit}", model.time_display_unit, model.time_unit)
     value = Column(f"{observable.name}_{observable.display_unit}", observable.display_unit, observable.unit)
-    if config.data is not None:
-        time = config.data.time if isinstance(config.data.time, Column) else time
-        value = config.data.value
+    if data is not None:
+        time = data.columns.time if isinstance(data.columns.time, Column) else time
+        value = data.columns.observable
     units = {entry.parameter.name: entry.parameter.unit for entry in config.parameters}
     truth = ", ".join(f"{name} = {v:.9g} {units[name]}" for name, v in simulation.theta.items())
-    lines = [*(f"# {line}" for line in comment.splitlines()), f"# parameters: {truth}"]
-    lines += [f"# {time.name} in {time.unit}, {value.name} in {value.unit}", f"{time.name},{value.name}"]
-    columns = (
-        convert(simulation.times, time.target, time.unit),
-        convert(simulation.values, value.target, value.unit),
-    )
-    lines += [f"{t:.9g},{v:.9g}" for t, v in zip(*columns, strict=True)]
+    times = convert(simulation.times, time.target, time.unit)
+    values = convert(simulation.values, value.target, value.unit)
+    lines = [
+        *(f"# {line}" for line in comment.splitlines()),
+        f"# parameters: {truth}",
+        f"# {time.name} in {time.unit}, {value.name} in {value.unit}",
+        f"{time.name},{value.name}",
+        *(f"{t:.9g},{v:.9g}" for t, v in zip(times, values, strict=True)),
+    ]
     return "\n".join(lines) + "\n"

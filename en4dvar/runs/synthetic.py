@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.config.synthetic import CampaignPlan, GroupPlan
+from en4dvar.config.synthetic import CampaignPlan, Group
 from en4dvar.diagnostics import nrmse
 from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import run_chunk
@@ -48,13 +48,15 @@ class SyntheticSet:
 
 def draw_campaign(plan: CampaignPlan) -> tuple[SyntheticSet, ...]:
     """Every data set of the campaign, named ``<group>_01`` …. Raises :class:`En4dvarError` where none can be drawn."""
-    return tuple(_draw(plan, group, i + 1) for group in plan.groups for i in range(group.datasets))
+    return tuple(
+        _draw(plan, name, group, i + 1) for name, group in plan.settings.groups.items() for i in range(group.datasets)
+    )
 
 
-def _draw(plan: CampaignPlan, group: GroupPlan, number: int) -> SyntheticSet:
-    name = f"{group.name}_{number:02d}"
+def _draw(plan: CampaignPlan, kind: str, group: Group, number: int) -> SyntheticSet:
+    name = f"{kind}_{number:02d}"
     stream = member_stream(plan.seed, name)
-    model = plan.model
+    model, asked = plan.model, plan.settings
     reason = ""
     for _ in range(ATTEMPTS):
         theta = dict(group.fixed)
@@ -62,10 +64,10 @@ def _draw(plan: CampaignPlan, group: GroupPlan, number: int) -> SyntheticSet:
             t.parameter.name: float(t.to_physical(np.array(t.mean + t.std * stream.standard_normal())))
             for t in group.terms
         }
-        shift = float(stream.uniform(*plan.time_shift))
-        gaps = stream.uniform(*plan.spacing, plan.most - 1)
-        times = stream.uniform(*plan.first) + np.concatenate([[0.0], np.cumsum(gaps)])
-        noise = plan.noise * stream.standard_normal(plan.most)
+        shift = float(stream.uniform(*asked.time_shift))
+        gaps = stream.uniform(*asked.spacing, asked.most - 1)
+        times = stream.uniform(*asked.first) + np.concatenate([[0.0], np.cumsum(gaps)])
+        noise = asked.noise * stream.standard_normal(asked.most)
         try:
             state = np.asarray(model.initial_state(theta), dtype=float)
         except ValueError as error:
@@ -77,11 +79,11 @@ def _draw(plan: CampaignPlan, group: GroupPlan, number: int) -> SyntheticSet:
             continue
         exact = np.asarray(plan.observable.operator(path), dtype=float)
         values = exact + noise
-        below = np.flatnonzero(values < plan.stop * np.maximum.accumulate(values))
-        count = int(below[0]) + 1 if len(below) else plan.most
-        if count >= plan.fewest:
+        below = np.flatnonzero(values < asked.stop * np.maximum.accumulate(values))
+        count = int(below[0]) + 1 if len(below) else asked.most
+        if count >= asked.fewest:
             truth = {**theta, TIME_SHIFT.name: shift}
-            return SyntheticSet(name, group.name, times[:count], values[:count], exact[:count], truth)
+            return SyntheticSet(name, kind, times[:count], values[:count], exact[:count], truth)
         reason = f"{count} usable readings"
     raise En4dvarError(f"{name}: no truth could be observed in {ATTEMPTS} attempts ({reason})")
 
@@ -104,7 +106,7 @@ def write_campaign(plan: CampaignPlan, sets: tuple[SyntheticSet, ...], command: 
 def _data_csv(plan: CampaignPlan, dataset: SyntheticSet, command: str) -> str:
     model, seen = plan.model, plan.observable
     t, v = f"t_{model.time_display_unit}", f"{seen.symbol.strip('$')}_{seen.display_unit}"
-    noise = convert(plan.noise, seen.unit, seen.display_unit)
+    noise = convert(plan.settings.noise, seen.unit, seen.display_unit)
     lines = [
         f"# SYNTHETIC data, no measurement: set {dataset.name} of the twin campaign {plan.name!r}",
         f"# {command}; seed {plan.seed}",

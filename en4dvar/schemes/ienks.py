@@ -14,9 +14,10 @@ Meteorol. Soc. 140, 1521.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from annotated_types import Ge, Gt, Le
 
 from en4dvar.ensemble.linalg import centre
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton
@@ -32,11 +33,16 @@ class IEnKS:
     ``transform``: members at the rows of 1wᵀ + T, Y = T⁻¹(P − p̄). ``bundle``: at 1wᵀ + εI, Y = (P − p̄)/ε.
     """
 
-    lag: int = 1
-    linearisation: Literal["transform", "bundle"] = "transform"
-    epsilon: float = 1e-4
-    max_iterations: int = 10
-    tolerance: float = 0.05
+    lag: Annotated[int, Ge(0), "Length of the smoother's window in cycles; 0 is a filter."] = 1
+    linearisation: Annotated[
+        Literal["transform", "bundle"],
+        "Regression over the ensemble (transform), or tangent from runs close to the iterate (bundle).",
+    ] = "transform"
+    epsilon: Annotated[float, Gt(0), Le(1), "Size of the bundle: factor on the anomalies."] = 1e-4
+    max_iterations: Annotated[int, Ge(1), "Iteration limit in each cycle."] = 10
+    tolerance: Annotated[
+        float, Gt(0), "Iterations end where the step is shorter than this, in posterior standard deviations."
+    ] = 0.05
 
     passes: ClassVar[int] = 1
     searches: ClassVar[bool] = False
