@@ -5,11 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
-from typing import Any, overload
-
-import numpy as np
-
-from en4dvar.state import Array
+from typing import Any
 
 UNITS: Mapping[str, str] = MappingProxyType(
     {
@@ -106,6 +102,11 @@ class Medium:
         return self.A * self.T_inf + self.B
 
     @property
+    def conduction_slope(self) -> float:
+        """a in the gas's conductivity over K_inf, a θ + (1−a), θ = T/T_inf."""
+        return self.A * self.T_inf / self.K_inf
+
+    @property
     def constants(self) -> dict[str, float]:
         """Name → SI value of every constant that has a source (:data:`UNITS` has the units)."""
         return {f.name: float(getattr(self, f.name)) for f in fields(self) if f.name in UNITS}
@@ -165,13 +166,3 @@ CONSTANT_SETS: Mapping[str, Medium] = MappingProxyType(
         ),
     }
 )
-
-
-@overload
-def saturated_vapour_pressure(temperature: float) -> float: ...
-@overload
-def saturated_vapour_pressure(temperature: Array) -> Array: ...
-def saturated_vapour_pressure(temperature: float | Array) -> float | Array:
-    """p_sat(T) = 1.17e11 exp(−5200/T) Pa, the fit of the rheometry codes (Estrada 2018); 3.1 kPa at 25 °C."""
-    pressure = 1.17e11 * np.exp(-5200.0 / np.asarray(temperature))
-    return np.asarray(pressure) if np.ndim(temperature) else float(pressure)

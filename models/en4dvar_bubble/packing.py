@@ -1,57 +1,30 @@
-"""From state vectors to the arrays of the compiled solver, and the thermodynamics of the gas that both sides need."""
+"""From state vectors to the arrays of the compiled solver."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from en4dvar.state import Array
-from en4dvar_bubble.medium import Medium, saturated_vapour_pressure
+from en4dvar_bubble.dynamics import Dynamics
+from en4dvar_bubble.gas import (
+    CRITICAL_TEMPERATURE,
+    GAS_CONSTANT,
+    SATURATION,
+    SATURATION_TEMPERATURE,
+    kirchhoff,
+    mole_fraction,
+    saturated_vapour_pressure,
+)
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.collocation import ball
 from en4dvar_bubble.solver.driver import Queue, Tables
 from en4dvar_bubble.solver.lanes import WIDTH
 
-if TYPE_CHECKING:
-    from en4dvar_bubble.model import BubbleModel
 
-GAS_CONSTANT = 8.314462618
-"""J/(mol K), CODATA 2018."""
-CRITICAL_TEMPERATURE = 647.096
-"""K, of water (IAPWS-95)."""
-_SATURATION = saturated_vapour_pressure(np.inf)
-_SATURATION_T = -298.15 * float(np.log(saturated_vapour_pressure(298.15) / _SATURATION))
-
-
-def mole_fraction(C: Array, medium: Medium) -> Array:
-    """Mole fraction of vapour from its mass fraction."""
-    return np.asarray(C / medium.M_v / (C / medium.M_v + (1 - C) / medium.M_g))
-
-
-def mass_fraction(chi: Array, medium: Medium) -> Array:
-    """Mass fraction of vapour from its mole fraction."""
-    return np.asarray(chi * medium.M_v / (chi * medium.M_v + (1 - chi) * medium.M_g))
-
-
-def kirchhoff(theta: Array, slope: float) -> Array:
-    """τ = ∫₁^θ k dθ for k = a θ + (1−a)."""
-    return np.asarray(0.5 * slope * (theta**2 - 1) + (1 - slope) * (theta - 1))
-
-
-def from_kirchhoff(tau: Array, slope: float) -> Array:
-    """θ from τ."""
-    return np.asarray(1 + 2 * tau / (np.sqrt(1 + 2 * slope * tau) + 1))
-
-
-def conduction_slope(medium: Medium) -> float:
-    """a = A T_∞/K_∞."""
-    return medium.A * medium.T_inf / medium.K_inf
-
-
-def law_tables(model: BubbleModel, values: Mapping[str, Array], queue: Queue) -> tuple[Tables, Callable[[], None]]:
+def law_tables(model: Dynamics, values: Mapping[str, Array], queue: Queue) -> tuple[Tables, Callable[[], None]]:
     """The laws of N members as tables in the kernel's units, and a call that completes them.
 
     The laws of the first members in the queue are sampled at once; they can be integrated while the call samples the
@@ -85,22 +58,20 @@ def law_tables(model: BubbleModel, values: Mapping[str, Array], queue: Queue) ->
     return tables, complete
 
 
-def pack(model: BubbleModel, x: Array) -> tuple[Array, Array]:
+def pack(model: Dynamics, x: Array) -> tuple[Array, Array]:
     """States (N, n_state) as initial values (N, n) and parameters (N, rows) of the solver."""
     medium, layout, system = model.medium, model.layout, model.system
     column = {name: x[:, s.start] for name, s in layout.slices.items()}
-    slope = conduction_slope(medium)
     log_R = np.log(column["R"] * 1e6)
     initial = np.zeros((len(x), system.size))
     initial[:, -2] = column["Rdot"] / column["R"] * 1e-6
     initial[:, -1] = log_R
-    par = np.empty((len(x), len(model.constants)))
-    par[:] = model.constants
+    par = np.tile(_constants(model), (len(x), 1))
     gas = (column["p_b"] - medium.p_v) / medium.rho
     if system.gas:
         m = system.gas
         theta = x[:, layout["T"]] / medium.T_inf
-        initial[:, :m] = kirchhoff(theta[:, :m], slope)
+        initial[:, :m] = kirchhoff(theta[:, :m], medium)
         wall = theta[:, m] if system.wall else np.ones(len(x))
         share = ball(m).weights[:m] / theta[:, :m]
         at_wall = ball(m).weights[m] / wall
@@ -113,7 +84,7 @@ def pack(model: BubbleModel, x: Array) -> tuple[Array, Array]:
         par[:, rows.LOG_GAS] = np.log(gas * (share.sum(axis=1) + at_wall) - outside) + 3 * log_R
         if system.wall:
             initial[:, system.first_medium : system.wall_row] = x[:, layout["T_m"]] / medium.T_inf - 1
-            initial[:, system.wall_row] = kirchhoff(wall, slope)
+            initial[:, system.wall_row] = kirchhoff(wall, medium)
     else:
         par[:, rows.LOG_GAS] = np.log(gas) + 3 * model.exponent * log_R
     if system.memory:
@@ -129,14 +100,14 @@ def pack(model: BubbleModel, x: Array) -> tuple[Array, Array]:
     return initial, par
 
 
-def hottest_wall(model: BubbleModel) -> float:
+def hottest_wall(model: Dynamics) -> float:
     """τ of a wall at the critical temperature of water, above which no vapour is in equilibrium with it; else inf."""
     if not (model.system.vapour and model.system.wall):
         return float(np.inf)
-    return float(kirchhoff(np.array(CRITICAL_TEMPERATURE / model.medium.T_inf), conduction_slope(model.medium)))
+    return float(kirchhoff(CRITICAL_TEMPERATURE / model.medium.T_inf, model.medium))
 
 
-def constants(model: BubbleModel) -> Array:
+def _constants(model: Dynamics) -> Array:
     """The parameter rows of the solver that are the same for every member, (rows,); zeros elsewhere."""
     medium, system = model.medium, model.system
     row = np.zeros(rows.PARAMETERS + rows.PER_MEMORY * system.memory)
@@ -146,15 +117,15 @@ def constants(model: BubbleModel) -> Array:
     row[rows.INVERSE_C] = 0.0 if system.radial == "rayleigh-plesset" else 1 / medium.c
     row[rows.CONDUCTION] = medium.K_inf * medium.T_inf / medium.rho * 1e6
     row[rows.KAPPA] = medium.kappa if system.gas else model.exponent
-    row[rows.SLOPE] = conduction_slope(medium)
+    row[rows.SLOPE] = medium.conduction_slope
     row[rows.AMPLITUDE] = model.driving.amplitude / medium.rho
     row[rows.TAIT_B] = medium.tait_B / medium.rho
     row[rows.TAIT_N] = medium.tait_n
     row[rows.DIFFUSION] = medium.D_v * 1e6
     row[rows.DIFFUSION_P] = medium.D_p
     row[rows.DIFFUSION_T] = medium.D_T
-    row[rows.SATURATION] = _SATURATION / medium.rho
-    row[rows.SATURATION_T] = _SATURATION_T / medium.T_inf
+    row[rows.SATURATION] = SATURATION / medium.rho
+    row[rows.SATURATION_T] = SATURATION_TEMPERATURE / medium.T_inf
     R_v = GAS_CONSTANT / medium.M_v
     row[rows.LATENT] = medium.L_v / (R_v * medium.T_inf) * medium.D_v * medium.rho / (medium.K_inf * medium.T_inf)
     row[rows.MEDIUM_K] = medium.K_m / medium.K_inf

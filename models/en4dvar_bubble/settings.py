@@ -22,11 +22,12 @@ from en4dvar.inputs.units import Quantity, parse_quantity
 from en4dvar.state import Parameter
 from en4dvar_bubble.driving import Reading
 from en4dvar_bubble.driving.settings import DrivingSettings, Histotripsy, with_kind
+from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX, Gas, Heat, Start, Vapour
+from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, get_law
 from en4dvar_bubble.laws.loading import qualified
-from en4dvar_bubble.laws.parameters import R0, R_EQ, R_MAX
-from en4dvar_bubble.medium import CONSTANT_SETS, UNITS, WATER_25C, Medium, saturated_vapour_pressure
-from en4dvar_bubble.solver.driver import Accuracy, Radial, preset
+from en4dvar_bubble.medium import CONSTANT_SETS, UNITS, WATER_25C, Medium
+from en4dvar_bubble.solver.driver import Accuracy, AccuracyName, Radial, preset
 
 SetName = Literal["water-25C", "imr-v1", "imr-v2"]
 Positive = Field(gt=0)
@@ -134,13 +135,13 @@ class BubbleSettings(_Section):
     """Constitutive law: a name of ``en4dvar laws``, or a class in a file: ./my_law.py:MyLaw."""
     radial: Radial = "keller-miksis"
     """Radial dynamics: how the compressibility of the medium enters."""
-    gas: Literal["heat", "polytropic", "isothermal", "adiabatic"] = "heat"
+    gas: Gas = "heat"
     """Gas in the bubble: energy equation (heat), or a polytropic law."""
-    vapour: Literal["none", "frozen", "transport"] = "none"
+    vapour: Vapour = "none"
     """Vapour: none, that of time zero as if it were gas, or diffusion with evaporation at the wall."""
-    medium_heat: Literal["cold", "conducting"] = "cold"
+    medium_heat: Heat = "cold"
     """Wall at the far-field temperature, or heat conduction in the medium."""
-    start: Literal["acoustic", "laser"] = "acoustic"
+    start: Start = "acoustic"
     """acoustic: at rest at R0, then driven; laser: released from R_max with the gas of R_eq."""
     driving: DrivingSettings = Histotripsy()
     """Pressure far away; default: the histotripsy pulse (acoustic start) or none (laser start)."""
@@ -150,7 +151,7 @@ class BubbleSettings(_Section):
     """Constant vapour pressure in the bubble: a pressure, or saturated at the far-field temperature."""
     constants: ConstantsSettings = ConstantsSettings()
     """Constants of medium and gas: the name of a set, or a section that replaces some of them."""
-    accuracy: Literal["fast", "standard", "reference"] = "standard"
+    accuracy: AccuracyName = "standard"
     """Nodes and tolerance together; errors of each in docs/solver.md."""
     nodes: Annotated[int, Field(ge=1, le=128)] | None = None
     """Collocation nodes in the gas; default: those of ``accuracy``."""

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from en4dvar.state import Array
 from en4dvar_bubble import tables as tables_module
 from en4dvar_bubble.driving import Driving, Reading
-from en4dvar_bubble.laws.base import GRID, VISCOUS_GRID
+from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import integrate, rows
 from en4dvar_bubble.solver.caching import stamp_with_sources
 from en4dvar_bubble.solver.collocation import ball, exterior
