@@ -11,11 +11,11 @@ import numpy as np
 
 from en4dvar.state import Array, Field, Parameter, StateLayout
 from en4dvar_bubble.driving import Driving, Reading, histotripsy, silence
-from en4dvar_bubble.gas import mass_fraction, saturated_vapour_pressure
+from en4dvar_bubble.gas import CRITICAL_TEMPERATURE, kirchhoff, mass_fraction, saturated_vapour_pressure
 from en4dvar_bubble.laws import ConstitutiveLaw, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.parameters import MANCIA, positive
 from en4dvar_bubble.medium import WATER_25C, Medium
-from en4dvar_bubble.solver.driver import Accuracy, Radial, System, preset
+from en4dvar_bubble.solver.driver import Accuracy, Radial, Solver, System, preset
 
 Gas = Literal["heat", "polytropic", "isothermal", "adiabatic"]
 Start = Literal["acoustic", "laser"]
@@ -93,6 +93,14 @@ class Dynamics:
             radial=self.radial,
             shear=self.law.shear_dependent,
         )
+
+    @cached_property
+    def solver(self) -> Solver:
+        """The compiled solver of these equations."""
+        hottest = np.inf
+        if self.system.vapour and self.system.wall:
+            hottest = float(kirchhoff(CRITICAL_TEMPERATURE / self.medium.T_inf, self.medium))
+        return Solver(self.system, self.driving, self.reading, self.accuracy, hottest)
 
     @property
     def exponent(self) -> float:

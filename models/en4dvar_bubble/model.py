@@ -12,10 +12,10 @@ import numpy as np
 from en4dvar.forward import Failure, ForwardModel, Observable, Shared, StateField, Trajectory, ValidityLimit
 from en4dvar.state import Array
 from en4dvar_bubble.dynamics import Dynamics
-from en4dvar_bubble.packing import hottest_wall, law_tables, pack
+from en4dvar_bubble.packing import law_tables, pack
 from en4dvar_bubble.paths import Paths
 from en4dvar_bubble.settings import BubbleSettings
-from en4dvar_bubble.solver.driver import Queue, Radial, Solution, ready
+from en4dvar_bubble.solver.driver import Queue, Radial, Solution
 
 FIRST_ORDER = "an expansion to first order in the Mach number: Prosperetti & Lezzi (1986), J. Fluid Mech. 168, 457"
 MACH_LIMITS: Mapping[Radial, tuple[float, str]] = {
@@ -100,8 +100,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         order = np.argsort(np.abs(micro), axis=1, kind="stable") if mirror else None
         if order is not None:
             micro = np.take_along_axis(np.abs(micro), order, axis=1)
-        options = (self.driving, self.reading, self.accuracy, hottest_wall(self))
-        kernel, solved = ready(self.system, initial, par, tables, start, micro, queue, *options)
+        kernel, solved = self.solver.prepared(queue, initial, par, tables, start, micro)
         once = Lock()
 
         def work() -> None:

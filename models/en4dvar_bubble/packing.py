@@ -10,7 +10,6 @@ import numpy as np
 from en4dvar.state import Array
 from en4dvar_bubble.dynamics import Dynamics
 from en4dvar_bubble.gas import (
-    CRITICAL_TEMPERATURE,
     GAS_CONSTANT,
     SATURATION,
     SATURATION_TEMPERATURE,
@@ -18,6 +17,7 @@ from en4dvar_bubble.gas import (
     mole_fraction,
     saturated_vapour_pressure,
 )
+from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.collocation import ball
 from en4dvar_bubble.solver.driver import Queue, Tables
@@ -90,21 +90,18 @@ def pack(model: Dynamics, x: Array) -> tuple[Array, Array]:
     if system.memory:
         initial[:, system.first_memory : -2] = x[:, layout["Z"]] / medium.rho
         memory = model.law.memory_tables(model.law_values(x))
+        member = np.arange(len(x), dtype=float)
         for j in range(system.memory):
             at = rows.MEMORY + rows.PER_MEMORY * j
             par[:, at], par[:, at + 1] = memory.relaxation_time[:, j] * 1e6, memory.convection[j]
+            par[:, at + 2] = (member * system.memory + j) * (2 * GRID.cells * 8)
 
     par[:, rows.LOG_R0] = np.log(column[model.stress_free_radius] * 1e6)
-    if "mu" in column and not system.shear:
+    if system.shear:
+        par[:, rows.VISCOUS_TABLE] = np.arange(len(x), dtype=float) * (VISCOUS_GRID.cells * 8)
+    elif "mu" in column:
         par[:, rows.VISCOSITY] = column["mu"] / medium.rho * 1e6
     return initial, par
-
-
-def hottest_wall(model: Dynamics) -> float:
-    """τ of a wall at the critical temperature of water, above which no vapour is in equilibrium with it; else inf."""
-    if not (model.system.vapour and model.system.wall):
-        return float(np.inf)
-    return float(kirchhoff(CRITICAL_TEMPERATURE / model.medium.T_inf, model.medium))
 
 
 def _constants(model: Dynamics) -> Array:

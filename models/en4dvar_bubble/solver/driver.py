@@ -16,6 +16,7 @@ from en4dvar_bubble import tables as tables_module
 from en4dvar_bubble.driving import Driving, Reading
 from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import integrate, rows
+from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output
 from en4dvar_bubble.solver.caching import stamp_with_sources
 from en4dvar_bubble.solver.collocation import ball, exterior
 
@@ -108,8 +109,8 @@ class System:
         return self.gas + self.vapour + self.medium + self.wall + self.memory + 2
 
     @property
-    def dims(self) -> tuple[int, ...]:
-        return (self.gas, self.vapour, self.medium, self.wall, self.memory, RADIALS[self.radial], int(self.shear))
+    def dims(self) -> Dims:
+        return Dims(self.gas, self.vapour, self.medium, self.wall, self.memory, RADIALS[self.radial], int(self.shear))
 
     @property
     def first_vapour(self) -> int:
@@ -213,7 +214,7 @@ def reason(status: int, record: Array) -> str:
 
 @cache
 def _gas_operators(m: int) -> Array:
-    """Collocation operators as one array in the kernel's layout (see ``equations.rhs``)."""
+    """Collocation operators as one array in the kernel's layout, see :class:`arrays.Equations`."""
     ops = np.zeros((2 * m + 3, m + 1))
     if m:
         b = ball(m)
@@ -224,7 +225,7 @@ def _gas_operators(m: int) -> Array:
 
 @cache
 def _medium_operators(m: int) -> Array:
-    """The same for the medium: m+1 rows of the derivative, m of the Laplacian, the nodes x."""
+    """The same for the medium."""
     ops = np.zeros((2 * m + 2, m + 1))
     if m:
         e = exterior(m, MEDIUM_LENGTH)
@@ -232,70 +233,76 @@ def _medium_operators(m: int) -> Array:
     return ops
 
 
-def _lengths(system: System) -> tuple[Any, Any]:
-    """``nodes`` and ``size`` of :func:`integrate.integrate`: as tuples, whose length the compiler sees, for few nodes.
+@dataclass(frozen=True, eq=False)
+class Solver:
+    """A system of equations, what drives it, and how accurately it is integrated."""
 
-    Unrolling halves the time of a step and costs a compilation (some seconds, once) for every number of nodes.
-    """
-    if system.general:
-        return None, np.zeros(system.size)
-    if system.gas in UNROLLED:
-        return (0,) * system.gas, (0,) * system.size
-    return np.zeros(system.gas), np.zeros(system.size)
+    system: System
+    driving: Driving
+    reading: Reading
+    accuracy: Accuracy
+    hottest_wall: float = np.inf
+    """τ of the wall above which there is no equilibrium with its vapour."""
 
+    @cached_property
+    def lengths(self) -> tuple[Any, Any]:
+        """``nodes`` and ``size`` of the equations: as tuples, whose length the compiler sees, for few nodes.
 
-def ready(
-    system: System,
-    initial: Array,
-    parameters: Array,
-    tables: Tables,
-    start: Array,
-    times: Array,
-    queue: Queue,
-    driving: Driving,
-    reading: Reading,
-    accuracy: Accuracy,
-    hottest_wall: float = np.inf,
-) -> tuple[Callable[[], object], Solution]:
-    """Everything set for the compiled integration of N members; a call that does it without the interpreter,
-    and the solution that it fills.
+        Unrolling halves the time of a step and costs a compilation (some seconds, once) for every number of nodes.
+        """
+        system = self.system
+        if system.general:
+            return None, np.zeros(system.size)
+        if system.gas in UNROLLED:
+            return (0,) * system.gas, (0,) * system.size
+        return np.zeros(system.gas), np.zeros(system.size)
 
-    Threads that make the call at once share the members; each returns when no member is left to begin, and all are done
-    when all have returned.
+    def equations(self, tables: Tables) -> Equations:
+        """What the compiled equations read that is the same for all members."""
+        system, driving = self.system, self.driving
+        gas, medium = _gas_operators(system.gas), _medium_operators(system.medium)
+        laws = (_ELASTIC_SPAN, tables.memory.reshape(-1, 1, 8), tables.viscous, _VISCOUS_SPAN)
+        return Equations(
+            *self.lengths, system.dims, gas, medium, *laws, driving.table, driving.span, READINGS[self.reading]
+        )
 
-    ``hottest_wall``: τ of the wall above which there is no equilibrium with its vapour.
-    initial (N, n) and parameters (N, rows) in the kernel's units; start (N,) and times (N, K) in µs, times increasing.
-    Members never influence each other: the bits do not depend on how they are batched.
-    """
-    n_members = len(initial)
-    out = np.empty((n_members, times.shape[1], system.size))
-    status = np.zeros(n_members, dtype=np.int64)
-    record = np.zeros((n_members, integrate.RECORD))
-    span = driving.span
-    inside = (span[1] - span[0]) / _STEPS_IN_DRIVING
-    if system.general:
-        parameters = parameters.copy()
-        member = np.arange(n_members, dtype=float)
-        parameters[:, rows.VISCOUS_TABLE] = member * (VISCOUS_GRID.cells * 8)
-        for j in range(system.memory):
-            offset = (member * system.memory + j) * (2 * GRID.cells * 8)
-            parameters[:, rows.MEMORY + rows.PER_MEMORY * j + 2] = offset
-    arguments = (
-        (queue.counter, queue.available, queue.order),
-        np.ascontiguousarray(initial),
-        parameters,
-        np.ascontiguousarray(start),
-        np.ascontiguousarray(times),
-        system.dims,
-        (tables.samples, tables.factor, tables.elastic),
-        (_gas_operators(system.gas), _ELASTIC_SPAN, driving.table, span, READINGS[reading]),
-        (_medium_operators(system.medium), tables.viscous, _VISCOUS_SPAN, tables.memory.reshape(-1, 1, 8)),
-        *_lengths(system),
-        driving.breaks,
-        system.tolerances(accuracy.rtol),
-        np.array([_FIRST_STEP, inside, accuracy.step_limit, accuracy.mach_limit, accuracy.time_limit, hottest_wall]),
-        out,
-        status,
-        record,
-    )
-    return partial(integrate.integrate, *arguments), Solution(out, status, record)
+    @cached_property
+    def control(self) -> Control:
+        """How the compiled integration chooses its steps, and when it gives a member up."""
+        accuracy, (begin, end, _, _) = self.accuracy, self.driving.span
+        return Control(
+            breaks=self.driving.breaks,
+            tolerances=self.system.tolerances(accuracy.rtol),
+            first_step=_FIRST_STEP,
+            longest_driven=float(end - begin) / _STEPS_IN_DRIVING,
+            step_limit=float(accuracy.step_limit),
+            mach_limit=float(accuracy.mach_limit),
+            seconds=float(accuracy.time_limit),
+            hottest_wall=float(self.hottest_wall),
+        )
+
+    def prepared(
+        self, queue: Queue, initial: Array, parameters: Array, tables: Tables, start: Array, times: Array
+    ) -> tuple[Callable[[], object], Solution]:
+        """Everything set for the compiled integration of N members; a call that does it without the interpreter,
+        and the solution that it fills.
+
+        Threads that make the call at once share the members; each returns when no member is left to begin, and all are
+        done when all have returned.
+
+        initial (N, n) and parameters (N, rows) in the kernel's units; start (N,) and times (N, K) in µs, times
+        increasing. Members never influence each other: the bits do not depend on how they are batched.
+        """
+        n_members = len(initial)
+        output = Output(
+            np.empty((n_members, times.shape[1], self.system.size)),
+            np.zeros(n_members, dtype=np.int64),
+            np.zeros((n_members, integrate.RECORD)),
+        )
+        members = Members(
+            *(queue.counter, queue.available, queue.order),
+            *(np.ascontiguousarray(initial), parameters, np.ascontiguousarray(start), np.ascontiguousarray(times)),
+            *(tables.samples, tables.factor, tables.elastic),
+        )
+        call = partial(integrate.integrate, members, self.equations(tables), self.control, output)
+        return call, Solution(*output)
