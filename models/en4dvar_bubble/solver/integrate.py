@@ -203,8 +203,10 @@ def _failure(lane, clock, lanes, eq, control, w, out):
     return failure
 
 
-@nb.njit(_nrt=False, forceinline=True)
+# With all that it calls: nothing is allocated, so no references to arrays need be counted.
+@nb.njit(_nrt=False)
 def _march(members, lanes, eq, control, w, out):
+    """Refill the lanes, step, look at every lane, until no member is left."""
     n_times = members.times.shape[1]
     waiting, running, attempts, clock = True, 0, 0, _clock(0)
     while True:
