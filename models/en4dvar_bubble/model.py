@@ -12,10 +12,10 @@ import numpy as np
 from en4dvar.forward import Failure, ForwardModel, Observable, Shared, StateField, Trajectory, ValidityLimit
 from en4dvar.state import Array
 from en4dvar_bubble.dynamics import Dynamics
-from en4dvar_bubble.packing import law_tables, pack
+from en4dvar_bubble.packing import pack
 from en4dvar_bubble.paths import Paths
 from en4dvar_bubble.settings import BubbleSettings
-from en4dvar_bubble.solver.driver import Queue, Radial, Solution
+from en4dvar_bubble.solver.driver import Radial, Solution
 
 FIRST_ORDER = "an expansion to first order in the Mach number: Prosperetti & Lezzi (1986), J. Fluid Mech. 168, 457"
 MACH_LIMITS: Mapping[Radial, tuple[float, str]] = {
@@ -91,21 +91,18 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         """:meth:`integrate` of states (N, n_state) in two: the work, without the interpreter, which threads can share,
         and its result.
         """
-        initial, par = pack(self, x)
-        queue = Queue.longest_first(par)
-        tables, complete = law_tables(self, self.law_values(x), queue)
-        start = np.full(len(x), t0 * 1e6)
         micro = times * 1e6
         mirror = self.start == "laser" and t0 == 0.0 and bool(np.any(times < 0))
         order = np.argsort(np.abs(micro), axis=1, kind="stable") if mirror else None
         if order is not None:
             micro = np.take_along_axis(np.abs(micro), order, axis=1)
-        kernel, solved = self.solver.prepared(queue, initial, par, tables, start, micro)
+        packed = pack(self, x, t0 * 1e6, micro)
+        kernel, solved = self.solver.prepared(packed.members, packed.memory, packed.viscous)
         once = Lock()
 
         def work() -> None:
             if once.acquire(blocking=False):
-                complete()
+                packed.complete()
             kernel()
 
         def finish() -> Paths:
@@ -115,6 +112,6 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
                 states = np.take_along_axis(solution.states, back[:, :, None], axis=1)
                 states[:, :, -2] *= np.where(times < 0, -1.0, 1.0)
                 solution = Solution(states, solution.status, solution.record)
-            return Paths(self, x, times, solution, par)
+            return Paths(self, x, times, solution, packed.members.parameters)
 
         return work, finish

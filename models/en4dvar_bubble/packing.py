@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,47 +19,79 @@ from en4dvar_bubble.gas import (
 )
 from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import rows
+from en4dvar_bubble.solver.arrays import Members
 from en4dvar_bubble.solver.collocation import ball
-from en4dvar_bubble.solver.driver import Queue, Tables
 from en4dvar_bubble.solver.lanes import WIDTH
 
+_NO_TABLE = np.zeros((0, GRID.cells, 8))
+_NO_SAMPLES = np.zeros((0, len(GRID.nodes)))
 
-def law_tables(model: Dynamics, values: Mapping[str, Array], queue: Queue) -> tuple[Tables, Callable[[], None]]:
-    """The laws of N members as tables in the kernel's units, and a call that completes them.
 
-    The laws of the first members in the queue are sampled at once; they can be integrated while the call samples the
-    others, which it then makes available.
+class Packed(NamedTuple):
+    """N members in the kernel's units and what their laws add to the equations; a call that completes them.
+
+    The elastic parts of the first members in the queue are sampled at once; they can be integrated while the call
+    samples the others, which it then makes available.
     """
-    law, rho = model.law, model.medium.rho
-    n_members = len(queue.order)
-    first, others = queue.order[:WIDTH], queue.order[WIDTH:]
+
+    members: Members
+    memory: Array
+    viscous: Array
+    complete: Callable[[], None]
+
+
+def pack(model: Dynamics, x: Array, start: float, times: Array) -> Packed:
+    """States (N, n_state) at ``start`` (µs), to be integrated to ``times`` (N, K) in µs."""
+    law, rho, system, values = model.law, model.medium.rho, model.system, model.law_values(x)
+    initial, par = _states(model, x)
+    n_members = len(x)
+    memory = viscous = _NO_TABLE
+    if system.memory:
+        memory = _memory(model, values, initial, par, x)
+    if system.shear:
+        viscous = law.viscous_table(values) / rho * 1e6
+        par[:, rows.VISCOUS_TABLE] = np.arange(n_members, dtype=float) * (VISCOUS_GRID.cells * 8)
+    elif "mu" in values:
+        par[:, rows.VISCOSITY] = values["mu"] / rho * 1e6
+
+    # Least damped, hence longest ringing, first, so that the lanes run dry together.
+    order = np.argsort(par[:, rows.VISCOSITY], kind="stable")
+    first, others = order[:WIDTH], order[WIDTH:]
+    available = np.full(1, n_members, dtype=np.int64)
+    samples, elastic = _NO_SAMPLES, _NO_TABLE
     some = law.samples({name: value[first] for name, value in values.items()})
     if some is None:
-        tables = Tables(elastic=law.table(values) / rho)
+        elastic = law.table(values) / rho
     else:
         samples = np.empty((n_members, some.shape[1]))
         samples[first] = some
-        queue.available[0] = len(first)
-        tables = Tables(samples=samples, factor=1 / rho)
+        available[0] = len(first)
 
     def complete() -> None:
         try:
-            if queue.available[0] < n_members:
+            if available[0] < n_members:
                 rest = law.samples({name: value[others] for name, value in values.items()})
-                tables.samples[others] = np.nan if rest is None else rest
+                samples[others] = np.nan if rest is None else rest
         finally:  # threads may be waiting
-            queue.available[0] = n_members
+            available[0] = n_members
 
-    if model.system.shear:
-        tables = replace(tables, viscous=law.viscous_table(values) / rho * 1e6)
-    if model.system.memory:
-        memory = law.memory_tables(values)
-        tables = replace(tables, memory=np.stack([memory.stiffness, memory.equilibrium], axis=2) / rho)
-    return tables, complete
+    members = Members(
+        counter=np.zeros(1, dtype=np.int64),
+        available=available,
+        order=order,
+        initial=initial,
+        parameters=par,
+        start=np.full(n_members, start),
+        times=np.ascontiguousarray(times),
+        samples=samples,
+        factor=1 / rho,
+        tables=elastic,
+    )
+    return Packed(members, memory, viscous, complete)
 
 
-def pack(model: Dynamics, x: Array) -> tuple[Array, Array]:
-    """States (N, n_state) as initial values (N, n) and parameters (N, rows) of the solver."""
+def _states(model: Dynamics, x: Array) -> tuple[Array, Array]:
+    """Initial values (N, n) and parameters (N, rows) of states (N, n_state); what the law adds to both is missing."""
     medium, layout, system = model.medium, model.layout, model.system
     column = {name: x[:, s.start] for name, s in layout.slices.items()}
     log_R = np.log(column["R"] * 1e6)
@@ -87,21 +119,21 @@ def pack(model: Dynamics, x: Array) -> tuple[Array, Array]:
             initial[:, system.wall_row] = kirchhoff(wall, medium)
     else:
         par[:, rows.LOG_GAS] = np.log(gas) + 3 * model.exponent * log_R
-    if system.memory:
-        initial[:, system.first_memory : -2] = x[:, layout["Z"]] / medium.rho
-        memory = model.law.memory_tables(model.law_values(x))
-        member = np.arange(len(x), dtype=float)
-        for j in range(system.memory):
-            at = rows.MEMORY + rows.PER_MEMORY * j
-            par[:, at], par[:, at + 1] = memory.relaxation_time[:, j] * 1e6, memory.convection[j]
-            par[:, at + 2] = (member * system.memory + j) * (2 * GRID.cells * 8)
-
     par[:, rows.LOG_R0] = np.log(column[model.stress_free_radius] * 1e6)
-    if system.shear:
-        par[:, rows.VISCOUS_TABLE] = np.arange(len(x), dtype=float) * (VISCOUS_GRID.cells * 8)
-    elif "mu" in column:
-        par[:, rows.VISCOSITY] = column["mu"] / medium.rho * 1e6
     return initial, par
+
+
+def _memory(model: Dynamics, values: Mapping[str, Array], initial: Array, par: Array, x: Array) -> Array:
+    """Tables of stiffness and equilibrium of the memory variables; writes their initial values and parameters."""
+    system, rho = model.system, model.medium.rho
+    initial[:, system.first_memory : -2] = x[:, model.layout["Z"]] / rho
+    memory = model.law.memory_tables(values)
+    member = np.arange(len(x), dtype=float)
+    for j in range(system.memory):
+        at = rows.MEMORY + rows.PER_MEMORY * j
+        par[:, at], par[:, at + 1] = memory.relaxation_time[:, j] * 1e6, memory.convection[j]
+        par[:, at + 2] = (member * system.memory + j) * (2 * GRID.cells * 8)
+    return (np.stack([memory.stiffness, memory.equilibrium], axis=2) / rho).reshape(-1, 1, 8)
 
 
 def _constants(model: Dynamics) -> Array:

@@ -7,8 +7,6 @@ from dataclasses import replace
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     ValidationInfo,
     WithJsonSchema,
@@ -23,7 +21,7 @@ from en4dvar.errors import ConfigError
 from en4dvar.inputs.units import Quantity, parse_quantity
 from en4dvar.state import Parameter
 from en4dvar_bubble.driving import Reading
-from en4dvar_bubble.driving.settings import DrivingSettings, Histotripsy, with_kind
+from en4dvar_bubble.driving.settings import DrivingSettings, Histotripsy, Section, with_kind
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX, Gas, Heat, Start, Vapour
 from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, get_law
@@ -37,11 +35,7 @@ _GIVEN = "given in the configuration"
 _VAPOUR_PRESSURE = {"anyOf": [{"const": "saturated"}, {"const": 0}, {"type": "string", "pattern": r"^\s*[\d.]"}]}
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
-
-
-class _NamedSet(_Section):
+class _NamedSet(Section):
     """A named set of constants, any of them replaced."""
 
     set: SetName = "water-25C"
@@ -108,7 +102,7 @@ ConstantsSettings = create_model(
 )
 
 
-class BubbleSettings(_Section):
+class BubbleSettings(Section):
     """What the forward model is; every default is recorded in the resolved configuration."""
 
     law: str = "quadratic-kelvin-voigt"

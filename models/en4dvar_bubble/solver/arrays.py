@@ -23,20 +23,13 @@ class Members(NamedTuple):
     counter: IntArray
     available: IntArray
     order: IntArray
-    initial: Array
-    """(N, n) states at ``start``."""
-    parameters: Array
-    """(N, rows), see :mod:`rows`."""
-    start: Array
-    """(N,) µs."""
-    times: Array
-    """(N, K) output times, increasing, µs."""
-    samples: Array
-    """(N, nodes) of J_e, tabulated when a member's turn comes; or (0, nodes)."""
-    factor: float
-    """Of the samples."""
-    tables: Array
-    """(N, cells, 8) of J_e where there are no samples."""
+    initial: Array  # (N, n) states at ``start``
+    parameters: Array  # (N, rows), see :mod:`rows`
+    start: Array  # (N,) µs
+    times: Array  # (N, K) output times, increasing, µs
+    samples: Array  # (N, nodes) of J_e, tabulated when a member's turn comes; or (0, nodes)
+    factor: float  # of the samples
+    tables: Array  # (N, cells, 8) of J_e where there are no samples
 
 
 class Dims(NamedTuple):
@@ -62,41 +55,28 @@ class Equations(NamedTuple):
     nodes: Any
     size: Any
     dims: Dims
-    gas: Array
-    """Collocation operators in the gas: gas+1 rows of d/dy (the last is the wall), gas rows of the Laplacian, a row of
-    radii and one of averaging weights."""
-    medium: Array
-    """Those in the medium: medium+1 rows of d/dx, medium rows of the Laplacian, a row of nodes."""
-    elastic_span: Array
-    """Of the tables against ln λ: first, last, cells per unit, cells."""
-    memory: Array
-    """Tables of the memory variables."""
-    viscous: Array
-    """Tables of ν against ln |V|."""
+    gas: Array  # collocation: gas+1 rows of d/dy (the last is the wall), gas of the Laplacian, radii, averaging weights
+    medium: Array  # likewise: medium+1 rows of d/dx, medium of the Laplacian, nodes
+    elastic_span: Array  # of the tables against ln λ: first, last, cells per unit, cells
+    memory: Array  # tables of the memory variables
+    viscous: Array  # tables of ν against ln |V|
     viscous_span: Array
-    driving: Array
-    """Table of the far-field pressure over its amplitude."""
+    driving: Array  # table of the far-field pressure over its amplitude
     driving_span: Array
-    reading: int
-    """When the driving is read, see :mod:`rows`."""
+    reading: int  # when the driving is read, see :mod:`rows`
 
 
 class Control(NamedTuple):
     """How steps are chosen and when a member has failed."""
 
-    breaks: Array
-    """Increasing instants (µs) that no step straddles."""
-    tolerances: Array
-    """(2, n) absolute and relative."""
+    breaks: Array  # increasing instants (µs) that no step straddles
+    tolerances: Array  # (2, n) absolute and relative
     first_step: float
-    longest_driven: float
-    """Longest step while the driving acts, µs."""
+    longest_driven: float  # longest step while the driving acts, µs
     step_limit: float
     mach_limit: float
-    seconds: float
-    """Of wall clock per member."""
-    hottest_wall: float
-    """τ of the wall above which a breakdown is put down to it."""
+    seconds: float  # of wall clock per member
+    hottest_wall: float  # τ of the wall above which a breakdown is put down to it
 
 
 class Output(NamedTuple):
@@ -110,10 +90,8 @@ class Output(NamedTuple):
 class Loaded(NamedTuple):
     """What the equations read of the members in the lanes."""
 
-    par: Array
-    """(rows, WIDTH)."""
-    elastic: Array
-    """(WIDTH, cells, 8) of J_e: small enough for the cache."""
+    par: Array  # (rows, WIDTH)
+    elastic: Array  # (WIDTH, cells, 8) of J_e: small enough for the cache
 
 
 class Lanes(NamedTuple):
@@ -123,21 +101,14 @@ class Lanes(NamedTuple):
     t: Array
     h: Array
     loaded: Loaded
-    member: IntArray
-    """Which one; −1 where a lane is idle."""
-    began: IntArray
-    """When it was taken, seconds."""
-    observed: IntArray
-    """Output times written."""
+    member: IntArray  # which one; −1 where a lane is idle
+    began: IntArray  # when it was taken, seconds
+    observed: IntArray  # output times written
     next_break: IntArray
-    proposed: Array
-    """The step before it was cut at a break."""
-    last_h: Array
-    """The last accepted step; negative before there is one."""
-    last_root: Array
-    """The fifth root of its error."""
-    rejected: Any
-    """Whether the last attempt was."""
+    proposed: Array  # the step before it was cut at a break
+    last_h: Array  # the last accepted step; negative before there is one
+    last_root: Array  # the fifth root of its error
+    rejected: Any  # whether the last attempt was
 
 
 class Workspace(NamedTuple):

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.state import Array
 from en4dvar_bubble import tables as tables_module
@@ -139,39 +138,6 @@ class System:
 
 
 _ELASTIC_SPAN, _VISCOUS_SPAN = GRID.span, VISCOUS_GRID.span
-_NO_TABLE = np.zeros((0, GRID.cells, 8))
-_NO_SAMPLES = np.zeros((0, len(GRID.nodes)))
-
-
-@dataclass(frozen=True)
-class Tables:
-    """What the laws of N members contribute, over the density.
-
-    J_e either as ``samples`` (N, nodes with halo) times ``factor``, tabulated when a member's turn comes, or as
-    finished tables ``elastic`` (N, cells, 8); ``viscous`` (N, cells, 8) of ν (µm²/µs); ``memory`` (N, q, 2, cells, 8)
-    of stiffness and equilibrium.
-    """
-
-    samples: Array = field(default_factory=lambda: _NO_SAMPLES)
-    factor: float = 1.0
-    elastic: Array = field(default_factory=lambda: _NO_TABLE)
-    viscous: Array = field(default_factory=lambda: _NO_TABLE)
-    memory: Array = field(default_factory=lambda: _NO_TABLE)
-
-
-@dataclass(frozen=True)
-class Queue:
-    """The order (N,) in which members are taken, how many of them are ``available`` (1,) yet, how many are taken."""
-
-    order: npt.NDArray[np.intp]
-    available: npt.NDArray[np.int64]
-    counter: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, dtype=np.int64))
-
-    @classmethod
-    def longest_first(cls, parameters: Array) -> Queue:
-        """Least damped, hence longest ringing, first, so that the lanes run dry together; all are available."""
-        order = np.argsort(parameters[:, rows.VISCOSITY], kind="stable")
-        return cls(order, np.full(1, len(order), dtype=np.int64))
 
 
 @dataclass(frozen=True)
@@ -193,23 +159,17 @@ class Solution:
 
 def reason(status: int, record: Array) -> str:
     """The failure in words."""
-    when = f"at t = {record[integrate.END_TIME]:.4g} µs"
-    match status:
-        case integrate.OK:
-            return ""
-        case integrate.STEP_LIMIT:
-            return f"step limit reached {when}"
-        case integrate.NON_FINITE:
-            return f"non-finite state {when}"
-        case integrate.STEP_UNDERFLOW:
-            return f"step size underflow {when}"
-        case integrate.MACH_LIMIT:
-            return f"model validity: wall Mach {record[integrate.MAX_MACH]:.3g} {when}"
-        case integrate.WALL_LIMIT:
-            return f"model validity: wall above the critical temperature of water {when}"
-        case integrate.TIME_LIMIT:
-            return f"time limit reached {when}"
-    raise ValueError(f"unknown status {status}")
+    if status == integrate.OK:
+        return ""
+    words = {
+        integrate.STEP_LIMIT: "step limit reached",
+        integrate.NON_FINITE: "non-finite state",
+        integrate.STEP_UNDERFLOW: "step size underflow",
+        integrate.MACH_LIMIT: f"model validity: wall Mach {record[integrate.MAX_MACH]:.3g}",
+        integrate.WALL_LIMIT: "model validity: wall above the critical temperature of water",
+        integrate.TIME_LIMIT: "time limit reached",
+    }
+    return f"{words[status]} at t = {record[integrate.END_TIME]:.4g} µs"
 
 
 @cache
@@ -257,11 +217,11 @@ class Solver:
             return (0,) * system.gas, (0,) * system.size
         return np.zeros(system.gas), np.zeros(system.size)
 
-    def equations(self, tables: Tables) -> Equations:
-        """What the compiled equations read that is the same for all members."""
+    def equations(self, memory: Array, viscous: Array) -> Equations:
+        """What the compiled equations read that is the same for all members; tables of the laws (…, cells, 8)."""
         system, driving = self.system, self.driving
         gas, medium = _gas_operators(system.gas), _medium_operators(system.medium)
-        laws = (_ELASTIC_SPAN, tables.memory.reshape(-1, 1, 8), tables.viscous, _VISCOUS_SPAN)
+        laws = (_ELASTIC_SPAN, memory, viscous, _VISCOUS_SPAN)
         return Equations(
             *self.lengths, system.dims, gas, medium, *laws, driving.table, driving.span, READINGS[self.reading]
         )
@@ -281,28 +241,17 @@ class Solver:
             hottest_wall=float(self.hottest_wall),
         )
 
-    def prepared(
-        self, queue: Queue, initial: Array, parameters: Array, tables: Tables, start: Array, times: Array
-    ) -> tuple[Callable[[], object], Solution]:
-        """Everything set for the compiled integration of N members; a call that does it without the interpreter,
-        and the solution that it fills.
+    def prepared(self, members: Members, memory: Array, viscous: Array) -> tuple[Callable[[], object], Solution]:
+        """A call that integrates the members without the interpreter, and the solution that it fills.
 
         Threads that make the call at once share the members; each returns when no member is left to begin, and all are
-        done when all have returned.
-
-        initial (N, n) and parameters (N, rows) in the kernel's units; start (N,) and times (N, K) in µs, times
-        increasing. Members never influence each other: the bits do not depend on how they are batched.
+        done when all have returned. Members never influence each other: the bits do not depend on how they are batched.
         """
-        n_members = len(initial)
+        n_members, n_times = members.times.shape
         output = Output(
-            np.empty((n_members, times.shape[1], self.system.size)),
+            np.empty((n_members, n_times, self.system.size)),
             np.zeros(n_members, dtype=np.int64),
             np.zeros((n_members, integrate.RECORD)),
         )
-        members = Members(
-            *(queue.counter, queue.available, queue.order),
-            *(np.ascontiguousarray(initial), parameters, np.ascontiguousarray(start), np.ascontiguousarray(times)),
-            *(tables.samples, tables.factor, tables.elastic),
-        )
-        call = partial(integrate.integrate, members, self.equations(tables), self.control, output)
+        call = partial(integrate.integrate, members, self.equations(memory, viscous), self.control, output)
         return call, Solution(*output)
