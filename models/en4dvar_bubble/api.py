@@ -14,10 +14,11 @@ import numpy.typing as npt
 from en4dvar.errors import ConfigError
 from en4dvar.state import Array
 from en4dvar_bubble.driving import Driving, Reading, histotripsy, silence
+from en4dvar_bubble.dynamics import Gas, Heat, Start, Vapour
+from en4dvar_bubble.gas import from_kirchhoff
 from en4dvar_bubble.laws import ConstitutiveLaw, get_law
 from en4dvar_bubble.medium import UNITS, WATER_25C, Medium
-from en4dvar_bubble.model import BubbleModel, Gas, Heat, Start, Vapour
-from en4dvar_bubble.packing import conduction_slope, from_kirchhoff
+from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.solver.driver import Accuracy, AccuracyName, Radial, preset
 from en4dvar_bubble.solver.integrate import MAX_MACH, MAX_THETA, RECORD, STEPS
 from en4dvar_bubble.solver.lanes import WIDTH
@@ -161,7 +162,7 @@ def _dataset(model: BubbleModel, theta: Mapping[str, Array], t: Array, out: _Out
     data["steps"] = (member, record[:, STEPS].astype(int), {"long_name": "accepted time steps"})
     data["max_wall_mach"] = (member, record[:, MAX_MACH], {"units": "1", "long_name": "largest wall Mach number"})
     if model.system.gas:
-        hottest = medium.T_inf * from_kirchhoff(record[:, MAX_THETA], conduction_slope(medium))
+        hottest = medium.T_inf * from_kirchhoff(record[:, MAX_THETA], medium)
         data["max_temperature"] = (member, hottest, {"units": "K", "long_name": "highest temperature near the centre"})
     coordinates: dict[str, Any] = {"time": ("time", t, {"units": "s", "long_name": "time"})}
     for p in model.parameters:

@@ -5,100 +5,93 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
-from typing import Any, overload
+from typing import Any
 
-import numpy as np
-
-from en4dvar.state import Array
-
-UNITS: Mapping[str, str] = MappingProxyType(
-    {
-        "rho": "kg/m^3",
-        "c": "m/s",
-        "p_inf": "Pa",
-        "S": "N/m",
-        "T_inf": "K",
-        "kappa": "1",
-        "A": "W/(m K^2)",
-        "B": "W/(m K)",
-        "tait_B": "Pa",
-        "tait_n": "1",
-        "K_m": "W/(m K)",
-        "c_m": "J/(kg K)",
-        "A_v": "W/(m K^2)",
-        "B_v": "W/(m K)",
-        "D_v": "m^2/s",
-        "D_p": "1",
-        "D_T": "1",
-        "L_v": "J/kg",
-        "M_g": "kg/mol",
-        "M_v": "kg/mol",
-    }
-)
 _PHYSICS = "water at 25 °C, 1 atm (customary value of the cavitation literature)"
 _PROSPERETTI = "Prosperetti, J. Fluid Mech. 222, 587 (1991): linear fit for air"
-_WATER_SOURCES: Mapping[str, str] = {
-    "rho": _PHYSICS,
-    "c": _PHYSICS,
-    "p_inf": "standard atmosphere",
-    "S": _PHYSICS,
-    "T_inf": "25 °C",
-    "kappa": "diatomic ideal gas",
-    "A": _PROSPERETTI,
-    "B": _PROSPERETTI,
-    "tait_B": "Tait equation of water, p + B ∝ ρⁿ (Gilmore 1952; Prosperetti & Lezzi 1986)",
-    "tait_n": "Tait equation of water, p + B ∝ ρⁿ (Gilmore 1952; Prosperetti & Lezzi 1986)",
-    "K_m": "IMRv2 src/forward_solver/default_case.m, commit 788a54d (Km)",
-    "c_m": "IMRv2 src/forward_solver/default_case.m, commit 788a54d (Cp)",
-    "A_v": "IMRv2 src/forward_solver/default_case.m, commit 788a54d (ATv)",
-    "B_v": "IMRv2 src/forward_solver/default_case.m, commit 788a54d (BTv)",
-    "D_v": "IMRv2 src/forward_solver/default_case.m, commit 788a54d (D0)",
-    "D_p": "IMRv2 src/forward_solver/default_case.m, commit 788a54d: a constant diffusivity",
-    "D_T": "IMRv2 src/forward_solver/default_case.m, commit 788a54d: a constant diffusivity",
-    "L_v": "IMRv2 src/forward_solver/default_case.m, commit 788a54d (L_heat)",
-    "M_g": "molar mass of dry air",
-    "M_v": "molar mass of water",
-}
+_TAIT = "Tait equation of water, p + B ∝ ρⁿ (Gilmore 1952; Prosperetti & Lezzi 1986)"
+_IMR_V2 = "IMRv2 src/forward_solver/default_case.m, commit 788a54d"
+_FIXED = f"{_IMR_V2}: a constant diffusivity"
+_VAPOUR = "(vapour: transport)"
+_CONDUCTING = "(medium_heat: conducting)"
+
+
+def _constant(value: float, unit: str, description: str, source: str, **bounds: float) -> Any:
+    """A constant of :class:`Medium`; ``bounds`` as pydantic names them."""
+    return field(default=value, metadata={"unit": unit, "description": description, "source": source, "bounds": bounds})
 
 
 @dataclass(frozen=True)
 class Medium:
     """SI values; the defaults are water and air at 25 °C (``water-25C``).
 
-    rho kg/m³, c m/s, p_inf Pa, S N/m (surface tension), T_inf K, kappa (ratio of specific heats of the gas), and the
-    gas's conductivity K(T) = A T + B with A in W/(m K²) and B in W/(m K) (Prosperetti 1991). ``p_v`` is a constant
-    vapour pressure in Pa that adds to the gas pressure (0: none).
-
-    For the enthalpy form and Gilmore's equation: Tait's (p + tait_B)/(p_inf + tait_B) = (ρ/rho)^tait_n. For a
-    conducting medium: conductivity K_m, specific heat c_m. For vapour transport: the vapour's conductivity
-    A_v T + B_v, diffusivity D_v (p_inf/p)^D_p (T/T_inf)^D_T in the gas (0 and 0: the constant of the rheometry codes;
-    1 and 1.75: Fuller, Schettler & Giddings 1966), latent heat L_v, molar masses M_g of the gas and M_v of the vapour.
-
-    ``sources`` says where each constant comes from.
+    The gas conducts heat with K(T) = A T + B (Prosperetti 1991), the vapour with A_v T + B_v; vapour diffuses in the
+    gas with D_v (p_inf/p)^D_p (T/T_inf)^D_T (0 and 0: the constant of the rheometry codes; 1 and 1.75: Fuller et al.
+    1966). The liquid of the enthalpy form and Gilmore's equation is Tait's,
+    (p + tait_B)/(p_inf + tait_B) = (ρ/rho)^tait_n. ``p_v`` is a constant vapour pressure in Pa that adds to the gas
+    pressure (0: none). ``sources`` says where each constant comes from.
     """
 
-    rho: float = 998.0
-    c: float = 1484.0
-    p_inf: float = 101325.0
-    S: float = 0.072
-    T_inf: float = 298.15
-    kappa: float = 1.4
-    A: float = 5.28e-5
-    B: float = 1.165e-2
+    rho: float = _constant(998.0, "kg/m^3", "Density of the medium.", _PHYSICS, gt=0)
+    c: float = _constant(1484.0, "m/s", "Speed of sound in the medium.", _PHYSICS, gt=0)
+    p_inf: float = _constant(101325.0, "Pa", "Far-field pressure.", "standard atmosphere", gt=0)
+    S: float = _constant(0.072, "N/m", "Surface tension.", _PHYSICS, ge=0)
+    T_inf: float = _constant(298.15, "K", "Far-field temperature.", "25 °C", gt=0)
+    kappa: float = _constant(1.4, "1", "Ratio of specific heats of the gas.", "diatomic ideal gas", gt=1)
+    A: float = _constant(5.28e-5, "W/(m K^2)", "Conductivity of the gas, K(T) = A T + B.", _PROSPERETTI, ge=0)
+    B: float = _constant(1.165e-2, "W/(m K)", "Conductivity of the gas, K(T) = A T + B.", _PROSPERETTI, ge=0)
     p_v: float = 0.0
-    tait_B: float = 304.913e6
-    tait_n: float = 7.15
-    K_m: float = 0.55
-    c_m: float = 4181.0
-    A_v: float = 3.30e-5
-    B_v: float = 1.742e-2
-    D_v: float = 24.2e-6
-    D_p: float = 0.0
-    D_T: float = 0.0
-    L_v: float = 2264.76e3
-    M_g: float = 28.966e-3
-    M_v: float = 18.01528e-3
-    sources: Mapping[str, str] = field(default_factory=lambda: dict(_WATER_SOURCES), compare=False, repr=False)
+    tait_B: float = _constant(
+        304.913e6, "Pa", "Tait equation of the medium: pressure B (enthalpy form and Gilmore).", _TAIT, gt=0
+    )
+    tait_n: float = _constant(
+        7.15, "1", "Tait equation of the medium: exponent n (enthalpy form and Gilmore).", _TAIT, gt=1
+    )
+    K_m: float = _constant(
+        0.55, "W/(m K)", f"Thermal conductivity of the medium {_CONDUCTING}.", f"{_IMR_V2} (Km)", gt=0
+    )
+    c_m: float = _constant(4181.0, "J/(kg K)", f"Specific heat of the medium {_CONDUCTING}.", f"{_IMR_V2} (Cp)", gt=0)
+    A_v: float = _constant(
+        3.30e-5,
+        "W/(m K^2)",
+        f"Conductivity of the vapour, K(T) = A_v T + B_v {_VAPOUR}.",
+        f"{_IMR_V2} (ATv)",
+        ge=0,
+    )
+    B_v: float = _constant(
+        1.742e-2,
+        "W/(m K)",
+        f"Conductivity of the vapour, K(T) = A_v T + B_v {_VAPOUR}.",
+        f"{_IMR_V2} (BTv)",
+        ge=0,
+    )
+    D_v: float = _constant(
+        24.2e-6,
+        "m^2/s",
+        f"Diffusivity of vapour in the gas at p_inf and T_inf {_VAPOUR}.",
+        f"{_IMR_V2} (D0)",
+        gt=0,
+    )
+    D_p: float = _constant(
+        0.0,
+        "1",
+        f"Diffusivity ∝ (p_inf/p)^D_p: 0 constant, as in the rheometry codes; 1 kinetic theory {_VAPOUR}.",
+        _FIXED,
+        ge=0,
+        le=2,
+    )
+    D_T: float = _constant(
+        0.0,
+        "1",
+        f"Diffusivity ∝ (T/T_inf)^D_T: 0 constant, as in the rheometry codes; 1.75 kinetic theory {_VAPOUR}.",
+        _FIXED,
+        ge=0,
+        le=3,
+    )
+    L_v: float = _constant(2264.76e3, "J/kg", f"Latent heat of evaporation {_VAPOUR}.", f"{_IMR_V2} (L_heat)", gt=0)
+    M_g: float = _constant(28.966e-3, "kg/mol", f"Molar mass of the gas {_VAPOUR}.", "molar mass of dry air", gt=0)
+    M_v: float = _constant(18.01528e-3, "kg/mol", f"Molar mass of the vapour {_VAPOUR}.", "molar mass of water", gt=0)
+    sources: Mapping[str, str] = field(default_factory=lambda: dict(_SOURCES), compare=False, repr=False)
 
     @property
     def K_inf(self) -> float:
@@ -106,9 +99,14 @@ class Medium:
         return self.A * self.T_inf + self.B
 
     @property
+    def conduction_slope(self) -> float:
+        """a in the gas's conductivity over K_inf, a θ + (1−a), θ = T/T_inf."""
+        return self.A * self.T_inf / self.K_inf
+
+    @property
     def constants(self) -> dict[str, float]:
         """Name → SI value of every constant that has a source (:data:`UNITS` has the units)."""
-        return {f.name: float(getattr(self, f.name)) for f in fields(self) if f.name in UNITS}
+        return {name: float(getattr(self, name)) for name in UNITS}
 
     def with_constants(self, source: str, **values: float) -> Medium:
         """The medium with some constants replaced, all from ``source``."""
@@ -116,11 +114,14 @@ class Medium:
         return replace(self, **changed, sources={**self.sources, **dict.fromkeys(values, source)})
 
 
+CONSTANTS = tuple(f for f in fields(Medium) if f.metadata)
+"""The fields of :class:`Medium` that are constants; unit, description, source and bounds are their ``metadata``."""
+UNITS: Mapping[str, str] = MappingProxyType({f.name: f.metadata["unit"] for f in CONSTANTS})
+_SOURCES: dict[str, str] = {f.name: f.metadata["source"] for f in CONSTANTS}
 WATER_25C = Medium()
 
 # The public rheometry codes (GitHub: InertialMicrocavitationRheometry, comp-physics/IMR-archive) disagree.
 _IMR_V1 = "IMR_v1 (IMR-vanilla) src/IMRcall_parameters.m, archive commit fb83ef1; IMRv2 src/data_assimilation, 26c6bf3"
-_IMR_V2 = "IMRv2 src/forward_solver/default_case.m, commit 788a54d"
 
 CONSTANT_SETS: Mapping[str, Medium] = MappingProxyType(
     {
@@ -165,13 +166,3 @@ CONSTANT_SETS: Mapping[str, Medium] = MappingProxyType(
         ),
     }
 )
-
-
-@overload
-def saturated_vapour_pressure(temperature: float) -> float: ...
-@overload
-def saturated_vapour_pressure(temperature: Array) -> Array: ...
-def saturated_vapour_pressure(temperature: float | Array) -> float | Array:
-    """p_sat(T) = 1.17e11 exp(−5200/T) Pa, the fit of the rheometry codes (Estrada 2018); 3.1 kPa at 25 °C."""
-    pressure = 1.17e11 * np.exp(-5200.0 / np.asarray(temperature))
-    return np.asarray(pressure) if np.ndim(temperature) else float(pressure)

@@ -1,106 +1,109 @@
-"""From state vectors to the arrays of the compiled solver, and the thermodynamics of the gas that both sides need."""
+"""From state vectors to the arrays of the compiled solver."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
 from en4dvar.state import Array
-from en4dvar_bubble.medium import Medium, saturated_vapour_pressure
+from en4dvar_bubble.dynamics import Dynamics
+from en4dvar_bubble.gas import (
+    GAS_CONSTANT,
+    SATURATION,
+    SATURATION_TEMPERATURE,
+    kirchhoff,
+    mole_fraction,
+    saturated_vapour_pressure,
+)
+from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import rows
+from en4dvar_bubble.solver.arrays import Members
 from en4dvar_bubble.solver.collocation import ball
-from en4dvar_bubble.solver.driver import Queue, Tables
 from en4dvar_bubble.solver.lanes import WIDTH
 
-if TYPE_CHECKING:
-    from en4dvar_bubble.model import BubbleModel
-
-GAS_CONSTANT = 8.314462618
-"""J/(mol K), CODATA 2018."""
-CRITICAL_TEMPERATURE = 647.096
-"""K, of water (IAPWS-95)."""
-_SATURATION = saturated_vapour_pressure(np.inf)
-_SATURATION_T = -298.15 * float(np.log(saturated_vapour_pressure(298.15) / _SATURATION))
+_NO_TABLE = np.zeros((0, GRID.cells, 8))
+_NO_SAMPLES = np.zeros((0, len(GRID.nodes)))
 
 
-def mole_fraction(C: Array, medium: Medium) -> Array:
-    """Mole fraction of vapour from its mass fraction."""
-    return np.asarray(C / medium.M_v / (C / medium.M_v + (1 - C) / medium.M_g))
+class Packed(NamedTuple):
+    """N members in the kernel's units and what their laws add to the equations; a call that completes them.
 
-
-def mass_fraction(chi: Array, medium: Medium) -> Array:
-    """Mass fraction of vapour from its mole fraction."""
-    return np.asarray(chi * medium.M_v / (chi * medium.M_v + (1 - chi) * medium.M_g))
-
-
-def kirchhoff(theta: Array, slope: float) -> Array:
-    """τ = ∫₁^θ k dθ for k = a θ + (1−a)."""
-    return np.asarray(0.5 * slope * (theta**2 - 1) + (1 - slope) * (theta - 1))
-
-
-def from_kirchhoff(tau: Array, slope: float) -> Array:
-    """θ from τ."""
-    return np.asarray(1 + 2 * tau / (np.sqrt(1 + 2 * slope * tau) + 1))
-
-
-def conduction_slope(medium: Medium) -> float:
-    """a = A T_∞/K_∞."""
-    return medium.A * medium.T_inf / medium.K_inf
-
-
-def law_tables(model: BubbleModel, values: Mapping[str, Array], queue: Queue) -> tuple[Tables, Callable[[], None]]:
-    """The laws of N members as tables in the kernel's units, and a call that completes them.
-
-    The laws of the first members in the queue are sampled at once; they can be integrated while the call samples the
-    others, which it then makes available.
+    The elastic parts of the first members in the queue are sampled at once; they can be integrated while the call
+    samples the others, which it then makes available.
     """
-    law, rho = model.law, model.medium.rho
-    n_members = len(queue.order)
-    first, others = queue.order[:WIDTH], queue.order[WIDTH:]
+
+    members: Members
+    memory: Array
+    viscous: Array
+    complete: Callable[[], None]
+
+
+def pack(model: Dynamics, x: Array, start: float, times: Array) -> Packed:
+    """States (N, n_state) at ``start`` (µs), to be integrated to ``times`` (N, K) in µs."""
+    law, rho, system, values = model.law, model.medium.rho, model.system, model.law_values(x)
+    initial, par = _states(model, x)
+    n_members = len(x)
+    memory = viscous = _NO_TABLE
+    if system.memory:
+        memory = _memory(model, values, initial, par, x)
+    if system.shear:
+        viscous = law.viscous_table(values) / rho * 1e6
+        par[:, rows.VISCOUS_TABLE] = np.arange(n_members, dtype=float) * (VISCOUS_GRID.cells * 8)
+    elif "mu" in values:
+        par[:, rows.VISCOSITY] = values["mu"] / rho * 1e6
+
+    # Least damped, hence longest ringing, first, so that the lanes run dry together.
+    order = np.argsort(par[:, rows.VISCOSITY], kind="stable")
+    first, others = order[:WIDTH], order[WIDTH:]
+    available = np.full(1, n_members, dtype=np.int64)
+    samples, elastic = _NO_SAMPLES, _NO_TABLE
     some = law.samples({name: value[first] for name, value in values.items()})
     if some is None:
-        tables = Tables(elastic=law.table(values) / rho)
+        elastic = law.table(values) / rho
     else:
         samples = np.empty((n_members, some.shape[1]))
         samples[first] = some
-        queue.available[0] = len(first)
-        tables = Tables(samples=samples, factor=1 / rho)
+        available[0] = len(first)
 
     def complete() -> None:
         try:
-            if queue.available[0] < n_members:
+            if available[0] < n_members:
                 rest = law.samples({name: value[others] for name, value in values.items()})
-                tables.samples[others] = np.nan if rest is None else rest
+                samples[others] = np.nan if rest is None else rest
         finally:  # threads may be waiting
-            queue.available[0] = n_members
+            available[0] = n_members
 
-    if model.system.shear:
-        tables = replace(tables, viscous=law.viscous_table(values) / rho * 1e6)
-    if model.system.memory:
-        memory = law.memory_tables(values)
-        tables = replace(tables, memory=np.stack([memory.stiffness, memory.equilibrium], axis=2) / rho)
-    return tables, complete
+    members = Members(
+        counter=np.zeros(1, dtype=np.int64),
+        available=available,
+        order=order,
+        initial=initial,
+        parameters=par,
+        start=np.full(n_members, start),
+        times=np.ascontiguousarray(times),
+        samples=samples,
+        factor=1 / rho,
+        tables=elastic,
+    )
+    return Packed(members, memory, viscous, complete)
 
 
-def pack(model: BubbleModel, x: Array) -> tuple[Array, Array]:
-    """States (N, n_state) as initial values (N, n) and parameters (N, rows) of the solver."""
+def _states(model: Dynamics, x: Array) -> tuple[Array, Array]:
+    """Initial values (N, n) and parameters (N, rows) of states (N, n_state); what the law adds to both is missing."""
     medium, layout, system = model.medium, model.layout, model.system
     column = {name: x[:, s.start] for name, s in layout.slices.items()}
-    slope = conduction_slope(medium)
     log_R = np.log(column["R"] * 1e6)
     initial = np.zeros((len(x), system.size))
     initial[:, -2] = column["Rdot"] / column["R"] * 1e-6
     initial[:, -1] = log_R
-    par = np.empty((len(x), len(model.constants)))
-    par[:] = model.constants
+    par = np.tile(_constants(model), (len(x), 1))
     gas = (column["p_b"] - medium.p_v) / medium.rho
     if system.gas:
         m = system.gas
         theta = x[:, layout["T"]] / medium.T_inf
-        initial[:, :m] = kirchhoff(theta[:, :m], slope)
+        initial[:, :m] = kirchhoff(theta[:, :m], medium)
         wall = theta[:, m] if system.wall else np.ones(len(x))
         share = ball(m).weights[:m] / theta[:, :m]
         at_wall = ball(m).weights[m] / wall
@@ -113,30 +116,27 @@ def pack(model: BubbleModel, x: Array) -> tuple[Array, Array]:
         par[:, rows.LOG_GAS] = np.log(gas * (share.sum(axis=1) + at_wall) - outside) + 3 * log_R
         if system.wall:
             initial[:, system.first_medium : system.wall_row] = x[:, layout["T_m"]] / medium.T_inf - 1
-            initial[:, system.wall_row] = kirchhoff(wall, slope)
+            initial[:, system.wall_row] = kirchhoff(wall, medium)
     else:
         par[:, rows.LOG_GAS] = np.log(gas) + 3 * model.exponent * log_R
-    if system.memory:
-        initial[:, system.first_memory : -2] = x[:, layout["Z"]] / medium.rho
-        memory = model.law.memory_tables(model.law_values(x))
-        for j in range(system.memory):
-            at = rows.MEMORY + rows.PER_MEMORY * j
-            par[:, at], par[:, at + 1] = memory.relaxation_time[:, j] * 1e6, memory.convection[j]
-
     par[:, rows.LOG_R0] = np.log(column[model.stress_free_radius] * 1e6)
-    if "mu" in column and not system.shear:
-        par[:, rows.VISCOSITY] = column["mu"] / medium.rho * 1e6
     return initial, par
 
 
-def hottest_wall(model: BubbleModel) -> float:
-    """τ of a wall at the critical temperature of water, above which no vapour is in equilibrium with it; else inf."""
-    if not (model.system.vapour and model.system.wall):
-        return float(np.inf)
-    return float(kirchhoff(np.array(CRITICAL_TEMPERATURE / model.medium.T_inf), conduction_slope(model.medium)))
+def _memory(model: Dynamics, values: Mapping[str, Array], initial: Array, par: Array, x: Array) -> Array:
+    """Tables of stiffness and equilibrium of the memory variables; writes their initial values and parameters."""
+    system, rho = model.system, model.medium.rho
+    initial[:, system.first_memory : -2] = x[:, model.layout["Z"]] / rho
+    memory = model.law.memory_tables(values)
+    member = np.arange(len(x), dtype=float)
+    for j in range(system.memory):
+        at = rows.MEMORY + rows.PER_MEMORY * j
+        par[:, at], par[:, at + 1] = memory.relaxation_time[:, j] * 1e6, memory.convection[j]
+        par[:, at + 2] = (member * system.memory + j) * (2 * GRID.cells * 8)
+    return (np.stack([memory.stiffness, memory.equilibrium], axis=2) / rho).reshape(-1, 1, 8)
 
 
-def constants(model: BubbleModel) -> Array:
+def _constants(model: Dynamics) -> Array:
     """The parameter rows of the solver that are the same for every member, (rows,); zeros elsewhere."""
     medium, system = model.medium, model.system
     row = np.zeros(rows.PARAMETERS + rows.PER_MEMORY * system.memory)
@@ -146,15 +146,15 @@ def constants(model: BubbleModel) -> Array:
     row[rows.INVERSE_C] = 0.0 if system.radial == "rayleigh-plesset" else 1 / medium.c
     row[rows.CONDUCTION] = medium.K_inf * medium.T_inf / medium.rho * 1e6
     row[rows.KAPPA] = medium.kappa if system.gas else model.exponent
-    row[rows.SLOPE] = conduction_slope(medium)
+    row[rows.SLOPE] = medium.conduction_slope
     row[rows.AMPLITUDE] = model.driving.amplitude / medium.rho
     row[rows.TAIT_B] = medium.tait_B / medium.rho
     row[rows.TAIT_N] = medium.tait_n
     row[rows.DIFFUSION] = medium.D_v * 1e6
     row[rows.DIFFUSION_P] = medium.D_p
     row[rows.DIFFUSION_T] = medium.D_T
-    row[rows.SATURATION] = _SATURATION / medium.rho
-    row[rows.SATURATION_T] = _SATURATION_T / medium.T_inf
+    row[rows.SATURATION] = SATURATION / medium.rho
+    row[rows.SATURATION_T] = SATURATION_TEMPERATURE / medium.T_inf
     R_v = GAS_CONSTANT / medium.M_v
     row[rows.LATENT] = medium.L_v / (R_v * medium.T_inf) * medium.D_v * medium.rho / (medium.K_inf * medium.T_inf)
     row[rows.MEDIUM_K] = medium.K_m / medium.K_inf

@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
 from en4dvar.batch import Batch
 from en4dvar.forward import Failure, Trajectory
 from en4dvar.state import Array, StateLayout
-from en4dvar_bubble.laws.base import GRID
-from en4dvar_bubble.medium import saturated_vapour_pressure
-from en4dvar_bubble.packing import conduction_slope, from_kirchhoff, mass_fraction
+from en4dvar_bubble.dynamics import Dynamics
+from en4dvar_bubble.gas import from_kirchhoff, mass_fraction, saturated_vapour_pressure
+from en4dvar_bubble.laws.tabulate import GRID
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.collocation import ball
 from en4dvar_bubble.solver.driver import Solution
 from en4dvar_bubble.solver.integrate import END_TIME, MAX_MACH
 from en4dvar_bubble.tables import evaluate
 
-if TYPE_CHECKING:
-    from en4dvar_bubble.model import BubbleModel
-
 
 @dataclass(frozen=True, eq=False)
 class Paths(Batch):
     """Integrated members: ``initial`` states (N, n_state), ``times`` (N, K) in s, the raw solution."""
 
-    model: BubbleModel
+    model: Dynamics
     initial: Array
     times: Array
     solution: Solution
@@ -89,7 +86,7 @@ class Paths(Batch):
         tau = self.solution.states[:, :, : system.gas]
         if system.wall:
             tau = np.concatenate([tau, self.solution.states[:, :, system.wall_row, None]], axis=2)
-        return from_kirchhoff(tau, conduction_slope(medium)) * medium.T_inf
+        return from_kirchhoff(tau, medium) * medium.T_inf
 
     def _chi(self) -> Array:
         system = self.model.system

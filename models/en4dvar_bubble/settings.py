@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import Field as FieldOfMedium
 from dataclasses import replace
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     ValidationInfo,
     WithJsonSchema,
+    create_model,
     field_serializer,
     field_validator,
     model_validator,
@@ -21,72 +21,25 @@ from en4dvar.hints import suggest
 from en4dvar.state import Parameter
 from en4dvar.units import Quantity, parse_quantity
 from en4dvar_bubble.driving import Reading
-from en4dvar_bubble.driving.settings import DrivingSettings, Histotripsy, with_kind
+from en4dvar_bubble.driving.settings import DrivingSettings, Histotripsy, Section, with_kind
+from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX, Gas, Heat, Start, Vapour
+from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, get_law
 from en4dvar_bubble.laws.loading import qualified
-from en4dvar_bubble.laws.parameters import R0, R_EQ, R_MAX
-from en4dvar_bubble.medium import CONSTANT_SETS, UNITS, WATER_25C, Medium, saturated_vapour_pressure
-from en4dvar_bubble.solver.driver import Accuracy, Radial, preset
+from en4dvar_bubble.medium import CONSTANT_SETS, CONSTANTS, UNITS, WATER_25C, Medium
+from en4dvar_bubble.solver.driver import Accuracy, AccuracyName, Radial, preset
 
 SetName = Literal["water-25C", "imr-v1", "imr-v2"]
-Positive = Field(gt=0)
-NonNegative = Field(ge=0)
 
 _GIVEN = "given in the configuration"
 _VAPOUR_PRESSURE = {"anyOf": [{"const": "saturated"}, {"const": 0}, {"type": "string", "pattern": r"^\s*[\d.]"}]}
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
-
-
-class ConstantsSettings(_Section):
+class _NamedSet(Section):
     """A named set of constants, any of them replaced."""
 
     set: SetName = "water-25C"
     """The set that fills what is not given."""
-    rho: Annotated[float, Quantity(UNITS["rho"]), Positive] = WATER_25C.rho
-    """Density of the medium."""
-    c: Annotated[float, Quantity(UNITS["c"]), Positive] = WATER_25C.c
-    """Speed of sound in the medium."""
-    p_inf: Annotated[float, Quantity(UNITS["p_inf"]), Positive] = WATER_25C.p_inf
-    """Far-field pressure."""
-    S: Annotated[float, Quantity(UNITS["S"]), NonNegative] = WATER_25C.S
-    """Surface tension."""
-    T_inf: Annotated[float, Quantity(UNITS["T_inf"]), Positive] = WATER_25C.T_inf
-    """Far-field temperature."""
-    kappa: Annotated[float, Field(gt=1)] = WATER_25C.kappa
-    """Ratio of specific heats of the gas."""
-    A: Annotated[float, Quantity(UNITS["A"]), NonNegative] = WATER_25C.A
-    """Conductivity of the gas, K(T) = A T + B."""
-    B: Annotated[float, Quantity(UNITS["B"]), NonNegative] = WATER_25C.B
-    """Conductivity of the gas, K(T) = A T + B."""
-    tait_B: Annotated[float, Quantity(UNITS["tait_B"]), Positive] = WATER_25C.tait_B
-    """Tait equation of the medium: pressure B (enthalpy form and Gilmore)."""
-    tait_n: Annotated[float, Field(gt=1)] = WATER_25C.tait_n
-    """Tait equation of the medium: exponent n (enthalpy form and Gilmore)."""
-    K_m: Annotated[float, Quantity(UNITS["K_m"]), Positive] = WATER_25C.K_m
-    """Thermal conductivity of the medium (medium_heat: conducting)."""
-    c_m: Annotated[float, Quantity(UNITS["c_m"]), Positive] = WATER_25C.c_m
-    """Specific heat of the medium (medium_heat: conducting)."""
-    A_v: Annotated[float, Quantity(UNITS["A_v"]), NonNegative] = WATER_25C.A_v
-    """Conductivity of the vapour, K(T) = A_v T + B_v (vapour: transport)."""
-    B_v: Annotated[float, Quantity(UNITS["B_v"]), NonNegative] = WATER_25C.B_v
-    """Conductivity of the vapour, K(T) = A_v T + B_v (vapour: transport)."""
-    D_v: Annotated[float, Quantity(UNITS["D_v"]), Positive] = WATER_25C.D_v
-    """Diffusivity of vapour in the gas at p_inf and T_inf (vapour: transport)."""
-    D_p: Annotated[float, Field(ge=0, le=2)] = WATER_25C.D_p
-    """Diffusivity ∝ (p_inf/p)^D_p: 0 constant, as in the rheometry codes; 1 kinetic theory (vapour: transport)."""
-    D_T: Annotated[float, Field(ge=0, le=3)] = WATER_25C.D_T
-    """Diffusivity ∝ (T/T_inf)^D_T: 0 constant, as in the rheometry codes; 1.75 kinetic theory (vapour: transport)."""
-    L_v: Annotated[float, Quantity(UNITS["L_v"]), Positive] = WATER_25C.L_v
-    """Latent heat of evaporation (vapour: transport)."""
-    M_g: Annotated[float, Quantity(UNITS["M_g"]), Positive] = WATER_25C.M_g
-    """Molar mass of the gas (vapour: transport)."""
-    M_v: Annotated[float, Quantity(UNITS["M_v"]), Positive] = WATER_25C.M_v
-    """Molar mass of the vapour (vapour: transport)."""
-    sources: dict[str, str] = Field(default_factory=lambda: dict(WATER_25C.sources))
-    """Where replaced values come from, by constant; recorded with the result."""
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
@@ -113,7 +66,7 @@ class ConstantsSettings(_Section):
         told = {**chosen.sources, **{name: _GIVEN for name in given if name in UNITS}, **sources}
         return {**inherited, **given, "sources": told}
 
-    @field_validator("sources")
+    @field_validator("sources", check_fields=False)
     @classmethod
     def _known(cls, value: dict[str, str]) -> dict[str, str]:
         for name in value:
@@ -123,24 +76,46 @@ class ConstantsSettings(_Section):
 
     @property
     def medium(self) -> Medium:
-        values = self.model_dump(exclude={"set", "sources"})
-        return Medium(**values, sources=dict(self.sources))
+        return Medium(**self.model_dump(exclude={"set"}))
 
 
-class BubbleSettings(_Section):
+def _key(constant: FieldOfMedium[Any]) -> tuple[Any, Any]:
+    """Type and default of a constant as a key of the section."""
+    about = constant.metadata
+    quantity = (Quantity(about["unit"]),) if about["unit"] != "1" else ()
+    return (
+        Annotated[(float, *quantity, Field(**about["bounds"]))],
+        Field(constant.default, description=about["description"]),
+    )
+
+
+_SOURCES = Field(
+    default_factory=lambda: dict(WATER_25C.sources),
+    description="Where replaced values come from, by constant; recorded with the result.",
+)
+ConstantsSettings = create_model(
+    "ConstantsSettings",
+    __base__=_NamedSet,
+    __doc__=_NamedSet.__doc__,
+    **{f.name: _key(f) for f in CONSTANTS},  # type: ignore[call-overload]
+    sources=(dict[str, str], _SOURCES),
+)
+
+
+class BubbleSettings(Section):
     """What the forward model is; every default is recorded in the resolved configuration."""
 
     law: str = "quadratic-kelvin-voigt"
     """Constitutive law: a name of ``en4dvar laws``, or a class in a file: ./my_law.py:MyLaw."""
     radial: Radial = "keller-miksis"
     """Radial dynamics: how the compressibility of the medium enters."""
-    gas: Literal["heat", "polytropic", "isothermal", "adiabatic"] = "heat"
+    gas: Gas = "heat"
     """Gas in the bubble: energy equation (heat), or a polytropic law."""
-    vapour: Literal["none", "frozen", "transport"] = "none"
+    vapour: Vapour = "none"
     """Vapour: none, that of time zero as if it were gas, or diffusion with evaporation at the wall."""
-    medium_heat: Literal["cold", "conducting"] = "cold"
+    medium_heat: Heat = "cold"
     """Wall at the far-field temperature, or heat conduction in the medium."""
-    start: Literal["acoustic", "laser"] = "acoustic"
+    start: Start = "acoustic"
     """acoustic: at rest at R0, then driven; laser: released from R_max with the gas of R_eq."""
     driving: DrivingSettings = Histotripsy()
     """Pressure far away; default: the histotripsy pulse (acoustic start) or none (laser start)."""
@@ -150,7 +125,7 @@ class BubbleSettings(_Section):
     """Constant vapour pressure in the bubble: a pressure, or saturated at the far-field temperature."""
     constants: ConstantsSettings = ConstantsSettings()
     """Constants of medium and gas: the name of a set, or a section that replaces some of them."""
-    accuracy: Literal["fast", "standard", "reference"] = "standard"
+    accuracy: AccuracyName = "standard"
     """Nodes and tolerance together; errors of each in docs/solver.md."""
     nodes: Annotated[int, Field(ge=1, le=128)] | None = None
     """Collocation nodes in the gas; default: those of ``accuracy``."""

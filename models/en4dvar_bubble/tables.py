@@ -40,7 +40,7 @@ class Grid:
 
 
 @nb.njit(cache=True, nogil=True)
-def _cell(out, a, da, dda, b, db, ddb):
+def quintic(out, a, da, dda, b, db, ddb):
     """Quintic on s ∈ [0, 1] from values and derivatives scaled by the cell width."""
     rise = b - a - da - 0.5 * dda
     turn = db - da - dda
@@ -80,7 +80,7 @@ def fill(samples, factor, out):
                 db += factor * _FIRST[r] * (right - left)
                 ddb += factor * _SECOND[r] * (right + left)
             if j > 0:
-                _cell(out[i, j - 1], a, da, dda, b, db, ddb)
+                quintic(out[i, j - 1], a, da, dda, b, db, ddb)
             a, da, dda = b, db, ddb
 
 
@@ -114,7 +114,7 @@ def from_slopes(slopes, step, zero):
         for j in range(zero - 1, -1, -1):
             value[j] = value[j + 1] - _area(first, second, third, j)
         for j in range(cells):
-            _cell(out[i, j], value[j], first[j], second[j], value[j + 1], first[j + 1], second[j + 1])
+            quintic(out[i, j], value[j], first[j], second[j], value[j + 1], first[j + 1], second[j + 1])
     return out
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from en4dvar_bubble import Accuracy, BubbleModel
-from en4dvar_bubble.medium import WATER_25C, saturated_vapour_pressure
-from en4dvar_bubble.packing import mole_fraction
+from en4dvar_bubble.gas import mole_fraction, saturated_vapour_pressure
+from en4dvar_bubble.medium import WATER_25C
 
 KINETIC = replace(WATER_25C, D_p=1.0, D_T=1.75)
 THETA = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from en4dvar_bubble import WATER_25C, Accuracy, BubbleModel, Medium, get_law, simulate
-from en4dvar_bubble.medium import saturated_vapour_pressure
-from en4dvar_bubble.packing import mole_fraction
+from en4dvar_bubble.gas import mole_fraction, saturated_vapour_pressure
 from en4dvar_bubble.solver.collocation import ball, exterior
 from en4dvar_bubble.solver.driver import System
 
@@ -50,8 +49,8 @@ class TestAgreementWithThePaperEquations:
         assert float(np.abs(conducting.R - laser().R).max()) < 1e-4 * 230e-6
 
     def test_vapour_of_vanishing_pressure_is_none(self, monkeypatch):
-        monkeypatch.setattr("en4dvar_bubble.packing._SATURATION", 1.0)
-        monkeypatch.setattr("en4dvar_bubble.model.saturated_vapour_pressure", lambda T: 1e-6)
+        monkeypatch.setattr("en4dvar_bubble.packing.SATURATION", 1.0)
+        monkeypatch.setattr("en4dvar_bubble.dynamics.saturated_vapour_pressure", lambda T: 1e-6)
         monkeypatch.setattr("en4dvar_bubble.packing.saturated_vapour_pressure", lambda T: 0 * T + 1e-6)
         tight = Accuracy(nodes=8, rtol=1e-8)
         assert float(np.abs(laser(tight, vapour="transport").R - laser(tight).R).max()) < 1e-6 * 230e-6

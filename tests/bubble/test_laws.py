@@ -14,10 +14,11 @@ from en4dvar.errors import ConfigError
 from en4dvar.state import Parameter
 from en4dvar_bubble.battery import CHECKS, describe, run_battery
 from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, Liquid, get_law
-from en4dvar_bubble.laws.base import GRID, MemoryVariable
 from en4dvar_bubble.laws.loading import available
+from en4dvar_bubble.laws.memory import MemoryVariable
 from en4dvar_bubble.laws.parameters import ALPHA, MU, G
 from en4dvar_bubble.laws.response import Cycle, respond
+from en4dvar_bubble.laws.tabulate import GRID
 from en4dvar_bubble.tables import evaluate
 
 STRETCH = np.exp(np.linspace(-1.5, 6.0, 301))

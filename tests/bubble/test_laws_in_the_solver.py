@@ -9,9 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from en4dvar_bubble import BubbleModel, Medium, get_law
-from en4dvar_bubble.laws.base import GRID
 from en4dvar_bubble.laws.loading import available
-from en4dvar_bubble.laws.tabulate import differentiate
+from en4dvar_bubble.laws.tabulate import GRID, differentiate
 from en4dvar_bubble.solver.driver import ACCURACIES
 from en4dvar_bubble.tables import evaluate
 

@@ -76,15 +76,15 @@ class TestFinding:
         np.testing.assert_allclose(own.R, built_in.R, rtol=1e-6)
 
     def test_module_and_class(self):
-        assert get_law("en4dvar_bubble.laws.gent:GentKelvinVoigt").name == "gent-kelvin-voigt"
+        assert get_law("en4dvar_bubble.laws.kelvin_voigt:GentKelvinVoigt").name == "gent-kelvin-voigt"
         with pytest.raises(ConfigError, match="did you mean 'GentKelvinVoigt'"):
-            get_law("en4dvar_bubble.laws.gent:GentKelvinVoight")
+            get_law("en4dvar_bubble.laws.kelvin_voigt:GentKelvinVoight")
         with pytest.raises(ConfigError, match="cannot be imported"):
             get_law("no_such_package.laws:Gent")
 
     def test_entry_point(self, monkeypatch):
         entries = [
-            EntryPoint("installed", "en4dvar_bubble.laws.gent:GentKelvinVoigt", loading.GROUP),
+            EntryPoint("installed", "en4dvar_bubble.laws.kelvin_voigt:GentKelvinVoigt", loading.GROUP),
             EntryPoint("broken", "no_such_package:Law", loading.GROUP),
         ]
         monkeypatch.setattr(loading, "entry_points", lambda group: entries if group == loading.GROUP else [])
@@ -167,7 +167,7 @@ class TestRefusing:
             ("    parameters = (MU, MU)\n", "two parameters are called 'mu'"),
             ("    parameters = ()\n", "parameters is empty"),
             ("    parameters = [MU]\n", "must be a tuple"),
-            ("    parameters = (R0,)\n", "'R0' is taken"),
+            ("    parameters = (Parameter('R0', 'm'),)\n", "'R0' is taken"),
             ("    def __init__(self, grade):\n        pass\n", "without arguments"),
         ],
     )

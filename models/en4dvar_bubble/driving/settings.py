@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
@@ -20,12 +21,20 @@ Delay = Annotated[Time, Field(ge=0)]
 Width = Annotated[Time, Field(gt=0)]
 
 
-class _Kind(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+class Section(BaseModel):
+    """A section of a YAML file: unknown keys are errors, the texts under its keys are their descriptions."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class _Kind(Section):
+    model_config = ConfigDict(allow_inf_nan=False)
+    pulse: ClassVar[Callable[..., Driving]]
+    """The function whose arguments are the keys."""
 
     def build(self) -> Driving:
         """The driving. Raises ValueError or :class:`En4dvarError`."""
-        raise NotImplementedError
+        return type(self).pulse(**self.model_dump(exclude={"kind"}))
 
     @model_validator(mode="after")
     def _can_be_built(self) -> _Kind:
@@ -41,16 +50,15 @@ class _Kind(BaseModel):
 class NoDriving(_Kind):
     """No driving."""
 
+    pulse = staticmethod(pulses.silence)
     kind: Literal["none"] = "none"
     """No driving."""
-
-    def build(self) -> Driving:
-        return pulses.silence()
 
 
 class Histotripsy(_Kind):
     """The rarefactional half cycle of a histotripsy pulse."""
 
+    pulse = staticmethod(pulses.histotripsy)
     kind: Literal["histotripsy"] = "histotripsy"
     """p_A [(1 + cos ω(t−δ))/2]^n for |t−δ| ≤ π/ω."""
     amplitude: Pressure = -24e6
@@ -62,13 +70,11 @@ class Histotripsy(_Kind):
     delay: Time = 5e-6
     """δ: the instant of the peak."""
 
-    def build(self) -> Driving:
-        return pulses.histotripsy(self.amplitude, self.frequency, self.exponent, self.delay)
-
 
 class Sine(_Kind):
     """A sine burst, with or without an envelope."""
 
+    pulse = staticmethod(pulses.sine_burst)
     kind: Literal["sine"] = "sine"
     """A sine burst."""
     amplitude: Pressure
@@ -86,15 +92,11 @@ class Sine(_Kind):
     taper: Annotated[float, Field(ge=0.01, le=1)] = 0.5
     """Share of the burst that the two tapers of the Tukey window take."""
 
-    def build(self) -> Driving:
-        return pulses.sine_burst(
-            self.amplitude, self.frequency, self.cycles, self.delay, self.phase, self.envelope, self.taper
-        )
-
 
 class Gaussian(_Kind):
     """A Gaussian pulse centred at ``delay`` with standard deviation ``width``."""
 
+    pulse = staticmethod(pulses.gaussian)
     kind: Literal["gaussian"] = "gaussian"
     """A Gaussian pulse."""
     amplitude: Pressure
@@ -104,13 +106,11 @@ class Gaussian(_Kind):
     width: Width
     """Standard deviation of the pulse in time."""
 
-    def build(self) -> Driving:
-        return pulses.gaussian(self.amplitude, self.delay, self.width)
-
 
 class Step(_Kind):
     """A step that lasts, or an impulse that ends after ``duration``."""
 
+    pulse = staticmethod(pulses.step)
     kind: Literal["step"] = "step"
     """A step or an impulse."""
     amplitude: Pressure
@@ -122,42 +122,36 @@ class Step(_Kind):
     rise: Width = 20e-9
     """Rise time."""
 
-    def build(self) -> Driving:
-        return pulses.step(self.amplitude, self.duration, self.delay, self.rise)
 
-
-class _Column(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+class _Column(Section):
+    dimension: ClassVar[str]
     name: Annotated[str, Field(min_length=1)]
     """Header of the column (CSV) or name of the field (.mat)."""
     unit: str
     """Unit of the numbers in the file; required, never guessed."""
 
+    @field_validator("unit")
+    @classmethod
+    def _unit(cls, unit: str) -> str:
+        convert(1.0, unit, cls.dimension)
+        return unit
+
 
 class TimeOfRecord(_Column):
     """Column of times; the unit is required."""
 
-    @field_validator("unit")
-    @classmethod
-    def _unit(cls, unit: str) -> str:
-        convert(1.0, unit, "s")
-        return unit
+    dimension = "s"
 
 
 class PressureOfRecord(_Column):
     """Column of pressures; the unit is required."""
 
-    @field_validator("unit")
-    @classmethod
-    def _unit(cls, unit: str) -> str:
-        convert(1.0, unit, "Pa")
-        return unit
+    dimension = "Pa"
 
 
-class Columns(BaseModel):
+class Columns(Section):
     """Which columns of the file hold time and pressure, and their units."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
     time: TimeOfRecord
     """Column of times."""
     pressure: PressureOfRecord

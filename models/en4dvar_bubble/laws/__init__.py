@@ -1,12 +1,12 @@
-"""Constitutive laws: one class in one file each. A new file of this folder is found by itself."""
+"""Constitutive laws, a family a file; a law is one class. A new file of this folder is found by itself."""
 
 from importlib import import_module
 from pkgutil import iter_modules
 
-from en4dvar_bubble.laws.base import REGISTRY, ConstitutiveLaw, Liquid, MemoryVariable
+from en4dvar_bubble.laws.base import REGISTRY, ConstitutiveLaw, Liquid
+from en4dvar_bubble.laws.kelvin_voigt import NeoHookeanKelvinVoigt, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.loading import get_law
-from en4dvar_bubble.laws.neo_hookean import NeoHookeanKelvinVoigt
-from en4dvar_bubble.laws.quadratic import QuadraticKelvinVoigt
+from en4dvar_bubble.laws.memory import MemoryVariable
 
 for _module in iter_modules(__path__):
     import_module(f"{__name__}.{_module.name}")

@@ -10,7 +10,6 @@ rate (K,). Everything is tabulated per member before the compiled integration st
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -20,11 +19,15 @@ from en4dvar.errors import ConfigError
 from en4dvar.state import Array, Parameter
 from en4dvar_bubble.laws.memory import MemoryTables, MemoryVariable
 from en4dvar_bubble.laws.parameters import MU
-from en4dvar_bubble.laws.tabulate import GRID, STRETCH, from_function, from_strain_energy
-from en4dvar_bubble.laws.viscous import VISCOUS_GRID, mean_viscosity
+from en4dvar_bubble.laws.tabulate import (
+    GRID,
+    STRETCH,
+    VISCOUS_GRID,
+    from_function,
+    from_strain_energy,
+    from_viscosity,
+)
 from en4dvar_bubble.tables import evaluate, from_values
-
-__all__ = ["GRID", "REGISTRY", "VISCOUS_GRID", "ConstitutiveLaw", "Liquid", "MemoryTables", "MemoryVariable"]
 
 REGISTRY: dict[str, type[ConstitutiveLaw]] = {}
 FILE_MODULE = "_en4dvar_bubble_law_"
@@ -32,15 +35,6 @@ FILE_MODULE = "_en4dvar_bubble_law_"
 _TOGETHER = 48  # members sampled at once: their temporary arrays fit in the cache
 _EXAMPLE_BY_NAME = {"G": 5e3, "alpha": 0.03, "mu": 0.1}
 _EXAMPLE_BY_UNIT = {"Pa": 5e3, "Pa s": 0.1, "s": 1e-6, "1": 0.5}
-
-
-@dataclass(frozen=True)
-class FileReference:
-    """Where a law was loaded from: absolute path, class name and hash of the source."""
-
-    path: str
-    name: str
-    digest: str
 
 
 Limits = tuple[tuple[type["ConstitutiveLaw"], Mapping[str, float]], ...]
@@ -69,7 +63,8 @@ class ConstitutiveLaw:
     """Whether J_e falls with the stretch everywhere, so that it always opposes the strain."""
     stretch_range: ClassVar[tuple[float, float]] = (0.2, 400.0)
     """Stretches over which the battery tests the law at the example values."""
-    reference: ClassVar[FileReference | None] = None
+    reference: ClassVar[Any] = None
+    """Of a class from a file: what makes an instance of it again when it is called, see ``loading.FileReference``."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -86,9 +81,7 @@ class ConstitutiveLaw:
         reference = type(self).__dict__.get("reference")
         if reference is None:
             return super().__reduce_ex__(protocol)
-        from en4dvar_bubble.laws.loading import reload_law
-
-        return reload_law, (reference,), self.__dict__ or None
+        return reference, (), self.__dict__ or None
 
     def stress(self, stretch: Array, p: Any) -> Array:
         """J_e(λ) (N, K) in Pa at stretches (K,): the elastic part of the stress integral; ``p.G`` is (N, 1)."""
@@ -116,21 +109,25 @@ class ConstitutiveLaw:
         return {p.name: np.full(n, value(p)) for p in self.parameters}
 
     @property
+    def closed_form(self) -> bool:
+        """Whether the elastic part is the stress, not W′(λ)."""
+        return type(self).stress is not ConstitutiveLaw.stress
+
+    @property
     def shear_dependent(self) -> bool:
         """Whether the viscosity is the method, not the parameter ``mu``."""
         return type(self).viscosity is not ConstitutiveLaw.viscosity
 
     def samples(self, values: Mapping[str, Array]) -> Array | None:
         """J_e in Pa of N members at the nodes of the grid and its halo, (N, K); None where the law is W′(λ)."""
-        if type(self).stress is ConstitutiveLaw.stress:
+        if not self.closed_form:
             return None
-        n = len(next(iter(values.values())))
+        n = members(values)
         samples = np.empty((n, len(GRID.nodes)))
         with np.errstate(all="ignore"):  # a law may overflow at stretches that no member reaches
             for first in range(0, n, _TOGETHER):
                 some = slice(first, first + _TOGETHER)
-                p, _ = _namespace(values if n <= _TOGETHER else {name: v[some] for name, v in values.items()})
-                samples[some] = self.stress(STRETCH, p)
+                samples[some] = self.stress(STRETCH, columns({name: v[some] for name, v in values.items()}))
         return samples
 
     def table(self, values: Mapping[str, Array]) -> Array:
@@ -138,33 +135,28 @@ class ConstitutiveLaw:
         samples = self.samples(values)
         if samples is not None:
             return from_values(samples)
-        p, n = _namespace(values)
+        p = columns(values)
         with np.errstate(all="ignore"):
-            return from_strain_energy(lambda stretch: self.strain_energy_rate(stretch, p), n)
+            return from_strain_energy(lambda stretch: self.strain_energy_rate(stretch, p), members(values))
 
     def viscous_table(self, values: Mapping[str, Array]) -> Array:
         """μ̄ (Pa s) against z = ln(|V| s), constant below the first node: (N, cells, 8) on :data:`VISCOUS_GRID`.
 
         For laws that are :attr:`shear_dependent`.
         """
-        p, n = _namespace(values)
+        p = columns(values)
         with np.errstate(over="ignore"):
-            return np.asarray(from_values(mean_viscosity(lambda rate: self.viscosity(rate, p), n)))
+            return from_viscosity(lambda rate: self.viscosity(rate, p), members(values))
 
     def memory_tables(self, values: Mapping[str, Array]) -> MemoryTables:
         """θ, k and the tables of a and b for values name → (N,) and M memory variables (M = 0 for most laws)."""
-        p, n = _namespace(values)
-        variables = self.memory(p)
-
-        def table(source: Any) -> Array:
-            return from_function(source if callable(source) else lambda stretch: source, n)
-
+        variables, n = self.memory(columns(values)), members(values)
+        shape = (n, len(variables), GRID.cells, 8)
+        stiffness, equilibrium, times = np.empty(shape), np.empty(shape), np.empty(shape[:2])
         with np.errstate(all="ignore"):
-            shape = (n, len(variables), GRID.cells, 8)
-            stiffness, equilibrium = np.empty(shape), np.empty(shape)
-            times = np.empty((n, len(variables)))
             for i, variable in enumerate(variables):
-                stiffness[:, i], equilibrium[:, i] = table(variable.stiffness), table(variable.equilibrium)
+                stiffness[:, i] = from_function(variable.stiffness_at, n)
+                equilibrium[:, i] = from_function(variable.equilibrium_at, n)
                 times[:, i] = np.broadcast_to(variable.relaxation_time, (n, 1))[:, 0]
         return MemoryTables(times, np.array([float(v.convection) for v in variables]), stiffness, equilibrium)
 
@@ -175,8 +167,7 @@ class ConstitutiveLaw:
     def mean_viscosity(self, rate: Array, values: Mapping[str, Array]) -> Array:
         """μ̄ at |V| = ``rate`` (N, K) in 1/s for N members, Pa s, from the same table the solver uses."""
         if not self.shear_dependent:
-            n = len(next(iter(values.values())))
-            mu = np.asarray(values["mu"], dtype=float)[:, None] if "mu" in values else np.zeros((n, 1))
+            mu = np.asarray(values["mu"], dtype=float)[:, None] if "mu" in values else np.zeros((members(values), 1))
             return np.broadcast_to(mu, rate.shape).copy()
         span = VISCOUS_GRID.span
         z = np.clip(np.log(np.maximum(rate, np.exp(span[0]))), span[0], span[1])
@@ -196,7 +187,11 @@ class Liquid(ConstitutiveLaw):
         return np.zeros_like(stretch)
 
 
-def _namespace(values: Mapping[str, Array]) -> tuple[SimpleNamespace, int]:
-    """Values as columns (N, 1), so that they broadcast against a row of stretches; and N."""
-    p = SimpleNamespace(**{name: np.asarray(v, dtype=float)[:, None] for name, v in values.items()})
-    return p, len(next(iter(values.values())))
+def columns(values: Mapping[str, Array]) -> SimpleNamespace:
+    """The ``p`` of a law's methods: values as columns (N, 1), so that they broadcast against a row of stretches."""
+    return SimpleNamespace(**{name: np.asarray(v, dtype=float)[:, None] for name, v in values.items()})
+
+
+def members(values: Mapping[str, Array]) -> int:
+    """N of values name → (N,)."""
+    return len(next(iter(values.values())))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import sys
 import traceback
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -13,10 +14,27 @@ from typing import Any
 
 from en4dvar.errors import ConfigError
 from en4dvar.hints import no_such_file, suggest
-from en4dvar_bubble.laws.base import FILE_MODULE, REGISTRY, ConstitutiveLaw, FileReference
+from en4dvar_bubble.laws.base import FILE_MODULE, REGISTRY, ConstitutiveLaw
 from en4dvar_bubble.laws.validity import check_law
 
 GROUP = "en4dvar_bubble.laws"
+
+
+@dataclass(frozen=True)
+class FileReference:
+    """Where a law was loaded from: absolute path, class name and hash of the source."""
+
+    path: str
+    name: str
+    digest: str
+
+    def __call__(self) -> ConstitutiveLaw:
+        """The unpickled law, loaded again. Raises :class:`ConfigError` if the file is no longer the same."""
+        path = Path(self.path)
+        if path.is_file() and _digest(path, path.read_bytes()) != self.digest:
+            raise ConfigError(f"{path}: the file has changed since the law {self.name} was loaded from it")
+        law: ConstitutiveLaw = _from_file(path, self.name)()
+        return law
 
 
 def get_law(name: str, base: Path | None = None) -> ConstitutiveLaw:
@@ -56,15 +74,6 @@ def available() -> dict[str, type[ConstitutiveLaw] | ConfigError]:
         except ConfigError as error:
             laws[entry.name] = error
     return dict(sorted((laws | REGISTRY).items()))
-
-
-def reload_law(reference: FileReference) -> ConstitutiveLaw:
-    """An unpickled law, loaded again from its file. Raises :class:`ConfigError` if the file is no longer the same."""
-    path = Path(reference.path)
-    if path.is_file() and _digest(path, path.read_bytes()) != reference.digest:
-        raise ConfigError(f"{path}: the file has changed since the law {reference.name} was loaded from it")
-    law: ConstitutiveLaw = _from_file(path, reference.name)()
-    return law
 
 
 def _from_file(path: Path, attribute: str) -> Any:

@@ -28,6 +28,14 @@ class MemoryVariable:
     stiffness: Source = 0.0
     equilibrium: Source = 0.0
 
+    def stiffness_at(self, stretch: Array) -> float | Array:
+        """a at stretches (K,)."""
+        return self.stiffness(stretch) if callable(self.stiffness) else self.stiffness
+
+    def equilibrium_at(self, stretch: Array) -> float | Array:
+        """b at stretches (K,)."""
+        return self.equilibrium(stretch) if callable(self.equilibrium) else self.equilibrium
+
 
 class MemoryTables(NamedTuple):
     """The memory variables of N members as the compiled solver takes them; tables on the grid of ln λ."""

@@ -7,13 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 
 from en4dvar.state import Array
-from en4dvar_bubble.laws.base import ConstitutiveLaw
+from en4dvar_bubble.laws.base import ConstitutiveLaw, columns
 
 
 @dataclass(frozen=True)
@@ -48,8 +46,7 @@ def respond(law: ConstitutiveLaw, values: Mapping[str, Array], cycle: Cycle, poi
     """Integrate one member (``values``: name → (1,)) over a cycle, relaxed at its start."""
     from scipy.integrate import solve_ivp
 
-    p = SimpleNamespace(**{name: np.asarray(v, dtype=float)[:, None] for name, v in values.items()})
-    variables = law.memory(p)
+    variables = law.memory(columns(values))
     nodes, weights = np.polynomial.legendre.leggauss(8)
     edges = np.linspace(0, cycle.period, points // 8 + 1)
     half = np.diff(edges)[:, None] / 2
@@ -64,11 +61,12 @@ def respond(law: ConstitutiveLaw, values: Mapping[str, Array], cycle: Cycle, poi
 
         def rhs(t: float, s: Array) -> Array:
             x, V = cycle.stretch(np.array([t])), float(cycle.rate(np.array(t)))
-            a, b = (np.array([_at(getattr(v, name), x) for v in variables]) for name in ("stiffness", "equilibrium"))
+            a = np.array([_scalar(v.stiffness_at(x)) for v in variables])
+            b = np.array([_scalar(v.equilibrium_at(x)) for v in variables])
             return np.asarray((b - s) / theta + V * (k * s + a))
 
-        start = np.array([_at(v.equilibrium, np.ones(1)) for v in variables])
-        stiffest = max(abs(_at(v.stiffness, np.ones(1))) for v in variables) or 1.0
+        start = np.array([_scalar(v.equilibrium_at(np.ones(1))) for v in variables])
+        stiffest = max(abs(_scalar(v.stiffness_at(np.ones(1)))) for v in variables) or 1.0
         solution = solve_ivp(
             rhs, (0, cycle.period), start, "LSODA", t_eval=times, rtol=1e-10, atol=1e-11 * stiffest,
             max_step=cycle.period / 50,
@@ -79,9 +77,5 @@ def respond(law: ConstitutiveLaw, values: Mapping[str, Array], cycle: Cycle, poi
     return Response(times, J, -float(J @ flux), -float(elastic @ flux), turnover)
 
 
-def _scalar(value: Any) -> float:
+def _scalar(value: float | Array) -> float:
     return float(np.ravel(value)[0])
-
-
-def _at(source: Any, stretch: Array) -> float:
-    return _scalar(source(stretch) if callable(source) else source)

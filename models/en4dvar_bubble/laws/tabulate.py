@@ -1,4 +1,4 @@
-"""From the functions of a law to its tables on the grid of ln λ."""
+"""From the functions of a law to its tables: elastic and memory functions on ln λ, the mean viscosity on ln |V|."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ import numba as nb
 import numpy as np
 
 from en4dvar.state import Array
-from en4dvar_bubble.tables import HALO, Grid, _cell, from_slopes, from_values
+from en4dvar_bubble.tables import HALO, Grid, from_slopes, from_values, quintic
+
+Function = Callable[[Array], float | Array]
 
 GRID = Grid(origin=-5.0, step=1 / 32, cells=496)
+"""ln λ from e⁻⁵ to e^10.5."""
 STRETCH = np.exp(GRID.nodes)
 
 # Strain energies that grow exponentially need derivatives from a finer grid than the cells of the table:
@@ -23,19 +26,29 @@ _UNSTRETCHED = int(np.flatnonzero(_FINE_LOG == 0.0)[0])
 # Interpolation of the removable 0/0 at λ = 1 from the four nodes on either side (eighth order).
 _ACROSS = np.array([0.8, -0.4, 4 / 35, -1 / 70])
 
+_LOWEST, _HIGHEST = np.log(1e-3), np.log(1e13)
+_CELLS = 384
+VISCOUS_GRID = Grid(origin=_LOWEST, step=(_HIGHEST - _LOWEST) / _CELLS, cells=_CELLS)
+"""z = ln(|V| s) from |V| = 1e-3 to 1e13 1/s."""
 
-def sample(function: Callable[[Array], Array], n: int) -> Array:
-    """``function``, stretch (K,) → broadcastable to (N, K), at the nodes of the grid and its halo."""
-    return np.ascontiguousarray(np.broadcast_to(function(STRETCH), (n, len(STRETCH))), dtype=float)
+# ∫₀^γ μ dγ as a sum of cells in ln γ, eight Gauss points each. A knee of the viscosity is about as wide in ln γ as
+# one, ten cells, whatever its shear rate. Below the first node 1024 cells reach down to γ = e^-98 of it, so that a
+# power law with exponent n > 0.2 is integrated to 1e-8.
+_BELOW = 1024
+_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+_LOG_NODES = VISCOUS_GRID.nodes
+_EDGES = _LOG_NODES[0] + VISCOUS_GRID.step * np.arange(-_BELOW, len(_LOG_NODES) - 1)
+_LOG_RATE = (_EDGES[:, None] + 0.5 * VISCOUS_GRID.step * (_POINTS + 1)).ravel()
+_SHEAR_RATE = 2 * np.sqrt(3) * np.exp(_LOG_RATE)
 
 
-def from_function(function: Callable[[Array], Array], n: int) -> Array:
+def from_function(function: Function, n: int) -> Array:
     """Table (N, cells, 8) of ``function``: stretch (K,) → broadcastable to (N, K)."""
-    return from_values(sample(function, n))
+    return from_values(np.ascontiguousarray(np.broadcast_to(function(STRETCH), (n, len(STRETCH))), dtype=float))
 
 
-def from_strain_energy(rate: Callable[[Array], Array], n: int) -> Array:
-    """Table (N, cells, 8) of `` · J_e`` from W′: dJ_e/d ln λ = −λ W′(λ)/(λ³ − 1), J_e(1) = 0."""
+def from_strain_energy(rate: Function, n: int) -> Array:
+    """Table (N, cells, 8) of J_e from W′: dJ_e/d ln λ = −λ W′(λ)/(λ³ − 1), J_e(1) = 0."""
     fine = -_FINE_STRETCH * rate(_FINE_STRETCH) / np.expm1(3 * _FINE_LOG)
     slopes = np.array(np.broadcast_to(fine, (n, len(_FINE_STRETCH))))
     near = [slopes[:, _UNSTRETCHED + k] + slopes[:, _UNSTRETCHED - k] for k in (1, 2, 3, 4)]
@@ -52,7 +65,7 @@ def _coarsen(fine, ratio, cells):  # type: ignore[no-untyped-def]
         for j in range(cells):
             a, b = fine[i, j * ratio], fine[i, (j + 1) * ratio]
             first, second = float(ratio), 2.0 * ratio * ratio
-            _cell(out[i, j], a[0], a[1] * first, a[2] * second, b[0], b[1] * first, b[2] * second)
+            quintic(out[i, j], a[0], a[1] * first, a[2] * second, b[0], b[1] * first, b[2] * second)
     return out
 
 
@@ -61,3 +74,14 @@ def differentiate(table: Array) -> Array:
     out = np.zeros_like(table)
     out[..., :5] = table[..., 1:6] * np.arange(1, 6) / GRID.step
     return out
+
+
+def from_viscosity(viscosity: Function, n: int) -> Array:
+    """Table (N, cells, 8) on :data:`VISCOUS_GRID` of μ̄(V) = ∫₀¹ μ(2√3 |V| s) ds, Pa s: what a spherical flow sees.
+
+    viscosity: shear rate (K,) in 1/s → (N, K) in Pa s, or broadcastable to it.
+    """
+    mu = np.broadcast_to(viscosity(_SHEAR_RATE), (n, len(_SHEAR_RATE)))
+    cells = (mu * np.exp(_LOG_RATE)).reshape(n, -1, len(_POINTS)) @ (0.5 * VISCOUS_GRID.step * _WEIGHTS)
+    upto = np.cumsum(cells, axis=1)[:, _BELOW - 1 :]
+    return from_values(np.asarray(upto / np.exp(_LOG_NODES)))

@@ -11,8 +11,8 @@ import numpy as np
 
 from en4dvar.errors import ConfigError
 from en4dvar.hints import suggest
-from en4dvar.state import Array, Parameter
-from en4dvar_bubble.laws.base import ConstitutiveLaw
+from en4dvar.state import Parameter
+from en4dvar_bubble.laws.base import ConstitutiveLaw, columns
 from en4dvar_bubble.laws.memory import MemoryVariable
 
 RESERVED = ("R", "Rdot", "p_b", "S", "T", "C", "R0", "R_eq", "R_max", "t_s")
@@ -61,19 +61,17 @@ def _check_parameters(kind: type[ConstitutiveLaw], name: str) -> None:
 def _probe(law: ConstitutiveLaw, name: str) -> None:
     """Call every method once with three members."""
     stretch, rate = np.array([0.9, 1.1, 2.0, 3.0]), np.array([1.0, 1e3, 1e6, 1e9])
-    values = law.example_values(_MEMBERS)
-    p = SimpleNamespace(**{n: v[:, None] for n, v in values.items()})
-    elastic = "stress" if type(law).stress is not ConstitutiveLaw.stress else "strain_energy_rate"
-    _call(getattr(law, elastic), stretch, p, f"{name}: {elastic}(stretch, p)")
+    p = columns(law.example_values(_MEMBERS))
+    elastic = "stress" if law.closed_form else "strain_energy_rate"
+    _call(getattr(law, elastic), (stretch, p), f"{name}: {elastic}(stretch, p)")
     if law.shear_dependent:
-        _call(law.viscosity, rate, p, f"{name}: viscosity(shear_rate, p)")
+        _call(law.viscosity, (rate, p), f"{name}: viscosity(shear_rate, p)")
     variables = _run(lambda: law.memory(p), f"{name}: memory(p)")
     if not (isinstance(variables, tuple) and all(isinstance(v, MemoryVariable) for v in variables)):
         raise ConfigError(f"{name}: memory(p) must return a tuple of MemoryVariable")
     for i, variable in enumerate(variables):
-        for what in ("stiffness", "equilibrium"):
-            source, where = getattr(variable, what), f"{name}: {what} of memory variable {i + 1}"
-            _call(_source(source), stretch, p, where)
+        for what, method in (("stiffness", variable.stiffness_at), ("equilibrium", variable.equilibrium_at)):
+            _call(method, (stretch,), f"{name}: {what} of memory variable {i + 1}")
         times = np.asarray(variable.relaxation_time, dtype=float)
         if times.shape not in ((), (_MEMBERS, 1)):
             raise ConfigError(f"{name}: relaxation_time of memory variable {i + 1}: shape {times.shape}, not (N, 1)")
@@ -81,12 +79,9 @@ def _probe(law: ConstitutiveLaw, name: str) -> None:
             raise ConfigError(f"{name}: relaxation_time of memory variable {i + 1} must be positive")
 
 
-def _source(source: Any) -> Callable[[Array, Any], Any]:
-    return lambda stretch, p: source(stretch) if callable(source) else source
-
-
-def _call(method: Callable[[Array, Any], Any], x: Array, p: Any, where: str) -> None:
-    result = np.asarray(_run(lambda: method(x, p), where))
+def _call(method: Callable[..., Any], arguments: tuple[Any, ...], where: str) -> None:
+    result = np.asarray(_run(lambda: method(*arguments), where))
+    x = arguments[0]
     try:
         fits = np.broadcast_shapes(result.shape, (_MEMBERS, len(x))) == (_MEMBERS, len(x))
     except ValueError:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.state import Array
 from en4dvar_bubble import tables as tables_module
 from en4dvar_bubble.driving import Driving, Reading
-from en4dvar_bubble.laws.base import GRID, VISCOUS_GRID
+from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import integrate, rows
+from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output
 from en4dvar_bubble.solver.caching import stamp_with_sources
 from en4dvar_bubble.solver.collocation import ball, exterior
 
@@ -108,8 +108,8 @@ class System:
         return self.gas + self.vapour + self.medium + self.wall + self.memory + 2
 
     @property
-    def dims(self) -> tuple[int, ...]:
-        return (self.gas, self.vapour, self.medium, self.wall, self.memory, RADIALS[self.radial], int(self.shear))
+    def dims(self) -> Dims:
+        return Dims(self.gas, self.vapour, self.medium, self.wall, self.memory, RADIALS[self.radial], int(self.shear))
 
     @property
     def first_vapour(self) -> int:
@@ -138,39 +138,6 @@ class System:
 
 
 _ELASTIC_SPAN, _VISCOUS_SPAN = GRID.span, VISCOUS_GRID.span
-_NO_TABLE = np.zeros((0, GRID.cells, 8))
-_NO_SAMPLES = np.zeros((0, len(GRID.nodes)))
-
-
-@dataclass(frozen=True)
-class Tables:
-    """What the laws of N members contribute, over the density.
-
-    J_e either as ``samples`` (N, nodes with halo) times ``factor``, tabulated when a member's turn comes, or as
-    finished tables ``elastic`` (N, cells, 8); ``viscous`` (N, cells, 8) of ν (µm²/µs); ``memory`` (N, q, 2, cells, 8)
-    of stiffness and equilibrium.
-    """
-
-    samples: Array = field(default_factory=lambda: _NO_SAMPLES)
-    factor: float = 1.0
-    elastic: Array = field(default_factory=lambda: _NO_TABLE)
-    viscous: Array = field(default_factory=lambda: _NO_TABLE)
-    memory: Array = field(default_factory=lambda: _NO_TABLE)
-
-
-@dataclass(frozen=True)
-class Queue:
-    """The order (N,) in which members are taken, how many of them are ``available`` (1,) yet, how many are taken."""
-
-    order: npt.NDArray[np.intp]
-    available: npt.NDArray[np.int64]
-    counter: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, dtype=np.int64))
-
-    @classmethod
-    def longest_first(cls, parameters: Array) -> Queue:
-        """Least damped, hence longest ringing, first, so that the lanes run dry together; all are available."""
-        order = np.argsort(parameters[:, rows.VISCOSITY], kind="stable")
-        return cls(order, np.full(1, len(order), dtype=np.int64))
 
 
 @dataclass(frozen=True)
@@ -192,28 +159,22 @@ class Solution:
 
 def reason(status: int, record: Array) -> str:
     """The failure in words."""
-    when = f"at t = {record[integrate.END_TIME]:.4g} µs"
-    match status:
-        case integrate.OK:
-            return ""
-        case integrate.STEP_LIMIT:
-            return f"step limit reached {when}"
-        case integrate.NON_FINITE:
-            return f"non-finite state {when}"
-        case integrate.STEP_UNDERFLOW:
-            return f"step size underflow {when}"
-        case integrate.MACH_LIMIT:
-            return f"model validity: wall Mach {record[integrate.MAX_MACH]:.3g} {when}"
-        case integrate.WALL_LIMIT:
-            return f"model validity: wall above the critical temperature of water {when}"
-        case integrate.TIME_LIMIT:
-            return f"time limit reached {when}"
-    raise ValueError(f"unknown status {status}")
+    if status == integrate.OK:
+        return ""
+    words = {
+        integrate.STEP_LIMIT: "step limit reached",
+        integrate.NON_FINITE: "non-finite state",
+        integrate.STEP_UNDERFLOW: "step size underflow",
+        integrate.MACH_LIMIT: f"model validity: wall Mach {record[integrate.MAX_MACH]:.3g}",
+        integrate.WALL_LIMIT: "model validity: wall above the critical temperature of water",
+        integrate.TIME_LIMIT: "time limit reached",
+    }
+    return f"{words[status]} at t = {record[integrate.END_TIME]:.4g} µs"
 
 
 @cache
 def _gas_operators(m: int) -> Array:
-    """Collocation operators as one array in the kernel's layout (see ``equations.rhs``)."""
+    """Collocation operators as one array in the kernel's layout, see :class:`arrays.Equations`."""
     ops = np.zeros((2 * m + 3, m + 1))
     if m:
         b = ball(m)
@@ -224,7 +185,7 @@ def _gas_operators(m: int) -> Array:
 
 @cache
 def _medium_operators(m: int) -> Array:
-    """The same for the medium: m+1 rows of the derivative, m of the Laplacian, the nodes x."""
+    """The same for the medium."""
     ops = np.zeros((2 * m + 2, m + 1))
     if m:
         e = exterior(m, MEDIUM_LENGTH)
@@ -232,70 +193,65 @@ def _medium_operators(m: int) -> Array:
     return ops
 
 
-def _lengths(system: System) -> tuple[Any, Any]:
-    """``nodes`` and ``size`` of :func:`integrate.integrate`: as tuples, whose length the compiler sees, for few nodes.
+@dataclass(frozen=True, eq=False)
+class Solver:
+    """A system of equations, what drives it, and how accurately it is integrated."""
 
-    Unrolling halves the time of a step and costs a compilation (some seconds, once) for every number of nodes.
-    """
-    if system.general:
-        return None, np.zeros(system.size)
-    if system.gas in UNROLLED:
-        return (0,) * system.gas, (0,) * system.size
-    return np.zeros(system.gas), np.zeros(system.size)
+    system: System
+    driving: Driving
+    reading: Reading
+    accuracy: Accuracy
+    hottest_wall: float = np.inf
+    """τ of the wall above which there is no equilibrium with its vapour."""
 
+    @cached_property
+    def lengths(self) -> tuple[Any, Any]:
+        """``nodes`` and ``size`` of the equations: as tuples, whose length the compiler sees, for few nodes.
 
-def ready(
-    system: System,
-    initial: Array,
-    parameters: Array,
-    tables: Tables,
-    start: Array,
-    times: Array,
-    queue: Queue,
-    driving: Driving,
-    reading: Reading,
-    accuracy: Accuracy,
-    hottest_wall: float = np.inf,
-) -> tuple[Callable[[], object], Solution]:
-    """Everything set for the compiled integration of N members; a call that does it without the interpreter,
-    and the solution that it fills.
+        Unrolling halves the time of a step and costs a compilation (some seconds, once) for every number of nodes.
+        """
+        system = self.system
+        if system.general:
+            return None, np.zeros(system.size)
+        if system.gas in UNROLLED:
+            return (0,) * system.gas, (0,) * system.size
+        return np.zeros(system.gas), np.zeros(system.size)
 
-    Threads that make the call at once share the members; each returns when no member is left to begin, and all are done
-    when all have returned.
+    def equations(self, memory: Array, viscous: Array) -> Equations:
+        """What the compiled equations read that is the same for all members; tables of the laws (…, cells, 8)."""
+        system, driving = self.system, self.driving
+        gas, medium = _gas_operators(system.gas), _medium_operators(system.medium)
+        laws = (_ELASTIC_SPAN, memory, viscous, _VISCOUS_SPAN)
+        return Equations(
+            *self.lengths, system.dims, gas, medium, *laws, driving.table, driving.span, READINGS[self.reading]
+        )
 
-    ``hottest_wall``: τ of the wall above which there is no equilibrium with its vapour.
-    initial (N, n) and parameters (N, rows) in the kernel's units; start (N,) and times (N, K) in µs, times increasing.
-    Members never influence each other: the bits do not depend on how they are batched.
-    """
-    n_members = len(initial)
-    out = np.empty((n_members, times.shape[1], system.size))
-    status = np.zeros(n_members, dtype=np.int64)
-    record = np.zeros((n_members, integrate.RECORD))
-    span = driving.span
-    inside = (span[1] - span[0]) / _STEPS_IN_DRIVING
-    if system.general:
-        parameters = parameters.copy()
-        member = np.arange(n_members, dtype=float)
-        parameters[:, rows.VISCOUS_TABLE] = member * (VISCOUS_GRID.cells * 8)
-        for j in range(system.memory):
-            offset = (member * system.memory + j) * (2 * GRID.cells * 8)
-            parameters[:, rows.MEMORY + rows.PER_MEMORY * j + 2] = offset
-    arguments = (
-        (queue.counter, queue.available, queue.order),
-        np.ascontiguousarray(initial),
-        parameters,
-        np.ascontiguousarray(start),
-        np.ascontiguousarray(times),
-        system.dims,
-        (tables.samples, tables.factor, tables.elastic),
-        (_gas_operators(system.gas), _ELASTIC_SPAN, driving.table, span, READINGS[reading]),
-        (_medium_operators(system.medium), tables.viscous, _VISCOUS_SPAN, tables.memory.reshape(-1, 1, 8)),
-        *_lengths(system),
-        driving.breaks,
-        system.tolerances(accuracy.rtol),
-        np.array([_FIRST_STEP, inside, accuracy.step_limit, accuracy.mach_limit, accuracy.time_limit, hottest_wall]),
-        out,
-        status,
-        record,
-    )
-    return partial(integrate.integrate, *arguments), Solution(out, status, record)
+    @cached_property
+    def control(self) -> Control:
+        """How the compiled integration chooses its steps, and when it gives a member up."""
+        accuracy, (begin, end, _, _) = self.accuracy, self.driving.span
+        return Control(
+            breaks=self.driving.breaks,
+            tolerances=self.system.tolerances(accuracy.rtol),
+            first_step=_FIRST_STEP,
+            longest_driven=float(end - begin) / _STEPS_IN_DRIVING,
+            step_limit=float(accuracy.step_limit),
+            mach_limit=float(accuracy.mach_limit),
+            seconds=float(accuracy.time_limit),
+            hottest_wall=float(self.hottest_wall),
+        )
+
+    def prepared(self, members: Members, memory: Array, viscous: Array) -> tuple[Callable[[], object], Solution]:
+        """A call that integrates the members without the interpreter, and the solution that it fills.
+
+        Threads that make the call at once share the members; each returns when no member is left to begin, and all are
+        done when all have returned. Members never influence each other: the bits do not depend on how they are batched.
+        """
+        n_members, n_times = members.times.shape
+        output = Output(
+            np.empty((n_members, n_times, self.system.size)),
+            np.zeros(n_members, dtype=np.int64),
+            np.zeros((n_members, integrate.RECORD)),
+        )
+        call = partial(integrate.integrate, members, self.equations(memory, viscous), self.control, output)
+        return call, Solution(*output)

@@ -1,7 +1,8 @@
 """The equations of the paper's bubble and their analytic Jacobian, eight members at a time.
 
 Keller–Miksis in pressure, an elastic solid with a Newtonian dashpot, polytropic gas or heat equation with a cold
-wall. Every other option is in :mod:`general`, which must agree with this module where they overlap.
+wall. Every other option is in :mod:`general`, which must agree with this module where they overlap. Arguments and their
+layout: :mod:`arrays`.
 
 State rows (n = m + 2): Kirchhoff temperatures τ_1…τ_m, V = Ṙ/R (1/µs), u = ln(R/µm). Units: µm, µs, pressures divided
 by the density (µm²/µs²), so no other scaling is needed. In the logarithmic variables radius and pressure cannot
@@ -84,14 +85,10 @@ def _gas(y, nodes, par, ops, work):
 
 
 @nb.njit(forceinline=True)
-def rhs(y, t, nodes, par, world, work, out):
-    """Write dy/dt (n, 8) to ``out``.
-
-    ``ops`` holds the collocation operators: rows 0…m of d/dy (the last is the wall), m rows of the Laplacian, then
-    radii (row 2m+1) and averaging weights (row 2m+2). ``work`` (4m+1, 8) is scratch.
-    """
+def rhs(y, t, eq, loaded, work, out):
+    """Write dy/dt (n, 8) to ``out``; ``work`` (4m+1, 8) is scratch."""
+    nodes, par, ops, reading = eq.nodes, loaded.par, eq.gas, eq.reading
     m = len(nodes)
-    ops, elastic, elastic_span, drive, drive_span, reading = world
     p, rate, E, _wall = _gas(y, nodes, par, ops, work)
     V = load(y, m)
     u = load(y, m + 1)
@@ -111,10 +108,8 @@ def rhs(y, t, nodes, par, world, work, out):
     when = load(t, 0)
     if reading != INSTANTANEOUS:
         when = when + Ric
-    f, g, _ = driving(when, drive, drive_span, load(par, AMPLITUDE))
-    J, Jx, _ = lookup(
-        elastic, load(par, TABLE), elastic_span[0], elastic_span[2], elastic_span[3], u - load(par, LOG_R0)
-    )
+    f, g, _ = driving(when, eq.driving, eq.driving_span, load(par, AMPLITUDE))
+    J, Jx, _ = lookup(loaded.elastic, load(par, TABLE), eq.elastic_span, u - load(par, LOG_R0))
     surface = load(par, SURFACE) / R
     nu4 = load(par, VISCOSITY) * 4.0
     P = p + load(par, VAPOUR) - load(par, AMBIENT) - f - surface + J - nu4 * V
@@ -130,13 +125,15 @@ def rhs(y, t, nodes, par, world, work, out):
 
 
 @nb.njit(forceinline=True)
-def jacobian(y, t, nodes, par, world, work, out, jac, dt):
-    """Write dy/dt to ``out`` (n, 8), ∂f/∂y to ``jac`` (n·n, 8; row i·n+j) and ∂f_V/∂t, the only nonzero one, to
-    ``dt`` (1, 8).
+def jacobian(y, t, eq, loaded, w):
+    """Write dy/dt to ``f`` of the workspace, ∂f/∂y to ``jac`` (row i·n+j) and ∂f_V/∂t, the only nonzero one, to ``dt``.
+
+    It is one long function because a split changes which multiply–adds are fused, and with them the last digit.
     """
+    nodes, par, ops, reading = eq.nodes, loaded.par, eq.gas, eq.reading
+    work, out, jac, dt = w.work, w.f, w.jac, w.dt
     m = len(nodes)
     n = m + 2
-    ops, elastic, elastic_span, drive, drive_span, reading = world
     p, rate, E, wall = _gas(y, nodes, par, ops, work)
     V = load(y, m)
     u = load(y, m + 1)
@@ -154,10 +151,8 @@ def jacobian(y, t, nodes, par, world, work, out, jac, dt):
     when = load(t, 0)
     if reading != INSTANTANEOUS:
         when = when + Ric
-    f, g, h = driving(when, drive, drive_span, load(par, AMPLITUDE))
-    J, Jx, Jxx = lookup(
-        elastic, load(par, TABLE), elastic_span[0], elastic_span[2], elastic_span[3], u - load(par, LOG_R0)
-    )
+    f, g, h = driving(when, eq.driving, eq.driving_span, load(par, AMPLITUDE))
+    J, Jx, Jxx = lookup(loaded.elastic, load(par, TABLE), eq.elastic_span, u - load(par, LOG_R0))
     surface = load(par, SURFACE) / R
     nu4 = load(par, VISCOSITY) * 4.0
     P = p + load(par, VAPOUR) - load(par, AMBIENT) - f - surface + J - nu4 * V

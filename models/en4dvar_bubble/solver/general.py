@@ -3,7 +3,8 @@
 State rows: Kirchhoff temperatures τ of the gas (mT), mole fractions Y = 1 − χ of the non-condensible gas (mY),
 temperatures θ_m − 1 of the medium (mM), the wall's τ_w where the medium conducts (an algebraic unknown: RODAS5P
 integrates the index-1 system as it stands), memory variables (q), V, u. Notation and units as in :mod:`equations`. The
-Jacobian is by one-sided differences.
+Jacobian is by one-sided differences. The functions are long because a split changes which multiply–adds are fused, and
+with them the last digit, which differences and bounces make a visible one.
 
 Gas and vapour. Both have the same κ, hence the same molar heat capacity, and with the molar-average velocity u* the
 energy equation is that of a pure gas (diffusion carries no net enthalpy):
@@ -46,9 +47,10 @@ def _derivative(y, first, count, wall, matrix, row):
 
 
 @nb.njit
-def _gas_and_medium(y, par, dims, ops, medium, V, u, out):
+def _gas_and_medium(y, eq, par, V, u, out):
     """Pressure and π̇; writes the rates of gas, vapour and medium and the residual of the wall."""
-    mT, mY, mM, wall, _, _, _ = dims
+    mT, mY, mM, wall, _, _, _ = eq.dims
+    ops, medium = eq.gas, eq.medium
     kappa = load(par, rows.KAPPA)
     if mT == 0:
         return exp(load(par, rows.LOG_GAS) - kappa * u * 3.0), kappa * V * (-3.0)
@@ -120,28 +122,23 @@ def _gas_and_medium(y, par, dims, ops, medium, V, u, out):
 
 
 @nb.njit
-def general_rhs(y, t, par, dims, world, extra, out):
-    """Write dy/dt (n, 8) to ``out``; the wall's row holds the residual of its algebraic equation.
-
-    ``dims`` = (mT, mY, mM, wall, q, radial equation, shear thinning); ``world`` as for :func:`equations.rhs`;
-    ``extra`` = (medium operators, viscous tables, their span, memory tables).
-    """
-    mT, mY, mM, wall, q, radial, shear = dims
-    ops, elastic, span, drive, drive_span, reading = world
-    medium, viscous, viscous_span, memory = extra
+def general_rhs(y, t, eq, loaded, out):
+    """Write dy/dt (n, 8) to ``out``; the wall's row holds the residual of its algebraic equation."""
+    mT, mY, mM, wall, q, radial, shear = eq.dims
+    par, span, viscous_span, reading = loaded.par, eq.elastic_span, eq.viscous_span, eq.reading
     oS = mT + mY + mM + wall
     V = load(y, oS + q)
     u = load(y, oS + q + 1)
-    p, rate = _gas_and_medium(y, par, dims, ops, medium, V, u, out)
+    p, rate = _gas_and_medium(y, eq, par, V, u, out)
 
     x = u - load(par, rows.LOG_R0)
-    J, Jx, _ = lookup(elastic, load(par, rows.TABLE), span[0], span[2], span[3], x)
+    J, Jx, _ = lookup(loaded.elastic, load(par, rows.TABLE), span, x)
     J_rate = Jx * V
     for j in range(q):
         s = load(y, oS + j)
         at = load(par, MEMORY + PER_MEMORY * j + 2)
-        stiffness, _, _ = lookup(memory, at, span[0], span[2], span[3], x)
-        rest, _, _ = lookup(memory, at + span[3] * 8.0, span[0], span[2], span[3], x)
+        stiffness, _, _ = lookup(eq.memory, at, span, x)
+        rest, _, _ = lookup(eq.memory, at + span[3] * 8.0, span, x)
         convection = load(par, MEMORY + PER_MEMORY * j + 1)
         change = (rest - s) / load(par, MEMORY + PER_MEMORY * j) + V * (convection * s + stiffness)
         store(out, oS + j, change)
@@ -153,7 +150,7 @@ def general_rhs(y, t, par, dims, world, extra, out):
     if shear:
         z = maximum(log(maximum(absolute(V) * 1e6, 1e-300)), viscous_span[0])
         at = load(par, rows.VISCOUS_TABLE)
-        nu, nu_z, _ = lookup(viscous, at, viscous_span[0], viscous_span[2], viscous_span[3], z)
+        nu, nu_z, _ = lookup(eq.viscous, at, viscous_span, z)
         dashpot = nu * V * 4.0
         dashpot_V = (nu + nu_z) * 4.0
 
@@ -162,7 +159,7 @@ def general_rhs(y, t, par, dims, world, extra, out):
     when = load(t, 0)
     if reading != INSTANTANEOUS:
         when = when + R * ic
-    f, g, _ = driving(when, drive, drive_span, load(par, rows.AMPLITUDE))
+    f, g, _ = driving(when, eq.driving, eq.driving_span, load(par, rows.AMPLITUDE))
     surface = load(par, rows.SURFACE) / R
     wall_pressure = p + load(par, rows.VAPOUR) - surface + J - dashpot
     wall_slope = p * rate + surface * V + J_rate
@@ -198,28 +195,30 @@ def general_rhs(y, t, par, dims, world, extra, out):
 
 
 @nb.njit
-def general_jacobian(y, t, par, dims, world, extra, shifted, out, changed, jac, dt):
-    """Write dy/dt to ``out`` (n, 8), ∂f/∂y to ``jac`` (row i·n+j) and ∂f_V/∂t to ``dt`` (1, 8), by differences."""
-    mT, mY, mM, wall, q, _, _ = dims
-    n = mT + mY + mM + wall + q + 2
-    general_rhs(y, t, par, dims, world, extra, out)
+def general_jacobian(y, t, eq, loaded, w):
+    """Write dy/dt to ``f`` (n, 8) of the workspace, ∂f/∂y to ``jac`` (row i·n+j) and ∂f_V/∂t to ``dt`` (1, 8), by
+    differences.
+    """
+    n, first_vapour = len(w.f), eq.dims.gas
+    shifted, changed = w.stage, w.y_new  # not in use yet
+    general_rhs(y, t, eq, loaded, w.f)
     for i in range(n):
         store(shifted, i, load(y, i))
     for j in range(n):
         value = load(y, j)
-        floor_j = 0.01 if j == n - 2 else 1e-6 if mT <= j < mT + mY else 1.0
+        floor_j = 0.01 if j == n - 2 else 1e-6 if first_vapour <= j < first_vapour + eq.dims.vapour else 1.0
         delta = _DELTA * maximum(absolute(value), floor_j)
         store(shifted, j, value + delta)
         delta = load(shifted, j) - value
-        general_rhs(shifted, t, par, dims, world, extra, changed)
+        general_rhs(shifted, t, eq, loaded, changed)
         inverse = 1.0 / delta
         for i in range(n):
-            store(jac, i * n + j, (load(changed, i) - load(out, i)) * inverse)
+            store(w.jac, i * n + j, (load(changed, i) - load(w.f, i)) * inverse)
         store(shifted, j, value)
     now = load(t, 0)
-    store(dt, 0, splat(0.0))
-    if world[4][1] > world[4][0]:
+    store(w.dt, 0, splat(0.0))
+    if eq.driving_span[1] > eq.driving_span[0]:
         store(t, 0, now + _DELTA)
-        general_rhs(y, t, par, dims, world, extra, changed)
-        store(dt, 0, (load(changed, n - 2) - load(out, n - 2)) / (load(t, 0) - now))
+        general_rhs(y, t, eq, loaded, changed)
+        store(w.dt, 0, (load(changed, n - 2) - load(w.f, n - 2)) / (load(t, 0) - now))
         store(t, 0, now)

@@ -9,6 +9,7 @@ be fused.
 from __future__ import annotations
 
 import operator
+from collections.abc import Callable
 from typing import Any
 
 import numba as nb
@@ -61,33 +62,32 @@ def _splat(builder: Any, value: Any) -> Any:
     return builder.shuffle_vector(first, ir.Constant(_VEC, ir.Undefined), zeros)
 
 
-def _constant(value: float) -> Any:
-    return ir.Constant(_VEC, [value] * WIDTH)
+def _operator(op: Any, result: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
+    """Let ``op`` of two lanes, or of lanes and a number for all of them, be what ``emit`` builds."""
 
-
-def _arithmetic(op: Any, method: str) -> None:
     @infer_global(op)
     class _Template(ConcreteTemplate):
         cases = [  # noqa: RUF012  # numba reads the attribute as a list
-            signature(lanes, lanes, lanes),
-            signature(lanes, lanes, types.float64),
-            signature(lanes, types.float64, lanes),
+            signature(result, lanes, lanes),
+            signature(result, lanes, types.float64),
+            signature(result, types.float64, lanes),
         ]
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return getattr(builder, method)(*(_splat(builder, a) for a in args), flags=_CONTRACT)
+        return emit(builder, _splat(builder, args[0]), _splat(builder, args[1]))
 
     for case in _Template.cases:
         lower_builtin(op, *case.args)(lower)
 
 
-for _op, _method in (
-    (operator.add, "fadd"),
-    (operator.sub, "fsub"),
-    (operator.mul, "fmul"),
-    (operator.truediv, "fdiv"),
-):
-    _arithmetic(_op, _method)
+_operator(operator.add, lanes, lambda builder, a, b: builder.fadd(a, b, flags=_CONTRACT))
+_operator(operator.sub, lanes, lambda builder, a, b: builder.fsub(a, b, flags=_CONTRACT))
+_operator(operator.mul, lanes, lambda builder, a, b: builder.fmul(a, b, flags=_CONTRACT))
+_operator(operator.truediv, lanes, lambda builder, a, b: builder.fdiv(a, b, flags=_CONTRACT))
+_operator(operator.lt, mask, lambda builder, a, b: builder.fcmp_ordered("<", a, b))
+_operator(operator.le, mask, lambda builder, a, b: builder.fcmp_ordered("<=", a, b))
+_operator(operator.gt, mask, lambda builder, a, b: builder.fcmp_ordered(">", a, b))
+_operator(operator.ge, mask, lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
 
 
 @infer_global(operator.neg)
@@ -98,22 +98,6 @@ class _Negate(ConcreteTemplate):
 @lower_builtin(operator.neg, lanes)
 def _lower_negate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return builder.fneg(args[0])
-
-
-def _comparison(op: Any, predicate: str) -> None:
-    @infer_global(op)
-    class _Template(ConcreteTemplate):
-        cases = [signature(mask, lanes, lanes), signature(mask, lanes, types.float64)]  # noqa: RUF012
-
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.fcmp_ordered(predicate, *(_splat(builder, a) for a in args))
-
-    for case in _Template.cases:
-        lower_builtin(op, *case.args)(lower)
-
-
-for _op, _predicate in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
-    _comparison(_op, _predicate)
 
 
 def _row_pointer(context: Any, builder: Any, array_type: Any, array: Any, row: Any) -> Any:

@@ -8,8 +8,9 @@ from en4dvar_bubble.solver.lanes import any_lane, floor, gather, maximum, minimu
 
 
 @nb.njit(forceinline=True)
-def lookup(table, offset, origin, per_unit, intervals, x):
+def lookup(table, offset, span, x):
     """Value, first and second derivative of a piecewise quintic; beyond its ends the last interval is extended."""
+    origin, per_unit, intervals = span[0], span[2], span[3]
     position = (x - origin) * per_unit
     cell = minimum(maximum(floor(position), 0.0), intervals - 1.0)
     s = position - cell
@@ -23,16 +24,14 @@ def lookup(table, offset, origin, per_unit, intervals, x):
 
 
 @nb.njit(forceinline=True)
-def driving(t, drive, span, amplitude):
-    """p_f, dp_f/dt, d²p_f/dt² at the lanes' times; zero outside the table's span (t_0, t_1, intervals per µs,
-    count).
-    """
+def driving(t, table, span, amplitude):
+    """p_f, dp_f/dt, d²p_f/dt² at the lanes' times; zero outside the table's span."""
     zero = splat(0.0)
     before = t < span[0]
     after = t > span[1]
     inside = select(before, 0.0, select(after, 0.0, 1.0))
     if not any_lane(inside > 0.5):
         return zero, zero, zero
-    f, g, h = lookup(drive, zero, span[0], span[2], span[3], t)
+    f, g, h = lookup(table, zero, span, t)
     scale = amplitude * inside
     return f * scale, g * scale, h * scale

@@ -10,8 +10,8 @@ import numpy as np
 from en4dvar.errors import DataError
 from en4dvar.state import Array, Parameter
 from en4dvar.units import convert
+from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX
 from en4dvar_bubble.laws.loading import qualified
-from en4dvar_bubble.laws.parameters import R0, R_EQ, R_MAX
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter.guess import Guess, first_guess

@@ -1,0 +1,128 @@
+"""The arrays that the compiled solver works on, in named groups.
+
+n is the number of unknowns, N that of the members. Arrays that end in :data:`~lanes.WIDTH` hold one column per lane.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from en4dvar.state import Array
+
+IntArray = np.ndarray[Any, np.dtype[np.int64]]
+
+
+class Members(NamedTuple):
+    """What is integrated. Members are taken in ``order`` (N,); turn ``counter`` (1,) is the next, and one that is not
+    ``available`` (1,) yet is waited for. Threads that integrate the same arrays at once share the members; which of
+    them integrates one makes no difference to it.
+    """
+
+    counter: IntArray
+    available: IntArray
+    order: IntArray
+    initial: Array  # (N, n) states at ``start``
+    parameters: Array  # (N, rows), see :mod:`rows`
+    start: Array  # (N,) µs
+    times: Array  # (N, K) output times, increasing, µs
+    samples: Array  # (N, nodes) of J_e, tabulated when a member's turn comes; or (0, nodes)
+    factor: float  # of the samples
+    tables: Array  # (N, cells, 8) of J_e where there are no samples
+
+
+class Dims(NamedTuple):
+    """Numbers of unknowns, and which equations: those of the general ones by ``radial`` and ``shear``."""
+
+    gas: int
+    vapour: int
+    medium: int
+    wall: int
+    memory: int
+    radial: int
+    shear: int
+
+
+class Equations(NamedTuple):
+    """What the equations read that is the same for all members.
+
+    ``nodes`` is None for the equations with every option; for the paper's, with their analytic Jacobian, a zero per
+    temperature node, and ``size`` a zero per unknown. Only their lengths count. That of a tuple belongs to its type:
+    the compiler knows it and unrolls; arrays serve any length.
+    """
+
+    nodes: Any
+    size: Any
+    dims: Dims
+    gas: Array  # collocation: gas+1 rows of d/dy (the last is the wall), gas of the Laplacian, radii, averaging weights
+    medium: Array  # likewise: medium+1 rows of d/dx, medium of the Laplacian, nodes
+    elastic_span: Array  # of the tables against ln λ: first, last, cells per unit, cells
+    memory: Array  # tables of the memory variables
+    viscous: Array  # tables of ν against ln |V|
+    viscous_span: Array
+    driving: Array  # table of the far-field pressure over its amplitude
+    driving_span: Array
+    reading: int  # when the driving is read, see :mod:`rows`
+
+
+class Control(NamedTuple):
+    """How steps are chosen and when a member has failed."""
+
+    breaks: Array  # increasing instants (µs) that no step straddles
+    tolerances: Array  # (2, n) absolute and relative
+    first_step: float
+    longest_driven: float  # longest step while the driving acts, µs
+    step_limit: float
+    mach_limit: float
+    seconds: float  # of wall clock per member
+    hottest_wall: float  # τ of the wall above which a breakdown is put down to it
+
+
+class Output(NamedTuple):
+    """``states`` (N, K, n) with NaN where not reached, ``status`` (N,), ``record`` (N, RECORD)."""
+
+    states: Array
+    status: IntArray
+    record: Array
+
+
+class Loaded(NamedTuple):
+    """What the equations read of the members in the lanes."""
+
+    par: Array  # (rows, WIDTH)
+    elastic: Array  # (WIDTH, cells, 8) of J_e: small enough for the cache
+
+
+class Lanes(NamedTuple):
+    """The members being integrated, each with its own time and step."""
+
+    y: Array
+    t: Array
+    h: Array
+    loaded: Loaded
+    member: IntArray  # which one; −1 where a lane is idle
+    began: IntArray  # when it was taken, seconds
+    observed: IntArray  # output times written
+    next_break: IntArray
+    proposed: Array  # the step before it was cut at a break
+    last_h: Array  # the last accepted step; negative before there is one
+    last_root: Array  # the fifth root of its error
+    rejected: Any  # whether the last attempt was
+
+
+class Workspace(NamedTuple):
+    """Scratch of a step, and what it leaves: the stages ``k``, ``y_new``; ``norm`` (3, WIDTH) of the error, its fifth
+    root, wall Mach number.
+    """
+
+    work: Array
+    f: Array
+    jac: Array
+    dt: Array
+    k: Array
+    stage: Array
+    y_new: Array
+    t_stage: Array
+    norm: Array
+    dense: Array

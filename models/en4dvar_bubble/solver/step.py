@@ -1,0 +1,183 @@
+"""One step of RODAS5P for all lanes: Jacobian, factorisation, stages, error.
+
+Functions that are inlined before their types are inferred (``inline="always"``) spare the compiler half of its time:
+every call of a compiled function passes each field of the named groups by itself.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+from numba.core.types import NoneType
+from numba.extending import overload
+
+from en4dvar_bubble.solver import rodas5p
+from en4dvar_bubble.solver.equations import jacobian, rhs
+from en4dvar_bubble.solver.general import general_jacobian, general_rhs
+from en4dvar_bubble.solver.lanes import absolute, exp, load, log, maximum, splat, sqrt, store
+from en4dvar_bubble.solver.rows import INVERSE_C
+
+_A, _C, _ALPHA, _D, _H = rodas5p.A, rodas5p.C, rodas5p.ALPHA, rodas5p.D, rodas5p.H
+_GAMMA, _STAGES = rodas5p.GAMMA, rodas5p.STAGES
+_EXPONENT = 1.0 / rodas5p.ORDER
+LEAST_ERROR = 1e-8  # the step grows as if the error were not smaller
+
+
+@nb.njit(forceinline=True)
+def _factorise(a, size):
+    """LU without pivoting, in place; the diagonal is replaced by its inverse. Rows i·n+j.
+
+    The temperature block comes first and is diagonally dominant; V and u follow as its border.
+    """
+    n = len(size)
+    for k in range(n):
+        pivot = 1.0 / load(a, k * n + k)
+        store(a, k * n + k, pivot)
+        for i in range(k + 1, n):
+            factor = load(a, i * n + k) * pivot
+            store(a, i * n + k, factor)
+            for j in range(k + 1, n):
+                store(a, i * n + j, load(a, i * n + j) - factor * load(a, k * n + j))
+
+
+@nb.njit(forceinline=True)
+def _solve(a, size, b, row):
+    """Solve in place for the right-hand side in rows ``row … row+n−1`` of ``b``."""
+    n = len(size)
+    for i in range(1, n):
+        total = load(b, row + i)
+        for j in range(i):
+            total = total - load(a, i * n + j) * load(b, row + j)
+        store(b, row + i, total)
+    for i in range(n - 1, -1, -1):
+        total = load(b, row + i)
+        for j in range(i + 1, n):
+            total = total - load(a, i * n + j) * load(b, row + j)
+        store(b, row + i, total * load(a, i * n + i))
+
+
+def _is_general(eq):
+    """Whether a type of :class:`arrays.Equations` is that of the equations with every option."""
+    return isinstance(eq.types[eq.fields.index("nodes")], NoneType)
+
+
+def _jacobian(y, t, eq, loaded, w):
+    """The right-hand side and its Jacobian, of the equations that the compiler chooses by the type of ``eq``."""
+
+
+@overload(_jacobian, jit_options={"forceinline": True})
+def _choose_jacobian(y, t, eq, loaded, w):
+    if _is_general(eq):
+        return lambda y, t, eq, loaded, w: general_jacobian(y, t, eq, loaded, w)
+    return lambda y, t, eq, loaded, w: jacobian(y, t, eq, loaded, w)
+
+
+def _rhs(y, t, eq, loaded, w):
+    """The right-hand side alone, to ``f``."""
+
+
+@overload(_rhs, jit_options={"forceinline": True})
+def _choose_rhs(y, t, eq, loaded, w):
+    if _is_general(eq):
+        return lambda y, t, eq, loaded, w: general_rhs(y, t, eq, loaded, w.f)
+    return lambda y, t, eq, loaded, w: rhs(y, t, eq, loaded, w.work, w.f)
+
+
+def _algebraic_row(eq):
+    """The row of the wall temperature, which has an algebraic equation; −1 where there is none."""
+
+
+@overload(_algebraic_row)
+def _choose_row(eq):
+    if _is_general(eq):
+        return lambda eq: eq.dims.gas + eq.dims.vapour + eq.dims.medium if eq.dims.wall else -1
+    return lambda eq: -1
+
+
+@nb.njit(inline="always")
+def _linearise(lanes, eq, algebraic, w):
+    """dy/dt to ``f``, ∂f_V/∂t to ``dt``, and 1/(hγ) − ∂f/∂y, without 1/(hγ) in the algebraic row, as its factors to
+    ``jac``.
+    """
+    _jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
+    n = len(w.f)
+    inverse_h = 1.0 / load(lanes.h, 0)
+    for i in range(n * n):
+        store(w.jac, i, -load(w.jac, i))
+    for i in range(n):
+        if i != algebraic:
+            store(w.jac, i * n + i, load(w.jac, i * n + i) + inverse_h * (1.0 / _GAMMA))
+    _factorise(w.jac, eq.size)
+
+
+@nb.njit(inline="always")
+def _stages(lanes, eq, algebraic, w):
+    """The stages to ``k``, the argument of the last to ``stage``."""
+    n = len(w.f)
+    fast_row = n - 2  # V, the only row with an explicit time dependence
+    step = load(lanes.h, 0)
+    inverse_h = 1.0 / step
+    now = load(lanes.t, 0)
+    slope_t = load(w.dt, 0) * step
+    for s in range(_STAGES):
+        if s > 0:
+            for i in range(n):
+                value = load(lanes.y, i)
+                for r in range(s):
+                    value = value + load(w.k, r * n + i) * _A[s, r]
+                store(w.stage, i, value)
+            store(w.t_stage, 0, now + step * _ALPHA[s])
+            _rhs(w.stage, w.t_stage, eq, lanes.loaded, w)
+        for i in range(n):
+            value = splat(0.0)
+            if i != algebraic:
+                for r in range(s):
+                    value = value + load(w.k, r * n + i) * _C[s, r]
+            store(w.k, s * n + i, load(w.f, i) + value * inverse_h)
+        store(w.k, s * n + fast_row, load(w.k, s * n + fast_row) + slope_t * _D[s])
+        _solve(w.jac, eq.size, w.k, s * n)
+
+
+@nb.njit(inline="always")
+def _judge(lanes, shear, tolerances, w):
+    """The new state to ``y_new``, error and wall Mach number to ``norm``."""
+    n = len(w.f)
+    inverse_h = 1.0 / load(lanes.h, 0)
+    total = splat(0.0)
+    last = (_STAGES - 1) * n
+    for i in range(n):
+        old = load(lanes.y, i)
+        error = load(w.k, last + i)
+        new = load(w.stage, i) + error
+        store(w.y_new, i, new)
+        size = maximum(absolute(old), absolute(new))
+        if shear and i == n - 2:
+            # At a bounce V passes the viscosity's knee in 1e-12 µs; on the scale √|V̇| nothing happens.
+            size = maximum(size, sqrt(absolute(new - old) * inverse_h))
+        ratio = error / (size * tolerances[1, i] + tolerances[0, i])
+        total = total + ratio * ratio
+    error_norm = sqrt(total * (1.0 / n))
+    store(w.norm, 0, error_norm)
+    store(w.norm, 1, exp(log(maximum(error_norm, LEAST_ERROR)) * _EXPONENT))
+    mach = absolute(load(w.y_new, n - 2)) * exp(load(w.y_new, n - 1)) * load(lanes.loaded.par, INVERSE_C)
+    store(w.norm, 2, mach)
+
+
+@nb.njit(forceinline=True)
+def attempt(lanes, eq, tolerances, w):
+    """One step of all lanes: see :class:`arrays.Workspace` for what it leaves."""
+    algebraic = _algebraic_row(eq)
+    _linearise(lanes, eq, algebraic, w)
+    _stages(lanes, eq, algebraic, w)
+    _judge(lanes, eq.dims.shear, tolerances, w)
+
+
+@nb.njit(forceinline=True)
+def interpolant(w):
+    """Rows 3n of the dense-output polynomial (K1, K2, K3) of all lanes, to ``dense``."""
+    n = len(w.f)
+    for r in range(3):
+        for i in range(n):
+            value = splat(0.0)
+            for s in range(_STAGES):
+                value = value + load(w.k, s * n + i) * _H[r, s]
+            store(w.dense, r * n + i, value)
