@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
 import pytest
 
+from en4dvar import report
 from en4dvar.analysis import Analysis, IterationRecord
 from en4dvar.caution import caution
 from en4dvar.forward import ForwardModel, Observable, StateField
@@ -16,6 +18,7 @@ from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.report.figures import all_figures
 from en4dvar.state import TIME_SHIFT, Array, Field, Parameter, StateLayout
 
 FAILED = 3
@@ -140,3 +143,9 @@ def make_analysis() -> Callable[..., Analysis]:
 @pytest.fixture(scope="session")
 def analysis() -> Analysis:
     return _analysis()
+
+
+@pytest.fixture
+def one_figure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports of this process draw the first of their figures only: enough where a test asks for files and pages."""
+    monkeypatch.setattr(report, "all_figures", lambda result: islice(all_figures(result), 1))

@@ -12,6 +12,12 @@ import numpy as np
 from toy_models import Oscillator
 
 from en4dvar.batch import Batch
+from en4dvar.state import Array
+
+
+def is_large(x: Array) -> bool:
+    """Whether the members are of a data set of large amplitude."""
+    return bool(np.median(x[:, 0]) > 150e-6)
 
 
 class Slow(Oscillator):
@@ -27,7 +33,7 @@ class DiesOnce(Slow):
 
     def trajectories(self, x, times):
         flag = Path(os.environ["EN4DVAR_TEST_FLAG"])
-        if np.median(x[:, 0]) > 150e-6 and not flag.exists():
+        if is_large(x) and not flag.exists():
             flag.touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return super().trajectories(x, times)
@@ -37,7 +43,7 @@ class DiesAlways(Oscillator):
     """Kills its process at a data set of large amplitude."""
 
     def trajectories(self, x, times):
-        if np.median(x[:, 0]) > 150e-6:
+        if is_large(x):
             os.kill(os.getpid(), signal.SIGKILL)
         return super().trajectories(x, times)
 
@@ -92,7 +98,7 @@ class Waits(Oscillator):
         return super().trajectories(x, times)
 
     def wait(self, flag):
-        end = time.monotonic() + 30
+        end = time.monotonic() + 300
         while not flag.exists():
             if time.monotonic() > end:
                 flag.with_suffix(".unheard").touch()
@@ -110,12 +116,14 @@ class WaitsTwice(Waits):
 
 
 class WaitsAndDies(Waits):
-    """Kills its process there, the first of all."""
+    """Waits so in the data set of large amplitude only, whose iterations that file is about, and dies there, once."""
+
+    def trajectories(self, x, times):
+        return super().trajectories(x, times) if is_large(x) else Oscillator.trajectories(self, x, times)
 
     def wait(self, flag):
         super().wait(flag)
         died = flag.with_suffix(".died")
         if not died.exists():
             died.touch()
-            time.sleep(0.5)  # the flag may be another data set's: what this one has to tell is sent by now
             os.kill(os.getpid(), signal.SIGKILL)

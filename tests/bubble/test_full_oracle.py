@@ -47,6 +47,7 @@ def test_diffusivity_of_kinetic_theory():
     assert difference(FINE, "transport", conducting=True, D_p=1.0, D_T=1.75) < 2e-3
 
 
+@pytest.mark.slow
 def test_conducting_medium_without_vapour():
     assert difference(FINE, "none", conducting=True) < 2e-3
 

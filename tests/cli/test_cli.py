@@ -60,8 +60,9 @@ def test_run_recovers_the_truth_and_prints_it(finished: tuple[Path, Result]) -> 
 
 def test_workers_and_executors_do_not_change_the_numbers(tmp_path: Path, finished: tuple[Path, Result]) -> None:
     outcome = call(
-        "run", write_toy(tmp_path), "--out", tmp_path / "run", "--workers", "2", "--set", "execution.executor=threads"
-    )
+        "run", write_toy(tmp_path), "--out", tmp_path / "run", "--workers", "2", "--no-report",
+        "--set", "execution.executor=threads",
+    )  # fmt: skip
     assert outcome.exit_code == 0, outcome.output
     one, two = (load_result(d / "posterior.nc").posterior for d in (finished[0], tmp_path / "run"))
     assert one.identical(two)
@@ -71,7 +72,7 @@ def test_campaign(tmp_path: Path) -> None:
     path = write_toy(tmp_path)
     for n in (1, 2):
         (tmp_path / f"set{n}.csv").write_text(csv_text(k=1.5 + n / 4))
-    outcome = call("run", path, "--out", tmp_path / "run", "--data", tmp_path / "set*.csv")
+    outcome = call("run", path, "--out", tmp_path / "run", "--data", tmp_path / "set*.csv", "--no-report")
     assert outcome.exit_code == 0, outcome.output
     results = [load_result(tmp_path / "run" / "datasets" / f"set{n}.nc") for n in (1, 2)]
     assert [r.name for r in results] == ["set1", "set2"]
@@ -82,9 +83,10 @@ def test_campaign(tmp_path: Path) -> None:
         assert tree["posterior"]["k"].mean(("chain", "draw")).values == pytest.approx(means, rel=1e-12)
 
 
+@pytest.mark.usefixtures("one_figure")
 def test_report_again(tmp_path: Path) -> None:
-    call("run", write_toy(tmp_path), "--out", tmp_path / "run")
-    (tmp_path / "run" / "report.html").unlink()
+    call("run", write_toy(tmp_path), "--out", tmp_path / "run", "--no-report")
+    assert not (tmp_path / "run" / "report.html").exists()
     outcome = call("report", tmp_path / "run")
     assert outcome.exit_code == 0
     assert (tmp_path / "run" / "report.html").stat().st_size > 10_000
@@ -200,6 +202,7 @@ def test_lost_ensemble(tmp_path: Path) -> None:
     assert "failed: TooFewMembersError" in (tmp_path / "out" / "run.log").read_text()
 
 
+@pytest.mark.usefixtures("one_figure")
 def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
@@ -218,6 +221,7 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "resumed: 0 of 1 data sets are done" in (out / "run.log").read_text()
 
 
+@pytest.mark.usefixtures("one_figure")
 def test_force_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None:
     path, out = write_toy(tmp_path), tmp_path / "out"
     assert call("run", path, "--out", out).exit_code == 0

@@ -130,7 +130,7 @@ def test_run_with_everything(tmp_path: Path) -> None:
         ("members: 8", "members: 24"),
         data="\n".join(lines) + "\n",
     )
-    outcome = CliRunner().invoke(main, ["run", str(config), "--out", str(tmp_path / "run")])
+    outcome = CliRunner().invoke(main, ["run", str(config), "--out", str(tmp_path / "run"), "--no-report"])
     assert outcome.exit_code == 0, outcome.output
     result = load_result(tmp_path / "run" / "posterior.nc")
     assert {name: v.attrs["units"] for name, v in result.posterior.data_vars.items()} == {
@@ -149,7 +149,7 @@ def test_run_with_everything(tmp_path: Path) -> None:
 
 def test_a_result_keeps_the_correlation(tmp_path: Path) -> None:
     config = write_toy(tmp_path, CORRELATED)
-    outcome = CliRunner().invoke(main, ["run", str(config), "--out", str(tmp_path / "run")])
+    outcome = CliRunner().invoke(main, ["run", str(config), "--out", str(tmp_path / "run"), "--no-report"])
     assert outcome.exit_code == 0, outcome.output
     correlation = load_result(tmp_path / "run" / "posterior.nc").observed_data["position_correlation"]
     assert correlation.dims == ("time", "time_column")

@@ -2,7 +2,6 @@
 
 import csv
 
-import arviz
 import numpy as np
 import pytest
 import xarray as xr
@@ -102,6 +101,8 @@ def test_correlated_errors_are_kept_beside_one_another(tmp_path):
 
 @pytest.mark.filterwarnings("ignore")  # whatever ArviZ and its dependencies deprecate
 def test_arviz_reads_every_group(campaign):
+    import arviz  # takes seconds
+
     data = arviz.from_netcdf(str(campaign.directory / "posterior.nc"))
     assert set(GROUPS) <= {str(g).strip("/") for g in (data.children if hasattr(data, "children") else data.groups())}
     table = arviz.summary(data, var_names=["k"], kind="stats")
@@ -110,6 +111,7 @@ def test_arviz_reads_every_group(campaign):
     assert table["mean"].astype(float).to_numpy() == pytest.approx(means, rel=1e-2)
 
 
+@pytest.mark.usefixtures("one_figure")
 def test_report_names_the_failures(campaign):
     html = write_report(campaign.directory).read_text()
     assert "3 data sets without a posterior" in html

@@ -11,10 +11,13 @@ from en4dvar.runs.runner import run_campaign
 
 
 class Listener:
-    """Lets the waiting models go on once the last iteration before is in the log, which came fast upon another."""
+    """Lets the waiting models go on once the last iteration before is in the log, which came fast upon another.
 
-    def __init__(self, out, flag):
-        self.out, self.flag, self.heard = out, flag, []
+    With ``of``, that of the data set of this name.
+    """
+
+    def __init__(self, out, flag, of=None):
+        self.out, self.flag, self.of, self.heard = out, flag, of, []
 
     def __call__(self, name, record):
         lines = log(self.out)
@@ -26,7 +29,7 @@ class Listener:
             assert any(f"{name}: iteration {record.iteration:2d}  J " in line for line in lines)
             assert not any(f"{name}: converged" in line for line in lines)
         self.heard.append((name, record.iteration))
-        if record.iteration == 2:
+        if record.iteration == 2 and self.of in (name, None):
             self.flag.touch()
 
 
@@ -36,8 +39,12 @@ def log(out):
 
 @pytest.fixture(scope="module")
 def quiet(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("quiet")
-    run_campaign(configuration(make_campaign(folder, 3), folder / "run", executor="serial"))
+    return undisturbed(tmp_path_factory.mktemp("campaign") / "quiet")
+
+
+def undisturbed(folder, **how):
+    folder.mkdir()
+    run_campaign(configuration(make_campaign(folder, 3, **how), folder / "run", executor="serial"))
     return folder / "run"
 
 
@@ -62,23 +69,23 @@ def test_an_iteration_is_told_before_its_data_set_ends(quiet, tmp_path, monkeypa
 
 @pytest.mark.parametrize("kind", ["processes", "dask"])
 @pytest.mark.fault("worker-killed")
-def test_iterations_of_a_killed_worker_are_told_again(quiet, tmp_path, monkeypatch, kind):
+def test_iterations_of_a_killed_worker_are_told_again(tmp_path, monkeypatch, kind):
+    """It dies as soon as three of them have been heard here: by then none of them is on its way."""
     monkeypatch.setenv("EN4DVAR_TEST_FLAG", str(tmp_path / "heard"))
-    path, out = make_campaign(tmp_path, 3, "execution_models:WaitsAndDies"), tmp_path / "run"
-    campaign = run_campaign(
-        configuration(path, out, executor=kind, workers=2), progress=Listener(out, tmp_path / "heard")
-    )
+    path, out = make_campaign(tmp_path, 3, "execution_models:WaitsAndDies", large=1), tmp_path / "run"
+    listener = Listener(out, tmp_path / "heard", of="set1")
+    campaign = run_campaign(configuration(path, out, executor=kind, workers=2), progress=listener)
     assert (tmp_path / "heard.died").exists()
     assert campaign.exit_code == 0
     assert not (tmp_path / "heard.unheard").exists()
-    assert_same_results(out, quiet)
+    assert_same_results(out, undisturbed(tmp_path / "quiet", large=1))
     lines = log(out)
-    assert sum("its worker was lost; another one repeats it" in line for line in lines) == 1
-    told = {result.name: iterations(lines, result.name) for result in campaign}
+    (lost,) = (line for line in lines if "its worker was lost" in line)
+    assert lost.endswith(" set1: its worker was lost; another one repeats it")
     for result in campaign:
-        n = result.iterations.sizes["iteration"]
-        assert told[result.name][-n:] == list(range(n))
-    assert sum(numbers.count(0) for numbers in told.values()) == 4
+        whole = list(range(result.iterations.sizes["iteration"]))
+        told_before = [0, 1, 2] if result.name == "set1" else []
+        assert iterations(lines, result.name) == told_before + whole
 
 
 @pytest.mark.parametrize("kind", ["serial", "threads", "processes", "dask"])

@@ -5,19 +5,31 @@ from run_files import assert_same_results, configuration, make_campaign
 
 from en4dvar.runs.runner import run_campaign
 
-WHERE = [(kind, n) for kind in ("serial", "threads", "processes", "dask") for n in (1, 2)]
+EVERYWHERE = [
+    ("serial", 2), ("threads", 2), ("processes", 2), ("dask", 2),
+    *(pytest.param(kind, 1, marks=pytest.mark.slow) for kind in ("threads", "processes", "dask")),
+]  # fmt: skip
+
+
+def undisturbed(folder, sets, large):
+    path = make_campaign(folder, sets, large=large)
+    assert run_campaign(configuration(path, folder / "run", executor="serial")).exit_code == 0
+    return path, folder / "run"
 
 
 @pytest.fixture(scope="module")
 def quiet(tmp_path_factory):
     """An undisturbed campaign of four data sets, one of large amplitude, in one process."""
-    folder = tmp_path_factory.mktemp("quiet")
-    path = make_campaign(folder, 4, large=2)
-    assert run_campaign(configuration(path, folder / "run", executor="serial")).exit_code == 0
-    return path, folder / "run"
+    return undisturbed(tmp_path_factory.mktemp("quiet"), 4, large=2)
 
 
-@pytest.mark.parametrize(("kind", "workers"), WHERE[1:])
+@pytest.fixture(scope="module")
+def few(tmp_path_factory):
+    """The same of two data sets, fewer than three workers: these share the members."""
+    return undisturbed(tmp_path_factory.mktemp("few"), 2, large=1)
+
+
+@pytest.mark.parametrize(("kind", "workers"), EVERYWHERE)
 def test_campaign_on_any_executor(quiet, tmp_path, kind, workers):
     path, run = quiet
     campaign = run_campaign(configuration(path, tmp_path / "run", executor=kind, workers=workers))
@@ -27,23 +39,24 @@ def test_campaign_on_any_executor(quiet, tmp_path, kind, workers):
 
 
 @pytest.mark.parametrize("kind", ["threads", "processes", "dask"])
-def test_members_on_workers_where_data_sets_are_few(quiet, tmp_path, kind):
-    path, run = quiet
-    config = configuration(path, tmp_path / "run", executor=kind, workers=5)
+def test_members_on_workers_where_data_sets_are_few(few, tmp_path, kind):
+    path, run = few
+    config = configuration(path, tmp_path / "run", executor=kind, workers=3)
     assert run_campaign(config).exit_code == 0
     assert_same_results(tmp_path / "run", run)
 
 
 @pytest.mark.parametrize("kind", ["processes", "dask"])
-@pytest.mark.parametrize("workers", [2, 5], ids=["data sets", "members"])
+@pytest.mark.parametrize(("campaign", "workers"), [("quiet", 2), ("few", 3)], ids=["data sets", "members"])
 @pytest.mark.fault("worker-killed")
-def test_death_of_a_worker_changes_nothing(quiet, tmp_path, monkeypatch, kind, workers):
-    _, run = quiet
-    path = make_campaign(tmp_path, 4, "execution_models:DiesOnce", large=2)
+def test_death_of_a_worker_changes_nothing(request, tmp_path, monkeypatch, kind, campaign, workers):
+    _, run = request.getfixturevalue(campaign)
+    sets = len(list((run / "datasets").iterdir()))
+    path = make_campaign(tmp_path, sets, "execution_models:DiesOnce", large=sets // 2)
     monkeypatch.setenv("EN4DVAR_TEST_FLAG", str(tmp_path / "died"))
-    campaign = run_campaign(configuration(path, tmp_path / "run", executor=kind, workers=workers))
+    done = run_campaign(configuration(path, tmp_path / "run", executor=kind, workers=workers))
     assert (tmp_path / "died").exists()
-    assert campaign.failures == ()
+    assert done.failures == ()
     assert_same_results(tmp_path / "run", run)
 
 

@@ -11,11 +11,10 @@ import cheap_model
 
 SCRIPT = """
 import resource, sys, time
-start = time.perf_counter()
 from en4dvar.runs.runner import run_campaign
 peak, first, ended = [], [], set()
 def told(name, record):
-    first.append(time.perf_counter() - start) if not first else None
+    first.append(time.process_time()) if not first else None
     ended.add(name)
     if len(ended) == int(sys.argv[3]) // 10 and not peak:
         peak.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)
@@ -28,7 +27,7 @@ if __name__ == "__main__":
 
 
 def estimate_many(folder: Path, sets: int, executor: str = "serial") -> tuple[float, float, float]:
-    """Peak memory (MB) after a tenth of the data sets and at the end, seconds to the first estimate.
+    """Peak memory (MB) after a tenth of the data sets and at the end, seconds of work to the first estimate.
 
     Raises
     ------

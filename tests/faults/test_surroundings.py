@@ -47,7 +47,7 @@ def test_a_clock_that_jumps_backwards(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "sets", [100, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.long])], ids=["few", "many"]
+    "sets", [40, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.long])], ids=["few", "many"]
 )
 @pytest.mark.fault("many-sets")
 def test_many_data_sets_in_flat_memory(tmp_path, sets):

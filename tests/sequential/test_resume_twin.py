@@ -197,8 +197,8 @@ def kill_and_resume(tmp_path: Path, kills: int, seed: int) -> None:
 
 
 def test_killed_and_resumed(tmp_path):
-    """SIGKILL at a few random moments of the cycles, each followed by a resume that may be killed as well."""
-    kill_and_resume(tmp_path, 2, 1)
+    """SIGKILL at a random moment of the cycles."""
+    kill_and_resume(tmp_path, 1, 1)
 
 
 @pytest.mark.slow

@@ -66,7 +66,7 @@ def test_probabilities_follow_the_exact_evidence_of_linear_models(tmp_path):
 
 def test_equal_models_are_undecidable_on_the_command_line(tmp_path):
     runs = [str(run_dir(tmp_path / name, ("a",), wide=wide)) for name, wide in (("first", 1.0), ("second", 1.1))]
-    done = CliRunner().invoke(main, ["compare", *runs])
+    done = CliRunner().invoke(main, ["compare", *runs, "--no-report"])
     assert done.exit_code == 0, done.output
     assert "undecidable: first and second differ by 0." in done.output
     assert done.output.splitlines()[0].split()[:3] == ["parameter", "unit", "data"]
@@ -88,7 +88,7 @@ def test_evidences_of_different_data_are_not_compared(tmp_path):
         assert comparison.verdict("set1") == f"not compared: {comparison.incomparable}"
         assert all(np.isnan(score.probability) and np.isnan(score.difference) for score in comparison.scores)
         assert {e.run for e in comparison.estimates} == {"one", other.name}
-        done = CliRunner().invoke(main, ["compare", str(one), str(other)])
+        done = CliRunner().invoke(main, ["compare", str(one), str(other), "--no-report"])
         assert done.exit_code == 0, done.output
         assert f"not compared: {message}" in done.output
 

@@ -32,18 +32,18 @@ GELS = ("0.3 %", "1 %")
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """Both gels with four data sets each, the sweep at 128 trajectories."""
+    """Both gels with three data sets each, the sweep at 128 trajectories."""
     folder = tmp_path_factory.mktemp("study")
     for key in ("03", "10"):
         for model in ("nh", "qs", "qlkv"):
             text = (CONFIGS / f"agarose_{key}_{model}.yaml").read_text()
-            data = CONFIGS / "data" / "agarose_twin" / f"agarose_{key}_0[1-4].csv"
+            data = CONFIGS / "data" / "agarose_twin" / f"agarose_{key}_0[1-3].csv"
             text = text.replace(f"data/agarose_twin/agarose_{key}_*.csv", str(data))
             (folder / f"agarose_{key}_{model}.yaml").write_text(text)
     text = (CONFIGS / "agarose_study.yaml").read_text()
     (folder / "study.yaml").write_text(text.replace("data/agarose_twin", str(CONFIGS / "data" / "agarose_twin")))
     call = [str(folder / "study.yaml"), "--set", "sweep.trajectories=128", "--set", "sweep.rounds=1"]
-    call += ["--set", "sweep.step=0.1 us", "--out", str(folder / "out"), "--set", "population.rounds=60"]
+    call += ["--set", "sweep.step=0.1 us", "--out", str(folder / "out"), "--set", "population.rounds=30"]
     call += ["--set", "population.passes=1", "--set", "population.draws=200", "--set", "population.exact=50"]
     result = CliRunner().invoke(study_command, call)
     assert result.exit_code == 0, (result.output, result.exception)
@@ -174,7 +174,7 @@ def test_results_as_netcdf(small):
     with xr.open_datatree(out / "study.nc") as tree:
         assert "SYNTHETIC" in tree.attrs["title"]
         fit = tree["/0.3 %/qlkv"].to_dataset()
-        assert dict(fit.sizes) == {"dataset": 4, "draw": 48}
+        assert dict(fit.sizes) == {"dataset": 3, "draw": 48}
         assert fit["G"].attrs["units"] == "Pa"
         rows = list(csv.DictReader((out / "sets.csv").read_text().splitlines()))
         row = next(r for r in rows if (r["gel"], r["model"], r["parameter"]) == ("0.3 %", "qlkv", "G"))
