@@ -88,6 +88,16 @@ def log_normalisation(observations: Observations) -> float:
     return float(np.sum(observations.weights * terms))
 
 
+def fixed_precision(observations: Observations) -> Array | None:
+    """(K,) β/std² where the errors are independent, Gaussian and of a std that no control vector changes; else None.
+
+    An estimated noise scale is not known here (see :func:`~en4dvar.ensemble.forecast.has_noise_scale`).
+    """
+    if observations.timed or observations.huber is not None or observations.correlation is not None:
+        return None
+    return np.asarray(observations.weights / observations.std**2)
+
+
 @dataclass(frozen=True)
 class Linearisation:
     """Predictions about one point: ``prediction`` m (K,), ``anomalies`` ∂m (N, K), and the same of the rates or None.

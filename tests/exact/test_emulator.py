@@ -15,7 +15,7 @@ from en4dvar.executor import ThreadsExecutor
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import AssimilationSettings
 from en4dvar.sampling import mcmc
-from en4dvar.sampling.emulator import emulate, needed_runs
+from en4dvar.sampling.emulated_cost import emulate, needed_runs
 from en4dvar.sampling.walkers import advance
 from en4dvar.state import NOISE_SCALE
 

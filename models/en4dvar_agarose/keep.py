@@ -18,9 +18,9 @@ from en4dvar.errors import OutputError
 from en4dvar.inputs.build import data_files, inverse_plan
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.storage.checkpoint import FOLDER, CheckpointError, digest, read_checkpoint, write_checkpoint
-from en4dvar.storage.fingerprint import Identity, identity
-from en4dvar_bubble.study.settings import StudyPlan
-from en4dvar_bubble.study.sweep import prepare_folder
+from en4dvar.storage.files import write_text
+from en4dvar.storage.fingerprint import Identity, identity, source_digest
+from en4dvar_agarose.settings import StudyPlan
 
 D = TypeVar("D")
 IDENTITY = f"{FOLDER}/study"
@@ -71,7 +71,7 @@ class Keep:
 def identity_of(plan: StudyPlan) -> Identity:
     """What decides the numbers of a study: its effort and seed, its configurations, readings, software and sources."""
     settings: dict[str, Any] = {"seed": plan.seed, "sweep": asdict(plan.sweep), "population": asdict(plan.population)}
-    common: dict[str, Any] = {"software": {}, "sources": {}}
+    common: dict[str, Any] = {"software": {}, "sources": {"en4dvar_agarose": source_digest("en4dvar_agarose")}}
     gels: dict[str, dict[str, Any]] = {}
     data: list[tuple[str, str]] = []
     for gel, models in plan.configs.items():
@@ -89,3 +89,30 @@ def identity_of(plan: StudyPlan) -> Identity:
 
 def _file(*words: str) -> str:
     return re.sub(r"[^A-Za-z0-9]+", "_", " ".join(words)).strip("_").lower()
+
+
+def prepare_folder(folder: Path, key: str, mode: str) -> Path:
+    """The folder of a sweep's chunks: ``new`` wants it empty, ``force`` empties it, ``resume`` wants the same ``key``.
+
+    Raises
+    ------
+    OutputError: it holds another sweep, or cannot be written.
+    """
+    mark = folder / "sweep.key"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        stored = mark.read_text(encoding="utf-8") if mark.exists() else ""
+        if mode == "force":
+            for file in (mark, *folder.glob("*.npz")):
+                file.unlink(missing_ok=True)
+            stored = ""
+        if stored and mode == "new":
+            raise OutputError(f"{folder}: holds a sweep; give --resume to continue it or --force to replace it")
+        if stored and stored != key:
+            raise OutputError(f"{folder}: holds the sweep of another configuration; give --force to replace it")
+        for partial in folder.glob(".*.tmp"):  # of a process that was killed
+            partial.unlink()
+        write_text(mark, key)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be used: {error.strerror or error}") from None
+    return folder

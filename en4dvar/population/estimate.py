@@ -1,23 +1,23 @@
-r"""The population behind the data sets: mean and between-bubble spread of each parameter.
+r"""The population behind the data sets: mean and spread between them of each parameter.
 
-    x_i ~ N(ν, diag τ²)   (transformed coordinates: ln G, ln α, ln μ, ln R0),     data_i ~ L_i(x_i)
+    x_i ~ N(ν, diag τ²)   (transformed coordinates, e.g. ln θ),     data_i ~ L_i(x_i)
 
 Stacking the per-set posteriors instead counts the prior once a set and so returns it where single sets are hardly
 informative. Here the prior enters once, as a hyperprior: ν ~ N(prior mean, ``mean_std``²), τ ~ half-normal(``spread``).
-Coordinates that are no property of the population (the time shift) keep their prior.
+Coordinates that are no property of the population (a time shift) keep their prior.
 
-The per-set likelihoods are curved sheets (the elastic stress determines one combination of G, α and R0), which no
-Gaussian describes, so a Gaussian two-stage step goes astray. In stages, each corrected by the next:
+Where the data determine combinations of parameters only, the per-set likelihoods are curved sheets, which no Gaussian
+describes, so that a Gaussian two-stage step goes astray. In stages, each corrected by the next:
 
 1. forward runs of every set around its posterior under a wide interim prior; polynomial emulators on them;
 2. interim posteriors on the emulators, as Gaussian mixtures with the interim prior divided out (Lunn et al. 2013, Stat.
    Med. 32, 4139, reweight the draws themselves, which fails where τ is small); they tell where (ν, τ) are likely, and 1
    and 2 are repeated with the interim prior that this gives: in the tail of a wide one a mixture is poor;
-3. a proposal for (ν, τ) with every x_i integrated out analytically (``study.hyper``);
+3. a proposal for (ν, τ) with every x_i integrated out analytically (:mod:`~en4dvar.population.hyper`);
 4. importance weights of its draws: the marginal likelihood of every set from draws of x_i, with the emulators, then
-   with forward runs (``study.weights``). What is returned is resampled by them. Where they leave few draws, the
-   proposal is fitted to what they say, or the interim prior once more, and all after it is done again; the best is
-   kept.
+   with forward runs (:mod:`~en4dvar.population.weights`). What is returned is resampled by them. Where they leave few
+   draws, the proposal is fitted to what they say, or the interim prior once more, and all after it is done again; the
+   best is kept.
 """
 
 from __future__ import annotations
@@ -29,16 +29,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar.executor import one_blas_thread
+from en4dvar.population.effort import Effort
+from en4dvar.population.hyper import Hyper, HyperPrior, walk
+from en4dvar.population.likelihoods import draw_interim
+from en4dvar.population.marginals import TEMPERATURE, SetPosterior
+from en4dvar.population.mixtures import Mixture, fit_mixtures
+from en4dvar.population.training import Training
+from en4dvar.population.weights import Weighed, normalised, with_emulators, with_runs
 from en4dvar.prior import Prior, member_stream
+from en4dvar.sampling.forward_runs import Runs
+from en4dvar.sampling.mixture import StudentMixture
 from en4dvar.state import Array
-from en4dvar_bubble.study.effort import Effort
-from en4dvar_bubble.study.emulator import draw_interim
-from en4dvar_bubble.study.hyper import Hyper, HyperPrior, Proposal, walk
-from en4dvar_bubble.study.marginals import TEMPERATURE
-from en4dvar_bubble.study.mixture import Mixtures, fit_mixtures
-from en4dvar_bubble.study.set_runs import Runs
-from en4dvar_bubble.study.training import Training
-from en4dvar_bubble.study.weights import Weighed, normalised, with_emulators, with_runs
 
 FEWEST = 100.0  # effective draws of a result that can be trusted
 WIDER = 1.3  # the interim prior than the population found
@@ -82,7 +83,7 @@ class Population:
 
     @property
     def std(self) -> Array:
-        """(M, p) draws of the between-bubble standard deviation, physical."""
+        """(M, p) draws of the standard deviation between the data sets, physical."""
         return self._moments()[1]
 
     def interval(self, level: float = 0.95) -> Array:
@@ -127,82 +128,89 @@ def estimate_population(
     if len(start) < 3:
         raise ValueError("a population needs at least 3 data sets")
     with one_blas_thread():
-        return _Search(runs, start, prior, names, seed, scales, effort, workers).result(names)
+        return _Estimate(runs, start, prior, names, seed, scales, effort, workers).result()
 
 
-class _Search:
+class _Estimate:
     """One estimate; see :func:`estimate_population`."""
 
     def __init__(
         self, runs: Runs, start: Array, prior: Prior, names: Sequence[str], seed: int, scales: HyperPrior,
         effort: Effort, workers: int,
     ):  # fmt: skip
-        self.runs, self.prior, self.seed, self.effort, self.workers = runs, prior, seed, effort, workers
+        self.runs, self.prior, self.names, self.seed = runs, prior, tuple(names), seed
+        self.effort, self.workers = effort, workers
         self.where = [prior.names.index(name) for name in names]
         self.hyper = Hyper(prior, self.where, scales)
-        self.mean, self.std = prior.mean.copy(), prior.std.copy()
+        self.mean, self.std = prior.mean.copy(), prior.std.copy()  # of the interim prior
         self.std[self.where] = math.hypot(scales.mean_std, scales.spread)  # what ν and τ allow
         self.training = Training(runs, start, self.mean, self.std, seed, effort, workers)
         self.tries = 0
 
-    def result(self, names: Sequence[str]) -> Population:
-        self.narrow(self.walked(self.mixtures(draws=30, components=8))[-2000:])
-        forward_runs, passes = 0, list[Population]()
+    def result(self) -> Population:
+        """The best of the passes: with more of them the interim prior comes closer to the population."""
+        self._narrow(self._walked(self._mixtures(draws=30, components=8))[-2000:])
+        found: list[Population] = []
+        forward_runs = 0
         for turn in range(self.effort.passes):
-            self.training.refit(self.mean, self.std, self.effort.refits)
-            mixtures = self.mixtures(draws=60, components=self.effort.components)
-            tempered = self.mixtures(draws=30, components=8, temperature=TEMPERATURE)
-            weighed = self.weighed(mixtures, tempered, self.walked(mixtures))
-            stream = member_stream(self.seed, "forward runs", turn)
-            found, count = with_runs(weighed, self.training.emulators, self.runs, self.effort.exact, stream)
+            population, h, count = self._pass(turn)
+            found.append(population)
             forward_runs += count
-            h, p = found.h[found.resampled(self.effort.draws, stream)], len(self.where)
-            evidence = normalised(weighed.logs)[1] + normalised(found.logs)[1]
-            sizes = weighed.effective, found.effective
-            passes.append(Population(tuple(names), self.prior, h[:, :p], np.exp(h[:, p:]), sizes, evidence, 0))
-            if min(sizes) >= self.effort.effective:
+            if min(population.weighed) >= self.effort.effective:
                 break
-            if passes[-1].size >= FEWEST:  # a few draws would make it too narrow
-                self.narrow(h)
-        best = max(passes, key=lambda found: found.size)
+            if population.size >= FEWEST:  # a few draws would make it too narrow
+                self._narrow(h)
+        best = max(found, key=lambda population: population.size)
         return replace(best, forward_runs=self.training.count + forward_runs)
 
-    def narrow(self, h: Array) -> None:
+    def _pass(self, turn: int) -> tuple[Population, Array, int]:
+        """The population with the interim prior as it is, its draws h (M, 2p), and forward runs made for weights."""
+        self.training.refit(self.mean, self.std, self.effort.refits)
+        likelihoods = self.training.likelihoods
+        mixtures = self._mixtures(draws=60, components=self.effort.components)
+        tempered = self._mixtures(draws=30, components=8, temperature=TEMPERATURE)
+        sets = [SetPosterior(*parts) for parts in zip(likelihoods, mixtures, tempered, strict=True)]
+        emulated = self._weighed(sets, self._walked(mixtures))
+        stream = member_stream(self.seed, "forward runs", turn)
+        exact, count = with_runs(emulated, likelihoods, self.runs, self.effort.exact, stream)
+        h, p = exact.h[exact.resampled(self.effort.draws, stream)], len(self.where)
+        evidence = normalised(emulated.logs)[1] + normalised(exact.logs)[1]
+        sizes = emulated.effective, exact.effective
+        return Population(self.names, self.prior, h[:, :p], np.exp(h[:, p:]), sizes, evidence, 0), h, count
+
+    def _narrow(self, h: Array) -> None:
         """Make the interim prior a little wider than populations (B, 2p)."""
         p = len(self.where)
         self.mean[self.where] = h[:, :p].mean(axis=0)
         self.std[self.where] = WIDER * np.sqrt(h[:, :p].var(axis=0) + np.exp(2 * h[:, p:]).mean(axis=0))
 
-    def mixtures(self, draws: int, components: int, temperature: float = 1.0) -> Mixtures:
+    def _mixtures(self, draws: int, components: int, temperature: float = 1.0) -> list[Mixture]:
         """Of the interim posteriors under the interim prior as it is, to the power 1/temperature."""
         self.tries += 1
-        words, root = f"interim draws {self.tries}", math.sqrt(temperature)
         interim = draw_interim(
-            self.training.emulators, self.mean, self.std, self.seed, words, draws, temperature=temperature,
-            workers=self.workers,
+            self.training.likelihoods, self.mean, self.std, self.seed, f"interim draws {self.tries}", draws,
+            temperature=temperature, workers=self.workers,
         )  # fmt: skip
-        words = f"mixtures {self.tries}"
-        return fit_mixtures(interim, self.mean, root * self.std, self.seed, words, components, workers=self.workers)
+        wide = math.sqrt(temperature) * self.std
+        return fit_mixtures(
+            interim, self.mean, wide, self.seed, f"mixtures {self.tries}", components, workers=self.workers
+        )
 
-    def walked(self, mixtures: Mixtures) -> Array:
+    def _walked(self, mixtures: Sequence[Mixture]) -> Array:
         """Populations (D, 2p) that the mixtures find likely."""
         stream = member_stream(self.seed, "population", self.tries)
         return walk(self.hyper, mixtures, stream, self.effort.hyper_walkers, self.effort.hyper_rounds)
 
-    def weighed(self, mixtures: Mixtures, tempered: Mixtures, h: Array) -> Weighed:
+    def _weighed(self, sets: Sequence[SetPosterior], h: Array) -> Weighed:
         """Draws of a proposal fitted to ``h``, with emulators; where few are left, of one fitted to those."""
-        found = self.proposed(mixtures, tempered, h, 0)
+        found = self._proposed(sets, h, 2 * self.tries)
         if found.effective < self.effort.effective:
             stream = member_stream(self.seed, "second fit", self.tries)
-            found = self.proposed(mixtures, tempered, found.h[found.resampled(len(h), stream)], 1)
+            found = self._proposed(sets, found.h[found.resampled(len(h), stream)], 2 * self.tries + 1)
         return found
 
-    def proposed(self, mixtures: Mixtures, tempered: Mixtures, h: Array, turn: int) -> Weighed:
-        number = 2 * self.tries + turn
+    def _proposed(self, sets: Sequence[SetPosterior], h: Array, turn: int) -> Weighed:
         at = h[np.linspace(0, len(h) - 1, 3000).astype(int)]
-        stream = member_stream(self.seed, "fit of the proposal", number)
-        proposal = Proposal.fitted(at, stream, self.effort.hyper_components)
-        return with_emulators(
-            self.hyper, proposal, self.training.emulators, mixtures, tempered, self.effort.draws, self.seed, number,
-            self.workers,
-        )  # fmt: skip
+        stream = member_stream(self.seed, "fit of the proposal", turn)
+        proposal = StudentMixture.fitted(at, stream, self.effort.hyper_components)
+        return with_emulators(self.hyper, proposal, sets, self.effort.draws, self.seed, turn, self.workers)

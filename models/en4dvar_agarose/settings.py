@@ -14,17 +14,17 @@ from en4dvar.config.schema import Name, QuantityText, Section
 from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.inputs.units import UnitError, parse_quantity
-from en4dvar_bubble.study.effort import Effort
-from en4dvar_bubble.study.paper import Model
-from en4dvar_bubble.study.sweep import SweepSettings
+from en4dvar.population import Effort
+from en4dvar.sampling.sweep import SweepSettings
+from en4dvar_agarose.paper import Model
 
 MODELS: tuple[Model, ...] = ("nh", "qs", "qlkv")
 
 
 class Sweep(Section):
-    """Size of the sweep of each model and gel; see :class:`~en4dvar_bubble.study.sweep.SweepSettings`."""
+    """Size of the sweep of each model and gel; see :class:`~en4dvar.sampling.sweep.SweepSettings`."""
 
-    trajectories: Annotated[int, Field(ge=2, le=10_000_000)] = SweepSettings.trajectories
+    trajectories: Annotated[int, Field(ge=2, le=10_000_000)] = 50_000
     """Size of the design."""
     shift: QuantityText = "0.8 us"
     """Largest time shift."""
@@ -46,7 +46,7 @@ class Sweep(Section):
 
 
 class PopulationSection(Section):
-    """How much the population estimate computes; see :mod:`~en4dvar_bubble.study.population`."""
+    """How much the population estimate computes; see :mod:`en4dvar.population`."""
 
     rounds: Annotated[int, Field(ge=30)] = Effort.rounds
     """Rounds of the walkers over each data set, from which its emulator is learnt."""
@@ -105,7 +105,7 @@ def load_study(path: str | Path, overrides: dict[str, Any] | None = None) -> Stu
     top = check(StudySchema, document.data, (), document, faults)
     if top is None:
         raise ConfigError(faults)
-    sweep = SweepSettings()
+    sweep = None
     try:
         sweep = top.sweep.built()
     except UnitError as error:
@@ -117,7 +117,7 @@ def load_study(path: str | Path, overrides: dict[str, Any] | None = None) -> Stu
     truth = base / top.truth if top.truth else None
     if truth and not truth.is_file():
         faults.append(document.fault(("truth",), f"{truth}: no such file"))
-    if faults:
+    if faults or sweep is None:
         raise ConfigError(faults)
     return StudyPlan(top.name, top.seed, top.synthetic, truth, sweep, top.population.built(), configs, document.text)
 

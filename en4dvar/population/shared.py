@@ -1,4 +1,4 @@
-r"""One gel: material parameters common to all data sets, the others (R0, t_s) of each bubble its own.
+r"""Shared parameters: some have one value in all data sets, the others are each set's own.
 
     J(u, v_1 … v_S) = ½ Σ_i Σ_k β (y − m(u, v_i))²/std² + ½ ‖u‖² + ½ Σ_i ‖v_i‖²
 
@@ -14,27 +14,40 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.prior import Prior
+from en4dvar.sampling.forward_runs import Runs
 from en4dvar.state import Array
-from en4dvar_bubble.study.set_runs import Runs
 
 STEP = 1e-3  # of a prior standard deviation, for the tangent
 SMALL = 1e-3  # decrease of J that ends the search
 SAMPLE = 8  # 2^8 points
+PIECES = 8  # of the sample, run one after the other
 ROUNDS = 3
+DAMPING = 10.0 ** np.arange(-1, 5)  # tried at once, relative to the last
 
 
 @dataclass(frozen=True)
-class OneGel:
-    """``common`` (c,) at the minimum, physical; ``chi2_per_reading``: about 1 where one gel explains all readings."""
+class SharedFit:
+    """``common`` (c,) of ``names`` at the minimum, physical; ``chi2_per_observation``: about 1 where one value of the
+    shared parameters explains all observations.
+    """
 
     names: tuple[str, ...]
     common: Array
     log_evidence: float
-    chi2_per_reading: float
+    chi2_per_observation: float
 
 
-def fit_one_gel(runs: Runs, starts: Array, prior: Prior, names: Sequence[str], most: int = 60) -> OneGel:
-    """Fit ``names`` in common.
+@dataclass(frozen=True)
+class _Minimum:
+    """Where J ends, whitened, J, and its Gauss–Newton Hessian there."""
+
+    z: Array
+    cost: float
+    hessian: Array
+
+
+def fit_shared(runs: Runs, starts: Array, prior: Prior, names: Sequence[str], most: int = 60) -> SharedFit:
+    """Fit ``names`` in common, with at most so many steps of each descent.
 
     Parameters
     ----------
@@ -45,20 +58,18 @@ def fit_one_gel(runs: Runs, starts: Array, prior: Prior, names: Sequence[str], m
     ValueError: the model cannot be run at any start.
     """
     where = [prior.names.index(name) for name in names]
-    problem = _Problem(runs, prior, where, starts.shape[1])
-    ends = [_search(problem, problem.pack(start), most) for start in starts]
-    z, cost, hessian = min(ends, key=lambda end: end[1])
-    if not np.isfinite(cost):
-        raise ValueError("one gel: the model cannot be run at any start")
-    residual = problem.residual(z[None])[0]
-    readings = int(np.sum(runs.weight > 0))
-    common = prior.mean[where] + prior.std[where] * z[: len(where)]
+    problem = _Shared(runs, prior, where, starts.shape[1])
+    best = min((_search(problem, problem.pack(start), most) for start in starts), key=lambda end: end.cost)
+    if not np.isfinite(best.cost):
+        raise ValueError("shared parameters: the model cannot be run at any start")
+    residual = problem.residual(best.z[None])[0]
+    common = prior.mean[where] + prior.std[where] * best.z[: len(where)]
     physical = np.array([prior.terms[j].to_physical(x) for j, x in zip(where, common, strict=True)])
-    evidence = -cost - 0.5 * float(np.linalg.slogdet(hessian)[1])
-    return OneGel(tuple(names), physical, evidence, float(np.sum(residual**2)) / readings)
+    evidence = -best.cost - 0.5 * float(np.linalg.slogdet(best.hessian)[1])
+    return SharedFit(tuple(names), physical, evidence, float(np.sum(residual**2)) / int(np.sum(runs.weight > 0)))
 
 
-class _Problem:
+class _Shared:
     """Whitened coordinates (c + S·b,): the common ones, then each set's own."""
 
     def __init__(self, runs: Runs, prior: Prior, where: list[int], n_sets: int):
@@ -91,11 +102,15 @@ class _Problem:
         from scipy.stats import norm, qmc  # not needed to import the package
 
         c, b = len(self.where), len(self.own)
+        if not b:
+            return z
         sample = norm.ppf(qmc.Sobol(b, rng=0).random_base2(SAMPLE))
         trial = np.tile(z, (1 + len(sample), 1))
         trial[1:, c:] = np.tile(sample, (1, self.n_sets))
         own = trial[:, c:].reshape(len(trial), self.n_sets, b)
-        total = np.concatenate([0.5 * np.sum(self.residual(part) ** 2, axis=2) for part in np.array_split(trial, 8)])
+        total = np.concatenate(
+            [0.5 * np.sum(self.residual(part) ** 2, axis=2) for part in np.array_split(trial, PIECES)]
+        )
         total = np.where(np.isfinite(total), total, np.inf) + 0.5 * np.sum(own**2, axis=2)
         best = own[np.argmin(total, axis=0), np.arange(self.n_sets)]
         return np.concatenate([z[:c], best.ravel()])
@@ -117,29 +132,28 @@ class _Problem:
         return r[0].ravel(), matrix.reshape(-1, len(z))
 
 
-def _search(problem: _Problem, z: Array, most: int) -> tuple[Array, float, Array]:
+def _search(problem: _Shared, z: Array, most: int) -> _Minimum:
     """Minima one after the other, each set's own coordinates looked for anew in between, until that finds nothing.
 
-    With the gel fixed from outside a bubble's own coordinates have several minima, which no descent leaves.
+    With the common coordinates fixed from outside a set's own have several minima, which no descent leaves.
     """
     best = _minimise(problem, problem.renewed(z), most)
     for _ in range(ROUNDS):
-        again = _minimise(problem, problem.renewed(best[0]), most)
-        if not again[1] < best[1] - SMALL:
+        again = _minimise(problem, problem.renewed(best.z), most)
+        if not again.cost < best.cost - SMALL:
             break
         best = again
     return best
 
 
-def _minimise(problem: _Problem, z: Array, most: int) -> tuple[Array, float, Array]:
-    """Where J ends, J, and its Gauss–Newton Hessian there."""
+def _minimise(problem: _Shared, z: Array, most: int) -> _Minimum:
     cost, damping = float(problem.cost(z[None])[0]), 1e-2
     for _ in range(most):
         r, matrix = problem.tangent(z)
         if not (np.isfinite(cost) and np.all(np.isfinite(matrix))):
-            return z, np.inf, np.eye(len(z))
+            return _Minimum(z, np.inf, np.eye(len(z)))
         hessian, slope = np.eye(len(z)) + matrix.T @ matrix, matrix.T @ r - z
-        tries = damping * 10.0 ** np.arange(-1, 5)
+        tries = damping * DAMPING
         trial = np.stack([z + np.linalg.solve(hessian + d * np.diag(np.diag(hessian)), slope) for d in tries])
         costs = problem.cost(trial)
         best = int(np.argmin(costs))
@@ -149,4 +163,4 @@ def _minimise(problem: _Problem, z: Array, most: int) -> tuple[Array, float, Arr
         if decrease <= SMALL:
             break
     _, matrix = problem.tangent(z)
-    return z, cost, np.eye(len(z)) + matrix.T @ matrix
+    return _Minimum(z, cost, np.eye(len(z)) + matrix.T @ matrix)

@@ -14,17 +14,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
+from en4dvar.population.likelihoods import EmulatedLikelihood, log_likelihood
+from en4dvar.population.mixtures import Mixture, condition, draw_conditioned
 from en4dvar.prior import member_stream
 from en4dvar.state import Array
-from en4dvar_bubble.study.emulator import Emulators, log_likelihood
-from en4dvar_bubble.study.mixture import Mixtures, condition, draw_conditioned
 
 DEFENSIVE = 0.1  # share ε of the draws
 TEMPERATURE, TEMPERED = 3.0, 0.3  # of t, and its share of what the mixtures draw
+
+
+class SetPosterior(NamedTuple):
+    """What is known of one data set's likelihood: L̂ on the emulator, and the mixtures m and t. Kernels can read it."""
+
+    likelihood: EmulatedLikelihood
+    mixture: Mixture
+    tempered: Mixture
 
 
 @dataclass(frozen=True)
@@ -40,17 +49,9 @@ class Marginals:
 
 
 def marginals(
-    emulators: Emulators,
-    mixtures: Mixtures,
-    tempered: Mixtures,
-    mean: Array,
-    variance: Array,
-    counts: Sequence[int],
-    picks: int,
-    seed: int,
-    words: str,
-    workers: int = 1,
-) -> Marginals:
+    sets: Sequence[SetPosterior], mean: Array, variance: Array, counts: Sequence[int], picks: int, seed: int,
+    words: str, workers: int = 1,
+) -> Marginals:  # fmt: skip
     """Estimates for populations of ``mean`` and ``variance`` (B, n), from ``counts`` (S,) draws of each set.
 
     ``picks`` of them are chosen by their weights; ``seed`` and ``words`` name the random streams.
@@ -59,46 +60,41 @@ def marginals(
     ------
     ValueError: fewer than two draws.
     """
-    n_sets, _, n = mixtures.linear.shape
-    shape = n_sets, len(mean)
-    logs, relative, x = np.empty(shape), np.empty(shape), np.empty((*shape, picks, n))
-
-    both, split = mixtures.joined(tempered), mixtures.linear.shape[1]
+    shape = len(sets), len(mean)
+    logs, relative, x = np.empty(shape), np.empty(shape), np.empty((*shape, picks, mean.shape[1]))
 
     def one(s: int) -> None:
-        few = max(1, round(DEFENSIVE * counts[s]))
+        few, split = max(1, round(DEFENSIVE * counts[s])), len(sets[s].mixture.constant)
+        both = sets[s].mixture.joined(sets[s].tempered)
         _marginals(
-            member_stream(seed, words, s), both.precision[s], both.linear[s], both.constant[s], split,
-            emulators.centre[s], emulators.whiten[s], emulators.coefficients[s], emulators.parents,
-            emulators.values[s], emulators.weight[s], mean, variance, counts[s], few, logs[s], relative[s], x[s],
+            member_stream(seed, words, s), both, split, sets[s].likelihood, mean, variance, counts[s], few, logs[s],
+            relative[s], x[s],
         )  # fmt: skip
 
     if min(counts) < 2:
         raise ValueError("a marginal needs at least two draws")
     with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(one, range(n_sets)))
+        list(pool.map(one, range(len(sets))))
     return Marginals(logs.T, relative.T, x.transpose(1, 0, 2, 3))
 
 
 @numba.njit(cache=True, nogil=True)
-def _marginals(  # type: ignore[no-untyped-def]
-    rng, precision, linear, constant, split, centre, whiten, coefficients, parents, values, weight, mean, variance,
-    count, few, out, relative, chosen,
-):  # fmt: skip
-    n_parts, n = linear.shape
+def _marginals(rng, both, split, likelihood, mean, variance, count, few, out, relative, chosen):  # type: ignore[no-untyped-def]
+    """One set: the first ``split`` components are its mixture's; ``few`` of ``count`` draws are of the population."""
+    n_parts, n = both.linear.shape
     middle, root = np.empty((n_parts, n)), np.zeros((n_parts, n, n))
     logs, offset = np.empty(n_parts), np.empty(n_parts)
     x, z = np.empty((count, n)), np.empty(n)
     share = few / count
     for b in range(mean.shape[0]):
         for m in range(n_parts):
-            logs[m] = condition(precision[m], linear[m], mean[b], variance[b], middle[m], root[m])
+            logs[m] = condition(both.precision[m], both.linear[m], mean[b], variance[b], middle[m], root[m])
         for begin, end, part in ((0, split, 1 - TEMPERED), (split, n_parts, TEMPERED)):
-            here = logs[begin:end] + constant[begin:end]
+            here = logs[begin:end] + both.constant[begin:end]
             top = here.max()
-            offset[begin:end] = constant[begin:end] + np.log((1 - share) * part / np.exp(here - top).sum()) - top
+            offset[begin:end] = both.constant[begin:end] + np.log((1 - share) * part / np.exp(here - top).sum()) - top
         cumulated = np.cumsum(np.exp(logs + offset))
-        of_draw = np.empty(count)
+        weights = np.empty(count)
         for c in range(count):
             for i in range(n):
                 z[i] = rng.standard_normal()
@@ -108,21 +104,20 @@ def _marginals(  # type: ignore[no-untyped-def]
             else:
                 m = min(np.searchsorted(cumulated, rng.random() * cumulated[-1]), n_parts - 1)
                 draw_conditioned(middle[m], root[m], z, x[c])
-            log_mixture = _log_mixture(x[c], precision, linear, offset)
-            of_draw[c] = log_likelihood(x[c], centre, whiten, coefficients, parents, values, weight)
-            of_draw[c] -= np.log(np.exp(min(log_mixture, 700.0)) + share)
-        top = of_draw.max()
+            log_mixture = _log_mixture(x[c], both.precision, both.linear, offset)
+            weights[c] = log_likelihood(x[c], likelihood) - np.log(np.exp(min(log_mixture, 700.0)) + share)
+        top = weights.max()
         total, squares = 0.0, 0.0
         for c in range(count):
-            of_draw[c] = np.exp(of_draw[c] - top)
-            total += of_draw[c]
-            squares += of_draw[c] ** 2
+            weights[c] = np.exp(weights[c] - top)
+            total += weights[c]
+            squares += weights[c] ** 2
         out[b] = top + np.log(total / count)
         relative[b] = (squares / count / (total / count) ** 2 - 1) * count / (count - 1)
-        of_draw = np.cumsum(of_draw)
+        cumulated_weights = np.cumsum(weights)
         for k in range(chosen.shape[1]):
-            pick = min(np.searchsorted(of_draw, rng.random() * of_draw[-1], side="right"), count - 1)
-            chosen[b, k] = x[pick]
+            at = rng.random() * cumulated_weights[-1]
+            chosen[b, k] = x[min(np.searchsorted(cumulated_weights, at, side="right"), count - 1)]
 
 
 @numba.njit(cache=True, nogil=True)

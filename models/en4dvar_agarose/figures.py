@@ -1,4 +1,4 @@
-"""The figures of the paper that are computed, drawn anew from a :class:`~en4dvar_bubble.study.run.Study`."""
+"""The figures of the paper that are computed, drawn anew from a :class:`~en4dvar_agarose.run.Study`."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, styled
 from en4dvar.state import Array
+from en4dvar_agarose import measured
+from en4dvar_agarose.fits import Fit, Study
+from en4dvar_agarose.paper import NAMES, QUANTITIES, Quantity, Route
 from en4dvar_bubble.model import BubbleModel
-from en4dvar_bubble.study import measured
-from en4dvar_bubble.study.paper import NAMES, QUANTITIES, Quantity, Route
-from en4dvar_bubble.study.run import Fit, Study
 
 # Okabe & Ito; line styles and hatches tell the same, for print without colour
 MODEL_COLOURS = {"nh": "#d55e00", "qs": "#009e73", "qlkv": "#0072b2"}

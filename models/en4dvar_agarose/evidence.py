@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from en4dvar.population import SharedFit
 from en4dvar.state import Array
-from en4dvar_bubble.study.one_gel import OneGel
 
 DECISIVE = 3.0  # |Δ log-evidence|: odds of 20 to 1
 MISFIT = 2.0  # χ² per reading above which a model is not one of those to choose from
@@ -36,10 +36,10 @@ class Comparison:
         return int(np.sum(np.abs(self.single) < DECISIVE))
 
 
-def compare_laws(single: Array, population: float, nh: OneGel, quadratic: OneGel) -> Comparison:
+def compare_laws(single: Array, population: float, nh: SharedFit, quadratic: SharedFit) -> Comparison:
     """From the differences (S,) of the sets' log-evidences, that of the populations, and both fits of one gel."""
     shared = quadratic.log_evidence - nh.log_evidence
-    chi2 = (nh.chi2_per_reading, quadratic.chi2_per_reading)
+    chi2 = (nh.chi2_per_observation, quadratic.chi2_per_observation)
     return Comparison(single, float(single.sum()), population, shared, chi2)
 
 

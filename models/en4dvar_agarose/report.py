@@ -10,15 +10,15 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from en4dvar.errors import OutputError
+from en4dvar.population import HyperPrior
 from en4dvar.report.style import COLUMN, DARK, LIGHT, css_variables, inline_svg, save_figure
 from en4dvar.storage.files import write_bytes, write_text
-from en4dvar_bubble.study import measured, tables
-from en4dvar_bubble.study.evidence import DECISIVE, MISFIT, probability, verdict
-from en4dvar_bubble.study.figures import all_figures
-from en4dvar_bubble.study.hyper import HyperPrior
-from en4dvar_bubble.study.paper import LABELS, NAMES, QUANTITIES, ROUTES, Route
-from en4dvar_bubble.study.run import Study, per_set_csv
-from en4dvar_bubble.study.store import study_netcdf
+from en4dvar_agarose import measured, tables
+from en4dvar_agarose.evidence import DECISIVE, MISFIT, probability, verdict
+from en4dvar_agarose.figures import all_figures
+from en4dvar_agarose.fits import Study
+from en4dvar_agarose.paper import LABELS, NAMES, QUANTITIES, ROUTES, Route
+from en4dvar_agarose.store import study_netcdf
 
 ROUTE_KEYS: tuple[Route, ...] = ("sweep", "en4dvar")
 Block = dict[str, Any]
@@ -36,7 +36,7 @@ def write_study(study: Study, directory: Path) -> Path:
         write_text(directory / f"table{number}.csv", tables.as_csv(study, rows, route))
         write_text(directory / f"table{number}.md", tables.as_markdown(study, rows, route))
         write_text(directory / f"table{number}.tex", tables.as_latex(study, rows, route))
-    write_text(directory / "sets.csv", per_set_csv(study))
+    write_text(directory / "sets.csv", tables.per_set_csv(study))
     write_text(directory / "study.yaml", study.plan.text)
     write_bytes(directory / "study.nc", study_netcdf(study))
     drawn = []
@@ -49,7 +49,7 @@ def write_study(study: Study, directory: Path) -> Path:
 
 def _page(study: Study, drawn: list[tuple[str, str, Markup, bool]]) -> str:
     environment = Environment(
-        loader=PackageLoader("en4dvar_bubble.study", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+        loader=PackageLoader("en4dvar_agarose", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
     plan = study.plan
     sets = sum(len(next(iter(models.values())).problems) for models in study.fits.values())

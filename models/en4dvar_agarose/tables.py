@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar_bubble.study.paper import LABELS, QUANTITIES, ROUTES, TABLES, Model, Quantity, Route
-from en4dvar_bubble.study.run import Study
+from en4dvar_agarose.fits import Study
+from en4dvar_agarose.paper import LABELS, QUANTITIES, ROUTES, TABLES, Model, Quantity, Route
 
 Pair = tuple[float, float]
 TITLES: dict[Route, str] = {
@@ -176,3 +176,25 @@ def spread_notes(study: Study) -> list[str]:
                         f"{ROUTES[route]}, {row.gel}, {LABELS[row.model]}, {cell.quantity.plain}: {ratio:.2g} times"
                     )
     return told
+
+
+def per_set_csv(study: Study) -> str:
+    """One line a gel, model, data set and parameter, in the units of the tables: both routes, truth, fit, DFS."""
+    head = "gel,model,dataset,parameter,unit,sweep,en4dvar_mean,en4dvar_std,q05,q50,q95,dfs,truth"
+    lines = [f"{head},nrmse_sweep,nrmse_en4dvar,log_evidence"]
+    for gel, models in study.fits.items():
+        for model, fit in models.items():
+            scores = {route: fit.nrmse(route) for route in ("sweep", "en4dvar")}
+            for q in QUANTITIES:
+                if not fit.estimated(q.name):
+                    continue
+                j, best = fit.prior.names.index(q.name), fit.values("sweep", q.name)
+                for i, (a, evidence) in enumerate(zip(fit.analyses, fit.log_evidence, strict=True)):
+                    x = q.factor * a.posterior[:, j]
+                    true = study.truth.get(a.name, {}).get(q.name, np.nan) * q.factor
+                    numbers = [best[i] * q.factor, np.nanmean(x), np.nanstd(x, ddof=1)]
+                    numbers += [*np.nanquantile(x, (0.05, 0.5, 0.95)), a.dfs_per_parameter[j], true]
+                    numbers += [scores["sweep"][i], scores["en4dvar"][i], evidence]
+                    values = ",".join(f"{v:.6g}" for v in numbers)
+                    lines.append(f"{gel},{model},{a.name},{q.name},{q.unit},{values}")
+    return "\n".join(lines) + "\n"

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from en4dvar.population import Population
 from en4dvar.state import Parameter
 from en4dvar.storage.netcdf import Group, Variable, to_bytes
-from en4dvar_bubble.study.population import Population
-from en4dvar_bubble.study.run import Fit, Study
+from en4dvar_agarose.fits import Fit, Study
 
 
 def study_netcdf(study: Study) -> bytes:

@@ -1,6 +1,6 @@
 r"""Mean ν and spread τ of a population: what the sets' mixtures say of them, and draws for importance sampling.
 
-h = (ν, ln τ). Walkers on the density with all bubbles integrated out over their mixtures find where it is; a mixture of
+h = (ν, ln τ). Walkers on the density with all sets integrated out over their mixtures find where it is; a mixture of
 Student t distributions fitted to them is the proposal q, from which draws are independent (adaptive importance
 sampling: Cappé et al. 2008, Stat. Comput. 18, 447). A walker left behind in a secondary mode moves q a little; the
 weights know what it is worth.
@@ -9,18 +9,18 @@ weights know what it is worth.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from en4dvar.population.mixtures import Mixture, log_marginal
 from en4dvar.prior import Prior
 from en4dvar.sampling.walkers import advance
 from en4dvar.state import Array
-from en4dvar_bubble.study.mixture import Mixtures, fit_gaussians
 
 SPREADS = (1e-3, 10.0)  # of τ; smaller ones are indistinguishable, and lost to rounding in the marginals
 MOVES = 5  # of one half of the walkers while the other stands still
-DEGREES = 5.0  # of freedom of the proposal: heavier tails than any part of the density has
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,7 @@ class Hyper:
 
     def __init__(self, prior: Prior, where: list[int], scales: HyperPrior):
         self.prior, self.where, self.scales = prior, where, scales
-        self.start = prior.mean[where]
-        p = len(where)
+        self.start, p = prior.mean[where], len(where)
         self.constant = -p * (0.5 * math.log(2 * math.pi) + math.log(scales.mean_std))
         self.constant += p * (0.5 * math.log(2 / math.pi) - math.log(scales.spread))
 
@@ -64,13 +63,13 @@ class Hyper:
         return np.hstack([nu, math.log(0.6 * self.scales.spread) + 0.5 * stream.standard_normal((count, p))])
 
 
-def walk(hyper: Hyper, mixtures: Mixtures, stream: np.random.Generator, walkers: int, rounds: int) -> Array:
+def walk(hyper: Hyper, mixtures: Sequence[Mixture], stream: np.random.Generator, walkers: int, rounds: int) -> Array:
     """(D, 2p) positions of walkers on p(h | mixtures), the first third left out."""
 
     def cost(h: Array) -> Array:
         logs = hyper.log_density(h)
         inside = np.isfinite(logs)
-        logs[inside] += mixtures.log_marginal(*hyper.population(h[inside]))
+        logs[inside] += log_marginal(mixtures, *hyper.population(h[inside]))
         return np.where(np.isnan(logs), np.inf, -logs)
 
     halves = list(hyper.scattered(walkers, stream).reshape(2, walkers // 2, -1))
@@ -82,34 +81,3 @@ def walk(hyper: Hyper, mixtures: Mixtures, stream: np.random.Generator, walkers:
         if number >= rounds // 3:
             kept += halves
     return np.concatenate(kept)
-
-
-@dataclass(frozen=True)
-class Proposal:
-    """Σ_m share_m t(h; centre_m, root_m root_mᵀ) with :data:`DEGREES` of freedom, in d dimensions."""
-
-    share: Array
-    centre: Array
-    root: Array
-
-    @classmethod
-    def fitted(cls, draws: Array, stream: np.random.Generator, components: int) -> Proposal:
-        """To draws (D, d)."""
-        share, centre, covariance = fit_gaussians(draws, stream, components, rounds=40)
-        return cls(share, centre, np.asarray(np.linalg.cholesky(covariance), dtype=float))
-
-    def draw(self, count: int, stream: np.random.Generator) -> Array:
-        """(count, d)."""
-        part = np.searchsorted(np.cumsum(self.share), stream.uniform(size=count)).clip(max=len(self.share) - 1)
-        normal = stream.standard_normal((count, self.centre.shape[1]))
-        scale = np.sqrt(DEGREES / stream.chisquare(DEGREES, count))
-        return np.asarray(self.centre[part] + np.einsum("bij,bj->bi", self.root[part], normal * scale[:, None]))
-
-    def log_density(self, h: Array) -> Array:
-        """(B,) at points (B, d)."""
-        d = h.shape[1]
-        z = np.linalg.solve(self.root, (h - self.centre[:, None]).transpose(0, 2, 1))
-        logs = -0.5 * (DEGREES + d) * np.log1p(np.sum(z**2, axis=1) / DEGREES)
-        logs += (np.log(self.share) - np.log(np.einsum("mii->mi", self.root)).sum(axis=1))[:, None]
-        constant = math.lgamma((DEGREES + d) / 2) - math.lgamma(DEGREES / 2) - d / 2 * math.log(DEGREES * math.pi)
-        return np.asarray(np.logaddexp.reduce(logs, axis=0) + constant)

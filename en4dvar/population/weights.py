@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.population.hyper import Hyper
+from en4dvar.population.likelihoods import EmulatedLikelihood
+from en4dvar.population.marginals import Marginals, SetPosterior, marginals
+from en4dvar.population.mixtures import log_marginal
 from en4dvar.prior import member_stream
+from en4dvar.sampling.forward_runs import Runs, log_likelihood
+from en4dvar.sampling.mixture import StudentMixture, resampled
 from en4dvar.state import Array
-from en4dvar_bubble.study.emulator import Emulators
-from en4dvar_bubble.study.hyper import Hyper, Proposal
-from en4dvar_bubble.study.marginals import Marginals, marginals
-from en4dvar_bubble.study.mixture import Mixtures
-from en4dvar_bubble.study.set_runs import Runs, log_likelihood
 
 NOISE = 0.4  # variance of a log-weight that estimates of the marginals may add
 FEWEST, MOST = 8, 1000  # draws of one marginal
@@ -38,11 +40,8 @@ class Weighed:
         return float(1 / np.sum(weights**2))
 
     def resampled(self, count: int, stream: np.random.Generator) -> npt.NDArray[np.intp]:
-        """(count,) indices, each as often as its weight says (systematic resampling)."""
-        where = np.searchsorted(
-            np.cumsum(normalised(self.logs)[0]), (np.arange(count) + stream.uniform()) / count, side="right"
-        )
-        return where.clip(max=len(self.h) - 1)
+        """(count,) indices of draws, each as often as its weight says."""
+        return resampled(normalised(self.logs)[0], count, stream)
 
 
 def normalised(logs: Array) -> tuple[Array, float]:
@@ -60,29 +59,26 @@ def normalised(logs: Array) -> tuple[Array, float]:
 
 
 def with_emulators(
-    hyper: Hyper, proposal: Proposal, emulators: Emulators, mixtures: Mixtures, tempered: Mixtures, count: int,
-    seed: int, round_: int, workers: int,
-) -> Weighed:  # fmt: skip
+    hyper: Hyper, proposal: StudentMixture, sets: Sequence[SetPosterior], count: int, seed: int, turn: int, workers: int
+) -> Weighed:
     """``count`` draws of the proposal with the weights p(h) Π_i p_i(h) / q(h) (Tran et al. 2013, "IS²").
 
     Each marginal p_i is estimated without bias, so that the weights are right whatever the numbers of draws; these are
     such that estimates add a variance of :data:`NOISE` to a log-weight.
     """
-    h = proposal.draw(count, member_stream(seed, "proposal", round_))
+    h = proposal.draw(count, member_stream(seed, "proposal", turn))
     logs = hyper.log_density(h) - proposal.log_density(h)
     inside = np.flatnonzero(np.isfinite(logs))
     mean, variance = hyper.population(h[inside])
-    likely = normalised(logs[inside] + mixtures.log_marginal(mean, variance))[0]
-    pilot = member_stream(seed, "pilot", round_).choice(len(inside), PILOT, p=likely)
+    likely = normalised(logs[inside] + log_marginal([one.mixture for one in sets], mean, variance))[0]
+    pilot = member_stream(seed, "pilot", turn).choice(len(inside), PILOT, p=likely)
 
-    def told(rows: npt.NDArray[np.intp] | slice, counts: list[int], words: str) -> Marginals:
-        words = f"{words} {round_}"
-        return marginals(emulators, mixtures, tempered, mean[rows], variance[rows], counts, PICKS, seed, words, workers)
+    def estimated(rows: npt.NDArray[np.intp] | slice, counts: list[int], words: str) -> Marginals:
+        return marginals(sets, mean[rows], variance[rows], counts, PICKS, seed, f"{words} {turn}", workers)
 
-    n_sets = len(emulators.centre)
-    root = np.sqrt(told(pilot, [TRIAL] * n_sets, "trial marginals").variance.mean(axis=0))
+    root = np.sqrt(estimated(pilot, [TRIAL] * len(sets), "trial marginals").variance.mean(axis=0))
     counts = np.clip(root * root.sum() / NOISE, FEWEST, MOST).astype(int).tolist()
-    found = told(slice(None), counts, "marginals")
+    found = estimated(slice(None), counts, "marginals")
     logs[inside] += found.logs.sum(axis=1)
     x = np.empty((len(h), *found.x.shape[1:]))
     x[inside] = found.x
@@ -90,7 +86,7 @@ def with_emulators(
 
 
 def with_runs(
-    weighed: Weighed, emulators: Emulators, runs: Runs, count: int, stream: np.random.Generator
+    weighed: Weighed, likelihoods: Sequence[EmulatedLikelihood], runs: Runs, count: int, stream: np.random.Generator
 ) -> tuple[Weighed, int]:
     """``count`` draws, as often as their weights say, weighed by Π_i of the mean L_i/L̂_i over draws of x_i; runs made.
 
@@ -106,7 +102,7 @@ def with_runs(
         for k in range(PICKS):
             sets = np.flatnonzero((done <= k) & (wanted > k))
             if len(sets):
-                ratio[:, sets, k] = _errors(runs, emulators, x[:, sets, k], sets)
+                ratio[:, sets, k] = _errors(runs, likelihoods, x[:, sets, k], sets)
         done = wanted.copy()
         errors = _relative_variance(ratio) / done
         while errors.sum() > NOISE:
@@ -119,11 +115,12 @@ def with_runs(
     return Weighed(weighed.h[kept], logs.sum(axis=1), x), count * int(done.sum())
 
 
-def _errors(runs: Runs, emulators: Emulators, x: Array, sets: npt.NDArray[np.intp]) -> Array:
+def _errors(runs: Runs, likelihoods: Sequence[EmulatedLikelihood], x: Array, sets: npt.NDArray[np.intp]) -> Array:
     """ln L/L̂ (B, s) of coordinates (B, s, n) of ``sets``."""
     parts = [x[i : i + BATCH] for i in range(0, len(x), BATCH)]
     exact = np.concatenate([log_likelihood(runs, runs.predictions(part, sets), sets) for part in parts])
-    return np.asarray(exact - emulators.log_likelihood(x, sets))
+    emulated = np.stack([likelihoods[s].log(x[:, i]) for i, s in enumerate(sets)], axis=1)
+    return np.asarray(exact - emulated)
 
 
 def _relative_variance(logs: Array) -> Array:

@@ -6,7 +6,7 @@ import csv
 import io
 
 from en4dvar.inputs.units import convert
-from en4dvar_bubble.study.sweep import SweepResult
+from en4dvar.sampling.sweep import SweepResult
 
 
 def sweep_csv(result: SweepResult) -> str:

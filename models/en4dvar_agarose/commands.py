@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import sys
 from pathlib import Path
@@ -45,12 +44,15 @@ def sweep(
     import hashlib
 
     from en4dvar.config import load_config
+    from en4dvar.executor import available_cores, make_executor
     from en4dvar.inputs.build import build
     from en4dvar.inputs.units import UnitError, parse_quantity
     from en4dvar.runs.interrupt import tell_interrupt
+    from en4dvar.sampling.sweep import SweepSettings, refinement_size, run_sweep
     from en4dvar.storage.files import write_text
-    from en4dvar_bubble.study.summary import sweep_csv, sweep_text
-    from en4dvar_bubble.study.sweep import SweepSettings, prepare_folder, refinement_size, run_sweep
+    from en4dvar_agarose.keep import prepare_folder
+    from en4dvar_agarose.run import earliest_reading, one_model
+    from en4dvar_agarose.summary import sweep_csv, sweep_text
 
     if force and resume:
         raise click.UsageError("--force and --resume exclude each other")
@@ -61,7 +63,7 @@ def sweep(
         raise click.UsageError(str(error)) from None
     if within < 0 or grid <= 0 or not width > 0:
         raise click.UsageError("--shift must not be negative, --step and --width must be positive")
-    problems = [problem for config in loaded for problem in build(config)]
+    problems = one_model([problem for config in loaded for problem in build(config)])
     chosen = SweepSettings(trajectories, within, grid, width, rounds=refine)
     folder = out or Path("runs") / f"{loaded[0].name}_sweep"
     readings = b"".join(p.observations.times.tobytes() + p.observations.values.tobytes() for p in problems)
@@ -70,8 +72,10 @@ def sweep(
     with (
         tell_interrupt(lambda: _to_continue(f"finished chunks are kept in {chunks}")),
         _bar(trajectories + refinement_size(chosen, len(problems))) as progress,
+        make_executor(problems[0].model, workers or available_cores()) as executor,
     ):
-        result = run_sweep(problems, chosen, loaded[0].seed, workers or _cores(), chunks, progress)
+        earliest = earliest_reading(problems[0].model)
+        result = run_sweep(problems, chosen, loaded[0].seed, executor, chunks, progress, earliest)
     write_text(folder / "sweep.csv", sweep_csv(result))
     click.echo(sweep_text(result))
     click.echo(f"best fits: {folder / 'sweep.csv'}")
@@ -95,12 +99,13 @@ def study(
     Example:
       en4dvar study configs/agarose_study.yaml
     """
+    from en4dvar.executor import available_cores
     from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
     from en4dvar.runs.rundir import RunDirectory
-    from en4dvar_bubble.study.keep import Keep
-    from en4dvar_bubble.study.report import write_study
-    from en4dvar_bubble.study.run import run_study
-    from en4dvar_bubble.study.settings import load_study
+    from en4dvar_agarose.keep import Keep
+    from en4dvar_agarose.report import write_study
+    from en4dvar_agarose.run import run_study
+    from en4dvar_agarose.settings import load_study
 
     if force and resume:
         raise click.UsageError("--force and --resume exclude each other")
@@ -112,7 +117,7 @@ def study(
         tell_interrupt(lambda: _to_continue(f"finished parts are kept in {folder}")),
     ):
         keep = Keep.open(directory, plan)
-        result = run_study(plan, workers or _cores(), lambda message: click.echo(message, err=True), keep)
+        result = run_study(plan, workers or available_cores(), lambda message: click.echo(message, err=True), keep)
         page = write_study(result, directory.work)
         files = (p for p in directory.work.rglob("*") if p.is_file() and not p.name.startswith("."))
         directory.claim(*sorted(p.relative_to(directory.work).as_posix() for p in files))
@@ -135,10 +140,6 @@ def _overrides(settings: tuple[str, ...], data: str | None) -> dict[str, Any]:
             raise click.BadParameter(f"{item!r} is not KEY=VALUE", param_hint="--set")
         overrides[key.strip()] = value
     return overrides | ({"data.path": [str(Path(data).absolute())]} if data else {})
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _bar(total: int) -> Any:
