@@ -7,9 +7,9 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 
 from en4dvar.prior import Prior, PriorTerm
+from en4dvar.sampling import evidence as evidence_module
+from en4dvar.sampling.evidence import DRAWS, ENOUGH, MOST_ROUNDS, sampled_evidence
 from en4dvar.state import Parameter
-from en4dvar_bubble.study import set_evidence as evidence_module
-from en4dvar_bubble.study.set_evidence import DRAWS, ENOUGH, MOST_ROUNDS, set_evidence
 
 
 def prior_of(mean, std):
@@ -39,7 +39,7 @@ class Linear(Runs):
         return x @ self.H[s].T
 
     def exact(self, mean, std):
-        """ln p(y) of every set, as set_evidence counts it."""
+        """ln p(y) of every set, as sampled_evidence counts it."""
         covariances = self.H @ np.diag(std**2) @ self.H.transpose(0, 2, 1) + 0.09 * np.eye(5)
         densities = [multivariate_normal(h @ mean, c) for h, c in zip(self.H, covariances, strict=True)]
         logs = [density.logpdf(y) for density, y in zip(densities, self.values, strict=True)]
@@ -64,11 +64,11 @@ class Spiked(Runs):
 
 def test_linear_sets_weak_and_sharp():
     runs, mean, std = Linear(), np.array([0.5, -0.5, 0.2, 0.0]), np.array([0.8, 1.2, 0.9, 0.3])
-    found = set_evidence(runs, prior_of(mean, std), seed=1)
+    found = sampled_evidence(runs, prior_of(mean, std), seed=1)
     assert found.log == pytest.approx(runs.exact(mean, std), abs=0.25)
     assert np.all(found.effective >= ENOUGH)
     assert runs.count[0] < runs.count[-1] <= MOST_ROUNDS * DRAWS  # the weak one was done sooner
-    again = set_evidence(Linear(), prior_of(mean, std), seed=1)
+    again = sampled_evidence(Linear(), prior_of(mean, std), seed=1)
     assert np.array_equal(found.log, again.log)
 
 
@@ -77,10 +77,10 @@ def test_too_few_effective_draws_are_drawn_again(monkeypatch):
     monkeypatch.setattr(evidence_module, "DRAWS", 120)
     mean, std = np.zeros(4), np.ones(4)
     monkeypatch.setattr(evidence_module, "TOO_FEW", 0.0)
-    once = set_evidence(Linear(), prior_of(mean, std), seed=1)
+    once = sampled_evidence(Linear(), prior_of(mean, std), seed=1)
     monkeypatch.setattr(evidence_module, "TOO_FEW", 100.0)
     runs = Linear()
-    found = set_evidence(runs, prior_of(mean, std), seed=1)
+    found = sampled_evidence(runs, prior_of(mean, std), seed=1)
     again = once.effective < 100
     assert 0 < again.sum() < 6
     assert np.array_equal(runs.count > 8 * 120, again)
@@ -93,7 +93,7 @@ def test_too_few_effective_draws_are_drawn_again(monkeypatch):
 
 def test_the_wide_mode_counts_not_the_lowest_spike():
     runs, prior = Spiked(), prior_of([0.0, 0.0], [1.0, 1.0])
-    found = [float(set_evidence(runs, prior, seed).log[0]) for seed in range(5)]
+    found = [float(sampled_evidence(runs, prior, seed).log[0]) for seed in range(5)]
     assert found == pytest.approx([np.log(runs.exact())] * 5, abs=0.2)
     laplace = np.log(2 * np.pi * 0.01**2) + norm.logpdf(1.0) * 2  # at the lowest J
     assert laplace < min(found) - 5
@@ -104,7 +104,7 @@ def test_a_set_that_cannot_be_run_has_no_evidence():
         def model(self, x, s):
             return np.where(s == 2, np.nan, super().model(x, s))
 
-    found = set_evidence(Lost(), prior_of(np.zeros(4), np.ones(4)), seed=1)
+    found = sampled_evidence(Lost(), prior_of(np.zeros(4), np.ones(4)), seed=1)
     assert found.log[2] == -np.inf
     assert found.effective[2] == 0
     assert np.isfinite(np.delete(found.log, 2)).all()

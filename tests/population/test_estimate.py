@@ -12,18 +12,16 @@ from scipy.stats import halfnorm, multivariate_normal, norm
 from en4dvar.config import load_config
 from en4dvar.ensemble.forecast import cost
 from en4dvar.errors import ConfigError
+from en4dvar.executor import ThreadsExecutor
 from en4dvar.inputs.build import build
+from en4dvar.population import Effort, HyperPrior, estimate_population
+from en4dvar.population.likelihoods import draw_interim, fit_likelihood
+from en4dvar.population.marginals import DEFENSIVE, SetPosterior, marginals
+from en4dvar.population.mixtures import Mixture, fit_mixtures, log_marginal
+from en4dvar.population.training import Training
 from en4dvar.prior import Prior, PriorTerm, member_stream
+from en4dvar.sampling.forward_runs import ForwardRuns, log_likelihood
 from en4dvar.state import Parameter
-from en4dvar_bubble.study.effort import Effort
-from en4dvar_bubble.study.emulator import design_matrix, draw_interim, fit_emulators, monomials
-from en4dvar_bubble.study.gaussian import divide_out
-from en4dvar_bubble.study.hyper import HyperPrior, Proposal
-from en4dvar_bubble.study.marginals import DEFENSIVE, marginals
-from en4dvar_bubble.study.mixture import Mixtures, fit_mixtures
-from en4dvar_bubble.study.population import estimate_population
-from en4dvar_bubble.study.set_runs import SetRuns, log_likelihood
-from en4dvar_bubble.study.training import Training
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SMALL = Effort(rounds=80, refits=2, components=8, hyper_walkers=32, draws=1500, exact=600)
@@ -160,11 +158,11 @@ def test_ensembles_in_a_minimum_that_is_not_the_lowest_are_left():
     assert training.count == 3 * 81 * 16 + 2 * (512 + 80 * 16)
 
 
-def test_monomials_are_all_of_them():
-    parents = monomials(3, 4)
-    assert len(parents) == 35  # (3 + 4)! / (3! 4!)
-    z = np.random.default_rng(0).standard_normal((60, 3))
-    assert np.linalg.matrix_rank(design_matrix(z, parents)) == 35
+def fitted(x, predictions, values, weight, degree, must=0):
+    """One emulated likelihood a set, every run counting by its likelihood alone."""
+    log_prior = np.zeros(x.shape[1])
+    parts = zip(x, predictions, values, weight, strict=True)
+    return [fit_likelihood(at, m, log_prior, y, w, at, degree, must) for at, m, y, w in parts]
 
 
 def test_emulators_return_polynomials_as_they_are():
@@ -172,12 +170,12 @@ def test_emulators_return_polynomials_as_they_are():
     n_sets = len(runs.truth)
     x = runs.truth[:, None] + 0.4 * rng.standard_normal((n_sets, 300, 2))
     seen = runs.predictions(x.transpose(1, 0, 2)).transpose(1, 0, 2)
-    emulators = fit_emulators(x, seen, np.zeros(x.shape[:2]), runs.values, runs.weight, x, degree=2)
     other = runs.truth + 0.7 * rng.standard_normal((50, n_sets, 2))
     exact = log_likelihood(runs, runs.predictions(other))
-    np.testing.assert_allclose(emulators.log_likelihood(other), exact, rtol=1e-7, atol=1e-7)
+    for s, likelihood in enumerate(fitted(x, seen, runs.values, runs.weight, degree=2)):
+        np.testing.assert_allclose(likelihood.log(other[:, s]), exact[:, s], rtol=1e-7, atol=1e-7)
     with pytest.raises(ValueError, match="monomials"):
-        fit_emulators(x[:, :5], seen[:, :5], np.zeros((n_sets, 5)), runs.values, runs.weight, x, degree=4)
+        fit_likelihood(x[0, :5], seen[0, :5], np.zeros(5), runs.values[0], runs.weight[0], x[0], degree=4)
 
 
 def test_what_an_emulator_misses_widens_its_likelihood():
@@ -185,13 +183,12 @@ def test_what_an_emulator_misses_widens_its_likelihood():
     line = np.linspace(-1, 1, 101)
     x = np.stack(np.meshgrid(line, line), axis=-1).reshape(1, -1, 2)
     seen = np.stack([0.3 * x[..., 0], x[..., 0] ** 2], axis=2)
-    log_prior = np.zeros(x.shape[:2])
     # log-likelihoods all but equal, so that every point counts the same
-    emulators = fit_emulators(x, seen, log_prior, np.zeros((1, 2)), np.full((1, 2), 1e-4), x, degree=1)
-    error = 1 / emulators.weight[0] - 1e4
+    (likelihood,) = fitted(x, seen, np.zeros((1, 2)), np.full((1, 2), 1e-4), degree=1)
+    error = 1 / likelihood.weight - 1e4
     np.testing.assert_allclose(error, [0, np.var(line**2)], atol=1e-3)
     at = np.array([1.0, 3.4, 4.6])
-    told = emulators.log_likelihood(np.stack([at, 0 * at], axis=1)[:, None])[:, 0]
+    told = likelihood.log(np.stack([at, 0 * at], axis=1))
     np.testing.assert_allclose(told[:2], 0, atol=1e-3)  # 3.4 is 5.9 standard deviations of the points
     assert told[2] == pytest.approx(-10 * (4.6 / (2 * line.std()) - 3) ** 2, rel=0.01)
 
@@ -200,7 +197,7 @@ def test_interim_draws_have_the_moments_of_quadrature():
     runs, rng = Curved(n_sets=3), np.random.default_rng(2)
     x = runs.truth[:, None] + 0.6 * rng.standard_normal((3, 600, 2))
     seen = runs.predictions(x.transpose(1, 0, 2)).transpose(1, 0, 2)
-    emulators = fit_emulators(x, seen, np.zeros(x.shape[:2]), runs.values, runs.weight, x, degree=2)
+    emulators = fitted(x, seen, runs.values, runs.weight, degree=2)
     mean, std = np.zeros(2), np.array([0.9, 0.7])
     draws = draw_interim(emulators, mean, std, 4, "x", count=400)
     a, b = np.meshgrid(np.linspace(-4, 4, 801), np.linspace(-3, 3, 601), indexing="ij")
@@ -246,7 +243,7 @@ class LinearSets:
         """Exact ones, trusted everywhere that counts."""
         x = 2 * self.rng.standard_normal((4, 200, 2))
         seen, weight = np.einsum("skj,sbj->sbk", self.H, x), np.full((4, 5), self.std**-2.0)
-        return fit_emulators(x, seen, np.zeros((4, 200)), self.y, weight, x, degree=1, visited=200)
+        return fitted(x, seen, self.y, weight, degree=1, must=200)
 
 
 def test_a_gaussian_likelihood_has_the_marginal_of_a_gaussian():
@@ -258,7 +255,7 @@ def test_a_gaussian_likelihood_has_the_marginal_of_a_gaussian():
     )
     mixtures = fit_mixtures(draws, mean, wide, 5, "mixtures", components=1)
     exact = [case.log_marginals(b).sum() for b in (0, 1)]
-    told = mixtures.log_marginal(case.nu, case.variance)
+    told = log_marginal(mixtures, case.nu, case.variance)
     assert told[1] - told[0] == pytest.approx(exact[1] - exact[0], abs=0.1)
 
 
@@ -268,12 +265,14 @@ def test_marginals_are_unbiased_and_their_draws_the_posterior_however_bad_the_mi
     case, count, repeats = LinearSets(), 60, 4000
     centre, covariance = case.interim(np.zeros(2), np.full(2, 1.2))
     centre = centre + shift * np.sqrt(np.einsum("sii->si", covariance))
-    found = divide_out(("", ""), centre, shrink**2 * covariance, np.zeros(4), np.zeros(2), np.full(2, 1.2))
-    mixtures = Mixtures(found.precision[:, None], found.linear[:, None], found.constant[:, None])
-    emulators = case.emulators()
+    mixtures = [
+        Mixture.divided(centre[[s]], shrink**2 * covariance[[s]], np.zeros(1), np.zeros(2), np.full(2, 1.2))
+        for s in range(4)
+    ]
+    sets = [SetPosterior(*parts) for parts in zip(case.emulators(), mixtures, mixtures, strict=True)]
     for b in (0, 1):
         mean, variance = np.tile(case.nu[b], (repeats, 1)), np.tile(case.variance[b], (repeats, 1))
-        told = marginals(emulators, mixtures, mixtures, mean, variance, [count] * 4, 1, 7, f"x{b}", workers=2)
+        told = marginals(sets, mean, variance, [count] * 4, 1, 7, f"x{b}", workers=2)
         ratio = np.exp(told.logs - case.log_marginals(b))
         variance_of = ratio.var(axis=0)
         np.testing.assert_array_less(np.abs(ratio.mean(axis=0) - 1), 4 * np.sqrt(variance_of / repeats) + 1e-6)
@@ -289,20 +288,6 @@ def test_marginals_are_unbiased_and_their_draws_the_posterior_however_bad_the_mi
             np.testing.assert_allclose(weights @ (x - middle) ** 2, np.diag(cov), rtol=0.15)
 
 
-def test_a_proposal_is_normalised_and_as_heavy_as_it_says():
-    rng = np.random.default_rng(3)
-    draws = np.concatenate([rng.standard_normal((3000, 3)), 4 + 0.3 * rng.standard_normal((1000, 3))])
-    proposal = Proposal.fitted(draws, rng, components=2)
-    h = proposal.draw(50_000, rng)
-    wide = multivariate_normal(np.ones(3), 9 * np.eye(3))
-    x = wide.rvs(50_000, random_state=rng)
-    assert np.mean(np.exp(proposal.log_density(x) - wide.logpdf(x))) == pytest.approx(1, abs=0.05)
-    weights = np.exp(multivariate_normal(np.zeros(3), np.eye(3)).logpdf(h) - proposal.log_density(h))
-    assert weights.mean() == pytest.approx(1, abs=0.02)
-    np.testing.assert_allclose(weights @ h**2 / weights.sum(), 1, atol=0.05)
-    assert weights.max() < 10
-
-
 def test_prior_divided_out_is_the_likelihood():
     rng = np.random.default_rng(0)
     H, y = rng.standard_normal((4, 3)), rng.standard_normal(4)
@@ -310,7 +295,7 @@ def test_prior_divided_out_is_the_likelihood():
     cov = np.linalg.inv(np.diag(std**-2.0) + H.T @ H / 0.09)
     middle = cov @ (mean / std**2 + H.T @ y / 0.09)
     evidence = multivariate_normal(H @ mean, H @ np.diag(std**2) @ H.T + 0.09 * np.eye(4)).logpdf(y)
-    found = divide_out(("a", "b", "c"), middle[None], cov[None], np.array([evidence]), mean, std)
+    found = Mixture.divided(middle[None], cov[None], np.array([evidence]), mean, std)
     x = mean + 0.4
     told = found.constant[0] + found.linear[0] @ x - 0.5 * x @ found.precision[0] @ x
     assert told == pytest.approx(multivariate_normal(H @ x, 0.09 * np.eye(4)).logpdf(y), abs=1e-9)
@@ -320,8 +305,9 @@ def test_runs_of_all_sets_are_those_of_each():
     problems = build(load_config(CONFIGS / "agarose_03_qlkv.yaml"))[:3]
     prior = problems[0].prior
     x = prior.mean + 0.3 * prior.std * member_stream(1, "x").standard_normal((4, 3, len(prior.names)))
-    runs = SetRuns(problems, workers=2)
-    told = log_likelihood(runs, runs.predictions(x))
+    with ThreadsExecutor(2) as executor:
+        runs = ForwardRuns(problems, executor)
+        told = log_likelihood(runs, runs.predictions(x))
     for s, problem in enumerate(problems):
         z = (x[:, s] - prior.mean) / prior.std
         np.testing.assert_allclose(-told[:, s], cost(problem, x[:, s]) - 0.5 * np.sum(z**2, axis=1), rtol=1e-6)
@@ -330,4 +316,4 @@ def test_runs_of_all_sets_are_those_of_each():
 def test_errors_that_a_population_cannot_take():
     config = load_config(CONFIGS / "agarose_03_qlkv.yaml", {"data.error.time_std": "0.2 us"})
     with pytest.raises(ConfigError, match="independent Gaussian errors"):
-        SetRuns(build(config))
+        ForwardRuns(build(config))

@@ -1,4 +1,4 @@
-"""One gel: all data sets of one material, fitted together, and where no single gel fits."""
+"""Shared parameters: all data sets of one gel fitted together, and where no single gel fits."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from scipy.stats import multivariate_normal
 from en4dvar.config import load_config
 from en4dvar.inputs.build import build
 from en4dvar.observations import Observations
+from en4dvar.population import fit_shared
 from en4dvar.prior import Prior, PriorTerm, member_stream
+from en4dvar.sampling.forward_runs import ForwardRuns
 from en4dvar.state import Parameter
-from en4dvar_bubble.study.one_gel import fit_one_gel
-from en4dvar_bubble.study.set_runs import SetRuns
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
@@ -41,7 +41,7 @@ def test_linear_case_is_the_evidence_of_all_data_at_once():
     terms = [PriorTerm(p, "normal", m, s) for p, m, s in zip(parameters, mean, std, strict=True)]
     prior = Prior(tuple(terms))
     n_sets, k = runs.values.shape
-    found = fit_one_gel(runs, np.tile(mean, (2, n_sets, 1)), prior, ["a", "b"])
+    found = fit_shared(runs, np.tile(mean, (2, n_sets, 1)), prior, ["a", "b"])
     covariance = 0.09 * np.eye(n_sets * k)
     common = runs.H[:, :, :2].reshape(-1, 2)
     covariance += common @ np.diag(std[:2] ** 2) @ common.T
@@ -57,15 +57,15 @@ def test_bubbles_of_one_gel_are_recognised_and_those_of_several_are_not():
     prior, stream = base[0].prior, member_stream(3, "one gel")
     truth = np.tile(prior.mean, (4, 1))
     truth[:, 3:] += 0.5 * prior.std[3:] * stream.standard_normal((4, 2))
-    exact = SetRuns(base).predictions(truth[None])[0]
+    exact = ForwardRuns(base).predictions(truth[None])[0]
     problems = []
     for s, problem in enumerate(base):
         o = problem.observations
         values = exact[s, : len(o)] + o.std * stream.standard_normal(len(o))
         problems.append(replace(problem, observations=Observations(o.times, values, o.std, o.time_std, o.weights)))
     names, starts = ["G", "alpha", "mu"], np.tile(prior.mean, (1, 4, 1))
-    one = fit_one_gel(SetRuns(problems), starts, prior, names)
-    assert 0.5 < one.chi2_per_reading < 1.6
+    one = fit_shared(ForwardRuns(problems), starts, prior, names)
+    assert 0.5 < one.chi2_per_observation < 1.6
     assert one.common[2] == pytest.approx(0.15, rel=0.05)  # viscosity is what is told best
-    several = fit_one_gel(SetRuns(base), starts, prior, names)  # the twin's bubbles differ in G, α and μ
-    assert several.chi2_per_reading > 3
+    several = fit_shared(ForwardRuns(base), starts, prior, names)  # the twin's bubbles differ in G, α and μ
+    assert several.chi2_per_observation > 3

@@ -15,14 +15,17 @@ from click.testing import CliRunner
 
 from en4dvar.config import load_config
 from en4dvar.errors import ConfigError, DataError, OutputError
+from en4dvar.executor import ThreadsExecutor
 from en4dvar.inputs.build import build
 from en4dvar.observations import Observations
-from en4dvar_bubble.commands_study import sweep as sweep_command
-from en4dvar_bubble.study.nearest import best_over_shifts, targets
-from en4dvar_bubble.study.sweep import SweepSettings, prepare_folder, run_sweep, sobol_box
+from en4dvar.sampling.nearest import best_over_shifts, targets
+from en4dvar.sampling.sweep import SweepSettings, run_sweep, sobol_box
+from en4dvar_agarose.commands import sweep as sweep_command
+from en4dvar_agarose.keep import prepare_folder
+from en4dvar_agarose.run import one_model
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-SMALL = SweepSettings(trajectories=192, chunk=64, step=0.1e-6)
+SMALL = SweepSettings(trajectories=192, shift=0.8e-6, step=0.1e-6, chunk=64)
 
 
 def readings(times, values, name="a"):
@@ -88,7 +91,8 @@ def test_sobol_box_grows_without_moving_and_fills_the_box():
 
 
 def test_bits_do_not_depend_on_workers_or_chunks(problems, whole):
-    other = run_sweep(problems, replace(SMALL, chunk=50), seed=1, workers=2)
+    with ThreadsExecutor(2) as executor:
+        other = run_sweep(problems, replace(SMALL, chunk=50), 1, executor)
     np.testing.assert_array_equal(other.theta, whole.theta)
     np.testing.assert_array_equal(other.nrmse, whole.nrmse)
 
@@ -137,7 +141,7 @@ def test_one_design_serves_two_gels_and_each_keeps_to_its_own_range(problems):
     stiff = build(load_config(CONFIGS / "agarose_10_qlkv.yaml"))[:2]
     calls = []
     result = run_sweep(
-        [*problems, *stiff], replace(SMALL, rounds=1), seed=1, progress=lambda done, _: calls.append(done)
+        one_model([*problems, *stiff]), replace(SMALL, rounds=1), seed=1, progress=lambda done, _: calls.append(done)
     )
     assert calls[-1] == result.trajectories == 192 + 2 * 32 * 5  # once, not once a gel
     kept = [j for j, name in enumerate(problems[0].prior.names) if name != "t_s"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from en4dvar_bubble.study.measured import bins, coverage, reliability
+from en4dvar_agarose.measured import bins, coverage, reliability
 
 
 def test_bins_by_hand():

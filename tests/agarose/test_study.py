@@ -17,14 +17,14 @@ from click.testing import CliRunner
 from run_files import assert_same_results, command, environment, resumed_until_done, run_cli
 
 from en4dvar.errors import ConfigError, OutputError
-from en4dvar_bubble.commands_study import study as study_command
-from en4dvar_bubble.study import tables
-from en4dvar_bubble.study.evidence import probability, verdict
-from en4dvar_bubble.study.figures import collapse
-from en4dvar_bubble.study.keep import identity_of
-from en4dvar_bubble.study.paper import QUANTITIES, TABLE_1, TABLE_2
-from en4dvar_bubble.study.run import run_study
-from en4dvar_bubble.study.settings import load_study
+from en4dvar_agarose import tables
+from en4dvar_agarose.commands import study as study_command
+from en4dvar_agarose.evidence import probability, verdict
+from en4dvar_agarose.figures import collapse
+from en4dvar_agarose.keep import identity_of
+from en4dvar_agarose.paper import QUANTITIES, TABLE_1, TABLE_2
+from en4dvar_agarose.run import run_study
+from en4dvar_agarose.settings import load_study
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 GELS = ("0.3 %", "1 %")
