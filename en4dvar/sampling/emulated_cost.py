@@ -11,16 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
 from en4dvar.diagnostics import effective_share
 from en4dvar.ensemble.forecast import Forecast
-from en4dvar.likelihood import fixed_precision, observation_cost
+from en4dvar.likelihood import observation_cost
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior
-from en4dvar.sampling.emulator import Coordinates, Emulator, basis
+from en4dvar.sampling.emulator import Coordinates, Emulator
 from en4dvar.sampling.walkers import advance
 from en4dvar.state import Array
 
@@ -39,18 +38,18 @@ Run = Callable[[Array], Forecast]
 
 @dataclass(frozen=True)
 class EmulatedCost:
-    """Ĵ (B,) of control vectors (B, n).
+    """Ĵ (B,) of control vectors (B, n): J of the predictions (and rates, ln σ) of ``emulator``.
 
-    ``observed`` is J_o (B,) of what the polynomials ``of_outputs`` (Ky, M) give, ``of_prior`` (n, 1 + n) the normalised
-    departure from the prior's mean. J_o is cut at ``ceiling``: far from its runs a polynomial says only that J is
-    large, and a walker that true J lets in there must find its way out. ``share`` is the effective share of the runs
-    that judge it, ``draws`` (S, n) are of exp(−Ĵ).
+    J_o is cut at ``ceiling``: far from its runs a polynomial says only that J is large, and a walker that true J lets
+    in there must find its way out. ``share`` is the effective share of the runs that judge it, ``draws`` (S, n) are of
+    exp(−Ĵ).
     """
 
     emulator: Emulator
-    of_outputs: Array
-    of_prior: Array
-    observed: Callable[[Array], Array]
+    prior: Prior
+    observations: Observations
+    has_rates: bool
+    has_scale: bool
     ceiling: float = math.inf
     share: float = math.nan
     draws: Array = field(default_factory=lambda: np.empty((0, 0)))
@@ -60,38 +59,26 @@ class EmulatedCost:
         return self._cost(self.emulator.coordinates.of(x))
 
     def _cost(self, z: Array) -> Array:
-        at = basis(z, self.emulator.parents)
-        departure = self.of_prior @ at[: self.of_prior.shape[1]]
-        return np.asarray(np.minimum(self.observed(self.of_outputs @ at), self.ceiling) + _half_square(departure))
+        outputs, k = self.emulator.at(z), len(self.observations)
+        rates = outputs[:, k : 2 * k] if self.has_rates else None
+        scale = np.exp(outputs[:, -1]) if self.has_scale else None
+        observed = observation_cost(self.observations, outputs[:, :k], rates, scale)
+        return np.minimum(observed, self.ceiling) + _prior_cost(self.prior, self.emulator.coordinates.back(z))
 
     def walk(self, x: Array, others: Array, random: np.random.Generator, rounds: int) -> list[Array]:
         """Positions (W, n) of walkers from ``x`` after each round, sampling exp(−Ĵ); ``others`` (W', n) stand still."""
         coordinates = self.emulator.coordinates
         z, others = coordinates.of(x), coordinates.of(others)
-        cost, positions = self._sum_of_squares() or self._cost, []
-        costs = cost(z)
+        costs, positions = self._cost(z), []
         for _ in range(rounds):
-            z, costs = advance(cost, z, costs, others, random, PER_ROUND)
+            z, costs = advance(self._cost, z, costs, others, random, PER_ROUND)
             positions.append(coordinates.back(z))
         return positions
-
-    def _sum_of_squares(self) -> Callable[[Array], Array] | None:
-        """:meth:`_cost` where it is nothing but squares: of as few polynomials as there are monomials, at most."""
-        if self.observed is not _half_square or math.isfinite(self.ceiling):
-            return None
-        rows = np.zeros((len(self.of_outputs) + len(self.of_prior), self.of_outputs.shape[1]))
-        rows[: len(self.of_outputs)] = self.of_outputs
-        rows[len(self.of_outputs) :, : self.of_prior.shape[1]] = self.of_prior
-        if len(rows) > rows.shape[1]:
-            rows = np.asarray(np.linalg.qr(rows, mode="r"))
-        return lambda z: _half_square(rows @ basis(z, self.emulator.parents))
 
 
 @dataclass(frozen=True)
 class _Runs:
-    """Members that could be run: control vectors (B, n), J (B,), and outputs (B, Ky): predictions and, where there are
-    any, rates and ln σ.
-    """
+    """Members that could be run: control vectors (B, n), outputs (B, Ky), J (B,)."""
 
     x: Array
     outputs: Array
@@ -100,11 +87,8 @@ class _Runs:
     has_scale: bool
 
     def joined(self, other: _Runs) -> _Runs:
-        x, outputs, costs = (
-            np.concatenate(pair)
-            for pair in ((self.x, other.x), (self.outputs, other.outputs), (self.costs, other.costs))
-        )
-        return replace(self, x=x, outputs=outputs, costs=costs)
+        x, outputs = np.concatenate([self.x, other.x]), np.concatenate([self.outputs, other.outputs])
+        return replace(self, x=x, outputs=outputs, costs=np.concatenate([self.costs, other.costs]))
 
 
 def needed_runs(n_parameters: int) -> tuple[int, int] | None:
@@ -179,28 +163,4 @@ def _fit(prior: Prior, observations: Observations, coordinates: Coordinates, deg
     """A run whose J exceeds the lowest by the width of a posterior, 2n, counts half."""
     excess = (runs.costs - runs.costs.min()) / (2 * len(coordinates.centre))
     emulator = Emulator.fitted(coordinates, degree, runs.x, runs.outputs, 1 / (1 + excess**2), RIDGE)
-    coefficients = emulator.coefficients.T
-    of_prior = np.column_stack([coordinates.centre - prior.mean, coordinates.root]) / prior.std[:, None]
-    precision = fixed_precision(observations)
-    if runs.has_rates or runs.has_scale or precision is None:
-        observed = partial(_cost_of_outputs, observations, runs.has_rates, runs.has_scale)
-        return EmulatedCost(emulator, coefficients, of_prior, observed)
-    # R is constant and J_o quadratic: the polynomials can be those of whitened residuals, of which M tell as much as K
-    residuals = -coefficients
-    residuals[:, 0] += observations.values
-    residuals *= np.sqrt(precision)[:, None]
-    if len(residuals) > residuals.shape[1]:
-        residuals = np.asarray(np.linalg.qr(residuals, mode="r"))
-    return EmulatedCost(emulator, residuals, of_prior, _half_square)
-
-
-def _cost_of_outputs(observations: Observations, has_rates: bool, has_scale: bool, outputs: Array) -> Array:
-    """J_o (B,) of predictions, rates and ln σ on top of each other (Ky, B)."""
-    k = len(observations.times)
-    rates = outputs[k : 2 * k].T if has_rates else None
-    return observation_cost(observations, outputs[:k].T, rates, np.exp(outputs[-1]) if has_scale else None)
-
-
-def _half_square(residuals: Array) -> Array:
-    """½ |v|² (B,) of residuals (K, B)."""
-    return np.asarray(0.5 * np.einsum("kb,kb->b", residuals, residuals))
+    return EmulatedCost(emulator, prior, observations, runs.has_rates, runs.has_scale)

@@ -70,8 +70,11 @@ class Emulator(NamedTuple):
 
     def predictions(self, x: Array) -> Array:
         """Outputs (B, K) at control vectors (B, n)."""
-        matrix = np.ascontiguousarray(basis(self.coordinates.of(x), self.parents).T)
-        return np.asarray(matrix @ self.coefficients)
+        return self.at(self.coordinates.of(x))
+
+    def at(self, z: Array) -> Array:
+        """Outputs (B, K) at coordinates (B, n)."""
+        return np.asarray(np.ascontiguousarray(basis(z, self.parents).T) @ self.coefficients)
 
 
 def monomials(n: int, degree: int) -> npt.NDArray[np.int64]:
