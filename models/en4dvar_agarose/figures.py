@@ -1,8 +1,10 @@
-"""The figures of the paper that are computed, drawn anew from a :class:`~en4dvar_agarose.run.Study`."""
+"""The figures of the paper that are computed, drawn anew from a :class:`~en4dvar_agarose.fits.Study`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,61 +21,59 @@ from en4dvar_bubble.model import BubbleModel
 MODEL_COLOURS = {"nh": "#d55e00", "qs": "#009e73", "qlkv": "#0072b2"}
 GEL_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#85858f")
 ALONE = {"nh": "NH", "qs": "QS QLKV", "qlkv": "QLKV"}
-Drawn = tuple[str, str, Figure]
+R0_FIRST = (QUANTITIES[3], *QUANTITIES[:3])
 FARTHEST = 30.0  # difference of log-evidences that the axis shows
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """A figure, the name of its files, and its caption."""
+
+    name: str
+    caption: str
+    figure: Figure
+
+
 def all_figures(study: Study) -> Iterator[Drawn]:
-    """(name, caption, figure) of every figure; captions say where data are synthetic."""
+    """Every figure; captions say where data are synthetic."""
     note = " Synthetic twin, no measurement." if study.plan.synthetic else ""
-    for name, caption, figure in _figures(study):
-        yield name, caption + note, figure
+    for drawn in _figures(study):
+        yield replace(drawn, caption=drawn.caption + note)
 
 
 def _figures(study: Study) -> Iterator[Drawn]:
-    count = "; ".join(f"{len(_any(study, gel).problems)} in {gel} gel" for gel in study.fits)
-    yield "scaled", f"Scaled radius against time, R/R_max against t/t_c: {count}.", scaled_data(study)
+    count = "; ".join(f"{len(study.any_fit(gel).problems)} in {gel} gel" for gel in study.fits)
+    yield Drawn("scaled", f"Scaled radius against time, R/R_max against t/t_c: {count}.", scaled_data(study))
     for gel, models in study.fits.items():
-        key = gel_key(gel)
         for model, fit in models.items():
             caption = f"Radius against time, {gel} gel; line: best {NAMES[model]} fit of the filled set (IMR sweep)."
-            yield f"dimensional_{key}_{model}", caption, dimensional(fit)
-    for route, words in (("sweep", "IMR sweep"), ("en4dvar", "En4D-Var, ensemble means")):
+            yield Drawn(f"dimensional_{gel_key(gel)}_{model}", caption, dimensional(fit))
+    routes: dict[Route, str] = {"sweep": "IMR sweep", "en4dvar": "En4D-Var, ensemble means"}
+    for route, words in routes.items():
         caption = f"Distributions of shear modulus (inset: stiffening), viscosity, stress-free radius; {words}."
-        yield f"distributions_{route}", caption, distributions(study, route)  # type: ignore[arg-type]
-        yield f"nrmse_{route}", f"Distributions of NRMSE for the models; {words}.", nrmse_figure(study, route)  # type: ignore[arg-type]
-    for gel, models in study.fits.items():
-        if "qlkv" in models:
-            fit, key = models["qlkv"], gel_key(gel)
-            members = len(fit.members("mu"))
-            caption = f"Combined final ensembles of all sets, {members} members; {gel} gel, general QLKV."
-            yield f"members_{key}", caption, combined(study, fit)
-            caption = f"Iterative estimates, one line a data set; {gel} gel, general QLKV."
-            yield f"iterations_{key}", caption, iterations(fit)
+        yield Drawn(f"distributions_{route}", caption, distributions(study, route))
+        yield Drawn(f"nrmse_{route}", f"Distributions of NRMSE for the models; {words}.", nrmse_figure(study, route))
+    for gel, fit in ((gel, models["qlkv"]) for gel, models in study.fits.items() if "qlkv" in models):
+        members = len(fit.members("mu"))
+        caption = f"Combined final ensembles of all sets, {members} members; {gel} gel, general QLKV."
+        yield Drawn(f"members_{gel_key(gel)}", caption, combined(study, fit))
+        caption = f"Iterative estimates, one line a data set; {gel} gel, general QLKV."
+        yield Drawn(f"iterations_{gel_key(gel)}", caption, iterations(fit))
     if study.populations:
         caption = "Population mean (95 % interval) by the hierarchical step and mean of the stacked ensembles"
-        yield "population", f"{caption}{', with the truths' if study.truth else ''}.", population(study)
+        yield Drawn("population", f"{caption}{', with the truths' if study.truth else ''}.", population(study))
     if study.comparisons:
-        yield (
-            "evidence",
-            "Log-evidence of the quadratic over the neo-Hookean law; shaded: undecidable.",
-            evidence(study),
-        )
-
+        caption = "Log-evidence of the quadratic over the neo-Hookean law; shaded: undecidable."
+        yield Drawn("evidence", caption, evidence(study))
     if study.plan.synthetic:
-        stated = (
-            "Stated probability of the favoured law against how often it was right; bars: binomial standard deviation."
-        )
-        yield "reliability", f"{stated} Repeated synthetic experiments, half by each law.", reliability_figure()
+        caption = "Stated probability of the favoured law against how often it was right; bars: binomial standard "
+        caption += "deviation. Repeated synthetic experiments, half by each law."
+        yield Drawn("reliability", caption, reliability_figure())
 
 
 def gel_key(gel: str) -> str:
     """A gel's label as part of a file name."""
     return "".join(c if c.isalnum() else "_" for c in gel.replace("%", "")).strip("_")
-
-
-def _any(study: Study, gel: str) -> Fit:
-    return next(iter(study.fits[gel].values()))
 
 
 def collapse(times: Array, radius: Array) -> tuple[float, float, float]:
@@ -99,20 +99,14 @@ def scaled_data(study: Study) -> Figure:
     axes = figure.subplots()
     for number, gel in enumerate(study.fits):
         colour = GEL_COLOURS[number % len(GEL_COLOURS)]
-        for i, problem in enumerate(_any(study, gel).problems):
+        for i, problem in enumerate(study.any_fit(gel).problems):
             o = problem.observations
             R_max, t_max, t_c = collapse(o.times, o.values)
+            marker, fill = ("o", "none") if number == 0 else ("s", colour)
             axes.plot(
-                (o.times - t_max) / t_c + 1,
-                o.values / R_max,
-                "o" if number == 0 else "s",
-                ms=3,
-                mfc="none" if number == 0 else colour,
-                mec=colour,
-                mew=0.6,
-                alpha=0.8,
+                (o.times - t_max) / t_c + 1, o.values / R_max, marker, ms=3, mfc=fill, mec=colour, mew=0.6, alpha=0.8,
                 label=f"{gel} gel" if i == 0 else None,
-            )
+            )  # fmt: skip
     axes.set(xlabel=r"$(t - t_{\max})/t_c + 1$", ylabel=r"$R/R_{\max}$", ylim=(0, 1.1))
     axes.legend(loc="lower center")
     return figure
@@ -191,8 +185,7 @@ def distributions(study: Study, route: Route) -> Figure:
     low, high = inset.get_xlim()
     ticks = (0.1, 0.3, 1, 3, 10, 30) if high / low > 10 else (0.5, 1, 2, 3, 5, 10, 20)
     inset.set_xticks([t for t in ticks if low <= t <= high])
-    handles, labels = panels[1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=4)
+    _legend_above(figure, panels[1], 4)
     return figure
 
 
@@ -203,13 +196,30 @@ def _lines(axes: Axes, study: Study, route: Route, q: Quantity, models: tuple[st
             if fit is not None and fit.estimated(q.name):
                 label = f"{ALONE[model]}, {gel}" if named else None
                 _density(axes, fit.values(route, q.name) * q.factor, MODEL_COLOURS[model], style, label)
+    axes.set_xlabel(_label(q))
+    low, high = _logarithmic(axes)
+    _ticks(axes, (1, 2, 5), every=2 if high / low > 30 else 1)
+
+
+def _logarithmic(axes: Axes) -> tuple[float, float]:
+    """Make the horizontal axis logarithmic; its limits."""
     axes.set_xscale("log")
     low, high = axes.get_xlim()
-    ticks = [t * 10.0**e for e in range(-4, 5) for t in (1, 2, 5)]
-    axes.set_xticks([t for t in ticks if low <= t <= high][:: 2 if high / low > 30 else 1])
+    return low, high
+
+
+def _ticks(axes: Axes, steps: Sequence[float], every: int = 1) -> None:
+    """Plain numbers at these multiples of powers of ten, on a logarithmic axis."""
+    low, high = axes.get_xlim()
+    axes.set_xticks([t * 10.0**e for e in range(-4, 5) for t in steps if low <= t * 10.0**e <= high][::every])
     axes.set_xticks([], minor=True)
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.set_xlabel(_label(q))
+
+
+def _legend_above(figure: Figure, axes: Axes, columns: int, **options: Any) -> None:
+    """What the axes' lines are, above all panels."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=columns, **options)
 
 
 @styled
@@ -240,8 +250,7 @@ def nrmse_figure(study: Study, route: Route) -> Figure:
 def combined(study: Study, fit: Fit) -> Figure:
     """Histograms of all posterior members with prior, mean and (twin) the truths."""
     figure = Figure(figsize=(COLUMN, 0.85 * COLUMN), layout="constrained")
-    order = (QUANTITIES[3], QUANTITIES[0], QUANTITIES[1], QUANTITIES[2])
-    for axes, q in zip(figure.subplots(2, 2).ravel(), order, strict=True):
+    for axes, q in zip(figure.subplots(2, 2).ravel(), R0_FIRST, strict=True):
         values = fit.members(q.name) * q.factor
         low, high = np.quantile(values, (0.001, 0.999))
         edges = np.linspace(float(low), float(high), 31)
@@ -255,8 +264,7 @@ def combined(study: Study, fit: Fit) -> Figure:
             axes.plot(truth, np.full(len(truth), height), "|", color=LIGHT["centre"], ms=6, label="truths")
         axes.set_xlabel(_label(q))
         axes.set_yticks([])
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=4, columnspacing=1.2, handlelength=1.4)
+    _legend_above(figure, axes, 4, columnspacing=1.2, handlelength=1.4)
     return figure
 
 
@@ -264,8 +272,7 @@ def combined(study: Study, fit: Fit) -> Figure:
 def iterations(fit: Fit) -> Figure:
     """Estimates of every data set against the iteration, from the prior mean on."""
     figure = Figure(figsize=(COLUMN, 0.85 * COLUMN), layout="constrained")
-    order = (QUANTITIES[3], QUANTITIES[0], QUANTITIES[1], QUANTITIES[2])
-    for axes, q in zip(figure.subplots(2, 2, sharex=True).ravel(), order, strict=True):
+    for axes, q in zip(figure.subplots(2, 2, sharex=True).ravel(), R0_FIRST, strict=True):
         j = fit.prior.names.index(q.name)
         guess = float(np.exp(fit.prior.mean[j])) * q.factor
         for analysis in fit.analyses:
@@ -299,14 +306,9 @@ def population(study: Study) -> Figure:
         panel.set_yticks(range(len(study.populations)), list(study.populations) if panel is panels[0] else [])
         panel.set_ylim(-0.6, len(study.populations) - 0.4)
         panel.set_xlabel(_label(q))
-        panel.set_xscale("log")
-        low, high = panel.get_xlim()
-        steps = (1, 2, 5) if high / low > 4 else (1, 1.5, 2, 3, 5, 7)
-        panel.set_xticks([t * 10.0**e for e in range(-4, 5) for t in steps if low <= t * 10.0**e <= high])
-        panel.set_xticks([], minor=True)
-        panel.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=3)
+        low, high = _logarithmic(panel)
+        _ticks(panel, (1, 2, 5) if high / low > 4 else (1, 1.5, 2, 3, 5, 7))
+    _legend_above(figure, panels[0], 3)
     return figure
 
 
@@ -361,6 +363,5 @@ def reliability_figure() -> Figure:
     right.set(xlabel=r"$\Delta$ log-evidence for the true law (ends: beyond)", ylabel="experiments")
     left.set_title("(a)", loc="left")
     right.set_title("(b)", loc="left")
-    handles, labels = left.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=2)
+    _legend_above(figure, left, 2)
     return figure

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -144,38 +144,31 @@ def as_latex(study: Study, rows: Sequence[Row], route: Route) -> str:
     return "\n".join([*lines, r"\end{tabular}", r"\end{table*}"]) + "\n"
 
 
-def disagreements(study: Study) -> list[str]:
-    """Where the computed mean differs from the printed one by more than both standard deviations together, and why."""
-    told = []
+def _estimates(study: Study) -> Iterator[tuple[str, Cell, Pair, Pair]]:
+    """Route, gel and law in words, and cell, of everything estimated that the paper prints; computed, then printed."""
     for route in ("sweep", "en4dvar"):
         for row in table(study, route):
             for cell in row.cells:
-                if cell.printed is None or cell.computed is None or cell.fixed:
-                    continue
-                gap = cell.computed[0] - cell.printed[0]
-                if abs(gap) > cell.printed[1] + cell.computed[1]:
-                    mine, paper = plus_minus(cell.computed), plus_minus(cell.printed)
-                    told.append(
-                        f"{ROUTES[route]}, {row.gel}, {LABELS[row.model]}: {cell.quantity.plain} is {mine} "
-                        f"{cell.quantity.unit} where the paper prints {paper}"
-                    )
-    return told
+                if cell.printed is not None and cell.computed is not None and not cell.fixed:
+                    yield f"{ROUTES[route]}, {row.gel}, {LABELS[row.model]}", cell, cell.computed, cell.printed
+
+
+def disagreements(study: Study) -> list[str]:
+    """Where the computed mean differs from the printed one by more than both standard deviations together."""
+    return [
+        f"{where}: {cell.quantity.plain} is {plus_minus(mine)} {cell.quantity.unit} where the paper prints "
+        f"{plus_minus(paper)}"
+        for where, cell, mine, paper in _estimates(study)
+        if abs(mine[0] - paper[0]) > paper[1] + mine[1]
+    ]
 
 
 def spread_notes(study: Study) -> list[str]:
     """Where the standard deviation differs from the printed one by a factor of two or more."""
-    told = []
-    for route in ("sweep", "en4dvar"):
-        for row in table(study, route):
-            for cell in row.cells:
-                if cell.printed is None or cell.computed is None or cell.fixed:
-                    continue
-                ratio = cell.computed[1] / cell.printed[1]
-                if not 0.5 < ratio < 2:
-                    told.append(
-                        f"{ROUTES[route]}, {row.gel}, {LABELS[row.model]}, {cell.quantity.plain}: {ratio:.2g} times"
-                    )
-    return told
+    ratios = ((where, cell, mine[1] / paper[1]) for where, cell, mine, paper in _estimates(study))
+    return [
+        f"{where}, {cell.quantity.plain}: {ratio:.2g} times" for where, cell, ratio in ratios if not 0.5 < ratio < 2
+    ]
 
 
 def per_set_csv(study: Study) -> str:
