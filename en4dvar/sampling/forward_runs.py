@@ -29,7 +29,7 @@ class Runs(Protocol):
         """(B, S, K) of control vectors (B, S, n), NaN where a run failed; anything finite where ``weight`` is 0."""
 
 
-class Clock:
+class Predictor:
     """F and H of a problem at instants that are not those of its observations."""
 
     def __init__(self, problem: InverseProblem, executor: Executor | None = None):
@@ -38,7 +38,7 @@ class Clock:
         self._initial_states = InitialStates(problem)
         self._reading = Reading((operator,), (), getattr(operator, "batched", False))
 
-    def observable(self, x: Array, times: Array) -> Array:
+    def at(self, x: Array, times: Array) -> Array:
         """(B, M) of control vectors (B, n), each at its own times (B, M) of the model; NaN where a run failed."""
         physical = self.problem.prior.to_physical(x)
         alive, states = self._initial_states(physical, out_of_bounds(self.problem.prior, physical))
@@ -69,8 +69,7 @@ class ForwardRuns:
     def __init__(self, problems: Sequence[InverseProblem], executor: Executor | None = None):
         shape = len(problems), max(len(p.observations) for p in problems)
         self.times, self.values, self.weight = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-        self.group = np.zeros(len(problems), dtype=int)  # of every set, its place in ``clocks``
-        self.clocks: list[Clock] = []
+        alike: dict[object, list[int]] = {}
         for s, p in enumerate(problems):
             o, k, precision = p.observations, len(p.observations), fixed_precision(p.observations)
             if p.prior.terms != problems[0].prior.terms:
@@ -79,31 +78,21 @@ class ForwardRuns:
                 raise ConfigError(f"{o.name}: a population needs independent Gaussian errors of known std")
             self.times[s] = o.times[-1]
             self.times[s, :k], self.values[s, :k], self.weight[s, :k] = o.times, o.values, precision
-            same = [g for g, clock in enumerate(self.clocks) if _same_path(clock.problem, p)]
-            if not same:
-                self.clocks.append(Clock(p, executor))
-            self.group[s] = same[0] if same else len(self.clocks) - 1
+            key = id(p.model), id(p.observable), tuple(sorted(p.fixed.items())), p.perturbations
+            alike.setdefault(key, []).append(s)
+        self.groups = [(Predictor(problems[sets[0]], executor), sets) for sets in alike.values()]
 
     def predictions(self, x: Array, sets: Sets = None) -> Array:
         """See :class:`Runs`."""
         chosen = np.arange(len(self.times)) if sets is None else sets
         out = np.empty((len(x), len(chosen), self.times.shape[1]))
-        for g, clock in enumerate(self.clocks):
-            here = np.flatnonzero(self.group[chosen] == g)
+        for predictor, members in self.groups:
+            here = np.flatnonzero(np.isin(chosen, members))
             if len(here):
                 flat = x[:, here].reshape(-1, x.shape[2])
-                times = np.tile(self.times[chosen[here]], (len(x), 1)) + clock.time_shifts(flat)[:, None]
-                out[:, here] = clock.observable(flat, times).reshape(len(x), len(here), -1)
+                times = np.tile(self.times[chosen[here]], (len(x), 1)) + predictor.time_shifts(flat)[:, None]
+                out[:, here] = predictor.at(flat, times).reshape(len(x), len(here), -1)
         return out
-
-
-def _same_path(a: InverseProblem, b: InverseProblem) -> bool:
-    return (
-        a.model is b.model
-        and a.observable is b.observable
-        and a.fixed == b.fixed
-        and a.perturbations == b.perturbations
-    )
 
 
 def log_likelihood(runs: Runs, predictions: Array, sets: Sets = None) -> Array:

@@ -21,7 +21,7 @@ from en4dvar.errors import ConfigError, DataError
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.prior import Prior, member_stream
 from en4dvar.problem import InverseProblem
-from en4dvar.sampling.forward_runs import Clock
+from en4dvar.sampling.forward_runs import Predictor
 from en4dvar.sampling.nearest import Targets, best_over_shifts, targets
 from en4dvar.state import TIME_SHIFT, Array, Parameter
 from en4dvar.storage.files import atomic_path
@@ -230,7 +230,7 @@ class _Score:
     def of(self, x: Array) -> tuple[Array, Array]:
         """NRMSE and shift (B, S) of coordinates (B, n)."""
         times = np.broadcast_to(self.aims.grid, (len(x), len(self.aims.grid)))
-        return best_over_shifts(Clock(self.problem).observable(x, times), self.aims)
+        return best_over_shifts(Predictor(self.problem).at(x, times), self.aims)
 
 
 def _refined(

@@ -50,7 +50,7 @@ def sweep(
     from en4dvar.runs.interrupt import tell_interrupt
     from en4dvar.sampling.sweep import SweepSettings, refinement_size, run_sweep
     from en4dvar.storage.files import write_text
-    from en4dvar_agarose.keep import prepare_folder
+    from en4dvar_agarose.checkpoints import prepare_folder
     from en4dvar_agarose.run import earliest_reading, one_model
     from en4dvar_agarose.summary import sweep_csv, sweep_text
 
@@ -102,7 +102,7 @@ def study(
     from en4dvar.executor import available_cores
     from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
     from en4dvar.runs.rundir import RunDirectory
-    from en4dvar_agarose.keep import Keep
+    from en4dvar_agarose.checkpoints import StudyCheckpoints
     from en4dvar_agarose.report import write_study
     from en4dvar_agarose.run import run_study
     from en4dvar_agarose.settings import load_study
@@ -116,7 +116,7 @@ def study(
         RunDirectory.open(folder, "force" if force else "resume" if resume else "new") as directory,
         tell_interrupt(lambda: _to_continue(f"finished parts are kept in {folder}")),
     ):
-        keep = Keep.open(directory, plan)
+        keep = StudyCheckpoints.open(directory, plan)
         result = run_study(plan, workers or available_cores(), lambda message: click.echo(message, err=True), keep)
         page = write_study(result, directory.work)
         files = (p for p in directory.work.rglob("*") if p.is_file() and not p.name.startswith("."))

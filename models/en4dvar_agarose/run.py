@@ -21,21 +21,21 @@ from en4dvar.problem import InverseProblem
 from en4dvar.sampling.evidence import Evidence, sampled_evidence
 from en4dvar.sampling.forward_runs import ForwardRuns
 from en4dvar.sampling.sweep import SweepResult, run_sweep
+from en4dvar_agarose.checkpoints import D, StudyCheckpoints
 from en4dvar_agarose.evidence import Comparison, compare_laws
 from en4dvar_agarose.fits import Fit, Study, read_truth
-from en4dvar_agarose.keep import D, Keep
 from en4dvar_agarose.paper import TABLE_2, Model
 from en4dvar_agarose.settings import StudyPlan
 from en4dvar_bubble.model import BubbleModel
 
-Tell = Callable[[str], None]
+Say = Callable[[str], None]
 SHARED = ("G", "alpha", "mu")  # properties of the gel; R0 and t_s belong to the bubble
 POPULATION = ("G", "alpha", "mu", "R0")
 COMPARED: tuple[Model, Model] = ("nh", "qlkv")
 FEWEST_SETS = 3  # of a population
 
 
-def run_study(plan: StudyPlan, workers: int = 1, tell: Tell | None = None, keep: Keep | None = None) -> Study:
+def run_study(plan: StudyPlan, workers: int = 1, say: Say | None = None, keep: StudyCheckpoints | None = None) -> Study:
     """Compute everything; the truth of a twin is read last and enters no estimate.
 
     ``keep``: where sweeps and populations are kept as they are done, and found by a study that continues.
@@ -47,7 +47,7 @@ def run_study(plan: StudyPlan, workers: int = 1, tell: Tell | None = None, keep:
     problems = {(gel, m): build(c) for gel, models in plan.configs.items() for m, c in models.items()}
     model = next(iter(problems.values()))[0].model
     with make_executor(model, workers) as executor:
-        work = _Work(plan, executor, workers, tell or (lambda message: None), keep, {})
+        work = _Parts(plan, executor, workers, say or (lambda message: None), keep, {})
         with work.timed("sweep"):
             sweeps = work.sweeps(problems)
         with work.timed("en4dvar"):
@@ -63,14 +63,14 @@ def run_study(plan: StudyPlan, workers: int = 1, tell: Tell | None = None, keep:
 
 
 @dataclass(frozen=True)
-class _Work:
+class _Parts:
     """The parts of a study."""
 
     plan: StudyPlan
     executor: Executor
     workers: int
-    say: Tell
-    keep: Keep | None
+    say: Say
+    keep: StudyCheckpoints | None
     seconds: dict[str, float]
 
     @contextmanager

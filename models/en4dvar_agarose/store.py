@@ -40,14 +40,14 @@ def study_netcdf(study: Study) -> bytes:
 def _fit(study: Study, fit: Fit) -> Group:
     variables: dict[str, Variable] = {}
     for j, p in enumerate(fit.prior.parameters):
-        told = _words(p)
-        variables[p.name] = Variable(("dataset", "draw"), np.stack([a.posterior[:, j] for a in fit.analyses]), told)
+        about = _words(p)
+        variables[p.name] = Variable(("dataset", "draw"), np.stack([a.posterior[:, j] for a in fit.analyses]), about)
         variables[f"dfs_{p.name}"] = _plain(
             np.array([a.dfs_per_parameter[j] for a in fit.analyses]), f"DFS of {p.name}"
         )
         truths = np.array([study.truth.get(name, {}).get(p.name, np.nan) for name in fit.names])
         if study.truth and np.isfinite(truths).any():
-            variables[f"truth_{p.name}"] = Variable(("dataset",), truths, told)
+            variables[f"truth_{p.name}"] = Variable(("dataset",), truths, about)
     for j, p in enumerate(fit.sweep.parameters):
         variables[f"sweep_{p.name}"] = Variable(("dataset",), fit.sweep.theta[:, j], _words(p))
     variables["sweep_t_s"] = Variable(("dataset",), fit.sweep.shift, {"units": "s", "long_name": "time shift"})
@@ -64,9 +64,9 @@ def _population(found: Population) -> Group:
     terms = {t.parameter.name: t.parameter for t in found.prior.terms}
     variables: dict[str, Variable] = {}
     for j, name in enumerate(found.names):
-        told = _words(terms[name])
-        variables[f"mean_{name}"] = Variable(("draw",), found.mean[:, j], told)
-        variables[f"spread_{name}"] = Variable(("draw",), found.std[:, j], told)
+        about = _words(terms[name])
+        variables[f"mean_{name}"] = Variable(("draw",), found.mean[:, j], about)
+        variables[f"spread_{name}"] = Variable(("draw",), found.std[:, j], about)
     judged = {
         "effective_draws": found.size,
         "effective_draws_emulators": found.weighed[0],

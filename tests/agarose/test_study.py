@@ -18,10 +18,10 @@ from run_files import assert_same_results, command, environment, resumed_until_d
 
 from en4dvar.errors import ConfigError, OutputError
 from en4dvar_agarose import tables
+from en4dvar_agarose.checkpoints import identity_of
 from en4dvar_agarose.commands import study as study_command
 from en4dvar_agarose.evidence import probability, verdict
 from en4dvar_agarose.figures import collapse
-from en4dvar_agarose.keep import identity_of
 from en4dvar_agarose.paper import QUANTITIES, TABLE_1, TABLE_2
 from en4dvar_agarose.run import run_study
 from en4dvar_agarose.settings import load_study

@@ -20,8 +20,8 @@ from en4dvar.inputs.build import build
 from en4dvar.observations import Observations
 from en4dvar.sampling.nearest import best_over_shifts, targets
 from en4dvar.sampling.sweep import SweepSettings, run_sweep, sobol_box
+from en4dvar_agarose.checkpoints import prepare_folder
 from en4dvar_agarose.commands import sweep as sweep_command
-from en4dvar_agarose.keep import prepare_folder
 from en4dvar_agarose.run import one_model
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

@@ -26,14 +26,14 @@ D = TypeVar("D")
 IDENTITY = f"{FOLDER}/study"
 
 
-class Keep:
+class StudyCheckpoints:
     """Results of the study ``key`` in ``folder``."""
 
     def __init__(self, folder: Path, key: str):
         self.folder, self.key = folder, key
 
     @classmethod
-    def open(cls, directory: RunDirectory, plan: StudyPlan) -> Keep:
+    def open(cls, directory: RunDirectory, plan: StudyPlan) -> StudyCheckpoints:
         """For a new study in ``directory``, or the one that is there.
 
         Raises
