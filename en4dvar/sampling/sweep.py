@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -60,8 +60,8 @@ class Best:
     def merged(self, other: Best) -> Best:
         """The better of the two, set by set; this one where they are equal."""
         better = other.nrmse > self.nrmse
-        pick = {f.name: (getattr(self, f.name), getattr(other, f.name)) for f in fields(self)}
-        return Best(**{k: np.where(better[:, None] if a.ndim == 2 else better, b, a) for k, (a, b) in pick.items()})
+        x = np.where(better[:, None], other.x, self.x)
+        return Best(x, np.where(better, other.shift, self.shift), np.where(better, other.nrmse, self.nrmse))
 
 
 @dataclass(frozen=True)
@@ -209,13 +209,13 @@ class _Score:
         """The best fits among coordinates (B, n), from ``file`` where they are, or kept there."""
         if file is not None and file.exists():
             with np.load(file) as stored:
-                return Best(**{f.name: stored[f.name] for f in fields(Best)})
+                return Best(**stored)
         best = self._best(x[:BATCH])
         for i in range(BATCH, len(x), BATCH):
             best = best.merged(self._best(x[i : i + BATCH]))
         if file is not None:
             with atomic_path(file, durable=False) as partial, partial.open("wb") as stream:
-                np.savez(stream, **{f.name: getattr(best, f.name) for f in fields(Best)})
+                np.savez(stream, **vars(best))
         return best
 
     def _best(self, x: Array) -> Best:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.population import SharedFit
 from en4dvar.state import Array
 
 DECISIVE = 3.0  # |Δ log-evidence|: odds of 20 to 1
@@ -18,29 +17,25 @@ MISFIT = 2.0  # χ² per reading above which a model is not one of those to choo
 class Comparison:
     """Log-evidence of the quadratic over the neo-Hookean law.
 
-    ``single`` (S,) of each data set by itself. ``independent``: of all of them, every bubble in a gel of its own.
-    ``population``: parameters of all bubbles about a common mean with a common spread. ``shared``: of all of them in
-    one gel, material parameters common and R0, t_s of each bubble's own. ``chi2`` of one gel per reading,
-    (neo-Hookean, quadratic): far from one where no single gel explains the readings.
+    ``single`` (S,) of each data set by itself. ``population``: parameters of all bubbles about a common mean with a
+    common spread. ``shared``: of all of them in one gel, material parameters common and R0, t_s of each bubble's own.
+    ``chi2`` of one gel per reading, (neo-Hookean, quadratic): far from one where no single gel explains the readings.
     """
 
     single: Array
-    independent: float
     population: float
     shared: float
     chi2: tuple[float, float]
 
     @property
+    def independent(self) -> float:
+        """Of all data sets, every bubble in a gel of its own."""
+        return float(self.single.sum())
+
+    @property
     def undecidable(self) -> int:
         """Data sets that cannot tell the laws apart."""
         return int(np.sum(np.abs(self.single) < DECISIVE))
-
-
-def compare_laws(single: Array, population: float, nh: SharedFit, quadratic: SharedFit) -> Comparison:
-    """From the differences (S,) of the sets' log-evidences, that of the populations, and both fits of one gel."""
-    shared = quadratic.log_evidence - nh.log_evidence
-    chi2 = (nh.chi2_per_observation, quadratic.chi2_per_observation)
-    return Comparison(single, float(single.sum()), population, shared, chi2)
 
 
 def probability(difference: Array) -> Array:

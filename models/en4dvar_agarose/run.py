@@ -22,7 +22,7 @@ from en4dvar.sampling.evidence import Evidence, sampled_evidence
 from en4dvar.sampling.forward_runs import ForwardRuns
 from en4dvar.sampling.sweep import SweepResult, run_sweep
 from en4dvar_agarose.checkpoints import D, StudyCheckpoints
-from en4dvar_agarose.evidence import Comparison, compare_laws
+from en4dvar_agarose.evidence import Comparison
 from en4dvar_agarose.fits import Fit, Study, read_truth
 from en4dvar_agarose.paper import TABLE_2, Model
 from en4dvar_agarose.settings import StudyPlan
@@ -166,9 +166,13 @@ class _Parts:
     def _comparison(self, models: Mapping[Model, Fit], populations: Mapping[Model, Population | None]) -> Comparison:
         nh, general = (models[m] for m in COMPARED)
         pooled = {m: math.nan if found is None else found.log_evidence for m, found in populations.items()}
-        shared = [self.kept(SharedFit, partial(self._one_gel, fit), fit) for fit in (nh, general)]
-        single = general.log_evidence - nh.log_evidence
-        return compare_laws(single, pooled["qlkv"] - pooled["nh"], *shared)
+        one_nh, one_general = (self.kept(SharedFit, partial(self._one_gel, fit), fit) for fit in (nh, general))
+        return Comparison(
+            single=general.log_evidence - nh.log_evidence,
+            population=pooled["qlkv"] - pooled["nh"],
+            shared=one_general.log_evidence - one_nh.log_evidence,
+            chi2=(one_nh.chi2_per_observation, one_general.chi2_per_observation),
+        )
 
     def _one_gel(self, fit: Fit) -> SharedFit:
         """All bubbles of a gel with the same material parameters."""
