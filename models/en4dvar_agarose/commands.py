@@ -57,13 +57,13 @@ def sweep(
     if force and resume:
         raise click.UsageError("--force and --resume exclude each other")
     loaded = [load_config(config, _overrides(settings, data)) for config in configs]
+    problems = one_model([problem for config in loaded for problem in build(config)])
     try:
-        within, grid = parse_quantity(shift, "s"), parse_quantity(step, "s")
+        within, grid = (parse_quantity(text, problems[0].model.time_unit) for text in (shift, step))
     except UnitError as error:
         raise click.UsageError(str(error)) from None
     if within < 0 or grid <= 0 or not width > 0:
         raise click.UsageError("--shift must not be negative, --step and --width must be positive")
-    problems = one_model([problem for config in loaded for problem in build(config)])
     chosen = SweepSettings(trajectories, within, grid, width, rounds=refine)
     folder = out or Path("runs") / f"{loaded[0].name}_sweep"
     readings = b"".join(p.observations.times.tobytes() + p.observations.values.tobytes() for p in problems)
