@@ -150,14 +150,7 @@ def sample(
     walkers = max(walkers, 2 * (n + 1)) + max(walkers, 2 * (n + 1)) % 2
     chain = resume
     state = _start(emcee, log_density, ensemble, seed, walkers, emulated) if chain is None else chain.emcee_state(emcee)
-    guided = 0.0 if emulated is None else GUIDED_SHARE
-    moves = [
-        (emcee.moves.DEMove(), (1 - guided) * DE_SHARE),
-        (emcee.moves.StretchMove(), (1 - guided) * (1 - DE_SHARE)),
-    ]
-    if emulated is not None:
-        moves.append((emcee.moves.MHMove(_guided(emulated)), guided))
-    sampler = emcee.EnsembleSampler(walkers, n, log_density, vectorize=True, moves=moves)
+    sampler = emcee.EnsembleSampler(walkers, n, log_density, vectorize=True, moves=_moves(emcee, emulated))
     sampler.log_prob_fn = log_density  # bare: emcee's wrapper prints every position where Ctrl-C comes
     while True:
         steps = 0 if chain is None else chain.steps
@@ -173,6 +166,16 @@ def sample(
         chain = _longer(chain, sampler, state.random_state)
         if keep is not None:
             keep(chain)
+
+
+def _moves(emcee: Any, emulated: Emulated | None) -> list[tuple[Any, float]]:
+    """Moves and their shares."""
+    guided = 0.0 if emulated is None else GUIDED_SHARE
+    moves = [
+        (emcee.moves.DEMove(), (1 - guided) * DE_SHARE),
+        (emcee.moves.StretchMove(), (1 - guided) * (1 - DE_SHARE)),
+    ]
+    return moves if emulated is None else [*moves, (emcee.moves.MHMove(_guided(emulated)), guided)]
 
 
 @dataclass(frozen=True)

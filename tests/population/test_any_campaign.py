@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import halfnorm, multivariate_normal, norm
-from toys import Fragile, Linear, make_problem
+from toys import Fragile, Vectorised, make_problem
 
 from en4dvar.errors import ConfigError
+from en4dvar.executor import ProcessesExecutor
 from en4dvar.population import Effort, HyperPrior, estimate_population, fit_shared
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
@@ -26,7 +27,7 @@ HYPER = HyperPrior(mean_std=0.8, spread=0.5)
 @pytest.fixture(scope="module")
 def campaign() -> list[InverseProblem]:
     """y = a + b cos(t + 1/3) + noise of std 0.3; a varies from set to set, every other set has a second model."""
-    rng, models = np.random.default_rng(4), (Linear(), Linear())
+    rng, models = np.random.default_rng(4), (Vectorised(), Vectorised())
     truths = [(1.0 + 0.5 * rng.standard_normal(), 0.4) for _ in range(SETS)]
     problems = [make_problem(models[s % 2], truth, std=STD, seed=s, k=4 + s % 3) for s, truth in enumerate(truths)]
     a, b = models[0].parameters
@@ -107,7 +108,7 @@ def test_evidence_of_each_set(campaign):
 
 def test_a_sweep_finds_the_time_shift():
     """A path with a minimum in time: what was observed 0.3 later than it happened."""
-    problem = make_problem(Linear(), [0.5, 1.0], std=1e-6, k=10)
+    problem = make_problem(Vectorised(), [0.5, 1.0], std=1e-6, k=10)
     o = problem.observations
     values = 0.5 + np.cos(o.times + 0.3 + 1 / 3)
     shifted = replace(problem, observations=replace(o, values=values))
@@ -115,6 +116,16 @@ def test_a_sweep_finds_the_time_shift():
     assert found.shift[0] == pytest.approx(0.3)
     assert found.nrmse[0] > 0.999
     assert [p.name for p in found.parameters] == ["a", "b"]
+
+
+def test_a_sweep_has_the_same_bits_in_processes(campaign):
+    sets = [replace(p, model=campaign[0].model) for p in campaign[:2]]
+    settings = SweepSettings(64, 0.1, 0.05, chunk=32, rounds=1, local=8)
+    alone = run_sweep(sets, settings, seed=1)
+    with ProcessesExecutor(2) as executor:
+        found = run_sweep(sets, settings, 1, executor)
+    np.testing.assert_array_equal(found.theta, alone.theta)
+    np.testing.assert_array_equal(found.nrmse, alone.nrmse)
 
 
 def test_members_that_cannot_be_run_and_time_shifts():
