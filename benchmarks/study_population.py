@@ -2,7 +2,7 @@
 
     python benchmarks/study_population.py 03 20 [first]     # gel, campaigns, number of the first
 
-Adds a line a campaign and parameter to models/en4dvar_bubble/study/measured/population.csv, which the study's report
+Adds a line a campaign and parameter to models/en4dvar_agarose/measured/population.csv, which the study's report
 shows; campaigns found there are left out, so a run that was stopped continues.
 """
 
@@ -25,11 +25,11 @@ from en4dvar.config.synthetic import resolve_campaign
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
+from en4dvar.population import estimate_population
 from en4dvar.runs.synthetic import draw_campaign
-from en4dvar_bubble.study.measured import FOLDER, POPULATION_HEAD
-from en4dvar_bubble.study.population import estimate_population
-from en4dvar_bubble.study.run import POPULATION
-from en4dvar_bubble.study.set_runs import SetRuns
+from en4dvar.sampling.forward_runs import ForwardRuns
+from en4dvar_agarose.measured import FOLDER, POPULATION_HEAD
+from en4dvar_agarose.run import POPULATION
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 GELS = {"03": "0.3 %", "10": "1 %"}
@@ -52,8 +52,9 @@ def campaign(key: str, seed: int) -> list[list[object]]:
         problems.append(replace(base, observations=observed))
     with ThreadsExecutor(THREADS) as executor:
         analyses = [assimilate(p, config.assimilation, config.seed, executor) for p in problems]
-    start = np.stack([base.prior.from_physical(a.posterior) for a in analyses])
-    found = estimate_population(SetRuns(problems, THREADS), start, base.prior, POPULATION, seed, workers=THREADS)
+        start = np.stack([base.prior.from_physical(a.posterior) for a in analyses])
+        runs = ForwardRuns(problems, executor)
+        found = estimate_population(runs, start, base.prior, POPULATION, seed, workers=THREADS)
     low, high = found.interval()
     terms = {t.parameter.name: t for t in group.terms}
     rows: list[list[object]] = []

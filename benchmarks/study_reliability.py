@@ -3,7 +3,7 @@
     python benchmarks/study_reliability.py paper 200 [first]      # the paper's experiment, 0.3 % gel
     python benchmarks/study_reliability.py deciding 100 [first]   # one that tells the laws apart
 
-Adds a line an experiment to models/en4dvar_bubble/study/measured/reliability.csv, which the study's report shows; those
+Adds a line an experiment to models/en4dvar_agarose/measured/reliability.csv, which the study's report shows; those
 found there are left out, so a run that was stopped continues. Truths are drawn from the priors the evidence integrates
 over, so stated probability and frequency must agree.
 """
@@ -21,13 +21,14 @@ import numpy as np
 from en4dvar.config import load_config
 from en4dvar.config.build import build
 from en4dvar.ensemble.forecast import forecast
+from en4dvar.executor import ThreadsExecutor
 from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.problem import InverseProblem
-from en4dvar_bubble.study.evidence import probability
-from en4dvar_bubble.study.measured import FOLDER, RELIABILITY_HEAD
-from en4dvar_bubble.study.set_evidence import set_evidence
-from en4dvar_bubble.study.set_runs import SetRuns
+from en4dvar.sampling.evidence import sampled_evidence
+from en4dvar.sampling.forward_runs import ForwardRuns
+from en4dvar_agarose.evidence import probability
+from en4dvar_agarose.measured import FOLDER, RELIABILITY_HEAD
 
 THREADS = int(os.environ.get("THREADS", "2"))
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
@@ -86,10 +87,9 @@ def compare(bases: dict[str, InverseProblem], experiment: Experiment, number: in
     """The law that generated experiment ``number`` and the log-evidence of the quadratic over the neo-Hookean law."""
     law = "qlkv" if number % 2 else "nh"
     observed = draw(bases[law], experiment, np.random.default_rng([11, number]))
-    log = {
-        name: float(set_evidence(SetRuns([replace(base, observations=observed)], THREADS), base.prior, number).log[0])
-        for name, base in bases.items()
-    }
+    with ThreadsExecutor(THREADS) as executor:
+        runs = {name: ForwardRuns([replace(base, observations=observed)], executor) for name, base in bases.items()}
+        log = {name: float(sampled_evidence(runs[name], bases[name].prior, number).log[0]) for name in bases}
     return law, log["qlkv"] - log["nh"]
 
 

@@ -106,6 +106,15 @@ class ChainState:
     random_has_normal: int
     random_normal: float
 
+    @property
+    def steps(self) -> int:
+        return len(self.samples)
+
+    def emcee_state(self, emcee: Any) -> Any:
+        """Where the walkers stand at the end, for emcee to go on."""
+        random = ("MT19937", self.random_key, self.random_position, self.random_has_normal, self.random_normal)
+        return emcee.State(self.samples[-1], log_prob=self.log_density[-1], random_state=random)
+
 
 def sample(
     log_density: Callable[[Array], Array],
@@ -139,83 +148,77 @@ def sample(
     emcee = _emcee()
     n = ensemble.shape[1]
     walkers = max(walkers, 2 * (n + 1)) + max(walkers, 2 * (n + 1)) % 2
-    if resume is None:
-        state, chain = _start(emcee, log_density, ensemble, seed, walkers, emulated), _Blocks(walkers, n)
-    else:
-        state, chain = _state_of(emcee, resume), _Blocks.of(resume)
+    chain = resume
+    state = _start(emcee, log_density, ensemble, seed, walkers, emulated) if chain is None else chain.emcee_state(emcee)
+    sampler = emcee.EnsembleSampler(walkers, n, log_density, vectorize=True, moves=_moves(emcee, emulated))
+    sampler.log_prob_fn = log_density  # bare: emcee's wrapper prints every position where Ctrl-C comes
+    while True:
+        steps = 0 if chain is None else chain.steps
+        if chain is not None:
+            mixing = _Mixing.of(chain, target)
+            if look is not None:
+                look(ChainRecord(steps, float(np.max(mixing.r_hat)), float(np.min(mixing.effective))))
+            if mixing.converged or steps >= max_steps:
+                return _finished(chain, mixing, ensemble)
+        sampler.reset()
+        block = min(max_steps - steps, max(BLOCK, steps // 4))
+        state = sampler.run_mcmc(state, block, skip_initial_state_check=True)
+        chain = _longer(chain, sampler, state.random_state)
+        if keep is not None:
+            keep(chain)
+
+
+def _moves(emcee: Any, emulated: Emulated | None) -> list[tuple[Any, float]]:
+    """Moves and their shares."""
     guided = 0.0 if emulated is None else GUIDED_SHARE
     moves = [
         (emcee.moves.DEMove(), (1 - guided) * DE_SHARE),
         (emcee.moves.StretchMove(), (1 - guided) * (1 - DE_SHARE)),
     ]
-    if emulated is not None:
-        moves.append((emcee.moves.MHMove(_guided(emulated)), guided))
-    sampler = emcee.EnsembleSampler(walkers, n, log_density, vectorize=True, moves=moves)
-    sampler.log_prob_fn = log_density  # bare: emcee's wrapper prints every position where Ctrl-C comes
-    steps, converged = chain.steps, False
-    while True:
-        if steps:
-            samples = chain.samples[int(BURN_IN * steps) :]
-            r_hat, effective = split_r_hat(samples), effective_sample_size(samples)
-            converged = bool(np.all(r_hat < MAX_R_HAT) and np.all(effective >= target))
-            if look is not None:
-                look(ChainRecord(steps, float(np.max(r_hat)), float(np.min(effective))))
-            if converged or steps >= max_steps:
-                break
-        block = min(max_steps - steps, max(BLOCK, steps // 4))
-        sampler.reset()
-        state = sampler.run_mcmc(state, block, skip_initial_state_check=True)
-        chain.add(sampler.get_chain(), sampler.get_log_prob(), sampler.backend.accepted)
-        steps += block
-        if keep is not None:
-            keep(chain.state(state.random_state))
-    flat = samples.reshape(-1, n)
+    return moves if emulated is None else [*moves, (emcee.moves.MHMove(_guided(emulated)), guided)]
+
+
+@dataclass(frozen=True)
+class _Mixing:
+    """What the part of a chain after burn-in says of its convergence."""
+
+    samples: Array
+    r_hat: Array
+    effective: Array
+    converged: bool
+
+    @classmethod
+    def of(cls, chain: ChainState, target: float) -> _Mixing:
+        samples = chain.samples[int(BURN_IN * chain.steps) :]
+        r_hat, effective = split_r_hat(samples), effective_sample_size(samples)
+        return cls(samples, r_hat, effective, bool(np.all(r_hat < MAX_R_HAT) and np.all(effective >= target)))
+
+
+def _finished(chain: ChainState, mixing: _Mixing, ensemble: Array) -> Chain:
+    flat = mixing.samples.reshape(-1, ensemble.shape[1])
     spread = flat.std(axis=0)
     return Chain(
-        samples=samples,
-        log_density=chain.log_density[int(BURN_IN * steps) :],
-        r_hat=r_hat,
-        effective=effective,
-        acceptance=float(np.mean(chain.accepted / steps)),
-        steps=steps,
-        converged=converged,
+        samples=mixing.samples,
+        log_density=chain.log_density[-len(mixing.samples) :],
+        r_hat=mixing.r_hat,
+        effective=mixing.effective,
+        acceptance=float(np.mean(chain.accepted / chain.steps)),
+        steps=chain.steps,
+        converged=mixing.converged,
         moved=(flat.mean(axis=0) - ensemble.mean(axis=0)) / spread,
         widened=spread / ensemble.std(axis=0, ddof=1),
     )
 
 
-@dataclass
-class _Blocks:
-    """The chain as it grows, block by block."""
-
-    walkers: int
-    size: int
-
-    def __post_init__(self) -> None:
-        self.samples = np.empty((0, self.walkers, self.size))
-        self.log_density = np.empty((0, self.walkers))
-        self.accepted = np.zeros(self.walkers)
-
-    @classmethod
-    def of(cls, state: ChainState) -> _Blocks:
-        chain = cls(*state.samples.shape[1:])
-        chain.add(state.samples, state.log_density, state.accepted)
-        return chain
-
-    @property
-    def steps(self) -> int:
-        return len(self.samples)
-
-    def add(self, samples: Array, log_density: Array, accepted: Array) -> None:
-        self.samples = np.concatenate([self.samples, samples])
-        self.log_density = np.concatenate([self.log_density, log_density])
-        self.accepted = self.accepted + accepted
-
-    def state(self, random: Any) -> ChainState:
-        _, key, position, has_normal, normal = random
-        return ChainState(
-            self.samples, self.log_density, self.accepted, key, int(position), int(has_normal), float(normal)
-        )
+def _longer(chain: ChainState | None, sampler: Any, random: Any) -> ChainState:
+    """The chain so far, if any, and the block that the sampler has just run."""
+    samples, log_density, accepted = sampler.get_chain(), sampler.get_log_prob(), sampler.backend.accepted
+    if chain is not None:
+        samples = np.concatenate([chain.samples, samples])
+        log_density = np.concatenate([chain.log_density, log_density])
+        accepted = chain.accepted + accepted
+    _, key, position, has_normal, normal = random
+    return ChainState(samples, log_density, accepted, key, int(position), int(has_normal), float(normal))
 
 
 def _start(
@@ -244,12 +247,6 @@ def _start(
         twin = alive[i % len(alive)]
         start[i] = start[twin] + 1e-3 * (start[twin] - ensemble.mean(axis=0))
     return emcee.State(start, random_state=np.random.RandomState(int(random.integers(2**32))).get_state())
-
-
-def _state_of(emcee: Any, chain: ChainState) -> Any:
-    """Where the walkers stand at the end of a chain."""
-    random = ("MT19937", chain.random_key, chain.random_position, chain.random_has_normal, chain.random_normal)
-    return emcee.State(chain.samples[-1], log_prob=chain.log_density[-1], random_state=random)
 
 
 def _guided(emulated: Emulated) -> Callable[[Array, Any], tuple[Array, Array]]:

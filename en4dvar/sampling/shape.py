@@ -13,7 +13,7 @@ import numpy as np
 from en4dvar import diagnostics as diag
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.prior import member_stream
-from en4dvar.sampling.emulator import Emulator, emulate
+from en4dvar.sampling.emulated_cost import EmulatedCost, emulate
 from en4dvar.state import Array
 
 CHAIN_FITS = 4  # of an emulator that has to guide a chain into the tails; two tell mean and spread
@@ -43,7 +43,7 @@ def examine_shape(space: WeightSpace, ensemble: Array, mode: Array, costs: Array
     return {**shape, "non_gaussian": diag.is_non_gaussian(shape)}
 
 
-def guide(space: WeightSpace, ensemble: Array, seed: int, fits: int = CHAIN_FITS) -> Emulator | None:
+def guide(space: WeightSpace, ensemble: Array, seed: int, fits: int = CHAIN_FITS) -> EmulatedCost | None:
     """An emulator of J about an ensemble (N, n); None where the settings or the model forbid."""
     wanted = space.settings.emulator
     if wanted == "off" or (wanted == "auto" and not space.problem.model.compiled):

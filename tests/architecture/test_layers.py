@@ -27,6 +27,7 @@ LAYERS = (
     ("cycling",),
     ("sampling",),
     ("assimilate",),
+    ("population",),
     ("inputs",),
     ("config",),
     ("storage",),

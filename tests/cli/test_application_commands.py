@@ -29,7 +29,7 @@ def test_an_interrupted_sweep_says_how_to_continue(tmp_path: Path, monkeypatch: 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("en4dvar_bubble.study.sweep.run_sweep", interrupt)
+    monkeypatch.setattr("en4dvar.sampling.sweep.run_sweep", interrupt)
     call = ["sweep", str(CONFIG), "--trajectories", "64", "--out", str(tmp_path / "sweep"), "--force"]
     monkeypatch.setattr("sys.argv", ["en4dvar", *call])
     done = CliRunner().invoke(main, call)

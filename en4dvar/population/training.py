@@ -1,0 +1,148 @@
+"""Forward runs of every data set about its posterior under an interim prior, and the emulators learnt from them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.population.effort import Effort
+from en4dvar.population.likelihoods import JITTER, EmulatedLikelihood, draw_interim, fit_likelihood
+from en4dvar.population.marginals import TEMPERATURE
+from en4dvar.prior import member_stream
+from en4dvar.sampling.forward_runs import Runs, Sets, log_likelihood
+from en4dvar.state import Array
+
+SAMPLE, SEARCH = 512, 80  # of the interim prior, and rounds of a search from it
+POOR = 4.0  # standard deviations of χ²
+SETTLING = 6  # the walkers' positions are kept after this part of their rounds
+PIECES = 8  # of a large batch of control vectors, run one after the other
+
+
+class Training:
+    """Points (S, B, n) that were run and what came of them (S, B, K); ``count`` forward runs.
+
+    The first are visited by walkers of each set under N(mean, std²), from ``start`` on. Where that fits too badly to be
+    chance (it may have ended in a minimum that is not the lowest), they start from where a search from a sample of
+    N(mean, std²) ends, if that is better.
+    """
+
+    def __init__(
+        self, runs: Runs, start: Array, mean: Array, std: Array, seed: int, effort: Effort, workers: int = 1
+    ):  # fmt: skip
+        self.runs, self.seed, self.degree, self.workers = runs, seed, effort.degree, workers
+        self.count, self.revisited, self.refits = 0, 0, 0
+        self.at, self.outputs = np.empty((0, 0, 0)), np.empty((0, 0, 0))
+        stream = member_stream(seed, "interim runs")
+        walkers = effort.walkers // 2 * 2
+        x, density = self._started(start, walkers, mean, std, stream)
+        kept = self._visit(x, density, mean, std, effort.rounds, stream)
+        self.likelihoods = self._fitted(kept, mean, std)
+        self.refit(mean, std, effort.refits)
+
+    def refit(self, mean: Array, std: Array, times: int) -> None:
+        """So many turns of running where the emulators see the posterior under N(mean, std²).
+
+        In every other turn it is the tempered one, which the weights draw from as well.
+        """
+        for _ in range(times):
+            words, hot = f"training draws {self.refits}", TEMPERATURE if self.refits % 2 else 1.0
+            draws = draw_interim(
+                self.likelihoods, mean, std, self.seed, words, count=4, temperature=hot, workers=self.workers
+            )
+            outputs = np.concatenate([self._run(part) for part in np.array_split(draws.transpose(1, 0, 2), 4)])
+            self.at = np.concatenate([self.at, draws], axis=1)
+            self.outputs = np.concatenate([self.outputs, outputs.transpose(1, 0, 2)], axis=1)
+            self.revisited += draws.shape[1]
+            self.refits += 1
+            self.likelihoods = self._fitted(draws, mean, std)
+
+    def _run(self, x: Array, sets: Sets = None) -> Array:
+        """Predictions (B, S, K) of control vectors (B, S, n)."""
+        self.count += x.shape[0] * x.shape[1]
+        return self.runs.predictions(x, sets)
+
+    def _started(
+        self, start: Array, walkers: int, mean: Array, std: Array, stream: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """(W, S, n) where the walkers start, and their log-densities (W, S)."""
+        x = start[:, stream.permutation(start.shape[1])[:walkers]].transpose(1, 0, 2).copy()
+        logs = log_likelihood(self.runs, self._run(x))
+        density = logs + _log_gauss(x, mean, std)
+        observations = np.sum(self.runs.weight > 0, axis=1)
+        poor = np.flatnonzero(-2 * logs.mean(axis=0) > observations + POOR * np.sqrt(2 * observations))
+        if len(poor):
+            found, best = self._searched(poor, mean, std, walkers, stream)
+            better = poor[best.max(axis=0) > density[:, poor].max(axis=0)]
+            chosen = np.isin(poor, better)
+            x[:, better], density[:, better] = found[:, chosen], best[:, chosen]
+        return x, density
+
+    def _visit(
+        self, x: Array, density: Array, mean: Array, std: Array, rounds: int, stream: np.random.Generator
+    ) -> Array:
+        """(S, D, n) positions of walkers (W, S, n), which move by differential evolution (ter Braak 2006), each half
+        about the other; what they try is what the emulators are learnt from.
+        """
+        _, n_sets, n = x.shape
+        half, sets = len(x) // 2, np.arange(n_sets)
+        x, density = x.reshape(2, half, n_sets, n), density.reshape(2, half, n_sets)
+        points, outputs, kept = [], [], []
+        for step in range(rounds):
+            for g in (0, 1):
+                a = stream.integers(half, size=(half, n_sets))
+                b = (a + stream.integers(1, half, size=(half, n_sets))) % half
+                jump = 1.0 if step % 10 == 0 else 2.38 / math.sqrt(2 * n) * (1.0 if step % 2 else 0.5)
+                trial = x[g] + jump * (x[1 - g][a, sets] - x[1 - g][b, sets])
+                trial = trial + JITTER * std * stream.standard_normal(trial.shape)
+                predicted = self._run(trial)
+                new = log_likelihood(self.runs, predicted) + _log_gauss(trial, mean, std)
+                better = np.log(stream.uniform(size=new.shape)) < new - density[g]
+                x[g] = np.where(better[..., None], trial, x[g])
+                density[g] = np.where(better, new, density[g])
+                if step >= rounds // SETTLING:
+                    points.append(trial)
+                    outputs.append(predicted)
+                    kept.append(x[g].copy())
+        self.at, self.outputs, positions = (
+            np.concatenate(parts).transpose(1, 0, 2) for parts in (points, outputs, kept)
+        )
+        return positions
+
+    def _searched(
+        self, sets: npt.NDArray[np.intp], mean: Array, std: Array, count: int, stream: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """(count, s, n) coordinates that differential evolution finds for ``sets``, and their log-densities."""
+
+        def evaluated(at: Array) -> Array:
+            pieces = [log_likelihood(self.runs, self._run(p, sets), sets) for p in np.array_split(at, PIECES)]
+            return np.concatenate(pieces) + _log_gauss(at, mean, std)
+
+        own = np.arange(len(sets))
+        x = mean + std * stream.standard_normal((SAMPLE, len(sets), len(mean)))
+        density = evaluated(x)
+        first = np.argsort(-density, axis=0)[:count]
+        x, density = x[first, own], density[first, own]
+        for _ in range(SEARCH):
+            a = stream.integers(count, size=density.shape)
+            b = (a + stream.integers(1, count, size=density.shape)) % count
+            top = x[np.argmax(density, axis=0), own]
+            pull, push = stream.uniform(0, 1, (2, *density.shape, 1))
+            trial = x + pull * (top - x) + push * (x[a, own] - x[b, own])
+            new = evaluated(trial)
+            better = new > density
+            x, density = np.where(better[..., None], trial, x), np.where(better, new, density)
+        return x, density
+
+    def _fitted(self, draws: Array, mean: Array, std: Array) -> list[EmulatedLikelihood]:
+        values, weight = self.runs.values, self.runs.weight
+        log_prior = _log_gauss(self.at, mean, std)
+        return [
+            fit_likelihood(x, outputs, log, values[s], weight[s], draws[s], self.degree, self.revisited)
+            for s, (x, outputs, log) in enumerate(zip(self.at, self.outputs, log_prior, strict=True))
+        ]
+
+
+def _log_gauss(x: Array, mean: Array, std: Array) -> Array:
+    return np.asarray(-0.5 * np.sum(((x - mean) / std) ** 2, axis=-1))

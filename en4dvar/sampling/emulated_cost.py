@@ -1,0 +1,155 @@
+"""A stand-in for J that costs nothing to evaluate: J of emulated predictions.
+
+J is a sum of squares of residuals, and a cubic fitted to a few hundred runs gives it to a few tenths where J itself
+varies by tens. The fit is weighted towards runs of low J and made twice: first at draws of the Gaussian posterior, then
+with runs where the first emulator says the posterior is. The share of those runs that importance weights exp(Ĵ − J)
+leave effective says how far Ĵ can be trusted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from en4dvar.diagnostics import effective_share
+from en4dvar.ensemble.forecast import Forecast
+from en4dvar.noise import Predicted
+from en4dvar.observations import Observations
+from en4dvar.prior import Prior
+from en4dvar.sampling.emulator import Coordinates, Emulator
+from en4dvar.sampling.walkers import advance
+from en4dvar.state import Array
+
+DEGREES = (3, 2)  # tried in this order
+RUNS_PER_TERM = 4
+FEWEST_RUNS, MOST_RUNS = 96, 512  # of one fit
+ENOUGH_ALIVE = 0.75  # share of the first runs that must succeed
+CEILING = 20.0  # above the lowest J_o of the runs
+RIDGE = 1e-9
+WALKERS = 300
+SCATTERED, SETTLED = 6, 10  # rounds of the walkers before the second fit, after it
+PER_ROUND = 10  # moves in a round
+
+Run = Callable[[Array], Forecast]
+
+
+@dataclass(frozen=True)
+class EmulatedCost:
+    """Ĵ (B,) of control vectors (B, n): J of the predictions (and rates, ln σ) of ``emulator``.
+
+    J_o is cut at ``ceiling``: far from its runs a polynomial says only that J is large, and a walker that true J lets
+    in there must find its way out. ``share`` is the effective share of the runs that judge it, ``draws`` (S, n) are of
+    exp(−Ĵ). Outputs are stacked as those of ``make``.
+    """
+
+    emulator: Emulator
+    prior: Prior
+    observations: Observations
+    make: Predicted
+    ceiling: float = math.inf
+    share: float = math.nan
+    draws: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+    def cost(self, x: Array) -> Array:
+        """Ĵ (B,) of control vectors (B, n)."""
+        return self._cost(self.emulator.coordinates.of(x))
+
+    def _cost(self, z: Array) -> Array:
+        observed = self.observations.cost(self.make.unstacked(self.emulator.at(z)))
+        return np.minimum(observed, self.ceiling) + _prior_cost(self.prior, self.emulator.coordinates.back(z))
+
+    def walk(self, x: Array, others: Array, random: np.random.Generator, rounds: int) -> list[Array]:
+        """Positions (W, n) of walkers from ``x`` after each round, sampling exp(−Ĵ); ``others`` (W', n) stand still."""
+        coordinates = self.emulator.coordinates
+        z, others = coordinates.of(x), coordinates.of(others)
+        costs, positions = self._cost(z), []
+        for _ in range(rounds):
+            z, costs = advance(self._cost, z, costs, others, random, PER_ROUND)
+            positions.append(coordinates.back(z))
+        return positions
+
+
+@dataclass(frozen=True)
+class _Runs:
+    """Members that could be run: control vectors (B, n), outputs (B, Ky) of the make of ``make``, J (B,)."""
+
+    x: Array
+    outputs: Array
+    costs: Array
+    make: Predicted
+
+    def joined(self, other: _Runs) -> _Runs:
+        x, outputs = np.concatenate([self.x, other.x]), np.concatenate([self.outputs, other.outputs])
+        return replace(self, x=x, outputs=outputs, costs=np.concatenate([self.costs, other.costs]))
+
+
+def needed_runs(n_parameters: int) -> tuple[int, int] | None:
+    """(Degree, runs of one fit) for so many parameters; None where there are too many of them."""
+    for degree in DEGREES:
+        runs = RUNS_PER_TERM * math.comb(n_parameters + degree, degree)
+        if runs <= MOST_RUNS:
+            return degree, max(FEWEST_RUNS, runs)
+    return None
+
+
+def emulate(
+    run: Run,
+    prior: Prior,
+    observations: Observations,
+    ensemble: Array,
+    random: np.random.Generator,
+    fits: int = 2,
+) -> EmulatedCost | None:
+    """Ĵ about a Gaussian ensemble (N, n), transformed, with draws of it.
+
+    Each of the ``fits`` takes the :func:`needed_runs` of the model through ``run``, from the second on where the one
+    before says the posterior is. None where there are too many parameters for polynomials, or so many runs fail that
+    the rest does not determine them.
+    """
+    n = ensemble.shape[1]
+    wanted = needed_runs(n)
+    if wanted is None or len(ensemble) <= n:
+        return None
+    degree, count = wanted
+    coordinates = Coordinates.about(ensemble)
+    runs = _run(run, prior, observations, coordinates.back(random.standard_normal((count, n))))
+    if len(runs.x) < ENOUGH_ALIVE * count:
+        return None
+    emulated = _fit(prior, observations, coordinates, degree, runs)
+    kept, share = runs.x, math.nan
+    walkers = kept[random.permutation(len(kept))[:WALKERS]]
+    for _ in range(fits - 1):
+        positions = emulated.walk(walkers, kept, random, SCATTERED)
+        walkers, kept = positions[-1], np.concatenate(positions[SCATTERED // 2 :])
+        new = _run(run, prior, observations, kept[np.linspace(0, len(kept) - 1, count).astype(int)])
+        if not len(new.x):
+            return None
+        share = effective_share(emulated.cost(new.x) - new.costs) * len(new.x) / count  # of the fit without them
+        runs = runs.joined(new)
+        emulated = _fit(prior, observations, coordinates, degree, runs)
+    settled = emulated.walk(walkers, kept, random, SETTLED)
+    ceiling = float(np.min(runs.costs - _prior_cost(prior, runs.x))) + CEILING
+    return replace(emulated, ceiling=ceiling, share=share, draws=np.concatenate(settled[SETTLED // 3 :]))
+
+
+def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> _Runs:
+    """Run control vectors (B, n); the survivors."""
+    found = run(x)
+    costs = _prior_cost(prior, x) + observations.cost(found.predicted)
+    alive = found.active & np.isfinite(costs)
+    return _Runs(x[alive], found.predicted.stacked[alive], costs[alive], found.predicted[:0])
+
+
+def _prior_cost(prior: Prior, x: Array) -> Array:
+    z = (x - prior.mean) / prior.std
+    return np.asarray(0.5 * (z * z).sum(axis=1))
+
+
+def _fit(prior: Prior, observations: Observations, coordinates: Coordinates, degree: int, runs: _Runs) -> EmulatedCost:
+    """A run whose J exceeds the lowest by the width of a posterior, 2n, counts half."""
+    excess = (runs.costs - runs.costs.min()) / (2 * len(coordinates.centre))
+    emulator = Emulator.fitted(coordinates, degree, runs.x, runs.outputs, 1 / (1 + excess**2), RIDGE)
+    return EmulatedCost(emulator, prior, observations, runs.make)

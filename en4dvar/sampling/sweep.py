@@ -1,0 +1,289 @@
+"""Every trajectory of one design against every data set: the best fit by NRMSE over a time shift.
+
+This is the "IMR Approach" of Mancia et al. (2021). The design is a scrambled Sobol sequence, uniform in the transformed
+coordinates of the priors within ``width`` standard deviations of their means. It is shared by all data sets, so a
+trajectory is computed once: where their priors differ it fills the smallest box around all of them, and each set takes
+its fit from within its own. Trajectories stream through in chunks; of each chunk only the best fit of every set is
+kept, on disk where a folder is given, and an interrupted sweep continues with the chunks that are missing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from en4dvar.errors import ConfigError, DataError
+from en4dvar.executor import Executor, SerialExecutor
+from en4dvar.files import atomic_path
+from en4dvar.prior import Prior, member_stream
+from en4dvar.problem import InverseProblem
+from en4dvar.sampling.forward_runs import Predictor
+from en4dvar.sampling.nearest import Targets, best_over_shifts, targets
+from en4dvar.state import TIME_SHIFT, Array, Parameter
+
+BATCH = 128  # trajectories whose full solution is in memory at once, a worker
+T = TypeVar("T")
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class SweepSettings:
+    """``shift`` and ``step``: the largest time shift and the step of the traces' time grid, in the model's time unit.
+
+    After the design come ``rounds`` of local refinement of every set's best fit by differential evolution (Storn &
+    Price 1997, "best/1"): ``local`` trajectories a set, first in ±``width``/4 prior standard deviations about it. They
+    follow the narrow valleys of parameters that make up for each other.
+    """
+
+    trajectories: int
+    shift: float
+    step: float
+    width: float = 3.0
+    chunk: int = 2048
+    rounds: int = 0
+    local: int = 32
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best fit of each of S sets so far: transformed ``x`` (S, n), ``shift`` (S,), ``nrmse`` (S,)."""
+
+    x: Array
+    shift: Array
+    nrmse: Array
+
+    def merged(self, other: Best) -> Best:
+        """The better of the two, set by set; this one where they are equal."""
+        better = other.nrmse > self.nrmse
+        x = np.where(better[:, None], other.x, self.x)
+        return Best(x, np.where(better, other.shift, self.shift), np.where(better, other.nrmse, self.nrmse))
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """Best fits of S data sets. ``theta`` (S, n) physical, SI, in the order of ``parameters``; ``shift`` (S,)."""
+
+    names: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
+    theta: Array
+    shift: Array
+    nrmse: Array
+    trajectories: int
+
+    def part(self, rows: slice) -> SweepResult:
+        """Of some of the data sets."""
+        return replace(
+            self, names=self.names[rows], theta=self.theta[rows], shift=self.shift[rows], nrmse=self.nrmse[rows]
+        )
+
+    @property
+    def mean(self) -> Array:
+        """(n,) NRMSE-weighted mean over the sets, Σ w θ / Σ w with w the NRMSE of the best fit."""
+        return np.asarray(np.average(self.theta, axis=0, weights=self.nrmse))
+
+    @property
+    def std(self) -> Array:
+        """(n,) NRMSE-weighted standard deviation over the sets, √(Σ w (θ − mean)² / Σ w)."""
+        return np.asarray(np.sqrt(np.average((self.theta - self.mean) ** 2, axis=0, weights=self.nrmse)))
+
+
+def run_sweep(
+    problems: Sequence[InverseProblem],
+    settings: SweepSettings,
+    seed: int,
+    executor: Executor | None = None,
+    folder: Path | None = None,
+    progress: Progress | None = None,
+    earliest: float = 0.0,
+) -> SweepResult:
+    """Fit every data set.
+
+    Parameters
+    ----------
+    problems: of one model and the same parameters with the same transforms, whose priors may differ. A prior on
+        ``t_s`` plays no part: the shift is searched within its limits.
+    folder: where finished chunks are kept, and found again by a sweep that continues; the caller clears it.
+    progress: called with the trajectories done and to do.
+    earliest: the instant before which the model has no path; −inf where it has one at any time.
+
+    Raises
+    ------
+    ConfigError: the data sets do not share a model, fixed values or parameters; nothing but t_s is estimated.
+    DataError: no trajectory fits a set; a reading would be compared before ``earliest``.
+    """
+    executor = executor or SerialExecutor()
+    ranges = _Ranges.of(problems, settings.width)
+    try:
+        aims = targets([p.observations for p in problems], settings.shift, settings.step, earliest)
+    except ValueError as error:
+        raise DataError(str(error)) from None
+    score = _Score(_without_shift(problems[0]), ranges, aims)
+    low, high = ranges.low.min(axis=0), ranges.high.max(axis=0)
+    design = sobol_box((low + high) / 2, (high - low) / 2, settings.trajectories, seed)
+    parts = [design[i : i + settings.chunk] for i in range(0, len(design), settings.chunk)]
+    total, done = settings.trajectories + refinement_size(settings, len(problems)), 0
+    found: dict[int, Best] = {}
+    for i, best in _results(executor, score.chunk, [(x, _file(folder, i)) for i, x in enumerate(parts)]):
+        found[i] = best
+        done += len(parts[i])
+        if progress is not None:
+            progress(done, total)
+    best = found[0]
+    for i in range(1, len(parts)):
+        best = best.merged(found[i])
+    for count, refined in _refined(score, best, settings, seed, executor):
+        best = refined
+        done += count
+        if progress is not None:
+            progress(done, total)
+    names = tuple(p.observations.name for p in problems)
+    lost = [name for name, value in zip(names, best.nrmse, strict=True) if not math.isfinite(value)]
+    if lost:
+        raise DataError(f"no trajectory of the design could be integrated for {', '.join(lost)}")
+    prior = score.problem.prior
+    return SweepResult(names, prior.parameters, prior.to_physical(best.x), best.shift, best.nrmse, done)
+
+
+def refinement_size(settings: SweepSettings, n_sets: int) -> int:
+    """Trajectories of the local refinement."""
+    return (settings.rounds + 1) * settings.local * n_sets if settings.rounds else 0
+
+
+def sobol_box(centre: Array, half: Array, count: int, seed: int) -> Array:
+    """Scrambled Sobol points (count, n) in ``centre`` ± ``half``; more points leave the first ones as they were."""
+    from scipy.stats import qmc  # not needed to import the package
+
+    unit = qmc.Sobol(len(centre), rng=seed).random_base2(max(1, math.ceil(math.log2(count))))[:count]
+    return np.asarray(centre + (2 * unit - 1) * half)
+
+
+def _without_shift(problem: InverseProblem) -> InverseProblem:
+    """The problem whose control vector is what a sweep searches. Raises :class:`ConfigError` where that is nothing."""
+    terms = tuple(t for t in problem.prior.terms if t.parameter.name != TIME_SHIFT.name)
+    if not terms:
+        raise ConfigError("nothing but the time shift is estimated; a sweep needs a prior on a parameter")
+    fixed = {name: value for name, value in problem.fixed.items() if name != TIME_SHIFT.name}
+    return replace(problem, prior=Prior(terms), fixed=fixed)
+
+
+@dataclass(frozen=True)
+class _Ranges:
+    """What is searched for each set, ``low`` to ``high`` (S, n), transformed, and the prior's ``std`` (S, n)."""
+
+    low: Array
+    high: Array
+    std: Array
+
+    @classmethod
+    def of(cls, problems: Sequence[InverseProblem], width: float) -> _Ranges:
+        """Raises :class:`ConfigError` where the data sets cannot share a design."""
+        first = problems[0]
+        for other in problems[1:]:
+            same = [(t.parameter.name, t.transform, t.bounds) for t in other.prior.terms] == [
+                (t.parameter.name, t.transform, t.bounds) for t in first.prior.terms
+            ]
+            if not same or other.fixed != first.fixed or other.model is not first.model:
+                raise ConfigError(
+                    "the design is shared: all data sets need one model, the same parameters and the same fixed "
+                    f"values, unlike {other.observations.name}"
+                )
+        priors = [_without_shift(p).prior for p in problems]
+        mean, std = np.stack([p.mean for p in priors]), np.stack([p.std for p in priors])
+        return cls(mean - width * std, mean + width * std, std)
+
+
+@dataclass(frozen=True)
+class _Score:
+    """What all chunks share; workers of any kind can have it."""
+
+    problem: InverseProblem
+    ranges: _Ranges
+    aims: Targets
+
+    def chunk(self, x: Array, file: Path | None) -> Best:
+        """The best fits among coordinates (B, n), from ``file`` where they are, or kept there."""
+        if file is not None and file.exists():
+            with np.load(file) as stored:
+                return Best(**stored)
+        best = self._best(x[:BATCH])
+        for i in range(BATCH, len(x), BATCH):
+            best = best.merged(self._best(x[i : i + BATCH]))
+        if file is not None:
+            with atomic_path(file, durable=False) as partial, partial.open("wb") as stream:
+                np.savez(stream, **vars(best))
+        return best
+
+    def _best(self, x: Array) -> Best:
+        nrmse, shift = self.of(x)
+        # the box around all priors holds coordinates that belong to no range of a set; a rounding is not outside
+        edge = 1e-9 * self.ranges.std
+        inside = np.all((x[:, None] >= self.ranges.low - edge) & (x[:, None] <= self.ranges.high + edge), axis=2)
+        nrmse = np.where(inside, nrmse, -np.inf)
+        row, sets = np.argmax(nrmse, axis=0), np.arange(nrmse.shape[1])
+        return Best(x[row], shift[row, sets], nrmse[row, sets])
+
+    def of(self, x: Array) -> tuple[Array, Array]:
+        """NRMSE and shift (B, S) of coordinates (B, n)."""
+        times = np.broadcast_to(self.aims.grid, (len(x), len(self.aims.grid)))
+        return best_over_shifts(Predictor(self.problem).at(x, times), self.aims)
+
+
+def _refined(
+    score: _Score, best: Best, settings: SweepSettings, seed: int, executor: Executor
+) -> Iterator[tuple[int, Best]]:
+    """Trajectories run and the best fits after each round."""
+    if not settings.rounds:
+        return
+    n_sets, half = len(best.nrmse), settings.width / 4 * score.ranges.std
+    x = np.stack([sobol_box(best.x[s], half[s], settings.local, seed + 1 + s) for s in range(n_sets)])
+    nrmse, shift = _own(score, x, executor)
+    stream = member_stream(seed, "sweep refinement")
+    for number in range(settings.rounds + 1):
+        if number:
+            trial = _trials(score.ranges, x, best, stream)
+            new, moved = _own(score, trial, executor)
+            better = new > nrmse
+            x, shift = np.where(better[..., None], trial, x), np.where(better, moved, shift)
+            nrmse = np.where(better, new, nrmse)
+        top, sets = np.argmax(nrmse, axis=1), np.arange(n_sets)
+        best = best.merged(Best(x[sets, top], shift[sets, top], nrmse[sets, top]))
+        yield nrmse.size, best
+
+
+def _trials(ranges: _Ranges, x: Array, best: Best, stream: np.random.Generator) -> Array:
+    """best + F (x_b − x_c) of each set, inside the range of the design."""
+    n_sets, count, _ = x.shape
+    pairs = np.argsort(stream.uniform(size=(n_sets, count, count)), axis=2)[..., :2]
+    b, c = (np.take_along_axis(x, pairs[..., k, None], axis=1) for k in (0, 1))
+    step = stream.uniform(0.4, 1.0, (n_sets, count, 1)) * (b - c)
+    return np.clip(best.x[:, None] + step, ranges.low[:, None], ranges.high[:, None])
+
+
+def _own(score: _Score, x: Array, executor: Executor) -> tuple[Array, Array]:
+    """NRMSE and shift (S, L) of coordinates (S, L, n), each against its own set."""
+    n_sets, count, n = x.shape
+    flat = x.reshape(-1, n)
+    found = dict(_results(executor, score.of, [(flat[i : i + BATCH],) for i in range(0, len(flat), BATCH)]))
+    parts = zip(*(found[i] for i in range(len(found))), strict=True)
+    nrmse, shift = (np.concatenate(p).reshape(n_sets, count, n_sets) for p in parts)
+    sets = np.arange(n_sets)
+    return nrmse[sets, :, sets], shift[sets, :, sets]
+
+
+def _results(
+    executor: Executor, function: Callable[..., T], calls: Sequence[tuple[Any, ...]]
+) -> Iterator[tuple[int, T]]:
+    """Index and value of every call, as they end; raises what a call raises."""
+    for i, value in executor.map(function, calls):
+        if isinstance(value, Exception):
+            raise value
+        yield i, value
+
+
+def _file(folder: Path | None, number: int) -> Path | None:
+    return folder / f"chunk_{number:05d}.npz" if folder else None

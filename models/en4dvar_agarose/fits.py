@@ -1,0 +1,155 @@
+"""What the study computes of each gel and model, and what can be said of it."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from en4dvar.analysis import Analysis
+from en4dvar.diagnostics import nrmse
+from en4dvar.errors import DataError
+from en4dvar.population import Population
+from en4dvar.prior import Prior
+from en4dvar.problem import InverseProblem
+from en4dvar.sampling.evidence import Evidence
+from en4dvar.sampling.sweep import SweepResult
+from en4dvar.state import Array
+from en4dvar_agarose.evidence import Comparison
+from en4dvar_agarose.paper import Model, Route
+from en4dvar_agarose.settings import StudyPlan
+
+_TRUTH_UNITS = {"G_kPa": ("G", 1e3), "alpha": ("alpha", 1.0), "mu_Pa_s": ("mu", 1.0), "R0_um": ("R0", 1e-6)}
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Both routes of one model on the S data sets of one gel."""
+
+    gel: str
+    model: Model
+    problems: tuple[InverseProblem, ...]
+    sweep: SweepResult
+    analyses: tuple[Analysis, ...]
+    evidence: Evidence | None = None
+
+    @property
+    def log_evidence(self) -> Array:
+        """(S,) ln p(y); by Laplace's approximation where it was not computed."""
+        if self.evidence is None:
+            return self.laplace_evidence
+        return self.evidence.log - np.array([p.observations.log_normalisation() for p in self.problems])
+
+    @property
+    def laplace_evidence(self) -> Array:
+        """(S,) ln p(y) by Laplace's approximation at the end of the iterations."""
+        return np.array([a.log_evidence for a in self.analyses])
+
+    @property
+    def prior(self) -> Prior:
+        return self.problems[0].prior
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the data sets."""
+        return tuple(p.observations.name for p in self.problems)
+
+    @property
+    def starts(self) -> Array:
+        """(S, N, n) posterior members in transformed space; one that failed is replaced by the centre."""
+        members = [np.where(np.isfinite(a.posterior), a.posterior, a.centre) for a in self.analyses]
+        return np.stack([self.prior.from_physical(m) for m in members])
+
+    def values(self, route: Route, name: str) -> Array:
+        """(S,) estimates of a parameter, SI: best fits of the sweep, or means of the posterior ensembles."""
+        if name in self.problems[0].fixed:
+            return np.full(len(self.problems), self.problems[0].fixed[name])
+        if route == "sweep":
+            return np.asarray(self.sweep.theta[:, [p.name for p in self.sweep.parameters].index(name)])
+        return np.array([np.nanmean(a.posterior[:, self.prior.names.index(name)]) for a in self.analyses])
+
+    def has(self, name: str) -> bool:
+        return name in self.prior.names or name in self.problems[0].fixed
+
+    def estimated(self, name: str) -> bool:
+        return name in self.prior.names
+
+    def nrmse(self, route: Route) -> Array:
+        """(S,) NRMSE of the best fit, or of the centre of the posterior."""
+        if route == "sweep":
+            return self.sweep.nrmse
+        return np.array([nrmse(a.observations.values, a.centre_predictions) for a in self.analyses])
+
+    def summary(self, route: Route, name: str) -> tuple[float, float]:
+        """NRMSE-weighted mean and standard deviation over the sets, SI; a fixed value has none."""
+        if not self.estimated(name):
+            return self.problems[0].fixed[name], 0.0
+        weights, values = self.nrmse(route), self.values(route, name)
+        mean = float(np.average(values, weights=weights))
+        return mean, float(np.sqrt(np.average((values - mean) ** 2, weights=weights)))
+
+    def dfs(self) -> dict[str, float]:
+        """Degrees of freedom for signal of each estimated parameter, mean over the sets."""
+        mean = np.mean([a.dfs_per_parameter for a in self.analyses], axis=0)
+        return dict(zip(self.prior.names, mean, strict=True))
+
+    def members(self, name: str) -> Array:
+        """(S·N,) posterior members of all sets, SI; failed ones left out."""
+        j = self.prior.names.index(name)
+        stacked = np.concatenate([a.posterior[:, j] for a in self.analyses])
+        return stacked[np.isfinite(stacked)]
+
+    def prior_members(self, name: str) -> Array:
+        """(N,) members of the prior, SI."""
+        return np.asarray(self.analyses[0].prior[:, self.prior.names.index(name)])
+
+
+@dataclass(frozen=True)
+class Study:
+    """All that the report shows. ``truth``: data set → parameter → SI value, empty without a twin. ``narrow``: the
+    general quadratic law again, with a prior on R0 as narrow as the spread that Table 2 prints.
+    """
+
+    plan: StudyPlan
+    fits: Mapping[str, Mapping[Model, Fit]]
+    populations: Mapping[str, Population]
+    comparisons: Mapping[str, Comparison]
+    truth: Mapping[str, Mapping[str, float]]
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    narrow: Mapping[str, Fit] = field(default_factory=dict)
+
+    def any_fit(self, gel: str) -> Fit:
+        """Of some model; all have the same data sets."""
+        return next(iter(self.fits[gel].values()))
+
+    def true_values(self, gel: str, name: str) -> Array:
+        """(S,) true values of a gel's data sets, SI; empty where there is no truth."""
+        return np.array([self.truth[n][name] for n in self.any_fit(gel).names if n in self.truth])
+
+    def coverage(self, gel: str, model: Model, name: str, level: float = 0.9) -> float:
+        """Share of the data sets whose central posterior interval holds the truth; NaN without a truth."""
+        fit, tail = self.fits[gel][model], (1 - level) / 2
+        j = fit.prior.names.index(name)
+        inside = [
+            low <= self.truth[a.name][name] <= high
+            for a in fit.analyses
+            if a.name in self.truth
+            for low, high in [np.nanquantile(a.posterior[:, j], (tail, 1 - tail))]
+        ]
+        return float(np.mean(inside)) if inside else float("nan")
+
+
+def read_truth(path: Path) -> dict[str, dict[str, float]]:
+    """Data set → parameter → SI value, of a ``truth.csv`` of a synthetic campaign. Raises :class:`DataError`."""
+    try:
+        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+        rows = list(csv.DictReader(lines))
+        return {
+            row["dataset"]: {name: factor * float(row[column]) for column, (name, factor) in _TRUTH_UNITS.items()}
+            for row in rows
+        }
+    except (OSError, KeyError, ValueError) as error:
+        raise DataError(f"{path}: not the truth of a synthetic campaign of bubbles: {error!r}") from None

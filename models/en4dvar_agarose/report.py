@@ -1,0 +1,241 @@
+"""One self-contained page, the tables in three formats, the figures as PDF and PNG."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from en4dvar.errors import OutputError
+from en4dvar.files import write_bytes, write_text
+from en4dvar.population import HyperPrior
+from en4dvar.report.style import COLUMN, DARK, LIGHT, css_variables, inline_svg, save_figure
+from en4dvar_agarose import measured, tables
+from en4dvar_agarose.evidence import DECISIVE, MISFIT, probability, verdict
+from en4dvar_agarose.figures import all_figures
+from en4dvar_agarose.fits import Study
+from en4dvar_agarose.paper import LABELS, NAMES, QUANTITIES, ROUTES, Route
+from en4dvar_agarose.store import study_netcdf
+
+ROUTE_KEYS: tuple[Route, ...] = ("sweep", "en4dvar")
+Rows = list[list[str]]
+
+
+def write_study(study: Study, directory: Path) -> Path:
+    """Write everything; returns the page. Raises :class:`OutputError`."""
+    figures_folder = directory / "figures"
+    try:
+        figures_folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{figures_folder}: cannot be created: {error.strerror or error}") from None
+    for number, route in enumerate(ROUTE_KEYS, 1):
+        rows = tables.table(study, route)
+        write_text(directory / f"table{number}.csv", tables.as_csv(study, rows, route))
+        write_text(directory / f"table{number}.md", tables.as_markdown(study, rows, route))
+        write_text(directory / f"table{number}.tex", tables.as_latex(study, rows, route))
+    write_text(directory / "sets.csv", tables.per_set_csv(study))
+    write_text(directory / "study.yaml", study.plan.text)
+    write_bytes(directory / "study.nc", study_netcdf(study))
+    figures = []
+    for drawn in all_figures(study):
+        save_figure(drawn.figure, figures_folder, drawn.name)
+        svg = Markup(inline_svg(drawn.figure, drawn.name, drawn.caption))
+        wide = drawn.figure.get_size_inches()[0] > 1.5 * COLUMN
+        figures.append({"name": drawn.name, "caption": drawn.caption, "svg": svg, "wide": wide})
+    return write_text(directory / "study.html", _page(study, figures))
+
+
+def _page(study: Study, figures: list[dict[str, Any]]) -> str:
+    environment = Environment(
+        loader=PackageLoader("en4dvar_agarose", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    fits = [fit for models in study.fits.values() for fit in models.values()]
+    return environment.get_template("page.html.j2").render(
+        plan=study.plan,
+        sweep=study.plan.sweep,
+        seconds=study.seconds,
+        hyper=HyperPrior(),
+        decisive=DECISIVE,
+        gels=len(study.fits),
+        members=fits[0].analyses[0].settings.members,
+        sets=sum(len(study.any_fit(gel).problems) for gel in study.fits),
+        findings=findings(study),
+        tables=[_table(study, route) for route in ROUTE_KEYS],
+        disagreements=tables.disagreements(study),
+        spreads=tables.spread_notes(study),
+        quantities=QUANTITIES,
+        dfs=_dfs(study),
+        narrow=_narrow(study),
+        coverage=_coverage(study),
+        population=_population(study),
+        effective=_effective(study),
+        comparison=_comparison(study),
+        judged=_judged(study),
+        campaigns=_campaigns() if study.plan.synthetic else [],
+        reliability=_reliability() if study.plan.synthetic else [],
+        figures=figures,
+        light=Markup(css_variables(LIGHT)),
+        dark=Markup(css_variables(DARK)),
+    )
+
+
+def _campaigns() -> Rows:
+    rows = []
+    for c in measured.coverage():
+        share = f"{c.held / c.campaigns:.2f} ± {c.error:.2f}"
+        rows.append([c.gel, c.parameter, str(c.held), share, str(c.of_drawn), str(c.campaigns)])
+    return rows
+
+
+def _reliability() -> Rows:
+    rows = []
+    for name, words in measured.EXPERIMENTS.items():
+        difference, quadratic = measured.reliability(name)
+        right = np.mean((difference > 0) == quadratic)
+        rows.append([words, "all", f"{right:.3f}", str(len(difference)), "–"])
+        for b in measured.bins(difference, quadratic):
+            rows.append([words, f"{b.stated:.3f}", f"{b.right:.3f}", str(b.count), f"{b.error:.3f}"])
+    return rows
+
+
+def findings(study: Study) -> list[str]:
+    """The paper's qualitative findings, in numbers of this study."""
+    found = []
+    for gel, models in study.fits.items():
+        for route in ROUTE_KEYS:
+            if {"nh", "qlkv"} <= set(models):
+                nh, general = (models[m].summary(route, "G")[0] for m in ("nh", "qlkv"))
+                mu = {m: models[m].summary(route, "mu")[0] for m in models}
+                viscosities = ", ".join(f"{LABELS[m]} {v:.3f}" for m, v in mu.items())
+                found.append(
+                    f"{gel}, {ROUTES[route]}: G of the neo-Hookean law is {nh / general:.1f} times that of the general "
+                    f"quadratic law; μ hardly depends on the model ({viscosities} Pa s)."
+                )
+    found += [words_of for gel in study.fits if (words_of := _apparent_modulus(study, gel))]
+    for route in ROUTE_KEYS:
+        used = [m for m in NAMES if any(m in models for models in study.fits.values())]
+        scores = {m: np.concatenate([f[m].nrmse(route) for f in study.fits.values() if m in f]) for m in used}
+        words = ", ".join(f"{LABELS[m]} {v.min():.3f} to {v.max():.3f}, mean {v.mean():.3f}" for m, v in scores.items())
+        found.append(f"NRMSE, {ROUTES[route]}: {words}.")
+    return found
+
+
+def _apparent_modulus(study: Study, gel: str) -> str:
+    """Why G of the neo-Hookean law scatters; needs the truth and the neo-Hookean fits."""
+    true = {name: study.true_values(gel, name) for name in ("G", "alpha", "R0")}
+    if "nh" not in study.fits[gel] or len(true["G"]) < 3:
+        return ""
+    sheet = np.log(true["G"] * true["alpha"] / true["R0"])
+    apparent = np.log(study.fits[gel]["nh"].values("en4dvar", "G"))
+    return (
+        f"{gel}: G of the neo-Hookean law stands for the stiffening it lacks: from bubble to bubble its logarithm "
+        f"follows that of the true G α / R₀ (correlation {np.corrcoef(sheet, apparent)[0, 1]:.2f}), so it scatters as "
+        f"α and R₀ do, by ± {apparent.std():.2f} in ln G."
+    )
+
+
+def _table(study: Study, route: Route) -> dict[str, Any]:
+    heads = tables.columns(study)
+    return {
+        "title": tables.TITLES[route],
+        "legend": "; ".join(words for _, words in heads),
+        "rows": [
+            {
+                "gel": row.gel,
+                "model": LABELS[row.model],
+                "cells": [[tables.text(cell, getattr(cell, a)) for a, _ in heads] for cell in row.cells],
+            }
+            for row in tables.table(study, route)
+        ],
+    }
+
+
+def _dfs(study: Study) -> Rows:
+    rows = []
+    for gel, models in study.fits.items():
+        for model, fit in models.items():
+            mean = fit.dfs()
+            shares = [f"{100 * mean[q.name]:.0f} %" if q.name in mean else "–" for q in QUANTITIES]
+            rows.append([gel, LABELS[model], *shares])
+    return rows
+
+
+def _narrow(study: Study) -> Rows:
+    rows = []
+    for gel, narrow in study.narrow.items():
+        for words, fit in (("of this study", study.fits[gel]["qlkv"]), ("as narrow as the printed spread", narrow)):
+            j = fit.prior.names.index("R0")
+            guess, spread = (np.exp(fit.prior.mean[j]) * 1e6, fit.prior.std[j])
+            mean, std = (1e6 * v for v in fit.summary("en4dvar", "R0"))
+            printed = tables.plus_minus(tables.TABLES["en4dvar"][gel]["qlkv"]["R0"])
+            prior, dfs = f"{guess:.3g} µm, ± {100 * spread:.0f} %", f"{100 * fit.dfs()['R0']:.0f} %"
+            estimates, lowest = tables.plus_minus((mean, std)), f"{fit.nrmse('en4dvar').min():.3f}"
+            rows.append([gel, words, prior, estimates, printed, dfs, lowest])
+    return rows
+
+
+def _coverage(study: Study) -> Rows:
+    return [
+        [gel, *(f"{100 * study.coverage(gel, 'qlkv', q.name):.0f} %" for q in QUANTITIES)]
+        for gel in study.fits
+        if study.truth and "qlkv" in study.fits[gel]
+    ]
+
+
+def _population(study: Study) -> Rows:
+    rows = []
+    for gel, found in study.populations.items():
+        fit = study.fits[gel]["qlkv"]
+        interval = found.interval()
+        for q in QUANTITIES:
+            j = found.names.index(q.name)
+            stacked, truth = fit.members(q.name) * q.factor, study.true_values(gel, q.name) * q.factor
+            mean, std = (np.median(values[:, j]) * q.factor for values in (found.mean, found.std))
+            low, high = interval[:, j] * q.factor
+            known = tables.plus_minus((truth.mean(), truth.std(ddof=1))) if len(truth) > 1 else "–"
+            cells = [f"{mean:.3g} [{low:.3g}, {high:.3g}]", f"{std:.2g}"]
+            rows.append(
+                [gel, f"{q.plain} ({q.unit})", *cells, tables.plus_minus((stacked.mean(), stacked.std())), known]
+            )
+    return rows
+
+
+def _effective(study: Study) -> str:
+    """How many draws stand behind each population."""
+    return "; ".join(
+        f"{gel}: {f.size:.0f} effective draws (weights with emulators {f.weighed[0]:.0f}, with forward runs "
+        f"{f.weighed[1]:.0f})" + ("" if f.converged else ", NOT CONVERGED: do not use")
+        for gel, f in study.populations.items()
+    )
+
+
+def _comparison(study: Study) -> Rows:
+    rows = []
+    for gel, found in study.comparisons.items():
+        compared = [
+            (name, value, verdict(value))
+            for name, value in zip(study.fits[gel]["qlkv"].names, found.single, strict=True)
+        ]
+        misfit = f"no verdict: no single gel fits (χ² per reading {found.chi2[0]:.1f} and {found.chi2[1]:.1f})"
+        compared += [
+            ("all sets, a gel each", found.independent, verdict(found.independent)),
+            ("all sets, one population", found.population, verdict(found.population)),
+            ("all sets, one gel", found.shared, misfit if min(found.chi2) > MISFIT else verdict(found.shared)),
+        ]
+        for words, value, judgement in compared:
+            rows.append([gel, words, f"{value:+.1f}", f"{float(probability(np.array(value))):.2f}", judgement])
+    return rows
+
+
+def _judged(study: Study) -> dict[str, Any]:
+    """What the evidences of single sets are worth, and how many decide."""
+    fits = [study.fits[gel][model] for gel in study.comparisons for model in ("nh", "qlkv")]
+    return {
+        "fewest": min((float(fit.evidence.effective.min()) for fit in fits if fit.evidence is not None), default=0.0),
+        "laplace": max((float(np.max(np.abs(fit.laplace_evidence - fit.log_evidence))) for fit in fits), default=0.0),
+        "undecided": sum(c.undecidable for c in study.comparisons.values()),
+        "total": sum(len(c.single) for c in study.comparisons.values()),
+    }

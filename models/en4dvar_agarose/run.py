@@ -1,0 +1,200 @@
+"""The study: both routes on every gel and model, then population and model comparison."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+from functools import partial
+
+import numpy as np
+
+from en4dvar.assimilate import assimilate
+from en4dvar.config.build import build
+from en4dvar.executor import Executor, make_executor
+from en4dvar.forward import ForwardModel
+from en4dvar.population import Population, SharedFit, estimate_population, fit_shared
+from en4dvar.prior import Prior
+from en4dvar.problem import InverseProblem
+from en4dvar.sampling.evidence import Evidence, sampled_evidence
+from en4dvar.sampling.forward_runs import ForwardRuns
+from en4dvar.sampling.sweep import SweepResult, run_sweep
+from en4dvar_agarose.checkpoints import D, StudyCheckpoints
+from en4dvar_agarose.evidence import Comparison
+from en4dvar_agarose.fits import Fit, Study, read_truth
+from en4dvar_agarose.paper import TABLE_2, Model
+from en4dvar_agarose.settings import StudyPlan
+from en4dvar_bubble.model import BubbleModel
+
+Say = Callable[[str], None]
+SHARED = ("G", "alpha", "mu")  # properties of the gel; R0 and t_s belong to the bubble
+POPULATION = ("G", "alpha", "mu", "R0")
+COMPARED: tuple[Model, Model] = ("nh", "qlkv")
+FEWEST_SETS = 3  # of a population
+
+
+def run_study(plan: StudyPlan, workers: int = 1, say: Say | None = None, keep: StudyCheckpoints | None = None) -> Study:
+    """Compute everything; the truth of a twin is read last and enters no estimate.
+
+    ``keep``: where sweeps and populations are kept as they are done, and found by a study that continues.
+
+    Raises
+    ------
+    DataError, ConfigError, TooFewMembersError: as the routes do.
+    """
+    problems = {(gel, m): build(c) for gel, models in plan.configs.items() for m, c in models.items()}
+    model = next(iter(problems.values()))[0].model
+    with make_executor(model, workers) as executor:
+        work = _Parts(plan, executor, workers, say or (lambda message: None), keep, {})
+        with work.timed("sweep"):
+            sweeps = work.sweeps(problems)
+        with work.timed("en4dvar"):
+            fits: dict[str, dict[Model, Fit]] = {gel: {} for gel in plan.configs}
+            for (gel, m), sets in problems.items():
+                fits[gel][m] = work.en4dvar(Fit(gel, m, sets, sweeps[gel, m], ()))
+            narrow = {gel: fit for gel, models in fits.items() if (fit := work.narrow(models.get("qlkv")))}
+        with work.timed("population"):
+            populations, comparisons = work.pooled(fits)
+    work.say(f"population and model comparison in {work.seconds['population']:.1f} s")
+    truth = read_truth(plan.truth) if plan.truth else {}
+    return Study(plan, fits, populations, comparisons, truth, work.seconds, narrow)
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """The parts of a study."""
+
+    plan: StudyPlan
+    executor: Executor
+    workers: int
+    say: Say
+    keep: StudyCheckpoints | None
+    seconds: dict[str, float]
+
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[part] = time.perf_counter() - start
+
+    def kept(self, kind: type[D], compute: Callable[[], D], fit: Fit) -> D:
+        """What ``compute`` gives, or gave before the study was interrupted."""
+        return self.keep.of(kind, compute, fit.gel, fit.model) if self.keep else compute()
+
+    def sweeps(
+        self, problems: Mapping[tuple[str, Model], Sequence[InverseProblem]]
+    ) -> dict[tuple[str, Model], SweepResult]:
+        """One design serves the data sets of one model with the same values fixed."""
+        groups: dict[object, list[tuple[str, Model]]] = {}
+        for (gel, model), sets in problems.items():
+            groups.setdefault((model, tuple(sorted(sets[0].fixed.items()))), []).append((gel, model))
+        found = {}
+        for sharing in groups.values():
+            every, began = one_model([p for key in sharing for p in problems[key]]), time.perf_counter()
+            folder = self.keep.sweep(*sharing[0]) if self.keep else None
+            result = run_sweep(
+                every, self.plan.sweep, self.plan.seed, self.executor, folder, earliest=earliest_reading(every[0].model)
+            )
+            first = 0
+            for key in sharing:
+                found[key] = result.part(slice(first, first + len(problems[key])))
+                first += len(problems[key])
+            words = " and ".join(f"{gel} {model}" for gel, model in sharing)
+            spent = time.perf_counter() - began
+            self.say(
+                f"{words}: sweep of {result.trajectories} trajectories against {len(every)} data sets in {spent:.1f} s"
+            )
+        return found
+
+    def en4dvar(self, fit: Fit) -> Fit:
+        """With the analyses of its problems."""
+        began = time.perf_counter()
+        found = self._analysed(fit)
+        spent = time.perf_counter() - began
+        self.say(f"{fit.gel} {fit.model}: En4D-Var of {len(fit.problems)} data sets in {spent:.1f} s")
+        return found
+
+    def _analysed(self, fit: Fit) -> Fit:
+        config = self.plan.configs[fit.gel][fit.model]
+        analyses = tuple(assimilate(p, config.assimilation, config.seed, self.executor) for p in fit.problems)
+        return replace(fit, analyses=analyses)
+
+    def narrow(self, fit: Fit | None) -> Fit | None:
+        """With a prior on R0 as narrow as printed; None where the paper prints none, or R0 is not estimated."""
+        printed = TABLE_2.get(fit.gel, {}).get(fit.model, {}).get("R0") if fit else None
+        if fit is None or printed is None or not fit.estimated("R0"):
+            return None
+        relative = printed[1] / printed[0]
+        terms = tuple(replace(t, std=relative) if t.parameter.name == "R0" else t for t in fit.prior.terms)
+        return self._analysed(replace(fit, problems=tuple(replace(p, prior=Prior(terms)) for p in fit.problems)))
+
+    def pooled(self, fits: Mapping[str, dict[Model, Fit]]) -> tuple[dict[str, Population], dict[str, Comparison]]:
+        """Populations of the general law and comparisons with the neo-Hookean, a gel each; ``fits`` get evidences."""
+        populations, comparisons = {}, {}
+        for gel, models in fits.items():
+            for m, fit in models.items():
+                models[m] = replace(fit, evidence=self.kept(Evidence, partial(self._evidence, fit), fit))
+            found = {m: self._population(models[m]) for m in COMPARED if m in models}
+            if (general := found.get("qlkv")) is not None:
+                populations[gel] = general
+            if len(found) == len(COMPARED):
+                comparisons[gel] = self._comparison(models, found)
+        return populations, comparisons
+
+    def _runs(self, fit: Fit) -> ForwardRuns:
+        return ForwardRuns(fit.problems, self.executor)
+
+    def _evidence(self, fit: Fit) -> Evidence:
+        return sampled_evidence(self._runs(fit), fit.prior, self.plan.seed)
+
+    def _population(self, fit: Fit) -> Population | None:
+        """None with fewer than 3 data sets."""
+        if len(fit.problems) < FEWEST_SETS:
+            return None
+        names = [name for name in POPULATION if fit.estimated(name)]
+
+        def compute() -> Population:
+            return estimate_population(
+                self._runs(fit), fit.starts, fit.prior, names, self.plan.seed, effort=self.plan.population,
+                workers=self.workers,
+            )  # fmt: skip
+
+        return self.kept(Population, compute, fit)
+
+    def _comparison(self, models: Mapping[Model, Fit], populations: Mapping[Model, Population | None]) -> Comparison:
+        nh, general = (models[m] for m in COMPARED)
+        pooled = {m: math.nan if found is None else found.log_evidence for m, found in populations.items()}
+        one_nh, one_general = (self.kept(SharedFit, partial(self._one_gel, fit), fit) for fit in (nh, general))
+        return Comparison(
+            single=general.log_evidence - nh.log_evidence,
+            population=pooled["qlkv"] - pooled["nh"],
+            shared=one_general.log_evidence - one_nh.log_evidence,
+            chi2=(one_nh.chi2_per_observation, one_general.chi2_per_observation),
+        )
+
+    def _one_gel(self, fit: Fit) -> SharedFit:
+        """All bubbles of a gel with the same material parameters."""
+        names = [name for name in SHARED if fit.estimated(name)]
+        centres = fit.starts.mean(axis=1)
+        starts = np.stack([centres, (centres + fit.prior.mean) / 2])
+        return fit_shared(self._runs(fit), starts, fit.prior, names)
+
+
+def one_model(problems: Sequence[InverseProblem]) -> list[InverseProblem]:
+    """With the first one's model where theirs is the same, as that of two configurations that differ in their data."""
+    first = problems[0].model
+    return [replace(p, model=first) if _same(first, p.model) else p for p in problems]
+
+
+def _same(a: ForwardModel, b: ForwardModel) -> bool:
+    """A law has no settings but its parameters: its class is all."""
+    if not (isinstance(a, BubbleModel) and isinstance(b, BubbleModel) and type(a.law) is type(b.law)):
+        return a is b
+    return all(getattr(a, f.name) == getattr(b, f.name) for f in fields(a) if f.name != "law")
+
+
+def earliest_reading(model: ForwardModel) -> float:
+    """A released bubble is symmetric in time; a driven one has no path before its start."""
+    return -math.inf if isinstance(model, BubbleModel) and model.start == "laser" else 0.0

@@ -1,0 +1,139 @@
+"""The study's YAML file: which configurations make it up, how large the sweep is, where a twin's truth is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from en4dvar.config import Config, load_config
+from en4dvar.config.document import Document, override, read_document
+from en4dvar.config.schema import Name, QuantityText, Section
+from en4dvar.config.validate import check
+from en4dvar.errors import ConfigError, Fault
+from en4dvar.population import Effort
+from en4dvar.sampling.sweep import SweepSettings
+from en4dvar.units import UnitError, parse_quantity
+from en4dvar_agarose.paper import Model
+
+MODELS: tuple[Model, ...] = ("nh", "qs", "qlkv")
+
+
+class Sweep(Section):
+    """Size of the sweep of each model and gel; see :class:`~en4dvar.sampling.sweep.SweepSettings`."""
+
+    trajectories: Annotated[int, Field(ge=2, le=10_000_000)] = 50_000
+    """Size of the design."""
+    shift: QuantityText = "0.8 us"
+    """Largest time shift."""
+    step: QuantityText = "0.025 us"
+    """Step of the time grid and of the shifts."""
+    width: Annotated[float, Field(gt=0, le=10)] = SweepSettings.width
+    """Range searched, in prior standard deviations."""
+    rounds: Annotated[int, Field(ge=0, le=50)] = SweepSettings.rounds
+    """Rounds of local refinement."""
+    local: Annotated[int, Field(ge=1)] = SweepSettings.local
+    """Trajectories a data set in each round of refinement."""
+
+    def built(self) -> SweepSettings:
+        """In seconds. Raises :class:`UnitError`."""
+        shift, step = parse_quantity(self.shift, "s"), parse_quantity(self.step, "s")
+        if shift < 0 or step <= 0:
+            raise UnitError("the shift must not be negative and the step must be positive")
+        return SweepSettings(self.trajectories, shift, step, self.width, rounds=self.rounds, local=self.local)
+
+
+class PopulationSection(Section):
+    """How much the population estimate computes; see :mod:`en4dvar.population`."""
+
+    rounds: Annotated[int, Field(ge=30)] = Effort.rounds
+    """Rounds of the walkers over each data set, from which its emulator is learnt."""
+    components: Annotated[int, Field(ge=1, le=100)] = Effort.components
+    """Gaussians in the mixture that stands for a data set's posterior."""
+    passes: Annotated[int, Field(ge=1)] = Effort.passes
+    """How often, at most, an interim prior is tried; it ends when there are enough effective draws."""
+    draws: Annotated[int, Field(ge=100)] = Effort.draws
+    """Draws of means and spreads that receive importance weights with emulators."""
+    exact: Annotated[int, Field(ge=50)] = Effort.exact
+    """Of them, those weighed by forward runs as well."""
+
+    def built(self) -> Effort:
+        """The rest as by default."""
+        return Effort(**self.model_dump())
+
+
+class StudySchema(Section):
+    """The whole file of ``en4dvar study``."""
+
+    name: Name
+    """Name of the study; its results go to runs/<name>."""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Seed of the sweeps."""
+    synthetic: bool
+    """Whether the data are a synthetic twin; every page says so."""
+    truth: str | None = None
+    """CSV file of the twin's true parameters, read for the report only; relative to this file's folder."""
+    sweep: Sweep = Sweep()
+    """Size of the sweep of each model and gel."""
+    population: PopulationSection = PopulationSection()
+    """How much the population estimate computes."""
+    gels: Annotated[dict[str, dict[str, str]], Field(min_length=1)]
+    """Label of the gel → model (nh, qs, qlkv) → configuration file, relative to this file's folder."""
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """A validated study; ``configs`` gel → model → configuration. ``truth`` is read for the report only."""
+
+    name: str
+    seed: int
+    synthetic: bool
+    truth: Path | None
+    sweep: SweepSettings
+    population: Effort
+    configs: dict[str, dict[Model, Config]]
+    text: str
+
+
+def load_study(path: str | Path, overrides: dict[str, Any] | None = None) -> StudyPlan:
+    """Read a study and every configuration it names; paths are relative to its folder. Raises :class:`ConfigError`."""
+    path = Path(path)
+    document = override(read_document(path), overrides or {})
+    faults: list[Fault] = []
+    top = check(StudySchema, document.data, (), document, faults)
+    if top is None:
+        raise ConfigError(faults)
+    sweep = None
+    try:
+        sweep = top.sweep.built()
+    except UnitError as error:
+        faults.append(document.fault(("sweep",), str(error)))
+    base = path.resolve().parent
+    configs = {gel: _configs(gel, files, base, document, faults) for gel, files in top.gels.items()}
+    if top.truth and not top.synthetic:
+        faults.append(document.fault(("truth",), "only a synthetic campaign has a truth"))
+    truth = base / top.truth if top.truth else None
+    if truth and not truth.is_file():
+        faults.append(document.fault(("truth",), f"{truth}: no such file"))
+    if faults or sweep is None:
+        raise ConfigError(faults)
+    return StudyPlan(top.name, top.seed, top.synthetic, truth, sweep, top.population.built(), configs, document.text)
+
+
+def _configs(
+    gel: str, files: dict[str, str], base: Path, document: Document, faults: list[Fault]
+) -> dict[Model, Config]:
+    found: dict[Model, Config] = {}
+    for name in files:
+        if name not in MODELS:
+            faults.append(document.fault(("gels", gel, name), f"write one of {', '.join(MODELS)}", at_key=True))
+    for model in MODELS:
+        if model not in files:
+            continue
+        try:
+            found[model] = load_config(base / files[model])
+        except ConfigError as error:
+            faults += error.problems
+    return found

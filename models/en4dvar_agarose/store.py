@@ -1,0 +1,85 @@
+"""A study as one netCDF file: a group a gel and model with both routes, and a population's draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from en4dvar.population import Population
+from en4dvar.state import Parameter
+from en4dvar.storage.netcdf import Group, Variable, to_bytes
+from en4dvar_agarose.fits import Fit, Study
+
+
+def study_netcdf(study: Study) -> bytes:
+    """Groups ``/<gel>/<model>``: ``sweep_<parameter>`` (dataset), ``<parameter>`` (dataset, draw) of the posterior
+    ensembles, NRMSE, log-evidence, DFS, ``truth_<parameter>``; ``/<gel>/population``: draws of mean and spread. SI.
+    """
+    about = {
+        "Conventions": "CF-1.8",
+        "title": f"Acoustic cavitation rheometry: {study.plan.name}"
+        + (" (SYNTHETIC twin, no measurement)" if study.plan.synthetic else ""),
+        "source": "en4dvar study; after Mancia et al. (2021), Acoustic Cavitation Rheometry",
+        "history": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} written by en4dvar study",
+        "configuration": study.plan.text,
+    }
+    groups = {"/": Group(attrs=about)}
+    for gel, models in study.fits.items():
+        name = gel.replace("/", "_")
+        groups[f"/{name}"] = Group(attrs={"gel": gel})
+        for model, fit in models.items():
+            groups[f"/{name}/{model}"] = _fit(study, fit)
+        if gel in study.populations:
+            groups[f"/{name}/population"] = _population(study.populations[gel])
+    return to_bytes(groups)
+
+
+def _fit(study: Study, fit: Fit) -> Group:
+    variables: dict[str, Variable] = {}
+    for j, p in enumerate(fit.prior.parameters):
+        about = _words(p)
+        variables[p.name] = Variable(("dataset", "draw"), np.stack([a.posterior[:, j] for a in fit.analyses]), about)
+        variables[f"dfs_{p.name}"] = _plain(
+            np.array([a.dfs_per_parameter[j] for a in fit.analyses]), f"DFS of {p.name}"
+        )
+        truths = np.array([study.truth.get(name, {}).get(p.name, np.nan) for name in fit.names])
+        if study.truth and np.isfinite(truths).any():
+            variables[f"truth_{p.name}"] = Variable(("dataset",), truths, about)
+    for j, p in enumerate(fit.sweep.parameters):
+        variables[f"sweep_{p.name}"] = Variable(("dataset",), fit.sweep.theta[:, j], _words(p))
+    variables["sweep_t_s"] = Variable(("dataset",), fit.sweep.shift, {"units": "s", "long_name": "time shift"})
+    for route, words in (("sweep", "best fit of the sweep"), ("en4dvar", "centre of the posterior")):
+        variables[f"nrmse_{route}"] = _plain(fit.nrmse(route), f"NRMSE, {words}")  # type: ignore[arg-type]
+    variables["log_evidence"] = _plain(fit.log_evidence, "log-evidence, adaptive importance sampling")
+    if fit.evidence is not None:
+        variables["evidence_draws"] = _plain(fit.evidence.effective, "effective number of draws of the log-evidence")
+    coords = {"dataset": Variable(("dataset",), np.array(fit.names, dtype=object), {"long_name": "data set"})}
+    return Group(variables, coords)
+
+
+def _population(found: Population) -> Group:
+    terms = {t.parameter.name: t.parameter for t in found.prior.terms}
+    variables: dict[str, Variable] = {}
+    for j, name in enumerate(found.names):
+        about = _words(terms[name])
+        variables[f"mean_{name}"] = Variable(("draw",), found.mean[:, j], about)
+        variables[f"spread_{name}"] = Variable(("draw",), found.std[:, j], about)
+    judged = {
+        "effective_draws": found.size,
+        "effective_draws_emulators": found.weighed[0],
+        "effective_draws_forward_runs": found.weighed[1],
+        "log_evidence": found.log_evidence,
+        "forward_runs": found.forward_runs,
+    }
+    return Group(variables, attrs=judged)
+
+
+def _words(p: Parameter) -> Mapping[str, Any]:
+    return {"units": p.unit, "long_name": p.label, "display_units": p.display_unit}
+
+
+def _plain(values: np.ndarray[Any, Any], words: str) -> Variable:
+    return Variable(("dataset",), values, {"units": "1", "long_name": words})

@@ -1,0 +1,198 @@
+"""The emulator of J, the walkers that sample it, and what a result says of its shape with their help."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from same_bits import assert_same_bits
+from toys import Decay, Fragile, Linear, Toy, make_problem
+
+from en4dvar.assimilate import assimilate, log_posterior
+from en4dvar.diagnostics import effective_share, is_non_gaussian, shape_warnings
+from en4dvar.ensemble.forecast import forecast
+from en4dvar.executor import ThreadsExecutor
+from en4dvar.prior import PriorTerm
+from en4dvar.problem import AssimilationSettings
+from en4dvar.sampling import mcmc
+from en4dvar.sampling.emulated_cost import emulate, needed_runs
+from en4dvar.sampling.walkers import advance
+from en4dvar.state import NOISE_SCALE
+
+LEVELS = {"plain": {}, "timing errors": {"time_std": 0.05}}
+
+
+class Cubic(Toy):
+    """Predictions that are cubic polynomials of the parameters, and their rates."""
+
+    def curve(self, theta, t):
+        a, b = theta
+        return float(a * t + 0.3 * a * b * t**2 - 0.1 * b**3 + 0.2 * a * a * b)
+
+    def rate(self, theta, t):
+        a, b = theta
+        return float(a + 0.6 * a * b * t)
+
+
+def emulated(problem, seed=0, members=40):
+    ensemble = problem.prior.mean + 0.3 * problem.prior.std * np.random.default_rng(seed).standard_normal(
+        (members, len(problem.prior.names))
+    )
+    random = np.random.default_rng(seed)
+    return emulate(lambda x: forecast(problem, x), problem.prior, problem.observations, ensemble, random)
+
+
+def assert_emulated(emulator, problem, x):
+    """J below the ceiling, the ceiling beyond; some of ``x`` are on either side."""
+    cost = -log_posterior(problem, x)
+    z = (x - problem.prior.mean) / problem.prior.std
+    of_prior = 0.5 * np.sum(z * z, axis=1)
+    low = cost - of_prior < emulator.ceiling
+    assert 10 < low.sum() < len(x) - 10
+    assert emulator.cost(x)[low] == pytest.approx(cost[low], rel=1e-3, abs=1e-3)
+    assert emulator.cost(x)[~low] == pytest.approx(of_prior[~low] + emulator.ceiling)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_emulator_of_cubic_predictions_is_j_itself(level):
+    problem = make_problem(Cubic(), [0.8, 1.1], **LEVELS[level])
+    emulator = emulated(problem)
+    x = problem.prior.mean + problem.prior.std * np.random.default_rng(5).standard_normal((200, 2))
+    assert_emulated(emulator, problem, np.concatenate([x, emulator.draws[::50]]))
+    assert emulator.share > 0.999
+    assert np.all(np.isfinite(emulator.draws))
+
+
+def test_emulator_of_an_estimated_noise_scale():
+    base = make_problem(Linear(("a", "b")), [1.0, 0.5], k=20)
+    prior = replace(base.prior, terms=(*base.prior.terms, PriorTerm.lognormal(NOISE_SCALE, 1.0, 0.4)))
+    problem = replace(base, prior=prior)
+    emulator = emulated(problem)
+    x = prior.mean + 0.3 * prior.std * np.random.default_rng(5).standard_normal((50, 3))
+    assert_emulated(emulator, problem, np.concatenate([x, emulator.draws[::50]]))
+
+
+def test_no_emulator_of_many_parameters_or_few_survivors():
+    assert needed_runs(5) == (3, 224)
+    assert needed_runs(1) == (3, 96)
+    assert needed_runs(12) == (2, 364)
+    assert needed_runs(30) is None
+    assert emulated(make_problem(Fragile(limit=5.0), [1.0, 0.5])) is not None
+    assert emulated(make_problem(Fragile(limit=0.8), [1.0, 0.5])) is None  # half of the runs fail
+
+
+def test_walkers_keep_a_distribution_they_start_from():
+    """10 000 walkers drawn from N(m, C) move 30 times about fixed others and still have its moments."""
+    rng = np.random.default_rng(1)
+    mean, root = np.array([1.0, -2.0, 0.5]), np.array([[1.0, 0, 0], [0.9, 0.3, 0], [0.2, -0.4, 2.0]])
+    inverse = np.linalg.inv(root)
+
+    def cost(x):
+        return 0.5 * np.sum(((x - mean) @ inverse.T) ** 2, axis=1)
+
+    x = mean + rng.standard_normal((10_000, 3)) @ root.T
+    others = mean + 1.5 * rng.standard_normal((200, 3)) @ root.T  # of another distribution: they only propose
+    moved, costs = advance(cost, x, cost(x), others, rng, 30)
+    assert np.mean(np.any(moved != x, axis=1)) > 0.95
+    assert np.array_equal(costs, cost(moved))
+    z = (moved - mean) @ inverse.T
+    assert z.mean(axis=0) == pytest.approx(np.zeros(3), abs=0.04)
+    assert np.cov(z.T) == pytest.approx(np.eye(3), abs=0.06)
+
+
+def test_a_wrong_emulator_guides_to_the_right_density():
+    """Twice as wide and beside the mark: the end points are accepted on the density itself."""
+    start = np.random.default_rng(0).standard_normal((48, 2))
+    chain = mcmc.sample(
+        lambda x: -0.5 * np.sum(x**2, axis=1),
+        start,
+        4,
+        target=1500,
+        emulated=SimpleNamespace(cost=lambda x: 0.125 * np.sum((x - 0.7) ** 2, axis=1), draws=0.7 + 2 * start),
+    )
+    assert chain.converged
+    assert chain.flat.mean(axis=0) == pytest.approx(np.zeros(2), abs=0.08)
+    assert np.cov(chain.flat.T) == pytest.approx(np.eye(2), abs=0.1)
+
+
+def skewed(compiled=True):
+    model = Decay(compiled=compiled)
+    a, b = model.parameters
+    terms = (PriorTerm.lognormal(a, 1.2, 0.8), PriorTerm.lognormal(b, 1.0, 1.2))
+    return make_problem(model, [1.5, 1.2], std=0.6, prior=terms, k=6)
+
+
+@pytest.fixture
+def nothing_cleared(monkeypatch):
+    """An emulator for every posterior, also one that the members' own J do not call in question."""
+    monkeypatch.setattr("en4dvar.sampling.shape.CLEARED", 1.0)
+
+
+def test_shift_and_ratio_are_those_of_the_posterior(nothing_cleared):
+    """Against the posterior on a grid, in units of its standard deviation.
+
+    The walk's own random error is 0.04 (shift) and 4 % (ratio) from seed to seed, so that the mean of twelve tells a
+    systematic one of 0.05; no single run is off by five of them.
+    """
+    problem = skewed()
+    axes = [m + s * np.linspace(-6, 6, 121) for m, s in zip(problem.prior.mean, problem.prior.std, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    p = np.exp(log_posterior(problem, grid))
+    p /= p.sum()
+    mean = p @ grid
+    std = np.sqrt(p @ (grid - mean) ** 2)
+    shifts, ratios = [], []
+    for seed in range(12):
+        analysis = assimilate(problem, AssimilationSettings(members=24), seed)
+        x = problem.prior.from_physical(analysis.posterior)
+        ratio = x.std(axis=0, ddof=1) / std
+        shape = analysis.shape
+        shifts.append(shape["mean_shift"] - np.max(np.abs(x.mean(axis=0) - mean) / std))
+        ratios.append(np.log(shape["spread_ratio"] / ratio[np.argmax(np.abs(np.log(ratio)))]))
+        assert shape["emulator_fit"] > 0.8
+    for errors in (shifts, ratios):
+        assert abs(np.mean(errors)) < 0.05
+        assert np.max(np.abs(errors)) < 0.2
+
+
+def test_the_emulator_is_for_cheap_models_unless_asked_for(nothing_cleared):
+    settings = AssimilationSettings(members=24)
+    slow, fast = skewed(compiled=False), skewed()
+    runs = 2 * needed_runs(2)[1]
+    without, with_ = assimilate(slow, settings, 1), assimilate(fast, settings, 1)
+    assert "mean_shift" not in without.shape
+    assert with_.forward_runs == without.forward_runs + runs
+    assert assimilate(slow, replace(settings, emulator="on"), 1).shape == with_.shape
+    assert "mean_shift" not in assimilate(fast, replace(settings, emulator="off"), 1).shape
+
+
+def test_a_gaussian_posterior_costs_no_more_runs():
+    problem = make_problem(Linear(("a", "b"), compiled=True), [1.0, 0.5])
+    analysis = assimilate(problem, AssimilationSettings(), 1)
+    assert set(analysis.shape) == {"gaussian_fit", "non_gaussian"}
+    assert not analysis.shape["non_gaussian"]
+
+
+def test_shape_has_the_same_bits_for_any_workers():
+    one = assimilate(skewed(), AssimilationSettings(members=24), 1)
+    with ThreadsExecutor(2) as executor:
+        assert_same_bits(assimilate(skewed(), AssimilationSettings(members=24), 1, executor), one)
+
+
+@pytest.mark.parametrize(
+    ("shift", "ratio", "share", "flag"),
+    [(0.6, 1.0, 0.9, True), (0.1, 1.4, 0.9, True), (0.1, 0.6, 0.9, True), (0.3, 1.1, 0.9, False), (9, 9, 0.1, False)],
+)
+def test_the_flag_follows_the_emulator_where_it_can_be_believed(shift, ratio, share, flag):
+    shape = {"gaussian_fit": 0.6, "mean_shift": shift, "spread_ratio": ratio, "emulator_fit": share}
+    assert is_non_gaussian(shape) is flag
+    assert bool(shape_warnings(shape)) is flag
+    assert is_non_gaussian({**shape, "gaussian_fit": 0.2}) is (flag or share < 0.2)
+
+
+def test_effective_share():
+    assert effective_share(np.zeros(50)) == 1
+    assert effective_share(np.where(np.arange(50) < 20, 3.0, -np.inf)) == pytest.approx(0.4)
+    one_in_a_tail = np.zeros(100)
+    one_in_a_tail[7] = 50.0
+    assert effective_share(one_in_a_tail) == 1  # it does not decide
