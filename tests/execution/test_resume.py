@@ -135,7 +135,7 @@ def altered(content):
 
 
 def of_an_older_version(content):
-    return content.replace(b"en4dvar-checkpoint 1 ", b"en4dvar-checkpoint 0 ", 1)
+    return content.replace(b"en4dvar-checkpoint 2 ", b"en4dvar-checkpoint 0 ", 1)
 
 
 def of_another_run(content):
