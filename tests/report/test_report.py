@@ -252,7 +252,7 @@ def test_processes_draw_the_same_pages(campaign_dir, tmp_path, monkeypatch):
     for run in (one, two):
         shutil.copytree(campaign_dir / "datasets", run / "datasets", ignore=shutil.ignore_patterns("é*"))
     write_pages(one)
-    monkeypatch.setattr(report, "_write_set", None)  # this process draws no page
+    monkeypatch.setattr(report, "render_set", None)  # this process draws no page
     write_pages(two, workers=2)
     assert len(list((two / "pages").iterdir())) == 2
     assert contents(one) == contents(two)
