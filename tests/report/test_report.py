@@ -237,20 +237,24 @@ def contents(run):
     return {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*.*") if p.is_file()}
 
 
-def test_processes_draw_the_same_pages(campaign_dir, tmp_path, monkeypatch):
+def test_processes_draw_the_same_pages(analysis, tmp_path, monkeypatch):
+    """Of one parameter: these have the fewest figures."""
     monkeypatch.setattr(report, "SHARE", 1)
     monkeypatch.setattr(report, "COPIES", 0)
     one, two = tmp_path / "one", tmp_path / "two"
-    for run in (one, two):
-        shutil.copytree(campaign_dir / "datasets", run / "datasets", ignore=shutil.ignore_patterns("é*"))
+    (one / "datasets").mkdir(parents=True)
+    for name in ("first", "second"):
+        single = replace(of_one_parameter(analysis), name=name)
+        save(Result.from_analysis(single, provenance("name: test\n")), one / "datasets" / f"{name}.nc")
+    shutil.copytree(one, two)
     write_report(one)
     monkeypatch.setattr(report, "_write_set", None)  # this process draws no page
     write_report(two, workers=2)
     assert len(list((two / "pages").iterdir())) == 2
     assert contents(one) == contents(two)
-    (two / "pages" / "two.html").unlink()
-    (two / "pages" / "two.html").mkdir()
-    with pytest.raises(OutputError, match=r"two\.html"):
+    (two / "pages" / "second.html").unlink()
+    (two / "pages" / "second.html").mkdir()
+    with pytest.raises(OutputError, match=r"second\.html"):
         write_report(two, workers=2)
 
 
@@ -297,8 +301,8 @@ def test_lost_ensemble_still_gets_a_report(write_run, make_analysis, survivors):
     assert "nan" not in "".join(Page(html).text).split()
 
 
-def test_single_parameter_has_no_pairs(write_run, analysis):
-    one = replace(
+def of_one_parameter(analysis):
+    return replace(
         analysis,
         parameters=analysis.parameters[:1],
         prior=analysis.prior[:, :1],
@@ -307,7 +311,10 @@ def test_single_parameter_has_no_pairs(write_run, analysis):
         dfs_per_parameter=analysis.dfs_per_parameter[:1],
         iterations=tuple(replace(r, members=r.members[:, :1], centre=r.centre[:1]) for r in analysis.iterations),
     )
-    run_dir = write_run(one)
+
+
+def test_single_parameter_has_no_pairs(write_run, analysis):
+    run_dir = write_run(of_one_parameter(analysis))
     write_report(run_dir)
     assert not (run_dir / "figures" / "pairs.pdf").exists()
     assert (run_dir / "figures" / "posterior.pdf").exists()
