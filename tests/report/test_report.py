@@ -245,7 +245,8 @@ def contents(run):
     return {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*.*") if p.is_file()}
 
 
-def test_processes_draw_the_same_pages(campaign_dir, tmp_path, monkeypatch):
+def test_processes_draw_the_same_pages(analysis, tmp_path, monkeypatch):
+    """Of one parameter: these have the fewest figures."""
     monkeypatch.setattr(report, "SHARE", 1)
     monkeypatch.setattr(report, "COPIES", 0)
     one, two = tmp_path / "one", tmp_path / "two"
