@@ -131,11 +131,15 @@ def read_observations(plan: Data, path: Path, name: str, weights: str = "sum") -
     times = times - float(zero)
     if times[0] < 0:
         raise DataError(f"{path}: the first observation used lies {-times[0]:g} before time zero; see data.time_zero")
+    try:
+        noise = _noise(plan, times, values, np.arange(len(series.times))[window])
+    except ValueError as error:
+        raise DataError(f"{readable(path)}: {error}") from None
     count = len(times)
     return Observations(
         times=times,
         values=values,
-        noise=_noise(plan, times, values, np.arange(len(series.times))[window]),
+        noise=noise,
         weights=np.full(count, 1.0 if weights == "sum" else 1.0 / count),
         name=name,
         source=readable(path),

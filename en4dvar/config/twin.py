@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, cast
 import numpy as np
 from pydantic import Field, model_validator
 
-from en4dvar.config.context import TEXT, Context, Made, quantity, read_each, require_sign, time_unit
+from en4dvar.config.context import TEXT, Context, Made, quantity, read_each, subject_unit, time_unit
 from en4dvar.config.document import Document
 from en4dvar.config.initial_state import dynamic_fields
 from en4dvar.config.load import read_file
@@ -29,7 +29,6 @@ from en4dvar.schemes import ON_A_SERIES
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import Localisation
-from en4dvar.units import parse_quantity
 
 FileName = Annotated[str, Field(min_length=1)]
 
@@ -41,20 +40,17 @@ def _errors(model: ForwardModel) -> dict[str, Observable]:
 def _stds(known: Callable[[ForwardModel], Mapping[str, Any]]) -> Made:
     """Standard deviations by the name of a thing that the model knows."""
 
-    def read(text: Any, context: Context) -> float:
-        std = parse_quantity(text, context.subject.unit)
-        require_sign(std, "positive", text)
-        return std
+    positive = quantity(subject_unit, "positive")
 
-    def read_all(given: Mapping[str, Any], context: Context) -> dict[str, float]:
+    def read(given: Mapping[str, Any], context: Context) -> dict[str, float]:
         things = known(context.model)
         with Faults() as faults:
             if not given:
                 faults.add((), f"give at least one of: {', '.join(things)}")
-            return read_each(given, things, context, faults, read)
+            return read_each(given, things, context, faults, positive.make)
 
     json = {"type": "object", "minProperties": 1, "additionalProperties": TEXT}
-    return Made(read_all, dict[str, Any], json)
+    return Made(read, dict[str, Any], json)
 
 
 def _correlation(path: str, context: Context) -> tuple[str, Correlation]:

@@ -11,6 +11,7 @@ from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar.config.build import build
 from en4dvar.errors import ConfigError, DataError
+from en4dvar.noise import CorrelatedNoise
 from en4dvar.report.result import load_result
 from en4dvar.storage.fingerprint import identity
 
@@ -35,20 +36,20 @@ def write_matrix(tmp_path: Path, k: int = 31) -> np.ndarray:
 
 def test_exponential_correlation(tmp_path: Path) -> None:
     y = observations(tmp_path, CORRELATED)
-    assert y.correlation is not None
-    assert y.correlation[0, 4] == pytest.approx(np.exp(-1))
+    assert isinstance(y.noise, CorrelatedNoise)
+    assert y.noise.correlation.matrix[0, 4] == pytest.approx(np.exp(-1))
     assert np.array_equal(y.std, np.full(31, 2e-6))
-    assert np.array_equal(y.time_std, np.full(31, 1e-5))
+    assert np.array_equal(y.noise.time_std, np.full(31, 1e-5))
 
 
 def test_covariance_file(tmp_path: Path) -> None:
     r = write_matrix(tmp_path)
     y = observations(tmp_path, FROM_FILE)
-    assert np.outer(y.std, y.std) * y.correlation == pytest.approx(1e-12 * r, rel=1e-12)
+    assert np.outer(y.std, y.std) * y.noise.correlation.matrix == pytest.approx(1e-12 * r, rel=1e-12)
     # one row a sample of the file: the window takes its own
     y = observations(tmp_path, FROM_FILE, ("  error:", "  window: {from: 20 ms, to: 100 ms}\n  error:"))
     assert len(y) == 17
-    assert np.outer(y.std, y.std) * y.correlation == pytest.approx(1e-12 * r[4:21, 4:21], rel=1e-12)
+    assert np.outer(y.std, y.std) * y.noise.correlation.matrix == pytest.approx(1e-12 * r[4:21, 4:21], rel=1e-12)
     write_matrix(tmp_path, 17)  # one row an observation of the window
     y = observations(tmp_path, FROM_FILE, ("  error:", "  window: {from: 20 ms, to: 100 ms}\n  error:"))
     assert y.std[[0, -1]] == pytest.approx([1e-6, 3e-6])

@@ -19,7 +19,9 @@ from doc_pages import ROOT
 
 import en4dvar
 import en4dvar_bubble
-from en4dvar.config import schema
+from en4dvar.config.data import Data
+from en4dvar.config.load import Estimation
+from en4dvar.config.schema import Assimilation
 from en4dvar_bubble.settings import BubbleSettings
 
 pytest.importorskip("mkdocs", reason="the extra docs is not installed")
@@ -68,7 +70,7 @@ def test_formulas_are_drawn_by_the_browser(site):
 
 def test_the_reference_is_complete(site):
     keys = (site / "reference_yaml.html").read_text(encoding="utf-8")
-    for section, prefix in ((schema.Schema, ""), (schema.Data, "data."), (schema.Assimilation, "assimilation.")):
+    for section, prefix in ((Estimation, ""), (Data, "data."), (Assimilation, "assimilation.")):
         for name in section.model_fields:
             assert f">{prefix}{name}<" in keys, name
     for name in BubbleSettings.model_fields:
