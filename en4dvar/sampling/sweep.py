@@ -162,6 +162,12 @@ def sobol_box(centre: Array, half: Array, count: int, seed: int) -> Array:
     return np.asarray(centre + (2 * unit - 1) * half)
 
 
+def _searched(problem: InverseProblem) -> tuple[object, ...]:
+    """What data sets of one design have in common besides the model."""
+    terms = [(t.parameter.name, t.transform, t.bounds) for t in problem.prior.terms]
+    return terms, problem.fixed, problem.perturbations, problem.observable.name
+
+
 def _without_shift(problem: InverseProblem) -> InverseProblem:
     """The problem whose control vector is what a sweep searches. Raises :class:`ConfigError` where that is nothing."""
     terms = tuple(t for t in problem.prior.terms if t.parameter.name != TIME_SHIFT.name)
@@ -184,10 +190,7 @@ class _Ranges:
         """Raises :class:`ConfigError` where the data sets cannot share a design."""
         first = problems[0]
         for other in problems[1:]:
-            same = [(t.parameter.name, t.transform, t.bounds) for t in other.prior.terms] == [
-                (t.parameter.name, t.transform, t.bounds) for t in first.prior.terms
-            ]
-            if not same or other.fixed != first.fixed or other.model is not first.model:
+            if other.model is not first.model or _searched(other) != _searched(first):
                 raise ConfigError(
                     "the design is shared: all data sets need one model, the same parameters and the same fixed "
                     f"values, unlike {other.observations.name}"

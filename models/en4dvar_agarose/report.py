@@ -138,15 +138,15 @@ def _apparent_modulus(study: Study, gel: str) -> str:
 
 
 def _table(study: Study, route: Route) -> dict[str, Any]:
-    heads = tables.columns(study)
+    heads = tables.sources(study)
     return {
         "title": tables.TITLES[route],
-        "legend": "; ".join(words for _, words in heads),
+        "legend": "; ".join(heads.values()),
         "rows": [
             {
                 "gel": row.gel,
                 "model": LABELS[row.model],
-                "cells": [[tables.text(cell, getattr(cell, a)) for a, _ in heads] for cell in row.cells],
+                "cells": [[cell.text(source) for source in heads] for cell in row.cells],
             }
             for row in tables.table(study, route)
         ],

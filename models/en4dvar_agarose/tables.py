@@ -5,15 +5,17 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
 from en4dvar_agarose.fits import Study
 from en4dvar_agarose.paper import LABELS, QUANTITIES, ROUTES, TABLES, Model, Quantity, Route
 
-Pair = tuple[float, float]
+Pair = tuple[float, float]  # mean and standard deviation
+Source = Literal["paper", "computed", "truth"]
 TITLES: dict[Route, str] = {
     "sweep": "Table 1. IMR sweep: NRMSE-weighted mean ± standard deviation of the best fits",
     "en4dvar": "Table 2. En4D-Var: NRMSE-weighted mean ± standard deviation of the ensemble means",
@@ -23,13 +25,16 @@ SYNTHETIC = "synthetic twin, no measurement"
 
 @dataclass(frozen=True)
 class Cell:
-    """One quantity of one model: mean and standard deviation, None where there is none; ``fixed``: not estimated."""
+    """One quantity of one model, by source, None where there is none; ``fixed``: not estimated."""
 
     quantity: Quantity
-    computed: Pair | None
-    printed: Pair | None
-    truth: Pair | None
-    fixed: bool = False
+    pairs: Mapping[Source, Pair | None]
+    fixed: bool
+
+    def text(self, source: Source, sign: str = "±") -> str:
+        """Mean and standard deviation; a value that was held fixed has only the first."""
+        pair = self.pairs[source]
+        return f"{pair[0]:.3g} (fixed)" if self.fixed and pair and source == "computed" else plus_minus(pair, sign)
 
 
 @dataclass(frozen=True)
@@ -46,20 +51,16 @@ def table(study: Study, route: Route) -> tuple[Row, ...]:
     rows = []
     for gel, models in study.fits.items():
         for model, fit in models.items():
-            printed = TABLES[route].get(gel, {}).get(model, {})
             cells = []
             for q in QUANTITIES:
-                pair = fit.summary(route, q.name) if fit.has(q.name) else None
+                mean, std = fit.summary(route, q.name) if fit.has(q.name) else (np.nan, np.nan)
                 true = study.true_values(gel, q.name) * q.factor
-                cells.append(
-                    Cell(
-                        q,
-                        (pair[0] * q.factor, pair[1] * q.factor) if pair else None,
-                        printed.get(q.name),
-                        (float(true.mean()), float(true.std(ddof=1))) if len(true) > 1 else None,
-                        fixed=fit.has(q.name) and not fit.estimated(q.name),
-                    )
-                )
+                pairs: dict[Source, Pair | None] = {
+                    "paper": TABLES[route].get(gel, {}).get(model, {}).get(q.name),
+                    "computed": (mean * q.factor, std * q.factor) if fit.has(q.name) else None,
+                    "truth": (float(true.mean()), float(true.std(ddof=1))) if len(true) > 1 else None,
+                }
+                cells.append(Cell(q, pairs, fixed=fit.has(q.name) and not fit.estimated(q.name)))
             rows.append(Row(gel, model, tuple(cells)))
     return tuple(rows)
 
@@ -75,16 +76,11 @@ def plus_minus(pair: Pair | None, sign: str = "±") -> str:
     return f"{mean:.{places}f} {sign} {std:.{places}f}"
 
 
-def text(cell: Cell, pair: Pair | None, sign: str = "±") -> str:
-    """A pair of a cell; a value that was held fixed has no standard deviation."""
-    return f"{pair[0]:.3g} (fixed)" if cell.fixed and pair and pair is cell.computed else plus_minus(pair, sign)
-
-
-def columns(study: Study) -> list[tuple[str, str]]:
-    """(attribute of a cell, heading) of what stands side by side."""
+def sources(study: Study) -> dict[Source, str]:
+    """What stands in a cell, with its heading."""
     mine = f"this work ({SYNTHETIC})" if study.plan.synthetic else "this work"
-    found = [("printed", "paper"), ("computed", mine)]
-    return [*found, ("truth", "truth of the twin")] if study.truth else found
+    found: dict[Source, str] = {"paper": "paper", "computed": mine}
+    return {**found, "truth": "truth of the twin"} if study.truth else found
 
 
 def as_csv(study: Study, rows: Sequence[Row], route: Route) -> str:
@@ -95,39 +91,39 @@ def as_csv(study: Study, rows: Sequence[Row], route: Route) -> str:
             f"# {ROUTES[route]} on a SYNTHETIC twin of the paper's campaign; only the paper_ columns are printed\n"
         )
     writer = csv.writer(out, lineterminator="\n")
-    sources = ("paper", "computed", "truth")
-    writer.writerow(["gel", "model", "quantity", "unit", *(f"{s}_{m}" for s in sources for m in ("mean", "std"))])
+    heads = [f"{source}_{moment}" for source in get_args(Source) for moment in ("mean", "std")]
+    writer.writerow(["gel", "model", "quantity", "unit", *heads])
     for row in rows:
         for cell in row.cells:
-            pairs = (cell.printed, cell.computed, cell.truth)
-            numbers = [f"{v:.6g}" if np.isfinite(v) else "" for p in pairs for v in (p or (np.nan, np.nan))]
+            values = [value for source in get_args(Source) for value in (cell.pairs[source] or (np.nan, np.nan))]
+            numbers = [f"{value:.6g}" if np.isfinite(value) else "" for value in values]
             writer.writerow([row.gel, LABELS[row.model], cell.quantity.name, cell.quantity.unit, *numbers])
     return out.getvalue()
 
 
 def as_markdown(study: Study, rows: Sequence[Row], route: Route) -> str:
     """A table a gel and model a line, with paper, computed and truth one below the other in a cell."""
-    heads = columns(study)
-    lines = [f"**{TITLES[route]}**", "", f"In each cell: {'; '.join(h for _, h in heads)}.", ""]
+    heads = sources(study)
+    lines = [f"**{TITLES[route]}**", "", f"In each cell: {'; '.join(heads.values())}.", ""]
     lines.append("| gel | model | " + " | ".join(f"{q.plain} ({q.unit})" for q in QUANTITIES) + " |")
     lines.append("|---" * (2 + len(QUANTITIES)) + "|")
     for row in rows:
-        cells = ["<br>".join(text(cell, getattr(cell, a)) for a, _ in heads) for cell in row.cells]
+        cells = ["<br>".join(cell.text(source) for source in heads) for cell in row.cells]
         lines.append(f"| {row.gel} | {LABELS[row.model]} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
 def as_latex(study: Study, rows: Sequence[Row], route: Route) -> str:
     """A ``tabular`` in a ``table*`` with booktabs-free rules, one line a source."""
-    heads = columns(study)
     caption = TITLES[route].partition(". ")[2].replace("±", r"$\pm$")
-    note = (
-        " The computed values come from a synthetic twin campaign, not from measurements."
-        if study.plan.synthetic
-        else ""
-    )
+    note = " The computed values come from a synthetic twin campaign, not from measurements."
     units = {"10⁻²": r"$10^{-2}$", "µm": r"$\mu$m", "Pa s": r"Pa\,s"}
-    lines = [r"\begin{table*}", rf"\caption{{{caption}.{note}}}", r"\begin{tabular}{llllll}", r"\hline"]
+    lines = [
+        r"\begin{table*}",
+        rf"\caption{{{caption}.{note if study.plan.synthetic else ''}}}",
+        r"\begin{tabular}{llllll}",
+        r"\hline",
+    ]
     names = " & ".join(f"{q.latex} ({units.get(q.unit, q.unit)})" for q in QUANTITIES)
     lines += [rf"Model & Source & {names} \\", r"\hline"]
     gel = ""
@@ -135,8 +131,8 @@ def as_latex(study: Study, rows: Sequence[Row], route: Route) -> str:
         if row.gel != gel:
             gel = row.gel
             lines += [rf"\multicolumn{{6}}{{l}}{{{gel.replace('%', chr(92) + '%')} gel}} \\", r"\hline"]
-        for i, (attribute, heading) in enumerate(heads):
-            cells = [text(cell, getattr(cell, attribute), r"$\pm$").replace("–", "--") for cell in row.cells]
+        for i, (source, heading) in enumerate(sources(study).items()):
+            cells = [cell.text(source, r"$\pm$").replace("–", "--") for cell in row.cells]
             lines.append(
                 rf"{LABELS[row.model] if i == 0 else ''} & {heading.partition(' (')[0]} & {' & '.join(cells)} \\"
             )
@@ -149,8 +145,9 @@ def _estimates(study: Study) -> Iterator[tuple[str, Cell, Pair, Pair]]:
     for route in ("sweep", "en4dvar"):
         for row in table(study, route):
             for cell in row.cells:
-                if cell.printed is not None and cell.computed is not None and not cell.fixed:
-                    yield f"{ROUTES[route]}, {row.gel}, {LABELS[row.model]}", cell, cell.computed, cell.printed
+                mine, paper = cell.pairs["computed"], cell.pairs["paper"]
+                if paper is not None and mine is not None and not cell.fixed:
+                    yield f"{ROUTES[route]}, {row.gel}, {LABELS[row.model]}", cell, mine, paper
 
 
 def disagreements(study: Study) -> list[str]:
