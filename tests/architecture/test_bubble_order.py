@@ -9,6 +9,10 @@ from pathlib import Path
 
 import pytest
 
+ORDER = (
+    "tables", "medium", "gas", "driving", "laws", "solver", "dynamics", "packing", "paths", "settings", "model", "api",
+    "battery", "starter", "examples", "commands", "commands_init",
+)  # fmt: skip
 BUBBLE = Path(__file__).resolve().parents[2] / "models" / "en4dvar_bubble"
 
 
@@ -49,6 +53,18 @@ def test_no_circles_in_the_bubble():
     graph = imports({name: path.read_text(encoding="utf-8") for name, path in modules(BUBBLE).items()})
     assert len(graph) > 30
     assert circle(graph) == []
+
+
+def test_the_bubble_imports_only_downwards():
+    """In the order that the package's docstring states; the paper's study stands above all of it."""
+    graph = imports({name: path.read_text(encoding="utf-8") for name, path in modules(BUBBLE).items()})
+    upward = []
+    for name, wanted in graph.items():
+        floors = {m.split(".")[1] for m in (name, *wanted) if "." in m} - {"study", "commands_study"}
+        if "." in name and "study" not in name:
+            here = ORDER.index(name.split(".")[1])
+            upward += [f"{name} imports {floor}" for floor in floors if ORDER.index(floor) > here]
+    assert upward == []
 
 
 @pytest.mark.parametrize(
