@@ -109,8 +109,12 @@ class _Asked:
 
 
 def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
-    """Columns and units for ``propose_config``: by option, by a telling name, or asked for."""
+    """Columns and units for ``propose_config``: by option, by a telling name, or asked for.
+
+    Raises one :class:`ConfigError` that names every option to add.
+    """
     from en4dvar.config.build import find_files
+    from en4dvar.errors import ConfigError
     from en4dvar.units import convert
 
     first, contents, decimal = _first_with_columns(list(find_files(Path.cwd(), [data]).values()))
@@ -126,7 +130,12 @@ def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
             time = time or _ask_column("times", shown)
             time_unit = time_unit or _ask_unit(time, shown, "s", "us, ms or s")
         radius_unit = radius_unit or _ask_unit(radius, shown, "m", "um, mm or m")
-    _require(missing, time_unit, radius_unit, asked, first, shown, contents.others)
+    needed = [*missing]
+    needed += ["--time-unit UNIT (e.g. us)"] * (time_unit is None and asked.time_step is None)
+    needed += ["--radius-unit UNIT (e.g. um)"] * (radius_unit is None)
+    if needed:
+        message = f"{first}: columns with numbers: {', '.join(shown) or 'none'}; units are never guessed: add "
+        raise ConfigError("\n".join([*(contents.others.values() if missing else ()), message + ", ".join(needed)]))
     convert(1.0, str(radius_unit), "m")
     if asked.time_step is not None:
         return {"radius": (radius, radius_unit), "time_step": asked.time_step, "decimal": decimal}
@@ -174,27 +183,6 @@ def _columns(asked: _Asked, shown: Mapping[str, str]) -> tuple[str | None, str |
 def _only(pattern: re.Pattern[str], names: Mapping[str, str]) -> str | None:
     fitting = [name for name in names if pattern.fullmatch(name)]
     return fitting[0] if len(fitting) == 1 else None
-
-
-def _require(
-    missing: Sequence[str],
-    time_unit: str | None,
-    radius_unit: str | None,
-    asked: _Asked,
-    path: Path,
-    shown: Mapping[str, str],
-    others: Mapping[str, str],
-) -> None:
-    """Raise one error that names every option to add."""
-    needed = list(missing)
-    needed += ["--time-unit UNIT (e.g. us)"] * (time_unit is None and asked.time_step is None)
-    needed += ["--radius-unit UNIT (e.g. um)"] * (radius_unit is None)
-    if needed:
-        from en4dvar.errors import ConfigError
-
-        columns = ", ".join(shown) or "none"
-        message = f"{path}: columns with numbers: {columns}; units are never guessed: add {', '.join(needed)}"
-        raise ConfigError("\n".join([*(others.values() if missing else ()), message]))
 
 
 def _interactive() -> bool:

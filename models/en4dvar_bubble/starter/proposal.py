@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter.guess import Guess, first_guess
-from en4dvar_bubble.starter.look import Look, Start, lobe, look, typical
+from en4dvar_bubble.starter.look import Lobe, Look, Start, lobe, look, typical
 
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
 MODEL: Mapping[Start, Mapping[str, str]] = {
@@ -132,20 +132,18 @@ def _looks(histories: Mapping[str, tuple[Array, Array]], start: Start | None) ->
 def _seen(views: Sequence[Look]) -> Look:
     """One look at several data sets: medians of the numbers, words of the first that is not clear."""
     first = next((v for v in views if not v.clear), views[0])
-    return Look(
-        n=sum(v.n for v in views),
-        times=(min(v.times[0] for v in views), max(v.times[1] for v in views)),
-        lobe=type(first.lobe)(*(typical([getattr(v.lobe, k) for v in views]) for k in ("R_max", "t_max", "t_c"))),
+    return replace(
+        first,
         step=typical([v.step for v in views]),
         noise=typical([v.noise for v in views]),
         rebound=typical([v.rebound for v in views]),
         rest=typical([v.rest for v in views]),
+        n=sum(v.n for v in views),
+        times=(min(v.times[0] for v in views), max(v.times[1] for v in views)),
+        lobe=Lobe(*(typical([getattr(v.lobe, k) for v in views]) for k in ("R_max", "t_max", "t_c"))),
         n_minima=min(v.n_minima for v in views),
         prominence=min(v.prominence for v in views),
         descent=max((v.descent for v in views if np.isfinite(v.descent)), default=float("nan")),
-        start=first.start,
-        reason=first.reason,
-        clear=first.clear,
     )
 
 
