@@ -102,6 +102,7 @@ class Analysis:
 
     @property
     def observations(self) -> Observations:
+        """What was assimilated."""
         return self.problem.observations
 
     @property

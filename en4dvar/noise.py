@@ -23,9 +23,10 @@ A kind of errors is one class of this file: :class:`Noise` is Gaussian and indep
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import ClassVar, Self, cast
 
 import numpy as np
 
@@ -364,6 +365,14 @@ class Correlation:
         """L⁻¹ (K, K), lower triangular."""
         return np.asarray(np.tril(np.linalg.solve(self.root, np.eye(len(self.root)))))
 
+    def decorrelated(self, columns: Array) -> Array:
+        """L⁻¹ applied to columns (K,) or (K, N)."""
+        return np.asarray(self.whitening @ columns)
+
+    def correlated(self, rows: Array) -> Array:
+        """Independent numbers (M, K) made to have this correlation."""
+        return np.asarray(rows @ self.root.T)
+
     @cached_property
     def scale_root(self) -> Array:
         """B (K, K), lower triangular, with B Bᵀ = I + C∘C⁻¹, the Fisher information of ln s."""
@@ -405,6 +414,16 @@ class CorrelatedNoise(Noise):
 
     def _log_root(self) -> Array:
         return np.asarray(-np.log(np.diag(self.correlation.whitening)))
+
+
+def noise_of_record(
+    std: Array, time_std: Array, matrices: Mapping[str, Array], attributes: Mapping[str, object]
+) -> Noise:
+    """The errors whose :meth:`Noise.matrices` and :meth:`Noise.attributes` are among what a file holds."""
+    threshold = attributes.get("huber_threshold")
+    return noise_of(
+        std, time_std, matrices.get("correlation"), None if threshold is None else float(cast(float, threshold))
+    )
 
 
 def noise_of(

@@ -41,4 +41,6 @@ class Series:
         """d = R_k^{-1/2}(y_k − reference) (p,) and S = R_k^{-1/2} anomaliesᵀ (p, N) of anomalies (N, p)."""
         std = self.std if self.std.ndim == 1 else self.std[k]
         d, s = (self.values[k] - reference) / std, (anomalies / std).T
-        return (d, s) if self.correlation is None else (self.correlation.whitening @ d, self.correlation.whitening @ s)
+        return (
+            (d, s) if self.correlation is None else (self.correlation.decorrelated(d), self.correlation.decorrelated(s))
+        )

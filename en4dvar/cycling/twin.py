@@ -155,7 +155,7 @@ def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, Series]
             experiment.error_correlation.check_size(len(std))
         except ValueError as error:
             raise ConfigError(f"twin.error_correlation: {error}") from None
-        noise = noise @ experiment.error_correlation.root.T
+        noise = experiment.error_correlation.correlated(noise)
     return outcome.states, Series(times, exact + std * noise, std, experiment.error_correlation)
 
 

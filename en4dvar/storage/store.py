@@ -15,7 +15,7 @@ from en4dvar.analysis import Analysis
 from en4dvar.caution import Caution
 from en4dvar.errors import OutputError
 from en4dvar.files import atomic_path
-from en4dvar.noise import noise_of
+from en4dvar.noise import noise_of_record
 from en4dvar.observations import Observations
 from en4dvar.state import Array, Parameter
 from en4dvar.storage.groups import SCALAR, build_groups
@@ -100,16 +100,12 @@ class StoredResult:
     def observations(self) -> Observations:
         """The observations (y, t, R) that the result was estimated from, to the bit."""
         data, name = self.observed_data, self.observable
-        correlation, attributes = f"{name}_correlation", {str(key): value for key, value in data.attrs.items()}
+        attributes = {str(key): value for key, value in data.attrs.items()}
+        own = {str(key).removeprefix(f"{name}_"): value.values for key, value in data.data_vars.items()}
         return Observations(
             times=data["time"].values,
             values=data[name].values,
-            noise=noise_of(
-                data[f"{name}_reading_std"].values,
-                data["time_std"].values,
-                data[correlation].values if correlation in data else None,
-                float(attributes["huber_threshold"]) if "huber_threshold" in attributes else None,
-            ),
+            noise=noise_of_record(own["reading_std"], own["time_std"], own, attributes),
             weights=data["weights"].values,
             name=self.name,
             source=str(attributes["data_source"]),
