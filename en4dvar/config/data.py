@@ -26,7 +26,7 @@ from en4dvar.config.schema import QuantityText, Section
 from en4dvar.config.validate import Faults
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.hints import suggest
-from en4dvar.inputs.readers import Column, Format, Matrix, Step
+from en4dvar.inputs.readers import Column, Format, Matrix, TimeStep
 from en4dvar.inputs.text_table import Decimal
 from en4dvar.inputs.window import Instant, parse_instant
 from en4dvar.units import UnitError, parse_quantity
@@ -77,13 +77,13 @@ class TimeColumn(Section):
         return self
 
 
-def _times(given: TimeColumn, context: Context) -> Column | Step:
+def _times(given: TimeColumn, context: Context) -> Column | TimeStep:
     unit = time_unit(context)
     if given.unit is not None:
         named = Column(str(given.name or given.step), given.unit, unit)
-        return named if given.name else Step(named)
+        return named if given.name else TimeStep(named)
     try:
-        return Step(value=parse_quantity(given.step or 0, unit))
+        return TimeStep(value=parse_quantity(given.step or 0, unit))
     except UnitError as error:
         raise ConfigError([Fault(str(error), "step")]) from None
 
@@ -95,7 +95,7 @@ class Columns(Section):
     """Which columns hold the time and the observable, each with its unit."""
 
     model_config = ConfigDict(json_schema_extra={"required": ["time"]}, populate_by_name=False)
-    time: Annotated[Column | Step, Made(_times, TimeColumn)] = None  # type: ignore[assignment]  # told by a rule
+    time: Annotated[Column | TimeStep, Made(_times, TimeColumn)] = None  # type: ignore[assignment]  # told by a rule
     """Observation times."""
     observable: Annotated[Column, _VALUES, Field(alias=PLACEHOLDER)] = None  # type: ignore[assignment]  # the same
     """The observable."""
@@ -120,7 +120,7 @@ def _prominence(text: Any, context: Context) -> float:
     return value
 
 
-class Window(Section):
+class WindowSection(Section):
     """First and last observation used: ``maximum``, ``minimum 2``, a time, or ``start``/``end`` of the file."""
 
     start: Annotated[Instant, Made(_instant)] = Field("start", alias="from", validate_default=True)
@@ -237,7 +237,7 @@ class Data(Section):
     """Decimal sign of the numbers in a CSV file."""
     columns: Annotated[Columns, OfObservable("column role")]
     """Which columns hold the time and the observable, each with its unit: ``time: {name: t, unit: us}``."""
-    window: Window = Field({}, validate_default=True)
+    window: WindowSection = Field({}, validate_default=True)
     """Which observations are used (the assimilation window); default: all."""
     time_zero: Annotated[Literal["file", "window"] | float, Made(_time_zero)] = Field("file", validate_default=True)
     """Where the model's clock starts: file (the file's own zero), window (the first observation used), or a time."""

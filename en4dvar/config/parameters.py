@@ -40,7 +40,7 @@ Location = Annotated[
 ]
 
 
-class Prior(Section):
+class PriorSection(Section):
     """A prior by name; locations and spreads carry the parameter's unit, a ``%`` spread is relative to the location."""
 
     prior: Literal["normal", "lognormal", "logit"]
@@ -102,7 +102,7 @@ class Uncertain:
     """A parameter with a prior; ``maximum`` as a location is the observed maximum in the window."""
 
     parameter: Parameter
-    spec: Prior
+    spec: PriorSection
 
     @property
     def needs_data(self) -> bool:
@@ -159,7 +159,7 @@ def _entry(given: Any, context: Context) -> Entry:
     if "from_file" in given:
         scalar = FromFile.model_validate(given, context=context)
         return Scalar(parameter, scalar.from_file, scalar.unit)
-    entry = Uncertain(parameter, Prior.model_validate(given, context=context))
+    entry = Uncertain(parameter, PriorSection.model_validate(given, context=context))
     if not entry.needs_data:
         entry.term()
     elif entry.spec.prior != "logit":

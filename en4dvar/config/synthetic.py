@@ -20,7 +20,7 @@ from en4dvar.prior import PriorTerm
 from en4dvar.units import parse_quantity
 
 
-class Group(Section):
+class GroupSection(Section):
     """Data sets of one kind: how many, and what their parameters are drawn from."""
 
     datasets: Annotated[int, Field(ge=1, le=999)]
@@ -67,7 +67,7 @@ def _below(directory: str, context: Context) -> Path:
     return context.base / directory
 
 
-class Campaign(Section):
+class CampaignSection(Section):
     """How the truths are observed, in the model's units. Pairs are the ends of uniform distributions."""
 
     directory: Annotated[Path, Made(_below, Annotated[str, Field(min_length=1)])]
@@ -86,7 +86,7 @@ class Campaign(Section):
     """Std of the error of a reading, in the observable's unit."""
     time_shift: Interval = (0.0, 0.0)
     """t_s: a reading told at t was taken at t + t_s."""
-    groups: Annotated[dict[Name, Group], Field(min_length=1)]
+    groups: Annotated[dict[Name, GroupSection], Field(min_length=1)]
     """Data sets of one kind, by name."""
 
     @model_validator(mode="after")
@@ -103,7 +103,7 @@ class CampaignFile(File):
 
     name: Name
     """Name of the campaign."""
-    campaign: Campaign
+    campaign: CampaignSection
     """How truths are drawn and observed."""
 
 
@@ -115,7 +115,7 @@ class CampaignPlan:
     seed: int
     model: ForwardModel
     directory: Path
-    settings: Campaign
+    settings: CampaignSection
 
     @property
     def observable(self) -> Observable:

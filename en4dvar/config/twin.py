@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -113,7 +113,7 @@ class Local(Section):
         return self
 
 
-_KINDS = cast(dict[str, Any], ON_A_SERIES)
+_KINDS = ON_A_SERIES
 _KEYS = {name: {field.name for field in fields(kind)} for name, kind in _KINDS.items()}
 _FOREIGN = {name: set().union(*_KEYS.values()) - keys for name, keys in _KEYS.items()}  # keys of other schemes
 _FILTERS = [name for name, kind in _KINDS.items() if issubclass(kind, ETKF)]

@@ -39,15 +39,15 @@ def check(
     try:
         return schema.model_validate(value, context=context)
     except ValidationError as error:
-        for told in _tell(error, schema):
-            fault = document.fault(_written(told, path, document), told.message, at_key=told.at_key)
+        for finding in _tell(error, schema):
+            fault = document.fault(_written(finding, path, document), finding.message, at_key=finding.at_key)
             if fault not in faults:
                 faults.append(fault)
     return None
 
 
 @dataclass(frozen=True)
-class _Told:
+class _Finding:
     """What is wrong at ``place``; ``absent``: its last key may be one that the file lacks."""
 
     place: Place
@@ -68,14 +68,14 @@ class Faults:
 
     def add(self, place: Place, message: str, *, at_key: bool = False) -> None:
         """A fault at a key, or of a key that is not there."""
-        self._add(_Told(place, message, at_key, absent=bool(place)))
+        self._add(_Finding(place, message, at_key, absent=bool(place)))
 
-    def _add(self, told: _Told) -> None:
-        message = told.message
+    def _add(self, finding: _Finding) -> None:
+        message = finding.message
         for declared, written in self._names.items():
             message = message.replace(declared, written)
-        context = {"message": message, "at_key": told.at_key, "absent": told.absent}
-        where = tuple(self._names.get(str(part), part) for part in told.place)
+        context = {"message": message, "at_key": finding.at_key, "absent": finding.absent}
+        where = tuple(self._names.get(str(part), part) for part in finding.place)
         self._lines.append({"type": PydanticCustomError("fault", "{message}", context), "loc": where, "input": None})
 
     @contextmanager
@@ -84,13 +84,15 @@ class Faults:
         try:
             yield
         except ValidationError as error:
-            for told in _tell(error, schema):
-                self._add(replace(told, place=(*place, *told.place)))
+            for finding in _tell(error, schema):
+                self._add(replace(finding, place=(*place, *finding.place)))
         except ConfigError as error:
             for fault in error.problems:
-                self._add(_Told((*place, fault.path) if fault.path else place, fault.message, absent=bool(fault.path)))
+                self._add(
+                    _Finding((*place, fault.path) if fault.path else place, fault.message, absent=bool(fault.path))
+                )
         except ValueError as error:
-            self._add(_Told(place, str(error)))
+            self._add(_Finding(place, str(error)))
 
     def __enter__(self) -> Self:
         return self
@@ -100,26 +102,26 @@ class Faults:
             raise ValidationError.from_exception_data("faults", self._lines)
 
 
-def _tell(error: ValidationError, schema: type[BaseModel]) -> Iterator[_Told]:
+def _tell(error: ValidationError, schema: type[BaseModel]) -> Iterator[_Finding]:
     for item in error.errors(include_url=False):
         kind, place, context = item["type"], tuple(item["loc"]), item.get("ctx", {})
         if kind == "fault":
-            yield _Told(place, **context)
+            yield _Finding(place, **context)
         elif kind == "union_tag_invalid":
             name = context["discriminator"].strip("'")
-            yield _Told((*place, name), _not_one_of(context["tag"], context["expected_tags"]), absent=True)
+            yield _Finding((*place, name), _not_one_of(context["tag"], context["expected_tags"]), absent=True)
         elif kind == "extra_forbidden":
             hint = suggest(place[-1], sorted(_known(schema, place[:-1])))
-            yield _Told(place, f"unknown key {str(place[-1])!r}{hint}", at_key=True)
+            yield _Finding(place, f"unknown key {str(place[-1])!r}{hint}", at_key=True)
         else:
-            yield _Told(place, _message(item), absent=kind == "missing")
+            yield _Finding(place, _message(item), absent=kind == "missing")
 
 
-def _written(told: _Told, path: Sequence[str | int], document: Document) -> Place:
+def _written(finding: _Finding, path: Sequence[str | int], document: Document) -> Place:
     """Pydantic puts names of union branches into the place; the document decides what is a path."""
     real = tuple(path)
-    for n, part in enumerate(told.place, 1):
-        if document.has((*real, part)) or (told.absent and n == len(told.place)):
+    for n, part in enumerate(finding.place, 1):
+        if document.has((*real, part)) or (finding.absent and n == len(finding.place)):
             real = (*real, part)
     return real
 

@@ -89,7 +89,7 @@ class DaskExecutor(FuturesExecutor):
             self._client = distributed.Client(
                 self._cluster or address, timeout=CONNECT_TIMEOUT, set_as_default=False, heartbeat_interval="1s"
             )
-            self._client.subscribe_topic(TOPIC, self._told)
+            self._client.subscribe_topic(TOPIC, self._pass_on)
             self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT)
             self.workers = workers or max(1, sum(self._client.nthreads().values()))
         except (OSError, ValueError) as error:
@@ -107,7 +107,7 @@ class DaskExecutor(FuturesExecutor):
         listener = key if tell else None
         return self._client.submit(_on_worker, self._limits, function, call, listener, key=key, pure=False)
 
-    def _told(self, event: tuple[float, tuple[str, bytes]]) -> None:
+    def _pass_on(self, event: tuple[float, tuple[str, bytes]]) -> None:
         """What a call tells, in dask's thread; calls of other runs tell it too."""
         key, message = event[1]
         if (tell := self._listening.get(key)) is not None:

@@ -38,7 +38,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Step:
+class TimeStep:
     """Uniform times from zero at the first sample: ``value``, or the file's scalar ``column``."""
 
     column: Column | None = None
@@ -55,7 +55,7 @@ class Matrix:
 
 
 @dataclass(frozen=True)
-class Series:
+class Readings:
     """One observable in time, in the model's units, times increasing; ``scalars`` as the file has them."""
 
     times: Array
@@ -65,8 +65,8 @@ class Series:
 
 
 def read_series(
-    path: Path, time: Column | Step, value: Column, format: Format | None = None, decimal: Decimal = "."
-) -> Series:
+    path: Path, time: Column | TimeStep, value: Column, format: Format | None = None, decimal: Decimal = "."
+) -> Readings:
     """Read one data set. ``format`` defaults to the one of the suffix; ``decimal`` is the decimal sign of a CSV file.
 
     Raises
@@ -93,7 +93,7 @@ def read_series(
     if len(wrong) and isinstance(time, Column):
         lines = [line for line, _ in table.rows] if table else []
         _tell_disorder(columns[time.name], kept, int(wrong[0]), time.unit, lines, path)
-    return Series(times[kept], values[kept], str(path), scalars)
+    return Readings(times[kept], values[kept], str(path), scalars)
 
 
 @dataclass(frozen=True)
@@ -209,7 +209,7 @@ def _tell_disorder(
     raise DataError(f"{where}: times must increase, but {times[after]:g} {unit} follows {times[before]:g} {unit}{hint}")
 
 
-def _step(step: Step, scalars: Mapping[str, float], path: Path) -> float:
+def _step(step: TimeStep, scalars: Mapping[str, float], path: Path) -> float:
     if step.column is None:
         value = step.value
     elif step.column.name not in scalars:

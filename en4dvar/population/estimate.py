@@ -37,7 +37,7 @@ from en4dvar.population.mixtures import Mixture, fit_mixtures
 from en4dvar.population.training import Training
 from en4dvar.population.weights import Weighed, normalised, with_emulators, with_runs
 from en4dvar.prior import Prior, member_stream
-from en4dvar.sampling.forward_runs import Runs
+from en4dvar.sampling.forward_runs import CampaignRuns
 from en4dvar.sampling.mixture import StudentMixture
 from en4dvar.state import Array
 
@@ -104,7 +104,7 @@ class Population:
 
 
 def estimate_population(
-    runs: Runs,
+    runs: CampaignRuns,
     start: Array,
     prior: Prior,
     names: Sequence[str],
@@ -135,7 +135,7 @@ class _Estimate:
     """One estimate; see :func:`estimate_population`."""
 
     def __init__(
-        self, runs: Runs, start: Array, prior: Prior, names: Sequence[str], seed: int, scales: HyperPrior,
+        self, runs: CampaignRuns, start: Array, prior: Prior, names: Sequence[str], seed: int, scales: HyperPrior,
         effort: Effort, workers: int,
     ):  # fmt: skip
         self.runs, self.prior, self.names, self.seed = runs, prior, tuple(names), seed

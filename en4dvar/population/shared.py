@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.prior import Prior
-from en4dvar.sampling.forward_runs import Runs
+from en4dvar.sampling.forward_runs import CampaignRuns
 from en4dvar.state import Array
 
 STEP = 1e-3  # of a prior standard deviation, for the tangent
@@ -46,7 +46,7 @@ class _Minimum:
     hessian: Array
 
 
-def fit_shared(runs: Runs, starts: Array, prior: Prior, names: Sequence[str], most: int = 60) -> SharedFit:
+def fit_shared(runs: CampaignRuns, starts: Array, prior: Prior, names: Sequence[str], most: int = 60) -> SharedFit:
     """Fit ``names`` in common, with at most so many steps of each descent.
 
     Parameters
@@ -72,7 +72,7 @@ def fit_shared(runs: Runs, starts: Array, prior: Prior, names: Sequence[str], mo
 class _Shared:
     """Whitened coordinates (c + S·b,): the common ones, then each set's own."""
 
-    def __init__(self, runs: Runs, prior: Prior, where: list[int], n_sets: int):
+    def __init__(self, runs: CampaignRuns, prior: Prior, where: list[int], n_sets: int):
         self.runs, self.prior, self.where, self.n_sets = runs, prior, where, n_sets
         self.own = [j for j in range(len(prior.names)) if j not in where]
         self.root = np.sqrt(runs.weight)

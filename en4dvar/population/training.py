@@ -11,7 +11,7 @@ from en4dvar.population.effort import Effort
 from en4dvar.population.likelihoods import JITTER, EmulatedLikelihood, draw_interim, fit_likelihood
 from en4dvar.population.marginals import TEMPERATURE
 from en4dvar.prior import member_stream
-from en4dvar.sampling.forward_runs import Runs, Sets, log_likelihood
+from en4dvar.sampling.forward_runs import CampaignRuns, Sets, log_likelihood
 from en4dvar.state import Array
 
 SAMPLE, SEARCH = 512, 80  # of the interim prior, and rounds of a search from it
@@ -29,7 +29,7 @@ class Training:
     """
 
     def __init__(
-        self, runs: Runs, start: Array, mean: Array, std: Array, seed: int, effort: Effort, workers: int = 1
+        self, runs: CampaignRuns, start: Array, mean: Array, std: Array, seed: int, effort: Effort, workers: int = 1
     ):  # fmt: skip
         self.runs, self.seed, self.degree, self.workers = runs, seed, effort.degree, workers
         self.count, self.revisited, self.refits = 0, 0, 0

@@ -14,7 +14,7 @@ from en4dvar.population.likelihoods import EmulatedLikelihood
 from en4dvar.population.marginals import Marginals, SetPosterior, marginals
 from en4dvar.population.mixtures import log_marginal
 from en4dvar.prior import member_stream
-from en4dvar.sampling.forward_runs import Runs, log_likelihood
+from en4dvar.sampling.forward_runs import CampaignRuns, log_likelihood
 from en4dvar.sampling.mixture import StudentMixture, resampled
 from en4dvar.state import Array
 
@@ -86,7 +86,11 @@ def with_emulators(
 
 
 def with_runs(
-    weighed: Weighed, likelihoods: Sequence[EmulatedLikelihood], runs: Runs, count: int, stream: np.random.Generator
+    weighed: Weighed,
+    likelihoods: Sequence[EmulatedLikelihood],
+    runs: CampaignRuns,
+    count: int,
+    stream: np.random.Generator,
 ) -> tuple[Weighed, int]:
     """``count`` draws, as often as their weights say, weighed by Π_i of the mean L_i/L̂_i over draws of x_i; runs made.
 
@@ -115,7 +119,9 @@ def with_runs(
     return Weighed(weighed.h[kept], logs.sum(axis=1), x), count * int(done.sum())
 
 
-def _errors(runs: Runs, likelihoods: Sequence[EmulatedLikelihood], x: Array, sets: npt.NDArray[np.intp]) -> Array:
+def _errors(
+    runs: CampaignRuns, likelihoods: Sequence[EmulatedLikelihood], x: Array, sets: npt.NDArray[np.intp]
+) -> Array:
     """ln L/L̂ (B, s) of coordinates (B, s, n) of ``sets``."""
     parts = [x[i : i + BATCH] for i in range(0, len(x), BATCH)]
     exact = np.concatenate([log_likelihood(runs, runs.predictions(part, sets), sets) for part in parts])

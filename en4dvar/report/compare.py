@@ -48,7 +48,7 @@ class ModelScore:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ComparedEstimate:
     """A parameter's posterior in one run for one data set; ``members`` (N',) alive, in the unit of ``summary``."""
 
     run: str
@@ -64,7 +64,7 @@ class Comparison:
     """
 
     scores: tuple[ModelScore, ...]
-    estimates: tuple[Estimate, ...] = ()
+    estimates: tuple[ComparedEstimate, ...] = ()
     incomparable: str = ""
 
     @property
@@ -78,7 +78,7 @@ class Comparison:
         return tuple(dict.fromkeys(estimate.summary.name for estimate in self.estimates))
 
     @property
-    def by_parameter(self) -> tuple[Estimate, ...]:
+    def by_parameter(self) -> tuple[ComparedEstimate, ...]:
         """The estimates, those of one parameter below each other."""
         return tuple(e for name in self.parameters for e in self.estimates if e.summary.name == name)
 
@@ -115,7 +115,7 @@ def compare_runs(runs: Sequence[str | Path]) -> Comparison:
     datasets = list(dict.fromkeys(dataset for held in results.values() for dataset in held))
     pairs = [(name, d, held[d]) for d in datasets for name, held in results.items() if d in held]
     estimates = tuple(
-        Estimate(name, dataset, row, result.members("posterior", row.name))
+        ComparedEstimate(name, dataset, row, result.members("posterior", row.name))
         for name, dataset, result in pairs
         for row in result.summary()
     )

@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from en4dvar.errors import OutputError
 from en4dvar.files import make_folder, write_text
-from en4dvar.report.compare import Comparison, Estimate, ModelScore
+from en4dvar.report.compare import ComparedEstimate, Comparison, ModelScore
 from en4dvar.report.html import render
 from en4dvar.report.style import COLUMN, LIGHT, inline_svg, panels, save_figure, scaled_histogram, styled
 from en4dvar.report.text import with_unit
@@ -41,7 +41,7 @@ def overlay(comparison: Comparison) -> Figure:
     return figure
 
 
-def _panel(ax: Axes, estimates: Sequence[Estimate], runs: Sequence[str]) -> None:
+def _panel(ax: Axes, estimates: Sequence[ComparedEstimate], runs: Sequence[str]) -> None:
     row = estimates[0].summary
     for i, run in enumerate(runs):
         values = _members([e for e in estimates if e.run == run], row.unit)
@@ -55,7 +55,7 @@ def _panel(ax: Axes, estimates: Sequence[Estimate], runs: Sequence[str]) -> None
     ax.xaxis.set_major_locator(MaxNLocator(5))
 
 
-def _members(estimates: Sequence[Estimate], unit: str) -> Array:
+def _members(estimates: Sequence[ComparedEstimate], unit: str) -> Array:
     """Members of all data sets of a run in ``unit``."""
     try:
         parts = [convert(e.members, e.summary.unit, unit) for e in estimates]

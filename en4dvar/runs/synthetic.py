@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.config.synthetic import CampaignPlan, Group
+from en4dvar.config.synthetic import CampaignPlan, GroupSection
 from en4dvar.diagnostics import nrmse
 from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import run_chunk
@@ -53,7 +53,7 @@ def draw_campaign(plan: CampaignPlan) -> tuple[SyntheticSet, ...]:
     )
 
 
-def _draw(plan: CampaignPlan, kind: str, group: Group, number: int) -> SyntheticSet:
+def _draw(plan: CampaignPlan, kind: str, group: GroupSection, number: int) -> SyntheticSet:
     name = f"{kind}_{number:02d}"
     stream = member_stream(plan.seed, name)
     model, asked = plan.model, plan.settings

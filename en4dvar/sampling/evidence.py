@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.prior import Prior, member_stream
-from en4dvar.sampling.forward_runs import Runs, log_likelihood
+from en4dvar.sampling.forward_runs import CampaignRuns, log_likelihood
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 from en4dvar.state import Array
 
@@ -38,7 +38,7 @@ class Evidence:
     effective: Array
 
 
-def sampled_evidence(runs: Runs, prior: Prior, seed: int) -> Evidence:
+def sampled_evidence(runs: CampaignRuns, prior: Prior, seed: int) -> Evidence:
     """At most :data:`MOST_ROUNDS` times :data:`DRAWS` forward runs of each set, or :data:`MORE` times as many.
 
     Deterministic in ``seed``. A set no draw of which can be run gets −inf.
@@ -53,7 +53,7 @@ def sampled_evidence(runs: Runs, prior: Prior, seed: int) -> Evidence:
     return Evidence(np.array([found[s].log for s in every]), np.array([found[s].effective for s in every]))
 
 
-def _sample(runs: Runs, prior: Prior, samplers: Mapping[int, _Importance]) -> None:
+def _sample(runs: CampaignRuns, prior: Prior, samplers: Mapping[int, _Importance]) -> None:
     """Rounds of all samplers, by the number of their set, until they have enough draws."""
     for _ in range(MOST_ROUNDS):
         going = np.array([s for s, one in samplers.items() if one.effective < ENOUGH], dtype=int)

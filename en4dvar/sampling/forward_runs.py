@@ -17,7 +17,7 @@ from en4dvar.state import TIME_SHIFT, Array
 Sets = npt.NDArray[np.intp] | None  # numbers of the data sets meant; all of them by default
 
 
-class Runs(Protocol):
+class CampaignRuns(Protocol):
     """``values`` and ``weight`` (S, K): observations and β/std², 0 beyond the last observation of a set."""
 
     values: Array
@@ -55,7 +55,7 @@ class Predictor:
 
 
 class ForwardRuns:
-    """:class:`Runs` of data sets with one prior; those that share model and fixed values are run together.
+    """:class:`CampaignRuns` of data sets with one prior; those that share model and fixed values are run together.
 
     A set with fewer observations than another is padded with its last instant: a model has to bear one twice.
 
@@ -81,7 +81,7 @@ class ForwardRuns:
         self.groups = [(Predictor(problems[sets[0]], executor), sets) for sets in alike.values()]
 
     def predictions(self, x: Array, sets: Sets = None) -> Array:
-        """See :class:`Runs`."""
+        """See :class:`CampaignRuns`."""
         chosen = np.arange(len(self.times)) if sets is None else sets
         out = np.empty((len(x), len(chosen), self.times.shape[1]))
         for predictor, members in self.groups:
@@ -93,7 +93,7 @@ class ForwardRuns:
         return out
 
 
-def log_likelihood(runs: Runs, predictions: Array, sets: Sets = None) -> Array:
+def log_likelihood(runs: CampaignRuns, predictions: Array, sets: Sets = None) -> Array:
     """−½ Σ β (y − m)²/std² (B, S) of predictions (B, S, K) for ``sets``, all by default; −inf where a run failed."""
     chosen = slice(None) if sets is None else sets
     squares = np.sum(runs.weight[chosen] * (runs.values[chosen] - predictions) ** 2, axis=2)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields
-from typing import Any, cast
+from typing import Any
 
 from en4dvar.schemes.base import Scheme
 from en4dvar.schemes.denkf import DEnKF
@@ -15,17 +14,19 @@ from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 
 # name in a configuration → class; its fields are keys of the section ``assimilation:``
-ON_A_WINDOW: dict[str, Callable[..., Scheme]] = {
+SCHEMES: dict[str, Any] = {
     "en4dvar": En4DVar,
     "es-mda": ESMDA,
     "etkf": ETKF,
     "denkf": DEnKF,
     "enkf-n": EnKFN,
+    "ienks": IEnKS,
 }
-ON_A_SERIES: dict[str, Callable[..., Scheme]] = {"etkf": ETKF, "ienks": IEnKS, "denkf": DEnKF, "enkf-n": EnKFN}
+ON_A_WINDOW, ON_A_SERIES = ({n: kind for n, kind in SCHEMES.items() if on in kind.on} for on in ("window", "series"))
 
 
 def window_scheme(settings: Any) -> Scheme:
     """The scheme that the settings of an estimate name, with those of their values that are its fields."""
     kind = ON_A_WINDOW[settings.scheme]
-    return kind(**{f.name: getattr(settings, f.name) for f in fields(cast(Any, kind))})
+    scheme: Scheme = kind(**{f.name: getattr(settings, f.name) for f in fields(kind)})
+    return scheme

@@ -126,11 +126,14 @@ def gauss_newton(w: Array, evaluation: Evaluation) -> GaussNewtonStep:
 class Scheme(Protocol):
     """The author of a scheme writes these.
 
+    ``on``: what it can be run on, ``window`` (the data of one set, for parameters), ``series``, or both.
     ``searches``: steps are Gauss–Newton steps of J, and how far to go is found by J of the central run
     (:mod:`en4dvar.descent.step_control`). Other schemes take their step as it is; their ensemble is run as a whole, and
     R is that at its mean, ``passes`` times. ``lag``: cycles of a series that the window is long; 0 is a filter.
     """
 
+    @property
+    def on(self) -> tuple[str, ...]: ...
     @property
     def searches(self) -> bool: ...
     @property

@@ -33,6 +33,7 @@ class En4DVar:
     linearisation: Literal["bundle", "transform"] = "bundle"
     epsilon: float = 1e-3
 
+    on: ClassVar[tuple[str, ...]] = ("window",)
     passes: ClassVar[int] = 1
     searches: ClassVar[bool] = True
     lag: ClassVar[int] = 0

@@ -16,7 +16,7 @@ Sources: Emerick & Reynolds (2013), Computers & Geosciences 55, 3; square root: 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -36,6 +36,8 @@ class ESMDA(ETKF):
 
     mda_coefficients: tuple[float, ...] = (4.0, 4.0, 4.0, 4.0)
     mda_form: Literal["perturbed", "square-root"] = "perturbed"
+
+    on: ClassVar[tuple[str, ...]] = ("window",)
 
     def __post_init__(self) -> None:
         if not self.mda_coefficients or not all(alpha > 0 for alpha in self.mda_coefficients):

@@ -22,6 +22,7 @@ from en4dvar.state import Array
 class ETKF:
     """The filter: a window without length, analysed once. Filters with another analysis say so in :meth:`advance`."""
 
+    on: ClassVar[tuple[str, ...]] = ("window", "series")
     searches: ClassVar[bool] = False
     passes: ClassVar[int] = 1
     lag: ClassVar[int] = 0

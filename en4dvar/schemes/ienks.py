@@ -44,6 +44,7 @@ class IEnKS:
         float, Gt(0), "Iterations end where the step is shorter than this, in posterior standard deviations."
     ] = 0.05
 
+    on: ClassVar[tuple[str, ...]] = ("series",)
     passes: ClassVar[int] = 1
     searches: ClassVar[bool] = False
 

@@ -214,7 +214,7 @@ def _range(values: Any) -> str:
 
 
 def _tell(target: Path, proposal: Proposal, example_only: bool) -> None:
-    for line in proposal.seen:
+    for line in proposal.remarks:
         click.echo(line)
     for warning in proposal.warnings:
         click.echo(f"warning: {warning}", err=True)

@@ -21,7 +21,7 @@ from en4dvar.hints import suggest
 from en4dvar.state import Parameter
 from en4dvar.units import Quantity, parse_quantity
 from en4dvar_bubble.driving import Reading
-from en4dvar_bubble.driving.settings import DrivingSettings, Histotripsy, Section, with_kind
+from en4dvar_bubble.driving.settings import PULSE_SECTIONS, DrivingSettings, Section, with_kind
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX, Gas, Heat, Start, Vapour
 from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, get_law
@@ -117,7 +117,7 @@ class BubbleSettings(Section):
     """Wall at the far-field temperature, or heat conduction in the medium."""
     start: Start = "acoustic"
     """acoustic: at rest at R0, then driven; laser: released from R_max with the gas of R_eq."""
-    driving: DrivingSettings = Histotripsy()
+    driving: DrivingSettings = PULSE_SECTIONS["histotripsy"]()
     """Pressure far away; default: the histotripsy pulse (acoustic start) or none (laser start)."""
     driving_read: Reading = "instantaneous"
     """When p_f is evaluated: at t, at t + R/c without its derivative (retarded), or both (as-printed)."""

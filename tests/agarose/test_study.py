@@ -50,6 +50,7 @@ def small(tmp_path_factory):
     return folder / "out", result.output, call
 
 
+@pytest.mark.slow
 def test_every_table_and_figure_is_there(small):
     out, told, _ = small
     for number in (1, 2):
@@ -66,6 +67,7 @@ def test_every_table_and_figure_is_there(small):
     assert "cannot tell the laws apart" in told
 
 
+@pytest.mark.slow
 def test_synthetic_is_said_wherever_numbers_appear(small):
     out, told, _ = small
     assert "synthetic twin" in told
@@ -79,6 +81,7 @@ def test_synthetic_is_said_wherever_numbers_appear(small):
     assert "http" not in page.replace("http-equiv", "")
 
 
+@pytest.mark.slow
 def test_tables_hold_the_printed_values(small):
     out, _, _ = small
     lines = [line.split(",") for line in (out / "table1.csv").read_text().splitlines() if not line.startswith("#")]
@@ -91,11 +94,13 @@ def test_tables_hold_the_printed_values(small):
     assert (TABLE_1["1 %"]["nh"]["G"], TABLE_2["0.3 %"]["qlkv"]["R0"]) == ((30.0, 3.8), (0.51, 0.06))
 
 
+@pytest.mark.slow
 def test_an_earlier_study_is_kept(small):
     _, _, call = small
     assert isinstance(CliRunner().invoke(study_command, call).exception, OutputError)
 
 
+@pytest.mark.slow
 def test_a_changed_study_is_not_continued(small):
     out, _, call = small
     before = sorted((file, file.stat().st_mtime_ns) for file in out.rglob("*"))
@@ -169,6 +174,7 @@ def _files(folder):
     return sum(1 for file in folder.rglob("*") if not file.name.startswith("."))
 
 
+@pytest.mark.slow
 def test_results_as_netcdf(small):
     out, _, _ = small
     with xr.open_datatree(out / "study.nc") as tree:
@@ -187,6 +193,7 @@ def test_results_as_netcdf(small):
 
 @pytest.mark.slow
 @pytest.mark.long
+@pytest.mark.slow
 def test_a_study_that_lost_some_results_is_resumed_to_the_same_tables(small):
     out, _, call = small
     before = {file.name: file.read_bytes() for file in [*out.glob("*.csv"), *out.glob("table*.md")]}

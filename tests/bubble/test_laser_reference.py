@@ -25,6 +25,7 @@ def test_cases_without_vapour_transport(case):
     assert np.sqrt(np.mean((R - expected) ** 2)) < 5e-4 * LASER["R_max"]
 
 
+@pytest.mark.slow
 def test_spurious_wall_temperature_explains_the_converged_difference():
     """The reference extrapolates to about 68.7 µm in its medium grid (``reference/README.md``); we find 65.3 µm."""
     z = reference("laser.npz")
@@ -35,6 +36,7 @@ def test_spurious_wall_temperature_explains_the_converged_difference():
     assert first_rebound(times, laser(3, times))[0] == pytest.approx(65.3e-6, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_medium_grid_explains_the_rest():
     """83.9 µm with 50 nodes (``reference/README.md``), less with more."""
     times = reference("laser.npz")["t_s"][:501]

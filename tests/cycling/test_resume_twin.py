@@ -196,6 +196,7 @@ def kill_and_resume(tmp_path: Path, kills: int, seed: int) -> None:
         finished += 1
 
 
+@pytest.mark.slow  # the states of every cycle are resumed above
 def test_killed_and_resumed(tmp_path):
     """SIGKILL at a random moment of the cycles."""
     kill_and_resume(tmp_path, 1, 1)

@@ -13,7 +13,7 @@ from pathlib import Path
 from en4dvar.config.document import read_document
 from en4dvar.config.synthetic import resolve_campaign
 from en4dvar.errors import ConfigError, DataError, En4dvarError
-from en4dvar.inputs.readers import Column, Matrix, Step, read_contents, read_covariance, read_series
+from en4dvar.inputs.readers import Column, Matrix, TimeStep, read_contents, read_covariance, read_series
 from en4dvar.report.result import load_result
 from en4dvar.runs.checks import validate
 from en4dvar.units import UnitError, parse_quantity
@@ -54,7 +54,9 @@ def mat_series(content: bytes, folder: Path) -> bool:
     path = folder / "case.mat"
     path.write_bytes(content)
     _accepted(lambda: read_contents(path), DataError, path)
-    return _accepted(lambda: read_series(path, Step(Column("dt", "s", "s")), Column("R", "m", "m")), DataError, path)
+    return _accepted(
+        lambda: read_series(path, TimeStep(Column("dt", "s", "s")), Column("R", "m", "m")), DataError, path
+    )
 
 
 def quantity(content: bytes, folder: Path) -> bool:

@@ -9,18 +9,18 @@ import pytest
 from scipy.io import savemat
 
 from en4dvar.errors import DataError
-from en4dvar.inputs.readers import Column, Series, Step, read_series
+from en4dvar.inputs.readers import Column, Readings, TimeStep, read_series
 
 TIME, RADIUS = Column("t", "us", "s"), Column("R", "um", "m")
 
 
-def csv(tmp_path: Path, text: str) -> Series:
+def csv(tmp_path: Path, text: str) -> Readings:
     path = tmp_path / "a.csv"
     path.write_text(text, encoding="utf-8")
     return read_series(path, TIME, RADIUS)
 
 
-def mat(tmp_path: Path, time: Column | Step = TIME, **fields: Any) -> Series:
+def mat(tmp_path: Path, time: Column | TimeStep = TIME, **fields: Any) -> Readings:
     savemat(tmp_path / "a.mat", fields)
     return read_series(tmp_path / "a.mat", time, RADIUS)
 
@@ -128,9 +128,9 @@ def test_mat_layouts(tmp_path: Path, shape: tuple[int, int]) -> None:
 
 def test_mat_time_step(tmp_path: Path) -> None:
     radius = np.array([np.nan, 5.0, 6.0, 7.0])
-    step = Step(Column("deltat", "us", "s"))
+    step = TimeStep(Column("deltat", "us", "s"))
     assert mat(tmp_path, step, R=radius, deltat=0.5).times.tolist() == [0.5e-6, 1e-6, 1.5e-6]
-    assert mat(tmp_path, Step(value=2e-6), R=radius).times.tolist() == [2e-6, 4e-6, 6e-6]
+    assert mat(tmp_path, TimeStep(value=2e-6), R=radius).times.tolist() == [2e-6, 4e-6, 6e-6]
     with pytest.raises(DataError, match="no scalar 'deltat' for the time step; did you mean 'delta_t'"):
         mat(tmp_path, step, R=radius, delta_t=0.5)
     with pytest.raises(DataError, match="time step 0 is not positive"):

@@ -95,7 +95,14 @@ def estimated(runs, seed):
     return estimate_population(runs, runs.start(seed), CURVED_PRIOR, ["a"], seed, CURVED_HYPER, SMALL)
 
 
-@pytest.mark.parametrize("runs", [Curved(), Curved(outlier=2.0), Cusped()], ids=["curved", "outlier", "cusped"])
+@pytest.mark.parametrize(
+    "runs",
+    [
+        pytest.param(Curved(), id="curved", marks=pytest.mark.slow),
+        pytest.param(Curved(outlier=2.0), id="outlier"),
+        pytest.param(Cusped(), id="cusped", marks=pytest.mark.slow),
+    ],
+)
 def test_a_population_of_curved_likelihoods_against_quadrature(runs):
     found = estimated(runs, 3)
     quantiles, evidence = by_quadrature(runs, CURVED_PRIOR, CURVED_HYPER)

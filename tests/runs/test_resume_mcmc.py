@@ -80,6 +80,7 @@ def kill_and_resume(folder: Path, kills: int, seed: int) -> None:
         finished += 1
 
 
+@pytest.mark.slow  # test_resume_loop.py resumes from every look at the chain
 def test_killed_and_resumed(tmp_path):
     """SIGKILL at a random moment."""
     kill_and_resume(tmp_path, 1, 1)

@@ -1,20 +1,45 @@
-"""Driving pressures in closed form."""
+"""Driving pressures in closed form, a function each.
+
+:func:`pulse` makes a function a kind of ``driving:`` in YAML: its arguments are the keys, declared here with unit,
+bounds and description, and the first line of its docstring says what it is.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Literal
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
+from annotated_types import Ge, Gt, Le
 
 from en4dvar.state import Array
+from en4dvar.units import Quantity
 from en4dvar_bubble.driving.base import Driving
 
 Envelope = Literal["none", "hann", "tukey"]
+Pressure = Annotated[float, Quantity("Pa")]
+Frequency = Annotated[float, Quantity("Hz"), Gt(0)]
+Time = Annotated[float, Quantity("s")]
+Delay = Annotated[Time, Ge(0)]
+Width = Annotated[Time, Gt(0)]
+Pulse = TypeVar("Pulse", bound=Callable[..., Driving])
+
+PULSES: dict[str, Callable[..., Driving]] = {}
 
 _CELLS_PER_CYCLE = 128
 _WIDTHS = 7.0  # a Gaussian is cut where it has fallen to 2e-11
+
+
+def pulse(kind: str) -> Callable[[Pulse], Pulse]:
+    """Register a function under the name that ``driving.kind`` has in YAML."""
+
+    def register(function: Pulse) -> Pulse:
+        PULSES[kind] = function
+        return function
+
+    return register
 
 
 @dataclass(frozen=True)
@@ -30,10 +55,14 @@ class _HalfCycle:
         return np.asarray(base**self.exponent)
 
 
+@pulse("histotripsy")
 def histotripsy(
-    amplitude: float = -24e6, frequency: float = 1e6, exponent: float = 3.7, delay: float = 5e-6
+    amplitude: Annotated[Pressure, "p_A; negative for rarefaction."] = -24e6,
+    frequency: Annotated[Frequency, "ω/2π."] = 1e6,
+    exponent: Annotated[float, Ge(1), "n."] = 3.7,
+    delay: Annotated[Time, "δ: the instant of the peak."] = 5e-6,
 ) -> Driving:
-    """The rarefactional half cycle p_A [(1 + cos ω(t−δ))/2]^n for |t−δ| ≤ π/ω.
+    """The rarefactional half cycle of a histotripsy pulse, p_A [(1 + cos ω(t−δ))/2]^n for |t−δ| ≤ π/ω.
 
     Amplitude and frequency are the paper's; n and δ are from the literature on this array (Vlaisavljevich et al. 2015).
     """
@@ -57,16 +86,19 @@ class _Burst:
         return np.asarray(wave * 0.5 * (1 - np.cos(np.pi * np.clip(2 * from_edge / self.taper, 0.0, 1.0))))
 
 
+@pulse("sine")
 def sine_burst(
-    amplitude: float,
-    frequency: float,
-    cycles: float,
-    delay: float = 0.0,
-    phase: float = 0.0,
-    envelope: Envelope = "none",
-    taper: float = 0.5,
+    amplitude: Annotated[Pressure, "Pressure amplitude."],
+    frequency: Annotated[Frequency, "Frequency."],
+    cycles: Annotated[float, Gt(0), Le(1000), "Length of the burst in periods."],
+    delay: Annotated[Delay, "When the burst begins."] = 0.0,
+    phase: Annotated[float, "Phase at its beginning, in radians."] = 0.0,
+    envelope: Annotated[
+        Envelope, "Window that the burst is multiplied by; without one the burst must begin and end at zero."
+    ] = "none",
+    taper: Annotated[float, Ge(0.01), Le(1), "Share of the burst that the two tapers of the Tukey window take."] = 0.5,
 ) -> Driving:
-    """p_A sin(2πf(t−δ) + φ) w(t) for 0 ≤ t − δ ≤ cycles/f.
+    """A sine burst, with or without an envelope: p_A sin(2πf(t−δ) + φ) w(t) for 0 ≤ t − δ ≤ cycles/f.
 
     ``envelope``: w = 1, the Hann window, or the Tukey window whose two cosine tapers together take the fraction
     ``taper`` of the burst (in steps of 0.001). Raises ValueError where the pressure would jump: without envelope the
@@ -95,8 +127,16 @@ class _Gaussian:
         return np.asarray(np.exp(-0.5 * ((t - self.delay) / self.width) ** 2))
 
 
-def gaussian(amplitude: float, delay: float, width: float) -> Driving:
-    """p_A exp(−(t−δ)²/(2σ²)) with σ = ``width``, cut at |t−δ| = 7σ where it is 2e-11 of the amplitude."""
+@pulse("gaussian")
+def gaussian(
+    amplitude: Annotated[Pressure, "Peak pressure."],
+    delay: Annotated[Delay, "The instant of the peak."],
+    width: Annotated[Width, "Standard deviation of the pulse in time."],
+) -> Driving:
+    """A Gaussian pulse p_A exp(−(t−δ)²/(2σ²)) with σ = ``width``.
+
+    It is cut at |t−δ| = 7σ, where it is 2e-11 of the amplitude.
+    """
     half = _WIDTHS * width
     return Driving(amplitude, delay - half, delay + half, _Gaussian(delay, width), stops=(delay,))
 
@@ -113,7 +153,13 @@ class _Step:
         return np.asarray(s**3 * (10 - 15 * s + 6 * s * s))
 
 
-def step(amplitude: float, duration: float, delay: float = 0.0, rise: float = 20e-9) -> Driving:
+@pulse("step")
+def step(
+    amplitude: Annotated[Pressure, "Pressure after the step."],
+    duration: Annotated[Width, "How long the pressure lasts."],
+    delay: Annotated[Delay, "When it begins."] = 0.0,
+    rise: Annotated[Width, "Rise time."] = 20e-9,
+) -> Driving:
     """A pressure p_A from ``delay`` for ``duration``: a step if that outlives the simulation, else an impulse.
 
     It rises within ``rise`` and falls within the same time at the end, both inside the duration, as the polynomial
@@ -130,6 +176,7 @@ def step(amplitude: float, duration: float, delay: float = 0.0, rise: float = 20
     return Driving(amplitude, delay, delay + duration, _Step(delay, exact, duration), cells, stops)
 
 
+@pulse("none")
 def silence() -> Driving:
     """No driving: the laser-induced bubble."""
     return Driving(0.0, 0.0, 1e-6, np.zeros_like, cells=1)

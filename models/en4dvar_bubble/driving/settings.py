@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from inspect import signature
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Union, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, create_model, field_validator, model_validator
 
 from en4dvar.errors import En4dvarError
 from en4dvar.units import Quantity, convert
-from en4dvar_bubble.driving import pulses
 from en4dvar_bubble.driving.base import Driving
+from en4dvar_bubble.driving.pulses import PULSES
 from en4dvar_bubble.driving.tabulated import from_file
-
-Pressure = Annotated[float, Quantity("Pa")]
-Frequency = Annotated[float, Quantity("Hz"), Field(gt=0)]
-Time = Annotated[float, Quantity("s")]
-Delay = Annotated[Time, Field(ge=0)]
-Width = Annotated[Time, Field(gt=0)]
 
 
 class Section(BaseModel):
@@ -47,80 +42,17 @@ class _Kind(Section):
         return self
 
 
-class NoDriving(_Kind):
-    """No driving."""
-
-    pulse = staticmethod(pulses.silence)
-    kind: Literal["none"] = "none"
-    """No driving."""
-
-
-class Histotripsy(_Kind):
-    """The rarefactional half cycle of a histotripsy pulse."""
-
-    pulse = staticmethod(pulses.histotripsy)
-    kind: Literal["histotripsy"] = "histotripsy"
-    """p_A [(1 + cos ω(t−δ))/2]^n for |t−δ| ≤ π/ω."""
-    amplitude: Pressure = -24e6
-    """p_A; negative for rarefaction."""
-    frequency: Frequency = 1e6
-    """ω/2π."""
-    exponent: Annotated[float, Field(ge=1)] = 3.7
-    """n."""
-    delay: Time = 5e-6
-    """δ: the instant of the peak."""
-
-
-class Sine(_Kind):
-    """A sine burst, with or without an envelope."""
-
-    pulse = staticmethod(pulses.sine_burst)
-    kind: Literal["sine"] = "sine"
-    """A sine burst."""
-    amplitude: Pressure
-    """Pressure amplitude."""
-    frequency: Frequency
-    """Frequency."""
-    cycles: Annotated[float, Field(gt=0, le=1000)]
-    """Length of the burst in periods."""
-    delay: Delay = 0.0
-    """When the burst begins."""
-    phase: float = 0.0
-    """Phase at its beginning, in radians."""
-    envelope: pulses.Envelope = "none"
-    """Window that the burst is multiplied by; without one the burst must begin and end at zero."""
-    taper: Annotated[float, Field(ge=0.01, le=1)] = 0.5
-    """Share of the burst that the two tapers of the Tukey window take."""
-
-
-class Gaussian(_Kind):
-    """A Gaussian pulse centred at ``delay`` with standard deviation ``width``."""
-
-    pulse = staticmethod(pulses.gaussian)
-    kind: Literal["gaussian"] = "gaussian"
-    """A Gaussian pulse."""
-    amplitude: Pressure
-    """Peak pressure."""
-    delay: Delay
-    """The instant of the peak."""
-    width: Width
-    """Standard deviation of the pulse in time."""
-
-
-class Step(_Kind):
-    """A step that lasts, or an impulse that ends after ``duration``."""
-
-    pulse = staticmethod(pulses.step)
-    kind: Literal["step"] = "step"
-    """A step or an impulse."""
-    amplitude: Pressure
-    """Pressure after the step."""
-    duration: Width
-    """How long the pressure lasts."""
-    delay: Delay = 0.0
-    """When it begins."""
-    rise: Width = 20e-9
-    """Rise time."""
+def _section(kind: str, function: Callable[..., Driving]) -> type[_Kind]:
+    """The section of a pulse; its keys are declared at the arguments of the function."""
+    hints, words = get_type_hints(function, include_extras=True), (function.__doc__ or "").splitlines()[0]
+    keys: dict[str, Any] = {"kind": (Literal[kind], Field(kind, description=words))}
+    for name, argument in signature(function).parameters.items():
+        described = " ".join(text for text in hints[name].__metadata__ if isinstance(text, str))
+        default = ... if argument.default is argument.empty else argument.default
+        keys[name] = (hints[name], Field(default, description=described))
+    section = create_model(kind.capitalize(), __base__=_Kind, __doc__=words, **keys)
+    section.pulse = staticmethod(function)
+    return section
 
 
 class _Column(Section):
@@ -169,7 +101,7 @@ class Tabulated(_Kind):
     """Which columns hold time and pressure, and their units."""
     format: Literal["csv", "mat"] | None = None
     """Format of the file; default: by its suffix."""
-    delay: Time = 0.0
+    delay: Annotated[float, Quantity("s")] = 0.0
     """Added to the times of the record."""
     scale: Annotated[float, Field()] = 1.0
     """Factor on the pressures."""
@@ -187,19 +119,22 @@ class Tabulated(_Kind):
         )
 
 
+PULSE_SECTIONS = {kind: _section(kind, function) for kind, function in PULSES.items()}
+
+
 class _AsWritten:
     """The JSON schema of what :func:`with_kind` accepts."""
 
     def __get_pydantic_json_schema__(self, core_schema: Any, handler: Any) -> dict[str, Any]:
         kinds = [
-            kind if Histotripsy.__name__ in kind["$ref"] else {"allOf": [kind], "required": ["kind"]}
+            kind if "Histotripsy" in kind["$ref"] else {"allOf": [kind], "required": ["kind"]}
             for kind in handler(core_schema)["oneOf"]
         ]
         return {"anyOf": [{"const": "none", "description": "No driving."}, *kinds]}
 
 
-DrivingSettings = Annotated[
-    NoDriving | Histotripsy | Sine | Gaussian | Step | Tabulated,
+DrivingSettings: Any = Annotated[
+    Union[(*PULSE_SECTIONS.values(), Tabulated)],
     Field(discriminator="kind"),
     _AsWritten(),
 ]

@@ -12,7 +12,7 @@ from en4dvar.config import resolve
 from en4dvar.config.build import build_one, find_files
 from en4dvar.config.document import parse_document
 from en4dvar.errors import ConfigError, DataError
-from en4dvar.inputs.readers import Column, Step, read_series
+from en4dvar.inputs.readers import Column, TimeStep, read_series
 from en4dvar.inputs.text_table import Decimal
 from en4dvar.state import Array
 from en4dvar.units import UnitError, parse_quantity, parse_unit
@@ -87,7 +87,7 @@ def histories(files: Mapping[str, Path], source: Source) -> tuple[dict[str, tupl
     ------
     DataError: none can be used. UnitError: a unit that is not of its kind.
     """
-    step = Step(value=parse_quantity(source.time_step, "s")) if source.time_step else None
+    step = TimeStep(value=parse_quantity(source.time_step, "s")) if source.time_step else None
     time = step or Column(*(source.time or ("", "s")), "s")
     found: dict[str, tuple[Array, Array]] = {}
     unusable: list[str] = []

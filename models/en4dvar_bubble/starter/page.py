@@ -49,7 +49,7 @@ def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> st
     head = [
         f"# yaml-language-server: $schema={SCHEMA_FILE}",
         f"# Proposed by: {command}",
-        *(f"# Seen: {line}" for line in proposal.seen),
+        *(f"# Seen: {line}" for line in proposal.remarks),
         *(f"# MIND: {line}" for line in proposal.warnings),
         "# Every value is a proposal; what was guessed from the data says so. Read, change, then:",
         "#   en4dvar validate THIS_FILE --plot        what would be estimated, and the prior over the data",

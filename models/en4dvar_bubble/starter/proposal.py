@@ -43,12 +43,12 @@ class Entry:
 
 @dataclass(frozen=True)
 class Proposal:
-    """What goes into the configuration; ``seen`` and ``warnings`` are told to the user."""
+    """What goes into the configuration; ``remarks`` and ``warnings`` are told to the user."""
 
     data: tuple[Entry, ...]
     model: tuple[Entry, ...]
     parameters: tuple[Entry, ...]
-    seen: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
 
@@ -65,22 +65,22 @@ def propose(
     views = list(looks.values())
     chosen = views[0].start
     model, law_name = _built(chosen, law)
-    seen = _seen(views)
-    others = _others(model, seen)
-    observed = {"R_max": seen.lobe.R_max, "t_c": seen.lobe.t_c, "rebound": seen.rebound}
+    look = _typical(views)
+    others = _others(model, look)
+    observed = {"R_max": look.lobe.R_max, "t_c": look.lobe.t_c, "rebound": look.rebound}
     guess = first_guess(model, others, observed)
-    ratio = seen.rayleigh_ratio(model.medium)
+    ratio = look.rayleigh_ratio(model.medium)
     told = [
-        f"R_max {_text(seen.lobe.R_max, 'm', 'um', 3)}, collapse {_text(seen.lobe.t_c, 's', 'us', 3)} later, "
+        f"R_max {_text(look.lobe.R_max, 'm', 'um', 3)}, collapse {_text(look.lobe.t_c, 's', 'us', 3)} later, "
         f"{ratio:.2f} of the Rayleigh time (elasticity shortens it, viscosity and gas prolong it)"
     ]
-    told += [f"start: {chosen} ({seen.reason})"] * seen.clear
+    told += [f"start: {chosen} ({look.reason})"] * look.clear
     other = "laser" if chosen == "acoustic" else "acoustic"
-    doubt = f"start: {chosen} is only a proposal ({seen.reason}); if it was {other}, say --start {other}"
-    warnings = [doubt] * (not seen.clear)
+    doubt = f"start: {chosen} is only a proposal ({look.reason}); if it was {other}, say --start {other}"
+    warnings = [doubt] * (not look.clear)
     if not PLAUSIBLE[0] < ratio < PLAUSIBLE[1]:
         warnings.append(f"the collapse takes {ratio:.3g} of the Rayleigh time; are the units of both columns right?")
-    elif not BUBBLES[0] < seen.lobe.R_max < BUBBLES[1]:
+    elif not BUBBLES[0] < look.lobe.R_max < BUBBLES[1]:
         warnings.append("no bubble has such a radius; are the units of both columns right?")
     elif guess.far:
         warnings.append(
@@ -88,9 +88,9 @@ def propose(
             + ("is the driving that of your experiment?" if chosen == "acoustic" else "are scale and frame rate right?")
         )
     return Proposal(
-        _data(chosen, seen, model, {**others, **guess.values}),
-        _model(law_name, chosen, seen),
-        _parameters(model, chosen, seen, guess),
+        _data(chosen, look, model, {**others, **guess.values}),
+        _model(law_name, chosen, look),
+        _parameters(model, chosen, look, guess),
         tuple(told),
         tuple(warnings),
     )
@@ -129,7 +129,7 @@ def _looks(histories: Mapping[str, tuple[Array, Array]], start: Start | None) ->
     return looks
 
 
-def _seen(views: Sequence[Look]) -> Look:
+def _typical(views: Sequence[Look]) -> Look:
     """One look at several data sets: medians of the numbers, words of the first that is not clear."""
     first = next((v for v in views if not v.clear), views[0])
     return replace(
@@ -147,42 +147,42 @@ def _seen(views: Sequence[Look]) -> Look:
     )
 
 
-def _others(model: BubbleModel, seen: Look) -> dict[str, float]:
+def _others(model: BubbleModel, look: Look) -> dict[str, float]:
     """Every parameter but G and μ at the centre of its proposed prior, SI."""
     example = {name: float(v[0]) for name, v in model.law.example_values().items() if name not in WIDTHS}
     if model.start == "acoustic":
         return {**example, "R0": NUCLEUS}
-    return {**example, "R_eq": _rest(seen), "R_max": seen.lobe.R_max}
+    return {**example, "R_eq": _rest(look), "R_max": look.lobe.R_max}
 
 
-def _rest(seen: Look) -> float:
-    return seen.rest if np.isfinite(seen.rest) else GAS_FRACTION * seen.lobe.R_max
+def _rest(look: Look) -> float:
+    return look.rest if np.isfinite(look.rest) else GAS_FRACTION * look.lobe.R_max
 
 
-def _data(start: Start, seen: Look, model: BubbleModel, theta: Mapping[str, float]) -> tuple[Entry, ...]:
+def _data(start: Start, look: Look, model: BubbleModel, theta: Mapping[str, float]) -> tuple[Entry, ...]:
     """Window, clock and errors."""
     if start == "laser":
-        end = f"minimum {min(seen.n_minima, 2)}" if seen.n_minima else "end"
-        low = f", prominence: {100 * seen.prominence:g} %" if seen.prominence < 0.1 else ""
+        end = f"minimum {min(look.n_minima, 2)}" if look.n_minima else "end"
+        low = f", prominence: {100 * look.prominence:g} %" if look.prominence < 0.1 else ""
         lines = [
             Entry("window", f"{{from: R_max, to: {end}{low}}}", "what happens before R_max is not modelled"),
             Entry("time_zero", "window", "the model's clock starts at R_max"),
         ]
     else:
-        end = _text(seen.descent, "s", "us", 4) if np.isfinite(seen.descent) else "end"
+        end = _text(look.descent, "s", "us", 4) if np.isfinite(look.descent) else "end"
         words = "growth and collapse down to 20 % of R_max; then the wall is too fast for the model"
-        lines = [Entry("window", f"{{from: start, to: {end}}}", words), _clock(seen, model, theta)]
-    least = LEAST_NOISE * seen.lobe.R_max
+        lines = [Entry("window", f"{{from: start, to: {end}}}", words), _clock(look, model, theta)]
+    least = LEAST_NOISE * look.lobe.R_max
     scatter = (
-        f"scatter near R_max: {_text(seen.noise, 'm', 'um')}"
-        if np.isfinite(seen.noise)
+        f"scatter near R_max: {_text(look.noise, 'm', 'um')}"
+        if np.isfinite(look.noise)
         else "too few points near R_max"
     )
-    if seen.noise > least:
-        std, words = _text(seen.noise, "m", "um"), scatter
+    if look.noise > least:
+        std, words = _text(look.noise, "m", "um"), scatter
     else:
         std, words = "1 % of maximum", f"{scatter}; a model is rarely better than 1 %"
-    timing = _text(TIMING * seen.step, "s", "us")
+    timing = _text(TIMING * look.step, "s", "us")
     key = "  time_std" if start == "laser" else "  # time_std"  # a flash is short
     return (
         *lines,
@@ -192,30 +192,30 @@ def _data(start: Start, seen: Look, model: BubbleModel, theta: Mapping[str, floa
     )
 
 
-def _clock(seen: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
+def _clock(look: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
     """Where the file's zero lies on the driving's clock: the maximum of the first guess is put on that of the data."""
     peak = getattr(model.driving, "end", 0.0)
-    times = np.linspace(0.0, peak + 5 * seen.lobe.t_c, 400)
+    times = np.linspace(0.0, peak + 5 * look.lobe.t_c, 400)
     shift = 0.0
     if all(p.name in theta for p in model.parameters):
         (path,) = model.trajectories(model.initial_states({n: np.array([v]) for n, v in theta.items()}), times)
         try:
-            shift = seen.lobe.t_max - lobe(times, path["R"]).t_max  # type: ignore[index]
+            shift = look.lobe.t_max - lobe(times, path["R"]).t_max  # type: ignore[index]
         except (DataError, TypeError):
             shift = 0.0
     if abs(shift) <= SAME_CLOCK:
         return Entry("time_zero", "file", "the file's clock agrees with that of the pulse")
-    zero = min(shift, seen.times[0])
+    zero = min(shift, look.times[0])
     return Entry(
         "time_zero", _text(zero, "s", "us"), "puts the guess's R_max on the data's: give the clock of your pulse"
     )
 
 
-def _model(law: str, start: Start, seen: Look | None) -> tuple[Entry, ...]:
+def _model(law: str, start: Start, look: Look | None) -> tuple[Entry, ...]:
     lines = [
         Entry("name", "bubble"),
         Entry("law", law, "others: en4dvar laws"),
-        Entry("start", start, seen.reason if seen else "or " + ("laser" if start == "acoustic" else "acoustic")),
+        Entry("start", start, look.reason if look else "or " + ("laser" if start == "acoustic" else "acoustic")),
         *(Entry(key, value) for key, value in MODEL[start].items()),
     ]
     if start == "acoustic":
@@ -224,7 +224,7 @@ def _model(law: str, start: Start, seen: Look | None) -> tuple[Entry, ...]:
     return tuple(lines)
 
 
-def _parameters(model: BubbleModel, start: Start, seen: Look, guess: Guess) -> tuple[Entry, ...]:
+def _parameters(model: BubbleModel, start: Start, look: Look, guess: Guess) -> tuple[Entry, ...]:
     lines = []
     for p in model.law.parameters:
         if p.name in guess.values:
@@ -236,8 +236,8 @@ def _parameters(model: BubbleModel, start: Start, seen: Look, guess: Guess) -> t
             lines.append(Entry(p.name, f"{{prior: lognormal, median: {value}, log_std: {width:.2g}}}", words))
         else:
             lines.append(_example(p, model))
-    lines += _radii(start, seen)
-    std = _text(0.5e-6 if start == "acoustic" else 0.5 * seen.step, "s", "us")
+    lines += _radii(start, look)
+    std = _text(0.5e-6 if start == "acoustic" else 0.5 * look.step, "s", "us")
     words = (
         "the clock of the data against that of the pulse" if start == "acoustic" else "R_max falls between two frames"
     )
@@ -257,21 +257,21 @@ def _example(p: Parameter, model: BubbleModel) -> Entry:
     return Entry(p.name, f"{{prior: normal, mean: {text}, std: 20 %}}", words)
 
 
-def _radii(start: Start, seen: Look | None) -> list[Entry]:
+def _radii(start: Start, look: Look | None) -> list[Entry]:
     if start == "acoustic":
         value = _text(NUCLEUS, "m", "um")
         return [
             Entry(R0.name, f"{{prior: lognormal, median: {value}, log_std: 0.5}}", f"{R0.label}: the data hardly tell")
         ]
-    known = seen is not None and np.isfinite(seen.rest)
+    known = look is not None and np.isfinite(look.rest)
     words = (
         "the radius at rest; wide, for real gas cools and leaks, the model's does not"
         if known
         else f"{GAS_FRACTION:g} R_max: no radius at rest is seen"
     )
-    value, width = (_text(_rest(seen), "m", "um") if seen else "20 um"), 0.3 if known else 0.4
+    value, width = (_text(_rest(look), "m", "um") if look else "20 um"), 0.3 if known else 0.4
     return [
-        Entry(R_EQ.name, f"{{prior: lognormal, median: {value}, log_std: {width}}}", words if seen else R_EQ.label),
+        Entry(R_EQ.name, f"{{prior: lognormal, median: {value}, log_std: {width}}}", words if look else R_EQ.label),
         Entry(R_MAX.name, "{prior: normal, mean: maximum, std: 1 %}", "the largest radius of each data set"),
     ]
 

@@ -1,0 +1,79 @@
+"""One word, one meaning: identifiers keep to the glossary (docs/glossary.md)."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+FILES = sorted(p for top in ("en4dvar", "models") for p in (ROOT / top).rglob("*.py"))
+
+# word in a name → the word of the glossary
+FORBIDDEN = {
+    "taken": "move, or record",
+    "scout": "descent",
+    "seen": "predictions, or what it is",
+    "told": "what was said",
+    "teller": "what passes it on",
+    "ending": "analysis, or outcome",
+    "particle": "member",
+    "sample_size": "members, or ensemble size",
+    "background_ensemble": "prior",
+    "deviation": "anomaly (of members), std (of errors)",
+    "deviations": "anomalies",
+    "perturbed_member": "member",
+    "posterior_mode": "mode",
+    "hyperparams": "parameters",
+    "obs": "observations",
+}
+
+
+def words(name: str) -> list[str]:
+    """The words of an identifier, lower case: of snake_case and CamelCase."""
+    return [w.lower() for part in name.split("_") for w in re.findall(r"[A-Z]?[a-z0-9]+|[A-Z]+(?![a-z])", part)]
+
+
+def names(source: str) -> set[str]:
+    """Every class, function and parameter that a file defines."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            found.add(node.name)
+        elif isinstance(node, ast.arg):
+            found.add(node.arg)
+    return found
+
+
+def odd(source: str) -> set[str]:
+    return {name for name in names(source) if set(words(name)) & FORBIDDEN.keys()}
+
+
+def test_identifiers_use_the_words_of_the_glossary():
+    found = {str(p.relative_to(ROOT)): sorted(names) for p in FILES if (names := odd(p.read_text(encoding="utf-8")))}
+    assert found == {}
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "class Scout: pass",
+        "def what_was_told(): pass",
+        "def f(posterior_ending): pass",
+        "def seen(): pass",
+    ],
+)
+def test_an_odd_word_would_be_seen(source):
+    assert odd(source)
+
+
+def test_a_class_name_has_one_meaning():
+    """No two modules of the framework define a public class of the same name."""
+    homes: dict[str, list[str]] = {}
+    for path in sorted((ROOT / "en4dvar").rglob("*.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                homes.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+    assert {name: where for name, where in homes.items() if len(where) > 1} == {}
