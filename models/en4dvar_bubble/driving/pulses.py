@@ -42,6 +42,12 @@ def pulse(kind: str) -> Callable[[Pulse], Pulse]:
     return register
 
 
+@pulse("none")
+def silence() -> Driving:
+    """No driving: the laser-induced bubble."""
+    return Driving(0.0, 0.0, 1e-6, np.zeros_like, cells=1)
+
+
 @dataclass(frozen=True)
 class _HalfCycle:
     frequency: float
@@ -174,9 +180,3 @@ def step(
     exact = duration / cells
     stops = (delay + exact, delay + duration - exact)
     return Driving(amplitude, delay, delay + duration, _Step(delay, exact, duration), cells, stops)
-
-
-@pulse("none")
-def silence() -> Driving:
-    """No driving: the laser-induced bubble."""
-    return Driving(0.0, 0.0, 1e-6, np.zeros_like, cells=1)
