@@ -96,6 +96,7 @@ class TestShapes:
 
 
 class TestTabulated:
+    @pytest.mark.slow
     def test_samples_of_a_known_pulse_drive_as_the_pulse(self):
         exact = gaussian(-5e4, delay=5e-6, width=0.5e-6)
         t = np.linspace(0, 12e-6, 601)

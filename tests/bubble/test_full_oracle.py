@@ -37,6 +37,7 @@ def difference(grid, vapour, conducting, **diffusivity):
     return np.abs(R - fast.R[0].values).max() / LASER["R_max"]
 
 
+@pytest.mark.slow
 def test_vapour_transport_and_conducting_medium():
     assert difference(FINE, "transport", conducting=True) < 2e-3
 

@@ -140,6 +140,7 @@ class TestBatching:
         few = simulate(parameters=gels(3), times=TIMES[::7]).R
         np.testing.assert_array_equal(few, simulate(parameters=gels(3), times=TIMES).R[:, ::7])
 
+    @pytest.mark.slow
     def test_restart_from_any_state_agrees_with_the_continuous_path(self):
         model = BubbleModel(accuracy=Accuracy(nodes=8, rtol=1e-8))
         x = model.initial_state({k: v[0] for k, v in gels(1).items()})

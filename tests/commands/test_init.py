@@ -70,7 +70,8 @@ def proposed(path: Path) -> Config:
     [
         ("acoustic", "5.6 us:30.1 us:1.4 us", "1.4 um"),  # multi-flash imaging: some 18 frames
         ("acoustic", "0 us:60 us:0.5 us", "1.4 um"),  # from the nucleus through rebounds
-        ("laser", "0 us:70 us:0.63 us", "2 um"),  # high-speed film from R_max on, the bubble not yet at rest
+        # A high-speed film from R_max on, the bubble not yet at rest.
+        pytest.param("laser", "0 us:70 us:0.63 us", "2 um", marks=pytest.mark.slow),
     ],
 )
 def test_synthetic_data_to_a_run(tmp_path: Path, start: str, times: str, noise_std: str) -> None:

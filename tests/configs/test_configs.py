@@ -59,6 +59,7 @@ def test_soft_polyacrylamide(tmp_path):
     assert mu == pytest.approx(0.0845, rel=0.03)
 
 
+@pytest.mark.slow
 def test_stiff_polyacrylamide(tmp_path):
     result = on_file("polyacrylamide_estrada", "PA1_exp2_RofTdata_0.mat", tmp_path)
     scores = result.sample_stats.attrs

@@ -51,7 +51,7 @@ def test_members_on_workers_where_data_sets_are_few(few, tmp_path, kind):
     [
         pytest.param("quiet", 2, "processes", id="data sets-processes"),
         pytest.param("few", 3, "processes", id="members-processes"),
-        pytest.param("quiet", 2, "dask", id="data sets-dask"),
+        pytest.param("quiet", 2, "dask", id="data sets-dask", marks=pytest.mark.slow),
         pytest.param("few", 3, "dask", id="members-dask", marks=pytest.mark.slow),
     ],
 )

@@ -46,6 +46,7 @@ def dies_at_first(flag, number):
     return number
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_slow_to_come_again_is_waited_for(tmp_path):
     """Dask closes what starts workers again where one is not there some time after a death: here before it can be."""
     with dask.config.set({"distributed.deploy.lost-worker-timeout": "10ms"}):
@@ -54,6 +55,7 @@ def test_a_worker_that_is_slow_to_come_again_is_waited_for(tmp_path):
         assert dask.config.get("distributed.deploy.lost-worker-timeout") == "10ms"
 
 
+@pytest.mark.slow
 def test_a_value_lost_with_the_last_worker_is_not_waited_for_without_end(cluster, impatient):
     with DaskExecutor(address=cluster.scheduler_address) as executor:
         calls = executor.map(square, [(3,), (4,)])

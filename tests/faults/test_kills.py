@@ -13,6 +13,7 @@ def test_killed_at_some_file_operations():
 
 
 @pytest.mark.fault("kill-force")
+@pytest.mark.slow
 def test_killed_while_an_earlier_run_is_replaced():
     found = survive(400, share=0.03, seed=39, force=True)
     assert found["operations"] > 90

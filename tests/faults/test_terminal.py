@@ -1,6 +1,7 @@
 """Ctrl-C at a terminal, where every process of the run gets it, and what is left of workers without a main process."""
 
 import fcntl
+import itertools
 import os
 import pty
 import re
@@ -61,10 +62,11 @@ def words(path, out, kind):
 
 @pytest.mark.parametrize(
     ("kind", "presses"),
-    [("serial", 1), ("processes", 1)]
+    [("serial", 1)]
     + [
         pytest.param(*case, marks=pytest.mark.slow)
-        for case in (("serial", 2), ("threads", 1), ("threads", 2), ("processes", 2), ("dask", 1), ("dask", 2))
+        for case in itertools.product(("serial", "threads", "processes", "dask"), (1, 2))
+        if case != ("serial", 1)
     ],
 )
 @pytest.mark.fault("interrupt")

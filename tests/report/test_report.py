@@ -245,6 +245,7 @@ def contents(run):
     return {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*.*") if p.is_file()}
 
 
+@pytest.mark.slow
 def test_processes_draw_the_same_pages(campaign_dir, tmp_path, monkeypatch):
     monkeypatch.setattr(report, "SHARE", 1)
     monkeypatch.setattr(report, "COPIES", 0)
