@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -13,6 +14,7 @@ from typing import Any, Self
 
 from en4dvar.analysis import ChainRecord, Record, StartRecord
 from en4dvar.errors import OutputError
+from en4dvar.files import own_file
 from en4dvar.runs.interrupt import Interrupted
 
 TYPICAL_ITERATIONS = 8.0
@@ -47,7 +49,10 @@ class RunLog:
 
     def __init__(self, path: Path, append: bool = False):
         try:
-            self._file = path.open("a" if append else "w", encoding="utf-8", errors="backslashreplace", buffering=1)
+            handle = own_file(path)
+            if not append:
+                os.ftruncate(handle, 0)
+            self._file = os.fdopen(handle, "a", encoding="utf-8", errors="backslashreplace", buffering=1)
         except OSError as error:
             raise OutputError(f"{path}: cannot be written: {error.strerror}") from None
         self._path = path
