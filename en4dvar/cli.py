@@ -21,7 +21,13 @@ from en4dvar.commands.simulate import simulate
 from en4dvar.commands.validate import validate
 from en4dvar.errors import En4dvarError
 
-OF_THE_DEVICE = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS)  # told by what writes; here is what is left
+OF_THE_DEVICE = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EIO,
+    errno.EROFS,
+)  # told by what writes; here is what is left
 
 
 class Commands(click.Group):
