@@ -157,8 +157,19 @@ def terminal_progress(n_datasets: int) -> Iterator[LiveProgress | None]:
         TimeElapsedColumn(),
         TextColumn("{task.fields[left]}"),
     )
-    with Bar(*columns, console=console, transient=True) as bar:
+    with shown(Bar(*columns, console=console, transient=True)) as bar:
         yield LiveProgress(bar, n_datasets)
+
+
+@contextmanager
+def shown(bar: Any) -> Iterator[Any]:
+    """Within, a bar of ``rich`` is on the terminal; one that is gone at the end (SIGHUP) ends nothing else."""
+    bar.start()
+    try:
+        yield bar
+    finally:
+        with suppress(OSError):
+            bar.stop()
 
 
 @contextmanager
@@ -171,7 +182,7 @@ def cycle_progress(cycles: int) -> Iterator[Callable[[int], None] | None]:
     if not console.is_terminal:
         yield None
         return
-    with Bar(console=console, transient=True) as bar:
+    with shown(Bar(console=console, transient=True)) as bar:
         task = bar.add_task("cycles", total=cycles)
         yield lambda cycle: bar.update(task, completed=cycle + 1)
 

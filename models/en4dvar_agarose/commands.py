@@ -153,13 +153,15 @@ def _bar(total: int) -> Any:
     from rich.console import Console
     from rich.progress import Progress
 
+    from en4dvar.runs.progress import shown as on_terminal
+
     @contextmanager
     def shown() -> Any:
         console = Console(stderr=True)
         if not console.is_terminal:
             yield None
             return
-        with Progress(console=console, transient=True) as bar:
+        with on_terminal(Progress(console=console, transient=True)) as bar:
             task = bar.add_task("trajectories", total=total)
             yield lambda done, _: bar.update(task, completed=done)
 

@@ -22,8 +22,11 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="limits and fork
 
 @pytest.fixture(scope="module")
 def quiet(tmp_path_factory):
+    return prepare(tmp_path_factory.mktemp("quiet"))
+
+
+def prepare(folder):
     """A folder with configurations and what the commands make of them on a good disk."""
-    folder = tmp_path_factory.mktemp("quiet")
     make_campaign(folder, 2)
     (folder / "twin.yaml").write_text(TWIN)
     for name in ("done", "other"):

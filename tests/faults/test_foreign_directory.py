@@ -34,13 +34,17 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 @pytest.fixture
 def foreign(done: tuple[Path, Path], tmp_path: Path) -> tuple[Path, Path, Path]:
-    """A configuration, a directory with its run, and beside it a folder with the user's own files."""
-    shutil.copytree(done[1], tmp_path / "run")
-    outside = tmp_path / "outside"
+    return beside_own_files(*done, tmp_path)
+
+
+def beside_own_files(path: Path, run: Path, folder: Path) -> tuple[Path, Path, Path]:
+    """A configuration, a directory with its run in ``folder``, and beside it one with the user's own files."""
+    shutil.copytree(run, folder / "run")
+    outside = folder / "outside"
+    outside.mkdir()
     for name in ("rc", "run", ".set0.nc.7.tmp", "set0.done", "chunk_00000.npz"):
-        outside.mkdir(exist_ok=True)
         (outside / name).write_text(SECRET)
-    return done[0], tmp_path / "run", outside
+    return path, folder / "run", outside
 
 
 def call(*words: object) -> Result:
@@ -132,9 +136,13 @@ ATTACKS: dict[str, Callable[[Path, Path], None]] = {
 @pytest.mark.fault("foreign")
 def test_nothing_outside_is_touched(foreign: tuple[Path, Path, Path], attack: Callable[[Path, Path], None]) -> None:
     """Every command that opens the directory: it does its work or refuses in words, and the user's files stay."""
-    path, run, outside = foreign
+    withstood(*foreign, attack)
+
+
+def withstood(path: Path, run: Path, outside: Path, attack: Callable[[Path, Path], None]) -> int:
+    """How many commands were tried. Raises :class:`AssertionError` where one touches what is outside."""
     attack(run, outside)
-    before = contents(outside)
+    before, tried = contents(outside), 0
     for words in (
         ("report", run),
         ("run", path, "--out", run, "--resume", "--no-report"),
@@ -144,6 +152,8 @@ def test_nothing_outside_is_touched(foreign: tuple[Path, Path, Path], attack: Ca
         assert told.exit_code in (0, 2), told.exception
         assert told.exit_code == 0 or told.stderr.count("\n") == 1
         assert contents(outside) == before, words
+        tried += 1
+    return tried
 
 
 @pytest.mark.fault("foreign")
