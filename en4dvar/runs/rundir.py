@@ -3,15 +3,11 @@
 ``.en4dvar-files`` lists what a run wrote, so that replacing it removes that and nothing else. A run with ``--force``
 works in ``.en4dvar-next`` and takes the place of the earlier files when it is complete; where that is interrupted, the
 next run there finishes it, and commands that read say so and read nothing.
-
-The directory may be a stranger's: every name, of the list or of ours, goes through :func:`en4dvar.files.inside`.
 """
 
 from __future__ import annotations
 
 import os
-import re
-import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -19,17 +15,22 @@ from pathlib import Path
 from typing import Literal
 
 from en4dvar.errors import OutputError
-from en4dvar.files import inside, make_folder, open_plain, write_text
+from en4dvar.files import inside, make_folder, write_text
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.lock import LOCK, locked
+from en4dvar.runs.replacement import (
+    LISTING,
+    PARTIAL,
+    finish_replacement,
+    listed_files,
+    remove_folder,
+    remove_partial,
+    replace_earlier_run,
+    write_list,
+)
 from en4dvar.storage.store import COMPLETE, NEXT, require_settled
 
-LISTING = ".en4dvar-files"
-OLD = ".en4dvar-old"
 FIXED = ("config.yaml", "config.resolved.yaml", "posterior.nc", "twin.nc", "run.log", "report.html", "summary.csv")
-FOLDERS = ("datasets", "figures", "pages", "checkpoints")
-_PARTIAL = re.compile(r"\..+\.\d+\.tmp")  # of en4dvar.files, left by a process that was killed
-
 Mode = Literal["new", "force", "resume", "report"]
 
 
@@ -86,9 +87,9 @@ class RunDirectory:
 
     def claim(self, *names: str) -> Path:
         """List files (relative names) as written by this run; returns the path of the last one."""
-        known, paths = _listed(self.work), [self.at(name) for name in names]
+        known, paths = listed_files(self.work), [self.at(name) for name in names]
         if set(names) - set(known):
-            _list(self.work, dict.fromkeys([*known, *names]))
+            write_list(self.work, dict.fromkeys([*known, *names]))
         return paths[-1] if paths else self.work
 
     def folder(self, name: str) -> Path:
@@ -117,23 +118,23 @@ class RunDirectory:
 
     def publish(self) -> None:
         """The run is complete: where it replaces an earlier one, take its place. Raises :class:`OutputError`."""
-        _list(self.work, [name for name in _listed(self.work) if self.at(name).exists()])
+        write_list(self.work, [name for name in listed_files(self.work) if self.at(name).exists()])
         if self.work != self.home:
             write_text(self.at(COMPLETE), "")
             try:
-                _replace_earlier_run(self.home)
+                replace_earlier_run(self.home)
             except OSError as error:
                 raise OutputError(f"{self.path}: cannot be replaced: {error.strerror or error}") from None
 
     def _withdraw(self) -> None:
         """Take back what :meth:`open` made, where the run has claimed nothing."""
         with suppress(OSError, OutputError):
-            if self.resumed or _listed(self.work):
+            if self.resumed or listed_files(self.work):
                 return
             for name in (LISTING, "run.log"):
                 self.at(name).unlink(missing_ok=True)
             if self.work != self.home:
-                _remove_folder(self.work)
+                remove_folder(self.work)
 
 
 def holds_run(path: Path) -> bool:
@@ -147,19 +148,19 @@ def _opened(path: Path, mode: Mode) -> Path:
         require_settled(path)
         work = path
     else:
-        _finish_replacement(path)
+        finish_replacement(path)
         work = inside(path, NEXT) if (path / NEXT / LISTING).exists() else path
     if not (work / LISTING).exists():
         raise OutputError(f"{path}: holds no run")
-    _remove_partial(work)
+    remove_partial(work)
     return work
 
 
 def _prepare(path: Path, mode: Mode) -> Path:
     """The folder of a new run, to write to. Raises :class:`OutputError`."""
-    _finish_replacement(path)
-    listed = _listed(path)
-    others = {p.name for p in path.iterdir() if not _PARTIAL.fullmatch(p.name)} - {LOCK}
+    finish_replacement(path)
+    listed = listed_files(path)
+    others = {p.name for p in path.iterdir() if not PARTIAL.fullmatch(p.name)} - {LOCK}
     if mode == "resume" and others:
         raise OutputError(f"{path}: holds no run")
     if mode == "new" and (listed or others - {LISTING}):  # an empty list is of a run that was killed before it began
@@ -170,81 +171,16 @@ def _prepare(path: Path, mode: Mode) -> Path:
     if foreign:
         raise OutputError(f"{path}: {foreign[0]} was not written by a run and would be replaced; move it away")
     following = inside(path, NEXT)
-    _remove_folder(following)  # of a run that was given up
-    _remove_partial(path)
+    remove_folder(following)  # of a run that was given up
+    remove_partial(path)
     work = path
     if any((path / name).exists() for name in listed):
         work = following
         work.mkdir()
-    _list(work, ())
+    write_list(work, ())
     return work
-
-
-def _finish_replacement(path: Path) -> None:
-    """Put in place what an earlier run had completed, and clear away what it had not begun."""
-    following = inside(path, NEXT)
-    _remove_folder(inside(path, OLD))
-    if (following / COMPLETE).exists():
-        _replace_earlier_run(path)
-    if not (following / LISTING).exists():  # of a run that ended before it began
-        _remove_folder(following)
-
-
-def _replace_earlier_run(path: Path) -> None:
-    """Move the files of ``.en4dvar-next`` into place. Can be repeated after it was interrupted anywhere."""
-    following = inside(path, NEXT)
-    names = _listed(following)
-    targets = [inside(path, name) for name in names]
-    _remove(path, set(_listed(path)) - set(names))
-    for name, target in zip(names, targets, strict=True):
-        if (following / name).exists():
-            target.parent.mkdir(parents=True, exist_ok=True)
-            (following / name).replace(target)
-    _list(path, names)
-    following.rename(path / OLD)  # at once: half of this folder would look like an interrupted run
-    _remove_folder(path / OLD)
-
-
-def _remove_folder(folder: Path) -> None:
-    if folder.is_dir():
-        shutil.rmtree(folder)
 
 
 def _remove_if_empty(folder: Path) -> None:
     with suppress(OSError):
         folder.rmdir()
-
-
-def _remove(path: Path, names: Iterable[str]) -> None:
-    for name in names:
-        if (file := inside(path, name)).is_file():
-            file.unlink()
-    for name in FOLDERS:
-        if (folder := inside(path, name)).is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
-
-
-def _remove_partial(work: Path) -> None:
-    for folder in (work, *(inside(work, name) for name in FOLDERS)):
-        for file in folder.glob(".*.tmp"):
-            if _PARTIAL.fullmatch(file.name):
-                file.unlink()
-
-
-def _list(work: Path, names: Iterable[str]) -> None:
-    write_text(work / LISTING, "".join(f"{name}\n" for name in names))
-
-
-def _listed(work: Path) -> tuple[str, ...]:
-    """The names in the list of ``work``, each of a place in ``work``. Raises :class:`OutputError`."""
-    listing = inside(work, LISTING)
-    try:
-        with open_plain(listing) as file:
-            names = tuple(file.read().decode("utf-8").splitlines())
-    except FileNotFoundError:
-        return ()
-    except UnicodeDecodeError:
-        raise OutputError(f"{listing}: damaged; it is no list of files") from None
-    for name in names:
-        inside(work, name)
-    return names

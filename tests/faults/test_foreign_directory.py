@@ -14,7 +14,9 @@ from en4dvar.cli import main
 from en4dvar.errors import OutputError
 from en4dvar.files import atomic_path, inside, write_text
 from en4dvar.runs.lock import LOCK
-from en4dvar.runs.rundir import COMPLETE, LISTING, NEXT, OLD, RunDirectory
+from en4dvar.runs.replacement import LISTING, OLD
+from en4dvar.runs.rundir import RunDirectory
+from en4dvar.storage.store import COMPLETE, NEXT
 
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="links and pipes of POSIX"),

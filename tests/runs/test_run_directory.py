@@ -109,7 +109,7 @@ def test_replacement_interrupted_anywhere_is_finished_later(earlier, monkeypatch
     for at in range(1, 30):
         shutil.rmtree(out)
         shutil.copytree(kept, out)
-        monkeypatch.setattr(rundir, "_replace_earlier_run", lambda path: None)
+        monkeypatch.setattr(rundir, "replace_earlier_run", lambda path: None)
         run_campaign(configuration(path, out), force=True)  # complete, but not yet in place
         monkeypatch.undo()
         steps = at
