@@ -53,10 +53,10 @@ def history(result: StoredResult) -> Figure:
     _band(top, result, "posterior_predictive", (0.05, 0.95), "posterior", 0.3, "posterior 90 %")
     _band(top, result, "posterior_predictive", (0.25, 0.75), "posterior", 0.6, "posterior 50 %")
     size, many = 2.2 if len(time) <= 150 else 1.2, len(time) > MANY
-    if many:  # one path instead of a bar for each
+    if many:  # one path instead of a bar for each, and pixels below the centre
         band = top.fill_between(time, data - std, data + std, color=LIGHT["ink"], alpha=0.3, lw=0, label="data ± std")
         band.set_rasterized(True)
-        top.plot(time, data, "o", ms=size, color=LIGHT["ink"], zorder=4, rasterized=True)
+        top.plot(time, data, ",", alpha=0.3, color=LIGHT["ink"], zorder=1.5, rasterized=True)
     else:
         top.errorbar(time, data, std, fmt="o", ms=size, lw=0.6, color=LIGHT["ink"], label="data ± std", zorder=4)
     top.plot(time, centre, lw=0.9, color=LIGHT["centre"], label="centre", zorder=3, rasterized=many)
@@ -70,7 +70,7 @@ def history(result: StoredResult) -> Figure:
     for limit, alpha in ((2, 0.12), (1, 0.16)):
         bottom.axhspan(-limit, limit, color=LIGHT["posterior"], alpha=alpha, lw=0)
     bottom.axhline(0, color=LIGHT["muted"], lw=0.6)
-    bottom.plot(time, residual, "o", ms=size, color=LIGHT["ink"], rasterized=many)
+    bottom.plot(time, residual, "," if many else "o", ms=size, color=LIGHT["ink"], rasterized=many)
     reach = 1.15 * max(3.0, float(np.max(np.abs(residual))))
     span = time[-1] - time[0]
     bottom.set(ylim=(-reach, reach), ylabel="residual / std", xlim=(time[0] - 0.03 * span, time[-1] + 0.03 * span))
