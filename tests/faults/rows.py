@@ -114,6 +114,22 @@ ROWS = tuple(
         ("clock", "the clock jumps backwards", "", "0", "everything; only monotonic clocks are used"),
         ("many-sets", "10 000 data sets in a folder", "", "0", "memory flat, the first estimate within seconds"),
         ("many-rows", "a data file of 1 000 000 rows", "", "0", "read within seconds; estimated in flat memory"),
+        ("many-members", "10 000 members", "", "0",
+         "time and memory in proportion to their number (En4D-Var with `linearisation: bundle`, the default)"),
+        ("mat-damaged", "a `.mat` file is damaged",
+         "not a MATLAB v5 file (it is cut short, or a size in it is damaged)", "2",
+         "everything; no compiled reader sees the file"),
+        ("bomb", "a file that is small until it is read, or has no end: a configuration of 100 MB, `.mat` that unpacks "
+         "to terabytes", "longer than 1 MB, which no configuration is; numbers belong into data files", "2",
+         "nothing is begun"),
+        ("alias-bomb", "aliases in YAML that name each other (\"billion laughs\")", "aliases are not used here; repeat "
+         "the value", "2", "nothing is begun"),
+        ("wide", "a CSV file of 10 000 000 columns",
+         "{file}: {count} columns; at most 10000 are read; if a line holds one column's numbers, transpose it", "2",
+         "nothing is begun"),
+        ("locale", "a Turkish or German locale", "", "0", "the same bits, points in every file"),
+        ("first-starts", "20 first starts at once: an empty cache of compiled code, one HOME", "", "0",
+         "all end, with the same bits"),
         ("paths", "blanks, any script, bytes that are not UTF-8 in the names of files and folders", "", "0",
          "everything"),
     )
