@@ -178,9 +178,10 @@ def _reason(check: Check, law: ConstitutiveLaw) -> str:
         check(law)
     except AssertionError as error:
         return str(error)
-    except Exception as error:
+    except BaseException as error:
+        reason = reason_of(error)
         frame = traceback.extract_tb(error.__traceback__)[-1]
-        return f"{type(error).__name__}: {error} ({frame.filename}:{frame.lineno})"
+        return f"{reason} ({frame.filename}:{frame.lineno})"
     return ""
 
 

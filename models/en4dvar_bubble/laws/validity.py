@@ -97,13 +97,12 @@ def _run(call: Callable[[], Any], where: str) -> Any:
     try:
         with np.errstate(all="ignore"):
             return call()
-    except Exception as error:
+    except BaseException as error:
+        reason = reason_of(error)
         frame = traceback.extract_tb(error.__traceback__)[-1]
         hint = ""
         if isinstance(error, AttributeError) and isinstance(error.obj, SimpleNamespace):
             hint = f"; p has no {error.name!r}{suggest(error.name, vars(error.obj))}"
         elif isinstance(error, ValueError) and "truth value" in str(error):
             hint = "; the arguments are arrays: write np.where instead of if, np.minimum instead of min"
-        raise ConfigError(
-            f"{where}: {type(error).__name__}: {error}{hint} ({frame.filename}:{frame.lineno})"
-        ) from error
+        raise ConfigError(f"{where}: {reason}{hint} ({frame.filename}:{frame.lineno})") from error
