@@ -18,6 +18,7 @@ from en4dvar.commands.run import run
 from en4dvar.commands.simulate import simulate
 from en4dvar.commands.validate import validate
 from en4dvar.errors import En4dvarError
+from en4dvar.user_code import describe
 
 
 class Commands(click.Group):
@@ -36,6 +37,10 @@ class Commands(click.Group):
             return super().invoke(ctx)
         except En4dvarError as error:
             raise Failed(str(error), error.exit_code) from error
+        except SystemExit as end:  # of a model or law: click ends in another way; another package's command may
+            if ctx.invoked_subcommand in plugin_commands():
+                raise
+            raise Failed(f"the code of a model ended the program: {describe(end)}", 1) from None
         except (KeyboardInterrupt, click.Abort) as interrupt:
             raise Failed(str(interrupt) or "interrupted", 130) from None
 

@@ -105,20 +105,29 @@ def _line(error: BaseException) -> str:
 @contextmanager
 def kept_apart() -> Iterator[None]:
     """What the process shares is afterwards as it was."""
-    folder, filters = os.getcwd(), warnings.filters[:]
+    folder, filters = _folder(), warnings.filters[:]
     mine = threading.current_thread() is threading.main_thread()
     handlers: dict[int, Any] = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)} if mine else {}
     try:
         with np.errstate():
             yield
     finally:
-        warnings.filters[:] = filters  # type: ignore[index]
-        with suppress(OSError):
-            if os.getcwd() != folder:
+        for added in [f for f in warnings.filters if f[0] == "error" and f not in filters]:
+            warnings.filters.remove(added)  # type: ignore[attr-defined]  # others are those of libraries it imports
+        if folder and _folder() != folder:
+            with suppress(OSError):
                 os.chdir(folder)
         for number, handler in handlers.items():
             if handler is not None and signal.getsignal(number) is not handler:
                 signal.signal(number, handler)
+
+
+def _folder() -> str:
+    """The working directory, "" where it is gone."""
+    try:
+        return os.getcwd()
+    except OSError:
+        return ""
 
 
 def file_of(module: str) -> Path | None:

@@ -78,7 +78,7 @@ class WeightSpace:
         return self.composite(x, extra_times)
 
     def check_repeats(self, prior_run: Forecast, extra_times: Array) -> None:
-        """Run two members of the prior forecast again, at the same instants. They are not among the ``forward_runs``, which no scheme used.
+        """Run two members of the prior forecast again, at the same instants; ``forward_runs`` does not count them.
 
         Raises :class:`ConfigError`: they give other predictions.
         """

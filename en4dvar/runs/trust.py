@@ -1,4 +1,4 @@
-"""Whose code a result file may run: that of this project and of installed packages; other code the user is asked for."""
+"""Whose code a result file may run: of this project and of installed packages; for other code the user is asked."""
 
 from __future__ import annotations
 

@@ -17,6 +17,7 @@ from en4dvar.errors import En4dvarError
 from en4dvar.hints import suggest
 from en4dvar.state import Array
 from en4dvar.units import parse_unit
+from en4dvar.user_code import reason_of
 from en4dvar_bubble.laws.base import ConstitutiveLaw, columns
 from en4dvar_bubble.laws.response import Cycle, respond
 from en4dvar_bubble.laws.tabulate import GRID, differentiate

@@ -145,7 +145,7 @@ class Disturbs(Oscillator):
     def step(self, x, t0, t1):
         if t0 == 0:
             np.seterr(all="raise")
-            np.random.seed(1)
+            np.random.seed(1)  # noqa: NPY002
             os.environ["EN4DVAR_TEST_DISTURBED"] = "1"
             threading.Thread(target=time.sleep, args=(0.01,), daemon=True).start()
         return super().step(x, t0, t1)
@@ -153,7 +153,7 @@ class Disturbs(Oscillator):
 
 def disturb():
     np.seterr(all="raise")
-    np.random.seed(1)
+    np.random.seed(1)  # noqa: NPY002
     os.chdir("/")
     warnings.simplefilter("error")
     signal.signal(signal.SIGINT, signal.SIG_IGN)

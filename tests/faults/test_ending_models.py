@@ -1,20 +1,25 @@
 """Code of a user that ends the program: a lost member or an error of the configuration, with every executor."""
 
 import os
+import signal
 import sys
+import warnings
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from faulty_models import STIFF
 from rows import row
 from run_files import assert_same_results, configuration, environment, make_campaign, run_cli
 from toy_config import write_toy
 
-from en4dvar.config import load_any
-from en4dvar.errors import ConfigError
+from en4dvar.cli import main
+from en4dvar.config import load_any, load_config
+from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import ProcessesExecutor, SerialExecutor, ThreadsExecutor
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.runner import run
+from en4dvar.runs.simulation import simulate
 from en4dvar.user_code import EndedError
 
 EXECUTORS = [
@@ -142,7 +147,8 @@ def test_a_model_that_ends_the_program_as_it_is_loaded(tmp_path, monkeypatch, pl
         load_any(path)
     (fault,) = told.value.problems
     assert fault.path.startswith("model")
-    assert (fault.line > 0) and "sys.exit(0)" in fault.message
+    assert fault.line > 0
+    assert "sys.exit(0)" in fault.message
     assert f"({file}:{PLACES[place].count(chr(10))})" in fault.message
 
 
@@ -158,3 +164,77 @@ def test_every_command_says_so(tmp_path, command):
         f"{path}:10:9: model.name: model 'ends:Model' cannot be loaded: SystemExit: sys.exit(0)"
     )
     assert row("load-exits").told(done.stderr)
+
+
+@pytest.mark.fault("model-shared")
+def test_what_a_model_changes_in_the_process(raising, tmp_path, monkeypatch):
+    """As it is made, and as it runs; the numbers are those of a model that leaves everything alone."""
+    monkeypatch.delenv("EN4DVAR_TEST_DISTURBED", raising=False)
+    before = shared()
+    config = configuration(faulty(tmp_path, "Disturbs"), tmp_path / "run", executor="serial")
+    assert shared() == before
+    result = run(config)
+    assert os.environ["EN4DVAR_TEST_DISTURBED"] == "1"
+    assert shared() == before
+    (tmp_path / "quiet").mkdir()
+    quiet = run(configuration(write_toy(tmp_path / "quiet"), tmp_path / "quiet" / "run", executor="serial"))
+    for key in ("A", "k"):
+        assert np.array_equal(result.posterior[key], quiet.posterior[key])
+
+
+def shared():
+    handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    return os.getcwd(), np.geterr(), sum(f[0] == "error" for f in warnings.filters), handlers
+
+
+SINGLE = {
+    "ExitsInH": "position cannot be read from the run",
+    "ExitsInInitialState": "the model refuses its parameters",
+}
+
+
+@pytest.mark.parametrize("model", SINGLE)
+@pytest.mark.fault("model-exits")
+def test_a_single_run_that_ends_the_program(tmp_path, model):
+    config = load_config(faulty(tmp_path, model), {"parameters.k": "5 N/m"})
+    with pytest.raises(En4dvarError, match=rf"{SINGLE[model]}: SystemExit: sys.exit\(0\)"):
+        simulate(config, np.array([0.0, 0.01]))
+
+
+@pytest.mark.fault("model-exits")
+def test_whatever_else_ends_the_program(tmp_path, monkeypatch):
+    """A part of a model that nobody thought of."""
+    monkeypatch.setattr("en4dvar.runs.simulation.run_chunk", lambda *_: sys.exit(0))
+    done = CliRunner().invoke(main, ["simulate", str(write_toy(tmp_path))])
+    assert (done.exit_code, done.stdout) == (1, "")
+    assert done.stderr == "the code of a model ended the program: SystemExit: sys.exit(0)\n"
+
+
+LAW = """\
+import sys
+from en4dvar import Parameter
+from en4dvar_bubble import ConstitutiveLaw
+
+class Law(ConstitutiveLaw):
+    title = "As none"
+    parameters = (Parameter("G", "Pa", bounds=(0.0, float("inf"))),)
+    def strain_energy_rate(self, stretch, p):
+        return p.G * stretch
+"""
+LAWS = {
+    "as it is loaded": "sys.exit(0)\n",
+    "as it is made": "    def __init__(self):\n        sys.exit(0)\n",
+    "as it is called": "    def strain_energy_rate(self, stretch, p):\n        sys.exit(0)\n",
+}
+
+
+@pytest.mark.parametrize("when", LAWS)
+@pytest.mark.fault("load-exits")
+def test_a_law_that_ends_the_program(tmp_path, when):
+    law = tmp_path / "law.py"
+    law.write_text(LAW + LAWS[when])
+    for words in (["laws", f"{law}:Law"], ["laws", "--check", f"{law}:Law"]):
+        done = CliRunner().invoke(main, words)
+        assert (done.exit_code, done.stdout) == (2, "")
+        assert "SystemExit: sys.exit(0)" in done.stderr
+        assert str(law) in done.stderr

@@ -44,13 +44,12 @@ def varying(folder, model, **assimilation):
     )
 
 
-@pytest.mark.parametrize("execution", [{"executor": "serial"}, {"executor": "threads", "workers": 2},
-                                       {"executor": "processes", "workers": 2}], ids=lambda e: e["executor"])  # fmt: skip
+@pytest.mark.parametrize("executor", ["serial", "threads", "processes"])
 @pytest.mark.parametrize("model", ["Noisy", "Counts", "Remembers"])
 @pytest.mark.fault("model-varies")
-def test_it_is_told_before_anything_is_estimated(tmp_path, model, execution):
+def test_it_is_told_before_anything_is_estimated(tmp_path, model, executor):
     with pytest.raises(ConfigError) as told:
-        run(configuration(varying(tmp_path, model), tmp_path / "run", **execution))
+        run(configuration(varying(tmp_path, model), tmp_path / "run", executor=executor, workers=2))
     assert row("model-varies").told(str(told.value))
     assert "toy: the model gives" in str(told.value)
     assert "differs by up to" in str(told.value)

@@ -12,6 +12,7 @@ import numpy as np
 from en4dvar.errors import ConfigError
 from en4dvar.hints import suggest
 from en4dvar.state import Parameter
+from en4dvar.user_code import reason_of
 from en4dvar_bubble.laws.base import ConstitutiveLaw, columns
 from en4dvar_bubble.laws.memory import MemoryVariable
 
@@ -30,6 +31,8 @@ def check_law(found: Any, name: str) -> ConstitutiveLaw:
         law = found()
     except TypeError as error:
         raise ConfigError(f"{name}: cannot be created without arguments: {error}") from error
+    except BaseException as error:
+        raise ConfigError(f"{name}: cannot be created: {reason_of(error)}") from error
     _probe(law, name)
     return law
 
