@@ -6,6 +6,8 @@ Exit codes: 0 done; 1 the run failed, or some data sets of a campaign; 2 usage, 
 
 from __future__ import annotations
 
+import os
+import sys
 from typing import Any
 
 import click
@@ -41,8 +43,21 @@ class Commands(click.Group):
             if ctx.invoked_subcommand in plugin_commands():
                 raise
             raise Failed(f"the code of a model ended the program: {describe(end)}", 1) from None
+        except (OSError, ValueError):
+            if not _output_closed():
+                raise
+            sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  for what is written as Python ends
+            raise Failed("standard output was closed, by a model perhaps; what was computed is kept", 1) from None
         except (KeyboardInterrupt, click.Abort) as interrupt:
             raise Failed(str(interrupt) or "interrupted", 130) from None
+
+
+def _output_closed() -> bool:
+    try:
+        os.fstat(1)
+    except OSError:
+        return True
+    return sys.stdout is None or sys.stdout.closed
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 import warnings
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -132,6 +133,16 @@ class Fails(Oscillator):
         type(self).runs += t0 == 0
         if type(self).runs > 9:
             raise ArithmeticError("not again")
+        return super().step(x, t0, t1)
+
+
+class Closes(Oscillator):
+    """Closes standard output as ``EN4DVAR_TEST_FAULT`` says: the file of Python, or that of the system."""
+
+    def step(self, x, t0, t1):
+        if t0 == 0:
+            with suppress(OSError):
+                os.close(1) if os.environ["EN4DVAR_TEST_FAULT"] == "system" else sys.stdout.close()
         return super().step(x, t0, t1)
 
 

@@ -106,8 +106,11 @@ ROWS = tuple(
          "{where}: SystemExit: sys.exit(0)", "2", "nothing is begun"),
         ("model-shared", "a model changes what the process shares: numpy's errors and random state, warnings, "
          "Ctrl-C, the working directory", "", "0", "everything; the same bits as without"),
+        ("output-closed", "a model closes standard output", "standard output was closed, by a model perhaps; what was "
+         "computed is kept", "1", "everything"),
         ("model-varies", "a model gives other numbers when a member is run again: noise, or a state that it keeps",
-         "the model gives other numbers when a member is run again", "2", "nothing; all other data sets fail, too"),
+         "the model gives other numbers when a member is run again", "2 (of many data sets: 1)",
+         "nothing is estimated"),
         ("rerun-stranger", "`rerun` of a result file that names code outside of the working directory and of "
          "installed packages", "{run}: its {model} is code outside of this project, {path}; read it, then give --trust "
          "to run it", "2", "nothing of that code has run; at a terminal the user is asked"),

@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +18,9 @@ from en4dvar.cli import main
 from en4dvar.config import load_any, load_config
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import ProcessesExecutor, SerialExecutor, ThreadsExecutor
+from en4dvar.report.result import load_result
 from en4dvar.runs.interrupt import Interrupted
-from en4dvar.runs.runner import run
+from en4dvar.runs.runner import run, run_campaign
 from en4dvar.runs.simulation import simulate
 from en4dvar.user_code import EndedError
 
@@ -108,7 +110,7 @@ def test_a_call_that_exits_has_raised(make):
 
 
 @pytest.mark.fault("model-os-exit-here")
-def test_the_end_of_the_process_of_the_run(tmp_path):
+def test_the_end_of_the_process_of_the_run(tmp_path, monkeypatch):
     """Nothing can catch it, and its exit code is the model's; what was done is kept."""
     path, out = make_campaign(tmp_path, 3, "execution_models:EndsAt"), tmp_path / "run"
     choice = ("--set", "execution.executor=serial", "--set", "execution.checkpoint_every=0", "--no-report")
@@ -116,10 +118,9 @@ def test_the_end_of_the_process_of_the_run(tmp_path):
     assert (ended.returncode, ended.stdout) == (0, "")
     assert not (out / "posterior.nc").exists()
     assert not (out / "run.log").read_text().endswith("done\n")
-    resumed = run_cli("run", path, "--out", out, "--resume", *choice, EN4DVAR_TEST_CALL=-1)
-    assert resumed.returncode == 0, resumed.stderr
-    quiet = run_cli("run", path, "--out", tmp_path / "quiet", *choice, EN4DVAR_TEST_CALL=-1)
-    assert quiet.returncode == 0
+    monkeypatch.setenv("EN4DVAR_TEST_CALL", "-1")
+    run_campaign(configuration(path, out, executor="serial"), resume=True)
+    run_campaign(configuration(path, tmp_path / "quiet", executor="serial"))
     assert_same_results(out, tmp_path / "quiet")
 
 
@@ -208,6 +209,18 @@ def test_whatever_else_ends_the_program(tmp_path, monkeypatch):
     done = CliRunner().invoke(main, ["simulate", str(write_toy(tmp_path))])
     assert (done.exit_code, done.stdout) == (1, "")
     assert done.stderr == "the code of a model ended the program: SystemExit: sys.exit(0)\n"
+
+
+@pytest.mark.parametrize("whose", ["system", pytest.param("python", marks=pytest.mark.slow)])
+@pytest.mark.fault("output-closed")
+def test_a_model_that_closes_standard_output(tmp_path, whose):
+    path = faulty(tmp_path, "Closes")
+    modules = os.pathsep.join([str(Path(__file__).parent), environment()["PYTHONPATH"]])
+    choice = ("--set", "execution.executor=serial", "--no-report")
+    done = run_cli("run", path, "--out", tmp_path / "run", *choice, PYTHONPATH=modules, EN4DVAR_TEST_FAULT=whose)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == "standard output was closed, by a model perhaps; what was computed is kept\n"
+    assert load_result(tmp_path / "run" / "posterior.nc").posterior["k"].size == 8
 
 
 LAW = """\
