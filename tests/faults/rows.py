@@ -111,6 +111,24 @@ ROWS = tuple(
         ("all-lost", "all members fail at once, in any iteration",
          "8 of 8 members failed in the {stage}; at least 4 must survive. Most frequent reasons: {reason} (8×)", "3",
          "all other data sets"),
+        ("model-exits", "it ends the program (`sys.exit()`, `quit()`), or raises what is no `Exception`",
+         "SystemExit: sys.exit(0)", "0", "the same, with every executor"),
+        ("model-os-exit", "it ends its process (`os._exit`, a crash of compiled code): in a worker process",
+         "a worker process died", "0", "the same"),
+        ("model-os-exit-here", "the same in the process of the run (serial, threads), which nothing can catch", "",
+         "that of the model", f"{DONE}; the same bits after --resume"),
+        ("load-exits", "the file of a model or law ends the program or raises anything as it is loaded or set up",
+         "{where}: SystemExit: sys.exit(0)", "2", "nothing is begun"),
+        ("model-shared", "a model changes what the process shares: numpy's errors and random state, warnings, "
+         "Ctrl-C, the working directory", "", "0", "everything; the same bits as without"),
+        ("output-closed", "a model closes standard output", "standard output was closed, by a model perhaps; what was "
+         "computed is kept", "1", "everything"),
+        ("model-varies", "a model gives other numbers when a member is run again: noise, or a state that it keeps",
+         "the model gives other numbers when a member is run again", "2 (of many data sets: 1)",
+         "nothing is estimated"),
+        ("rerun-stranger", "`rerun` of a result file that names code outside of the working directory and of "
+         "installed packages", "{run}: its {model} is code outside of this project, {path}; read it, then give --trust "
+         "to run it", "2", "nothing of that code has run; at a terminal the user is asked"),
         ("clock", "the clock jumps backwards", "", "0", "everything; only monotonic clocks are used"),
         ("many-sets", "10 000 data sets in a folder", "", "0", "memory flat, the first estimate within seconds"),
         ("many-rows", "a data file of 1 000 000 rows", "", "0", "read within seconds; estimated in flat memory"),
