@@ -99,6 +99,9 @@ ROWS = tuple(
         ("clock", "the clock jumps backwards", "", "0", "everything; only monotonic clocks are used"),
         ("many-sets", "10 000 data sets in a folder", "", "0", "memory flat, the first estimate within seconds"),
         ("many-rows", "a data file of 1 000 000 rows", "", "0", "read within seconds; estimated in flat memory"),
+        ("read-only-home", "program and HOME cannot be written",
+         "note: {place} cannot be written; compiled code is kept in {folder}, and compiled again where that is gone "
+         "(set NUMBA_CACHE_DIR to a folder that stays)", "0", "everything"),
         ("paths", "blanks, any script, bytes that are not UTF-8 in the names of files and folders", "", "0",
          "everything"),
     )
