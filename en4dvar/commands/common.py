@@ -25,7 +25,12 @@ class Failed(click.ClickException):
         self.exit_code = exit_code  # type: ignore[misc]
 
     def show(self, file: IO[Any] | None = None) -> None:
-        click.echo(self.message, file=file, err=file is None)
+        click.echo(printable(self.message), file=file, err=file is None)
+
+
+def printable(text: str) -> str:
+    """Lines without what a terminal would obey: names and values come from files of anybody."""
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
 @dataclass(frozen=True)

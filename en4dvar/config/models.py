@@ -1,4 +1,4 @@
-"""From the ``model:`` section to a forward model: by entry point (group ``en4dvar.models``) or ``package:object``."""
+"""From the ``model:`` section to a forward model: registered (``en4dvar.models``), in a package or in a file."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
+from en4dvar import own_file
 from en4dvar.config.document import Document
+from en4dvar.config.symbols import check_symbols
 from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, En4dvarError, Fault
+from en4dvar.files import PathError
 from en4dvar.forward import ForwardModel, StateField
-from en4dvar.hints import suggest
+from en4dvar.hints import shown, suggest
 
 GROUP = "en4dvar.models"
+OWN = "./my_model.py:MyModel, or package:MyModel"
 
 
 class NoSettings(BaseModel):
@@ -25,21 +29,28 @@ class NoSettings(BaseModel):
 
 
 def find_model(name: str) -> type[ForwardModel]:
-    """The model class called ``name``. Raises :class:`ConfigError`."""
+    """The model class called ``name``: registered, ``package:Class`` or ``/path/file.py:Class``.
+
+    Raises :class:`ConfigError`.
+    """
     found: Any
     try:
-        if ":" in name:
+        if own_file.is_file_reference(name):
+            found = own_file.load(name)
+        elif ":" in name:
             module, _, attribute = name.partition(":")
             found = getattr(import_module(module), attribute)
         else:
             registered = {e.name: e for e in entry_points(group=GROUP)}
             if name not in registered:
-                raise ConfigError(f"unknown model {name!r}{suggest(name, registered)}; or write package:object")
+                raise ConfigError(f"unknown model {shown(name)}{suggest(name, registered)}; or write {OWN}")
             found = registered[name].load()
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"model {name!r} cannot be loaded: {error}") from error
+    except ConfigError:
+        raise
+    except Exception as error:  # the package is the user's, and may raise anything
+        raise ConfigError(f"model {shown(name)} cannot be loaded: {type(error).__name__}: {error}") from error
     if not (isinstance(found, type) and issubclass(found, ForwardModel)):
-        raise ConfigError(f"{name!r} is not a subclass of en4dvar.ForwardModel")
+        raise ConfigError(f"{shown(name)} is not a subclass of en4dvar.ForwardModel")
     if hasattr(found, "Settings") != hasattr(found, "from_settings"):
         lacking = "from_settings" if hasattr(found, "Settings") else "Settings"
         raise ConfigError(
@@ -62,6 +73,7 @@ def build_model(kind: type[ForwardModel], settings: BaseModel) -> ForwardModel:
         if hasattr(kind, "from_settings"):
             raise
         raise ConfigError(f"{error}; a class that takes arguments needs Settings and from_settings") from error
+    check_symbols((*model.parameters, *model.observables))
     for observable in model.observables:
         if isinstance(observable.operator, StateField):
             for field in (observable.operator.name, observable.operator.rate_of):
@@ -87,8 +99,10 @@ def read_model(
         faults.append(document.fault(("model", "name"), "name the model, e.g. name: bubble"))
         return None
     try:
+        if own_file.is_file_reference(name):
+            name = own_file.absolute(name, base)
         kind: Any = find_model(name)
-    except ConfigError as error:
+    except (ConfigError, PathError) as error:
         faults.append(document.fault(("model", "name"), str(error)))
         return None
     options = {key: value for key, value in raw.items() if key != "name"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,8 @@ def run_chunk(model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
     if has_time_limit() and len(x) > model.batch:
         return _by_batch(model, x, times)
     try:
-        outcomes = within_time_limit(lambda: kept(model.trajectories(x, times)))
+        with without_warnings():
+            outcomes = within_time_limit(lambda: kept(model.trajectories(x, times)))
         reason = f"the model returned {len(outcomes)} trajectories for {len(x)} members"
     except (Exception, TimeLimitError) as error:  # a model may fail in any way; the reason is kept
         outcomes, reason = [], describe(error)
@@ -54,6 +56,12 @@ def _by_batch(model: ForwardModel, x: Array, times: Array) -> list[Outcome]:
 def kept(outcomes: Sequence[Outcome]) -> Sequence[Outcome]:
     """A batch as it is, anything else as a list."""
     return outcomes if isinstance(outcomes, Batch) else list(outcomes)
+
+
+def without_warnings() -> np.errstate:
+    """Within, numpy does not warn of an overflow, say: a member that it spoils fails, and says so itself."""
+    quiet: dict[str, Any] = {kind: "ignore" for kind, told in np.geterr().items() if told == "warn"}
+    return np.errstate(**quiet)
 
 
 def describe(error: BaseException) -> str:

@@ -7,6 +7,7 @@ scalars collected.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -182,8 +183,8 @@ def _opened(path: Path, format: Format | None) -> Iterator[Format]:
 
 
 def _require_file(path: Path) -> None:
-    if not path.is_file():
-        raise DataError(f"{path}: is a directory" if path.is_dir() else no_such_file(path))
+    if not os.path.isfile(path):  # Path.is_file raises for a name that is too long, or in a closed folder
+        raise DataError(f"{path}: is a directory" if os.path.isdir(path) else no_such_file(path))
 
 
 def _check(times: Array, values: Array, name: str, path: Path) -> None:

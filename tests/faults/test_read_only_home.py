@@ -33,7 +33,7 @@ def as_a_user() -> list[str]:
 
 @pytest.fixture(scope="module")
 def closed() -> Iterator[tuple[Path, Run]]:
-    """A folder that only the user can write, and a runner of ``en4dvar`` from a read-only copy with a read-only HOME."""
+    """A folder that users can write in, and a runner of ``en4dvar`` from a read-only copy, with a read-only HOME."""
     user = as_a_user()
     here = Path(tempfile.mkdtemp(prefix="en4dvar_closed_"))
     for top in (ROOT / "en4dvar", *(ROOT / "models").glob("en4dvar_*")):
@@ -114,5 +114,5 @@ def test_nowhere_at_all_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
         raise FileNotFoundError(2, "No usable temporary directory found")
 
     monkeypatch.setattr(tempfile, "gettempdir", nowhere)
-    with pytest.raises(compiled.OutputError, match="No usable temporary directory found.*NUMBA_CACHE_DIR"):
+    with pytest.raises(compiled.OutputError, match=r"No usable temporary directory found.*NUMBA_CACHE_DIR"):
         compiled._keep_in_a_temporary_folder()

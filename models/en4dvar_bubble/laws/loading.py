@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from en4dvar.errors import ConfigError
+from en4dvar.files import expanded
 from en4dvar.hints import no_such_file, suggest
 from en4dvar_bubble.laws.base import FILE_MODULE, REGISTRY, ConstitutiveLaw
 from en4dvar_bubble.laws.validity import check_law
@@ -50,7 +51,7 @@ def get_law(name: str, base: Path | None = None) -> ConstitutiveLaw:
         return REGISTRY[name]()
     where, colon, attribute = name.rpartition(":")
     if colon and (where.endswith(".py") or "/" in where or "\\" in where):
-        path = ((base or Path.cwd()) / Path(where).expanduser()).resolve()
+        path = ((base or Path.cwd()) / expanded(where)).resolve()
         found = _from_file(path, attribute)
     elif colon:
         found = _from_module(where, attribute)
