@@ -26,12 +26,15 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
 
 
 def _plain(cell: object) -> object:
-    """A cell that is no formula: text as it is, or behind an apostrophe.
+    """A cell that is no formula: text as it is, or behind an apostrophe; without the line breaks of old.
 
     >>> _plain("=1+1"), _plain("-a"), _plain("-1.5"), _plain("a=b"), _plain(-1.5)
     ("'=1+1", "'-a", '-1.5', 'a=b', -1.5)
     """
-    if not isinstance(cell, str) or not (cell[:1] in ("\t", "\r", "\n") or cell.lstrip()[:1] in _FORMULA):
+    if not isinstance(cell, str):
+        return cell
+    cell = cell.replace("\r", " ")  # csv does not quote it, and a new line begins there
+    if not (cell[:1] in ("\t", "\n") or cell.lstrip()[:1] in _FORMULA):
         return cell
     try:
         float(cell)

@@ -22,11 +22,12 @@ def check_symbols(things: Iterable[Parameter | Observable]) -> None:
     """Raises :class:`ConfigError`: a label or symbol that cannot be written in a figure."""
     for thing in things:
         for what, text in (("symbol", thing.symbol), ("label", thing.label)):
-            if reason := _fault(text):
+            if reason := symbol_fault(text):
                 raise ConfigError(f"the {what} {shown(text)} of {thing.name} cannot be written in a figure: {reason}")
 
 
-def _fault(text: str) -> str:
+def symbol_fault(text: str) -> str:
+    """What keeps ``text`` from being written in a figure, "" where nothing does."""
     if not text.isprintable():
         return "it holds characters that are not printed"
     if _SIMPLE.fullmatch(text):  # matplotlib takes time to import

@@ -18,6 +18,7 @@ from en4dvar.files import atomic_path
 from en4dvar.noise import noise_of_record
 from en4dvar.observations import Observations
 from en4dvar.state import Array, Parameter
+from en4dvar.storage.complete import check_complete
 from en4dvar.storage.groups import SCALAR, build_groups
 from en4dvar.storage.netcdf import tree_of
 from en4dvar.storage.seal import check_seal, seal_file
@@ -25,8 +26,6 @@ from en4dvar.summary import ParameterSummary, living, results_table
 
 if TYPE_CHECKING:
     import pandas as pd
-
-GROUPS = ("prior", "posterior", "posterior_predictive", "observed_data", "sample_stats", "iterations")
 
 
 @dataclass(frozen=True)
@@ -179,7 +178,5 @@ def load_stored(path: str | Path) -> StoredResult:
             nodes = {node.path: node.to_dataset(inherit=False).load() for node in tree.subtree}
     except OSError as error:
         raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
-    missing = [group for group in GROUPS if f"/{group}" not in nodes]
-    if missing:
-        raise OutputError(f"{path}: not a result of en4dvar: no group {', '.join(missing)}")
+    check_complete(path, nodes)
     return StoredResult(xr.DataTree.from_dict(nodes))
