@@ -240,9 +240,9 @@ def test_a_result_sealed_again_without_what_is_read(stored: Path, tmp_path: Path
         ("/", None, "dataset", None),
     ):
         folder = altered(stored, tmp_path, *place)
-        for words in (["report"], ["export"], ["export", "--latex"]):
-            done = call(words[0], folder, *words[1:])
-            assert (done.exit_code, type(done.exception)) == (2, SystemExit), (place, words, done.exception)
+        for kind in ("--csv", "--latex", "--members"):
+            done = call("export", folder, kind)
+            assert (done.exit_code, type(done.exception)) == (2, SystemExit), (place, kind, done.exception)
             assert row("result-incomplete").told(done.stderr)
 
 
