@@ -20,9 +20,11 @@ sys.path[:0] = [str(ROOT / "tests" / "faults"), str(ROOT / "tests"), str(ROOT / 
 
 import fuzz  # noqa: E402
 from children import Task, attempt  # noqa: E402
+from first_starts import start_together  # noqa: E402
 from fuzz_targets import TARGETS  # noqa: E402
 from killing import survive  # noqa: E402
 from many import estimate_many  # noqa: E402
+from mat_damage import survive as survive_mats  # noqa: E402
 from run_files import make_campaign  # noqa: E402
 from soak import soak  # noqa: E402
 from test_commands import calls, prepare  # noqa: E402
@@ -44,6 +46,14 @@ def inputs(quick: bool, seed: int) -> None:
         print(f"inputs tried {target:39} {tried:6}   {failed} findings", flush=True)
         total, findings = total + tried, findings + failed
     print(f"inputs tried {'in all':39} {total:6}   {findings} findings")
+
+
+def mats(quick: bool, seed: int) -> None:
+    """Damaged ``.mat`` files, plain and compressed, of every kind of variable."""
+    with tempfile.TemporaryDirectory() as folder:
+        found = survive_mats(Path(folder), 1000 if quick else 50_000, seed)
+    for outcome, count in found.items():
+        print(f"damaged .mat files {outcome:33} {count:6}", flush=True)
 
 
 def kills(quick: bool, seed: int) -> int:
@@ -109,6 +119,11 @@ def main() -> None:
     given = parser.parse_args()
     print(f"commit {git_commit(Path(__file__))}, seed {given.seed}, {cpu_model()}")
     inputs(given.quick, given.seed)
+    mats(given.quick, given.seed)
+    with tempfile.TemporaryDirectory() as folder:
+        print(
+            f"first starts at once, same bits {start_together(Path(folder), 3 if given.quick else 20):26}", flush=True
+        )
     print(f"kills survived {'in all, the same bits after each':37} {kills(given.quick, given.seed):6}")
     disks(given.quick)
     foreign()

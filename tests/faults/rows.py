@@ -111,9 +111,43 @@ ROWS = tuple(
         ("all-lost", "all members fail at once, in any iteration",
          "8 of 8 members failed in the {stage}; at least 4 must survive. Most frequent reasons: {reason} (8×)", "3",
          "all other data sets"),
+        ("model-exits", "it ends the program (`sys.exit()`, `quit()`), or raises what is no `Exception`",
+         "SystemExit: sys.exit(0)", "0", "the same, with every executor"),
+        ("model-os-exit", "it ends its process (`os._exit`, a crash of compiled code): in a worker process",
+         "a worker process died", "0", "the same"),
+        ("model-os-exit-here", "the same in the process of the run (serial, threads), which nothing can catch", "",
+         "that of the model", f"{DONE}; the same bits after --resume"),
+        ("load-exits", "the file of a model or law ends the program or raises anything as it is loaded or set up",
+         "{where}: SystemExit: sys.exit(0)", "2", "nothing is begun"),
+        ("model-shared", "a model changes what the process shares: numpy's errors and random state, warnings, "
+         "Ctrl-C, the working directory", "", "0", "everything; the same bits as without"),
+        ("output-closed", "a model closes standard output", "standard output was closed, by a model perhaps; what was "
+         "computed is kept", "1", "everything"),
+        ("model-varies", "a model gives other numbers when a member is run again: noise, or a state that it keeps",
+         "the model gives other numbers when a member is run again", "2 (of many data sets: 1)",
+         "nothing is estimated"),
+        ("rerun-stranger", "`rerun` of a result file that names code outside of the working directory and of "
+         "installed packages", "{run}: its {model} is code outside of this project, {path}; read it, then give --trust "
+         "to run it", "2", "nothing of that code has run; at a terminal the user is asked"),
         ("clock", "the clock jumps backwards", "", "0", "everything; only monotonic clocks are used"),
         ("many-sets", "10 000 data sets in a folder", "", "0", "memory flat, the first estimate within seconds"),
         ("many-rows", "a data file of 1 000 000 rows", "", "0", "read within seconds; estimated in flat memory"),
+        ("many-members", "10 000 members", "", "0",
+         "time and memory in proportion to their number (En4D-Var with `linearisation: bundle`, the default)"),
+        ("mat-damaged", "a `.mat` file is damaged",
+         "not a MATLAB v5 file (it is cut short, or a size in it is damaged)", "2",
+         "everything; no compiled reader sees the file"),
+        ("bomb", "a file that is small until it is read, or has no end: a configuration of 100 MB, `.mat` that unpacks "
+         "to terabytes", "longer than 1 MB, which no configuration is; numbers belong into data files", "2",
+         "nothing is begun"),
+        ("alias-bomb", "aliases in YAML that name each other (\"billion laughs\")", "aliases are not used here; repeat "
+         "the value", "2", "nothing is begun"),
+        ("wide", "a CSV file of 10 000 000 columns",
+         "{file}: {count} columns; at most 10000 are read; if a line holds one column's numbers, transpose it", "2",
+         "nothing is begun"),
+        ("locale", "a Turkish or German locale", "", "0", "the same bits, points in every file"),
+        ("first-starts", "20 first starts at once: an empty cache of compiled code, one HOME", "", "0",
+         "all end, with the same bits"),
         ("paths", "blanks, any script, bytes that are not UTF-8 in the names of files and folders", "", "0",
          "everything"),
     )
