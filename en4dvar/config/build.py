@@ -68,6 +68,10 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
     terms, fixed = resolve_parameters(config, observations)
     terms = (*terms, *(perturbed.term for perturbed in config.initial_state))
     perturbations = tuple(perturbed.perturbation for perturbed in config.initial_state)
+    asked = config.assimilation
+    if asked.sampling == "exact" and asked.members <= len(terms):
+        message = f"{asked.members} are too few for {len(terms)} parameters; at least {len(terms) + 1}"
+        raise ConfigError([config.document.fault(("assimilation", "members"), message)])
     problem = InverseProblem(config.model, config.observable, observations, Prior(terms), fixed, perturbations)
     check_problem(problem)
     return problem

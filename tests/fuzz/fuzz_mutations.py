@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
+from collections.abc import Iterator
 from typing import Any
 
 from hypothesis import strategies as st
@@ -33,6 +34,18 @@ def paths(node: Any, here: Path = ()) -> list[Path]:
     return found
 
 
+def one_changed(document: dict[str, Any]) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """``document`` with one scalar replaced: by every odd value, and by the same quantity of every odd size."""
+    for path in paths(document):
+        old = parent(document, path)[path[-1]]
+        if isinstance(old, dict | list):
+            continue
+        for new in (*ODD, *(of_size(old, number) for number in NUMBERS)):
+            changed = copy.deepcopy(document)
+            parent(changed, path)[path[-1]] = new
+            yield path, changed
+
+
 def parent(document: Any, path: Path) -> Any:
     for key in path[:-1]:
         document = document[key]
@@ -57,10 +70,8 @@ NUMBERS = (
 SIZED = re.compile(r"\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?(?P<unit>\s*[^\d\s].*|)")
 
 
-@st.composite
-def resized(draw: st.DrawFn, value: Any) -> Any:
+def of_size(value: Any, number: str) -> Any:
     """A number, or a quantity, of another size and of the same unit; anything else as it is."""
-    number = draw(st.sampled_from(NUMBERS))
     if isinstance(value, int | float) and not isinstance(value, bool):
         return float(number)
     found = SIZED.fullmatch(value) if isinstance(value, str) else None
@@ -90,7 +101,7 @@ def mutated(draw: st.DrawFn, document: dict[str, Any]) -> dict[str, Any]:
             case "replace":
                 holder[key] = draw(values)
             case "resize":
-                holder[key] = draw(resized(holder[key]))
+                holder[key] = of_size(holder[key], draw(st.sampled_from(NUMBERS)))
             case "remove":
                 del holder[key]
             case "rename" if isinstance(holder, dict):
