@@ -161,7 +161,9 @@ class TestTabulated:
 class TestResponse:
     """A small polytropic bubble against scipy on the same equation, written here in SI units."""
 
-    @pytest.mark.parametrize("name", PULSES)
+    @pytest.mark.parametrize(
+        "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "histotripsy")) for name in PULSES]
+    )
     def test_agrees_with_an_independent_integration(self, name):
         driving = PULSES[name]
         weak = type(driving)(

@@ -16,11 +16,12 @@ from test_reference import reference
 
 from en4dvar_bubble import Accuracy
 
+pytestmark = pytest.mark.slow  # these equations and nodes are compiled for nothing else
+
 POLYTROPIC = [0, 1, 2, 3, 12, 13, 14, 15, 24, 25, 26, 27, 36, 37, 38, 39]
 RAYLEIGH_PLESSET = [0, 1, 2, 3]
 COLD = [4, 5, 6, 7, 16, 17, 18, 19, 28, 29, 30, 31, 40, 41, 42, 43]
 CONDUCTING = [8, 9, 10, 11, 20, 21, 22, 23, 32, 33, 34, 35, 44, 45, 46, 47]
-QUICK = {16, 18, 30, 43}
 IN_CI = {10, 22, 33, 47}  # of the slow ones with a conducting medium, each for one kind of difference
 FINE = Accuracy(nodes=48, medium_nodes=48, rtol=1e-8)
 
@@ -29,7 +30,7 @@ def some(cases):
     def marks(i):
         return [pytest.mark.long] if i == 19 or (i in CONDUCTING and i not in IN_CI) else []
 
-    return [i if i in QUICK else pytest.param(i, marks=[pytest.mark.slow, *marks(i)]) for i in cases]
+    return [pytest.param(i, marks=marks(i)) for i in cases]
 
 
 def case(i):
@@ -50,7 +51,6 @@ def test_lists_are_the_stored_ones():
     assert list(np.flatnonzero(medium == 1)) == CONDUCTING
 
 
-@pytest.mark.slow  # an equation that the fast suite compiles for nothing else
 @pytest.mark.parametrize("i", RAYLEIGH_PLESSET)
 def test_rayleigh_plesset_polytropic(i):
     c, t, expected = case(i)

@@ -10,6 +10,7 @@ from en4dvar.executor import dask as dask_executor
 from en4dvar.runs.runner import run_campaign
 
 
+@pytest.mark.slow
 @pytest.mark.fault("scheduler-lost")
 def test_lost_scheduler_is_one_clear_error_and_the_run_resumes(tmp_path):
     path, out = make_campaign(tmp_path, 4, "execution_models:Slow"), tmp_path / "run"

@@ -67,6 +67,7 @@ def test_a_value_lost_with_the_last_worker_is_not_waited_for_without_end(cluster
             next(calls)
 
 
+@pytest.mark.slow
 @pytest.mark.fault("no-worker")
 def test_without_any_worker_the_run_ends_and_can_be_resumed(tmp_path, cluster, impatient):
     path, out = make_campaign(tmp_path, 3, "execution_models:Slow"), tmp_path / "run"

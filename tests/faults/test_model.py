@@ -67,6 +67,7 @@ def test_only_the_faulty_members_are_lost(raising, tmp_path, monkeypatch, name):
         pytest.param("allocates", marks=pytest.mark.fault("model-memory")),
     ],
 )
+@pytest.mark.slow
 def test_limits_on_dask(raising, tmp_path, monkeypatch, name):
     check_losses(raising, tmp_path, monkeypatch, name, {**LIMITS[name], "executor": "dask"})
 

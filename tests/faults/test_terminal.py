@@ -121,7 +121,7 @@ def test_nohup_stays_in_force():
         signal.signal(signal.SIGHUP, before)
 
 
-@pytest.mark.parametrize("kind", ["processes", "dask"])
+@pytest.mark.parametrize("kind", ["processes", pytest.param("dask", marks=pytest.mark.slow)])
 @pytest.mark.fault("kill-workers")
 def test_workers_end_with_the_main_process(tmp_path, kind):
     path, out = make_campaign(tmp_path, 4, "execution_models:Waits"), tmp_path / "run"

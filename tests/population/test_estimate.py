@@ -99,7 +99,7 @@ def estimated(runs, seed):
     "runs",
     [
         pytest.param(Curved(), id="curved", marks=pytest.mark.slow),
-        pytest.param(Curved(outlier=2.0), id="outlier"),
+        pytest.param(Curved(outlier=2.0), id="outlier", marks=pytest.mark.slow),
         pytest.param(Cusped(), id="cusped", marks=pytest.mark.slow),
     ],
 )

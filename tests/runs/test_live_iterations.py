@@ -52,7 +52,7 @@ def iterations(lines, name):
     return [int(found[1]) for line in lines if (found := re.search(rf" {name}: iteration +(\d+)  J ", line))]
 
 
-@pytest.mark.parametrize("kind", ["threads", "processes", "dask"])
+@pytest.mark.parametrize("kind", ["threads", "processes", pytest.param("dask", marks=pytest.mark.slow)])
 def test_an_iteration_is_told_before_its_data_set_ends(quiet, tmp_path, monkeypatch, kind):
     monkeypatch.setenv("EN4DVAR_TEST_FLAG", str(tmp_path / "heard"))
     path, out = make_campaign(tmp_path, 3, "execution_models:WaitsTwice"), tmp_path / "run"
@@ -67,7 +67,7 @@ def test_an_iteration_is_told_before_its_data_set_ends(quiet, tmp_path, monkeypa
         assert iterations(log(out), result.name) == list(range(n))
 
 
-@pytest.mark.parametrize("kind", ["processes", "dask"])
+@pytest.mark.parametrize("kind", ["processes", pytest.param("dask", marks=pytest.mark.slow)])
 @pytest.mark.fault("worker-killed")
 def test_iterations_of_a_killed_worker_are_told_again(tmp_path, monkeypatch, kind):
     """It dies as soon as three of them have been heard here: by then none of them is on its way."""
@@ -88,7 +88,7 @@ def test_iterations_of_a_killed_worker_are_told_again(tmp_path, monkeypatch, kin
         assert iterations(lines, result.name) == told_before + whole
 
 
-@pytest.mark.parametrize("kind", ["serial", "threads", "processes", "dask"])
+@pytest.mark.parametrize("kind", ["serial", "threads", "processes", pytest.param("dask", marks=pytest.mark.slow)])
 def test_what_calls_tell_comes_in_order_and_before_their_end(kind):
     """For any call; one that raises has told too."""
     seen = []
