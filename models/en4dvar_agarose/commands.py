@@ -105,6 +105,7 @@ def study(
     from en4dvar.executor import available_cores
     from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
     from en4dvar.runs.rundir import RunDirectory
+    from en4dvar.storage.checkpoint import FOLDER
     from en4dvar_agarose.checkpoints import StudyCheckpoints
     from en4dvar_agarose.report import write_study
     from en4dvar_agarose.run import run_study
@@ -120,15 +121,23 @@ def study(
         RunDirectory.open(folder, "force" if force else "resume" if resume else "new") as directory,
         tell_interrupt(lambda: _to_continue(f"finished parts are kept in {folder}")),
     ):
+        before = _times(directory.work)
         keep = StudyCheckpoints.open(directory, plan)
         result = run_study(plan, workers or available_cores(), lambda message: click.echo(message, err=True), keep)
         page = write_study(result, directory.work)
-        files = (p for p in directory.work.rglob("*") if p.is_file() and not p.name.startswith("."))
-        directory.claim(*sorted(p.relative_to(directory.work).as_posix() for p in files))
+        # What was there before and has not been written since is the user's, unless it is a checkpoint.
+        written = (name for name, time in _times(directory.work).items() if before.get(name) != time)
+        directory.claim(*sorted({*written, *(name for name in before if name.startswith(f"{FOLDER}/"))}))
         directory.publish()
     for gel, comparison in result.comparisons.items():
         click.echo(f"{gel}: {comparison.undecidable} of {len(comparison.single)} data sets cannot tell the laws apart")
     click.echo(f"report: {folder / page.name}" + (" (synthetic twin, no measurement)" if plan.synthetic else ""))
+
+
+def _times(folder: Path) -> dict[str, int]:
+    """When each file was last written, ns, by its name."""
+    files = (p for p in folder.rglob("*") if p.is_file() and not p.name.startswith("."))
+    return {p.relative_to(folder).as_posix(): p.stat().st_mtime_ns for p in files}
 
 
 def _to_continue(kept: str) -> str:

@@ -109,8 +109,19 @@ def test_a_changed_study_is_not_continued(small):
     assert "-  draws: 200\n+  draws: 250" in str(error)
     assert "give --force" in str(error)
     assert sorted((file, file.stat().st_mtime_ns) for file in out.rglob("*")) == before
-    nowhere = [*call, "--out", str(out.parent / "none"), "--resume"]
-    assert isinstance(CliRunner().invoke(study_command, nowhere).exception, OutputError)
+
+
+@pytest.mark.slow
+def test_a_file_of_the_user_is_not_taken_for_one_of_the_study(small):
+    """It would be removed by the next ``--force``."""
+    out, _, call = small
+    notes = out / "notes.txt"
+    notes.write_text("mine")
+    assert CliRunner().invoke(study_command, [*call, "--resume"]).exit_code == 0
+    listed = (out / ".en4dvar-files").read_text().splitlines()
+    assert "notes.txt" not in listed
+    assert {"study.html", "study.nc", "table1.csv"} <= set(listed)
+    notes.unlink()
 
 
 def test_what_decides_the_numbers_of_a_study(tmp_path):
