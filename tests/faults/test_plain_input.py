@@ -150,7 +150,7 @@ def test_a_model_in_a_file_goes_to_other_processes_and_is_run_again(tmp_path: Pa
     options = ["--no-report", "--out", tmp_path / "run", "--set", "execution.executor=processes"]
     done = call("run", path, *options, "--set", "execution.workers=2")
     assert done.exit_code == 0, done.output
-    assert "the same bits" in call("rerun", tmp_path / "run").output
+    assert "the same bits" in call("rerun", tmp_path / "run", "--trust").output
 
 
 @pytest.mark.fault("own-code")
