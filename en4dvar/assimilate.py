@@ -111,9 +111,11 @@ class _Assimilation:
         self.progress, self._keep = progress, keep
         self.scheme = window_scheme(settings)
         robust = np.isfinite(problem.observations.noise.counts_within)
-        if not self.scheme.searches and (problem.has_noise_scale or robust):
+        estimated = any(p.name in problem.prior.names for p in problem.discrepancy)
+        if not self.scheme.searches and (problem.has_noise_scale or robust or estimated):
             raise ConfigError(
-                f"{settings.scheme} takes Gaussian errors of known std: neither sigma nor a robust cost; use en4dvar"
+                f"{settings.scheme} takes Gaussian errors of known covariance: neither sigma nor a robust cost nor a "
+                "discrepancy; use en4dvar"
             )
         self.space = WeightSpace(problem, settings, seed, executor)
         self.grid = np.linspace(problem.observations.times[0], problem.observations.times[-1], GRID_POINTS)
@@ -152,7 +154,7 @@ class _Assimilation:
             prior_predictions=prior_run.predictions[:-1],
             posterior_predictions=after.predictions,
             centre_predictions=last.predictions[0],
-            error_std=noise.error_std(last.predicted[0]),
+            error_std=noise.total_std(last.predicted[0]),
             log_likelihood=observations.log_likelihood(after.predicted),
             trajectory_times=self.grid,
             prior_trajectories=prior_run.path[:-1],
