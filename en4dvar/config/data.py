@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
 from en4dvar.config.context import (
     PLACEHOLDER,
@@ -230,8 +230,16 @@ class DiscrepancySection(Section):
         )
 
 
+def _estimated(given: Any) -> Any:
+    if given == "estimated":
+        return {}
+    if given is not None and not isinstance(given, dict):
+        raise ValueError("write estimated, or the priors of its amplitude and length")
+    return given
+
+
 class Error(Section):
-    """Observation errors: a std or a whole covariance, errors of the times, a correlation, a robust cost."""
+    """Observation errors: a std or a whole covariance, errors of the times, a correlation, a robust cost, a discrepancy."""
 
     model_config = ConfigDict(populate_by_name=False)
     std: Annotated[Spread | None, Made(_error_std)] = Field(None, alias=f"{PLACEHOLDER}_std")
@@ -248,7 +256,7 @@ class Error(Section):
     """Threshold of the robust cost in std."""
     discrepancy: Annotated[
         DiscrepancySection | None,
-        BeforeValidator(lambda given: {} if given == "estimated" else given),
+        BeforeValidator(_estimated, json_schema_input_type=Literal["estimated"] | DiscrepancySection | None),
     ] = None
     """What the model misses: ``estimated``, or its priors. Adds ``discrepancy_amplitude`` and ``discrepancy_length``."""
 

@@ -20,6 +20,10 @@ from en4dvar.units import convert
 
 COLLAPSED = 1 / 9  # of the mean of 2 (J − J_min) per parameter: a spread below a third of what J allows
 SHORT_STEP = 0.5  # posterior standard deviations
+OTHER_KERNEL = (
+    "the discrepancy has another shape than its kernel: try data.error.discrepancy.kernel: matern-3/2, or grows_beyond, "
+    "and compare the evidence"
+)
 NO_SPREAD = 1e-8  # of the prior's: members that agree to rounding
 
 
@@ -76,7 +80,8 @@ def _structure(a: Analysis) -> tuple[Caution, ...]:
     model, observations = a.problem.model, a.problem.observations
     times = convert(observations.times, model.time_unit, model.time_display_unit)
     robust = math.isfinite(observations.noise.counts_within)
-    return tuple(checks.structure(a.residuals, robust, model.time_display_unit, times))
+    found = tuple(checks.structure(a.residuals, robust, model.time_display_unit, times))
+    return tuple(replace(c, advice=OTHER_KERNEL) for c in found) if a.discrepancy else found
 
 
 def _fit(a: Analysis, odd: Sequence[Caution]) -> checks.Findings:
