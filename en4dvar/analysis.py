@@ -69,8 +69,8 @@ Progress = Callable[[str, Record], None]  # what hears of them, with the name of
 class Discrepancy:
     """What the model misses, given the residual at the centre: ``mean`` and ``std`` (K,) in the observable's unit.
 
-    ``shares`` (n, 3) divide the posterior variance of each parameter, transformed and in the linear approximation at the
-    centre, into what comes from the errors of the readings, from the discrepancy, and from the prior; rows sum to 1.
+    ``shares`` (n, 3) divide the posterior variance of each parameter, transformed and in the linear approximation at
+    the centre, into what comes from the readings' errors, from the discrepancy, and from the prior; rows sum to 1.
     """
 
     mean: Array

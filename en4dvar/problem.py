@@ -53,7 +53,7 @@ class InverseProblem:
 
     @property
     def discrepancy(self) -> tuple[Parameter, ...]:
-        """Amplitude and length of the model's discrepancy in the units of the observable and of time; () without one."""
+        """Amplitude and length of the model's discrepancy, in the units of the problem; () without one."""
         if not self.observations.noise.discrepant:
             return ()
         return discrepancy_parameters(self.model, self.observable)

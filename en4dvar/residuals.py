@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.state import Array
 
@@ -34,10 +35,12 @@ class Residuals:
     white: Array
     expected: Array
     speed: Array
-    which: Array
+    which: npt.NDArray[np.intp]
 
     @classmethod
-    def of(cls, white: Array, sensitivity: Array, prior_precision: float, speed: Array, which: Array) -> Residuals:
+    def of(
+        cls, white: Array, sensitivity: Array, prior_precision: float, speed: Array, which: npt.NDArray[np.intp]
+    ) -> Residuals:
         """From whitened sensitivities S (K, r), all rows of which take part in A, and N − 1.
 
         ``white`` (K',) and ``sensitivity`` (K'', r) are those of the observations and, below, of what moves R.
@@ -108,11 +111,6 @@ class Residuals:
         total = float(self.white @ np.linalg.solve(self.expected, self.white))
         share = min(1.0, float(self.studentised[worst] ** 2) / total)
         return int(self.which[worst]), min(1.0, k * float(1 - betainc(0.5, (k - 1) / 2, share)))
-
-    def autocorrelation(self, lags: int) -> Array:
-        """(lags,) of lag 1, 2, …"""
-        e = self.white
-        return np.array([e[lag:] @ e[:-lag] for lag in range(1, lags + 1)]) / (e @ e)
 
     def _chance(self, form: Array) -> float:
         """P(xᵀFx/xᵀx ≥ eᵀFe/eᵀe) for x ~ N(0, Q)."""

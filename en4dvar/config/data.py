@@ -175,7 +175,9 @@ def _error_std(text: Any, context: Context) -> Spread:
 
 def _length(text: Any, context: Context) -> Spread:
     relative = _OF_WINDOW.fullmatch(str(text).strip())
-    spread = Spread(parse_quantity(relative[1] if relative else text, "1" if relative else time_unit(context)), bool(relative))
+    spread = Spread(
+        parse_quantity(relative[1] if relative else text, "1" if relative else time_unit(context)), bool(relative)
+    )
     require_sign(spread.value, "positive", text)
     return spread
 
@@ -215,7 +217,7 @@ class DiscrepancySection(Section):
     kernel: Literal["exponential", "matern-3/2", "matern-5/2"] = "exponential"
     """Correlation in time: exponential (rough paths), or Matérn's with one or two derivatives."""
     grows_beyond: Annotated[float | None, quantity(_rate_unit, "positive")] = None
-    """Rate of the observable beyond which the amplitude grows in proportion to it, e.g. 20 m/s; default: it is constant."""
+    """Rate of the observable beyond which the amplitude grows in proportion to it, e.g. 20 m/s; default: constant."""
 
     def kernel_at(self, times: Array) -> Kernel:
         """The kernel at observation times (K,)."""
@@ -239,7 +241,7 @@ def _estimated(given: Any) -> Any:
 
 
 class Error(Section):
-    """Observation errors: a std or a whole covariance, errors of the times, a correlation, a robust cost, a discrepancy."""
+    """Observation errors: a std or a covariance, errors of the times, a correlation, a robust cost, what the model misses."""
 
     model_config = ConfigDict(populate_by_name=False)
     std: Annotated[Spread | None, Made(_error_std)] = Field(None, alias=f"{PLACEHOLDER}_std")
@@ -258,7 +260,7 @@ class Error(Section):
         DiscrepancySection | None,
         BeforeValidator(_estimated, json_schema_input_type=Literal["estimated"] | DiscrepancySection | None),
     ] = None
-    """What the model misses: ``estimated``, or its priors. Adds ``discrepancy_amplitude`` and ``discrepancy_length``."""
+    """What the model misses: ``estimated``, or priors. Adds ``discrepancy_amplitude`` and ``discrepancy_length``."""
 
     @classmethod
     def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:

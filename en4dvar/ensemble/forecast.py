@@ -24,8 +24,8 @@ class Forecast:
     """Predictions of B members; NaN rows where a member failed.
 
     ``predicted`` (B, …) at the observations: predictions (B, K), their rates where R depends on them, the noise scale
-    and the discrepancy where there is one; ``path`` (B, M) at the extra times, ``failures`` (B,) reasons, "" for members
-    alive, ``extremes`` (B, V) what the members reached of the model's V limits of validity (empty without extra times).
+    and the discrepancy where there is one; ``path`` (B, M) at the extra times, ``failures`` (B,) reasons, "" for
+    members alive, ``extremes`` (B, V) what the members reached of the model's V limits of validity (empty without extra times).
     """
 
     predicted: Predicted
@@ -163,9 +163,7 @@ def _reading(problem: InverseProblem, limits: bool) -> Reading:
         return Reading((operator,), largest, batched)
     if not isinstance(operator, RateOperator):
         what = "a timing error" if problem.observations.noise.timed else "a discrepancy that grows with the rate"
-        raise ConfigError(
-            f"{what} needs the rate of {problem.observable.name}, which the model does not provide"
-        )
+        raise ConfigError(f"{what} needs the rate of {problem.observable.name}, which the model does not provide")
     return Reading((operator, operator.rate), largest, batched)
 
 

@@ -68,8 +68,8 @@ def structure(residuals: Residuals | None, robust: bool, unit: str, times: Array
     if chance < ODD:
         words = (
             f"the residuals have a structure in time: their lag-1 autocorrelation is {residuals.lag_one:.2f}, and they "
-            f"have {runs} runs of one sign where about {expected:.0f} are expected (probability {_chance(chance)} where "
-            "the model is right): error bars are those of independent errors"
+            f"have {runs} runs of one sign where about {expected:.0f} are expected (probability {_chance(chance)} "
+            "where the model is right): error bars are those of independent errors"
         )
         yield caution("residual-structure", words)
     if residuals.collapse_chance < ODD:
@@ -82,8 +82,8 @@ def structure(residuals: Residuals | None, robust: bool, unit: str, times: Array
         which, probability = residuals.outlier
         place = int(np.flatnonzero(residuals.which == which)[0])
         words = (
-            f"the reading at {times[which]:.4g} {unit} is {abs(residuals.studentised[place]):.1f} standard deviations off "
-            f"(probability {_chance(probability)}); its leverage is {residuals.leverage[place]:.0%}"
+            f"the reading at {times[which]:.4g} {unit} is {abs(residuals.studentised[place]):.1f} standard deviations "
+            f"off (probability {_chance(probability)}); its leverage is {residuals.leverage[place]:.0%}"
         )
         yield caution("odd-residuals", words)
 

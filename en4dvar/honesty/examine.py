@@ -21,8 +21,8 @@ from en4dvar.units import convert
 COLLAPSED = 1 / 9  # of the mean of 2 (J − J_min) per parameter: a spread below a third of what J allows
 SHORT_STEP = 0.5  # posterior standard deviations
 OTHER_KERNEL = (
-    "the discrepancy has another shape than its kernel: try data.error.discrepancy.kernel: matern-3/2, or grows_beyond, "
-    "and compare the evidence"
+    "the discrepancy has another shape than its kernel: try data.error.discrepancy.kernel: matern-3/2, or "
+    "grows_beyond, and compare the evidence"
 )
 NO_SPREAD = 1e-8  # of the prior's: members that agree to rounding
 

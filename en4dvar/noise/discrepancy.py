@@ -125,7 +125,7 @@ class DiscrepancyNoise(Noise):
         return float(np.sum(weights * (np.log(self.std) + self._log_norm())))
 
     def whiten(self, values: Array, weights: Array, at: Linearisation) -> tuple[Array, Array]:
-        root = np.linalg.cholesky(self._covariance(at.prediction))
+        root = np.asarray(np.linalg.cholesky(self._covariance(at.prediction)), dtype=float)
         residual = values - at.prediction.values
         white = solve_triangular(root, np.column_stack([residual, at.anomalies.T]), lower=True)
         v, directions = white[:, 0], self._directions(at)
@@ -179,9 +179,7 @@ class DiscrepancyNoise(Noise):
 
     def _innovations(self, values: Array, predicted: Predicted) -> Array:
         """v and the diagonal of L (2, …, K); NaN where a prediction is not finite or R + A is singular to rounding."""
-        return self._in_parts(
-            predicted, 2, lambda runs: whitened(values - runs.values, self._covariance(runs))
-        )
+        return self._in_parts(predicted, 2, lambda runs: whitened(values - runs.values, self._covariance(runs)))
 
 
 def in_rows(predicted: Predicted) -> Predicted:
@@ -217,7 +215,7 @@ def whitened(residuals: Array, covariances: Array) -> tuple[Array, Array]:
 
 def _root_or_nan(matrix: Array) -> Array:
     try:
-        return np.linalg.cholesky(matrix)
+        return np.asarray(np.linalg.cholesky(matrix), dtype=float)
     except np.linalg.LinAlgError:
         return np.full_like(matrix, np.nan)
 

@@ -83,7 +83,7 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
         u, light = self._solved(values, p)
         s, discrepancy = self.error_std(p), self.covariance_of_discrepancy(p)
         root = np.linalg.cholesky(np.diag(s**2 / light) + discrepancy)
-        expected = np.linalg.cholesky(np.diag(s**2 / self._curvature) + discrepancy)
+        expected = np.asarray(np.linalg.cholesky(np.diag(s**2 / self._curvature) + discrepancy), dtype=float)
         white = solve_triangular(root, np.column_stack([values - p.values, at.anomalies.T]), lower=True)
         directions = self._directions(at)
         changes = [both_sides(expected, one.errors / self._curvature + one.discrepancy) for one in directions]
@@ -140,7 +140,7 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
         """y − m and s (B, K), A (B, K, K); NaN and one where either is not finite."""
         residual = values - runs.values
         s, covariance = np.broadcast_to(self.error_std(runs), residual.shape), self.covariance_of_discrepancy(runs)
-        broken = ~(np.isfinite(residual + s).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
+        broken = np.logical_not(np.isfinite(residual + s).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
         residual[broken] = np.nan
         return residual, np.where(broken[:, None], 1.0, s), np.where(broken[:, None, None], 0.0, covariance)
 
@@ -163,7 +163,9 @@ def solve_boxed(residual: Array, s: Array, covariance: Array, threshold: float) 
             break
         edge = side[going] != 0
         matrix = np.where(edge[:, :, None], unit, total[going])
-        u[going] = np.linalg.solve(matrix, np.where(edge, side[going] * most[going], residual[going])[..., None])[..., 0]
+        u[going] = np.linalg.solve(matrix, np.where(edge, side[going] * most[going], residual[going])[..., None])[
+            ..., 0
+        ]
         errors = residual - np.einsum("bij,bj->bi", covariance, u)
         moved = np.where(np.abs(errors) > threshold * s, np.sign(errors), 0.0)
         going = going & np.any(moved != side, axis=1)
@@ -178,7 +180,7 @@ def _reweighted(residual: Array, s: Array, covariance: Array, threshold: float) 
     """The same u (K,) by iteratively reweighted least squares, which never fails to descend."""
     weights, u = np.ones_like(s), np.zeros_like(s)
     for _ in range(REWEIGHTED):
-        u = np.linalg.solve(np.diag(s**2 / weights) + covariance, residual)
+        u = np.asarray(np.linalg.solve(np.diag(s**2 / weights) + covariance, residual), dtype=float)
         before, weights = weights, threshold * s / np.maximum(np.abs(residual - covariance @ u), threshold * s)
         if np.max(np.abs(weights - before)) < SETTLED:
             break

@@ -97,9 +97,9 @@ def test_a_changed_covariance_file_is_another_run(tmp_path: Path) -> None:
         (ERROR, f"{ERROR}, threshold: 2", "data.error.threshold: is that of the robust cost"),
         (ERROR, f"{ERROR}, robust: huber, threshold: -2", "data.error.threshold: must be positive, not -2"),
         (ERROR, f"{ERROR}, robust: huber, correlation_time: 3 s", "data.error.robust: not together with correlation_t"),
-        (ERROR, f"{ERROR}, discrepancy: yes", "data.error.discrepancy: write estimated, or the priors of its amplitude"),
-        (ERROR, f"{ERROR}, discrepancy: {{length: {{median: 3}}}}", "data.error.discrepancy.length.median: 3 has no unit"),
-        (ERROR, f"{ERROR}, discrepancy: {{amplitude: {{median: -3 um}}}}", "discrepancy.amplitude.median: must be positive"),
+        (ERROR, f"{ERROR}, discrepancy: yes", "data.error.discrepancy: write estimated, or the priors"),
+        (ERROR, f"{ERROR}, discrepancy: {{length: {{median: 3}}}}", "discrepancy.length.median: 3 has no unit"),
+        (ERROR, f"{ERROR}, discrepancy: {{amplitude: {{median: -3 um}}}}", "amplitude.median: must be positive"),
         (ERROR, f"{ERROR}, discrepancy: {{kernel: matern}}", "data.error.discrepancy.kernel: 'matern' is not "),
         (ERROR, f"{ERROR}, discrepancy: {{grows_beyond: 3 us}}", "data.error.discrepancy.grows_beyond: '3 us': unit"),
         (ERROR, f"{ERROR}, covariance: {{path: R.csv, unit: m2}}", "data.error.covariance: not together with position"),
@@ -137,10 +137,14 @@ def test_discrepancy_is_scaled_to_the_data_or_as_it_is_given(tmp_path: Path) -> 
     assert (amplitude.std, length.std) == (1.0, 0.7)
     assert y.noise.kernel.smoothness == 0.5
     assert not y.noise.kernel.grows
-    given = "{amplitude: {median: 3 um}, length: {median: 4 ms, log_std: 0.3}, kernel: matern-3/2, grows_beyond: 2 mm/s}"
+    given = (
+        "{amplitude: {median: 3 um}, length: {median: 4 ms, log_std: 0.3}, kernel: matern-3/2, grows_beyond: 2 mm/s}"
+    )
     problem, terms = terms_of(tmp_path, (ERROR, f"{ERROR}, time_std: 10 us, robust: huber, discrepancy: {given}"))
     noise = problem.observations.noise
-    assert np.exp([terms["discrepancy_amplitude"].mean, terms["discrepancy_length"].mean]) == pytest.approx([3e-6, 4e-3])
+    assert np.exp([terms["discrepancy_amplitude"].mean, terms["discrepancy_length"].mean]) == pytest.approx(
+        [3e-6, 4e-3]
+    )
     assert terms["discrepancy_length"].std == 0.3
     assert (noise.kernel.smoothness, noise.kernel.grows_beyond, noise.threshold) == (1.5, 2e-3, 1.345)
 

@@ -26,7 +26,9 @@ def test_chances_are_uniform_where_the_model_is_right():
     found = [looked_at(root @ rng.standard_normal(K), sensitivity) for _ in range(600)]
     for chances in ([r.lag_one_chance for r in found], [r.collapse_chance for r in found]):
         for level in (0.1, 0.5, 0.9):
-            assert np.mean(np.array(chances) < level) == pytest.approx(level, abs=4 * np.sqrt(level * (1 - level) / 600))
+            assert np.mean(np.array(chances) < level) == pytest.approx(
+                level, abs=4 * np.sqrt(level * (1 - level) / 600)
+            )
     for chances in ([r.runs_chance for r in found], [r.outlier[1] for r in found]):  # never too often
         assert np.mean(np.array(chances) < 0.05) < 0.09
 
