@@ -11,6 +11,7 @@ from en4dvar import diagnostics as diag
 from en4dvar.analysis import Analysis, Discrepancy, Progress, Record
 from en4dvar.caution import Caution, caution
 from en4dvar.descent.loop import iterate
+from en4dvar.descent.marginal import marginal_members
 from en4dvar.descent.noise_scale import mean_beyond_mode
 from en4dvar.descent.start import StartState, choose_start
 from en4dvar.descent.variance import shares_of_variance
@@ -134,6 +135,8 @@ class _Assimilation:
         ends = space.control(np.vstack([w + transform, w]))
         posterior, mode = ends[:-1], ends[-1]
         posterior = posterior + mean_beyond_mode(problem, mode, posterior, descent.records[-1].dfs)
+        if self.scheme.searches and problem.discrepancy and descent.iterate.linear is not None:
+            posterior = marginal_members(space, descent.iterate.linear, mode, posterior, self.seed)
         posterior, refinement, refine_warnings = self.refine(posterior, start.refinement)
         if self.scheme.searches or refinement:
             ends = np.vstack([posterior, mode])

@@ -192,9 +192,9 @@ LogStd = Annotated[float, Field(gt=0)]
 class AmplitudeSection(Section):
     """Lognormal prior of the discrepancy's standard deviation."""
 
-    median: Annotated[Spread, Made(_error_std)] = Field("2 % of maximum", validate_default=True)
+    median: Annotated[Spread, Made(_error_std)] = Field("0.5 % of maximum", validate_default=True)
     """A quantity in the observable's unit, or e.g. '2 % of maximum'."""
-    log_std: LogStd = 1.0
+    log_std: LogStd = 1.5
     """Standard deviation of the natural logarithm."""
 
 
@@ -241,7 +241,7 @@ def _estimated(given: Any) -> Any:
 
 
 class Error(Section):
-    """Observation errors: a std or a covariance, errors of the times, a correlation, a robust cost, what the model misses."""
+    """Observation errors: a std or a covariance, of the times, correlation, a robust cost, what the model misses."""
 
     model_config = ConfigDict(populate_by_name=False)
     std: Annotated[Spread | None, Made(_error_std)] = Field(None, alias=f"{PLACEHOLDER}_std")

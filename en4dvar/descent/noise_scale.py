@@ -25,7 +25,7 @@ from en4dvar.state import NOISE_SCALE, Array
 
 def mean_beyond_mode(problem: InverseProblem, mode: Array, posterior: Array, dfs: float) -> Array:
     """What to add to the ``mode`` (n,) for the mean (n,); zero without a noise scale, or beside a discrepancy,
-    whose amplitude shares the score with σ: there a Markov chain tells the mean.
+    where all parameters of the errors are marginalised (:mod:`en4dvar.descent.marginal`).
 
     ``posterior`` (N, n) are members whose covariance is C, ``dfs`` = tr (M + U) C; all in transformed space.
     """

@@ -25,7 +25,8 @@ class Forecast:
 
     ``predicted`` (B, …) at the observations: predictions (B, K), their rates where R depends on them, the noise scale
     and the discrepancy where there is one; ``path`` (B, M) at the extra times, ``failures`` (B,) reasons, "" for
-    members alive, ``extremes`` (B, V) what the members reached of the model's V limits of validity (empty without extra times).
+    members alive, ``extremes`` (B, V) what the members reached of the model's V limits of validity (empty without extra
+    times).
     """
 
     predicted: Predicted

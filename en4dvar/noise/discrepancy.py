@@ -93,16 +93,20 @@ class DiscrepancyNoise(Noise):
         return np.hypot(self.error_std(predicted), amplitude[..., None] * self.kernel.growth(predicted.rates))
 
     def frozen(self, predicted: Predicted) -> Noise:
-        covariance = self._covariance(predicted)
+        covariance = self.covariance(predicted)
         std = np.sqrt(np.diag(covariance))
         correlation = covariance / np.outer(std, std)
         np.fill_diagonal(correlation, 1.0)
         return CorrelatedNoise(std, np.zeros_like(std), Correlation(0.5 * (correlation + correlation.T)))
 
+    def gaussian_at(self, values: Array, predicted: Predicted) -> DiscrepancyNoise:
+        """Gaussian errors that count each reading as these do at a prediction."""
+        return self
+
     def explained(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
         """Mean and std (K,) of δ given the residual at one prediction."""
         covariance = self.covariance_of_discrepancy(predicted)
-        root = np.linalg.cholesky(self._covariance(predicted))
+        root = np.linalg.cholesky(self.covariance(predicted))
         both = np.column_stack([values - predicted.values, covariance])
         mean, *gain = (covariance @ cho_solve((root, True), both)).T
         variance = np.diag(covariance) - np.diag(np.array(gain))
@@ -125,7 +129,7 @@ class DiscrepancyNoise(Noise):
         return float(np.sum(weights * (np.log(self.std) + self._log_norm())))
 
     def whiten(self, values: Array, weights: Array, at: Linearisation) -> tuple[Array, Array]:
-        root = np.asarray(np.linalg.cholesky(self._covariance(at.prediction)), dtype=float)
+        root = np.asarray(np.linalg.cholesky(self.covariance(at.prediction)), dtype=float)
         residual = values - at.prediction.values
         white = solve_triangular(root, np.column_stack([residual, at.anomalies.T]), lower=True)
         v, directions = white[:, 0], self._directions(at)
@@ -134,7 +138,7 @@ class DiscrepancyNoise(Noise):
         return augmented(weights, white, directions, changes, score)
 
     def precision_times(self, values: Array, weights: Array, at: Predicted, vectors: Array) -> Array:
-        root = np.linalg.cholesky(self._covariance(at))
+        root = np.linalg.cholesky(self.covariance(at))
         return np.asarray(weights[0] * cho_solve((root, True), vectors.T).T)
 
     def _amplitude_and_length(self, predicted: Predicted) -> tuple[Array, Array]:
@@ -142,7 +146,7 @@ class DiscrepancyNoise(Noise):
             raise ValueError("predictions lack amplitude and length of the discrepancy")
         return np.asarray(predicted.discrepancy[..., 0]), np.asarray(predicted.discrepancy[..., 1])
 
-    def _covariance(self, predicted: Predicted) -> Array:
+    def covariance(self, predicted: Predicted) -> Array:
         """R + A (…, K, K)."""
         return self.covariance_of_errors(predicted) + self.covariance_of_discrepancy(predicted)
 
@@ -179,7 +183,7 @@ class DiscrepancyNoise(Noise):
 
     def _innovations(self, values: Array, predicted: Predicted) -> Array:
         """v and the diagonal of L (2, …, K); NaN where a prediction is not finite or R + A is singular to rounding."""
-        return self._in_parts(predicted, 2, lambda runs: whitened(values - runs.values, self._covariance(runs)))
+        return self._in_parts(predicted, 2, lambda runs: whitened(values - runs.values, self.covariance(runs)))
 
 
 def in_rows(predicted: Predicted) -> Predicted:

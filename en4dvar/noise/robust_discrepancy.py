@@ -58,6 +58,10 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
     def frozen(self, predicted: Predicted) -> CorrelatedNoise:
         raise NotImplementedError("a robust cost is never frozen: its scheme searches")
 
+    def gaussian_at(self, values: Array, predicted: Predicted) -> DiscrepancyNoise:
+        root = np.sqrt(self._solved(values, predicted)[1])
+        return DiscrepancyNoise(self.std / root, self.time_std / root, self.kernel)
+
     def down_weights(self, values: Array, predicted: Predicted) -> Array:
         return self._solved(values, predicted)[1]
 

@@ -77,7 +77,7 @@ def history(result: StoredResult) -> Figure:
 
 @styled
 def residuals(result: StoredResult) -> Figure:
-    """Whitened residuals in time, their autocorrelation, normal quantiles, leverages, and a discrepancy where there is one."""
+    """Whitened residuals in time, their autocorrelation, normal quantiles, leverages; the discrepancy if any."""
     name, stats = result.observable, result.sample_stats
     time = _shown(result.observed_data["time"])
     white, studentised, leverage = (
@@ -185,8 +185,8 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
     if f"{result.observable}_whitened_residual" in result.sample_stats:
         yield (
             "residuals",
-            "Residuals of the centre, whitened: in time (with a discrepancy below its mean ± std), their "
-            "autocorrelation (band: 95 % of independent numbers), against normal quantiles, and the leverage of each reading.",
+            "Residuals of the centre, whitened: in time (below it a discrepancy, mean ± std), their "
+            "autocorrelation (band: 95 % of independent numbers), against normal quantiles; leverages.",
             residuals(result),
         )
     yield "cost", "The cost J and its two terms at the iterate that starts each iteration.", cost(result)

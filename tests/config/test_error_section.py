@@ -132,9 +132,9 @@ def test_discrepancy_is_scaled_to_the_data_or_as_it_is_given(tmp_path: Path) -> 
     y = problem.observations
     amplitude, length = terms["discrepancy_amplitude"], terms["discrepancy_length"]
     assert (amplitude.parameter.unit, length.parameter.unit) == ("m", "s")
-    assert np.exp(amplitude.mean) == pytest.approx(0.02 * y.values.max())
+    assert np.exp(amplitude.mean) == pytest.approx(0.005 * y.values.max())
     assert np.exp(length.mean) == pytest.approx(0.1 * (y.times[-1] - y.times[0]))
-    assert (amplitude.std, length.std) == (1.0, 0.7)
+    assert (amplitude.std, length.std) == (1.5, 0.7)
     assert y.noise.kernel.smoothness == 0.5
     assert not y.noise.kernel.grows
     given = (
