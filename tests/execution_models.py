@@ -70,6 +70,25 @@ class Stops(Oscillator):
         return super().trajectories(x, times)
 
 
+class EndsAt(Oscillator):
+    """Ends the process of the run at call number ``EN4DVAR_TEST_CALL`` of ``trajectories``; exit code 0."""
+
+    calls = 0
+
+    def trajectories(self, x, times):
+        type(self).calls += 1
+        if type(self).calls == int(os.environ["EN4DVAR_TEST_CALL"]):
+            os._exit(0)
+        return super().trajectories(x, times)
+
+
+class Noisy(Oscillator):
+    """0.1 % of noise in every step."""
+
+    def step(self, x, t0, t1):
+        return super().step(x, t0, t1) * (1 + 1e-3 * np.random.default_rng().standard_normal())
+
+
 class Swift(Oscillator):
     """All members at once, in closed form."""
 

@@ -14,6 +14,7 @@ from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, En4dvarError, Fault
 from en4dvar.forward import ForwardModel, StateField
 from en4dvar.hints import suggest
+from en4dvar.user_code import RefusedError, file_of, loading, require_permission
 
 GROUP = "en4dvar.models"
 
@@ -28,15 +29,17 @@ def find_model(name: str) -> type[ForwardModel]:
     """The model class called ``name``. Raises :class:`ConfigError`."""
     found: Any
     try:
-        if ":" in name:
-            module, _, attribute = name.partition(":")
-            found = getattr(import_module(module), attribute)
-        else:
-            registered = {e.name: e for e in entry_points(group=GROUP)}
-            if name not in registered:
-                raise ConfigError(f"unknown model {name!r}{suggest(name, registered)}; or write package:object")
-            found = registered[name].load()
-    except (ImportError, AttributeError, ValueError) as error:
+        with loading(f"model {name!r} cannot be loaded"):
+            if ":" in name:
+                module, _, attribute = name.partition(":")
+                require_permission(f"model {name!r}", file_of(module))
+                found = getattr(import_module(module), attribute)
+            else:
+                registered = {e.name: e for e in entry_points(group=GROUP)}
+                if name not in registered:
+                    raise ConfigError(f"unknown model {name!r}{suggest(name, registered)}; or write package:object")
+                found = registered[name].load()
+    except ValueError as error:
         raise ConfigError(f"model {name!r} cannot be loaded: {error}") from error
     if not (isinstance(found, type) and issubclass(found, ForwardModel)):
         raise ConfigError(f"{name!r} is not a subclass of en4dvar.ForwardModel")
@@ -56,13 +59,15 @@ def settings_of(kind: type[ForwardModel]) -> type[BaseModel]:
 
 def build_model(kind: type[ForwardModel], settings: BaseModel) -> ForwardModel:
     """The model of validated settings. Raises :class:`ConfigError` where the class does not fit together."""
-    try:
-        model: ForwardModel = kind.from_settings(settings) if hasattr(kind, "from_settings") else kind()
-    except TypeError as error:
-        if hasattr(kind, "from_settings"):
-            raise
-        raise ConfigError(f"{error}; a class that takes arguments needs Settings and from_settings") from error
-    for observable in model.observables:
+    with loading(f"{kind.__name__} cannot be made"):
+        try:
+            model: ForwardModel = kind.from_settings(settings) if hasattr(kind, "from_settings") else kind()
+        except TypeError as error:
+            if hasattr(kind, "from_settings"):
+                raise
+            raise ConfigError(f"{error}; a class that takes arguments needs Settings and from_settings") from error
+        observables = model.observables
+    for observable in observables:
         if isinstance(observable.operator, StateField):
             for field in (observable.operator.name, observable.operator.rate_of):
                 if field is not None and field not in model.layout.names:
@@ -92,11 +97,14 @@ def read_model(
         faults.append(document.fault(("model", "name"), str(error)))
         return None
     options = {key: value for key, value in raw.items() if key != "name"}
-    settings: BaseModel | None = check(settings_of(kind), options, ("model",), document, faults, {"base": base})
-    if settings is None:
-        return None
     try:
+        with loading(f"the settings of {name} cannot be read"):
+            settings: BaseModel | None = check(settings_of(kind), options, ("model",), document, faults, {"base": base})
+        if settings is None:
+            return None
         model = build_model(kind, settings)
+    except RefusedError:
+        raise
     except (En4dvarError, ValueError) as error:
         faults.append(document.fault(("model",), str(error)))
         return None

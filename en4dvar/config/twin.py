@@ -144,6 +144,8 @@ class Sequential(_Iterations):
     """Rotate the ensemble at random after each analysis, mean and covariance kept."""
     localisation: Local | None = None
     """Gaspari–Cohn taper over the indices of the observed field (filters only)."""
+    stochastic_model: bool = False
+    """true: accept a model that gives other numbers when a member is run again; by default that is an error."""
 
     @model_validator(mode="after")
     def _belongs_together(self) -> Self:
@@ -158,7 +160,10 @@ class Sequential(_Iterations):
     def built(self, localisation: Localisation | None) -> SequentialSettings:
         """What the loop needs."""
         scheme = _KINDS[self.scheme](**{key: getattr(self, key) for key in _KEYS[self.scheme]})
-        return SequentialSettings(scheme, Inflation(self.inflation, self.rtps), self.rotation, localisation)
+        inflation = Inflation(self.inflation, self.rtps)
+        return SequentialSettings(
+            scheme, inflation, self.rotation, localisation, stochastic_model=self.stochastic_model
+        )
 
     def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """As given, without what the scheme does not take."""

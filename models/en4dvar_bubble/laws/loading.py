@@ -14,6 +14,7 @@ from typing import Any
 
 from en4dvar.errors import ConfigError
 from en4dvar.hints import no_such_file, suggest
+from en4dvar.user_code import file_of, kept_apart, loading, reason_of, require_permission
 from en4dvar_bubble.laws.base import FILE_MODULE, REGISTRY, ConstitutiveLaw
 from en4dvar_bubble.laws.validity import check_law
 
@@ -51,8 +52,10 @@ def get_law(name: str, base: Path | None = None) -> ConstitutiveLaw:
     where, colon, attribute = name.rpartition(":")
     if colon and (where.endswith(".py") or "/" in where or "\\" in where):
         path = ((base or Path.cwd()) / Path(where).expanduser()).resolve()
+        require_permission(f"law {name!r}", Path(where))
         found = _from_file(path, attribute)
     elif colon:
+        require_permission(f"law {name!r}", file_of(where))
         found = _from_module(where, attribute)
     else:
         found = _from_entry_point(name)
@@ -87,10 +90,11 @@ def _from_file(path: Path, attribute: str) -> Any:
         module.__file__ = str(path)
         sys.modules[key] = module
         try:
-            exec(compile(source, str(path), "exec"), module.__dict__)
-        except Exception as error:
+            with kept_apart():
+                exec(compile(source, str(path), "exec"), module.__dict__)
+        except BaseException as error:
             del sys.modules[key]
-            raise ConfigError(f"{_line(error, path)}: {type(error).__name__}: {error}") from error
+            raise ConfigError(f"{_line(error, path)}: {reason_of(error)}") from error
     found = _attribute(sys.modules[key], attribute, str(path))
     if isinstance(found, type) and issubclass(found, ConstitutiveLaw) and found.__module__ == key:
         found.reference = FileReference(str(path), attribute, digest)
@@ -98,10 +102,8 @@ def _from_file(path: Path, attribute: str) -> Any:
 
 
 def _from_module(where: str, attribute: str) -> Any:
-    try:
+    with loading(f"law '{where}:{attribute}' cannot be imported"):
         return _attribute(import_module(where), attribute, where)
-    except ImportError as error:
-        raise ConfigError(f"law '{where}:{attribute}' cannot be imported: {error}") from error
 
 
 def _from_entry_point(name: str) -> Any:
@@ -110,10 +112,8 @@ def _from_entry_point(name: str) -> Any:
         known = sorted({*REGISTRY, *registered})
         own = "; a class of your own is my_law.py:ClassName" if name.endswith(".py") else ""
         raise ConfigError(f"unknown law {name!r}{own or suggest(name, known)}")
-    try:
+    with loading(f"law {name!r}: entry point {registered[name].value!r} cannot be loaded"):
         return registered[name].load()
-    except Exception as error:
-        raise ConfigError(f"law {name!r}: entry point {registered[name].value!r} cannot be loaded: {error}") from error
 
 
 def _attribute(module: ModuleType, name: str, where: str) -> Any:
@@ -127,7 +127,7 @@ def _digest(path: Path, source: bytes) -> str:
     return hashlib.sha256(str(path).encode() + b"\0" + source).hexdigest()
 
 
-def _line(error: Exception, path: Path) -> str:
+def _line(error: BaseException, path: Path) -> str:
     """``file:line`` of the error in the user's file."""
     if isinstance(error, SyntaxError) and error.filename == str(path):
         return f"{path}:{error.lineno}"
