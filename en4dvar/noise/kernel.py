@@ -19,9 +19,9 @@ class Kernel:
     """cov(δ, δ') = a² g g' k(|t − t'|/ℓ) with a Matérn correlation k of smoothness ν, at ``times`` (K,).
 
     ν = ½ is exp(−|t − t'|/ℓ), whose paths are continuous and nowhere smooth; those of ν = 3/2 have one derivative,
-    those of 5/2 two. g = √(1 + (ṁ/``grows_beyond``)²) grows with the rate of the observable, since a model that is early
-    or late errs most where that is fast; g = 1 by default. Source: Rasmussen & Williams (2006), Gaussian Processes for
-    Machine Learning, § 4.2.1.
+    those of 5/2 two. g = √(1 + (ṁ/``grows_beyond``)²) grows with the rate of the observable, since a model that is
+    early or late errs most where that is fast; g = 1 by default. Source: Rasmussen & Williams (2006), Gaussian
+    Processes for Machine Learning, § 4.2.1.
 
     Raises
     ------

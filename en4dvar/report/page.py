@@ -58,7 +58,7 @@ def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
     s = result.sample_stats.attrs
     alive, members, n_estimated = int(s["n_active"]), int(s["n_members"]), len(result.posterior.data_vars)
     chi2, dfs, nrmse = (float(s[key]) for key in ("chi2_per_observation", "dfs", "nrmse"))
-    structured = any(c.code == "residual-structure" for c in result.cautions)
+    structured = any(c.code in ("residual-structure", "odd-residuals") for c in result.cautions)
     chi2_words, chi2_odd = judge_chi2(chi2, int(s["n_weighted"]), dfs, structured)
     informed = f"of {n_estimated} parameters determined by the data"
     ended = "by its own criterion" if s["converged"] else "not converged"
@@ -74,7 +74,7 @@ def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
 def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = False) -> tuple[str, bool]:
     """What χ² per observation says in plain words, and whether it needs attention (as warnings of the run do).
 
-    ``structured``: the residuals have a structure in time, which their size does not show.
+    ``structured``: the residuals have a structure, which their size does not show.
     """
     if not math.isfinite(chi2):
         return "cannot be told", True
@@ -85,7 +85,7 @@ def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = 
     if chi2 * n_observations < low:
         return f"misfit is below the stated noise, which may be overstated; {expected}", True
     if structured:
-        return f"the size of the misfit is as stated, its structure in time is not; {expected}", True
+        return f"the size of the misfit is as stated, its structure is not; {expected}", True
     return f"misfit agrees with the stated noise; {expected}", False
 
 
