@@ -21,7 +21,6 @@ from en4dvar.commands.run import run
 from en4dvar.commands.simulate import simulate
 from en4dvar.commands.validate import validate
 from en4dvar.errors import En4dvarError
-from en4dvar.user_code import describe
 
 OF_THE_DEVICE = (
     errno.ENOSPC,
@@ -53,6 +52,8 @@ class Commands(click.Group):
         except SystemExit as end:  # of a model or law: click ends in another way; another package's command may
             if ctx.invoked_subcommand in plugin_commands():
                 raise
+            from en4dvar.user_code import describe
+
             raise Failed(f"the code of a model ended the program: {describe(end)}", 1) from None
         except (KeyboardInterrupt, click.Abort) as interrupt:
             raise Failed(str(interrupt) or "interrupted", 130) from None

@@ -106,13 +106,13 @@ class Swift(Oscillator):
 
 
 class Waits(Oscillator):
-    """Call number 8 of its thread, in the first iterations of a data set, waits for the file ``EN4DVAR_TEST_FLAG``."""
+    """Call number 9 of its thread, in the first iterations of a data set, waits for the file ``EN4DVAR_TEST_FLAG``."""
 
     calls = threading.local()
 
     def trajectories(self, x, times):
         self.calls.n = getattr(self.calls, "n", 0) + 1
-        if self.calls.n == 8:
+        if self.calls.n == 9:
             self.wait(Path(os.environ["EN4DVAR_TEST_FLAG"]))
         return super().trajectories(x, times)
 
@@ -126,10 +126,10 @@ class Waits(Oscillator):
 
 
 class WaitsTwice(Waits):
-    """Call number 5, in the search for a start, waits for a file of that name with the suffix ``.start``."""
+    """Call number 6, in the search for a start, waits for a file of that name with the suffix ``.start``."""
 
     def trajectories(self, x, times):
-        if getattr(self.calls, "n", 0) == 4:
+        if getattr(self.calls, "n", 0) == 5:
             self.wait(Path(os.environ["EN4DVAR_TEST_FLAG"]).with_suffix(".start"))
         return super().trajectories(x, times)
 

@@ -21,6 +21,7 @@ from en4dvar.config.validate import Faults
 from en4dvar.cycling.sequential import SequentialSettings
 from en4dvar.cycling.twin import TwinExperiment
 from en4dvar.errors import ConfigError, DataError, Fault
+from en4dvar.files import expanded
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.inputs.readers import Matrix, read_covariance
 from en4dvar.noise import Correlation
@@ -55,9 +56,9 @@ def _stds(known: Callable[[ForwardModel], Mapping[str, Any]]) -> Made:
 
 def _correlation(path: str, context: Context) -> tuple[str, Correlation]:
     """The absolute path and the matrix."""
-    file = (context.base / path).absolute()
     try:
-        return str(file), Correlation(read_covariance(Matrix(file.expanduser(), "1", "1")))
+        file = (context.base / expanded(path)).absolute()
+        return str(file), Correlation(read_covariance(Matrix(file, "1", "1")))
     except (DataError, ValueError) as error:
         raise ConfigError(str(error)) from None
 

@@ -245,12 +245,14 @@ class _Run:
             return
         start, end = self.times[self.start : self.start + 2]
 
-        def run(members: list[int]) -> tuple[Array, tuple[str, ...]]:
-            try:
-                paths = propagate(self.model, self.ensemble[members], start, np.array([end]), self.executor)
-            except MembersLost as lost:
-                return np.full((len(members), self.ensemble.shape[1]), np.nan), tuple(lost.reasons)
-            return paths[:, 0], ("",) * len(members)
+        def run(members: list[int]) -> tuple[Array, list[str]]:
+            states, failures = np.full((len(members), self.ensemble.shape[1]), np.nan), [""] * len(members)
+            for row, i in enumerate(members):  # one by one: where one is lost, the other is not
+                try:
+                    states[row] = propagate(self.model, self.ensemble[[i]], start, np.array([end]), self.executor)[0, 0]
+                except MembersLost as lost:
+                    (failures[row],) = lost.reasons
+            return states, failures
 
         both = [0, len(self.ensemble) - 1]
         states, failures = run(both)

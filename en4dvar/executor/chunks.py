@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,7 @@ def run_chunk(model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
     if has_time_limit() and len(x) > model.batch:
         return _by_batch(model, x, times)
     try:
-        with np.errstate():  # what a model sets is not for us
+        with without_warnings():
             outcomes = within_time_limit(lambda: kept(model.trajectories(x, times)))
         reason = f"the model returned {len(outcomes)} trajectories for {len(x)} members"
     except TimeLimitError as error:
@@ -58,3 +59,12 @@ def _by_batch(model: ForwardModel, x: Array, times: Array) -> list[Outcome]:
 def kept(outcomes: Sequence[Outcome]) -> Sequence[Outcome]:
     """A batch as it is, anything else as a list."""
     return outcomes if isinstance(outcomes, Batch) else list(outcomes)
+
+
+def without_warnings() -> np.errstate:
+    """Within, numpy does not warn of an overflow, say: a member that it spoils fails, and says so itself.
+
+    What a model sets is for the model alone.
+    """
+    quiet: dict[str, Any] = {kind: "ignore" for kind, told in np.geterr().items() if told == "warn"}
+    return np.errstate(**quiet)
