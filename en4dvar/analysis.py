@@ -10,6 +10,7 @@ import numpy as np
 from en4dvar.caution import Caution
 from en4dvar.observations import Observations
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.residuals import Residuals
 from en4dvar.state import Array, Parameter
 
 
@@ -65,6 +66,19 @@ Progress = Callable[[str, Record], None]  # what hears of them, with the name of
 
 
 @dataclass(frozen=True)
+class Discrepancy:
+    """What the model misses, given the residual at the centre: ``mean`` and ``std`` (K,) in the observable's unit.
+
+    ``shares`` (n, 3) divide the posterior variance of each parameter, transformed and in the linear approximation at
+    the centre, into what comes from the readings' errors, from the discrepancy, and from the prior; rows sum to 1.
+    """
+
+    mean: Array
+    std: Array
+    shares: Array
+
+
+@dataclass(frozen=True)
 class Analysis:
     """The outcome for one data set: members in order, physical SI values, NaN where a member failed.
 
@@ -98,6 +112,8 @@ class Analysis:
     shape: Mapping[str, float] = field(default_factory=dict)  # how Gaussian the posterior is (en4dvar.sampling.shape)
     down_weights: Array | None = None  # (K,) of observations in a robust cost, at the centre; None with Gaussian errors
     refinement: Mapping[str, float] = field(default_factory=dict)  # summary of the Markov chain, if any
+    residuals: Residuals | None = None  # whitened, at the centre, with what is expected of them
+    discrepancy: Discrepancy | None = None  # of the model, at the centre; None where none is allowed for
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) of the model's limits, by the posterior
 
     @property

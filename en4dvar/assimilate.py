@@ -8,18 +8,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar import diagnostics as diag
-from en4dvar.analysis import Analysis, Progress, Record
+from en4dvar.analysis import Analysis, Discrepancy, Progress, Record
 from en4dvar.caution import Caution, caution
 from en4dvar.descent.loop import iterate
+from en4dvar.descent.marginal import marginal_members
 from en4dvar.descent.noise_scale import mean_beyond_mode
 from en4dvar.descent.start import StartState, choose_start
+from en4dvar.descent.variance import shares_of_variance
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, log_posterior
 from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.honesty import ControlEnsembles, examine
+from en4dvar.noise import Predicted
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.residuals import Residuals
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.shape import examine_shape, guide
 from en4dvar.schemes import window_scheme
@@ -111,9 +115,11 @@ class _Assimilation:
         self.progress, self._keep = progress, keep
         self.scheme = window_scheme(settings)
         robust = np.isfinite(problem.observations.noise.counts_within)
-        if not self.scheme.searches and (problem.has_noise_scale or robust):
+        estimated = any(p.name in problem.prior.names for p in problem.discrepancy)
+        if not self.scheme.searches and (problem.has_noise_scale or robust or estimated):
             raise ConfigError(
-                f"{settings.scheme} takes Gaussian errors of known std: neither sigma nor a robust cost; use en4dvar"
+                f"{settings.scheme} takes Gaussian errors of known covariance: neither sigma nor a robust cost nor a "
+                "discrepancy; use en4dvar"
             )
         self.space = WeightSpace(problem, settings, seed, executor)
         self.grid = np.linspace(problem.observations.times[0], problem.observations.times[-1], GRID_POINTS)
@@ -131,6 +137,8 @@ class _Assimilation:
         ends = space.ensemble(descent.weights.w, transform)
         posterior, mode = ends[:-1], ends[-1]
         posterior = posterior + mean_beyond_mode(problem, mode, posterior, descent.records[-1].dfs)
+        if self.scheme.searches and problem.discrepancy and descent.iterate.linear is not None:
+            posterior = marginal_members(space, descent.iterate.linear, mode, posterior, self.seed)
         posterior, refinement, refine_warnings = self.refine(posterior, start.refinement)
         if self.scheme.searches or refinement:
             ends = np.vstack([posterior, mode])
@@ -154,7 +162,7 @@ class _Assimilation:
             prior_predictions=prior_run.predictions[:-1],
             posterior_predictions=after.predictions,
             centre_predictions=last.predictions[0],
-            error_std=noise.error_std(last.predicted[0]),
+            error_std=noise.total_std(last.predicted[0]),
             log_likelihood=observations.log_likelihood(after.predicted),
             trajectory_times=self.grid,
             prior_trajectories=prior_run.path[:-1],
@@ -173,10 +181,30 @@ class _Assimilation:
                 descent.iterate.cost, descent.newton.hessian.singular_values, len(space.members), observations
             ),
             extremes=after.extremes,
+            residuals=self.residuals(descent),
+            discrepancy=self.discrepancy(descent, last.predicted[0]),
         )
         control = ControlEnsembles(space.members, posterior, mode, costs, centre_cost)
         found = (*start.warnings, *refine_warnings)
         return replace(analysis, cautions=examine(analysis, control, descent.worst_loss, found))
+
+    def residuals(self, descent: Descent) -> Residuals | None:
+        """Of the linearisation at the end."""
+        observations, linear = self.problem.observations, descent.iterate.linear
+        if linear is None:
+            return None
+        at = linear.prediction
+        rates = np.gradient(at.values, observations.times) if at.rates is None else at.rates
+        white, sensitivity = observations.whiten(linear)
+        return Residuals.of(white, sensitivity, len(self.space.members) - 1, np.abs(rates), observations.used)
+
+    def discrepancy(self, descent: Descent, central: Predicted) -> Discrepancy | None:
+        """Of the model, where the observations allow for one."""
+        observations, linear = self.problem.observations, descent.iterate.linear
+        explained = observations.noise.explained(observations.values, central)
+        if explained is None or linear is None:
+            return None
+        return Discrepancy(*explained, shares_of_variance(self.space, linear))
 
     def start(self, prior_run: Forecast, resume: LoopState | None) -> LoopState:
         """The state from which the iterations go on."""

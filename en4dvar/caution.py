@@ -20,6 +20,11 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
     ),
     "rank-deficient": ("serious", "give more members than parameters (assimilation.members), or sampling: exact"),
     "misfit": ("serious", "look at the residuals: model, window or stated observation error must change"),
+    "residual-structure": (
+        "serious",
+        "let the data tell what the model misses (data.error.discrepancy: estimated), choose another model, or a "
+        "shorter window; a larger error or sigma would hide it and leave the estimates where they are",
+    ),
     "prior-conflict": ("serious", "check units and data; if both are right, widen the prior and say so"),
     "model-validity": (
         "serious",
@@ -32,6 +37,10 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
     "at-bound": ("caution", "widen the bound if physics allows it; else quote a limit, not mean ± std"),
     "non-gaussian": ("caution", "set assimilation.refine: mcmc, which samples the posterior as it is"),
     "overstated-error": ("caution", "state the observation error as it is (or estimate sigma); intervals are too wide"),
+    "odd-residuals": (
+        "caution",
+        "look at the figure of the residuals and at these readings before quoting the intervals",
+    ),
     "start-moved": ("note", "no action is needed where the iterations converged"),
     "down-weighted": ("note", "look at these observations; they count less than the others"),
     "not-informed": ("note", "do not quote it as measured: fix it, or add data that depend on it"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, MinLen
@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le, MinLen
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior
-from en4dvar.state import NOISE_SCALE, Parameter
+from en4dvar.state import DISCREPANCY, NOISE_SCALE, Parameter
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,8 @@ class InverseProblem:
 
     The control vector holds ``prior.parameters`` in transformed space. A parameter named ``t_s`` shifts the observation
     times: member i is observed at t_k + t_s,i; one named ``sigma`` multiplies the std of every observation error, where
-    the model has no parameter of that name. ``perturbations`` act on the initial state. ``fixed`` are physical SI
+    the model has no parameter of that name. ``discrepancy_amplitude`` and ``discrepancy_length`` are those of the
+    discrepancy that the observations allow for. ``perturbations`` act on the initial state. ``fixed`` are physical SI
     values of the other parameters.
     """
 
@@ -49,6 +50,22 @@ class InverseProblem:
         """Whether ``sigma`` is given and scales the observation errors (rather than being the model's own)."""
         given = NOISE_SCALE.name in self.prior.names or NOISE_SCALE.name in self.fixed
         return given and all(p.name != NOISE_SCALE.name for p in self.model.parameters)
+
+    @property
+    def discrepancy(self) -> tuple[Parameter, ...]:
+        """Amplitude and length of the model's discrepancy, in the units of the problem; () without one."""
+        if not self.observations.noise.discrepant:
+            return ()
+        return discrepancy_parameters(self.model, self.observable)
+
+
+def discrepancy_parameters(model: ForwardModel, observable: Observable) -> tuple[Parameter, Parameter]:
+    """:data:`~en4dvar.state.DISCREPANCY` in the units of an observable and of the model's time."""
+    amplitude, length = DISCREPANCY
+    return (
+        replace(amplitude, unit=observable.unit, display_unit=observable.display_unit),
+        replace(length, unit=model.time_unit, display_unit=model.time_display_unit),
+    )
 
 
 Positive = Annotated[float, Gt(0)]

@@ -69,6 +69,28 @@ NOISE_SCALE = Parameter(
 )
 
 
+DISCREPANCY = (
+    Parameter(
+        name="discrepancy_amplitude",
+        unit="1",
+        transform="lognormal",
+        bounds=(0.0, np.inf),
+        label="amplitude of the discrepancy",
+        symbol=r"$a_\delta$",
+        source="standard deviation of the Gaussian process that y − m is beside its errors; in the observable's unit",
+    ),
+    Parameter(
+        name="discrepancy_length",
+        unit="s",
+        transform="lognormal",
+        bounds=(0.0, np.inf),
+        label="correlation time of the discrepancy",
+        symbol=r"$\ell_\delta$",
+        source="time over which the discrepancy forgets itself; in the model's time unit",
+    ),
+)
+
+
 @dataclass(frozen=True)
 class Field:
     """A named block of a state vector; a perturbed initial state must lie strictly inside its ``bounds``."""

@@ -23,7 +23,7 @@ from en4dvar.inputs.window import select
 from en4dvar.noise import Noise, noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import InverseProblem
+from en4dvar.problem import InverseProblem, discrepancy_parameters
 from en4dvar.state import Array
 from en4dvar.units import UnitError, convert
 
@@ -66,7 +66,7 @@ def build_one(config: Config, name: str, path: Path) -> InverseProblem:
 def problem_of(config: Config, observations: Observations) -> InverseProblem:
     """The inverse problem of observations, wherever they come from. Raises :class:`ConfigError`."""
     terms, fixed = resolve_parameters(config, observations)
-    terms = (*terms, *(perturbed.term for perturbed in config.initial_state))
+    terms = (*terms, *(perturbed.term for perturbed in config.initial_state), *_discrepancy(config, observations))
     perturbations = tuple(perturbed.perturbation for perturbed in config.initial_state)
     asked = config.assimilation
     if asked.sampling == "exact" and asked.members <= len(terms):
@@ -75,6 +75,15 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
     problem = InverseProblem(config.model, config.observable, observations, Prior(terms), fixed, perturbations)
     check_problem(problem)
     return problem
+
+
+def _discrepancy(config: Config, observations: Observations) -> tuple[PriorTerm, ...]:
+    """Priors of the discrepancy that the observations allow for."""
+    asked = None if config.data is None else config.data.error.discrepancy
+    if asked is None or not observations.noise.discrepant:
+        return ()
+    times, parameters = observations.times, discrepancy_parameters(config.model, config.observable)
+    return asked.terms(parameters, float(observations.values.max()), float(times[-1] - times[0]))
 
 
 def data_files(plan: Data) -> dict[str, Path]:
@@ -176,6 +185,7 @@ def _noise(plan: Data, times: Array, values: Array, samples: npt.NDArray[np.intp
     A covariance file holds one row an observation of the window, or one a usable sample of the whole series.
     """
     error, correlation = plan.error, None
+    kernel = error.discrepancy.kernel_at(times) if error.discrepancy else None
     time_std = np.full(len(times), error.time_std)
     if error.covariance is not None:
         covariance = read_covariance(error.covariance)
@@ -186,13 +196,13 @@ def _noise(plan: Data, times: Array, values: Array, samples: npt.NDArray[np.intp
         std = np.sqrt(np.diag(covariance))
         correlation = covariance / np.outer(std, std)
         np.fill_diagonal(correlation, 1.0)
-        return noise_of(std, time_std, correlation)
+        return noise_of(std, time_std, correlation, discrepancy=kernel)
     if error.std is None:
         raise ConfigError("data.error: neither a std nor a covariance")
     std = np.full(len(times), error.std.absolute(float(values.max())))
     if error.correlation_time is not None:
         correlation = np.exp(-np.abs(np.subtract.outer(times, times)) / error.correlation_time)
-    return noise_of(std, time_std, correlation, error.huber)
+    return noise_of(std, time_std, correlation, error.huber, kernel)
 
 
 def resolve_parameters(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
 from en4dvar.config.context import (
     PLACEHOLDER,
@@ -30,9 +31,13 @@ from en4dvar.hints import shown, suggest
 from en4dvar.inputs.readers import Column, Format, Matrix, TimeStep
 from en4dvar.inputs.text_table import Decimal
 from en4dvar.inputs.window import Instant, parse_instant
+from en4dvar.noise import SMOOTHNESS, Kernel
+from en4dvar.prior import PriorTerm
+from en4dvar.state import Array, Parameter
 from en4dvar.units import UnitError, parse_quantity
 
 _RELATIVE = re.compile(r"(.*%)\s+of\s+(?:the\s+)?maximum")
+_OF_WINDOW = re.compile(r"(.*%)\s+of\s+(?:the\s+)?window")
 HUBER = 1.345  # 95 % efficiency where the errors are Gaussian after all: Huber (1981), Robust Statistics
 
 
@@ -169,8 +174,75 @@ def _error_std(text: Any, context: Context) -> Spread:
     return spread
 
 
+def _length(text: Any, context: Context) -> Spread:
+    relative = _OF_WINDOW.fullmatch(str(text).strip())
+    spread = Spread(
+        parse_quantity(relative[1] if relative else text, "1" if relative else time_unit(context)), bool(relative)
+    )
+    require_sign(spread.value, "positive", text)
+    return spread
+
+
+def _rate_unit(context: Context) -> str:
+    return f"({observable_unit(context)})/({time_unit(context)})"
+
+
+LogStd = Annotated[float, Field(gt=0)]
+
+
+class AmplitudeSection(Section):
+    """Lognormal prior of the discrepancy's standard deviation."""
+
+    median: Annotated[Spread, Made(_error_std)] = Field("0.5 % of maximum", validate_default=True)
+    """A quantity in the observable's unit, or e.g. '2 % of maximum'."""
+    log_std: LogStd = 1.5
+    """Standard deviation of the natural logarithm."""
+
+
+class LengthSection(Section):
+    """Lognormal prior of the time over which the discrepancy forgets itself."""
+
+    median: Annotated[Spread, Made(_length)] = Field("10 % of window", validate_default=True)
+    """A time, or e.g. '10 % of window'."""
+    log_std: LogStd = 0.7
+    """Standard deviation of the natural logarithm."""
+
+
+class DiscrepancySection(Section):
+    """What the model misses: a Gaussian process beside the errors whose amplitude and length are estimated."""
+
+    amplitude: AmplitudeSection = Field({}, validate_default=True)
+    """Prior of ``discrepancy_amplitude``, its standard deviation."""
+    length: LengthSection = Field({}, validate_default=True)
+    """Prior of ``discrepancy_length``, its correlation time."""
+    kernel: Literal["exponential", "matern-3/2", "matern-5/2"] = "exponential"
+    """Correlation in time: exponential (rough paths), or Matérn's with one or two derivatives."""
+    grows_beyond: Annotated[float | None, quantity(_rate_unit, "positive")] = None
+    """Rate of the observable beyond which the amplitude grows in proportion to it, e.g. 20 m/s; default: constant."""
+
+    def kernel_at(self, times: Array) -> Kernel:
+        """The kernel at observation times (K,)."""
+        return Kernel(times, SMOOTHNESS[self.kernel], self.grows_beyond or math.inf)
+
+    def terms(self, parameters: tuple[Parameter, Parameter], maximum: float, window: float) -> tuple[PriorTerm, ...]:
+        """Priors of amplitude and length, from the largest observation and the duration of the window."""
+        amplitude, length = parameters
+        return (
+            PriorTerm.lognormal(amplitude, self.amplitude.median.absolute(maximum), self.amplitude.log_std),
+            PriorTerm.lognormal(length, self.length.median.absolute(window), self.length.log_std),
+        )
+
+
+def _estimated(given: Any) -> Any:
+    if given == "estimated":
+        return {}
+    if given is not None and not isinstance(given, dict):
+        raise ValueError("write estimated, or the priors of its amplitude and length")
+    return given
+
+
 class Error(Section):
-    """Observation errors: a std or a whole covariance, errors of the times, a correlation, a robust cost."""
+    """Observation errors: a std or a covariance, of the times, correlation, a robust cost, what the model misses."""
 
     model_config = ConfigDict(populate_by_name=False)
     std: Annotated[Spread | None, Made(_error_std)] = Field(None, alias=f"{PLACEHOLDER}_std")
@@ -185,6 +257,11 @@ class Error(Section):
     """Robust cost: readings far off count less."""
     threshold: Annotated[float, quantity(lambda c: "1", "positive")] = HUBER
     """Threshold of the robust cost in std."""
+    discrepancy: Annotated[
+        DiscrepancySection | None,
+        BeforeValidator(_estimated, json_schema_input_type=Literal["estimated"] | DiscrepancySection | None),
+    ] = None
+    """What the model misses: ``estimated``, or priors. Adds ``discrepancy_amplitude`` and ``discrepancy_length``."""
 
     @classmethod
     def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
@@ -243,7 +320,8 @@ class Data(Section):
     time_zero: Annotated[Literal["file", "window"] | float, Made(_time_zero)] = Field("file", validate_default=True)
     """Where the model's clock starts: file (the file's own zero), window (the first observation used), or a time."""
     error: Annotated[Error, OfObservable()]
-    """Observation errors: ``<observable>_std``, ``time_std``, ``correlation_time``, ``covariance`` or ``robust``."""
+    """Observation errors: ``<observable>_std``, ``time_std``, ``correlation_time``, ``covariance``, ``robust``,
+    ``discrepancy``."""
 
     @classmethod
     def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:

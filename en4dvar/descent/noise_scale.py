@@ -24,12 +24,13 @@ from en4dvar.state import NOISE_SCALE, Array
 
 
 def mean_beyond_mode(problem: InverseProblem, mode: Array, posterior: Array, dfs: float) -> Array:
-    """What to add to the ``mode`` (n,) for the mean (n,); zero without a noise scale.
+    """What to add to the ``mode`` (n,) for the mean (n,); zero without a noise scale, or beside a discrepancy,
+    where all parameters of the errors are marginalised (:mod:`en4dvar.descent.marginal`).
 
     ``posterior`` (N, n) are members whose covariance is C, ``dfs`` = tr (M + U) C; all in transformed space.
     """
     prior, name = problem.prior, NOISE_SCALE.name
-    if name not in prior.names or not problem.has_noise_scale:
+    if name not in prior.names or not problem.has_noise_scale or problem.discrepancy:
         return np.zeros(len(mode))
     column = prior.names.index(name)
     anomalies = posterior - posterior.mean(axis=0)

@@ -23,9 +23,10 @@ SAME_INSTANT = 1e-9  # of the window: an extra time this close to an observation
 class Forecast:
     """Predictions of B members; NaN rows where a member failed.
 
-    ``predicted`` (B, …) at the observations: predictions (B, K), their rates where an observation has a timing error,
-    the noise scale where there is one; ``path`` (B, M) at the extra times, ``failures`` (B,) reasons, "" for members
-    alive, ``extremes`` (B, V) what the members reached of the model's V limits of validity (empty without extra times).
+    ``predicted`` (B, …) at the observations: predictions (B, K), their rates where R depends on them, the noise scale
+    and the discrepancy where there is one; ``path`` (B, M) at the extra times, ``failures`` (B,) reasons, "" for
+    members alive, ``extremes`` (B, V) what the members reached of the model's V limits of validity (empty without extra
+    times).
     """
 
     predicted: Predicted
@@ -64,7 +65,7 @@ class Composite:
         self.problem, self.executor = problem, executor or SerialExecutor()
         self._initial_states = InitialStates(problem)
         self._reading = {limits: _reading(problem, limits) for limits in (False, True)}
-        self._scaled = problem.has_noise_scale
+        self._scaled, self._discrepancy = problem.has_noise_scale, problem.discrepancy
 
     def __call__(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
         """Run control vectors ``x`` (B, n; transformed) through F and H.
@@ -94,6 +95,9 @@ class Composite:
             observed[0][:, at_observations],
             observed[1][:, at_observations] if len(observed) > 1 else None,
             _of_framework(problem, physical, NOISE_SCALE, 1.0) if self._scaled else None,
+            np.stack([_of_framework(problem, physical, p, np.nan) for p in self._discrepancy], axis=1)
+            if self._discrepancy
+            else None,
         )
         return Forecast(predicted, observed[0][:, at_extra], tuple(failures), extremes)
 
@@ -134,11 +138,12 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
         observable without a rate.
     """
     perturbed = [p.parameter for p in problem.perturbations]
-    known = {p.name: p for p in (TIME_SHIFT, NOISE_SCALE, *perturbed, *problem.model.parameters)}
+    discrepancy = problem.discrepancy
+    known = {p.name: p for p in (TIME_SHIFT, NOISE_SCALE, *discrepancy, *perturbed, *problem.model.parameters)}
     estimated, fixed = set(problem.prior.names), set(problem.fixed)
     if unknown := {p.field for p in problem.perturbations} - set(problem.model.layout.names):
         raise ConfigError(f"initial_state: {', '.join(sorted(unknown))}: not a field of the model's state")
-    required = {p.name for p in (*perturbed, *problem.model.parameters)} - {TIME_SHIFT.name}
+    required = {p.name for p in (*discrepancy, *perturbed, *problem.model.parameters)} - {TIME_SHIFT.name}
     for names, message in (
         (required - estimated - fixed, "neither fixed nor estimated"),
         (estimated & fixed, "both fixed and estimated"),
@@ -151,16 +156,15 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
 
 
 def _reading(problem: InverseProblem, limits: bool) -> Reading:
-    """H; its rate where an observation has a timing error; the model's limits of validity where asked for."""
+    """H; its rate where R depends on it; the model's limits of validity where asked for."""
     operator = problem.observable.operator
     largest = tuple(limit.name for limit in problem.model.validity) if limits else ()
     batched = getattr(operator, "batched", False)
-    if not problem.observations.noise.timed:
+    if not problem.observations.noise.needs_rates:
         return Reading((operator,), largest, batched)
     if not isinstance(operator, RateOperator):
-        raise ConfigError(
-            f"a timing error needs the rate of {problem.observable.name}, which the model does not provide"
-        )
+        what = "a timing error" if problem.observations.noise.timed else "a discrepancy that grows with the rate"
+        raise ConfigError(f"{what} needs the rate of {problem.observable.name}, which the model does not provide")
     return Reading((operator, operator.rate), largest, batched)
 
 

@@ -14,12 +14,14 @@ from en4dvar.caution import Caution, caution
 from en4dvar.diagnostics import HARDLY_INFORMED, chi2_interval
 from en4dvar.forward import ValidityLimit
 from en4dvar.prior import Prior
+from en4dvar.residuals import Residuals
 from en4dvar.state import Array
 from en4dvar.units import convert
 
 SAME_DIRECTION = 1e-8  # relative singular value below which anomalies do not span a direction
 NEAR = 0.05  # of the width of an interval
 PILED_UP = 0.2  # share of members near a bound
+ODD = 1e-3  # probability below which residuals are told to be odd
 BEYOND = 0.1  # share of members beyond a limit of the model
 Findings = Iterator[Caution]
 
@@ -51,6 +53,43 @@ def fit(chi2: float, n_observations: int, total_dfs: float) -> Findings:
     elif chi2 < low:
         words = f"{words}: the stated observation error is larger than the scatter of the data"
         yield caution("overstated-error", words)
+
+
+def structure(residuals: Residuals | None, robust: bool, unit: str, times: Array) -> Findings:
+    """Residuals that are not the independent numbers of one variance that they should be.
+
+    Each probability is that of a finding at least as odd where model, prior and errors are right; :data:`ODD` keeps all
+    together below half a per cent. ``times`` (K,) of all observations in ``unit``.
+    """
+    if residuals is None or not residuals.enough:
+        return
+    runs, expected = residuals.runs
+    chance = min(residuals.lag_one_chance, residuals.runs_chance)
+    if chance < ODD:
+        words = (
+            f"the residuals have a structure in time: their lag-1 autocorrelation is {residuals.lag_one:.2f}, and they "
+            f"have {runs} runs of one sign where about {expected:.0f} are expected (probability {_chance(chance)} "
+            "where the model is right): error bars are those of independent errors"
+        )
+        yield caution("residual-structure", words)
+    if residuals.collapse_chance < ODD:
+        words = (
+            "the residuals are larger where the observable changes fast (probability "
+            f"{_chance(residuals.collapse_chance)} where the errors are as stated): the times or the model err there"
+        )
+        yield caution("odd-residuals", words)
+    if not robust and residuals.outlier[1] < ODD:
+        which, probability = residuals.outlier
+        place = int(np.flatnonzero(residuals.which == which)[0])
+        words = (
+            f"the reading at {times[which]:.4g} {unit} is {abs(residuals.studentised[place]):.1f} standard deviations "
+            f"off (probability {_chance(probability)}); its leverage is {residuals.leverage[place]:.0%}"
+        )
+        yield caution("odd-residuals", words)
+
+
+def _chance(probability: float) -> str:
+    return f"{probability:.1g}" if probability > 1e-6 else "below 1e-6"
 
 
 def conflict(prior: Prior, centre: Array) -> Findings:

@@ -10,15 +10,20 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.analysis import Analysis
-from en4dvar.caution import Caution, caution, worst_first
+from en4dvar.caution import CATALOGUE, Caution, caution, worst_first
 from en4dvar.diagnostics import active_members, shape_warnings
 from en4dvar.honesty import checks
 from en4dvar.honesty.lost import loss
 from en4dvar.prior import Prior
 from en4dvar.state import Array
+from en4dvar.units import convert
 
 COLLAPSED = 1 / 9  # of the mean of 2 (J − J_min) per parameter: a spread below a third of what J allows
 SHORT_STEP = 0.5  # posterior standard deviations
+OTHER_KERNEL = (
+    "the discrepancy has another shape than its kernel: try data.error.discrepancy.kernel: matern-3/2, or "
+    "grows_beyond, and compare the evidence"
+)
 NO_SPREAD = 1e-8  # of the prior's: members that agree to rounding
 
 
@@ -47,9 +52,9 @@ def examine(
     ``worst_loss`` (N,) are the reasons of failure, "" for a member alive, in the iteration that lost most; ``found``
     are warnings met on the way.
     """
-    a, problem, last = analysis, analysis.problem, analysis.iterations[-1]
-    prior, n_used = problem.prior, len(problem.observations.used)
+    a, problem, prior = analysis, analysis.problem, analysis.problem.prior
     alive = active_members(a.posterior_failures)
+    odd = _structure(a)
     return worst_first(
         (
             *found,
@@ -60,7 +65,8 @@ def examine(
             *loss("prior forecast", a.prior_failures, prior, control.prior),
             *loss("iterations", worst_loss, prior),
             *loss("posterior forecast", a.posterior_failures, prior, control.posterior),
-            *checks.fit(last.chi2_per_observation * n_used, n_used, last.dfs),
+            *_fit(a, odd),
+            *odd,
             *checks.conflict(prior, control.centre),
             *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
             *(checks.validity(problem.model.validity, a.extremes[alive]) if problem.model.validity else ()),
@@ -68,6 +74,24 @@ def examine(
             *checks.information(prior.names, a.dfs_per_parameter),
         )
     )
+
+
+def _structure(a: Analysis) -> tuple[Caution, ...]:
+    model, observations = a.problem.model, a.problem.observations
+    times = convert(observations.times, model.time_unit, model.time_display_unit)
+    robust = math.isfinite(observations.noise.counts_within)
+    found = tuple(checks.structure(a.residuals, robust, model.time_display_unit, times))
+    return tuple(replace(c, advice=OTHER_KERNEL) for c in found) if a.discrepancy else found
+
+
+def _fit(a: Analysis, odd: Sequence[Caution]) -> checks.Findings:
+    """The size of the residuals; where they have a structure, no scale of the errors is offered as a cure."""
+    last, n_used = a.iterations[-1], len(a.problem.observations.used)
+    structured = any(c.code == "residual-structure" for c in odd)
+    for one in checks.fit(last.chi2_per_observation * n_used, n_used, last.dfs):
+        if structured and one.code == "overstated-error":
+            one = replace(one, advice=CATALOGUE["residual-structure"][1])
+        yield one
 
 
 def unfinished(analysis: Analysis) -> checks.Findings:

@@ -83,6 +83,34 @@ def history(result: StoredResult) -> Figure:
 
 
 @styled
+def residuals(result: StoredResult) -> Figure:
+    """Whitened residuals in time, their autocorrelation, normal quantiles, leverages; the discrepancy if any."""
+    name, stats = result.observable, result.sample_stats
+    time = _shown(result.observed_data["time"])
+    white, studentised, leverage = (
+        np.asarray(stats[f"{name}_{key}"].values) for key in ("whitened_residual", "studentised", "leverage")
+    )
+    counts = np.isfinite(white)
+    label = with_unit("time", result.observed_data["time"].attrs["display_units"])
+    discrepant = f"{name}_discrepancy" in stats
+    figure = Figure(figsize=(COLUMN, (13.0 if discrepant else 10.0) / 2.54), layout="constrained")
+    grid = figure.add_gridspec(3 if discrepant else 2, 3)
+    top, below = figure.add_subplot(grid[0, :]), grid.nrows - 1
+    top.axhline(0, color=LIGHT["muted"], lw=0.6)
+    top.plot(time[counts], white[counts], "-", color=LIGHT["muted"], lw=0.5)
+    top.plot(time[counts], white[counts], "o", ms=2.2, color=LIGHT["ink"])
+    top.set(xlabel=label, ylabel="whitened residual")
+    if discrepant:
+        _discrepancy(figure.add_subplot(grid[1, :]), result, time, label)
+    _autocorrelation(figure.add_subplot(grid[below, 0]), white[counts])
+    _quantiles(figure.add_subplot(grid[below, 1]), studentised[counts])
+    ax = figure.add_subplot(grid[below, 2])
+    ax.vlines(time[counts], 0, leverage[counts], color=LIGHT["posterior"], lw=0.9)
+    ax.set(xlabel=label, ylabel="leverage", ylim=(0, None))
+    return figure
+
+
+@styled
 def cost(result: StoredResult) -> Figure:
     """J and its two terms over the iterations; logarithmic where J falls by more than a factor of 20."""
     steps = result.iterations["iteration"].values
@@ -161,10 +189,50 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
         "residual of the centre over its standard deviation.",
         history(result),
     )
+    if f"{result.observable}_whitened_residual" in result.sample_stats:
+        yield (
+            "residuals",
+            "Residuals of the centre, whitened: in time (below it a discrepancy, mean ± std), their "
+            "autocorrelation (band: 95 % of independent numbers), against normal quantiles; leverages.",
+            residuals(result),
+        )
     yield "cost", "The cost J and its two terms at the iterate that starts each iteration.", cost(result)
     yield "iterations", "Parameters over the iterations: ensemble mean ± std (blue), centre (dashed).", traces(result)
     if 2 <= len(result.posterior.data_vars) <= MAX_PAIRS and result.alive.sum() > 2:
         yield "pairs", "Posterior members in pairs of parameters; above the diagonal the correlation.", pairs(result)
+
+
+def _discrepancy(ax: Axes, result: StoredResult, time: Array, label: str) -> None:
+    """Data less the centre, and mean ± std of what the model misses."""
+    name, stats = result.observable, result.sample_stats
+    residual = _shown(result.observed_data[name]) - _shown(stats[f"{name}_centre"])
+    mean, std = _shown(stats[f"{name}_discrepancy"]), _shown(stats[f"{name}_discrepancy_std"])
+    ax.axhline(0, color=LIGHT["muted"], lw=0.6)
+    ax.fill_between(time, mean - std, mean + std, color=LIGHT["posterior"], alpha=0.35, lw=0, label="discrepancy ± std")
+    ax.plot(time, residual, "o", ms=2.2, color=LIGHT["ink"], label="data − centre")
+    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
+    ax.set(xlabel=label, ylabel=with_unit("residual", str(stats[f"{name}_discrepancy"].attrs["display_units"])))
+
+
+def _autocorrelation(ax: Axes, white: Array) -> None:
+    lags = max(1, min(15, len(white) // 3))
+    correlation = [float(white[lag:] @ white[:-lag]) / float(white @ white) for lag in range(1, lags + 1)]
+    limit = 1.96 / np.sqrt(len(white))
+    ax.axhspan(-limit, limit, color=LIGHT["posterior"], alpha=0.16, lw=0)
+    ax.axhline(0, color=LIGHT["muted"], lw=0.6)
+    ax.vlines(np.arange(1, lags + 1), 0, correlation, color=LIGHT["ink"], lw=1.2)
+    ax.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+    ax.set(xlabel="lag", ylabel="autocorrelation", ylim=(min(-0.6, *correlation), max(1.0, *correlation)))
+
+
+def _quantiles(ax: Axes, values: Array) -> None:
+    from scipy.special import ndtri
+
+    expected = ndtri((np.arange(len(values)) + 0.5) / len(values))
+    reach = float(np.max(np.abs(expected))) * 1.1
+    ax.plot([-reach, reach], [-reach, reach], color=LIGHT["muted"], lw=0.6)
+    ax.plot(expected, np.sort(values), "o", ms=2, color=LIGHT["ink"])
+    ax.set(xlabel="normal quantile", ylabel="residual / std")
 
 
 def _reach(prior: Array, posterior: Array) -> tuple[float | None, float | None]:

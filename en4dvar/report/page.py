@@ -11,7 +11,7 @@ from en4dvar.diagnostics import chi2_interval
 from en4dvar.report.html import render
 from en4dvar.report.style import Drawing
 from en4dvar.report.text import number_like, plain_number
-from en4dvar.storage.groups import ITERATION_SCALARS
+from en4dvar.storage.groups import ITERATION_SCALARS, SHARES
 from en4dvar.storage.store import StoredResult
 from en4dvar.units import convert
 
@@ -41,6 +41,8 @@ def render_set(
         rows=result.summary(),
         cautions=result.cautions,
         tiles=_tiles(result),
+        shares=_shares(result),
+        discrepancy_share=result.sample_stats.attrs.get("discrepancy_share"),
         identifiers=IDENTIFIERS,
         figures=figures,
         lost=[(i, str(reason)) for i, reason in enumerate(reasons) if reason],
@@ -56,7 +58,8 @@ def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
     s = result.sample_stats.attrs
     alive, members, n_estimated = int(s["n_active"]), int(s["n_members"]), len(result.posterior.data_vars)
     chi2, dfs, nrmse = (float(s[key]) for key in ("chi2_per_observation", "dfs", "nrmse"))
-    chi2_words, chi2_odd = judge_chi2(chi2, int(s["n_weighted"]), dfs)
+    structured = any(c.code in ("residual-structure", "odd-residuals") for c in result.cautions)
+    chi2_words, chi2_odd = judge_chi2(chi2, int(s["n_weighted"]), dfs, structured)
     informed = f"of {n_estimated} parameters determined by the data"
     ended = "by its own criterion" if s["converged"] else "not converged"
     return [
@@ -68,8 +71,11 @@ def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
     ]
 
 
-def judge_chi2(chi2: float, n_observations: int, dfs: float) -> tuple[str, bool]:
-    """What χ² per observation says in plain words, and whether it needs attention (as warnings of the run do)."""
+def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = False) -> tuple[str, bool]:
+    """What χ² per observation says in plain words, and whether it needs attention (as warnings of the run do).
+
+    ``structured``: the residuals have a structure, which their size does not show.
+    """
     if not math.isfinite(chi2):
         return "cannot be told", True
     low, high = chi2_interval(max(1.0, n_observations - dfs))
@@ -78,7 +84,22 @@ def judge_chi2(chi2: float, n_observations: int, dfs: float) -> tuple[str, bool]
         return f"misfit exceeds the stated noise: model or noise is wrong; {expected}", True
     if chi2 * n_observations < low:
         return f"misfit is below the stated noise, which may be overstated; {expected}", True
+    if structured:
+        return f"the size of the misfit is as stated, its structure is not; {expected}", True
     return f"misfit agrees with the stated noise; {expected}", False
+
+
+def _shares(result: StoredResult) -> list[tuple[str, str, str, list[str]]]:
+    """(symbol, std, unit, its parts from errors, discrepancy and prior) of each parameter; parts add in quadrature."""
+    stats = result.sample_stats
+    if "variance_from_errors" not in stats:
+        return []
+    rows = []
+    for row in result.summary():
+        shares = [float(stats[f"variance_from_{source}"].sel(parameter=row.name)) for source in SHARES]
+        parts = [number_like(row.std * math.sqrt(max(0.0, share)), row.std) for share in shares]
+        rows.append((row.symbol, number_like(row.std, row.std), row.unit, parts))
+    return rows
 
 
 def _fixed(result: StoredResult) -> list[tuple[str, str, float, str]]:

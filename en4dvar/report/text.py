@@ -11,10 +11,10 @@ from en4dvar.diagnostics import HARDLY_INFORMED
 
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _NAMES = (
-    "alpha beta gamma delta epsilon zeta eta theta kappa lambda mu nu xi rho sigma tau phi chi psi omega pi infty "
+    "alpha beta gamma delta epsilon zeta eta theta kappa lambda mu nu xi rho sigma tau phi chi psi omega pi infty ell "
     "Gamma Delta Theta Lambda Sigma Phi Psi Omega"
 )
-_GREEK = dict(zip(_NAMES.split(), "αβγδεζηθκλμνξρστφχψωπ∞ΓΔΘΛΣΦΨΩ", strict=True))
+_GREEK = dict(zip(_NAMES.split(), "αβγδεζηθκλμνξρστφχψωπ∞ℓΓΔΘΛΣΦΨΩ", strict=True))
 
 DFS_WORDS = (
     (HARDLY_INFORMED, "data say nothing"),

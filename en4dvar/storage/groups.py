@@ -178,12 +178,49 @@ def _sample_stats(a: Analysis) -> Variables:
         "centre": _variable("parameter", a.centre, "1", centre),
         "dfs": _variable("parameter", a.dfs_per_parameter, "1", "degrees of freedom for signal of the parameter"),
         f"{name}_centre": _observable(a, ("time",), a.centre_predictions, "prediction at the minimum of J"),
+        **_residuals(a),
+        **_discrepancy(a),
         **{
             f"{v.name}_reached": _variable(
                 MEMBER, a.extremes[None, :, i], v.unit, v.label, limit=v.value, source=v.source
             )
             for i, v in enumerate(a.problem.model.validity)
         },
+    }
+
+
+def _residuals(a: Analysis) -> Variables:
+    """Whitened residuals and leverages (time), NaN where a reading does not count."""
+    name, found = a.problem.observable.name, a.residuals
+    if found is None:
+        return {}
+    white, leverage, studentised = np.full((3, len(a.observations)), np.nan)
+    white[found.which], leverage[found.which], studentised[found.which] = found.white, found.leverage, found.studentised
+    return {
+        f"{name}_whitened_residual": _variable("time", white, "1", "whitened residual at the minimum of J"),
+        f"{name}_studentised": _variable("time", studentised, "1", "whitened residual over its own expected std"),
+        f"{name}_leverage": _variable("time", leverage, "1", "share of the reading in its own prediction"),
+    }
+
+
+SHARES = ("errors", "discrepancy", "prior")
+
+
+def _discrepancy(a: Analysis) -> Variables:
+    """What the model misses (time), and where the variance of each parameter comes from (parameter)."""
+    name, found = a.problem.observable.name, a.discrepancy
+    if found is None:
+        return {}
+    shares = {
+        f"variance_from_{source}": _variable(
+            "parameter", found.shares[:, i], "1", f"share of the posterior variance that comes from the {source}"
+        )
+        for i, source in enumerate(SHARES)
+    }
+    return {
+        f"{name}_discrepancy": _observable(a, ("time",), found.mean, "what the model misses, at the minimum of J"),
+        f"{name}_discrepancy_std": _observable(a, ("time",), found.std, "std of what the model misses"),
+        **shares,
     }
 
 
@@ -206,9 +243,31 @@ def _scalars(a: Analysis) -> dict[str, Any]:
         "stop_reason": a.stop_reason,
         "forward_runs": a.forward_runs,
         "warning_codes": " ".join(codes(a.cautions)),
+        **_judged_residuals(a),
         **a.shape,
         **a.refinement,
     }
+
+
+def _judged_residuals(a: Analysis) -> dict[str, Any]:
+    """Numbers that say whether the residuals have a structure; none where there are too few readings."""
+    found = a.residuals
+    numbers: dict[str, Any] = {}
+    if found is not None and found.enough:
+        numbers |= {
+            "residual_lag_one": found.lag_one,
+            "residual_lag_one_chance": found.lag_one_chance,
+            "residual_runs": found.runs[0],
+            "residual_runs_expected": found.runs[1],
+            "residual_runs_chance": found.runs_chance,
+            "residual_collapse_chance": found.collapse_chance,
+            "residual_outlier_chance": found.outlier[1],
+        }
+    if a.discrepancy is not None:
+        residual = a.observations.values - a.centre_predictions
+        left = residual - a.discrepancy.mean
+        numbers["discrepancy_share"] = 1 - float(left @ left) / (float(residual @ residual) or np.nan)
+    return numbers
 
 
 def _text(strings: Sequence[str]) -> npt.NDArray[np.object_]:

@@ -106,7 +106,7 @@ class StoredResult:
         return Observations(
             times=data["time"].values,
             values=data[name].values,
-            noise=noise_of_record(own["reading_std"], own["time_std"], own, attributes),
+            noise=noise_of_record(data["time"].values, own["reading_std"], own["time_std"], own, attributes),
             weights=data["weights"].values,
             name=self.name,
             source=str(attributes["data_source"]),

@@ -97,6 +97,11 @@ def test_a_changed_covariance_file_is_another_run(tmp_path: Path) -> None:
         (ERROR, f"{ERROR}, threshold: 2", "data.error.threshold: is that of the robust cost"),
         (ERROR, f"{ERROR}, robust: huber, threshold: -2", "data.error.threshold: must be positive, not -2"),
         (ERROR, f"{ERROR}, robust: huber, correlation_time: 3 s", "data.error.robust: not together with correlation_t"),
+        (ERROR, f"{ERROR}, discrepancy: yes", "data.error.discrepancy: write estimated, or the priors"),
+        (ERROR, f"{ERROR}, discrepancy: {{length: {{median: 3}}}}", "discrepancy.length.median: 3 has no unit"),
+        (ERROR, f"{ERROR}, discrepancy: {{amplitude: {{median: -3 um}}}}", "amplitude.median: must be positive"),
+        (ERROR, f"{ERROR}, discrepancy: {{kernel: matern}}", "data.error.discrepancy.kernel: 'matern' is not "),
+        (ERROR, f"{ERROR}, discrepancy: {{grows_beyond: 3 us}}", "data.error.discrepancy.grows_beyond: '3 us': unit"),
         (ERROR, f"{ERROR}, covariance: {{path: R.csv, unit: m2}}", "data.error.covariance: not together with position"),
         (ERROR, "covariance: {path: R.csv, unit: um}", "data.error.covariance.unit: unit 'um' cannot be converted to"),
         (ERROR, "covariance: {path: R.csv}", "data.error.covariance.unit: required, but not given"),
@@ -115,6 +120,62 @@ def test_mistakes_are_located(tmp_path: Path, old: str, new: str, fault: str) ->
     text = str(error.value.problems[0])
     assert fault in text
     assert text.removeprefix(f"{tmp_path}/").startswith("toy.yaml:")
+
+
+def terms_of(tmp_path: Path, *replacements: tuple[str, str]):
+    (problem,) = build(load_config(write_toy(tmp_path, *replacements)))
+    return problem, {term.parameter.name: term for term in problem.prior.terms}
+
+
+def test_discrepancy_is_scaled_to_the_data_or_as_it_is_given(tmp_path: Path) -> None:
+    problem, terms = terms_of(tmp_path, (ERROR, f"{ERROR}, discrepancy: estimated"))
+    y = problem.observations
+    amplitude, length = terms["discrepancy_amplitude"], terms["discrepancy_length"]
+    assert (amplitude.parameter.unit, length.parameter.unit) == ("m", "s")
+    assert np.exp(amplitude.mean) == pytest.approx(0.005 * y.values.max())
+    assert np.exp(length.mean) == pytest.approx(0.1 * (y.times[-1] - y.times[0]))
+    assert (amplitude.std, length.std) == (1.5, 0.7)
+    assert y.noise.kernel.smoothness == 0.5
+    assert not y.noise.kernel.grows
+    given = (
+        "{amplitude: {median: 3 um}, length: {median: 4 ms, log_std: 0.3}, kernel: matern-3/2, grows_beyond: 2 mm/s}"
+    )
+    problem, terms = terms_of(tmp_path, (ERROR, f"{ERROR}, time_std: 10 us, robust: huber, discrepancy: {given}"))
+    noise = problem.observations.noise
+    assert np.exp([terms["discrepancy_amplitude"].mean, terms["discrepancy_length"].mean]) == pytest.approx(
+        [3e-6, 4e-3]
+    )
+    assert terms["discrepancy_length"].std == 0.3
+    assert (noise.kernel.smoothness, noise.kernel.grows_beyond, noise.threshold) == (1.5, 2e-3, 1.345)
+
+
+def test_a_discrepancy_from_yaml_to_the_page(tmp_path: Path) -> None:
+    """A slow wave that the model lacks: posterior variables, what is kept, and what the page says."""
+    lines = csv_text().splitlines()
+    for i, line in enumerate(lines[2:], 2):
+        time, position = map(float, line.split(","))
+        lines[i] = f"{time},{position + 8 * np.sin(time / 8)}"
+    config = write_toy(
+        tmp_path, (ERROR, f"{ERROR}, discrepancy: {{grows_beyond: 10 m/s}}"), ("members: 8", "members: 24"),
+        data="\n".join(lines) + "\n",
+    )  # fmt: skip
+    outcome = CliRunner().invoke(main, ["run", str(config), "--out", str(tmp_path / "run")])
+    assert outcome.exit_code == 0, outcome.output
+    result = load_result(tmp_path / "run" / "posterior.nc")
+    units = {name: v.attrs["units"] for name, v in result.posterior.data_vars.items()}
+    assert units["discrepancy_amplitude"] == "m"
+    assert units["discrepancy_length"] == "s"
+    stats = result.sample_stats
+    shares = [stats[f"variance_from_{source}"].values for source in ("errors", "discrepancy", "prior")]
+    assert np.sum(shares, axis=0) == pytest.approx(np.ones(len(units)))
+    assert 0.5 < stats.attrs["discrepancy_share"] <= 1
+    y = load_config(config)
+    (problem,) = build(y)
+    assert result.observations().noise.attributes() == problem.observations.noise.attributes()
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "What the error bars are made of" in page
+    assert 'id="d0-residuals"' in page
+    assert "+ discrepancy" in CliRunner().invoke(main, ["validate", str(config)]).output
 
 
 def test_run_with_everything(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 from toys import Decay, Fragile, Toy, Vectorised, Wave, make_problem, with_noise
 
 from en4dvar.analysis import Analysis
@@ -59,6 +60,22 @@ def outlier() -> InverseProblem:
     return replace(problem, observations=with_noise(replace(problem.observations, values=values), huber=1.5))
 
 
+def bent(std: float = 0.05) -> InverseProblem:
+    """Data with a slow wave that the model lacks, smaller than the error that is stated."""
+    problem = make_problem(Vectorised(TWO), (1.0, 0.5), k=40, std=std)
+    y = problem.observations
+    rough = np.random.default_rng(5).standard_normal(40)
+    exact = y.values - std * np.random.default_rng(1).standard_normal(40)
+    return replace(problem, observations=replace(y, values=exact + std * (0.9 * np.sin(5 * y.times) + 0.3 * rough)))
+
+
+def spiked() -> InverseProblem:
+    problem = make_problem(Vectorised(TWO), (1.0, 0.5), k=40)
+    values = problem.observations.values.copy()
+    values[12] += 0.8
+    return replace(problem, observations=replace(problem.observations, values=values))
+
+
 def chain_not_converged() -> Analysis:
     return run(linear(), refine="mcmc", members=12)
 
@@ -78,6 +95,8 @@ PROVOKED: dict[str, Callable[[], Analysis]] = {
     ),
     "at-bound": lambda: run(bounded(1.6, lambda a: PriorTerm.logit(a, (0.0, 1.0), 0.5, 1.5), (0.0, 1.0))),
     "non-gaussian": lambda: run(make_problem(Product(TWO), (1.0, 1.0), std=0.1)),
+    "residual-structure": lambda: run(bent()),
+    "odd-residuals": lambda: run(spiked()),
     "start-moved": lambda: run(
         make_problem(Fragile(-0.9, names=TWO), (-1.0, 0.5)), start="prior-mean", min_active_fraction=0.2
     ),

@@ -1,0 +1,138 @@
+r"""The posterior beside an estimated discrepancy: a mixture over amplitude, length and noise scale.
+
+At the mode of J these are too small, for a fit uses up degrees of freedom, and a posterior at one value of them is too
+narrow. With the predictions linear about the mode, m(u) = m(0) + M u in the other coordinates u ~ N(0, I), all that
+depends on the parameters h of the covariance K(h) is known in closed form,
+
+    p(h|y) ∝ N(y − m(0); 0, K + M Mᵀ) p(h),   u | h ~ N(P MᵀK⁻¹(y − m(0)), P),   P = (I + MᵀK⁻¹M)⁻¹,
+
+and needs no run of the model. p(h|y) is sampled by importance from Student's t about the mode (Kennedy & O'Hagan 2001;
+nested Laplace approximations: Rue, Martino & Chopin 2009, J. R. Stat. Soc. B 71, 319).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.noise import DiscrepancyNoise, Linearisation, Predicted
+from en4dvar.prior import member_stream
+from en4dvar.state import NOISE_SCALE, Array
+
+Mask = npt.NDArray[np.bool_]
+DRAWS, FREEDOM = 1500, 5.0  # of Student's t
+WIDER = 1.3  # than the Gaussian at the mode
+AT_ONCE = 250
+ENOUGH = 60.0  # effective draws below which the ensemble stays as it is
+
+
+def marginal_members(space: WeightSpace, linear: Linearisation, mode: Array, posterior: Array, seed: int) -> Array:
+    """Members (N, n), transformed, in place of ``posterior`` (N, n), the Gaussian about the ``mode`` (n,)."""
+    problem, prior = space.problem, space.problem.prior
+    names = {p.name for p in problem.discrepancy} | ({NOISE_SCALE.name} if problem.has_noise_scale else set())
+    of_errors = np.array([name in names for name in prior.names])
+    if not np.any([p.name in prior.names for p in problem.discrepancy]):
+        return posterior
+    z_mode = (mode - prior.mean) / prior.std
+    stream = member_stream(seed, "discrepancy")
+    covariance = np.atleast_2d(np.cov(posterior.T)) / np.outer(prior.std, prior.std)
+    root = WIDER * np.linalg.cholesky(covariance[np.ix_(of_errors, of_errors)])
+    normal = stream.standard_normal((DRAWS, len(root))) / np.sqrt(stream.chisquare(FREEDOM, (DRAWS, 1)) / FREEDOM)
+    draws = z_mode[of_errors] + normal @ root.T
+    log_proposal = -0.5 * (FREEDOM + len(root)) * np.log1p(np.sum(normal**2, axis=1) / FREEDOM)
+    log_marginal, means, covariances = _given(space, linear, mode, of_errors, draws)
+    log_weights = log_marginal - log_proposal
+    weights = np.exp(log_weights - np.nanmax(log_weights))
+    weights = np.where(np.isfinite(weights), weights, 0.0)
+    weights /= weights.sum()
+    if 1 / np.sum(weights**2) < ENOUGH:
+        return posterior
+    members = _drawn(weights, draws, means, covariances, of_errors, len(posterior), stream)
+    if space.settings.sampling == "exact":
+        members = _with_moments(members, weights, draws, means, covariances, of_errors)
+    return np.asarray(prior.mean + prior.std * members)
+
+
+def _given(
+    space: WeightSpace, linear: Linearisation, mode: Array, of_errors: Mask, draws: Array
+) -> tuple[Array, Array, Array]:
+    """ln p(h|y) (D,) up to a constant, and mean (D, n') and covariance (D, n', n') of u, for draws of h (D, n'')."""
+    prior, observations = space.problem.prior, space.problem.observations
+    noise = observations.noise
+    assert isinstance(noise, DiscrepancyNoise)
+    at, beta = linear.prediction, float(observations.weights[0])
+    noise = noise.gaussian_at(observations.values, at)
+    to_control = space.anomalies.T @ space.basis / prior.std[:, None]
+    slopes = (linear.anomalies.T @ np.linalg.pinv(to_control))[:, ~of_errors]
+    rest = (mode - prior.mean)[~of_errors] / prior.std[~of_errors]
+    columns = np.column_stack([observations.values - at.values + slopes @ rest, slopes])
+    x = np.tile(mode, (len(draws), 1))
+    x[:, of_errors] = prior.mean[of_errors] + prior.std[of_errors] * draws
+    predicted = _predicted(space, at, prior.to_physical(x))
+    log_density, means, covariances = [], [], []
+    for first in range(0, len(draws), AT_ONCE):
+        covariance = noise.covariance(predicted[first : first + AT_ONCE]) / beta
+        solved = np.linalg.solve(covariance, np.broadcast_to(columns, (len(covariance), *columns.shape)))
+        products = columns.T @ solved
+        information = np.eye(slopes.shape[1]) + products[:, 1:, 1:]
+        inverse = np.linalg.inv(information)
+        mean = np.einsum("dij,dj->di", inverse, products[:, 1:, 0])
+        squares = products[:, 0, 0] - np.einsum("di,di->d", products[:, 0, 1:], mean)
+        dets = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(information)[1]
+        log_density.append(-0.5 * (squares + dets))
+        means.append(mean)
+        covariances.append(inverse)
+    log_prior = -0.5 * np.sum(draws**2, axis=1)
+    return np.concatenate(log_density) + log_prior, np.concatenate(means), np.concatenate(covariances)
+
+
+def _predicted(space: WeightSpace, at: Predicted, physical: Array) -> Predicted:
+    """The predictions of the mode beside parameters (D, n) of the errors."""
+    problem, count = space.problem, len(physical)
+
+    def column(name: str) -> Array:
+        names = problem.prior.names
+        return physical[:, names.index(name)] if name in names else np.full(count, problem.fixed.get(name, 1.0))
+
+    return Predicted(
+        np.tile(at.values, (count, 1)),
+        None if at.rates is None else np.tile(at.rates, (count, 1)),
+        column(NOISE_SCALE.name) if problem.has_noise_scale else None,
+        np.stack([column(p.name) for p in problem.discrepancy], axis=1),
+    )
+
+
+def _drawn(
+    weights: Array,
+    draws: Array,
+    means: Array,
+    covariances: Array,
+    of_errors: Mask,
+    count: int,
+    stream: np.random.Generator,
+) -> Array:
+    """(N, n) members of the mixture, in units of the prior: systematic in h, random in u."""
+    places = (np.arange(count) + stream.random()) / count
+    chosen = np.minimum(np.searchsorted(np.cumsum(weights), places), len(weights) - 1)
+    roots = np.linalg.cholesky(covariances[chosen])
+    members = np.empty((count, len(of_errors)))
+    members[:, of_errors] = draws[chosen]
+    members[:, ~of_errors] = means[chosen] + np.einsum(
+        "dij,dj->di", roots, stream.standard_normal((count, means.shape[1]))
+    )
+    return members
+
+
+def _with_moments(
+    members: Array, weights: Array, draws: Array, means: Array, covariances: Array, of_errors: Mask
+) -> Array:
+    """The members mapped linearly so that mean and covariance are those of the whole mixture."""
+    centres = np.empty((len(draws), len(of_errors)))
+    centres[:, of_errors], centres[:, ~of_errors] = draws, means
+    mean = weights @ centres
+    target = (weights[:, None] * (centres - mean)).T @ (centres - mean)
+    target[np.ix_(~of_errors, ~of_errors)] += np.einsum("d,dij->ij", weights, covariances)
+    anomalies = members - members.mean(axis=0)
+    own = np.linalg.cholesky(np.atleast_2d(np.cov(members.T)))
+    return np.asarray(mean + np.linalg.solve(own, anomalies.T).T @ np.linalg.cholesky(target).T)

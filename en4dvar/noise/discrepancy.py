@@ -1,0 +1,249 @@
+r"""Errors beside a discrepancy of the model that is correlated in time: y = m + δ + ε.
+
+With ε as of R = D C D and δ a Gaussian process of covariance A (:mod:`en4dvar.noise.kernel`), whose amplitude a and
+length ℓ are parameters, δ is marginalised: y − m has the covariance R + A = L Lᵀ, v = L⁻¹(y − m),
+
+    J_o = β [ ½ vᵀv + Σ ln(L_kk/std_k) ].
+
+With M_j = L⁻¹ ∂_j(R + A) L⁻ᵀ the score of a direction j that moves the covariance is ½ (vᵀM_j v − tr M_j), the Fisher
+information F_ij = ½ tr(M_i M_j) = Q Λ Qᵀ; rows √Λ Qᵀ of S with Qᵀ score/√Λ of d give both, beside the rows L⁻¹ ∂m.
+
+Sources: Kennedy & O'Hagan (2001), J. R. Stat. Soc. B 63, 425 (discrepancy); Mardia & Marshall (1984), Biometrika 71,
+135 (score and information).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from scipy.linalg import cho_solve, solve_triangular
+
+from en4dvar.noise.correlated import CorrelatedNoise, Correlation
+from en4dvar.noise.gaussian import Noise
+from en4dvar.noise.kernel import Kernel
+from en4dvar.noise.predicted import Linearisation, Predicted
+from en4dvar.state import Array
+
+AT_ONCE = 1 << 21  # elements of covariance matrices in one call
+BORDER = 1e300  # beside it every square of a whitened residual is nothing
+SAME = 1e-12  # relative eigenvalue of an information that counts as none
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A way to move R + A: derivatives ∂R and ∂A (K, K), and how far each of the coordinates moves along it (N,)."""
+
+    errors: Array
+    discrepancy: Array
+    coordinates: Array
+
+
+@dataclass(frozen=True)
+class DiscrepancyNoise(Noise):
+    """Gaussian errors, correlated where there is a ``correlation``, beside a discrepancy with a ``kernel``."""
+
+    kernel: Kernel
+    correlation: Correlation | None = None
+
+    discrepant: ClassVar[bool] = True
+
+    def check(self, weights: Array) -> None:
+        super().check(weights)
+        if self.correlation is not None:
+            self.correlation.check_size(len(weights))
+        if self.kernel.times.shape != weights.shape:
+            raise ValueError(f"the kernel of the discrepancy is that of {len(self.kernel.times)} observations")
+        if np.ptp(weights) > 0:
+            raise ValueError("a discrepancy needs one weight for all observations")
+
+    @property
+    def words(self) -> str:  # type: ignore[override]
+        return f"{', correlated' if self.correlation else ''} + discrepancy"
+
+    @property
+    def needs_rates(self) -> bool:
+        return self.timed or self.kernel.grows
+
+    def attributes(self) -> dict[str, float]:
+        grows = self.kernel.grows_beyond
+        return {"discrepancy_smoothness": self.kernel.smoothness, "discrepancy_grows_beyond": grows}
+
+    def matrices(self) -> dict[str, tuple[Array, str]]:
+        if self.correlation is None:
+            return {}
+        return {"correlation": (self.correlation.matrix, "correlation of the observation errors")}
+
+    def covariance_of_errors(self, predicted: Predicted) -> Array:
+        """R (…, K, K)."""
+        s = self.error_std(predicted)
+        c = np.eye(len(self.std)) if self.correlation is None else self.correlation.matrix
+        return np.asarray(s[..., :, None] * s[..., None, :] * c)
+
+    def covariance_of_discrepancy(self, predicted: Predicted) -> Array:
+        """A (…, K, K)."""
+        amplitude, length = self._amplitude_and_length(predicted)
+        a = amplitude[..., None] * self.kernel.growth(predicted.rates)
+        return np.asarray(a[..., :, None] * a[..., None, :] * self.kernel.correlation(length))
+
+    def total_std(self, predicted: Predicted) -> Array:
+        amplitude, _ = self._amplitude_and_length(predicted)
+        return np.hypot(self.error_std(predicted), amplitude[..., None] * self.kernel.growth(predicted.rates))
+
+    def frozen(self, predicted: Predicted) -> Noise:
+        covariance = self.covariance(predicted)
+        std = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(std, std)
+        np.fill_diagonal(correlation, 1.0)
+        return CorrelatedNoise(std, np.zeros_like(std), Correlation(0.5 * (correlation + correlation.T)))
+
+    def gaussian_at(self, values: Array, predicted: Predicted) -> DiscrepancyNoise:
+        """Gaussian errors that count each reading as these do at a prediction."""
+        return self
+
+    def explained(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
+        """Mean and std (K,) of δ given the residual at one prediction."""
+        covariance = self.covariance_of_discrepancy(predicted)
+        root = np.linalg.cholesky(self.covariance(predicted))
+        both = np.column_stack([values - predicted.values, covariance])
+        mean, *gain = (covariance @ cho_solve((root, True), both)).T
+        variance = np.diag(covariance) - np.diag(np.array(gain))
+        return mean, np.sqrt(np.maximum(variance, 0.0))
+
+    def whitened_residual(self, values: Array, predicted: Predicted) -> Array:
+        return self._innovations(values, predicted)[0]
+
+    def cost(self, values: Array, weights: Array, predicted: Predicted) -> Array:
+        v, roots = self._innovations(values, predicted)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            total = weights[0] * np.sum(0.5 * v * v + np.log(roots / self.std), axis=-1)
+        return np.where(np.isfinite(total), total, np.inf)
+
+    def log_likelihood(self, values: Array, predicted: Predicted) -> Array:
+        v, roots = self._innovations(values, predicted)
+        return np.asarray(-0.5 * v * v - np.log(roots) - self._log_norm())
+
+    def log_normalisation(self, weights: Array) -> float:
+        return float(np.sum(weights * (np.log(self.std) + self._log_norm())))
+
+    def whiten(self, values: Array, weights: Array, at: Linearisation) -> tuple[Array, Array]:
+        root = np.asarray(np.linalg.cholesky(self.covariance(at.prediction)), dtype=float)
+        residual = values - at.prediction.values
+        white = solve_triangular(root, np.column_stack([residual, at.anomalies.T]), lower=True)
+        v, directions = white[:, 0], self._directions(at)
+        changes = [both_sides(root, one.errors + one.discrepancy) for one in directions]
+        score = np.array([0.5 * (v @ change @ v - np.trace(change)) for change in changes])
+        return augmented(weights, white, directions, changes, score)
+
+    def precision_times(self, values: Array, weights: Array, at: Predicted, vectors: Array) -> Array:
+        root = np.linalg.cholesky(self.covariance(at))
+        return np.asarray(weights[0] * cho_solve((root, True), vectors.T).T)
+
+    def _amplitude_and_length(self, predicted: Predicted) -> tuple[Array, Array]:
+        if predicted.discrepancy is None:
+            raise ValueError("predictions lack amplitude and length of the discrepancy")
+        return np.asarray(predicted.discrepancy[..., 0]), np.asarray(predicted.discrepancy[..., 1])
+
+    def covariance(self, predicted: Predicted) -> Array:
+        """R + A (…, K, K)."""
+        return self.covariance_of_errors(predicted) + self.covariance_of_discrepancy(predicted)
+
+    def _directions(self, at: Linearisation) -> list[Direction]:
+        """What moves the covariance: the parameters of the errors, and the rates of each of the N coordinates."""
+        p = at.prediction
+        errors, discrepancy = self.covariance_of_errors(p), self.covariance_of_discrepancy(p)
+        found, nothing = [], np.zeros_like(errors)
+        if at.log_scale_anomalies is not None:
+            found.append(Direction(2 * errors, nothing, at.log_scale_anomalies))
+        if at.log_discrepancy_anomalies is not None:
+            amplitude, length = self._amplitude_and_length(p)
+            a = amplitude * self.kernel.growth(p.rates)
+            of_length = np.outer(a, a) * self.kernel.log_length_slope(length)
+            found.append(Direction(nothing, 2 * discrepancy, at.log_discrepancy_anomalies[:, 0]))
+            found.append(Direction(nothing, of_length, at.log_discrepancy_anomalies[:, 1]))
+        log_s = self._log_std_anomalies(replace(at, log_scale_anomalies=None))
+        if log_s is not None and p.rates is not None and at.rate_anomalies is not None:
+            log_g = self.kernel.log_growth_slope(p.rates) * at.rate_anomalies
+            for s, g, unit in zip(log_s, log_g, np.eye(len(log_s)), strict=True):
+                found.append(Direction(errors * np.add.outer(s, s), discrepancy * np.add.outer(g, g), unit))
+        return found
+
+    def _in_parts(self, predicted: Predicted, arrays: int, evaluate: Callable[[Predicted], Sequence[Array]]) -> Array:
+        """(arrays, …, K) of what ``evaluate`` gives of some of the runs at a time, so many that they fit in memory."""
+        runs = in_rows(predicted)
+        found = np.empty((arrays, *runs.values.shape))
+        chunk = max(1, AT_ONCE // runs.values.shape[-1] ** 2)
+        for first in range(0, len(runs.values), chunk):
+            part = slice(first, first + chunk)
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                found[:, part] = evaluate(runs[part])
+        return found.reshape(arrays, *predicted.values.shape)
+
+    def _innovations(self, values: Array, predicted: Predicted) -> Array:
+        """v and the diagonal of L (2, …, K); NaN where a prediction is not finite or R + A is singular to rounding."""
+        return self._in_parts(predicted, 2, lambda runs: whitened(values - runs.values, self.covariance(runs)))
+
+
+def in_rows(predicted: Predicted) -> Predicted:
+    """The same with one leading dimension."""
+    k = predicted.values.shape[-1]
+    return Predicted(
+        predicted.values.reshape(-1, k),
+        None if predicted.rates is None else predicted.rates.reshape(-1, k),
+        None if predicted.noise_scale is None else np.asarray(predicted.noise_scale).reshape(-1),
+        None if predicted.discrepancy is None else predicted.discrepancy.reshape(-1, 2),
+    )
+
+
+def whitened(residuals: Array, covariances: Array) -> tuple[Array, Array]:
+    """L⁻¹r and the diagonal of L, each (B, K), for residuals (B, K) and covariances (B, K, K); NaN where there is no L.
+
+    The Cholesky factor of a covariance that is bordered by the residual has L⁻¹r as its last row.
+    """
+    count, k = residuals.shape
+    bordered = np.empty((count, k + 1, k + 1))
+    bordered[:, :k, :k] = covariances
+    bordered[:, k, :k] = bordered[:, :k, k] = residuals
+    bordered[:, k, k] = BORDER
+    known = np.isfinite(bordered).all(axis=(1, 2))
+    bordered[~known] = np.eye(k + 1)
+    try:
+        roots = np.linalg.cholesky(bordered)
+    except np.linalg.LinAlgError:
+        roots = np.stack([_root_or_nan(one) for one in bordered])
+    roots[~known] = np.nan
+    return roots[:, k, :k], np.diagonal(roots, axis1=1, axis2=2)[:, :k]
+
+
+def _root_or_nan(matrix: Array) -> Array:
+    try:
+        return np.asarray(np.linalg.cholesky(matrix), dtype=float)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
+
+
+def both_sides(root: Array, matrix: Array) -> Array:
+    """L⁻¹ B L⁻ᵀ of a symmetric B (K, K)."""
+    half = solve_triangular(root, matrix, lower=True)
+    return np.asarray(solve_triangular(root, half.T, lower=True))
+
+
+def augmented(
+    weights: Array, white: Array, directions: Sequence[Direction], changes: Sequence[Array], score: Array
+) -> tuple[Array, Array]:
+    """d and S of the whitened residual and anomalies (K, 1 + N), with the rows of what moves the covariance below."""
+    rows, side = _information_rows(changes, score)
+    moved = rows @ np.stack([one.coordinates for one in directions])
+    d, sensitivity = np.concatenate([white[:, 0], side]), np.concatenate([white[:, 1:], moved])
+    return np.sqrt(weights[0]) * d, np.sqrt(weights[0]) * sensitivity
+
+
+def _information_rows(changes: Sequence[Array], score: Array) -> tuple[Array, Array]:
+    """Rows (r, D) and their right-hand side (r,): rowsᵀrows is the information of D directions, rowsᵀside the score."""
+    flat = np.array([change.ravel() for change in changes])
+    values, vectors = np.linalg.eigh(0.5 * flat @ flat.T)
+    kept = values > SAME * values[-1]
+    root = np.sqrt(values[kept])
+    return root[:, None] * vectors[:, kept].T, (score @ vectors[:, kept]) / root

@@ -1,0 +1,135 @@
+r"""What the residuals of a fit look like beside what they should be: independent numbers of one variance.
+
+Whitened residuals e (K,) at the minimum of J are not independent even where model, prior and R are right: the fit has
+absorbed a part of the noise. In the linear Gaussian case they are N(0, Q),
+
+    Q = I − S A⁻¹ Sᵀ,     A = (N−1) I + SᵀS,
+
+so that a ratio eᵀFe/eᵀe, which knows no scale, exceeds what was found with the probability that a quadratic form of
+known eigenvalues is positive (Imhof 1961, Biometrika 48, 419; Durbin & Watson 1971, ibid. 58, 1). The diagonal of I − Q
+is the leverage of each reading: the share of itself in its own prediction.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.state import Array
+
+FEWEST = 8  # readings below which nothing is said
+MOST = 500  # of them are looked at, evenly chosen blocks would tell no more
+FREQUENCIES = np.expm1(np.linspace(np.log1p(1e-4), np.log1p(400.0), 700))
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Of the K readings that count: whitened residuals ``white`` e (K,), their covariance ``expected`` Q (K, K), and
+    the ``speed`` |ṁ| (K,) of the observable there. ``which`` (K,) are their places in the data.
+    """
+
+    white: Array
+    expected: Array
+    speed: Array
+    which: npt.NDArray[np.intp]
+
+    @classmethod
+    def of(
+        cls, white: Array, sensitivity: Array, prior_precision: float, speed: Array, which: npt.NDArray[np.intp]
+    ) -> Residuals:
+        """From whitened sensitivities S (K, r), all rows of which take part in A, and N − 1.
+
+        ``white`` (K',) and ``sensitivity`` (K'', r) are those of the observations and, below, of what moves R.
+        """
+        k = len(speed)
+        hessian = prior_precision * np.eye(sensitivity.shape[1]) + sensitivity.T @ sensitivity
+        own = sensitivity[:k]
+        expected = np.eye(k) - own @ np.linalg.solve(hessian, own.T)
+        return cls(white[:k][which], expected[np.ix_(which, which)], speed[which], which)
+
+    @cached_property
+    def leverage(self) -> Array:
+        """(K,) share of each reading in its own prediction."""
+        return np.asarray(1 - np.diag(self.expected))
+
+    @cached_property
+    def studentised(self) -> Array:
+        """Residuals (K,) over their own expected std."""
+        return np.asarray(self.white / np.sqrt(np.maximum(np.diag(self.expected), 1e-12)))
+
+    @property
+    def enough(self) -> bool:
+        """Whether there is anything to be said."""
+        return FEWEST <= len(self.white) <= MOST and bool(np.all(np.isfinite(self.white)) and np.any(self.white))
+
+    @cached_property
+    def lag_one(self) -> float:
+        """Autocorrelation of neighbours, Σ e_k e_{k+1}/Σ e²."""
+        return float(self.white[1:] @ self.white[:-1] / (self.white @ self.white))
+
+    @cached_property
+    def lag_one_chance(self) -> float:
+        """Probability of so high an autocorrelation where the model is right."""
+        k = len(self.white)
+        return self._chance(0.5 * (np.eye(k, k=1) + np.eye(k, k=-1)))
+
+    @cached_property
+    def runs(self) -> tuple[int, float]:
+        """Runs of one sign, and how many are expected of independent residuals."""
+        positive = self.white > 0
+        n, above = len(positive), int(positive.sum())
+        return 1 + int(np.sum(positive[1:] != positive[:-1])), 1 + 2 * above * (n - above) / n
+
+    @cached_property
+    def runs_chance(self) -> float:
+        """Probability of so few runs, by the normal approximation (Wald & Wolfowitz 1940, Ann. Math. Stat. 11, 147)."""
+        found, expected = self.runs
+        n = len(self.white)
+        variance = (expected - 1) * (expected - 2) / (n - 1)
+        return 0.5 * math.erfc((expected - found - 0.5) / math.sqrt(2 * variance)) if variance > 0 else 1.0
+
+    @cached_property
+    def collapse_chance(self) -> float:
+        """Probability of residuals that are so much larger where the observable moves fast."""
+        ranks = np.argsort(np.argsort(self.speed)).astype(float)
+        return self._chance(np.diag(ranks - ranks.mean())) if np.ptp(self.speed) > 0 else 1.0
+
+    @cached_property
+    def outlier(self) -> tuple[int, float]:
+        """The reading of the largest studentised residual, its place in the data, and the probability of one so large.
+
+        Of u = Q^{-1/2}e, independent normal numbers, each studentised residual is a projection, so that its square over
+        uᵀu is Beta(½, (K − 1)/2); times K for the largest of them (Bonferroni).
+        """
+        from scipy.special import betainc
+
+        k, worst = len(self.white), int(np.argmax(np.abs(self.studentised)))
+        total = float(self.white @ np.linalg.solve(self.expected, self.white))
+        share = min(1.0, float(self.studentised[worst] ** 2) / total)
+        return int(self.which[worst]), min(1.0, k * float(1 - betainc(0.5, (k - 1) / 2, share)))
+
+    def _chance(self, form: Array) -> float:
+        """P(xᵀFx/xᵀx ≥ eᵀFe/eᵀe) for x ~ N(0, Q)."""
+        ratio = float(self.white @ form @ self.white / (self.white @ self.white))
+        values, vectors = np.linalg.eigh(self.expected)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        return positive_chance(np.linalg.eigvalsh(root.T @ (form - ratio * np.eye(len(form))) @ root))
+
+
+def positive_chance(weights: Array) -> float:
+    """P(Σ λ_k z_k² > 0) of independent normal z for weights λ (K,), by Imhof's integral.
+
+    >>> round(positive_chance(np.array([1.0, -1.0])), 6), round(positive_chance(np.array([1.0, 1.0, -1.0])), 4)
+    (0.5, 0.7071)
+    """
+    scaled = weights / np.max(np.abs(weights))
+    u = FREQUENCIES
+    angle = 0.5 * np.arctan(np.outer(u, scaled)).sum(axis=1)
+    size = np.exp(0.25 * np.log1p(np.outer(u, scaled) ** 2).sum(axis=1))
+    integrand = np.sin(angle) / (u * size)
+    area = float(np.trapezoid(integrand, u)) + float(u[0]) * 0.5 * float(scaled.sum())
+    return min(1.0, max(0.0, 0.5 + area / math.pi))

@@ -1,0 +1,85 @@
+"""Chances of residuals: uniform where the model is right, against draws, and small where they have a structure."""
+
+import numpy as np
+import pytest
+from honesty.provoked import bent, run, spiked
+
+from en4dvar.report.page import judge_chi2
+from en4dvar.residuals import Residuals, positive_chance
+
+K = 20
+
+
+def designed():
+    sensitivity = np.sqrt(45) * np.vstack([np.cos(np.linspace(0, 2, K) * j) for j in range(4)]).T
+    expected = np.eye(K) - sensitivity @ np.linalg.solve(47 * np.eye(4) + sensitivity.T @ sensitivity, sensitivity.T)
+    return sensitivity, np.linalg.cholesky(expected)
+
+
+def looked_at(white, sensitivity):
+    return Residuals.of(white, sensitivity, 47, np.linspace(0, 1, K) ** 2, np.arange(K))
+
+
+def test_chances_are_uniform_where_the_model_is_right():
+    sensitivity, root = designed()
+    rng = np.random.default_rng(0)
+    found = [looked_at(root @ rng.standard_normal(K), sensitivity) for _ in range(600)]
+    for chances in ([r.lag_one_chance for r in found], [r.collapse_chance for r in found]):
+        for level in (0.1, 0.5, 0.9):
+            assert np.mean(np.array(chances) < level) == pytest.approx(
+                level, abs=4 * np.sqrt(level * (1 - level) / 600)
+            )
+    for chances in ([r.runs_chance for r in found], [r.outlier[1] for r in found]):  # never too often
+        assert np.mean(np.array(chances) < 0.05) < 0.09
+
+
+def test_imhof_against_draws():
+    weights = np.random.default_rng(1).standard_normal(12)
+    z = np.random.default_rng(2).standard_normal((200_000, 12))
+    assert positive_chance(weights) == pytest.approx(np.mean(z**2 @ weights > 0), abs=0.004)
+
+
+def test_leverages_add_up_to_the_degrees_of_freedom():
+    analysis = run(bent())
+    assert analysis.residuals is not None
+    assert analysis.residuals.leverage.sum() == pytest.approx(analysis.iterations[-1].dfs, rel=1e-9)
+    squares = float(analysis.residuals.white @ analysis.residuals.white)
+    assert squares / 40 == pytest.approx(analysis.iterations[-1].chi2_per_observation, rel=1e-9)
+
+
+def test_size_and_structure_are_told_apart():
+    analysis = run(bent())
+    codes = {c.code for c in analysis.cautions}
+    assert "residual-structure" in codes
+    assert "misfit" not in codes  # its size is as stated
+    assert "agrees" in judge_chi2(1.0, 40, 2.0)[0]
+    words, attention = judge_chi2(1.0, 40, 2.0, structured=True)
+    assert "agrees" not in words
+    assert attention
+
+
+def test_no_scale_is_offered_as_a_cure_of_structure():
+    problem = bent()
+    problem.observations.std[:] *= 4
+    cautions = {c.code: c for c in run(problem).cautions}
+    assert "estimate sigma" not in cautions["overstated-error"].advice
+    assert "discrepancy" in cautions["overstated-error"].advice
+
+
+def test_a_discrepancy_takes_the_structure():
+    from problem.test_discrepancy import with_discrepancy
+
+    analysis = run(with_discrepancy(bent(), amplitude=(0.05, 1.0), length=(0.3, 0.7), smoothness=1.5, sigma=0.7))
+    assert "residual-structure" not in {c.code for c in analysis.cautions}
+    found = analysis.discrepancy
+    assert found is not None
+    residual = analysis.observations.values - analysis.centre_predictions
+    assert np.sum((residual - found.mean) ** 2) < 0.5 * np.sum(residual**2)
+    assert found.shares.sum(axis=1) == pytest.approx(np.ones(5))
+    assert np.all(found.shares > -1e-12)
+    assert found.shares[0, 1] > 0.3  # most of what is left unknown of a is the discrepancy's
+
+
+def test_an_outlier_is_named():
+    words = next(c.words for c in run(spiked()).cautions if c.code == "odd-residuals")
+    assert f"{run(spiked()).observations.times[12]:.4g}" in words
