@@ -10,6 +10,7 @@ import numpy as np
 from en4dvar.caution import Caution
 from en4dvar.observations import Observations
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.response.what_if import Shift
 from en4dvar.state import Array, Parameter
 
 
@@ -99,6 +100,7 @@ class Analysis:
     down_weights: Array | None = None  # (K,) of observations in a robust cost, at the centre; None with Gaussian errors
     refinement: Mapping[str, float] = field(default_factory=dict)  # summary of the Markov chain, if any
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) of the model's limits, by the posterior
+    what_if: tuple[Shift, ...] = ()  # under the model's alternatives; the largest first
 
     @property
     def observations(self) -> Observations:

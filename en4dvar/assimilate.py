@@ -20,6 +20,8 @@ from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.honesty import ControlEnsembles, examine
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.response.linear import LinearResponse
+from en4dvar.response.what_if import what_if
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.shape import examine_shape, guide
 from en4dvar.schemes import window_scheme
@@ -141,6 +143,9 @@ class _Assimilation:
         centre_cost = float(self.costs(ends[-1:], last)[0])
         shape = {} if refinement else examine_shape(space, posterior, mode, costs, self.seed)
         observations, prior = problem.observations, problem.prior
+        response, std = self.response(descent, mode, last), posterior.std(axis=0, ddof=1)
+        shifts = what_if(problem, response, std, centre_cost, space.executor)
+        space.forward_runs += sum(shift.runs for shift in shifts)
         analysis = Analysis(
             problem=problem,
             settings=self.settings,
@@ -171,6 +176,7 @@ class _Assimilation:
                 descent.iterate.cost, descent.newton.hessian.singular_values, len(space.members), observations
             ),
             extremes=after.extremes,
+            what_if=shifts,
         )
         control = ControlEnsembles(space.members, posterior, mode, costs, centre_cost)
         found = (*start.warnings, *refine_warnings)
@@ -236,6 +242,14 @@ class _Assimilation:
         )
         warnings = () if chain.converged else (caution("chain-not-converged", chain.warning()),)
         return chain.thin(len(posterior), self.settings.sampling == "exact"), chain.summary(), warnings
+
+    def response(self, descent: Descent, mode: Array, central: Forecast) -> LinearResponse:
+        """How the mode (n,), whose run is ``central``, follows what it was inferred from."""
+        space, linear = self.space, descent.iterate.linear
+        assert linear is not None
+        linear = replace(linear, prediction=central.predicted[0])
+        directions = space.basis.T @ space.anomalies
+        return LinearResponse(mode, linear, directions, len(space.members) - 1.0, self.problem.observations)
 
     def costs(self, members: Array, run: Forecast) -> Array:
         """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""

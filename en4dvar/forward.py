@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -60,6 +60,38 @@ class ValidityLimit:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "label", self.label or self.name)
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """The same experiment with one assumption changed: what a result would be then is told beside it.
+
+    ``words`` complete "if …", e.g. "the pulse were 5 % stronger". ``model`` takes the place of the model, with the same
+    parameters and observables; ``values`` and ``times`` multiply the observations and their errors; ``parameters`` are
+    factors of a parameter's value where it is fixed, of the centre of its prior where it is estimated.
+    """
+
+    name: str
+    words: str
+    model: ForwardModel | None = None
+    values: float = 1.0
+    times: float = 1.0
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PathQuantity:
+    """What a path went through, e.g. a strain rate: ``trajectory[name]`` (K,) in ``unit``; its size is of interest."""
+
+    name: str
+    unit: str
+    label: str = ""
+    symbol: str = ""
+    display_unit: str = ""
+
+    def __post_init__(self) -> None:
+        for key, value in (("symbol", self.name), ("display_unit", self.unit), ("label", self.name)):
+            object.__setattr__(self, key, getattr(self, key) or value)
 
 
 @runtime_checkable
@@ -141,7 +173,8 @@ class ForwardModel(ABC):
     fast path likes to get at once (executors cut chunks at multiples of it); ``compiled`` says that ``trajectories``
     releases the interpreter lock, so that threads serve it. ``autonomous`` says that F depends on elapsed time alone:
     sequential schemes may start ``trajectories`` at any instant, where otherwise they repeat ``step``. ``validity``
-    names quantities and the limits beyond which the equations do not hold.
+    names quantities and the limits beyond which the equations do not hold. ``alternatives`` are assumptions that could
+    be otherwise, for :mod:`en4dvar.response.what_if`.
 
     A model that has settings in YAML also has ``Settings`` (a pydantic model of its ``model:`` section) and
     ``from_settings``; without them the class is called without arguments. In a sequence, parameters that the state
@@ -157,6 +190,7 @@ class ForwardModel(ABC):
     compiled: ClassVar[bool] = False
     autonomous: ClassVar[bool] = False
     validity: tuple[ValidityLimit, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
 
     @abstractmethod
     def initial_state(self, theta: Mapping[str, float]) -> Array:

@@ -9,9 +9,11 @@ from typing import Any
 
 from en4dvar.diagnostics import chi2_interval
 from en4dvar.report.html import render
+from en4dvar.report.responses import exceeding
 from en4dvar.report.style import Drawing
 from en4dvar.report.text import number_like, plain_number
 from en4dvar.storage.groups import ITERATION_SCALARS
+from en4dvar.storage.responses import stored_shifts
 from en4dvar.storage.store import StoredResult
 from en4dvar.units import convert
 
@@ -41,6 +43,8 @@ def render_set(
         rows=result.summary(),
         cautions=result.cautions,
         tiles=_tiles(result),
+        what_if=(what_if := stored_shifts(result)),
+        exceeding=exceeding(what_if),
         identifiers=IDENTIFIERS,
         figures=figures,
         lost=[(i, str(reason)) for i, reason in enumerate(reasons) if reason],

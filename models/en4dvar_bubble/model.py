@@ -9,8 +9,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from en4dvar.forward import Failure, ForwardModel, Observable, Shared, StateField, Trajectory, ValidityLimit
+from en4dvar.forward import Alternative, Failure, ForwardModel, Observable, Shared, StateField, Trajectory, ValidityLimit
 from en4dvar.state import Array
+from en4dvar_bubble.alternatives import alternatives
 from en4dvar_bubble.dynamics import Dynamics
 from en4dvar_bubble.packing import pack
 from en4dvar_bubble.paths import Paths
@@ -61,6 +62,11 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         """The largest Mach number of the wall that the radial equation can bear, and where that is said."""
         value, source = MACH_LIMITS[self.radial]
         return (ValidityLimit("wall_mach", value, label="Mach number of the bubble wall", source=source),)
+
+    @property
+    def alternatives(self) -> tuple[Alternative, ...]:  # type: ignore[override]
+        """See :mod:`en4dvar_bubble.alternatives`."""
+        return alternatives(self)
 
     def initial_state(self, theta: Mapping[str, float]) -> Array:
         return np.asarray(self.initial_states({p.name: np.array([theta[p.name]]) for p in self.parameters})[0])

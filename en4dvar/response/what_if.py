@@ -1,0 +1,130 @@
+"""What if an assumption is off: where the posterior would lie, for each alternative that the model offers.
+
+The first run of an alternative, at the mode, gives the linear response; each further one, where that leads, corrects it
+with the same tangent (a chord iteration), until what it changes is small. An alternative that does not settle within
+:data:`MOST_RUNS` is beyond linear response, and said to be: only a fit tells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from en4dvar.ensemble.forecast import Composite
+from en4dvar.executor import Executor
+from en4dvar.forward import Alternative
+from en4dvar.observations import Observations
+from en4dvar.problem import InverseProblem
+from en4dvar.response.linear import LinearResponse
+from en4dvar.state import Array
+
+MOST_RUNS = 4  # of one alternative
+SETTLED = 0.1  # of the shift, and of a posterior standard deviation: a correction below one of them counts as small
+
+
+@dataclass(frozen=True)
+class Shift:
+    """Where the posterior would go under the alternative ``name``; ``words`` complete "if …".
+
+    ``change`` (n,) of the mode in physical SI values, ``relative`` (n,) to the mode where a parameter cannot be negative
+    (else NaN), ``in_std`` (n,) in transformed space per posterior standard deviation. ``cost_change``: J there minus J of the fit, positive where the data speak against the alternative.
+    ``settled``: whether linear response tells (else NaN, and ``reason`` says why); ``runs`` it took.
+    """
+
+    name: str
+    words: str
+    change: Array
+    relative: Array
+    in_std: Array
+    cost_change: float
+    runs: int
+    reason: str = ""
+
+    @property
+    def settled(self) -> bool:
+        return not self.reason
+
+    @property
+    def largest(self) -> float:
+        """Of the shifts in posterior standard deviations; of one that is not known, infinity."""
+        return float(np.max(np.abs(self.in_std))) if self.settled else np.inf
+
+
+def what_if(
+    problem: InverseProblem, response: LinearResponse, std: Array, cost: float, executor: Executor
+) -> tuple[Shift, ...]:
+    """The shifts of all alternatives of the problem's model, those that exceed the error bar most first.
+
+    ``std`` (n,) of the posterior, transformed; ``cost`` J at ``response.at``.
+    """
+    shifts = [_shift(problem, response, std, cost, executor, one) for one in problem.model.alternatives]
+    return tuple(sorted(shifts, key=lambda shift: -shift.largest))
+
+
+def changed_problem(problem: InverseProblem, alternative: Alternative) -> InverseProblem:
+    """The problem under an alternative, but for the centres of priors; see :func:`prior_shift`."""
+    o = problem.observations
+    noise = replace(
+        o.noise, std=abs(alternative.values) * o.noise.std, time_std=abs(alternative.times) * o.noise.time_std
+    )
+    observations = replace(o, values=alternative.values * o.values, times=alternative.times * o.times, noise=noise)
+    fixed = {name: value * alternative.parameters.get(name, 1.0) for name, value in problem.fixed.items()}
+    return replace(problem, model=alternative.model or problem.model, observations=observations, fixed=fixed)
+
+
+def prior_shift(problem: InverseProblem, factors: Sequence[tuple[str, float]]) -> Array:
+    """Change (n,) of the prior's mean, transformed, when the physical value there is multiplied by ``factors``."""
+    prior = problem.prior
+    centre = prior.to_physical(prior.mean)
+    moved = centre.copy()
+    for name, factor in factors:
+        if name in prior.names:
+            moved[prior.names.index(name)] *= factor
+    return np.asarray(prior.from_physical(moved) - prior.mean)
+
+
+def _shift(
+    problem: InverseProblem,
+    response: LinearResponse,
+    std: Array,
+    cost: float,
+    executor: Executor,
+    alternative: Alternative,
+) -> Shift:
+    runs, unknown = 0, np.full(len(std), np.nan)
+    about = alternative.name, _words(problem, alternative)
+    try:
+        changed = changed_problem(problem, alternative)
+        of_prior = prior_shift(problem, tuple(alternative.parameters.items()))
+        composite = Composite(changed, executor)
+    except Exception as error:  # a model may offer what does not suit the problem; the reason is kept
+        return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be set up: {error}")
+    moved, reason = np.zeros(len(std)), "beyond linear response"
+    for _ in range(MOST_RUNS):
+        run = composite((response.at + moved)[None])
+        runs += 1
+        if run.failures[0]:
+            return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be run: {run.failures[0]}")
+        step = response.step(changed.observations, run.predicted[0], moved, of_prior)
+        moved = moved + step
+        correction = float(np.max(np.abs(step / std)))
+        if runs > 1 and correction <= SETTLED * max(1.0, float(np.max(np.abs(moved / std)))):
+            reason = ""
+            break
+    if reason:
+        return Shift(*about, unknown, unknown, unknown, np.nan, runs, reason)
+    prior = problem.prior
+    z = (response.at + moved - step - prior.mean - of_prior) / prior.std
+    there = 0.5 * float(z @ z) + float(changed.observations.cost(run.predicted)[0])
+    mode, positive = prior.to_physical(response.at), prior.bounds[0] >= 0
+    change = prior.to_physical(response.at + moved) - mode
+    relative = np.divide(change, mode, out=unknown.copy(), where=positive & (mode > 0))
+    return Shift(*about, change, relative, moved / std, there - cost, runs)
+
+
+def _words(problem: InverseProblem, alternative: Alternative) -> str:
+    """Those of the alternative; a parameter that is estimated is what the prior says of it."""
+    estimated = any(name in problem.prior.names for name in alternative.parameters)
+    return f"the prior said that {alternative.words}" if estimated else alternative.words
