@@ -10,6 +10,7 @@ import numpy as np
 from en4dvar.caution import Caution
 from en4dvar.observations import Observations
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.response.ledger import Ledger
 from en4dvar.response.what_if import Shift
 from en4dvar.state import Array, Parameter
 
@@ -101,6 +102,7 @@ class Analysis:
     refinement: Mapping[str, float] = field(default_factory=dict)  # summary of the Markov chain, if any
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) of the model's limits, by the posterior
     what_if: tuple[Shift, ...] = ()  # under the model's alternatives; the largest first
+    ledger: Ledger | None = None  # what the path went through where it informed the parameters
 
     @property
     def observations(self) -> Observations:

@@ -20,6 +20,7 @@ from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.honesty import ControlEnsembles, examine
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.response.ledger import ledger
 from en4dvar.response.linear import LinearResponse
 from en4dvar.response.what_if import what_if
 from en4dvar.sampling import mcmc
@@ -145,7 +146,8 @@ class _Assimilation:
         observations, prior = problem.observations, problem.prior
         response, std = self.response(descent, mode, last), posterior.std(axis=0, ddof=1)
         shifts = what_if(problem, response, std, centre_cost, space.executor)
-        space.forward_runs += sum(shift.runs for shift in shifts)
+        path = ledger(problem, response, std)
+        space.forward_runs += sum(shift.runs for shift in shifts) + (path.runs if path else 0)
         analysis = Analysis(
             problem=problem,
             settings=self.settings,
@@ -177,6 +179,7 @@ class _Assimilation:
             ),
             extremes=after.extremes,
             what_if=shifts,
+            ledger=path,
         )
         control = ControlEnsembles(space.members, posterior, mode, costs, centre_cost)
         found = (*start.warnings, *refine_warnings)

@@ -174,7 +174,8 @@ class ForwardModel(ABC):
     releases the interpreter lock, so that threads serve it. ``autonomous`` says that F depends on elapsed time alone:
     sequential schemes may start ``trajectories`` at any instant, where otherwise they repeat ``step``. ``validity``
     names quantities and the limits beyond which the equations do not hold. ``alternatives`` are assumptions that could
-    be otherwise, for :mod:`en4dvar.response.what_if`.
+    be otherwise, for :mod:`en4dvar.response.what_if`; ``path_quantities`` and the names of the ``path_parameters``, fields
+    of the state that act along the path (not at its start alone), are for :mod:`en4dvar.response.ledger`.
 
     A model that has settings in YAML also has ``Settings`` (a pydantic model of its ``model:`` section) and
     ``from_settings``; without them the class is called without arguments. In a sequence, parameters that the state
@@ -191,6 +192,8 @@ class ForwardModel(ABC):
     autonomous: ClassVar[bool] = False
     validity: tuple[ValidityLimit, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
+    path_quantities: tuple[PathQuantity, ...] = ()
+    path_parameters: tuple[str, ...] = ()
 
     @abstractmethod
     def initial_state(self, theta: Mapping[str, float]) -> Array:
@@ -220,13 +223,21 @@ class ForwardModel(ABC):
         own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
         return [self._march(x[i], own[i]) for i in range(len(x))]
 
+    def resumed(self, x: Array, start: Array, times: Array) -> Sequence[Trajectory | Failure]:
+        """:meth:`trajectories` from states ``x`` (N, n_state) at ``start`` (N,) instead of time zero.
+
+        At those of the ``times`` (N, K) that lie before its start a member is where it started. This default repeats
+        :meth:`step`.
+        """
+        return [self._march(x[i], np.maximum(times[i], start[i]), float(start[i])) for i in range(len(x))]
+
     def share(self, x: Array, times: Array) -> Shared | None:
         """:meth:`trajectories` of states (N, n_state) as work that threads share, where the model can; else None."""
         return None
 
-    def _march(self, x: Array, times: Array) -> Trajectory | Failure:
+    def _march(self, x: Array, times: Array, start: float = 0.0) -> Trajectory | Failure:
         states = np.empty((len(times), self.layout.size))
-        x, t = np.array(x, dtype=float), 0.0  # a step may work in place; the ensemble stays as it is
+        x, t = np.array(x, dtype=float), start  # a step may work in place; the ensemble stays as it is
         for k, t_next in enumerate(times):
             if t_next != t:
                 try:
