@@ -13,7 +13,7 @@ from en4dvar.report.responses import exceeding
 from en4dvar.report.style import Drawing
 from en4dvar.report.text import number_like, plain_number
 from en4dvar.storage.groups import ITERATION_SCALARS
-from en4dvar.storage.responses import stored_shifts
+from en4dvar.storage.responses import stored_ledger, stored_shifts
 from en4dvar.storage.store import StoredResult
 from en4dvar.units import convert
 
@@ -45,6 +45,7 @@ def render_set(
         tiles=_tiles(result),
         what_if=(what_if := stored_shifts(result)),
         exceeding=exceeding(what_if),
+        entries=stored_ledger(result),
         identifiers=IDENTIFIERS,
         figures=figures,
         lost=[(i, str(reason)) for i, reason in enumerate(reasons) if reason],

@@ -8,7 +8,10 @@ from collections.abc import Iterable, Sequence
 from markupsafe import Markup
 
 from en4dvar.report.text import fixed, number_like, pretty_unit, symbol_html
-from en4dvar.storage.responses import StoredShift
+from en4dvar.storage.responses import StoredShift, stored_ledger, stored_shifts
+from en4dvar.storage.store import StoredResult
+
+Lines = list[tuple[object, ...]]
 
 
 def shift_text(shift: StoredShift) -> str:
@@ -46,3 +49,11 @@ def sentence(shifts: Sequence[StoredShift], symbol: bool = False) -> str:
 def exceeding(rows: Iterable[Sequence[StoredShift]]) -> list[Sequence[StoredShift]]:
     """The alternatives that move a parameter beyond its error bar."""
     return [row for row in rows if any(shift.exceeds for shift in row)]
+
+
+def response_lines(result: StoredResult) -> tuple[Lines, Lines]:
+    """Lines of ``what_if.csv`` and of ``ledger.csv``, the name of the data set first."""
+    return (
+        [(result.name, *shift.cells) for row in stored_shifts(result) for shift in row],
+        [(result.name, *entry.cells) for row in stored_ledger(result) for entry in row],
+    )

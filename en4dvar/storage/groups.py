@@ -189,6 +189,7 @@ def _scalars(a: Analysis) -> dict[str, Any]:
         "stop_reason": a.stop_reason,
         "forward_runs": a.forward_runs,
         "what_if_runs": sum(shift.runs for shift in a.what_if),
+        "ledger_runs": a.ledger.runs if a.ledger else 0,
         "warning_codes": " ".join(codes(a.cautions)),
         **a.shape,
         **a.refinement,

@@ -1,4 +1,4 @@
-"""How a posterior responds, in a result file: the shifts under the model's alternatives, written and read."""
+"""How a posterior responds, in a result file: shifts under the model's alternatives, and the ledger; written and read."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from en4dvar.analysis import Analysis
+from en4dvar.response.ledger import QUANTILES
 from en4dvar.storage.netcdf import Variable, variable
 from en4dvar.units import convert
 
@@ -19,6 +20,8 @@ ALTERNATIVE = ("alternative", "parameter")
 SHIFT_COLUMNS = (
     "alternative", "if", "parameter", "unit", "change", "relative_change", "change_in_std", "cost_change", "reason",
 )  # fmt: skip
+
+ENTRY_COLUMNS = ("parameter", "quantity", "unit", "q05", "q50", "q95")
 
 
 @dataclass(frozen=True)
@@ -53,14 +56,43 @@ class StoredShift:
 
 def response_coordinates(a: Analysis) -> dict[str, Variable]:
     """Of the dimensions of :func:`response_variables`."""
-    if not a.what_if:
-        return {}
-    names = _text(shift.name for shift in _in_order(a))
-    return {"alternative": variable("alternative", names, "1", "assumption that could be otherwise", fill=False)}
+    found = {}
+    if a.what_if:
+        names = _text(shift.name for shift in _in_order(a))
+        found["alternative"] = variable("alternative", names, "1", "assumption that could be otherwise", fill=False)
+    if a.ledger is not None:
+        names = _text(a.ledger.parameters)
+        found["path_parameter"] = variable("path_parameter", names, "1", "acts along the path", fill=False)
+        found["quantile"] = variable("quantile", QUANTILES, "1", "quantile under the weights", fill=False)
+    return found
 
 
 def response_variables(a: Analysis) -> dict[str, Variable]:
-    """Variables of ``sample_stats``; none where the model offers no alternatives."""
+    """Variables of ``sample_stats``; none where the model offers neither alternatives nor quantities of its path."""
+    return {**_of_shifts(a), **_of_ledger(a)}
+
+
+def _of_ledger(a: Analysis) -> dict[str, Variable]:
+    if a.ledger is None:
+        return {}
+    book, model = a.ledger, a.problem.model
+    of_cell = ("path_parameter", "path_cell")
+    edges = np.column_stack([book.edges[:-1], book.edges[1:]])
+    times = {"display_units": model.time_display_unit}
+    found = {
+        "ledger_time": variable(("path_cell", "path_edge"), edges, model.time_unit, "begin and end of the cell", **times),
+        "ledger_weight": variable(of_cell, book.weights, "1", "share of the cell in what informed the parameter"),
+        "ledger_kernel": variable(of_cell, book.kernel, "1", "averaging kernel of the estimate over the cell"),
+    }
+    for i, q in enumerate(book.quantities):
+        about = {"display_units": q.display_unit, "symbol": q.symbol}
+        name, of_quantiles = f"ledger_{q.name}", book.quantiles[:, i]
+        found[name] = variable("path_cell", book.values[i], q.unit, f"{q.label}, mean size in the cell", **about)
+        found[f"{name}_quantiles"] = variable(("path_parameter", "quantile"), of_quantiles, q.unit, q.label, **about)
+    return found
+
+
+def _of_shifts(a: Analysis) -> dict[str, Variable]:
     if not a.what_if:
         return {}
     shifts = _in_order(a)
@@ -107,6 +139,46 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
 
     largest = np.where(of["reason"] == "", np.abs(in_std).max(axis=1), np.inf)
     return tuple(row(i, str(stats["alternative"].values[i])) for i in np.argsort(-largest, kind="stable"))
+
+
+@dataclass(frozen=True)
+class StoredEntry:
+    """Where on the path one parameter was informed, in one quantity: ``low``, ``median``, ``high`` are 5, 50, 95 %."""
+
+    parameter: str
+    symbol: str
+    quantity: str
+    label: str
+    unit: str
+    low: float
+    median: float
+    high: float
+
+    @property
+    def cells(self) -> tuple[object, ...]:
+        """In the order of :data:`ENTRY_COLUMNS`."""
+        return self.parameter, self.quantity, self.unit, self.low, self.median, self.high
+
+
+def stored_ledger(result: StoredResult) -> tuple[tuple[StoredEntry, ...], ...]:
+    """A row a parameter that acts along the path, in it one entry a quantity of the path; display units."""
+    stats = result.sample_stats
+    if "ledger_weight" not in stats:
+        return ()
+    ending = "_quantiles"
+    quantities = [str(v).removesuffix(ending) for v in stats.data_vars if str(v).endswith(ending)]
+
+    def entry(i: int, parameter: str, quantity: str) -> StoredEntry:
+        v = stats[quantity + ending]
+        shown = v.attrs["display_units"]
+        numbers = convert(np.asarray(v.values[i], dtype=float), v.attrs["units"], shown).tolist()
+        symbol = result.posterior[parameter].attrs["symbol"]
+        return StoredEntry(
+            parameter, symbol, quantity.removeprefix("ledger_"), v.attrs["long_name"], shown, *numbers
+        )
+
+    names = list(map(str, stats["path_parameter"].values))
+    return tuple(tuple(entry(i, name, q) for q in quantities) for i, name in enumerate(names))
 
 
 def _in_order(a: Analysis) -> list[Any]:
