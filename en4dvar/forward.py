@@ -174,8 +174,8 @@ class ForwardModel(ABC):
     releases the interpreter lock, so that threads serve it. ``autonomous`` says that F depends on elapsed time alone:
     sequential schemes may start ``trajectories`` at any instant, where otherwise they repeat ``step``. ``validity``
     names quantities and the limits beyond which the equations do not hold. ``alternatives`` are assumptions that could
-    be otherwise, for :mod:`en4dvar.response.what_if`; ``path_quantities`` and the names of the ``path_parameters``, fields
-    of the state that act along the path (not at its start alone), are for :mod:`en4dvar.response.ledger`.
+    be otherwise, for :mod:`en4dvar.response.what_if`; ``path_quantities`` and ``path_parameters``, names
+    of fields of the state that act along the path and not only at its start, are for :mod:`en4dvar.response.ledger`.
 
     A model that has settings in YAML also has ``Settings`` (a pydantic model of its ``model:`` section) and
     ``from_settings``; without them the class is called without arguments. In a sequence, parameters that the state

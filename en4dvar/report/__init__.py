@@ -18,10 +18,9 @@ from en4dvar.hints import suggest
 from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import SetSummary, overview_figures, render_overview
 from en4dvar.report.page import IDENTIFIERS, render_set
-from en4dvar.report.responses import Lines, response_lines
+from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, Lines, response_lines
 from en4dvar.report.style import draw
 from en4dvar.storage.campaign_file import failed_datasets
-from en4dvar.storage.responses import ENTRY_COLUMNS, SHIFT_COLUMNS
 from en4dvar.storage.store import load_stored, result_files
 from en4dvar.summary import summary_csv
 from en4dvar.tables import csv_text

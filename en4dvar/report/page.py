@@ -9,11 +9,10 @@ from typing import Any
 
 from en4dvar.diagnostics import chi2_interval
 from en4dvar.report.html import render
-from en4dvar.report.responses import exceeding
+from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
 from en4dvar.report.style import Drawing
 from en4dvar.report.text import number_like, plain_number
 from en4dvar.storage.groups import ITERATION_SCALARS
-from en4dvar.storage.responses import stored_ledger, stored_shifts
 from en4dvar.storage.store import StoredResult
 from en4dvar.units import convert
 

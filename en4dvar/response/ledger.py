@@ -5,7 +5,7 @@ of time, readings would be off by ∫ L_kj(τ) δx_j(τ) dτ, and the estimate, 
 
     δx̂_j = ∫ a_j(τ) δx_j(τ) dτ,     a_j(τ) = Σ_k G_jk L_kj(τ),
 
-G the gain of the whitened innovations: an averaging kernel (Backus & Gilbert 1968, Geophys. J. R. Astron. Soc. 16, 169),
+G the gain of the whitened innovations: an averaging kernel (Backus & Gilbert 1968, Geophys. J. R. Astr. Soc. 16, 169),
 whose integral is the parameter's degrees of freedom for signal but for what acts through the initial state. The share
 of |a_j| that falls into a cell of time is the weight of what the path went through there.
 
@@ -90,14 +90,18 @@ def ledger(problem: InverseProblem, response: LinearResponse, std: Array) -> Led
     edges, states, values = path
     columns = [prior.names.index(name) for name in names]
     moved = response.at + CHANGE * np.diag(std)[columns]
-    changes = [(model.layout[name].start, prior.to_physical(x)[j]) for name, j, x in zip(names, columns, moved, strict=True)]
+    changes = [
+        (model.layout[name].start, prior.to_physical(x)[j]) for name, j, x in zip(names, columns, moved, strict=True)
+    ]
     local = _localised(problem, states[:-1], edges[:-1], times, changes) / (CHANGE * std[columns])[:, None, None]
-    kernel = np.stack([gain @ _whitened(response, one) for gain, one in zip(response.gain[columns], local, strict=True)])
+    kernel = np.stack(
+        [gain @ _whitened(response, one) for gain, one in zip(response.gain[columns], local, strict=True)]
+    )
     return Ledger(names, model.path_quantities, edges, values, kernel, 1 + (len(names) + 1) * (len(edges) - 1))
 
 
 def _path(problem: InverseProblem, start: Array, end: float) -> tuple[Array, Array, Array] | None:
-    """Edges (M + 1,) of the cells, states there (M + 1, n_state), sizes (V, M) of the quantities of the centre's path."""
+    """Edges (M + 1,) of the cells, states there (M + 1, n_state), sizes (V, M) of the quantities there."""
     model = problem.model
     even = np.linspace(0.0, end, CELLS * FINE + 1)
     (first,) = model.trajectories(start, even)

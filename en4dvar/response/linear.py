@@ -50,8 +50,11 @@ class LinearResponse:
         """Coordinates (…, r) of changes (…, n) of the control vector, of least length."""
         return np.asarray(np.linalg.lstsq(self.directions.T, changes.T, rcond=None)[0].T)
 
-    def step(self, observations: Observations, predicted: Predicted, moved: Array, prior_shift: Array) -> Array:
-        """δx (n,) to the mode of a changed problem, from ``at`` + ``moved`` (n,), where it was ``predicted`` (one run).
+    def step(
+        self, observations: Observations, predicted: Predicted, moved: Array, prior_shift: Array
+    ) -> tuple[Array, float]:
+        """δx (n,) to the mode of a changed problem, from ``at`` + ``moved`` (n,), where it was ``predicted`` (one run),
+        and by how much its J falls on the way, as far as it is quadratic.
 
         ``observations`` are the changed ones, ``prior_shift`` (n,) is the change of the prior's mean.
         """
@@ -59,7 +62,8 @@ class LinearResponse:
         changed, tangent = observations.whiten(replace(self.linear, prediction=predicted))
         offset = self.coordinates(moved - prior_shift)
         gradient = self.precision * offset - tangent.T @ changed + S.T @ d
-        return np.asarray(-np.linalg.solve(self._hessian(tangent), gradient) @ self.directions)
+        step = -np.linalg.solve(self._hessian(tangent), gradient)
+        return np.asarray(step @ self.directions), -0.5 * float(gradient @ step)
 
     def _hessian(self, S: Array) -> Array:
         return np.asarray(self.precision * np.eye(S.shape[1]) + S.T @ S)

@@ -15,7 +15,6 @@ import numpy as np
 from en4dvar.ensemble.forecast import Composite
 from en4dvar.executor import Executor
 from en4dvar.forward import Alternative
-from en4dvar.observations import Observations
 from en4dvar.problem import InverseProblem
 from en4dvar.response.linear import LinearResponse
 from en4dvar.state import Array
@@ -28,9 +27,10 @@ SETTLED = 0.1  # of the shift, and of a posterior standard deviation: a correcti
 class Shift:
     """Where the posterior would go under the alternative ``name``; ``words`` complete "if …".
 
-    ``change`` (n,) of the mode in physical SI values, ``relative`` (n,) to the mode where a parameter cannot be negative
-    (else NaN), ``in_std`` (n,) in transformed space per posterior standard deviation. ``cost_change``: J there minus J of the fit, positive where the data speak against the alternative.
-    ``settled``: whether linear response tells (else NaN, and ``reason`` says why); ``runs`` it took.
+    ``change`` (n,) of the mode in physical SI values, ``relative`` (n,) to the mode where a parameter cannot be
+    negative (else NaN), ``in_std`` (n,) in transformed space per posterior standard deviation. ``cost_change``: J there
+    minus J of the fit, positive where the data speak against the alternative. Where linear response does not tell,
+    these are NaN and ``reason`` says why. ``runs``: forward runs it took.
     """
 
     name: str
@@ -105,9 +105,11 @@ def _shift(
     for _ in range(MOST_RUNS):
         run = composite((response.at + moved)[None])
         runs += 1
+        if run.failures[0] and runs > 1:  # where linear response led
+            break
         if run.failures[0]:
             return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be run: {run.failures[0]}")
-        step = response.step(changed.observations, run.predicted[0], moved, of_prior)
+        step, decrease = response.step(changed.observations, run.predicted[0], moved, of_prior)
         moved = moved + step
         correction = float(np.max(np.abs(step / std)))
         if runs > 1 and correction <= SETTLED * max(1.0, float(np.max(np.abs(moved / std)))):
@@ -117,7 +119,7 @@ def _shift(
         return Shift(*about, unknown, unknown, unknown, np.nan, runs, reason)
     prior = problem.prior
     z = (response.at + moved - step - prior.mean - of_prior) / prior.std
-    there = 0.5 * float(z @ z) + float(changed.observations.cost(run.predicted)[0])
+    there = 0.5 * float(z @ z) + float(changed.observations.cost(run.predicted)[0]) - decrease
     mode, positive = prior.to_physical(response.at), prior.bounds[0] >= 0
     change = prior.to_physical(response.at + moved) - mode
     relative = np.divide(change, mode, out=unknown.copy(), where=positive & (mode > 0))

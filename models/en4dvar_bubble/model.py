@@ -9,7 +9,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from en4dvar.forward import Alternative, Failure, ForwardModel, Observable, PathQuantity, Shared, StateField, Trajectory, ValidityLimit
+from en4dvar.forward import (
+    Alternative,
+    Failure,
+    ForwardModel,
+    Observable,
+    PathQuantity,
+    Shared,
+    StateField,
+    Trajectory,
+    ValidityLimit,
+)
 from en4dvar.state import Array
 from en4dvar_bubble.alternatives import alternatives
 from en4dvar_bubble.dynamics import Dynamics
