@@ -71,7 +71,7 @@ def summarise(a: Analysis) -> tuple[ParameterSummary, ...]:
 
 def remarks(a: Analysis) -> tuple[str, ...]:
     """What the terminal says below the table: the alternatives that move a parameter beyond its error bar."""
-    large = [shift for shift in a.what_if if shift.largest > 1]
+    large = [shift for shift in a.what_if if shift.exceeds]
     lines = [f"what if {shift.words}: {_moved(a.parameters, shift)}" for shift in large[:MOST_REMARKS]]
     more = len(large) - len(lines)
     return (*lines, *([f"what if: {more} more exceed the error bar; see the report"] if more else []))

@@ -90,7 +90,7 @@ def stored_ledger(result: StoredResult) -> tuple[tuple[StoredEntry, ...], ...]:
 
 
 def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
-    """A row an alternative, in it one shift a parameter; the alternatives that exceed the error bar most first."""
+    """A row an alternative, in it one shift a parameter; the largest first, then those unknown, then small ones."""
     stats = result.sample_stats
     if "what_if_change" not in stats:
         return ()
@@ -117,7 +117,7 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
             for j, (name, about) in enumerate(zip(names, abouts, strict=True))
         )
 
-    largest = np.where(of["reason"] == "", np.abs(in_std).max(axis=1), np.inf)
+    largest = np.where(of["reason"] == "", np.abs(in_std).max(axis=1), 1.0)
     return tuple(row(i, str(stats["alternative"].values[i])) for i in np.argsort(-largest, kind="stable"))
 
 
@@ -134,16 +134,15 @@ def shift_text(shift: StoredShift) -> str:
     return text if value <= 0 or not math.isfinite(value) else f"+{text}"
 
 
-def sentence(shifts: Sequence[StoredShift], symbol: bool = False) -> str:
+def sentence(shifts: Sequence[StoredShift]) -> str:
     """What an alternative would do to the parameters that it moves beyond their error bar."""
     first = shifts[0]
     if first.reason:
-        return f"if {first.words}, the posterior cannot be told without another fit ({first.reason})"
+        return f"if {first.words}, only another fit tells ({first.reason})"
     moved = sorted((s for s in shifts if s.exceeds), key=lambda s: -abs(s.in_std))
-    name = (lambda s: symbol_html(s.symbol)) if symbol else (lambda s: s.parameter)
     parts = [
         Markup("{} would be {} {} ({} times its error bar)").format(
-            name(s),
+            symbol_html(s.symbol),
             shift_text(s).lstrip("+−"),
             "higher" if s.change > 0 else "lower",
             fixed(abs(s.in_std), 1),
@@ -154,8 +153,8 @@ def sentence(shifts: Sequence[StoredShift], symbol: bool = False) -> str:
 
 
 def exceeding(rows: Iterable[Sequence[StoredShift]]) -> list[Sequence[StoredShift]]:
-    """The alternatives that move a parameter beyond its error bar."""
-    return [row for row in rows if any(shift.exceeds for shift in row)]
+    """The alternatives that move a parameter beyond its error bar, or may."""
+    return [row for row in rows if row[0].reason or any(shift.exceeds for shift in row)]
 
 
 def response_lines(result: StoredResult) -> tuple[Lines, Lines]:

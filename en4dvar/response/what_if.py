@@ -48,14 +48,19 @@ class Shift:
 
     @property
     def largest(self) -> float:
-        """Of the shifts in posterior standard deviations; of one that is not known, infinity."""
-        return float(np.max(np.abs(self.in_std))) if self.settled else np.inf
+        """Of the shifts in posterior standard deviations; one that cannot be told counts as an error bar."""
+        return float(np.max(np.abs(self.in_std))) if self.settled else 1.0
+
+    @property
+    def exceeds(self) -> bool:
+        """Whether a parameter goes, or may go, beyond its error bar."""
+        return self.largest > 1 or not self.settled
 
 
 def what_if(
     problem: InverseProblem, response: LinearResponse, std: Array, cost: float, executor: Executor
 ) -> tuple[Shift, ...]:
-    """The shifts of all alternatives of the problem's model, those that exceed the error bar most first.
+    """The shifts of all alternatives of the problem's model: the largest first, then those unknown, then small ones.
 
     ``std`` (n,) of the posterior, transformed; ``cost`` J at ``response.at``.
     """

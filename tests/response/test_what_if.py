@@ -129,7 +129,7 @@ def test_relative_changes_are_of_what_cannot_be_negative():
     assert np.isnan(shift.relative[1])
 
 
-def test_what_cannot_be_run_or_told_has_a_reason_and_leads_the_list():
+def test_what_cannot_be_run_or_told_has_a_reason_and_stands_before_what_is_small():
     problem = make_problem(Decay(), [1.0, 0.8], std=0.01, k=15)
     problem = offering(
         problem,
