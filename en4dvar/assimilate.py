@@ -145,8 +145,8 @@ class _Assimilation:
         shape = {} if refinement else examine_shape(space, posterior, mode, costs, self.seed)
         observations, prior = problem.observations, problem.prior
         response, std = self.response(descent, mode, last), posterior.std(axis=0, ddof=1)
-        shifts = what_if(problem, response, std, centre_cost, space.executor)
-        path = ledger(problem, response, std)
+        shifts = what_if(problem, response, std, centre_cost, space.executor) if self.settings.what_if else ()
+        path = ledger(problem, response, std) if self.settings.what_if else None
         space.forward_runs += sum(shift.runs for shift in shifts) + (path.runs if path else 0)
         analysis = Analysis(
             problem=problem,

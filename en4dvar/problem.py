@@ -103,6 +103,10 @@ class AssimilationSettings:
         Literal["auto", "on", "off"],
         "A few hundred more runs to tell how Gaussian the posterior is: auto (compiled models), on, or off.",
     ] = "auto"
+    what_if: Annotated[
+        bool,
+        "Tell what the result would be under the alternatives that the model offers, and what on the path informed it.",
+    ] = True
     mda_coefficients: Annotated[
         tuple[Positive, ...],
         MinLen(1),

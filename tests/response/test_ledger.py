@@ -79,6 +79,7 @@ def test_no_ledger_without_quantities_and_nan_where_runs_fail():
     of = problem([1.0, 1.2, 1.5])
     fixed = replace(of, prior=Prior(of.prior.terms[1:]), fixed={"theta": 2.0})
     assert assimilate(fixed, SETTINGS, 1).ledger is None
+    assert assimilate(of, replace(SETTINGS, what_if=False), 1).ledger is None
     of.model.path_quantities = ()
     assert assimilate(of, SETTINGS, 1).ledger is None
     assert np.isnan(assimilate(problem([1.0, 1.2, 1.5], Breaking()), SETTINGS, 1).ledger.weights).all()

@@ -158,6 +158,7 @@ def test_the_posterior_is_the_same_and_its_runs_are_counted():
     assert np.array_equal(first.posterior, second.posterior)
     assert second.forward_runs == first.forward_runs + second.what_if[0].runs
     assert first.what_if == ()
+    assert assimilate(other, replace(SETTINGS, what_if=False), 3).what_if == ()
     (line,) = remarks(second)
     assert line.startswith("what if …: ")
     assert "std)" in line
