@@ -6,11 +6,13 @@ Exit codes: 0 done; 1 the run failed, or some data sets of a campaign; 2 usage, 
 
 from __future__ import annotations
 
+import errno
+import sys
 from typing import Any
 
 import click
 
-from en4dvar.commands.common import Failed
+from en4dvar.commands.common import Failed, give_up_output
 from en4dvar.commands.listings import models, schema
 from en4dvar.commands.plugin_commands import PluginCommand, plugin_commands
 from en4dvar.commands.results import compare, export, report, rerun
@@ -18,6 +20,14 @@ from en4dvar.commands.run import run
 from en4dvar.commands.simulate import simulate
 from en4dvar.commands.validate import validate
 from en4dvar.errors import En4dvarError
+
+OF_THE_DEVICE = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EIO,
+    errno.EROFS,
+)  # told by what writes; here is what is left
 
 
 class Commands(click.Group):
@@ -33,11 +43,19 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
-            return super().invoke(ctx)
+            value = super().invoke(ctx)
+            sys.stdout.flush()
+            return value
         except En4dvarError as error:
             raise Failed(str(error), error.exit_code) from error
         except (KeyboardInterrupt, click.Abort) as interrupt:
             raise Failed(str(interrupt) or "interrupted", 130) from None
+        except OSError as error:
+            if error.errno not in OF_THE_DEVICE:
+                raise
+            if error.filename is None:  # or what is left of it is tried again, and told, when the interpreter ends
+                give_up_output()
+            raise Failed(f"{error.filename or 'standard output'}: cannot be written: {error.strerror}", 2) from error
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})

@@ -16,6 +16,18 @@ def suggest(word: object, known: Iterable[str]) -> str:
     return f"; known: {', '.join(names)}" if names else ""
 
 
+def short(text: str, most: int = 60) -> str:
+    """A name or value as a message can quote it."""
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+def listed(names: Iterable[str], most: int = 30) -> str:
+    """Names with commas between; of many the first, and how many more there are."""
+    known = [short(name) for name in names]
+    more = f" and {len(known) - most} more" if len(known) > most else ""
+    return f"{', '.join(known[:most])}{more}"
+
+
 def no_such_file(path: Path) -> str:
     """``"<path>: no such file"`` and what lies beside it: similar names, else files of the same kind."""
     try:

@@ -53,10 +53,11 @@ def compare(run_dirs: tuple[Path, ...], out: Path | None, no_report: bool) -> No
         click.echo(f"{estimates_table(comparison)}\n")
     click.echo(comparison_table(comparison))
     if not no_report:
+        from en4dvar.files import inside
         from en4dvar.report.overlay import write_comparison
 
         names = "_".join(re.sub(r"[^\w.+-]", "_", name) for name in comparison.runs)
-        folder = out or run_dirs[0].absolute().parent / f"compare_{names}"[:LONGEST]
+        folder = out or inside(run_dirs[0].absolute().parent, f"compare_{names}"[:LONGEST])
         page = write_comparison(comparison, folder)
         click.echo(f"report: {page if out else os.path.relpath(page)}")
 

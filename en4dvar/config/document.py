@@ -21,6 +21,8 @@ from en4dvar.hints import no_such_file
 Key = tuple[str | int, ...]
 Mark = tuple[int, int]  # line and column, from 1
 
+LONGEST = 1_000_000  # bytes of a file, some ten seconds to read: the paths of 10 000 data sets and more
+
 _INT = re.compile(r"[-+]?\d{1,18}")
 _FLOAT = re.compile(r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d{1,3})?")
 _WORDS = {
@@ -73,7 +75,12 @@ class Document:
 def read_document(path: Path) -> Document:
     """Read and parse a YAML file. Raises :class:`ConfigError` listing every fault found."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        with path.open("rb") as file:
+            content = file.read(LONGEST + 1)
+        if len(content) > LONGEST:
+            words = f"longer than {LONGEST / 1e6:g} MB, which no configuration is; numbers belong into data files"
+            raise ConfigError([Fault(words, file=str(path))])
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigError([Fault(f"not UTF-8 text ({error.reason} at byte {error.start})", file=str(path))]) from None
     except OSError as error:

@@ -14,7 +14,7 @@ import numpy as np
 
 from en4dvar.errors import OutputError
 from en4dvar.report.text import number_like
-from en4dvar.storage.store import StoredResult, load_stored, result_files
+from en4dvar.storage.store import StoredResult, load_stored, require_settled, result_files
 from en4dvar.summary import ParameterSummary, summary_csv
 from en4dvar.tables import csv_text
 
@@ -49,6 +49,7 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
 def posterior_file(run_dir: str | Path) -> Path:
     """The netCDF file of a run or campaign, in the ArviZ schema as it is. Raises :class:`OutputError`."""
     path = Path(run_dir) / "posterior.nc"
+    require_settled(path.parent)
     if not path.is_file():
         raise OutputError(f"{run_dir}: holds no posterior.nc; is it the directory of a finished run?")
     return path

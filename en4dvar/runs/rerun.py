@@ -23,6 +23,7 @@ from en4dvar.storage.campaign_file import failed_datasets
 from en4dvar.storage.checkpoint import file_digest
 from en4dvar.storage.fingerprint import Identity, identity
 from en4dvar.storage.provenance import provenance
+from en4dvar.storage.store import result_files
 
 SURROUNDINGS = ("python_version", "package_versions", "platform", "cpu", "git_commit")
 
@@ -78,7 +79,7 @@ def rerun(run_dir: str | Path, workers: int | None = None) -> Rerun:
     """
     run_dir = Path(run_dir)
     campaign = run_dir / "posterior.nc"
-    files = sorted((run_dir / "datasets").glob("*.nc")) or [campaign]
+    files = result_files(run_dir)
     first = load_result(files[0])
     if "identity" not in first.attributes:
         raise OutputError(f"{files[0]}: does not record all that a run is made of; it was written by a program")
