@@ -74,7 +74,7 @@ def remarks(a: Analysis) -> tuple[str, ...]:
     large = [shift for shift in a.what_if if shift.exceeds]
     lines = [f"what if {shift.words}: {_moved(a.parameters, shift)}" for shift in large[:MOST_REMARKS]]
     more = len(large) - len(lines)
-    return (*lines, *([f"what if: {more} more exceed the error bar; see the report"] if more else []))
+    return (*lines, *([f"what if: {more} more exceed the error bar, or may; see the report"] if more else []))
 
 
 def _moved(parameters: Iterable[Parameter], shift: Shift) -> str:
