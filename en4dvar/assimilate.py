@@ -125,6 +125,8 @@ class _Assimilation:
         problem, space, noise = self.problem, self.space, self.problem.observations.noise
         prior_run = space.forecast(np.vstack([space.members, space.mean]), self.grid)
         space.require_members(prior_run[:-1].failures, "prior forecast")
+        if not self.settings.stochastic_model:
+            space.check_repeats(prior_run, self.grid)
         start = self.start(prior_run, resume) if resume is None or resume.descent is None else resume
         descent = self.iterate(start, prior_run)
 

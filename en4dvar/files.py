@@ -15,7 +15,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from en4dvar.errors import OutputError
+from en4dvar.errors import En4dvarError, OutputError
+
+
+class PathError(En4dvarError, ValueError):
+    """A path that stands for nothing. A ``ValueError`` too, so that pydantic collects it."""
+
+    exit_code = 2
+
 
 _KINDS = {
     stat.S_IFLNK: "a symbolic link",
@@ -126,6 +133,14 @@ def make_folder(path: str | Path) -> Path:
     except OSError as error:
         raise OutputError(f"{path}: cannot be created: {error.strerror}") from None
     return path
+
+
+def expanded(text: str) -> Path:
+    """The path, a ``~`` at its beginning as the folder it stands for. Raises :class:`PathError`."""
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:
+        raise PathError(f"{text}: the home folder that ~ stands for is not known") from None
 
 
 def readable(text: object) -> str:

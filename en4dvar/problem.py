@@ -107,6 +107,10 @@ class AssimilationSettings:
         bool,
         "Tell what the result would be under the alternatives that the model offers, and what on the path informed it.",
     ] = True
+    stochastic_model: Annotated[
+        bool,
+        "true: accept a model that gives other numbers when a member is run again; by default that is an error.",
+    ] = False
     mda_coefficients: Annotated[
         tuple[Positive, ...],
         MinLen(1),

@@ -27,7 +27,7 @@ class Failed(click.ClickException):
 
     def show(self, file: IO[Any] | None = None) -> None:
         try:
-            click.echo(self.message, file=file, err=file is None)
+            click.echo(printable(self.message), file=file, err=file is None)
         except OSError:  # the terminal is gone, or the disk of the log is full: the exit code says it all the same
             give_up_output()
 
@@ -42,6 +42,11 @@ def give_up_output() -> None:
             except OSError:
                 os.dup2(nowhere, stream.fileno())
         os.close(nowhere)
+
+
+def printable(text: str) -> str:
+    """Lines without what a terminal would obey: names and values come from files of anybody."""
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from en4dvar import diagnostics as diag
 from en4dvar.descent.step_control import Trials
 from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
 from en4dvar.ensemble.linalg import FEW, Hessian, ThinTransform, anomaly_basis, centre
+from en4dvar.ensemble.repeat import check_repeats
 from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor
 from en4dvar.prior import Prior, Sampling
@@ -108,6 +109,19 @@ class WeightSpace:
     def forecast(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
         self.forward_runs += len(x)
         return self.composite(x, extra_times)
+
+    def check_repeats(self, prior_run: Forecast, extra_times: Array) -> None:
+        """Run two members of the prior forecast again, at the same instants; ``forward_runs`` does not count them.
+
+        Raises :class:`ConfigError`: they give other predictions.
+        """
+
+        def again(members: list[int]) -> tuple[Array, tuple[str, ...]]:
+            run = self.composite(self.members[members], extra_times)
+            return run.predictions, run.failures
+
+        alive = prior_run[: len(self.members)]
+        check_repeats(self.problem.model, alive.predictions, alive.failures, again, self.problem.observations.name)
 
     def observation_cost(self, run: Forecast) -> Array:
         """J_o (B,)."""

@@ -8,6 +8,7 @@ scalars collected.
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -203,8 +204,8 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def _require_file(path: Path) -> None:
-    if not path.is_file():
-        raise DataError(f"{path}: is a directory" if path.is_dir() else no_such_file(path))
+    if not os.path.isfile(path):  # Path.is_file raises for a name that is too long, or in a closed folder
+        raise DataError(f"{path}: is a directory" if os.path.isdir(path) else no_such_file(path))
 
 
 def _check(times: Array, values: Array, name: str, path: Path) -> None:

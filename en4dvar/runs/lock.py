@@ -90,11 +90,11 @@ def _is_dead(owner: str) -> bool:
     if owner == _OTHER:  # not written yet
         return True
     number, _, host = owner.removeprefix("process ").partition(" on ")
-    if host != socket.gethostname() or not number.isdigit() or sys.platform == "win32":
+    if host != socket.gethostname() or not number.isdecimal() or sys.platform == "win32":
         return False
     try:
         os.kill(int(number), 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):  # the second: no process can have this number
         return True
     except OSError:
         pass

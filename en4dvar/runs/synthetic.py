@@ -24,6 +24,7 @@ from en4dvar.forward import Failure
 from en4dvar.prior import member_stream
 from en4dvar.state import TIME_SHIFT, Array
 from en4dvar.units import convert
+from en4dvar.user_code import reason_of
 
 ATTEMPTS = 100  # truths that cannot be integrated, or yield too few readings, are drawn again so often
 TRUTH = "truth.csv"
@@ -70,8 +71,8 @@ def _draw(plan: CampaignPlan, kind: str, group: GroupSection, number: int) -> Sy
         noise = asked.noise * stream.standard_normal(asked.most)
         try:
             state = np.asarray(model.initial_state(theta), dtype=float)
-        except ValueError as error:
-            reason = str(error)
+        except BaseException as error:
+            reason = str(error) if isinstance(error, ValueError) else reason_of(error)
             continue
         (path,) = run_chunk(model, state[None], times + shift)
         if isinstance(path, Failure):

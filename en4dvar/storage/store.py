@@ -17,6 +17,7 @@ from en4dvar.errors import OutputError
 from en4dvar.noise import noise_of_record
 from en4dvar.observations import Observations
 from en4dvar.state import Array, Parameter
+from en4dvar.storage.complete import check_complete
 from en4dvar.storage.groups import SCALAR, build_groups
 from en4dvar.storage.netcdf import netcdf_file, tree_of
 from en4dvar.storage.seal import check_seal
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 NEXT = ".en4dvar-next"  # in a run directory: the run that replaces its result
 COMPLETE = ".en4dvar-complete"  # in that: it is being put in place
-GROUPS = ("prior", "posterior", "posterior_predictive", "observed_data", "sample_stats", "iterations")
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,5 @@ def load_stored(path: str | Path) -> StoredResult:
             nodes = {node.path: node.to_dataset(inherit=False).load() for node in tree.subtree}
     except OSError as error:
         raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
-    missing = [group for group in GROUPS if f"/{group}" not in nodes]
-    if missing:
-        raise OutputError(f"{path}: not a result of en4dvar: no group {', '.join(missing)}")
+    check_complete(path, nodes)
     return StoredResult(xr.DataTree.from_dict(nodes))

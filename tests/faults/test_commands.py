@@ -17,7 +17,7 @@ model: {name: lorenz96, size: 12}
 twin: {cycles: 5, burn_in: 1, interval: 0.05, error: {x_std: 1}, initial_std: {x: 0.1}}
 assimilation: {scheme: etkf, members: 15, inflation: 1.02}
 """
-pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="limits and forks of POSIX")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reason="limits and forks of POSIX")]
 
 
 @pytest.fixture(scope="module")
@@ -29,12 +29,12 @@ def prepare(folder):
     """A folder with configurations and what the commands make of them on a good disk."""
     make_campaign(folder, 2)
     (folder / "twin.yaml").write_text(TWIN)
-    for name in ("done", "other"):
-        found = attempt([Task(["run", str(folder / "toy.yaml"), "--out", str(folder / name), "--no-report"])])
-        assert found[0].code == 0, found[0].told
-    assert (
-        attempt([Task(["run", str(folder / "twin.yaml"), "--out", str(folder / "twin"), "--no-report"])])[0].code == 0
-    )
+    tasks = [
+        Task(["run", str(folder / f"{config}.yaml"), "--out", str(folder / name), "--no-report"])
+        for config, name in (("toy", "done"), ("toy", "other"), ("twin", "twin"))
+    ]
+    for found in attempt(tasks):
+        assert found.code == 0, found.told
     return folder
 
 
@@ -78,7 +78,6 @@ def assert_told(task, found, reason):
         assert all(after[name] for name in files(task.copy) if name.suffix != ".log")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("fault", [("fsync", "EIO"), ("replace", "EDQUOT"), ("fsync", "ENOSPC")], ids="-".join)
 @pytest.mark.fault("disk-failing")
 def test_a_call_that_fails(quiet, tmp_path, fault):
@@ -94,7 +93,7 @@ def test_a_call_that_fails(quiet, tmp_path, fault):
         assert row("disk-failing").told(found.told) or "cannot be used as run directory" in found.told
 
 
-@pytest.mark.parametrize("limit", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (300, 9000))])
+@pytest.mark.parametrize("limit", [0, 300, 9000])
 @pytest.mark.fault("disk-failing")
 def test_no_room(quiet, tmp_path, limit):
     """The kernel refuses bytes beyond a size, also those of libraries (HDF5, PDF)."""
@@ -111,7 +110,6 @@ def test_no_room(quiet, tmp_path, limit):
         assert found.code == 0, found.told
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("words", [("export", "done"), ("schema",), ("models",), ("run", "toy.yaml", "--no-report")])
 @pytest.mark.fault("output-full")
 def test_output_that_cannot_be_written(quiet, tmp_path, words):
@@ -129,7 +127,6 @@ def test_output_that_cannot_be_written(quiet, tmp_path, words):
         assert run_cli(*given, "--resume").returncode == 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["report", "report of a twin", "export", "compare"])
 @pytest.mark.fault("kill-commands")
 def test_killed_commands_are_given_again(quiet, tmp_path, name):
@@ -155,7 +152,6 @@ def test_killed_commands_are_given_again(quiet, tmp_path, name):
             assert target.read_bytes() == whole.read_bytes()
 
 
-@pytest.mark.slow
 @pytest.mark.fault("kill-commands")
 def test_a_killed_rerun_leaves_everything(quiet, tmp_path):
     shutil.copytree(quiet / "done", tmp_path / "run")
