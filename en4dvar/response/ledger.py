@@ -21,11 +21,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.ensemble.members import EVERYONE, InitialStates, Reading
+from en4dvar.executor.chunks import without_warnings
 from en4dvar.forward import Failure, PathQuantity, Trajectory
 from en4dvar.noise import Linearisation
 from en4dvar.problem import InverseProblem
 from en4dvar.response.linear import LinearResponse
 from en4dvar.state import TIME_SHIFT, Array
+from en4dvar.user_code import reason_of
 
 CELLS = 32  # M, of the path in time; narrow where its quantities change
 FINE = 20  # points of a cell at which the path is read
@@ -72,13 +74,22 @@ def weighted_quantiles(values: Array, weights: Array) -> Array:
 def ledger(problem: InverseProblem, response: LinearResponse, std: Array) -> Ledger | None:
     """The ledger of a posterior with standard deviations ``std`` (n,), transformed, in this process.
 
-    None where the model names no quantities of its path, none of its path parameters is estimated, or the centre
-    cannot be run.
+    None where the model names no quantities of its path, none of its path parameters is estimated, or it cannot be run
+    like this: a model may fail in any way, and the posterior is there already.
     """
-    model, prior = problem.model, problem.prior
-    names = tuple(name for name in prior.names if name in model.path_parameters)
-    if not names or not model.path_quantities:
+    names = tuple(name for name in problem.prior.names if name in problem.model.path_parameters)
+    if not names or not problem.model.path_quantities or not response.defined or not np.all(std > 0):
         return None
+    try:
+        with without_warnings():
+            return _ledger(problem, response, std, names)
+    except BaseException as error:
+        reason_of(error)  # an interrupt is one
+        return None
+
+
+def _ledger(problem: InverseProblem, response: LinearResponse, std: Array, names: tuple[str, ...]) -> Ledger | None:
+    model, prior = problem.model, problem.prior
     physical = prior.to_physical(response.at)
     reasons = [""]
     alive, start = InitialStates(problem)(physical[None], reasons)
@@ -97,7 +108,7 @@ def ledger(problem: InverseProblem, response: LinearResponse, std: Array) -> Led
     kernel = np.stack(
         [gain @ _whitened(response, one) for gain, one in zip(response.gain[columns], local, strict=True)]
     )
-    return Ledger(names, model.path_quantities, edges, values, kernel, 1 + (len(names) + 1) * (len(edges) - 1))
+    return Ledger(names, model.path_quantities, edges, values, kernel, 2 + (len(names) + 1) * (len(edges) - 1))
 
 
 def _path(problem: InverseProblem, start: Array, end: float) -> tuple[Array, Array, Array] | None:

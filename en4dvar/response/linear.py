@@ -35,6 +35,11 @@ class LinearResponse:
     precision: float
     observations: Observations
 
+    @property
+    def defined(self) -> bool:
+        """Whether the mode could be run."""
+        return bool(np.isfinite(self.linear.prediction.values).all())
+
     @cached_property
     def whitened(self) -> tuple[Array, Array]:
         """d (K',) and S (K', r) at ``at``."""

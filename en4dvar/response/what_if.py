@@ -65,6 +65,8 @@ def what_if(
 
     ``std`` (n,) of the posterior, transformed; ``cost`` J at ``response.at``.
     """
+    if not response.defined or not np.all(std > 0):
+        return ()
     shifts = [_shift(problem, response, std, cost, executor, one) for one in problem.model.alternatives]
     return tuple(sorted(shifts, key=lambda shift: -shift.largest))
 

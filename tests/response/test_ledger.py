@@ -85,13 +85,31 @@ def test_no_ledger_without_quantities_and_nan_where_runs_fail():
     assert np.isnan(assimilate(problem([1.0, 1.2, 1.5], Breaking()), SETTINGS, 1).ledger.weights).all()
 
 
+class Raising(Acting):
+    """Ends in the middle of what nobody asked for."""
+
+    def resumed(self, x, start, times):
+        raise SystemExit(3)
+
+
+class Interrupted(Acting):
+    def resumed(self, x, start, times):
+        raise KeyboardInterrupt
+
+
+def test_a_model_that_raises_keeps_its_posterior():
+    assert assimilate(problem([1.0, 1.2, 1.5], Raising()), SETTINGS, 1).ledger is None
+    with pytest.raises(KeyboardInterrupt):
+        assimilate(problem([1.0, 1.2, 1.5], Interrupted()), SETTINGS, 1)
+
+
 def test_runs_are_counted():
     model = Acting()
     counted = assimilate(problem([1.0, 1.2, 1.5], model), SETTINGS, 1)
     model = Acting()
     model.path_parameters = ()
     without = assimilate(problem([1.0, 1.2, 1.5], model), SETTINGS, 1)
-    assert counted.ledger.runs == 1 + 2 * CELLS
+    assert counted.ledger.runs == 2 + 2 * CELLS
     assert counted.forward_runs - without.forward_runs == counted.ledger.runs
 
 
