@@ -11,6 +11,8 @@ from en4dvar.caution import Caution
 from en4dvar.observations import Observations
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.residuals import Residuals
+from en4dvar.response.ledger import Ledger
+from en4dvar.response.what_if import Shift
 from en4dvar.state import Array, Parameter
 
 
@@ -115,6 +117,8 @@ class Analysis:
     residuals: Residuals | None = None  # whitened, at the centre, with what is expected of them
     discrepancy: Discrepancy | None = None  # of the model, at the centre; None where none is allowed for
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) of the model's limits, by the posterior
+    what_if: tuple[Shift, ...] = ()  # under the model's alternatives; the largest first
+    ledger: Ledger | None = None  # what the path went through where it informed the parameters
 
     @property
     def observations(self) -> Observations:

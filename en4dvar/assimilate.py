@@ -24,6 +24,9 @@ from en4dvar.honesty import ControlEnsembles, examine
 from en4dvar.noise import Predicted
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.residuals import Residuals
+from en4dvar.response.ledger import ledger
+from en4dvar.response.linear import LinearResponse
+from en4dvar.response.what_if import what_if
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.shape import examine_shape, guide
 from en4dvar.schemes import window_scheme
@@ -151,6 +154,10 @@ class _Assimilation:
         centre_cost = float(self.costs(ends[-1:], last)[0])
         shape = {} if refinement else examine_shape(space, posterior, mode, costs, self.seed)
         observations, prior = problem.observations, problem.prior
+        response, std = self.response(descent, mode, last), posterior.std(axis=0, ddof=1)
+        shifts = what_if(problem, response, std, centre_cost, space.executor) if self.settings.what_if else ()
+        path = ledger(problem, response, std) if self.settings.what_if else None
+        space.forward_runs += sum(shift.runs for shift in shifts) + (path.runs if path else 0)
         analysis = Analysis(
             problem=problem,
             settings=self.settings,
@@ -183,6 +190,8 @@ class _Assimilation:
             extremes=after.extremes,
             residuals=self.residuals(descent),
             discrepancy=self.discrepancy(descent, last.predicted[0]),
+            what_if=shifts,
+            ledger=path,
         )
         control = ControlEnsembles(space.members, posterior, mode, costs, centre_cost)
         found = (*start.warnings, *refine_warnings)
@@ -266,6 +275,14 @@ class _Assimilation:
         )
         warnings = () if chain.converged else (caution("chain-not-converged", chain.warning()),)
         return chain.thin(len(posterior), self.settings.sampling == "exact"), chain.summary(), warnings
+
+    def response(self, descent: Descent, mode: Array, central: Forecast) -> LinearResponse:
+        """How the mode (n,), whose run is ``central``, follows what it was inferred from."""
+        space, linear = self.space, descent.iterate.linear
+        assert linear is not None
+        linear = replace(linear, prediction=central.predicted[0])
+        directions = space.basis.T @ space.anomalies
+        return LinearResponse(mode, linear, directions, len(space.members) - 1.0, self.problem.observations)
 
     def costs(self, members: Array, run: Forecast) -> Array:
         """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -61,6 +61,38 @@ class ValidityLimit:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "label", self.label or self.name)
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """The same experiment with one assumption changed: what a result would be then is told beside it.
+
+    ``words`` complete "if …", e.g. "the pulse were 5 % stronger". ``model`` takes the place of the model, with the same
+    parameters and observables; ``values`` and ``times`` multiply the observations and their errors; ``parameters`` are
+    factors of a parameter's value where it is fixed, of the centre of its prior where it is estimated.
+    """
+
+    name: str
+    words: str
+    model: ForwardModel | None = None
+    values: float = 1.0
+    times: float = 1.0
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PathQuantity:
+    """What a path went through, e.g. a strain rate: ``trajectory[name]`` (K,) in ``unit``; its size is of interest."""
+
+    name: str
+    unit: str
+    label: str = ""
+    symbol: str = ""
+    display_unit: str = ""
+
+    def __post_init__(self) -> None:
+        for key, value in (("symbol", self.name), ("display_unit", self.unit), ("label", self.name)):
+            object.__setattr__(self, key, getattr(self, key) or value)
 
 
 @runtime_checkable
@@ -142,7 +174,9 @@ class ForwardModel(ABC):
     fast path likes to get at once (executors cut chunks at multiples of it); ``compiled`` says that ``trajectories``
     releases the interpreter lock, so that threads serve it. ``autonomous`` says that F depends on elapsed time alone:
     sequential schemes may start ``trajectories`` at any instant, where otherwise they repeat ``step``. ``validity``
-    names quantities and the limits beyond which the equations do not hold.
+    names quantities and the limits beyond which the equations do not hold. ``alternatives`` are assumptions that could
+    be otherwise, for :mod:`en4dvar.response.what_if`; ``path_quantities`` and ``path_parameters``, names
+    of fields of the state that act along the path and not only at its start, are for :mod:`en4dvar.response.ledger`.
 
     A model that has settings in YAML also has ``Settings`` (a pydantic model of its ``model:`` section) and
     ``from_settings``; without them the class is called without arguments. In a sequence, parameters that the state
@@ -158,6 +192,9 @@ class ForwardModel(ABC):
     compiled: ClassVar[bool] = False
     autonomous: ClassVar[bool] = False
     validity: tuple[ValidityLimit, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
+    path_quantities: tuple[PathQuantity, ...] = ()
+    path_parameters: tuple[str, ...] = ()
 
     @abstractmethod
     def initial_state(self, theta: Mapping[str, float]) -> Array:
@@ -187,13 +224,21 @@ class ForwardModel(ABC):
         own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
         return [self._march(x[i], own[i]) for i in range(len(x))]
 
+    def resumed(self, x: Array, start: Array, times: Array) -> Sequence[Trajectory | Failure]:
+        """:meth:`trajectories` from states ``x`` (N, n_state) at ``start`` (N,) instead of time zero.
+
+        At those of the ``times`` (N, K) that lie before its start a member is where it started. This default repeats
+        :meth:`step`.
+        """
+        return [self._march(x[i], np.maximum(times[i], start[i]), float(start[i])) for i in range(len(x))]
+
     def share(self, x: Array, times: Array) -> Shared | None:
         """:meth:`trajectories` of states (N, n_state) as work that threads share, where the model can; else None."""
         return None
 
-    def _march(self, x: Array, times: Array) -> Trajectory | Failure:
+    def _march(self, x: Array, times: Array, start: float = 0.0) -> Trajectory | Failure:
         states = np.empty((len(times), self.layout.size))
-        x, t = np.array(x, dtype=float), 0.0  # a step may work in place; the ensemble stays as it is
+        x, t = np.array(x, dtype=float), start  # a step may work in place; the ensemble stays as it is
         for k, t_next in enumerate(times):
             if t_next != t:
                 try:

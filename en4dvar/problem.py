@@ -120,6 +120,10 @@ class AssimilationSettings:
         Literal["auto", "on", "off"],
         "A few hundred more runs to tell how Gaussian the posterior is: auto (compiled models), on, or off.",
     ] = "auto"
+    what_if: Annotated[
+        bool,
+        "Tell what the result would be under the alternatives that the model offers, and what on the path informed it.",
+    ] = True
     stochastic_model: Annotated[
         bool,
         "true: accept a model that gives other numbers when a member is run again; by default that is an error.",

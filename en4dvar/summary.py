@@ -11,9 +11,12 @@ import numpy.typing as npt
 from en4dvar.analysis import Analysis
 from en4dvar.caution import Caution, codes
 from en4dvar.diagnostics import active_members
+from en4dvar.response.what_if import Shift
 from en4dvar.state import Array, Parameter
 from en4dvar.tables import csv_text, table
 from en4dvar.units import convert
+
+MOST_REMARKS = 3
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,27 @@ def summarise(a: Analysis) -> tuple[ParameterSummary, ...]:
         )
         for j, p in enumerate(a.parameters)
     )
+
+
+def remarks(a: Analysis) -> tuple[str, ...]:
+    """What the terminal says below the table: the alternatives that move a parameter beyond its error bar."""
+    large = [shift for shift in a.what_if if shift.exceeds]
+    lines = [f"what if {shift.words}: {_moved(a.parameters, shift)}" for shift in large[:MOST_REMARKS]]
+    more = len(large) - len(lines)
+    return (*lines, *([f"what if: {more} more exceed the error bar, or may; see the report"] if more else []))
+
+
+def _moved(parameters: Iterable[Parameter], shift: Shift) -> str:
+    """The parameters beyond their error bar under an alternative."""
+    if shift.reason:
+        return f"only another fit tells ({shift.reason})"
+    words = []
+    for p, change, relative, in_std in zip(parameters, shift.change, shift.relative, shift.in_std, strict=True):
+        if abs(in_std) > 1:
+            value = f"{convert(float(change), p.unit, p.display_unit):+.2g} {p.display_unit}"
+            shown = value if np.isnan(relative) else f"{100 * relative:+.2g} %"
+            words.append(f"{p.name} {shown} ({abs(in_std):.1f} std)")
+    return ", ".join(words)
 
 
 def results_table(summaries: Mapping[str, Iterable[ParameterSummary]]) -> str:

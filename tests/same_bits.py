@@ -12,7 +12,9 @@ def assert_same_bits(a: Any, b: Any) -> None:
         left, right = getattr(a, field.name), getattr(b, field.name)
         if isinstance(left, np.ndarray):
             assert np.array_equal(left, right, equal_nan=True), field.name
-        elif field.name == "iterations":
+        elif is_dataclass(left) and field.name == "ledger":
+            assert_same_bits(left, right)
+        elif field.name in ("iterations", "what_if"):
             assert len(left) == len(right)
             for x, y in zip(left, right, strict=True):
                 assert_same_bits(x, y)

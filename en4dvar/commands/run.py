@@ -86,6 +86,9 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
 
     if len(campaign) <= MOST_TOLD:
         click.echo(results_table({o.name: o.summary for o in campaign.outcomes if not o.failure}))
+    for outcome in campaign.outcomes[:MOST_TOLD]:
+        for remark in outcome.remarks:
+            click.echo(f"{outcome.name}: {remark}")
     for notice in campaign.notices:
         click.echo(f"warning: {notice}", err=True)
     found = [(o.name, warning) for o in campaign.outcomes for warning in o.warnings]

@@ -11,12 +11,12 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from en4dvar.report import text
+from en4dvar.report import responses, text
 from en4dvar.report.style import DARK, LIGHT, css_variables
 
 WRITERS = (  # what templates call
     text.fixed, text.informed_words, text.number_like, text.percent, text.plain_number, text.plus_minus,
-    text.pretty_unit, text.symbol_html,
+    text.pretty_unit, text.rough_number, text.symbol_html, responses.sentence, responses.shift_text,
 )  # fmt: skip
 
 
@@ -41,6 +41,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["upper_first"] = lambda words: words[:1].upper() + words[1:]
     environment.globals |= {write.__name__: write for write in WRITERS}
     return environment
 

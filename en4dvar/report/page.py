@@ -9,6 +9,7 @@ from typing import Any
 
 from en4dvar.diagnostics import chi2_interval
 from en4dvar.report.html import render
+from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
 from en4dvar.report.style import Drawing
 from en4dvar.report.text import number_like, plain_number
 from en4dvar.storage.groups import ITERATION_SCALARS, SHARES
@@ -43,6 +44,9 @@ def render_set(
         tiles=_tiles(result),
         shares=_shares(result),
         discrepancy_share=result.sample_stats.attrs.get("discrepancy_share"),
+        what_if=(what_if := stored_shifts(result)),
+        exceeding=exceeding(what_if),
+        entries=stored_ledger(result),
         identifiers=IDENTIFIERS,
         figures=figures,
         lost=[(i, str(reason)) for i, reason in enumerate(reasons) if reason],

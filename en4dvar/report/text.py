@@ -59,6 +59,17 @@ def plain_number(value: float, digits: int = 4) -> str:
     return text.replace("-", "−")
 
 
+def rough_number(value: float) -> str:
+    """Two significant digits, as people write them; an en dash for NaN.
+
+    >>> rough_number(287.4), rough_number(1.333), rough_number(6.18e6)
+    ('290', '1.3', '6.2×10⁶')
+    """
+    if not math.isfinite(value) or not 1 <= abs(value) < 1e4:
+        return plain_number(value, 2)
+    return plain_number(float(f"{value:.2g}"))
+
+
 def number_like(value: float, std: float) -> str:
     """``value`` rounded to the precision that ``std`` allows.
 

@@ -32,6 +32,7 @@ class DatasetOutcome:
     summary: tuple[ParameterSummary, ...] = ()
     n_observations: int = 0
     sha256: str = ""
+    remarks: tuple[str, ...] = ()  # that the terminal shows below the table
 
 
 @dataclass(frozen=True)

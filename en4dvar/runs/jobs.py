@@ -18,7 +18,7 @@ from en4dvar.runs.campaign import DatasetOutcome
 from en4dvar.storage.checkpoint import Keeper, digest
 from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import to_bytes
-from en4dvar.summary import summarise
+from en4dvar.summary import remarks, summarise
 
 SEND_EVERY = 0.1  # s; a worker sends the records of its iterations no more often
 Records = tuple[tuple[str, Record], ...]  # each with the name of its data set
@@ -77,6 +77,7 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
         summary=summarise(analysis),
         n_observations=len(analysis.observations),
         sha256=digest(content),
+        remarks=remarks(analysis),
     )
     converged = "converged" if analysis.converged else "not converged"
     return Estimate(content, f"{converged}: {analysis.stop_reason}; {analysis.forward_runs} forward runs", outcome)

@@ -30,7 +30,10 @@ from en4dvar.runs.replacement import (
 )
 from en4dvar.storage.store import COMPLETE, NEXT, require_settled
 
-FIXED = ("config.yaml", "config.resolved.yaml", "posterior.nc", "twin.nc", "run.log", "report.html", "summary.csv")
+FIXED = (
+    "config.yaml", "config.resolved.yaml", "posterior.nc", "twin.nc", "run.log", "report.html", "summary.csv",
+    "what_if.csv", "ledger.csv",
+)  # fmt: skip
 Mode = Literal["new", "force", "resume", "report"]
 
 

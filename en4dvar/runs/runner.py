@@ -13,7 +13,7 @@ from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.executor import Executor, choose_executor, one_blas_thread
 from en4dvar.files import write_text
-from en4dvar.report import write_pages
+from en4dvar.report import TABLES, write_pages
 from en4dvar.report.result import Result
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
 from en4dvar.runs.interrupt import terminate_as_interrupt
@@ -171,7 +171,7 @@ def _finish(work: Worklist, report_workers: int) -> None:
 
 
 def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int = 1) -> Path:
-    directory.claim("report.html", "summary.csv")
+    directory.claim("report.html", "summary.csv", *TABLES)
     with directory.claiming("figures", "pages"):
         return write_pages(directory.work, datasets, workers)
 

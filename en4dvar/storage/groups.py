@@ -19,7 +19,9 @@ from en4dvar.analysis import Analysis
 from en4dvar.caution import codes
 from en4dvar.diagnostics import active_members, nrmse
 from en4dvar.state import Array, Parameter
-from en4dvar.storage.netcdf import Group, Variable
+from en4dvar.storage.netcdf import Group, Variable, netcdf_attributes
+from en4dvar.storage.netcdf import variable as _variable
+from en4dvar.storage.responses import response_coordinates, response_variables
 
 CONVENTIONS = "CF-1.11 ACDD-1.3"
 REFERENCES = (
@@ -67,19 +69,6 @@ def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]
     }
 
 
-def netcdf_attributes(attributes: Mapping[Any, Any]) -> dict[str, Any]:
-    """Attributes as netCDF can hold them: truth values become 0/1, absent ones "", other objects their text."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, bool | np.bool_):
-            return int(value)
-        if value is None:
-            return ""
-        return value if isinstance(value, str | int | float | np.number | np.ndarray) else str(value)
-
-    return {str(key): plain(value) for key, value in attributes.items()}
-
-
 def about(p: Parameter) -> dict[str, Any]:
     """What a variable of the parameter says of itself."""
     return {
@@ -89,14 +78,6 @@ def about(p: Parameter) -> dict[str, Any]:
         "symbol": p.symbol,
         "source": p.source,
     }
-
-
-def _variable(
-    dims: str | tuple[str, ...], values: Any, units: str, long_name: str, *, fill: bool = True, **attrs: Any
-) -> Variable:
-    dims = (dims,) if isinstance(dims, str) else dims
-    attributes = netcdf_attributes({"units": units, "long_name": long_name, **attrs})
-    return Variable(dims, np.asarray(values), attributes, fill)
 
 
 def _coordinates(a: Analysis) -> Variables:
@@ -109,6 +90,7 @@ def _coordinates(a: Analysis) -> Variables:
         "path_time": _time(a, "path_time", a.trajectory_times, "time on the clock of the observations"),
         "parameter": _variable("parameter", names, "1", "estimated parameter", fill=False),
         "iteration": _variable("iteration", [r.iteration for r in a.iterations], "1", "iteration", fill=False),
+        **response_coordinates(a),
     }
 
 
@@ -186,6 +168,7 @@ def _sample_stats(a: Analysis) -> Variables:
             )
             for i, v in enumerate(a.problem.model.validity)
         },
+        **response_variables(a),
     }
 
 
@@ -242,6 +225,8 @@ def _scalars(a: Analysis) -> dict[str, Any]:
         "converged": a.converged,
         "stop_reason": a.stop_reason,
         "forward_runs": a.forward_runs,
+        "what_if_runs": sum(shift.runs for shift in a.what_if),
+        "ledger_runs": a.ledger.runs if a.ledger else 0,
         "warning_codes": " ".join(codes(a.cautions)),
         **_judged_residuals(a),
         **a.shape,

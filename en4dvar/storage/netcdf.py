@@ -55,6 +55,28 @@ class Group:
         return {dim: size for v in every for dim, size in zip(v.dims, v.values.shape, strict=True)}
 
 
+def netcdf_attributes(attributes: Mapping[Any, Any]) -> dict[str, Any]:
+    """Attributes as netCDF can hold them: truth values become 0/1, absent ones "", other objects their text."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, bool | np.bool_):
+            return int(value)
+        if value is None:
+            return ""
+        return value if isinstance(value, str | int | float | np.number | np.ndarray) else str(value)
+
+    return {str(key): plain(value) for key, value in attributes.items()}
+
+
+def variable(
+    dims: str | tuple[str, ...], values: Any, units: str, long_name: str, *, fill: bool = True, **attrs: Any
+) -> Variable:
+    """A variable with what CF asks of it."""
+    dims = (dims,) if isinstance(dims, str) else dims
+    attributes = netcdf_attributes({"units": units, "long_name": long_name, **attrs})
+    return Variable(dims, np.asarray(values), attributes, fill)
+
+
 Groups = Mapping[str, Group]
 """By path, the root ``/`` first."""
 

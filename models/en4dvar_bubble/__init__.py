@@ -2,8 +2,9 @@
 
 From the bottom up, each importing only what stands before it: ``tables`` (smooth functions), ``medium`` (constants),
 ``gas``, ``driving``, ``laws``, ``solver`` (compiled), ``dynamics`` (what is assumed, and the state at the start),
-``packing`` (states to the solver's arrays), ``paths`` (and back), ``settings`` (YAML), ``model`` (the forward model),
-``api`` (``simulate``), ``battery`` (checks of a law), ``starter`` (``en4dvar init``), ``examples``, commands.
+``alternatives`` (what could be otherwise), ``packing`` (states to the solver's arrays), ``paths`` (and back),
+``settings`` (YAML), ``model`` (the forward model), ``api`` (``simulate``), ``battery`` (checks of a law), ``starter``
+(``en4dvar init``), ``examples``, commands.
 """
 
 from en4dvar_bubble.api import simulate

@@ -9,8 +9,19 @@ from typing import ClassVar
 
 import numpy as np
 
-from en4dvar.forward import Failure, ForwardModel, Observable, Shared, StateField, Trajectory, ValidityLimit
+from en4dvar.forward import (
+    Alternative,
+    Failure,
+    ForwardModel,
+    Observable,
+    PathQuantity,
+    Shared,
+    StateField,
+    Trajectory,
+    ValidityLimit,
+)
 from en4dvar.state import Array
+from en4dvar_bubble.alternatives import alternatives
 from en4dvar_bubble.dynamics import Dynamics
 from en4dvar_bubble.packing import pack
 from en4dvar_bubble.paths import Paths
@@ -40,6 +51,11 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         ),
     )
 
+    path_quantities = (
+        PathQuantity("strain_rate", "s^-1", "hoop strain rate at the wall, |Ṙ|/R", r"$|\dot{R}|/R$"),
+        PathQuantity("stretch", "1", "hoop stretch at the wall, R over the stress-free radius", r"$R/R_0$"),
+    )
+
     @classmethod
     def from_settings(cls, settings: BubbleSettings) -> BubbleModel:
         """The model of a ``model:`` section."""
@@ -61,6 +77,16 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         """The largest Mach number of the wall that the radial equation can bear, and where that is said."""
         value, source = MACH_LIMITS[self.radial]
         return (ValidityLimit("wall_mach", value, label="Mach number of the bubble wall", source=source),)
+
+    @property
+    def path_parameters(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Those of the law."""
+        return tuple(p.name for p in self.law.parameters)
+
+    @property
+    def alternatives(self) -> tuple[Alternative, ...]:  # type: ignore[override]
+        """See :mod:`en4dvar_bubble.alternatives`."""
+        return alternatives(self)
 
     def initial_state(self, theta: Mapping[str, float]) -> Array:
         return np.asarray(self.initial_states({p.name: np.array([theta[p.name]]) for p in self.parameters})[0])
@@ -87,12 +113,19 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         work()
         return finish()
 
-    def prepared(self, x: Array, times: Array, t0: float = 0.0) -> tuple[Callable[[], object], Callable[[], Paths]]:
+    def resumed(self, x: Array, start: Array, times: Array) -> Sequence[Trajectory | Failure]:
+        work, finish = self.prepared(np.asarray(x, dtype=float), times, start)
+        work()
+        return finish()
+
+    def prepared(
+        self, x: Array, times: Array, t0: Array | float = 0.0
+    ) -> tuple[Callable[[], object], Callable[[], Paths]]:
         """:meth:`integrate` of states (N, n_state) in two: the work, without the interpreter, which threads can share,
         and its result.
         """
         micro = times * 1e6
-        mirror = self.start == "laser" and t0 == 0.0 and bool(np.any(times < 0))
+        mirror = self.start == "laser" and not np.any(t0) and bool(np.any(times < 0))
         order = np.argsort(np.abs(micro), axis=1, kind="stable") if mirror else None
         if order is not None:
             micro = np.take_along_axis(np.abs(micro), order, axis=1)

@@ -40,8 +40,8 @@ class Packed(NamedTuple):
     complete: Callable[[], None]
 
 
-def pack(model: Dynamics, x: Array, start: float, times: Array) -> Packed:
-    """States (N, n_state) at ``start`` (µs), to be integrated to ``times`` (N, K) in µs."""
+def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packed:
+    """States (N, n_state) at ``start`` (µs, one or (N,)), to be integrated to ``times`` (N, K) in µs."""
     law, rho, system, values = model.law, model.medium.rho, model.system, model.law_values(x)
     initial, par = _states(model, x)
     n_members = len(x)
@@ -81,7 +81,7 @@ def pack(model: Dynamics, x: Array, start: float, times: Array) -> Packed:
         order=order,
         initial=initial,
         parameters=par,
-        start=np.full(n_members, start),
+        start=np.full(n_members, start, dtype=float),
         times=np.ascontiguousarray(times),
         samples=samples,
         factor=1 / rho,

@@ -81,6 +81,12 @@ class Paths(Batch):
     def _Rdot(self) -> Array:
         return self["R"] * self.solution.states[:, :, -2] * 1e6
 
+    def _strain_rate(self) -> Array:
+        return np.abs(self.solution.states[:, :, -2]) * 1e6
+
+    def _stretch(self) -> Array:
+        return np.exp(self.solution.states[:, :, -1] - self.par[:, None, rows.LOG_R0])
+
     def _T(self) -> Array:
         system, medium = self.model.system, self.model.medium
         tau = self.solution.states[:, :, : system.gas]

@@ -1,0 +1,165 @@
+"""How a posterior responds to its assumptions, read from a result: rows of tables, sentences of the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup
+
+from en4dvar.report.text import fixed, number_like, pretty_unit, symbol_html
+from en4dvar.storage.store import StoredResult
+from en4dvar.units import convert
+
+Lines = list[tuple[object, ...]]
+SHIFT_COLUMNS = (
+    "alternative", "if", "parameter", "unit", "change", "relative_change", "change_in_std", "cost_change", "reason",
+)  # fmt: skip
+
+ENTRY_COLUMNS = ("parameter", "quantity", "unit", "q05", "q50", "q95")
+
+
+@dataclass(frozen=True)
+class StoredShift:
+    """What one parameter would do under one alternative: ``change`` in ``unit``, the display unit.
+
+    ``relative``: of the value, NaN where that may be negative. ``reason``: why linear response does not tell, or "".
+    """
+
+    alternative: str
+    words: str
+    parameter: str
+    symbol: str
+    unit: str
+    change: float
+    relative: float
+    in_std: float
+    cost_change: float
+    reason: str
+
+    @property
+    def exceeds(self) -> bool:
+        """Whether it is more than the parameter's standard deviation."""
+        return abs(self.in_std) > 1
+
+    @property
+    def cells(self) -> tuple[object, ...]:
+        """In the order of :data:`SHIFT_COLUMNS`."""
+        numbers = (self.change, self.relative, self.in_std, self.cost_change)
+        return (self.alternative, self.words, self.parameter, self.unit, *numbers, self.reason)
+
+
+@dataclass(frozen=True)
+class StoredEntry:
+    """Where on the path one parameter was informed, in one quantity: ``low``, ``median``, ``high`` are 5, 50, 95 %."""
+
+    parameter: str
+    symbol: str
+    quantity: str
+    label: str
+    unit: str
+    low: float
+    median: float
+    high: float
+
+    @property
+    def cells(self) -> tuple[object, ...]:
+        """In the order of :data:`ENTRY_COLUMNS`."""
+        return self.parameter, self.quantity, self.unit, self.low, self.median, self.high
+
+
+def stored_ledger(result: StoredResult) -> tuple[tuple[StoredEntry, ...], ...]:
+    """A row a parameter that acts along the path, in it one entry a quantity of the path; display units."""
+    stats = result.sample_stats
+    if "ledger_weight" not in stats:
+        return ()
+    ending = "_quantiles"
+    quantities = [str(v).removesuffix(ending) for v in stats.data_vars if str(v).endswith(ending)]
+
+    def entry(i: int, parameter: str, quantity: str) -> StoredEntry:
+        v = stats[quantity + ending]
+        shown = v.attrs["display_units"]
+        numbers = convert(np.asarray(v.values[i], dtype=float), v.attrs["units"], shown).tolist()
+        symbol = result.posterior[parameter].attrs["symbol"]
+        return StoredEntry(parameter, symbol, quantity.removeprefix("ledger_"), v.attrs["long_name"], shown, *numbers)
+
+    names = list(map(str, stats["path_parameter"].values))
+    return tuple(tuple(entry(i, name, q) for q in quantities) for i, name in enumerate(names))
+
+
+def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
+    """A row an alternative, in it one shift a parameter; the largest first, then those unknown, then small ones."""
+    stats = result.sample_stats
+    if "what_if_change" not in stats:
+        return ()
+    of = {key: stats[f"what_if_{key}"].values for key in ("words", "cost_change", "reason")}
+    change, relative, in_std = (
+        stats[f"what_if_{key}"].values for key in ("change", "relative_change", "change_in_std")
+    )
+    names, abouts = list(map(str, result.posterior)), [v.attrs for v in result.posterior.data_vars.values()]
+
+    def row(i: int, alternative: str) -> tuple[StoredShift, ...]:
+        common = float(of["cost_change"][i]), str(of["reason"][i])
+        return tuple(
+            StoredShift(
+                alternative,
+                str(of["words"][i]),
+                name,
+                about["symbol"],
+                about["display_units"],
+                convert(float(change[i, j]), about["units"], about["display_units"]),
+                float(relative[i, j]),
+                float(in_std[i, j]),
+                *common,
+            )
+            for j, (name, about) in enumerate(zip(names, abouts, strict=True))
+        )
+
+    largest = np.where(of["reason"] == "", np.abs(in_std).max(axis=1), 1.0)
+    return tuple(row(i, str(stats["alternative"].values[i])) for i in np.argsort(-largest, kind="stable"))
+
+
+def shift_text(shift: StoredShift) -> str:
+    """``"+15 %"``, or in the parameter's unit where its value may be negative, as fine as its error bar is.
+
+    An en dash where it is not known.
+    """
+    value, unit = shift.change, pretty_unit(shift.unit)
+    if math.isfinite(shift.relative):
+        value, unit = 100 * shift.relative, "%"
+    bar = abs(value / shift.in_std) if shift.in_std else math.nan
+    text = f"{number_like(value, bar)} {unit}".strip() if math.isfinite(value) else "–"
+    return text if value <= 0 or not math.isfinite(value) else f"+{text}"
+
+
+def sentence(shifts: Sequence[StoredShift]) -> str:
+    """What an alternative would do to the parameters that it moves beyond their error bar."""
+    first = shifts[0]
+    if first.reason:
+        return f"if {first.words}, only another fit tells ({first.reason})"
+    moved = sorted((s for s in shifts if s.exceeds), key=lambda s: -abs(s.in_std))
+    parts = [
+        Markup("{} would be {} {} ({} times its error bar)").format(
+            symbol_html(s.symbol),
+            shift_text(s).lstrip("+−"),
+            "higher" if s.change > 0 else "lower",
+            fixed(abs(s.in_std), 1),
+        )
+        for s in moved
+    ]
+    return Markup("if {}, {}").format(first.words, Markup(", ").join(parts))
+
+
+def exceeding(rows: Iterable[Sequence[StoredShift]]) -> list[Sequence[StoredShift]]:
+    """The alternatives that move a parameter beyond its error bar, or may."""
+    return [row for row in rows if row[0].reason or any(shift.exceeds for shift in row)]
+
+
+def response_lines(result: StoredResult) -> tuple[Lines, Lines]:
+    """Lines of ``what_if.csv`` and of ``ledger.csv``, the name of the data set first."""
+    return (
+        [(result.name, *shift.cells) for row in stored_shifts(result) for shift in row],
+        [(result.name, *entry.cells) for row in stored_ledger(result) for entry in row],
+    )

@@ -1,0 +1,53 @@
+"""What about an experiment with a bubble could be otherwise than assumed, each by as much as laboratories differ.
+
+Sizes: a hydrophone states the amplitude within 5 to 10 %; weather moves the ambient pressure by 2 % about its mean,
+1000 m of height by 11 %; the rheometry codes take 0.056 to 0.072 N/m for the surface tension of water in a gel; a
+calibration target gives the scale of the picture within about 1 %.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache
+
+from en4dvar.forward import Alternative, ForwardModel
+from en4dvar_bubble.dynamics import Dynamics
+from en4dvar_bubble.gas import saturated_vapour_pressure
+
+PULSE, AMBIENT, SURFACE, REST, SCALE, CLOCK = 1.05, 1.02, 0.8, 1.1, 1.01, 1.01
+
+
+@lru_cache(maxsize=4)  # the data sets of a campaign share their model; not in the model, which is sent to workers
+def alternatives(model: ForwardModel) -> tuple[Alternative, ...]:
+    """Those of a bubble: pulse, ambient pressure, surface tension, gas, vapour, radius at rest, scale, time step."""
+    assert isinstance(model, Dynamics)
+    return tuple(_alternatives(model))
+
+
+def _alternatives(model: Dynamics) -> Iterator[Alternative]:
+    def changed(name: str, words: str, **options: object) -> Alternative:
+        return Alternative(name, words, replace(model, **options))  # type: ignore[arg-type]
+
+    medium, driving, rest = model.medium, model.driving, model.stress_free_radius
+    if not driving.silent:
+        stronger = replace(driving, amplitude=PULSE * driving.amplitude)
+        yield changed("pulse_amplitude", "the pulse were 5 % stronger", driving=stronger)
+    pressure = replace(medium, p_inf=AMBIENT * medium.p_inf)
+    yield changed("ambient_pressure", "the ambient pressure were 2 % higher", medium=pressure)
+    tension = replace(medium, S=SURFACE * medium.S)
+    yield changed("surface_tension", "the surface tension were 20 % lower", medium=tension)
+    if model.gas != "heat":
+        yield changed("gas_model", "the gas conducted heat to the wall (gas: heat)", gas="heat")
+    elif model.vapour != "transport" and model.medium_heat == "cold":
+        yield changed("gas_model", "the gas were polytropic (gas: polytropic)", gas="polytropic")
+    if medium.p_v:
+        yield changed("vapour", "there were no vapour in the bubble", medium=replace(medium, p_v=0.0))
+    elif model.vapour == "none":
+        saturated = replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))
+        yield changed("vapour", "vapour filled the bubble (vapour_pressure: saturated)", medium=saturated)
+    else:
+        yield changed("vapour", "there were no vapour in the bubble (vapour: none)", vapour="none")
+    yield Alternative("radius_at_rest", f"{rest} were 10 % larger", parameters={rest: REST})
+    yield Alternative("length_scale", "all radii were 1 % larger (µm per pixel)", values=SCALE)
+    yield Alternative("time_scale", "the time between frames were 1 % longer", times=CLOCK)

@@ -1,0 +1,147 @@
+"""What a bubble offers: alternatives whose predicted effect is that of a fit done again, and the ledger of its path."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from en4dvar.assimilate import assimilate
+from en4dvar.ensemble.forecast import forecast
+from en4dvar.noise import noise_of
+from en4dvar.observations import Observations
+from en4dvar.prior import Prior, PriorTerm
+from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.response.what_if import changed_problem
+from en4dvar_bubble import BubbleModel, NeoHookeanKelvinVoigt
+
+SETTINGS = AssimilationSettings(starts=3)
+STD = 1.4e-6
+
+
+def twin(model, prior, times, seed=1, spread=0.5):
+    rng = np.random.default_rng(seed)
+    truth = prior.mean + spread * prior.std * rng.standard_normal(len(prior.names))
+    ones = np.ones(len(times))
+    observations = Observations(times, ones, noise_of(STD * ones), ones)
+    problem = InverseProblem(model, model.observables[0], observations, prior)
+    values = forecast(problem, truth[None]).predictions[0] + STD * rng.standard_normal(len(times))
+    return replace(problem, observations=replace(observations, values=values))
+
+
+def acoustic(seed=1):
+    model = BubbleModel()
+    p = {p.name: p for p in model.parameters}
+    medians = {"G": 500.0, "alpha": 0.03, "mu": 0.1, "R0": 0.5e-6}
+    prior = Prior(tuple(PriorTerm.lognormal(p[name], median, 0.3) for name, median in medians.items()))
+    return twin(model, prior, np.arange(6e-6, 24e-6, 1.5e-6), seed)
+
+
+def laser(seed=1):
+    model = BubbleModel(law=NeoHookeanKelvinVoigt(), start="laser", gas="polytropic")
+    p = {p.name: p for p in model.parameters}
+    terms = (
+        PriorTerm.lognormal(p["G"], 4e3, 0.5),
+        PriorTerm.lognormal(p["mu"], 0.06, 0.5),
+        PriorTerm.normal(p["R_max"], 250e-6, 5e-6),
+        PriorTerm.lognormal(p["R_eq"], 35e-6, 0.2),
+    )
+    return twin(model, Prior(terms), np.arange(0.7e-6, 40e-6, 1.4e-6), seed)
+
+
+@pytest.fixture(scope="module")
+def fits():
+    """Problem and analysis of either start."""
+    return {start: (p := make(), assimilate(p, SETTINGS, 1)) for start, make in STARTS.items()}
+
+
+STARTS = {"acoustic": acoustic, "laser": laser}
+
+
+@pytest.mark.parametrize(
+    ("start", "name"),
+    [("acoustic", "pulse_amplitude"), ("acoustic", "length_scale"), ("laser", "time_scale"), ("laser", "length_scale")],
+)
+def test_the_predicted_change_is_that_of_a_fit_done_again(fits, start, name):
+    problem, analysis = fits[start]
+    (alternative,) = (one for one in problem.model.alternatives if one.name == name)
+    (shift,) = (one for one in analysis.what_if if one.name == name)
+    again = assimilate(changed_problem(problem, alternative), SETTINGS, 1)
+    z = problem.prior.from_physical(analysis.posterior).std(axis=0, ddof=1)
+    change = (problem.prior.from_physical(again.centre) - problem.prior.from_physical(analysis.centre)) / z
+    assert np.abs(change).max() > 0.5  # more than rounding is predicted
+    np.testing.assert_allclose(shift.in_std, change, rtol=0, atol=0.2 * np.abs(change).max())
+    leading = np.abs(change).argmax()
+    assert shift.in_std[leading] == pytest.approx(change[leading], rel=0.1)
+    assert shift.cost_change == pytest.approx(again.iterations[-1].cost - analysis.iterations[-1].cost, abs=0.5)
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_every_alternative_is_told_or_has_a_reason(fits, start):
+    problem, analysis = fits[start]
+    offered = {one.name for one in problem.model.alternatives}
+    driven = {"pulse_amplitude"} if start == "acoustic" else set()
+    common = {"ambient_pressure", "surface_tension", "gas_model", "vapour", "radius_at_rest"}
+    assert offered == driven | common | {"length_scale", "time_scale"}
+    assert {one.name for one in analysis.what_if} == offered
+    for shift in analysis.what_if:
+        assert np.isfinite(shift.change).all() != bool(shift.reason)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"vapour": "frozen"},
+        {"start": "laser", "vapour": "transport", "medium_heat": "conducting"},
+        {"gas": "isothermal"},
+        {"gas": "polytropic", "start": "laser"},
+    ],
+)
+def test_alternatives_can_be_made_for_any_options(options):
+    model = BubbleModel(**options)
+    others = [one.model for one in model.alternatives if one.model is not None]
+    assert others
+    assert all([p.name for p in other.parameters] == [p.name for p in model.parameters] for other in others)
+
+
+def test_alternatives_are_not_sent_along_with_the_model():
+    model = BubbleModel()
+    assert model.alternatives is model.alternatives
+    assert not any("alternative" in key for key in vars(model))
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_a_path_can_be_resumed_from_any_instant(start):
+    problem = STARTS[start]()
+    model = problem.model
+    values = dict(zip(problem.prior.names, problem.prior.to_physical(problem.prior.mean), strict=True))
+    x = model.initial_state(values)[None]
+    times = np.linspace(0, 22e-6, 45)
+    (whole,) = model.trajectories(x, times)
+    starts = times[[10, 21, 30]]
+    resumed = model.resumed(whole.states[[10, 21, 30]], starts, np.broadcast_to(times, (3, 45)))
+    for path, begin in zip(resumed, starts, strict=True):
+        later = times >= begin
+        np.testing.assert_allclose(path["R"][later], whole["R"][later], rtol=2e-3)
+
+
+def test_viscosity_is_informed_only_where_the_wall_moves(fits):
+    _, analysis = fits["acoustic"]
+    book = analysis.ledger
+    assert book.parameters == ("G", "alpha", "mu")
+    np.testing.assert_allclose(book.weights.sum(axis=1), 1.0)
+    before_pulse = book.edges[1:] < 4.4e-6
+    assert before_pulse.any()
+    assert book.weights[:, before_pulse].max() < 1e-3
+    G, _, mu = book.quantiles[:, 0, 1]  # medians of the strain rate
+    assert mu > 10 * G
+    assert book.quantiles[0, 1, 1] > 50  # stretch where the modulus is felt
+    assert 1e5 < mu < 1e8
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_the_kernels_sum_to_the_degrees_of_freedom(fits, start):
+    problem, analysis = fits[start]
+    of_law = [problem.prior.names.index(name) for name in analysis.ledger.parameters]
+    np.testing.assert_allclose(analysis.ledger.kernel.sum(axis=1), analysis.dfs_per_parameter[of_law], atol=0.03)
