@@ -125,7 +125,7 @@ else:
 
 class _Scheme(Section):
     scheme: OnASeries
-    """etkf, denkf (deterministic) or enkf-n (finite size), which are filters, or ienks (sliding-window smoother)."""
+    """A filter (one analysis a cycle), or ienks (sliding-window smoother)."""
     members: Annotated[int, Field(ge=3)]
     """Ensemble size N."""
 

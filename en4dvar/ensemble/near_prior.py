@@ -51,8 +51,8 @@ class NearPrior:
         return float(len(self.transform) - 1)
 
     def solve(self, g: Array) -> Array:
-        """A⁻¹ g for g (N,)."""
-        return np.asarray(self.transform @ (self.transform @ g) / self.prior_precision)
+        """A⁻¹ g for g (N,), or for every row of g (M, N)."""
+        return np.asarray((self.transform @ (self.transform @ g.T)).T / self.prior_precision)
 
     @property
     def inverse_transform(self) -> Array:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -173,7 +173,11 @@ def _opened(path: Path, format: Format | None) -> Iterator[Format]:
     _require_file(path)
     kind = format or SUFFIXES.get(path.suffix.lower())
     if kind is None:
-        hint = "save the sheet as CSV" if path.suffix.lower() in SHEETS else "write format: csv or mat"
+        hint = (
+            "save the sheet as CSV"
+            if path.suffix.lower() in SHEETS
+            else f"write format: {' or '.join(get_args(Format))}"
+        )
         raise DataError(f"{path}: the format cannot be told from the suffix {path.suffix!r}; {hint}")
     try:
         yield kind

@@ -82,6 +82,11 @@ class Localisation:
                 continue
             root = np.sqrt(taper[near])
             local = Evaluation(root * evaluation.d[near], root[:, None] * evaluation.S[near])
-            rows = scheme.advance(prior, local, 0, draw).weights.rows
-            analysed[:, block] = apply_weights(ensemble[:, block], rows)
+            step = scheme.advance(prior, local, 0, _of_some(draw, near))
+            analysed[:, block] = apply_weights(ensemble[:, block], step.weights.rows)
         return analysed
+
+
+def _of_some(draw: Draw, near: npt.NDArray[np.bool_]) -> Draw:
+    """The numbers of the observations ``near`` (K',): an observation is perturbed in the same way in every block."""
+    return lambda purpose: draw(purpose)[:, near]

@@ -146,7 +146,7 @@ def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
 def _first_with_columns(files: Sequence[Path]) -> tuple[Path, Contents, Decimal]:
     """The first file that holds columns of numbers, and its decimal sign. Raises :class:`DataError`: there is none."""
     from en4dvar.errors import DataError
-    from en4dvar.inputs.readers import read_contents
+    from en4dvar.inputs.readers import SUFFIXES, read_contents
 
     faults: list[str] = []
     for file in files:
@@ -160,7 +160,8 @@ def _first_with_columns(files: Sequence[Path]) -> tuple[Path, Contents, Decimal]
         if contents.columns:
             return file, contents, "."
         reason = next(iter(contents.others.values()), f"{file}: no column holds numbers")
-        header = "; the first line that is no comment (#) must name the columns" if file.suffix != ".mat" else ""
+        text = SUFFIXES[file.suffix.lower()] == "csv"
+        header = "; the first line that is no comment (#) must name the columns" if text else ""
         faults.append(reason + header * ("put #" not in reason))
     raise DataError("\n".join(faults))
 

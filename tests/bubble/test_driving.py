@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 from en4dvar.errors import DataError
 from en4dvar_bubble import Accuracy, Medium, simulate
-from en4dvar_bubble.driving import from_file, gaussian, histotripsy, silence, sine_burst, step, tabulated
+from en4dvar_bubble.driving import from_file, gaussian, histotripsy, pulses, silence, sine_burst, step, tabulated
 
 PULSES = {
     "histotripsy": histotripsy(),
@@ -29,6 +29,10 @@ def evaluate(driving, t):
     position = (t * 1e6 - driving.grid.origin) / driving.grid.step
     cell = np.clip(np.floor(position).astype(int), 0, driving.cells - 1)
     return driving.amplitude * sum(driving.table[cell, k] * (position - cell) ** k for k in range(6))
+
+
+def test_every_kind_of_the_configuration_has_an_example_here():
+    assert set(pulses.PULSES) - {"none"} <= set(PULSES), "add it to PULSES above, under its name in YAML"
 
 
 @pytest.mark.parametrize("name", PULSES)
@@ -157,7 +161,7 @@ class TestTabulated:
 class TestResponse:
     """A small polytropic bubble against scipy on the same equation, written here in SI units."""
 
-    @pytest.mark.parametrize("name", ["sine", "half a cycle", "hann", "tukey", "gaussian", "step"])
+    @pytest.mark.parametrize("name", PULSES)
     def test_agrees_with_an_independent_integration(self, name):
         driving = PULSES[name]
         weak = type(driving)(

@@ -362,6 +362,17 @@ def test_unknown_law_is_refused_with_a_suggestion():
         get_law("neo-hookean-kelvin-voight")
 
 
+def test_every_law_of_the_package_has_a_name():
+    """A class without one is not registered, so that no configuration could use it and no battery would test it."""
+
+    def shipped(base):
+        for law in base.__subclasses__():
+            yield from [law] * law.__module__.startswith("en4dvar_bubble.laws.")
+            yield from shipped(law)
+
+    assert {law for law in shipped(ConstitutiveLaw) if law.name not in REGISTRY} == {Liquid}
+
+
 def test_two_laws_of_one_name_are_refused():
     with pytest.raises(ConfigError, match="two laws are called 'newtonian'"):
         type("Other", (Liquid,), {"name": "newtonian"})

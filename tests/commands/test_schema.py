@@ -64,7 +64,7 @@ def test_a_model_of_ones_own(validator: Draft202012Validator) -> None:
     ("old", "new"),
     [("seed: 1", "sede: 1"), ("seed: 1", "seed: one"), ("name: bubble", "name: bubbel"), ("gas: heat", "gas: hot"),
      ("unit: us", "units: us"), (", unit: us", ""), ("prior: lognormal", "prior: log"), ("members: 48", "members: 2"),
-     ("scheme: en4dvar", "scheme: enkf"), ("radius_std", "radius_sdt"), ("median: 0.5 kPa", "medain: 0.5 kPa"),
+     ("scheme: en4dvar", "scheme: en3dvar"), ("radius_std", "radius_sdt"), ("median: 0.5 kPa", "medain: 0.5 kPa"),
      ("gas: heat", "constants: {rho: 998}"), ("gas: heat", "driving: {kind: sine}"), ("model:", "modle:")],
 )  # fmt: skip
 def test_a_mistake_is_seen(validator: Draft202012Validator, old: str, new: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
@@ -148,11 +150,12 @@ def test_root_near_the_prior_is_that_of_the_decomposition(shape, bound):
     """Up to (Σ λ⁴)^{1/4} = 1 of M = SᵀS/(N − 1) takes the series, beyond it the eigenvectors; both to rounding."""
     s = centre(RNG(0).standard_normal(shape).T)[1].T
     s *= np.sqrt(bound * (shape[1] - 1) / np.linalg.norm(s.T @ s @ s.T @ s) ** 0.5)
-    near, exact, g = NearPrior.of(s), Hessian.of(s), RNG(1).standard_normal(shape[1])
+    near, exact, g = NearPrior.of(s), Hessian.of(s), RNG(1).standard_normal((3, shape[1]))
     assert isinstance(near, NearPrior) == (bound < 1)
     assert near.transform == pytest.approx(exact.transform, abs=1e-14)
     assert near.inverse_transform == pytest.approx(exact.inverse_transform, abs=1e-13 * max(1, bound))
-    assert near.solve(g) == pytest.approx(exact.solve(g), rel=1e-13, abs=1e-15)
+    for rows in (g[0], g, RNG(2).standard_normal((shape[1], shape[1]))):
+        assert near.solve(rows) == pytest.approx(exact.solve(rows), rel=1e-13, abs=1e-15)
     assert near.transform @ np.ones(shape[1]) == pytest.approx(np.ones(shape[1]), abs=1e-13)
 
 
@@ -207,6 +210,24 @@ def test_local_analysis_sees_what_is_near():
     step = gauss_newton(np.zeros(6), Evaluation(root * e.d, root[:, None] * e.S))
     by_hand = apply_weights(ensemble[:, :1], step.direction + step.transform)
     assert analysed[:, :1] == pytest.approx(by_hand, abs=1e-12)
+
+
+@dataclass(frozen=True)
+class Perturbing(ETKF):
+    """The mean moves by innovations that are perturbed."""
+
+    def advance(self, weights, evaluation, iteration, draw):
+        perturbed = Evaluation(evaluation.d + draw("test")[0], evaluation.S)
+        return gauss_newton(weights.w, perturbed)
+
+
+def test_a_local_analysis_perturbs_each_observation_in_one_way():
+    """A scheme that draws sees the numbers of its observations, the same ones in every block."""
+    positions, draws = np.arange(12.0), RNG(3).standard_normal((6, 12))
+    ensemble, e = RNG(2).standard_normal((6, 12)), evaluation()
+    local = Localisation([np.arange(6), np.arange(6, 12)], (distances(np.array([2.0, 9.0]), positions) < 5) * 1.0)
+    expected = local.analysis(ETKF(), ensemble, Evaluation(e.d + draws[0], e.S), None)
+    assert local.analysis(Perturbing(), ensemble, e, lambda purpose: draws) == pytest.approx(expected, abs=1e-13)
 
 
 def test_variables_without_position_or_observation_stay():

@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, Union, get_type_hints
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, create_model, field_validator, model_validator
 
 from en4dvar.errors import En4dvarError
+from en4dvar.inputs.readers import Format
 from en4dvar.units import Quantity, convert
 from en4dvar_bubble.driving.base import Driving
 from en4dvar_bubble.driving.pulses import PULSES
@@ -99,7 +100,7 @@ class Tabulated(_Kind):
     """CSV or .mat file, relative to the configuration's folder."""
     columns: Columns
     """Which columns hold time and pressure, and their units."""
-    format: Literal["csv", "mat"] | None = None
+    format: Format | None = None
     """Format of the file; default: by its suffix."""
     delay: Annotated[float, Quantity("s")] = 0.0
     """Added to the times of the record."""
