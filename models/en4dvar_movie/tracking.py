@@ -18,6 +18,7 @@ from en4dvar_movie.uncertainty import Errors, errors_of
 
 LEAST_SEEN = 0.12  # share of the outline inside the frame
 LEAST_RADIUS = 2.5  # pixels
+ROUGH = 0.08  # of the contrast: scatter about a real outline, beside the noise of the camera
 MOST_BLUR = 0.12  # of the radius, of an outline that the frame cuts
 
 
@@ -90,10 +91,10 @@ def find_bubble(
     if place is None:
         return Found(number, None, "no bubble: nothing differs from the background")
     outline = fit_outline(background.steadied(image, tiles, place[0]), place[0], optics)
-    return Found(number, outline, _fault(outline, optics))
+    return Found(number, outline, _fault(outline, optics, background.noise))
 
 
-def _fault(outline: Outline | None, optics: Optics) -> str:
+def _fault(outline: Outline | None, optics: Optics, noise: float) -> str:
     """Why an outline is none; "" where it is one."""
     if outline is None:
         return "no circle fits the outline"
@@ -103,6 +104,8 @@ def _fault(outline: Outline | None, optics: Optics) -> str:
         return f"cut: {outline.seen:.0%} of the outline lies in the frame"
     if outline.seen < 0.9 and outline.width > MOST_BLUR * outline.circle.R:
         return f"cut and blurred: {outline.seen:.0%} of the outline lies in the frame, and it is no edge"
+    if outline.noise > 2.5 * noise + ROUGH * abs(optics.contrast):
+        return "the brightness next to the outline is not that of a bubble"
     if outline.contrast > 0.25 * optics.contrast:
         return "faint: the outline has no contrast"
     return ""
