@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy import ndimage
 
 from en4dvar.errors import DataError
@@ -15,9 +17,13 @@ from en4dvar_movie.kernels import normalise
 from en4dvar_movie.locate import TILE, locate
 from en4dvar_movie.outline import Circle, Optics, fit_outline
 
+Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 LEADING = 40  # frames looked at for the background
 SAMPLES = 24  # frames looked at for what they share
 SMOOTH = 12.0  # pixels: the brightness that contrasts are relative to varies slowly
+LEAST_SPREAD = 0.002  # of the contrast
+NOISY = 0.1  # of a pixel's noise: what a contrast can be uncertain by for the noise
+SPECK = 100  # pixels: the largest change that is no bubble
 LEAST_CONTRAST = 0.08  # of the background's brightness
 BRIGHT = 0.25  # of the contrast: how much brighter a flash is
 CHANGED = 0.3  # share of tiles that a flash changes
@@ -61,7 +67,8 @@ def find_background(movie: Movie) -> tuple[Background, Optics]:
     noise = pixel_noise(first)
     empty = 0 if _holds_a_blob(first, noise) else _quiet(leading, first, noise)
     level = np.mean(np.array(leading[:empty], dtype=np.float32), axis=0) if empty else smooth_surface(samples)
-    noise = pixel_noise(np.array([f - level for f in leading[:empty]]).ravel() if empty > 2 else first - level)
+    if empty > 2:
+        noise = pixel_noise(np.array([f - level for f in leading[:empty]])) * float(np.sqrt(empty / (empty - 1)))
     background = _with_sign(level, samples, noise, empty)
     if empty:
         background = _refined(background, samples)
@@ -83,7 +90,7 @@ def _look(movie: Movie) -> tuple[list[Frame], list[Frame]]:
     return leading, samples
 
 
-def pixel_noise(image: Array) -> float:
+def pixel_noise(image: Image) -> float:
     """Std of the noise of an image (H, W) or of numbers (n,): robust, of differences between neighbours."""
     return max(1.4826 * float(np.median(np.abs(np.diff(image)))) / np.sqrt(2), 0.3)
 
@@ -109,7 +116,7 @@ def smooth_surface(frames: Sequence[Frame]) -> Array:
     return (terms @ fitted).reshape(typical.shape).astype(np.float32)
 
 
-def _holds_a_blob(first: Array, noise: float) -> bool:
+def _holds_a_blob(first: Image, noise: float) -> bool:
     """Whether a frame differs from a smooth surface in one large patch."""
     surface = smooth_surface([first])
     far = np.abs(ndimage.uniform_filter(first - surface, 5)) > max(4 * noise, 0.25 * float(np.median(np.abs(surface))))
@@ -117,11 +124,12 @@ def _holds_a_blob(first: Array, noise: float) -> bool:
     return bool(count and np.bincount(labels.ravel())[1:].max() > max(60, 2e-4 * first.size))
 
 
-def _quiet(leading: Sequence[Frame], first: Array, noise: float) -> int:
+def _quiet(leading: Sequence[Frame], first: Image, noise: float) -> int:
     """How many leading frames look like the first."""
     for number, frame in enumerate(leading):
-        off = ndimage.uniform_filter(frame - first, 5)
-        if float(np.max(np.abs(off))) > max(2.5 * noise, 0.06 * float(np.median(first))):
+        off = np.abs(ndimage.uniform_filter(frame - first, 5)) > max(2 * noise, 0.06 * float(np.median(first)))
+        labels, count = ndimage.label(off)
+        if count and np.bincount(labels.ravel())[1:].max() > SPECK:  # larger than dirt that drifts
             return number
     return len(leading)
 
@@ -178,6 +186,9 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie) -> O
     if not found:
         raise DataError(f"{movie.path}: no frame shows a bubble that differs from the background")
     large = sorted(found, key=lambda o: o.circle.R / o.width)[3 * len(found) // 4 :]  # they show the full contrast
-    return Optics(
-        float(np.median([o.contrast for o in large])), float(np.percentile([o.width for o in found], 20)), 0.001
-    )
+    contrasts = np.array([o.contrast for o in large])
+    contrast = float(np.median(contrasts))
+    scatter = 1.2533 * float(np.std(contrasts)) / max(len(large) - 1, 1) ** 0.5  # of a median
+    width = float(np.percentile([o.width for o in found], 20))
+    scatter = min(scatter, NOISY * background.noise)  # more is not noise: bubbles differ in how bright their centre is
+    return Optics(contrast, width, max(scatter / -contrast, LEAST_SPREAD))

@@ -12,10 +12,16 @@ import click
 @click.command()
 @click.argument("movie", type=click.Path(path_type=Path))
 @click.option("--pixel", metavar="LENGTH", help="Size of a pixel, e.g. '2.76 um'; needed where the file does not tell.")
-@click.option("--frame-rate", metavar="RATE", help="Frames per time, e.g. '270 kHz'; needed where the file does not tell.")
-@click.option("--exposure", metavar="TIME", help="Exposure of a frame, e.g. '500 ns': the timing error is a tenth of it.")
+@click.option(
+    "--frame-rate", metavar="RATE", help="Frames per time, e.g. '270 kHz'; needed where the file does not tell."
+)
+@click.option(
+    "--exposure", metavar="TIME", help="Exposure of a frame, e.g. '500 ns': the timing error is a tenth of it."
+)
 @click.option("--raw", metavar="WxHxBITS", help="Shape of the frames of a file without header, e.g. 512x128x8.")
-@click.option("--corrections", type=click.Path(path_type=Path), help="Text file: FRAME out, or FRAME X Y RADIUS (pixels).")
+@click.option(
+    "--corrections", type=click.Path(path_type=Path), help="Text file: FRAME out, or FRAME X Y RADIUS (pixels)."
+)
 @click.option("--out", type=click.Path(path_type=Path), help="CSV file to write; default <name of the movie>.csv.")
 @click.option("--page", type=click.Path(path_type=Path), help="HTML page to write; default beside the CSV file.")
 @click.option("--force", is_flag=True, help="Replace these files.")

@@ -1,8 +1,8 @@
 """Frames corrected by hand: a small text file, a line a frame.
 
-    # frame  what
-    12       out   blurred, two bubbles
-    19       270.5 64.0 28.0   start here: x, y and radius in pixels
+# frame  what
+12       out   blurred, two bubbles
+19       270.5 64.0 28.0   start here: x, y and radius in pixels
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Reading movies frame by frame: TIFF stacks, folders of TIFF or PNG frames, mp4 and avi, raw files with a stated shape.
+"""Reading movies frame by frame: TIFF stacks, folders of TIFF or PNG frames, mp4, avi, raw files of a stated shape.
 
 Frames are (H, W) arrays of brightness, 8 or 16 bit. Nothing is held: a movie is a way to run through its frames.
 """
@@ -49,7 +49,9 @@ class Movie:
                     channel = _channel(read)
                     if _is_coloured(read) and not self.notes:
                         name = ("red", "green", "blue")[channel]
-                        self.notes.append(f"{self.path}: frames are in colour; the channel with most light, {name}, is used")
+                        self.notes.append(
+                            f"{self.path}: frames are in colour; the channel with most light, {name}, is used"
+                        )
                 frame = _grey(read, channel, f"{self.path}: frame {number}")
                 shape = shape or frame.shape
                 if frame.shape != shape:
@@ -102,7 +104,9 @@ def _grey(read: Any, channel: int, where: str) -> Frame:
     if frame.ndim == 3 and frame.shape[2] in (3, 4):
         frame = np.ascontiguousarray(frame[..., channel])
     if frame.ndim != 2 or min(frame.shape) < LEAST_SIDE:
-        raise DataError(f"{where} has the shape {_size(frame.shape)}; frames are images of {LEAST_SIDE} pixels and more")
+        raise DataError(
+            f"{where} has the shape {_size(frame.shape)}; frames are images of {LEAST_SIDE} pixels and more"
+        )
     if frame.dtype.kind not in "uif":
         raise DataError(f"{where} holds {frame.dtype}, not brightness")
     return frame
@@ -218,9 +222,11 @@ def _raw(path: Path, raw: str) -> Movie:
 
 
 def with_scale(movie: Movie, pixel: float | None, rate: float | None) -> Movie:
-    """The movie with the scale that the user gives, else the file's own. Raises :class:`DataError` where both are mute."""
+    """The movie with the given scale, else the file's own. Raises :class:`DataError` where both are mute."""
     pixel, rate = pixel or movie.pixel, rate or movie.rate
     missing = ["--pixel '2.76 um'"] * (not pixel > 0) + ["--frame-rate '270 kHz'"] * (not rate > 0)
     if missing:
-        raise DataError(f"{movie.path}: the file does not tell its scale, which is never guessed: add {' '.join(missing)}")
+        raise DataError(
+            f"{movie.path}: the file does not tell its scale, which is never guessed: add {' '.join(missing)}"
+        )
     return replace(movie, pixel=pixel, rate=rate)

@@ -69,10 +69,10 @@ def _weight(u):
 @nb.njit(cache=True, nogil=True)
 def _bounds(shape, x, y, reach):
     return (
-        max(0, int(math.floor(y - reach))),
-        min(shape[0], int(math.ceil(y + reach)) + 1),
-        max(0, int(math.floor(x - reach))),
-        min(shape[1], int(math.ceil(x + reach)) + 1),
+        max(0, math.floor(y - reach)),
+        min(shape[0], math.ceil(y + reach) + 1),
+        max(0, math.floor(x - reach)),
+        min(shape[1], math.ceil(x + reach) + 1),
     )
 
 
@@ -127,10 +127,10 @@ def normal_equations(image, p, modes, ring, cutoff):
 
 @nb.njit(cache=True, nogil=True)
 def influence(image, p, modes, ring, cutoff, weights, sectors):
-    """What moves the radius: Σ of (weights·J_i) ψ_i by sector (S,), and Σ of its squares over pixels."""
+    """What moves the radius: Σ of u_i = (weights·J_i) ψ_i by sector (S,), Σ u_i² over pixels, and Σ ψ'_i / Σ w_i."""
     row = np.zeros(8 + 2 * (modes - 1))
     sums = np.zeros(sectors)
-    squares = 0.0
+    squares = slopes = total = 0.0
     top, bottom, left, right = _bounds(image.shape, ring[0], ring[1], ring[3])
     for j in range(top, bottom):
         for i in range(left, right):
@@ -141,11 +141,14 @@ def influence(image, p, modes, ring, cutoff, weights, sectors):
             u = 0.0
             for a in range(len(row)):
                 u += weights[a] * row[a]
-            u *= r * _weight(r / cutoff)
+            v = min(1.0, (r / cutoff) ** 2)
+            slopes += (1 - v) * (1 - 5 * v)
+            total += (1 - v) ** 2
+            u *= r * (1 - v) ** 2
             turn = math.atan2(j - p[1], i - p[0]) / (2 * math.pi) + 0.5
             sums[min(sectors - 1, int(turn * sectors))] += u
             squares += u * u
-    return sums, squares
+    return sums, squares, slopes / total
 
 
 @nb.njit(cache=True, nogil=True)

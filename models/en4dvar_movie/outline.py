@@ -46,8 +46,8 @@ class Outline:
     """What one image says; pixels.
 
     ``width`` is the std of the edge's blur, ``modes`` (2, M−1) are A_n and B_n, ``variance`` that of R if pixels were
-    independent and ``ratio`` what sectors of the outline say in units of it; ``mode_std`` is the std of a mode's
-    amplitude. ``seen`` is the share of the outline inside the frame.
+    independent and ``ratio`` what sectors of the outline say in units of it, ``common`` the variance that comes from
+    the contrast of the movie; ``mode_std`` is the std of a mode's amplitude. ``seen`` is the share of the outline inside the frame.
     """
 
     circle: Circle
@@ -57,6 +57,7 @@ class Outline:
     modes: Array
     variance: float
     ratio: float
+    common: float
     mode_std: float
     seen: float
 
@@ -66,10 +67,10 @@ class Outline:
 
     @property
     def eccentricity(self) -> float:
-        """That of the ellipse of mode 2."""
+        """That of the ellipse of mode 2; NaN where it was not fitted."""
         part = self.amplitude(2) / self.circle.R
         if not part < 1:
-            return 0.0
+            return float("nan")
         return float(np.sqrt(1 - ((1 - part) / (1 + part)) ** 2))
 
     def points(self, angles: Array) -> Array:
@@ -179,17 +180,28 @@ def _outline(image: Array, p: Array, modes: int, ring: Array, noise: float, opti
     except np.linalg.LinAlgError:
         return None
     sectors = int(np.clip(2 * np.pi * p[R] / max(4.0, 2 * p[W]), 8, 256))
-    sums, spread = influence(image, p, modes, ring, cutoff, inverse[R], sectors)
+    sums, spread, slope = influence(image, p, modes, ring, cutoff, inverse[R], sectors)
     seen = share_inside(image.shape, Circle(*p[:3]))
     free = len(p) - 2 * _glare_is_far(p, ring)
     used = max(1.0, seen * sectors)
     lost = min(0.8, (3 + 2 * (modes - 1)) / used)  # what the fit of the circle and its modes takes out of the sums
-    variance = spread * total / max(total - free, 1.0)
+    # the step of robust weights is the M-estimator's, its error that of Huber (1981): ψ' in the place of the weights
+    variance = spread / max(slope, 0.3) ** 2 * total / max(total - free, 1.0)
     shape = p[SHAPE:].reshape(-1, 2).T if modes > 1 else np.zeros((2, 0))
     mode_std = float(np.sqrt(max(np.diag(inverse)[SHAPE:].mean(), 0) * squares / total)) if modes > 1 else 0.0
+    common = noise**2 * inverse[R, CONTRAST] ** 2 * precision[CONTRAST]  # of the contrast that all frames share
     ratio = float(np.sum(sums**2) / (1 - lost) / max(spread, 1e-30))
     return Outline(
-        Circle(*map(float, p[:3])), float(p[W]), float(p[CONTRAST]), noise, shape, float(variance), ratio, mode_std, seen
+        Circle(*map(float, p[:3])),
+        float(p[W]),
+        float(p[CONTRAST]),
+        noise,
+        shape,
+        float(variance),
+        ratio,
+        float(common),
+        mode_std,
+        seen,
     )
 
 

@@ -11,7 +11,6 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from en4dvar.report.style import DARK, LIGHT, css_variables, inline_svg, styled
-from en4dvar.state import Array
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.outline import MODES
 from en4dvar_movie.table import Scale
@@ -39,9 +38,7 @@ def page_text(movie: Movie, found: Track, scale: Scale, command: str) -> str:
         scale=f"{1e6 * scale.pixel:.6g} µm a pixel, {scale.rate:.6g} frames a second",
         background=found.background.frames,
         common=f"{float(np.median([r.errors.common for r in used])) * 1e6 * scale.pixel:.2g}" if used else "",
-        figures=[inline_svg(figure, name, name) for name, figure in (("radius", _radius(used, scale)), ("shape", _shape(used, scale)))]
-        if used
-        else [],
+        figures=[inline_svg(_radius(used, scale), "radius", "radius"), inline_svg(_shape(used, scale), "shape", "shape")],
         strip=_strip(movie, found),
         left_out=[r for r in found.readings if not r.used],
         remarks=[r for r in used if r.reason],
@@ -72,7 +69,15 @@ def _shape(used: list[Reading], scale: Scale) -> Figure:
     left.set(xlabel="time (µs)", ylabel="eccentricity")
     for n in range(2, MODES + 1):
         part = [o.amplitude(n) / o.circle.R if o else np.nan for o in outlines]
-        right.plot(times, part, lw=0.9, alpha=1 - 0.15 * (n - 2), color=LIGHT["centre"], ls=["-", "--", "-.", ":", "-"][n - 2], label=f"{n}")
+        right.plot(
+            times,
+            part,
+            lw=0.9,
+            alpha=1 - 0.15 * (n - 2),
+            color=LIGHT["centre"],
+            ls=["-", "--", "-.", ":", "-"][n - 2],
+            label=f"{n}",
+        )
     right.set(xlabel="time (µs)", ylabel="mode over radius")
     right.legend(title="mode", ncols=2)
     return figure
@@ -104,7 +109,7 @@ def _picture(frame: Frame, reading: Reading, found: Track) -> dict[str, str]:
     }
 
 
-def png(picture: Array) -> str:
+def png(picture: Frame) -> str:
     """A picture of 8 bit as base64."""
     from PIL import Image
 

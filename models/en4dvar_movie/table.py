@@ -39,7 +39,7 @@ def to_csv(readings: Sequence[Reading], scale: Scale, movie: str, command: str) 
         f"en4dvar track, version {version('en4dvar')}: {command}",
         f"movie: {movie}; pixel: {1e6 * scale.pixel:.9g} um; frame rate: {scale.rate:.9g} Hz; exposure: {exposure}",
         f"R_std_um is independent from frame to frame; the level of the edge moves all radii together, by "
-        f"{1e6 * scale.pixel * float(np.median(common)) if common else 0:.2g} um; an error of the pixel's size scales them",
+        f"{1e6 * scale.pixel * float(np.median(common)) if common else 0:.2g} um; the pixel's size scales them",
     ]
     out = io.StringIO()
     out.writelines(f"# {' '.join(line.split())}\n" for line in head)
@@ -58,6 +58,7 @@ def _row(reading: Reading, scale: Scale) -> Iterable[str]:
         return [*first, *[""] * 6, *last]
     numbers = [
         f"{um * reading.radius:.4f}", f"{um * reading.errors.std:.4f}", f"{1e6 * scale.time_std:.4g}",
-        f"{um * outline.circle.x:.3f}", f"{um * outline.circle.y:.3f}", f"{outline.eccentricity:.4f}",
+        f"{um * outline.circle.x:.3f}", f"{um * outline.circle.y:.3f}",
+        f"{outline.eccentricity:.4f}".replace("nan", ""),
     ]  # fmt: skip
     return [*first, *numbers, *last]

@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
-import numpy as np
-
 from en4dvar_movie.background import CHANGED, LEAST_CONTRAST, Background, find_background, share_changed
 from en4dvar_movie.corrections import Correction
 from en4dvar_movie.frames import Frame, Movie
@@ -111,7 +109,9 @@ def _fault(outline: Outline | None, optics: Optics, noise: float) -> str:
     return ""
 
 
-def in_order(look: Callable[[tuple[int, Frame]], Found], frames: Iterable[tuple[int, Frame]], workers: int) -> Iterator[Found]:
+def in_order(
+    look: Callable[[tuple[int, Frame]], Found], frames: Iterable[tuple[int, Frame]], workers: int
+) -> Iterator[Found]:
     """``look`` at each frame in threads; a few frames are held at a time."""
     if workers == 1:
         yield from map(look, frames)

@@ -24,6 +24,7 @@ from en4dvar_movie.outline import Optics, Outline
 
 NEIGHBOURS = 10  # frames to each side
 STUDENT = 2.92 / 1.645  # 95 % quantiles of t with 2 degrees of freedom and of the normal distribution
+FLOOR = 0.005  # pixels: what sampling by whole pixels leaves uncertain in the best of images
 SIGNIFICANT = 3.0  # std of a mode's amplitude from which it is one
 COLLAPSE = 0.2  # of the radius: blur from which the bubble has collapsed within the exposure
 THRESHOLD = 0.05  # of the contrast: what the level of the edge can be off by in all frames alike
@@ -31,7 +32,7 @@ THRESHOLD = 0.05  # of the contrast: what the level of the edge can be off by in
 
 @dataclass(frozen=True)
 class Errors:
-    """In pixels: the corrected ``radius``, its independent std, and how far all radii move together by the edge's level."""
+    """In pixels: the corrected ``radius``, its independent std, how far all radii move together by the edge's level."""
 
     radius: float
     std: float
@@ -65,7 +66,7 @@ def _smoothed(outlines: Sequence[Outline | None]) -> Array:
 def _errors(outline: Outline, ratio: float, optics: Optics) -> Errors:
     sharp = min(outline.width, optics.width)
     radius = outline.circle.R + 0.5 * sharp**2 / outline.circle.R
-    variance = outline.variance * ratio + _hidden(outline)
+    variance = outline.variance * ratio + outline.common + _hidden(outline) + FLOOR**2
     words = ""
     if outline.width > COLLAPSE * outline.circle.R:
         variance += (0.25 * outline.width) ** 2
