@@ -2,8 +2,9 @@
 
 Inputs are derived from valid ones by coverage-guided fuzzing (``fuzz.py``, needs atheris). Runs are killed at every
 operation on the file system and at random moments (forecasts, checkpoints, netCDF, report), resumed and compared bit by
-bit with an undisturbed run; a folder of 10 000 data sets is estimated; the soak is run. Prints inputs tried, kills
-survived and sets completed. Half an hour; ``--quick`` does a little of each in three minutes.
+bit with an undisturbed run; every command is given disks that are full or fail, and run directories that somebody else
+prepared; a folder of 10 000 data sets is estimated; the soak is run. Prints inputs tried, kills survived, refusals in
+words and sets completed. Half an hour; ``--quick`` does a little of each in three minutes.
 """
 
 from __future__ import annotations
@@ -18,10 +19,16 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests" / "faults"), str(ROOT / "tests"), str(ROOT / "tests" / "fuzz")]
 
 import fuzz  # noqa: E402
+from children import Task, attempt  # noqa: E402
+from first_starts import start_together  # noqa: E402
 from fuzz_targets import TARGETS  # noqa: E402
 from killing import survive  # noqa: E402
 from many import estimate_many  # noqa: E402
+from mat_damage import survive as survive_mats  # noqa: E402
+from run_files import make_campaign  # noqa: E402
 from soak import soak  # noqa: E402
+from test_commands import calls, prepare  # noqa: E402
+from test_foreign_directory import ATTACKS, beside_own_files, call, withstood  # noqa: E402
 
 from en4dvar.storage.provenance import cpu_model, git_commit  # noqa: E402
 
@@ -39,6 +46,14 @@ def inputs(quick: bool, seed: int) -> None:
         print(f"inputs tried {target:39} {tried:6}   {failed} findings", flush=True)
         total, findings = total + tried, findings + failed
     print(f"inputs tried {'in all':39} {total:6}   {findings} findings")
+
+
+def mats(quick: bool, seed: int) -> None:
+    """Damaged ``.mat`` files, plain and compressed, of every kind of variable."""
+    with tempfile.TemporaryDirectory() as folder:
+        found = survive_mats(Path(folder), 1000 if quick else 50_000, seed)
+    for outcome, count in found.items():
+        print(f"damaged .mat files {outcome:33} {count:6}", flush=True)
 
 
 def kills(quick: bool, seed: int) -> int:
@@ -59,6 +74,44 @@ def kills(quick: bool, seed: int) -> int:
     return total
 
 
+def disks(quick: bool) -> None:
+    """Commands that met a disk that was full or failed, and said so in words."""
+    told = given = 0
+    faults = [{"limit": 0}, {"fails": "fsync", "error": "EIO"}]
+    if not quick:
+        faults += [{"limit": n} for n in (300, 3000, 9000, 30_000, 100_000)]
+        faults += [{"fails": f, "error": e} for f in ("fsync", "replace") for e in ("ENOSPC", "EDQUOT")]
+    with tempfile.TemporaryDirectory() as folder:
+        quiet = prepare(Path(folder))
+        for fault in faults:
+            tasks = []
+            for number, name in enumerate(calls(quiet, "")):
+                words, before = calls(quiet, f"{folder}/out{number}")[name]
+                if name != "study" or fault == {"limit": 0}:
+                    tasks.append(Task(words, before, f"{folder}/out{number}", **fault))
+            for task, found in zip(tasks, attempt(tasks, HOUR), strict=True):
+                given += 1
+                if found.code:
+                    assert found.code == 2, (task.words, found.told)
+                    assert "Traceback" not in found.told, (task.words, found.told)
+                    told += 1
+    print(
+        f"commands on disks that are full or fail {given:18}   {told} refused in words, the others had room", flush=True
+    )
+
+
+def foreign() -> None:
+    """Commands that opened a run directory which somebody else had prepared, and touched nothing outside."""
+    tried = 0
+    with tempfile.TemporaryDirectory() as folder:
+        path = make_campaign(Path(folder), 2)
+        assert call("run", path, "--out", f"{folder}/run", "--no-report").exit_code == 0
+        for number, attack in enumerate(ATTACKS.values()):
+            place = Path(folder) / str(number)
+            tried += withstood(*beside_own_files(path, Path(folder) / "run", place), attack)
+    print(f"commands in {len(ATTACKS)} prepared run directories {tried:21}   nothing outside was touched", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true")
@@ -66,7 +119,14 @@ def main() -> None:
     given = parser.parse_args()
     print(f"commit {git_commit(Path(__file__))}, seed {given.seed}, {cpu_model()}")
     inputs(given.quick, given.seed)
+    mats(given.quick, given.seed)
+    with tempfile.TemporaryDirectory() as folder:
+        print(
+            f"first starts at once, same bits {start_together(Path(folder), 3 if given.quick else 20):26}", flush=True
+        )
     print(f"kills survived {'in all, the same bits after each':37} {kills(given.quick, given.seed):6}")
+    disks(given.quick)
+    foreign()
     sets = 200 if given.quick else 10_000
     with tempfile.TemporaryDirectory() as folder:
         early, late, first = estimate_many(Path(folder), sets, "processes")

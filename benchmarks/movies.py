@@ -94,11 +94,10 @@ def tell_speed(count: int = 1000) -> None:
             for k in range(count):
                 file.write(few[k if k < 3 else 3 + (k - 3) % 20], contiguous=True)
         for n in (2, 1):
-            begun = time.perf_counter(), time.process_time()
+            begun, busy = time.perf_counter(), time.process_time()
             track(open_movie(path), n)
-            print(
-                f"{n} workers: {time.perf_counter() - begun[0]:.1f} s, {time.process_time() - begun[1]:.1f} s of processors"
-            )
+            took, busy = time.perf_counter() - begun, time.process_time() - busy
+            print(f"{n} workers: {took:.1f} s, {busy:.1f} s of processors")
 
 
 if __name__ == "__main__":

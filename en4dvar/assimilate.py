@@ -122,11 +122,13 @@ class _Assimilation:
         problem, space, noise = self.problem, self.space, self.problem.observations.noise
         prior_run = space.forecast(np.vstack([space.members, space.mean]), self.grid)
         space.require_members(prior_run[:-1].failures, "prior forecast")
+        if not self.settings.stochastic_model:
+            space.check_repeats(prior_run, self.grid)
         start = self.start(prior_run, resume) if resume is None or resume.descent is None else resume
         descent = self.iterate(start, prior_run)
 
-        w, transform = descent.weights.w, descent.newton.transform if self.scheme.searches else descent.weights.T
-        ends = space.control(np.vstack([w + transform, w]))
+        transform = descent.newton.hessian.economical_transform if self.scheme.searches else descent.weights.T
+        ends = space.ensemble(descent.weights.w, transform)
         posterior, mode = ends[:-1], ends[-1]
         posterior = posterior + mean_beyond_mode(problem, mode, posterior, descent.records[-1].dfs)
         posterior, refinement, refine_warnings = self.refine(posterior, start.refinement)

@@ -6,11 +6,14 @@ Exit codes: 0 done; 1 the run failed, or some data sets of a campaign; 2 usage, 
 
 from __future__ import annotations
 
+import errno
+import os
+import sys
 from typing import Any
 
 import click
 
-from en4dvar.commands.common import Failed
+from en4dvar.commands.common import Failed, give_up_output
 from en4dvar.commands.listings import models, schema
 from en4dvar.commands.plugin_commands import PluginCommand, plugin_commands
 from en4dvar.commands.results import compare, export, report, rerun
@@ -18,6 +21,14 @@ from en4dvar.commands.run import run
 from en4dvar.commands.simulate import simulate
 from en4dvar.commands.validate import validate
 from en4dvar.errors import En4dvarError
+
+OF_THE_DEVICE = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EIO,
+    errno.EROFS,
+)  # told by what writes; here is what is left
 
 
 class Commands(click.Group):
@@ -33,11 +44,43 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
-            return super().invoke(ctx)
+            value = super().invoke(ctx)
+            sys.stdout.flush()
+            return value
         except En4dvarError as error:
             raise Failed(str(error), error.exit_code) from error
+        except SystemExit as end:  # of a model or law: click ends in another way; another package's command may
+            if ctx.invoked_subcommand in plugin_commands():
+                raise
+            from en4dvar.user_code import describe
+
+            raise Failed(f"the code of a model ended the program: {describe(end)}", 1) from None
         except (KeyboardInterrupt, click.Abort) as interrupt:
             raise Failed(str(interrupt) or "interrupted", 130) from None
+        except (OSError, ValueError) as error:
+            if failed := _about_output(error):
+                raise failed from error
+            raise
+
+
+def _about_output(error: OSError | ValueError) -> Failed | None:
+    """What the user is told where standard output is closed or a device takes no more."""
+    if _output_closed():
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  for what is written as Python ends
+        return Failed("standard output was closed, by a model perhaps; what was computed is kept", 1)
+    if not isinstance(error, OSError) or error.errno not in OF_THE_DEVICE:
+        return None
+    if error.filename is None:  # or what is left of it is tried again, and told, when the interpreter ends
+        give_up_output()
+    return Failed(f"{error.filename or 'standard output'}: cannot be written: {error.strerror}", 2)
+
+
+def _output_closed() -> bool:
+    try:
+        os.fstat(1)
+    except OSError:
+        return True
+    return sys.stdout is None or sys.stdout.closed
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})

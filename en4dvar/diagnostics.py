@@ -20,9 +20,9 @@ GAUSSIAN_ENOUGH = 0.35  # the same of the members: the criterion where there is 
 HARDLY_INFORMED = 0.1  # DFS of a parameter below which its posterior is said to be its prior
 
 
-def background_cost(w: Array) -> Array:
-    """J_b = (N−1)/2 ‖w‖² of weights (…, N)."""
-    return np.asarray(0.5 * (w.shape[-1] - 1) * np.add.reduce(w * w, axis=-1))
+def background_cost(w: Array, n_members: int | None = None) -> Array:
+    """J_b = (N−1)/2 ‖w‖² of weights (…, N), or of their coordinates (…, r) in an orthonormal basis."""
+    return np.asarray(0.5 * ((n_members or w.shape[-1]) - 1) * np.add.reduce(w * w, axis=-1))
 
 
 def dfs(singular_values: Array, n_members: int) -> float:

@@ -14,6 +14,7 @@ from typing import ClassVar, Protocol, runtime_checkable
 import numpy as np
 
 from en4dvar.state import Array, Parameter, StateLayout
+from en4dvar.user_code import reason_of
 
 
 @dataclass(frozen=True)
@@ -197,8 +198,8 @@ class ForwardModel(ABC):
             if t_next != t:
                 try:
                     x = np.asarray(self.step(x, t, float(t_next)), dtype=float)
-                except Exception as error:  # a model may fail in any way; the reason is kept
-                    return Failure(f"{type(error).__name__}: {error}", t)
+                except BaseException as error:  # a model may fail in any way; the reason is kept
+                    return Failure(reason_of(error), t)
                 t = float(t_next)
             if x.shape != (self.layout.size,):
                 return Failure(f"step returned shape {x.shape}, expected ({self.layout.size},)", t)

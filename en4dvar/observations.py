@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from en4dvar.errors import DataError
 from en4dvar.noise import Linearisation, Noise, Predicted
+from en4dvar.prior import LARGEST
 from en4dvar.state import Array
 
 
@@ -54,6 +55,9 @@ class Observations:
             raise DataError(f"{where}: {k} usable observations in the window; at least 3 are needed")
         if not (np.all(np.isfinite(self.times)) and np.all(np.isfinite(self.values))):
             raise DataError(f"{where}: observations must be finite")
+        largest = float(np.max(np.abs([self.times, self.values])))
+        if not largest < LARGEST:
+            raise DataError(f"{where}: {largest:g} among the observations; is the unit right? (less than {LARGEST:g})")
         if not np.all(np.diff(self.times) > 0):
             at = int(np.flatnonzero(np.diff(self.times) <= 0)[0])
             raise DataError(f"{where}: times must increase; {self.times[at]:g} is followed by {self.times[at + 1]:g}")
@@ -63,6 +67,12 @@ class Observations:
             self.noise.check(self.weights)
         except ValueError as error:
             raise DataError(f"{where}: {error}") from None
+        smallest, std = float(self.std.min()), float(self.std.max())
+        if not (std < LARGEST and largest < LARGEST * smallest and smallest * LARGEST > 1):
+            raise DataError(
+                f"{where}: an error std of {smallest if std < LARGEST else std:g} beside observations up to "
+                f"{largest:g}: their ratio is too large; is the unit right?"
+            )
 
     @property
     def std(self) -> Array:

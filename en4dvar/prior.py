@@ -25,6 +25,9 @@ from en4dvar.errors import ConfigError
 from en4dvar.state import Array, Parameter, TransformName
 
 Sampling = Literal["exact", "random"]
+LARGEST = 1e150  # its square is a number still
+LARGEST_LOG = 300.0  # std of a logarithm or logit: one std is 130 powers of ten
+RESOLVED = 1e-12  # of the mean: an ensemble that spreads by less has four digits at most
 
 
 @dataclass(frozen=True)
@@ -49,11 +52,23 @@ class PriorTerm:
         self._require(
             math.isfinite(self.std) and self.std > 0, f"the standard deviation must be positive, not {self.std:g}"
         )
+        self._require_digits()
         if self.transform == "logit":
             low, high = self.bounds
             self._require(
                 -math.inf < low < high < math.inf, f"logit needs finite bounds, low < high, not {self.bounds}"
             )
+
+    def _require_digits(self) -> None:
+        """The ensemble must spread by more than rounding, its squares and physical values must be numbers."""
+        around = abs(self.mean) if self.transform == "normal" else max(1.0, abs(self.mean))
+        self._require(
+            self.std > max(1 / LARGEST, RESOLVED * around),
+            f"the standard deviation {self.std:g} is too small to be told from rounding",
+        )
+        largest = LARGEST if self.transform == "normal" else LARGEST_LOG
+        self._require(self.std < largest, f"the standard deviation {self.std:g} is too large; less than {largest:g}")
+        self._require(abs(self.mean) < LARGEST, f"{self.mean:g} is too large; less than {LARGEST:g}")
 
     def _require(self, condition: bool, message: str) -> None:
         if not condition:
@@ -80,6 +95,10 @@ class PriorTerm:
         log_mean = _log(parameter, "mean", mean)
         if not std > 0:
             raise ConfigError(f"prior of {parameter.name}: the standard deviation must be positive, not {std:g}")
+        if not std < LARGEST * mean:
+            raise ConfigError(
+                f"prior of {parameter.name}: a standard deviation of {std:g} beside a mean of {mean:g} is too large"
+            )
         variance = math.log1p((std / mean) ** 2)
         return cls(parameter, "lognormal", log_mean - variance / 2, math.sqrt(variance))
 

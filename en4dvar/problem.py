@@ -103,6 +103,10 @@ class AssimilationSettings:
         Literal["auto", "on", "off"],
         "A few hundred more runs to tell how Gaussian the posterior is: auto (compiled models), on, or off.",
     ] = "auto"
+    stochastic_model: Annotated[
+        bool,
+        "true: accept a model that gives other numbers when a member is run again; by default that is an error.",
+    ] = False
     mda_coefficients: Annotated[
         tuple[Positive, ...],
         MinLen(1),

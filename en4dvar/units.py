@@ -14,6 +14,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, overload
 
 from en4dvar.errors import En4dvarError
+from en4dvar.hints import shown
 
 if TYPE_CHECKING:
     from en4dvar.state import Array
@@ -182,21 +183,25 @@ def parse_quantity(value: str | float, unit: str) -> float:
     >>> parse_quantity("0.42 kPa", "Pa"), parse_quantity("1 %", "1"), parse_quantity(3, "1")
     (420.0, 0.01, 3.0)
     """
-    example = f"; write e.g. '{value} {unit}'"
     if isinstance(value, bool) or not isinstance(value, str | int | float):
-        raise UnitError(f"{value!r} is not a quantity; write a number and a unit such as '1 {unit}'")
+        raise UnitError(f"{shown(value)} is not a quantity; write a number and a unit such as '1 {unit}'")
     text = str(value).strip()
     number = _NUMBER.match(text)
     if number is None:
-        raise UnitError(f"{value!r} is not a quantity; write a number and a unit such as '1 {unit}'")
+        raise UnitError(f"{shown(value)} is not a quantity; write a number and a unit such as '1 {unit}'")
+    if len(number[0]) > LONGEST:
+        raise UnitError(f"{shown(value)}: a number of {len(number[0])} characters")
     given = text[number.end() :].strip()
     if not given and parse_unit(unit).powers != ONE.powers:
-        raise UnitError(f"{text} has no unit{example}")
+        raise UnitError(f"{text} has no unit; write e.g. '{text} {unit}'")
     try:
         factor = _factor(given or "1", unit)
     except UnitError as error:
-        raise UnitError(f"{text!r}: {error}") from None
-    return float(Fraction(number[0]) * factor)
+        raise UnitError(f"{shown(text)}: {error}") from None
+    try:
+        return float(Fraction(number[0]) * factor)
+    except OverflowError:
+        raise UnitError(f"{shown(text)}: larger than any number of the computer") from None
 
 
 @dataclass(frozen=True)

@@ -70,6 +70,25 @@ class Stops(Oscillator):
         return super().trajectories(x, times)
 
 
+class EndsAt(Oscillator):
+    """Ends the process of the run at call number ``EN4DVAR_TEST_CALL`` of ``trajectories``; exit code 0."""
+
+    calls = 0
+
+    def trajectories(self, x, times):
+        type(self).calls += 1
+        if type(self).calls == int(os.environ["EN4DVAR_TEST_CALL"]):
+            os._exit(0)
+        return super().trajectories(x, times)
+
+
+class Noisy(Oscillator):
+    """0.1 % of noise in every step."""
+
+    def step(self, x, t0, t1):
+        return super().step(x, t0, t1) * (1 + 1e-3 * np.random.default_rng().standard_normal())
+
+
 class Swift(Oscillator):
     """All members at once, in closed form."""
 
@@ -87,13 +106,13 @@ class Swift(Oscillator):
 
 
 class Waits(Oscillator):
-    """Call number 8 of its thread, in the first iterations of a data set, waits for the file ``EN4DVAR_TEST_FLAG``."""
+    """Call number 9 of its thread, in the first iterations of a data set, waits for the file ``EN4DVAR_TEST_FLAG``."""
 
     calls = threading.local()
 
     def trajectories(self, x, times):
         self.calls.n = getattr(self.calls, "n", 0) + 1
-        if self.calls.n == 8:
+        if self.calls.n == 9:
             self.wait(Path(os.environ["EN4DVAR_TEST_FLAG"]))
         return super().trajectories(x, times)
 
@@ -107,10 +126,10 @@ class Waits(Oscillator):
 
 
 class WaitsTwice(Waits):
-    """Call number 5, in the search for a start, waits for a file of that name with the suffix ``.start``."""
+    """Call number 6, in the search for a start, waits for a file of that name with the suffix ``.start``."""
 
     def trajectories(self, x, times):
-        if getattr(self.calls, "n", 0) == 4:
+        if getattr(self.calls, "n", 0) == 5:
             self.wait(Path(os.environ["EN4DVAR_TEST_FLAG"]).with_suffix(".start"))
         return super().trajectories(x, times)
 

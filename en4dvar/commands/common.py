@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import functools
+import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -25,7 +26,27 @@ class Failed(click.ClickException):
         self.exit_code = exit_code  # type: ignore[misc]
 
     def show(self, file: IO[Any] | None = None) -> None:
-        click.echo(self.message, file=file, err=file is None)
+        try:
+            click.echo(printable(self.message), file=file, err=file is None)
+        except OSError:  # the terminal is gone, or the disk of the log is full: the exit code says it all the same
+            give_up_output()
+
+
+def give_up_output() -> None:
+    """What is still to be written to standard output and error goes nowhere."""
+    with suppress(OSError, ValueError):  # a stream without a file
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.stdout, sys.stderr):
+            try:
+                stream.flush()
+            except OSError:
+                os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
+
+
+def printable(text: str) -> str:
+    """Lines without what a terminal would obey: names and values come from files of anybody."""
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
 @dataclass(frozen=True)
@@ -93,6 +114,14 @@ def deliver(text: str, out: Path | None, what: str) -> None:
 def command_line(without: tuple[str, ...] = (), also: tuple[str, ...] = ()) -> str:
     """What the user typed, with the program's name as it is installed; some words left out, others added."""
     return shlex.join(["en4dvar", *(word for word in sys.argv[1:] if word not in without), *also])
+
+
+def note_beginning(run_dir: Path, resume: bool) -> None:
+    """Say that there is nothing to resume, as for a batch job that was killed before it began."""
+    from en4dvar.runs.rundir import holds_run
+
+    if resume and not holds_run(run_dir):
+        click.echo(f"note: {run_dir} holds no run yet; this one begins", err=True)
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from pathlib import Path
 
 import click
@@ -53,10 +54,11 @@ def compare(run_dirs: tuple[Path, ...], out: Path | None, no_report: bool) -> No
         click.echo(f"{estimates_table(comparison)}\n")
     click.echo(comparison_table(comparison))
     if not no_report:
+        from en4dvar.files import inside
         from en4dvar.report.overlay import write_comparison
 
         names = "_".join(re.sub(r"[^\w.+-]", "_", name) for name in comparison.runs)
-        folder = out or run_dirs[0].absolute().parent / f"compare_{names}"[:LONGEST]
+        folder = out or inside(run_dirs[0].absolute().parent, f"compare_{names}"[:LONGEST])
         page = write_comparison(comparison, folder)
         click.echo(f"report: {page if out else os.path.relpath(page)}")
 
@@ -92,11 +94,13 @@ def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
 @click.command()
 @click.argument("run_dir", type=click.Path(path_type=Path))
 @click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
-def rerun(run_dir: Path, workers: int | None) -> None:
+@click.option("--trust", is_flag=True, help="Run code that the files name, wherever it lies: read it before.")
+def rerun(run_dir: Path, workers: int | None, trust: bool) -> None:
     """Repeat a run from what its result files record, and compare to the last bit. Nothing is written.
 
     Configuration, seed and observations are those in the files. Where a bit differs, or anything that decides them has
     changed since (versions, sources, processor, data files), it is told; the exit code is 1 where a bit differs.
+    A law or model outside of the current folder and of installed packages is run after a question, or with --trust.
 
     \b
     Example:
@@ -104,7 +108,8 @@ def rerun(run_dir: Path, workers: int | None) -> None:
     """
     from en4dvar.runs.rerun import rerun as repeat
 
-    found = repeat(run_dir, workers)
+    ask = (lambda question: click.confirm(question, err=True)) if sys.stdin.isatty() else None
+    found = repeat(run_dir, workers, trust=trust, ask=ask)
     click.echo(str(found))
     if not found.same:
         raise Failed("the run is not reproduced", 1)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import chdir
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from en4dvar.commands.common import Failed, Source, command_line, config_options, continuable
+from en4dvar.commands.common import Failed, Source, command_line, config_options, continuable, note_beginning
 
 if TYPE_CHECKING:
     from en4dvar.config import Config, TwinConfig
@@ -20,7 +21,11 @@ MOST_TOLD = 30  # data sets, warnings and failures on the terminal; all of them 
 @config_options
 @click.option("--out", type=click.Path(path_type=Path), help="Run directory; default output.directory or runs/<name>.")
 @click.option("--force", is_flag=True, help="Replace an earlier run in the run directory, once this one is complete.")
-@click.option("--resume", is_flag=True, help="Continue the interrupted run in the run directory, to the same bits.")
+@click.option(
+    "--resume",
+    is_flag=True,
+    help="Continue the interrupted run in the run directory, to the same bits; begin where there is none.",
+)
 @click.option("--no-report", is_flag=True, help="Leave figures and page to 'en4dvar report'.")
 @click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
 @click.option("--scheduler", metavar="ADDRESS", help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786.")
@@ -50,7 +55,9 @@ def run(
         "execution.workers": workers,
         "execution.address": scheduler,
     }
-    config = load_any(source.path, source.overrides(**special))
+    with chdir("."):  # own code of a configuration may leave this folder, which --out refers to
+        config = load_any(source.path, source.overrides(**special))
+    note_beginning(config.directory, resume)
     if not isinstance(config, TwinConfig):
         _estimate(config, force, resume)
     elif scheduler:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,11 +56,16 @@ def simulate(
 def _simulate_campaign(source: Source, out: Path | None, seed: int | None, force: bool) -> None:
     from en4dvar.config.document import override, read_document
     from en4dvar.config.synthetic import resolve_campaign
+    from en4dvar.files import inside
     from en4dvar.runs.synthetic import draw_campaign, write_campaign
 
     document = override(read_document(source.path), source.overrides(seed=seed))
-    plan = resolve_campaign(document, source.path.resolve().parent)
-    plan = replace(plan, directory=out) if out else plan
+    base = source.path.resolve().parent
+    plan = resolve_campaign(document, base)
+    if out:
+        plan = replace(plan, directory=out)
+    else:  # a folder that came with the configuration may be a link
+        inside(base, os.path.relpath(plan.directory, base))
     sets = draw_campaign(plan)
     truth = write_campaign(plan, sets, command_line(), force)
     fits = [s.nrmse for s in sets]

@@ -72,15 +72,11 @@ def _warn(one: Preview) -> None:
 
 
 def _draw(config: Config, previews: Sequence[Preview], problems: Sequence[InverseProblem]) -> str:
-    from en4dvar.errors import OutputError
+    from en4dvar.files import make_folder
     from en4dvar.report.predictive import prior_predictive
     from en4dvar.report.style import save_figure
 
-    folder, name = config.directory.parent, f"{config.directory.name}_prior"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be created: {error.strerror}") from None
+    folder, name = make_folder(config.directory.parent), f"{config.directory.name}_prior"
     save_figure(prior_predictive(previews), folder, name)
     left = f" ({len(previews)} of {len(problems)} data sets)" if len(previews) < len(problems) else ""
     return f"{Path(folder) / name}.png and .pdf{left}"

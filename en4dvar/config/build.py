@@ -18,7 +18,7 @@ from en4dvar.config.data import Data
 from en4dvar.config.parameters import Fixed, Uncertain
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.errors import ConfigError, DataError, Fault
-from en4dvar.files import readable
+from en4dvar.files import PathError, expanded, readable
 from en4dvar.inputs.readers import SUFFIXES, Column, read_covariance, read_series
 from en4dvar.inputs.window import select
 from en4dvar.noise import Noise, noise_of
@@ -69,6 +69,10 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
     terms, fixed = resolve_parameters(config, observations)
     terms = (*terms, *(perturbed.term for perturbed in config.initial_state))
     perturbations = tuple(perturbed.perturbation for perturbed in config.initial_state)
+    asked = config.assimilation
+    if asked.sampling == "exact" and asked.members <= len(terms):
+        message = f"{asked.members} are too few for {len(terms)} parameters; at least {len(terms) + 1}"
+        raise ConfigError([config.document.fault(("assimilation", "members"), message)])
     problem = InverseProblem(config.model, config.observable, observations, Prior(terms), fixed, perturbations)
     check_problem(problem)
     return problem
@@ -88,14 +92,17 @@ def find_files(base: Path, texts: Sequence[str]) -> dict[str, Path]:
     """:func:`data_files` of paths, folders and patterns relative to ``base``. Raises :class:`DataError`."""
     paths: list[Path] = []
     for text in texts:
-        path = base / Path(text).expanduser()
-        if glob.has_magic(text) and not path.exists():
+        try:
+            path = base / expanded(text)
+        except PathError as error:
+            raise DataError(str(error)) from None
+        if glob.has_magic(text) and not os.path.exists(path):
             found = sorted(Path(p) for p in glob.glob(str(path), recursive=True))
             if not found:
                 raise DataError(f"{path}: no file matches")
             paths += found
-        elif path.is_dir():
-            held = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+        elif os.path.isdir(path):
+            held = sorted(p for p in _beside(path) if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
             if not held:
                 raise DataError(f"{path}: the folder holds no data file ({', '.join(SUFFIXES)})")
             paths += held
@@ -105,6 +112,13 @@ def find_files(base: Path, texts: Sequence[str]) -> dict[str, Path]:
     if again:
         raise DataError(f"{again[0]}: occurs more than once in data.path")
     return dict(zip(_unique_names(paths), paths, strict=True))
+
+
+def _beside(folder: Path) -> list[Path]:
+    try:
+        return list(folder.iterdir())
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be read: {error.strerror}") from None
 
 
 def _unique_names(paths: list[Path]) -> list[str]:

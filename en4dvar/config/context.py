@@ -18,7 +18,7 @@ from pydantic_core import CoreSchema, core_schema
 from en4dvar.config.validate import Faults
 from en4dvar.errors import ConfigError
 from en4dvar.forward import ForwardModel, Observable
-from en4dvar.hints import suggest
+from en4dvar.hints import brief, shown, suggest
 from en4dvar.units import convert, parse_quantity, parse_unit
 
 T = TypeVar("T")
@@ -121,9 +121,9 @@ def quantity(unit: Unit, sign: Literal["", "positive", "not negative"] = "") -> 
 def require_sign(value: float, sign: Literal["positive", "not negative"], text: object) -> None:
     """Raises :class:`ConfigError` for a value of another sign."""
     if sign == "positive" and not value > 0:
-        raise ConfigError(f"must be positive, not {text}")
+        raise ConfigError(f"must be positive, not {brief(str(text), 80)}")
     if value < 0:
-        raise ConfigError(f"must not be negative, not {text}")
+        raise ConfigError(f"must not be negative, not {brief(str(text), 80)}")
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def read_each(
     found: dict[str, T] = {}
     for name, value in given.items():
         if name not in known:
-            words = unknown(name) if unknown else f"unknown key {name!r}{suggest(name, known)}"
+            words = unknown(name) if unknown else f"unknown key {shown(name)}{suggest(name, known)}"
             faults.add((name,), words, at_key=True)
             continue
         context.subject = known[name]
@@ -204,7 +204,7 @@ class OfObservable:
             with Faults(names) as faults:
                 for key in given:
                     if key not in keys:
-                        faults.add((key,), f"unknown {self.what} {key!r}{suggest(key, keys)}", at_key=True)
+                        faults.add((key,), f"unknown {self.what} {shown(key)}{suggest(key, keys)}", at_key=True)
                 with faults.at(schema=source):
                     return validate({keys[key]: value for key, value in given.items() if key in keys})
 

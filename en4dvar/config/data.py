@@ -26,7 +26,8 @@ from en4dvar.config.context import (
 from en4dvar.config.schema import QuantityText, Section
 from en4dvar.config.validate import Faults
 from en4dvar.errors import ConfigError, Fault
-from en4dvar.hints import suggest
+from en4dvar.files import expanded
+from en4dvar.hints import shown, suggest
 from en4dvar.inputs.readers import Column, Format, Matrix, TimeStep
 from en4dvar.inputs.text_table import Decimal
 from en4dvar.inputs.window import Instant, parse_instant
@@ -147,7 +148,7 @@ class CovarianceFile(Section):
 
 
 def _matrix(given: CovarianceFile, context: Context) -> Matrix:
-    return Matrix(context.base / Path(given.path).expanduser(), given.unit, _square(context))
+    return Matrix(context.base / expanded(given.path), given.unit, _square(context))
 
 
 def parse_error_std(text: Any, unit: str) -> Spread:
@@ -289,7 +290,7 @@ class Data(Section):
         roles = ["time", *(observable.name for observable in context.units.observables)]
         for name in columns:
             if name not in roles:
-                faults.add(("columns", name), f"unknown column role {name!r}{suggest(name, roles)}", at_key=True)
+                faults.add(("columns", name), f"unknown column role {shown(name)}{suggest(name, roles)}", at_key=True)
         if columns.keys() <= set(roles):
             faults.add(("columns",), f"name the column of one observable of: {', '.join(roles[1:])}")
 

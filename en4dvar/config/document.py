@@ -16,12 +16,14 @@ from typing import Any
 import yaml
 
 from en4dvar.errors import ConfigError, Fault
-from en4dvar.hints import no_such_file
+from en4dvar.hints import brief, no_such_file, shown
 
 Key = tuple[str | int, ...]
 Mark = tuple[int, int]  # line and column, from 1
 
-_INT = re.compile(r"[-+]?\d{1,18}")
+LONGEST = 1_000_000  # bytes of a file, some ten seconds to read: the paths of 10 000 data sets and more
+
+_INT = re.compile(r"[-+]?\d{1,40}")
 _FLOAT = re.compile(r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d{1,3})?")
 _WORDS = {
     ".inf": math.inf,
@@ -49,7 +51,7 @@ class Document:
 
     def fault(self, path: Sequence[str | int], message: str, *, at_key: bool = False) -> Fault:
         """A fault at ``path``, or at its nearest ancestor that is written in the file."""
-        dotted = _dotted(path)
+        dotted, message = brief(_dotted(path), 200), brief(message)
         for n in range(len(path), -1, -1):
             key = tuple(path[:n])
             if key in self.origins:
@@ -73,7 +75,12 @@ class Document:
 def read_document(path: Path) -> Document:
     """Read and parse a YAML file. Raises :class:`ConfigError` listing every fault found."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        with path.open("rb") as file:
+            content = file.read(LONGEST + 1)
+        if len(content) > LONGEST:
+            words = f"longer than {LONGEST / 1e6:g} MB, which no configuration is; numbers belong into data files"
+            raise ConfigError([Fault(words, file=str(path))])
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigError([Fault(f"not UTF-8 text ({error.reason} at byte {error.start})", file=str(path))]) from None
     except OSError as error:
@@ -144,7 +151,7 @@ class _Loader(yaml.SafeLoader):
         if isinstance(event, yaml.AliasEvent):
             raise _Refused("aliases are not used here; repeat the value", event.start_mark)
         if getattr(event, "tag", None) is not None:
-            raise _Refused(f"tag {event.tag!r}: tags are not used here", event.start_mark)
+            raise _Refused(f"tag {shown(event.tag)}: tags are not used here", event.start_mark)
         return super().compose_node(parent, index)
 
 
@@ -193,7 +200,7 @@ class _Tree:
             name, where = str(key.value), _mark(key)
             here = (*path, name)
             if name in result:
-                message = f"duplicate key {name!r}, first given on line {self.keys[here][0]}"
+                message = f"duplicate key {shown(name)}, first given on line {self.keys[here][0]}"
                 self.faults.append(Fault(message, _dotted(path), self.file, *where))
                 continue
             self.keys[here] = where

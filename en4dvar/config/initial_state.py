@@ -9,7 +9,7 @@ from en4dvar.config.context import Context, Made, parse_spread, read_each
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
 from en4dvar.forward import ForwardModel
-from en4dvar.hints import suggest
+from en4dvar.hints import shown, suggest
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import StatePerturbation
 from en4dvar.state import Field, Parameter
@@ -59,7 +59,7 @@ def _perturbed(given: Mapping[str, Any], context: Context) -> tuple[Perturbed, .
     def unknown(name: str) -> str:
         if name in {p.name for p in context.model.parameters}:
             return f"{name} is a parameter: give it a prior in parameters"
-        return f"unknown field {name!r} of the state{suggest(name, fields)}"
+        return f"unknown field {shown(name)} of the state{suggest(name, fields)}"
 
     def read(entry: Any, context: Context) -> Perturbed:
         return InitialSpread.model_validate(entry, context=context).std

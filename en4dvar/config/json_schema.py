@@ -149,7 +149,7 @@ def _model_section(models: list[str]) -> Json:
         "required": ["name"],
         "properties": {
             "name": {
-                "description": "Name of the model (see 'en4dvar models'), or package:object.",
+                "description": "Name of the model (see 'en4dvar models'), ./my_model.py:MyModel, or package:MyModel.",
                 "anyOf": [{"enum": sorted(models)}, {"type": "string", "pattern": ":"}],
             }
         },

@@ -33,10 +33,10 @@ def time_grid(start: str | float, end: str | float, step: str | float, unit: str
     last, width = parse_quantity(end, unit), parse_quantity(step, unit)
     if not width > 0 or not last > first:
         raise UnitError(f"no instants from {first:g} to {last:g} {unit} in steps of {width:g} {unit}")
-    count = int(np.floor((last - first) / width * (1 + 1e-9))) + 1
-    if not 3 <= count <= 1_000_000:
-        raise UnitError(f"{count} instants; give between 3 and a million")
-    return np.asarray(first + width * np.arange(count), dtype=float)
+    steps = (last - first) / width * (1 + 1e-9)
+    if not 2 <= steps < 1_000_000:
+        raise UnitError(f"{steps:.6g} steps; give between 2 and a million")
+    return np.asarray(first + width * np.arange(int(np.floor(steps)) + 1), dtype=float)
 
 
 class Times(Section):

@@ -1,4 +1,4 @@
-"""From the ``model:`` section to a forward model: by entry point (group ``en4dvar.models``) or ``package:object``."""
+"""From the ``model:`` section to a forward model: registered (``en4dvar.models``), in a package or in a file."""
 
 from __future__ import annotations
 
@@ -9,13 +9,18 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
+from en4dvar import user_file
 from en4dvar.config.document import Document
+from en4dvar.config.symbols import check_symbols
 from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, En4dvarError, Fault
+from en4dvar.files import PathError
 from en4dvar.forward import ForwardModel, StateField
-from en4dvar.hints import suggest
+from en4dvar.hints import shown, suggest
+from en4dvar.user_code import RefusedError, file_of, loading, require_permission
 
 GROUP = "en4dvar.models"
+OWN = "./my_model.py:MyModel, or package:MyModel"
 
 
 class NoSettings(BaseModel):
@@ -25,21 +30,29 @@ class NoSettings(BaseModel):
 
 
 def find_model(name: str) -> type[ForwardModel]:
-    """The model class called ``name``. Raises :class:`ConfigError`."""
+    """The model class called ``name``: registered, ``package:Class`` or ``/path/file.py:Class``.
+
+    Raises :class:`ConfigError`.
+    """
     found: Any
     try:
-        if ":" in name:
-            module, _, attribute = name.partition(":")
-            found = getattr(import_module(module), attribute)
-        else:
-            registered = {e.name: e for e in entry_points(group=GROUP)}
-            if name not in registered:
-                raise ConfigError(f"unknown model {name!r}{suggest(name, registered)}; or write package:object")
-            found = registered[name].load()
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"model {name!r} cannot be loaded: {error}") from error
+        with loading(f"model {shown(name)} cannot be loaded"):
+            if user_file.is_file_reference(name):
+                require_permission(f"model {shown(name)}", Path(name.rpartition(":")[0]))
+                found = user_file.load(name)
+            elif ":" in name:
+                module, _, attribute = name.partition(":")
+                require_permission(f"model {shown(name)}", file_of(module))
+                found = getattr(import_module(module), attribute)
+            else:
+                registered = {e.name: e for e in entry_points(group=GROUP)}
+                if name not in registered:
+                    raise ConfigError(f"unknown model {shown(name)}{suggest(name, registered)}; or write {OWN}")
+                found = registered[name].load()
+    except ValueError as error:
+        raise ConfigError(f"model {shown(name)} cannot be loaded: {error}") from error
     if not (isinstance(found, type) and issubclass(found, ForwardModel)):
-        raise ConfigError(f"{name!r} is not a subclass of en4dvar.ForwardModel")
+        raise ConfigError(f"{shown(name)} is not a subclass of en4dvar.ForwardModel")
     if hasattr(found, "Settings") != hasattr(found, "from_settings"):
         lacking = "from_settings" if hasattr(found, "Settings") else "Settings"
         raise ConfigError(
@@ -56,13 +69,16 @@ def settings_of(kind: type[ForwardModel]) -> type[BaseModel]:
 
 def build_model(kind: type[ForwardModel], settings: BaseModel) -> ForwardModel:
     """The model of validated settings. Raises :class:`ConfigError` where the class does not fit together."""
-    try:
-        model: ForwardModel = kind.from_settings(settings) if hasattr(kind, "from_settings") else kind()
-    except TypeError as error:
-        if hasattr(kind, "from_settings"):
-            raise
-        raise ConfigError(f"{error}; a class that takes arguments needs Settings and from_settings") from error
-    for observable in model.observables:
+    with loading(f"{kind.__name__} cannot be made"):
+        try:
+            model: ForwardModel = kind.from_settings(settings) if hasattr(kind, "from_settings") else kind()
+        except TypeError as error:
+            if hasattr(kind, "from_settings"):
+                raise
+            raise ConfigError(f"{error}; a class that takes arguments needs Settings and from_settings") from error
+        observables = model.observables
+    check_symbols((*model.parameters, *observables))
+    for observable in observables:
         if isinstance(observable.operator, StateField):
             for field in (observable.operator.name, observable.operator.rate_of):
                 if field is not None and field not in model.layout.names:
@@ -87,16 +103,21 @@ def read_model(
         faults.append(document.fault(("model", "name"), "name the model, e.g. name: bubble"))
         return None
     try:
+        if user_file.is_file_reference(name):
+            name = user_file.absolute(name, base)
         kind: Any = find_model(name)
-    except ConfigError as error:
+    except (ConfigError, PathError) as error:
         faults.append(document.fault(("model", "name"), str(error)))
         return None
     options = {key: value for key, value in raw.items() if key != "name"}
-    settings: BaseModel | None = check(settings_of(kind), options, ("model",), document, faults, {"base": base})
-    if settings is None:
-        return None
     try:
+        with loading(f"the settings of {name} cannot be read"):
+            settings: BaseModel | None = check(settings_of(kind), options, ("model",), document, faults, {"base": base})
+        if settings is None:
+            return None
         model = build_model(kind, settings)
+    except RefusedError:
+        raise
     except (En4dvarError, ValueError) as error:
         faults.append(document.fault(("model",), str(error)))
         return None

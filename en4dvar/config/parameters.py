@@ -12,7 +12,7 @@ from en4dvar.config.context import Context, Made, Spread, parse_spread, read_eac
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
 from en4dvar.errors import ConfigError, Fault
-from en4dvar.hints import suggest
+from en4dvar.hints import brief, shown, suggest
 from en4dvar.prior import PriorTerm
 from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Parameter
 from en4dvar.units import parse_quantity
@@ -29,7 +29,7 @@ def _bounded(text: Any, parameter: Parameter) -> float:
     low, high = parameter.bounds
     value = parse_quantity(text, parameter.unit)
     if not low <= value <= high:
-        raise ConfigError(f"{text} is outside the bounds [{low:g}, {high:g}] {parameter.unit}")
+        raise ConfigError(f"{brief(str(text), 80)} is outside the bounds [{low:g}, {high:g}] {parameter.unit}")
     return value
 
 
@@ -187,11 +187,13 @@ def entries(kind: str = "") -> Made:
         known = {p.name: p for p in model.parameters}  # a model's own sigma goes before
         known |= {p.name: p for p in (shift, NOISE_SCALE) if p.name not in known}
         defaults: Mapping[str, float] = getattr(model, "defaults", {})
+
+        def unknown(name: str) -> str:
+            return f"unknown parameter {shown(name)}{suggest(name, known)}"
+
         found: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in defaults.items()}
         with Faults() as faults:
-            found |= read_each(
-                given, known, context, faults, _entry, lambda name: f"unknown parameter {name!r}{suggest(name, known)}"
-            )
+            found |= read_each(given, known, context, faults, _entry, unknown)
             for name, entry in found.items():
                 if kind and entry.needs_data:
                     faults.add((name,), f"{kind} has no data file to take a value from")

@@ -21,6 +21,7 @@ from en4dvar.config.validate import Faults
 from en4dvar.cycling.sequential import SequentialSettings
 from en4dvar.cycling.twin import TwinExperiment
 from en4dvar.errors import ConfigError, DataError, Fault
+from en4dvar.files import expanded
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.inputs.readers import Matrix, read_covariance
 from en4dvar.noise import Correlation
@@ -55,9 +56,9 @@ def _stds(known: Callable[[ForwardModel], Mapping[str, Any]]) -> Made:
 
 def _correlation(path: str, context: Context) -> tuple[str, Correlation]:
     """The absolute path and the matrix."""
-    file = (context.base / path).absolute()
     try:
-        return str(file), Correlation(read_covariance(Matrix(file.expanduser(), "1", "1")))
+        file = (context.base / expanded(path)).absolute()
+        return str(file), Correlation(read_covariance(Matrix(file, "1", "1")))
     except (DataError, ValueError) as error:
         raise ConfigError(str(error)) from None
 
@@ -144,6 +145,8 @@ class Sequential(_Iterations):
     """Rotate the ensemble at random after each analysis, mean and covariance kept."""
     localisation: Local | None = None
     """Gaspari–Cohn taper over the indices of the observed field (filters only)."""
+    stochastic_model: bool = False
+    """true: accept a model that gives other numbers when a member is run again; by default that is an error."""
 
     @model_validator(mode="after")
     def _belongs_together(self) -> Self:
@@ -158,7 +161,10 @@ class Sequential(_Iterations):
     def built(self, localisation: Localisation | None) -> SequentialSettings:
         """What the loop needs."""
         scheme = _KINDS[self.scheme](**{key: getattr(self, key) for key in _KEYS[self.scheme]})
-        return SequentialSettings(scheme, Inflation(self.inflation, self.rtps), self.rotation, localisation)
+        inflation = Inflation(self.inflation, self.rtps)
+        return SequentialSettings(
+            scheme, inflation, self.rotation, localisation, stochastic_model=self.stochastic_model
+        )
 
     def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """As given, without what the scheme does not take."""

@@ -12,7 +12,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from en4dvar.config.document import Document
 from en4dvar.errors import ConfigError, Fault
-from en4dvar.hints import suggest
+from en4dvar.hints import shown, suggest
 
 M = TypeVar("M", bound=BaseModel)
 Place = tuple[str | int, ...]
@@ -24,6 +24,8 @@ _MESSAGES = {
     "model_type": _SECTION,
     "model_attributes_type": _SECTION,
     "string_type": "expected text; put it in quotes",
+    "path_type": "expected the path of a file or folder",
+    "int_parsing_size": "too large for a whole number",
 }
 
 
@@ -112,7 +114,7 @@ def _tell(error: ValidationError, schema: type[BaseModel]) -> Iterator[_Finding]
             yield _Finding((*place, name), _not_one_of(context["tag"], context["expected_tags"]), absent=True)
         elif kind == "extra_forbidden":
             hint = suggest(place[-1], sorted(_known(schema, place[:-1])))
-            yield _Finding(place, f"unknown key {str(place[-1])!r}{hint}", at_key=True)
+            yield _Finding(place, f"unknown key {shown(str(place[-1]))}{hint}", at_key=True)
         else:
             yield _Finding(place, _message(item), absent=kind == "missing")
 
@@ -133,16 +135,16 @@ def _message(item: Any) -> str:
     if kind in ("literal_error", "enum"):
         return _not_one_of(item["input"], context["expected"].replace(" or ", ", "))
     if kind == "too_short":
-        return f"give at least {context['min_length']}, not {item['input']!r}"
+        return f"give at least {context['min_length']}, not {shown(item['input'])}"
     message = _MESSAGES.get(kind, item["msg"].replace("Input should be", "should be"))
-    return message if kind == "missing" else f"{message}, not {item['input']!r}"
+    return message if kind == "missing" else f"{message}, not {shown(item['input'])}"
 
 
 def _not_one_of(given: object, expected: str) -> str:
     choices = [choice.strip("' ") for choice in expected.split(", ")]
     hint = suggest(given, choices)
     few = f"one of {', '.join(choices)}" if len(choices) > 1 else choices[0]
-    return f"{given!r} is not {few}" + (hint if hint.startswith("; did") else "")
+    return f"{shown(given)} is not {few}" + (hint if hint.startswith("; did") else "")
 
 
 def _known(schema: type[BaseModel], place: Place) -> set[str]:

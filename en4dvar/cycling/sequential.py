@@ -21,6 +21,7 @@ from en4dvar.cycling.rotation import Rotations, rotate
 from en4dvar.cycling.series import Series
 from en4dvar.descent.loop import iterate
 from en4dvar.ensemble.linalg import centre
+from en4dvar.ensemble.repeat import check_repeats
 from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.forward import Failure, ForwardModel, Observable, Trajectory
@@ -39,6 +40,7 @@ class SequentialSettings:
     """How the loop treats the ensemble of ``scheme``; ``localisation`` only with a filter (lag 0).
 
     ``rotation``: every analysis is turned by a random mean-preserving rotation (:mod:`en4dvar.cycling.rotation`).
+    ``stochastic_model``: a model that gives other numbers when a member is run again is accepted.
     """
 
     scheme: Scheme
@@ -46,6 +48,7 @@ class SequentialSettings:
     rotation: bool = False
     localisation: Localisation | None = None
     min_active_fraction: float = 0.5
+    stochastic_model: bool = False
 
     def __post_init__(self) -> None:
         if self.localisation is not None and not isinstance(self.scheme, ETKF):
@@ -112,12 +115,15 @@ def run_sequential(
 
     Raises
     ------
-    TooFewMembersError: the ensemble is lost. ValueError: localisation with correlated errors.
+    TooFewMembersError: the ensemble is lost. ValueError: localisation with correlated errors. ConfigError: the model
+        gives other numbers when a member is run again.
     """
     if settings.localisation is not None and series.correlation is not None:
         raise ValueError("localisation needs observations with independent errors")
     with one_blas_thread():
         run = _Run(model, tuple(observables), members, series, settings, seed, executor or SerialExecutor(), resume)
+        if not settings.stochastic_model:
+            run.check_repeats()
         for cycle in range(resume.cycle if resume else 0, len(series.times)):
             run.cycle(cycle)
             if on_cycle is not None:
@@ -229,6 +235,28 @@ class _Run:
         self.after.put(k, at[-1])
         self.ensemble, self.start = at[0], next_start
         self.cycles_done = newest
+
+    def check_repeats(self) -> None:
+        """Two members, over the first interval, twice: in one order and in the other; no cycle uses these runs.
+
+        Raises :class:`ConfigError`: they differ.
+        """
+        if self.start + 1 >= len(self.times):
+            return
+        start, end = self.times[self.start : self.start + 2]
+
+        def run(members: list[int]) -> tuple[Array, list[str]]:
+            states, failures = np.full((len(members), self.ensemble.shape[1]), np.nan), [""] * len(members)
+            for row, i in enumerate(members):  # one by one: where one is lost, the other is not
+                try:
+                    states[row] = propagate(self.model, self.ensemble[[i]], start, np.array([end]), self.executor)[0, 0]
+                except MembersLost as lost:
+                    (failures[row],) = lost.reasons
+            return states, failures
+
+        both = [0, len(self.ensemble) - 1]
+        states, failures = run(both)
+        check_repeats(self.model, states, failures, lambda again: run([both[i] for i in again]))
 
     def analyse(self, k: int) -> tuple[Array, Array]:
         """Mean and anomalies of the posterior at the start of the window; members lost are dropped from the prior."""

@@ -26,11 +26,12 @@ from en4dvar.cycling.sequential import (
 )
 from en4dvar.cycling.series import Series
 from en4dvar.errors import ConfigError, En4dvarError
-from en4dvar.executor import Executor, SerialExecutor
+from en4dvar.executor import Executor, SerialExecutor, run_chunk
 from en4dvar.forward import Failure, ForwardModel, Observable
 from en4dvar.noise import Correlation
 from en4dvar.prior import Prior, member_stream
 from en4dvar.state import Array
+from en4dvar.user_code import reason_of
 
 OVERCONFIDENT = 0.5  # spread over RMSE of an ensemble that has lost the truth
 
@@ -143,7 +144,7 @@ def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, Series]
     """
     model, times = experiment.model, experiment.times
     start = _initial(experiment, [member_stream(seed, "truth")])
-    (outcome,) = model.trajectories(start, times)
+    (outcome,) = run_chunk(model, start, times)
     if isinstance(outcome, Failure):
         raise En4dvarError(f"the truth cannot be integrated: {outcome.reason}")
     exact = predictions(experiment.observables, outcome)
@@ -207,8 +208,8 @@ def _initial(experiment: TwinExperiment, streams: list[np.random.Generator]) -> 
         states = np.array(
             model.initial_states(theta) if theta else [model.initial_state({})] * len(streams), dtype=float
         )
-    except Exception as error:  # a model may fail in any way
-        raise En4dvarError(f"the initial state cannot be made: {type(error).__name__}: {error}") from error
+    except BaseException as error:  # a model may fail in any way
+        raise En4dvarError(f"the initial state cannot be made: {reason_of(error)}") from error
     if states.shape != (len(streams), model.layout.size):
         raise En4dvarError(
             f"initial_state returned shape {states.shape[1:]}, but the layout has ({model.layout.size},)"

@@ -21,7 +21,7 @@ from en4dvar.descent.step_control import Move
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.ensemble.forecast import Forecast
-from en4dvar.schemes.base import Scheme, Weights
+from en4dvar.schemes.base import Scheme
 from en4dvar.schemes.en4dvar import En4DVar
 
 ROUGH = 1e-2  # relative decrease of J at which a descent stops that only has to tell basins apart
@@ -54,26 +54,29 @@ def choose_start(
     ``resume``: where the comparison was interrupted. ``keep`` is called before each round of moves with the state to
     resume from, ``tell`` after it.
     """
-    n_members, candidates = len(space.members), space.drawn.at_members
-    costs = diag.background_cost(candidates) + space.observation_cost(run)
-    identity = np.eye(n_members)
+    n_members, drawn = len(space.members), space.drawn
+
+    def descent_from(member: int) -> Descent:
+        return Descent(space.start(drawn.at_member(member)))
+
+    costs = drawn.background_costs + space.observation_cost(run)
     warnings: tuple[Caution, ...] = ()
     if space.settings.start == "prior-mean":
         if np.isfinite(costs[-1]):
-            return Descent(Weights(candidates[-1], identity)), ()
+            return descent_from(n_members), ()
         words = f"the prior mean cannot be run ({run.failures[-1]}); started from the best prior member"
         warnings = (caution("start-moved", words),)
     best = np.argsort(costs, kind="stable")
     affordable = n_members // (space.basis.shape[1] + 1) if scheme.economical(space.basis) else 1
-    starts = [Weights(candidates[i], identity) for i in best[:affordable] if np.isfinite(costs[i])]
+    starts = [i for i in best[:affordable].tolist() if np.isfinite(costs[i])]
     together = min(space.settings.starts, len(starts))
     if together < 2:
-        return Descent(Weights(candidates[best[0]], identity)), warnings
-    comparison = resume or StartState(lowest=Descent(starts[0]))
+        return descent_from(int(best[0])), warnings
+    comparison = resume or StartState(lowest=descent_from(starts[0]))
     window = Rounds(space, seed, comparison, keep, tell)
     while window.rank < len(starts):
         if not window.descents:
-            window.descents = [Descent(weights) for weights in starts[window.rank : window.rank + together]]
+            window.descents = [descent_from(i) for i in starts[window.rank : window.rank + together]]
         iterate(window, scheme, window.descents)
         window.lowest = min(window.lowest, *window.descents, key=lambda descent: descent.cost)
         if window.lowest.cost <= window.plausible:
@@ -99,7 +102,7 @@ class Rounds(DataWindow):
     def __init__(self, space: WeightSpace, seed: int, before: StartState, keep: Keep, tell: Callable[[Record], None]):
         super().__init__(space, seed, lambda: keep(self.comparison), tell)
         self.descents, self.rank, self.rounds = [d.kept for d in before.descents], before.first, before.rounds
-        self.lowest = before.lowest.kept if before.lowest else Descent(Weights.prior(len(space.members)))
+        self.lowest = before.lowest.kept if before.lowest else Descent(space.start(np.zeros(len(space.members))))
         self.plausible = highest_plausible(space)
 
     def comparison(self) -> StartState:
@@ -124,8 +127,8 @@ class Rounds(DataWindow):
             descent.ended = True
             return
         step, before = descent.newton, descent.cost
-        self.record(descent, step.transform, move.step_length)
-        descent.weights, descent.cost = Weights(move.w, step.transform), move.cost
+        self.record(descent, step.hessian.economical_transform, move.step_length)
+        descent.weights, descent.cost = self.space.onwards(move.w, step.hessian), move.cost
         rough = max(before - move.cost, step.predicted_decrease) <= ROUGH * max(1.0, move.cost)
         descent.ended = rough or descent.iteration == self.settings.max_iterations
 

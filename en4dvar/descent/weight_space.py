@@ -11,12 +11,16 @@ import numpy as np
 from en4dvar import diagnostics as diag
 from en4dvar.descent.step_control import Trials
 from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
-from en4dvar.ensemble.linalg import anomaly_basis, centre
+from en4dvar.ensemble.linalg import FEW, Hessian, ThinTransform, anomaly_basis, centre
+from en4dvar.ensemble.repeat import check_repeats
 from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor
 from en4dvar.prior import Prior, Sampling
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.schemes.base import Weights
 from en4dvar.state import Array
+
+NOT_READ: Array = np.empty((0, 0))
 
 
 @dataclass(frozen=True)
@@ -29,15 +33,25 @@ class PriorEnsemble:
     variance: Array
     basis: Array
 
-    @cached_property
-    def at_members(self) -> Array:
-        """Weights (N + 1, N) of the members and, last, of their mean.
+    def at_member(self, i: int) -> Array:
+        """Weights (N,) of member i; those of the mean follow the last.
 
         e_i is moved to the minimum-norm weights of the same member, so that J_b is ½‖x − x̄0‖² in the prior covariance.
         """
-        weights = np.vstack([self.basis @ self.basis.T, np.zeros(len(self.members))])
-        weights.flags.writeable = False
-        return weights
+        n_members = len(self.members)
+        if i == n_members:
+            return np.zeros(n_members)
+        return np.asarray(self._projection[i] if n_members <= FEW else self.basis @ self.basis[i])
+
+    @property
+    def background_costs(self) -> Array:
+        """J_b (N + 1,) of the weights of the members and their mean."""
+        return diag.background_cost(np.vstack([self.basis, np.zeros(self.basis.shape[1])]), len(self.members))
+
+    @cached_property
+    def _projection(self) -> Array:
+        """U Uᵀ (N, N)."""
+        return np.asarray(self.basis @ self.basis.T)
 
 
 @lru_cache(maxsize=4)
@@ -72,9 +86,42 @@ class WeightSpace:
         """Control vectors (…, n) of weights (…, N)."""
         return np.asarray(self.mean + w @ self.anomalies)
 
+    def ensemble(self, w: Array, transform: Array | ThinTransform) -> Array:
+        """Control vectors (N + 1, n) of the members w + T_i of a transform T and, last, of w (N,)."""
+        if isinstance(transform, ThinTransform):
+            middle = self.control(w)
+            return np.vstack([middle + transform @ self.anomalies, middle])
+        return self.control(np.vstack([w + transform, w]))
+
+    def start(self, w: Array) -> Weights:
+        """Weights of a descent from w (N,), with the transform of the prior."""
+        return Weights(w, np.eye(len(w)) if self._reads_transform else NOT_READ)
+
+    def onwards(self, w: Array, hessian: Hessian) -> Weights:
+        """Weights of a descent at w (N,), with the transform of where it comes from."""
+        return Weights(w, hessian.transform if self._reads_transform else NOT_READ)
+
+    @property
+    def _reads_transform(self) -> bool:
+        """Few members take it along in any case; of many, only a regression over the ensemble asks for it."""
+        return len(self.members) <= FEW or self.settings.linearisation == "transform"
+
     def forecast(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
         self.forward_runs += len(x)
         return self.composite(x, extra_times)
+
+    def check_repeats(self, prior_run: Forecast, extra_times: Array) -> None:
+        """Run two members of the prior forecast again, at the same instants; ``forward_runs`` does not count them.
+
+        Raises :class:`ConfigError`: they give other predictions.
+        """
+
+        def again(members: list[int]) -> tuple[Array, tuple[str, ...]]:
+            run = self.composite(self.members[members], extra_times)
+            return run.predictions, run.failures
+
+        alive = prior_run[: len(self.members)]
+        check_repeats(self.problem.model, alive.predictions, alive.failures, again, self.problem.observations.name)
 
     def observation_cost(self, run: Forecast) -> Array:
         """J_o (B,)."""

@@ -18,6 +18,7 @@ from en4dvar.analysis import IterationRecord, Record
 from en4dvar.descent.step_control import STEP_CONTROLS, Move, Point, Tangent, run_searches
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.forecast import NO_TIMES, Forecast
+from en4dvar.ensemble.linalg import ThinTransform
 from en4dvar.errors import TooFewMembersError
 from en4dvar.noise import Linearisation, Predicted
 from en4dvar.prior import member_stream
@@ -149,11 +150,10 @@ class DataWindow:
         control = STEP_CONTROLS[self.settings.step_control]
         return run_searches([control(self._point(descent)) for descent in descents], self.space.try_out)
 
-    def record(self, descent: Descent, transform: Array, step_length: float) -> None:
+    def record(self, descent: Descent, transform: Array | ThinTransform, step_length: float) -> None:
         """Add the record of an iterate: the ensemble of ``transform`` (N, N) there, and how far it is left."""
         space, at, step = self.space, descent.iterate, descent.newton
-        w = descent.weights.w
-        ensemble = space.control(np.concatenate([w + transform, w[None]]))
+        ensemble = space.ensemble(descent.weights.w, transform)
         physical = space.problem.prior.to_physical(ensemble)
         record = IterationRecord(
             iteration=descent.iteration,
@@ -178,7 +178,7 @@ class DataWindow:
 
     def _minimise(self, scheme: Scheme, descent: Descent) -> None:
         settings, at, step = self.settings, descent.iterate, descent.newton
-        move, contracted = None, Weights(descent.weights.w, step.transform)
+        move, contracted = None, self.space.onwards(descent.weights.w, step.hessian)
         if not descent.stop:
             if step.norm <= settings.step_tolerance:
                 descent.stop, descent.converged = f"step of {step.norm:.2g} posterior standard deviations", True
@@ -189,7 +189,7 @@ class DataWindow:
                 if move is None and self._same_members(scheme, contracted, descent.weights):
                     descent.stop = "no decrease possible along the step"
                     descent.converged = step.predicted_decrease <= self.small(at.cost)
-        self.record(descent, step.transform, move.step_length if move else 0.0)
+        self.record(descent, step.hessian.economical_transform, move.step_length if move else 0.0)
         descent.ended = bool(descent.stop)
         if descent.ended:
             return
@@ -199,7 +199,7 @@ class DataWindow:
         if at.cost - move.cost <= self.small(at.cost) and step.predicted_decrease <= self.small(at.cost):
             # one more forecast, to linearise at the end point
             descent.stop, descent.converged = f"relative decrease of J below {settings.cost_tolerance:g}", True
-        descent.weights = Weights(move.w, step.transform)
+        descent.weights = self.space.onwards(move.w, step.hessian)
 
     def _take(self, scheme: Scheme, descent: Descent) -> None:
         """The whole step; the iterate after the last one is recorded, too."""

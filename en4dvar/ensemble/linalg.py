@@ -14,6 +14,7 @@ import numpy as np
 from en4dvar.state import Array
 
 GRAM_LIMIT = 100.0
+FEW = 512  # members up to which a transform is a matrix (2 MB); beyond, time and memory grow with N, not N²
 
 
 def centre(ensemble: Array) -> tuple[Array, Array]:
@@ -54,6 +55,23 @@ def anomaly_basis(anomalies: Array) -> Array:
 def min_norm_fit(design: Array, values: Array) -> Array:
     """Minimum-norm least-squares solution C of ``design @ C = values``; (m, r), (m, k) → (r, k)."""
     return np.asarray(np.linalg.lstsq(design, values, rcond=None)[0])
+
+
+@dataclass(frozen=True)
+class ThinTransform:
+    """T = I − Rᵀ diag(shrink) R of many members, without the matrix (N, N): ``rows`` R (m, N), ``shrink`` (m,)."""
+
+    rows: Array
+    shrink: Array
+
+    def __matmul__(self, columns: Array) -> Array:
+        """T applied to (N, n)."""
+        return np.asarray(columns - self.rows.T @ (self.shrink[:, None] * (self.rows @ columns)))
+
+    @property
+    def dense(self) -> Array:
+        """T (N, N)."""
+        return np.asarray(np.eye(self.rows.shape[1]) - (self.rows.T * self.shrink) @ self.rows)
 
 
 @dataclass(frozen=True)
@@ -114,10 +132,18 @@ class Hessian:
     @cached_property
     def transform(self) -> Array:
         """T = √(N−1) A^{-1/2} (N, N), the symmetric root: T 1 = 1 when S 1 = 0."""
+        return self._thin.dense
+
+    @property
+    def economical_transform(self) -> Array | ThinTransform:
+        """T as a matrix where members are few."""
+        return self.transform if self.rows.shape[1] <= FEW else self._thin
+
+    @property
+    def _thin(self) -> ThinTransform:
         # 1/√(1+x) − 1 = −x / (√(1+x) (1 + √(1+x))), x = σ²/(N−1)
         root = np.sqrt(1 + self.singular_values**2 / self.prior_precision)
-        shrink = 1 / (self.prior_precision * root * (1 + root))
-        return np.asarray(np.eye(self.rows.shape[1]) - (self.rows.T * shrink) @ self.rows)
+        return ThinTransform(self.rows, 1 / (self.prior_precision * root * (1 + root)))
 
     @property
     def inverse_transform(self) -> Array:

@@ -14,11 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.batch import Batch
-from en4dvar.executor import Outcome, describe
+from en4dvar.executor import Outcome
 from en4dvar.forward import Failure
 from en4dvar.prior import Prior
 from en4dvar.problem import InverseProblem
 from en4dvar.state import Array
+from en4dvar.user_code import own_fault, reason_of
 
 Indices = npt.NDArray[np.intp] | slice
 EVERYONE = slice(None)
@@ -59,13 +60,14 @@ class InitialStates:
             return alive, np.empty((0, self.size))
         try:
             return alive, self._build(physical[alive])
-        except Exception:  # some member has no state: find out which, one by one
+        except BaseException as error:  # some member has no state: find out which, one by one
+            own_fault(error)
             states = []
         for i in np.arange(len(failures))[alive]:
             try:
                 states.append(self._build(physical[i : i + 1]))
-            except Exception as error:  # a model may refuse parameters in any way; the reason is kept
-                failures[i] = describe(error)
+            except BaseException as error:  # a model may refuse parameters in any way; the reason is kept
+                failures[i] = reason_of(error)
         return _without(failures), np.concatenate([np.empty((0, self.size)), *states])
 
     def _build(self, physical: Array) -> Array:
@@ -119,8 +121,8 @@ class Reading:
                 read = self._all(outcomes)
                 if read[0].shape[1:] == (len(outcomes), n_times) and np.isfinite(read[0]).all():
                     return *read, [""] * len(outcomes)
-            except Exception:  # of some member: find out which, one by one
-                pass
+            except BaseException as error:  # of some member: find out which, one by one
+                own_fault(error)
         values = np.full((len(self.quantities), len(outcomes), n_times), np.nan)
         largest = np.full((len(outcomes), len(self.largest)), np.nan)
         reasons = [""] * len(outcomes)
@@ -130,8 +132,8 @@ class Reading:
                 continue
             try:
                 one = self._all([outcome])
-            except Exception as error:  # H belongs to the user as well
-                reasons[i] = describe(error)
+            except BaseException as error:  # H belongs to the user as well
+                reasons[i] = reason_of(error)
                 continue
             if one[0].shape[2:] != (n_times,):
                 reasons[i] = "misshapen prediction"

@@ -5,7 +5,7 @@ from typing import Literal
 
 from en4dvar.executor.base import Executor, ExecutorError, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread
-from en4dvar.executor.chunks import Outcome, cut, describe, run_chunk
+from en4dvar.executor.chunks import Outcome, cut, run_chunk
 from en4dvar.executor.limits import NO_LIMITS, Limits, TimeLimitError
 from en4dvar.executor.local import SerialExecutor, ThreadsExecutor
 from en4dvar.executor.processes import ProcessesExecutor
@@ -24,7 +24,6 @@ __all__ = [
     "available_cores",
     "choose_executor",
     "cut",
-    "describe",
     "make_executor",
     "one_blas_thread",
     "run_chunk",

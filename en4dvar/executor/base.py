@@ -9,9 +9,10 @@ from typing import Any, Self, TypeVar
 import numpy as np
 
 from en4dvar.errors import En4dvarError
-from en4dvar.executor.chunks import Outcome, cut, describe, run_chunk
+from en4dvar.executor.chunks import Outcome, cut, run_chunk
 from en4dvar.forward import Failure, ForwardModel
 from en4dvar.state import Array
+from en4dvar.user_code import reason_of
 
 T = TypeVar("T")
 Call = tuple[Any, ...]
@@ -71,7 +72,7 @@ class Executor(ABC):
                 batches = cut(size, model.batch, size)
                 results += self._chunks(model, x[part], times[part], batches)
             else:
-                reason = str(outcome) if isinstance(outcome, WorkerLostError) else describe(outcome)
+                reason = str(outcome) if isinstance(outcome, WorkerLostError) else reason_of(outcome)
                 results += [Failure(reason)] * size
         return results
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from en4dvar.batch import Batch
 from en4dvar.executor.limits import TimeLimitError, has_time_limit, within_time_limit
 from en4dvar.forward import Failure, ForwardModel, Trajectory
 from en4dvar.state import Array
+from en4dvar.user_code import describe, reason_of
 
 Outcome = Trajectory | Failure
 
@@ -34,10 +36,13 @@ def run_chunk(model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
     if has_time_limit() and len(x) > model.batch:
         return _by_batch(model, x, times)
     try:
-        outcomes = within_time_limit(lambda: kept(model.trajectories(x, times)))
+        with without_warnings():
+            outcomes = within_time_limit(lambda: kept(model.trajectories(x, times)))
         reason = f"the model returned {len(outcomes)} trajectories for {len(x)} members"
-    except (Exception, TimeLimitError) as error:  # a model may fail in any way; the reason is kept
+    except TimeLimitError as error:
         outcomes, reason = [], describe(error)
+    except BaseException as error:  # a model may fail in any way; the reason is kept
+        outcomes, reason = [], reason_of(error)
     if len(outcomes) == len(x):
         return outcomes
     if len(x) <= model.batch:
@@ -56,6 +61,10 @@ def kept(outcomes: Sequence[Outcome]) -> Sequence[Outcome]:
     return outcomes if isinstance(outcomes, Batch) else list(outcomes)
 
 
-def describe(error: BaseException) -> str:
-    """An exception as the reason of a failure."""
-    return f"{type(error).__name__}: {error}"
+def without_warnings() -> np.errstate:
+    """Within, numpy does not warn of an overflow, say: a member that it spoils fails, and says so itself.
+
+    What a model sets is for the model alone.
+    """
+    quiet: dict[str, Any] = {kind: "ignore" for kind, told in np.geterr().items() if told == "warn"}
+    return np.errstate(**quiet)

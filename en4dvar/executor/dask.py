@@ -25,6 +25,7 @@ from en4dvar.executor.base import Call, ExecutorError, T, Tell, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
 from en4dvar.executor.futures import Events, FuturesExecutor
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
+from en4dvar.user_code import in_worker, own_fault
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster
@@ -188,14 +189,19 @@ class DaskExecutor(FuturesExecutor):
 def dask_setup(_: Any) -> None:
     """In a worker of this machine: Ctrl-C is the main process's business."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    in_worker()
 
 
 def _on_worker(limits: Limits, function: Callable[..., T], call: Call, listener: str | None) -> T:
     one_blas_thread_for_good()
     apply_limits(limits)
-    if listener is None:
-        return function(*call)
-    from distributed import get_worker
+    tell: list[Tell] = []
+    if listener is not None:
+        from distributed import get_worker
 
-    worker = get_worker()
-    return function(*call, lambda message: worker.log_event(TOPIC, (listener, pickle.dumps(message))))
+        worker = get_worker()
+        tell = [lambda message: worker.log_event(TOPIC, (listener, pickle.dumps(message)))]
+    try:
+        return function(*call, *tell)
+    except BaseException as error:  # dask takes SystemExit for the end of the worker
+        raise own_fault(error) from None

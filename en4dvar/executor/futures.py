@@ -11,6 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from en4dvar.executor.base import Call, Executor, Hear, T, Tell, WorkerLostError
+from en4dvar.user_code import own_fault
 
 Events = queue.SimpleQueue[Any]  # futures that ended, and (index, message) of what calls tell
 
@@ -96,8 +97,8 @@ class PoolExecutor(FuturesExecutor):
     def _value(self, future: Future[T]) -> T | Exception:
         try:
             return future.result()
-        except Exception as error:
-            return error
+        except BaseException as error:
+            return own_fault(error)
 
     def _give_up(self, futures: Collection[Future[Any]]) -> None:
         for future in futures:

@@ -23,6 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from en4dvar.user_code import Stop
+
 T = TypeVar("T")
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30, "Ti": 2**40}
 _BYTES = re.compile(r"\s*(\d+(?:\.\d+)?)\s*(k|M|G|T|Ki|Mi|Gi|Ti)?B\s*")
@@ -49,7 +51,7 @@ class Limits:
 NO_LIMITS = Limits()
 
 
-class TimeLimitError(BaseException):
+class TimeLimitError(Stop):
     """A batch is past its time. Not an :class:`Exception`, so that no model takes it for one of its own."""
 
 

@@ -10,6 +10,7 @@ from en4dvar.executor.chunks import Outcome, kept, run_chunk
 from en4dvar.executor.futures import PoolExecutor
 from en4dvar.forward import ForwardModel
 from en4dvar.state import Array
+from en4dvar.user_code import own_fault
 
 
 class SerialExecutor(Executor):
@@ -21,8 +22,8 @@ class SerialExecutor(Executor):
         for i, call in enumerate(calls):
             try:
                 value: T | Exception = function(*call, *([functools.partial(hear, i)] if hear else []))
-            except Exception as error:
-                value = error
+            except BaseException as error:
+                value = own_fault(error)
             yield i, value
 
     def trajectories(self, model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
@@ -51,6 +52,7 @@ class ThreadsExecutor(PoolExecutor):
             for future in futures:
                 future.result()
             results = kept(shared.results())
-        except Exception:  # told member by member
+        except BaseException as error:  # told member by member
+            own_fault(error)
             results = []
         return results if len(results) == len(x) else super().trajectories(model, x, times)

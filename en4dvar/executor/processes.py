@@ -23,9 +23,9 @@ from typing import Any
 
 from en4dvar.executor.base import Call, ExecutorError, T, Tell, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
-from en4dvar.executor.chunks import describe
 from en4dvar.executor.futures import PoolExecutor
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
+from en4dvar.user_code import describe, in_worker, own_fault
 
 CLOSE_TIMEOUT = 10.0  # s for a worker to end by itself
 MOST_STILLBORN = 8  # workers in a row that end before they have begun
@@ -59,8 +59,8 @@ class _Worker:
             content = memoryview(self.receive())
             try:
                 value = pickle.loads(content[1:])
-            except Exception as error:  # a value that cannot be made again here
-                value = error
+            except BaseException as error:  # a value that cannot be made again here
+                value = own_fault(error)
             if content[:1] == ANSWER:
                 return value
             if tell:
@@ -205,18 +205,18 @@ def _answer(message: bytes, tell: Tell) -> bytes:
     value: Any
     try:
         function, call, listening = pickle.loads(message)
-    except Exception as error:
-        value = _unsendable(error)
+    except BaseException as error:
+        value = _unsendable(own_fault(error))
     else:
         try:
             value = function(*call, *([tell] if listening else []))
-        except Exception as error:
-            error.add_note(f"in a worker process:\n{traceback.format_exc()}")
-            value = error
+        except BaseException as error:
+            value = own_fault(error)
+            value.add_note(f"in a worker process:\n{traceback.format_exc()}")
     try:
         return bytes(ForkingPickler.dumps(value))
-    except Exception as error:  # of the value or of an exception with something in it that stays here
-        reason = value if isinstance(value, Exception) else error
+    except BaseException as error:  # of the value or of an exception with something in it that stays here
+        reason = value if isinstance(value, Exception) else own_fault(error)
         return bytes(ForkingPickler.dumps(RuntimeError(describe(reason))))
 
 
@@ -231,6 +231,7 @@ def _unsendable(error: Exception) -> TypeError:
 def prepare_worker(limits: Limits = NO_LIMITS) -> None:
     """Ctrl-C is the main process's business, BLAS uses one thread, and nobody works for a main process that is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    in_worker()
     one_blas_thread_for_good()
     apply_limits(limits)
     threading.Thread(target=_end_with_parent, name="en4dvar-parent", daemon=True).start()

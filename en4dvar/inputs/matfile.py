@@ -1,72 +1,196 @@
-"""Vectors and scalars of MATLAB v5 files."""
+"""Vectors and scalars of MATLAB v5 files, read here rather than by a library.
+
+One flipped bit in a file takes the process down inside scipy's compiled reader, which trusts sizes it finds in the
+file. To check all that it trusts is to read the file, so this does: every size is compared with the bytes that are
+there before it is used, and bytes become numbers by ``numpy.frombuffer`` alone. Of a struct, a cell array or text only
+the name is read. MathWorks, *MAT-File Format* (R2019b), chapter 1.
+"""
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from en4dvar.errors import DataError
+from en4dvar.state import Array
 
-COMPRESSED = 15  # miCOMPRESSED of the MAT-file format, level 5
+HEADER = 128  # bytes
+MOST = 1 << 25  # numbers in all vectors of a file: 256 MiB, whatever a small compressed file may unpack to
+MATRIX, COMPRESSED = 14, 15  # kinds of elements
+HEAD = 4096  # bytes of a compressed variable that tell what it is
+NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+OPAQUE = 17  # class of tables, strings and objects: no size is stored, the second element is the name
+CLASSES = {1: "a cell array", 2: "a struct", 3: "an object", 4: "text", 5: "a sparse matrix", 16: "a function"}
+CLASSES |= {OPAQUE: "an object"}
+NUMERIC = range(6, 16)  # classes of arrays of numbers
+COMPLEX = 0x800
 
 
-def mat_vectors(path: Path) -> tuple[dict[str, Any], dict[str, float], dict[str, str]]:
-    """Real vectors of a ``.mat`` file, its finite scalars, and in words what else it holds."""
-    from scipy.io import loadmat
+class _Damaged(Exception):
+    """What is wrong with the bytes."""
 
-    raw = path.read_bytes()  # scipy's reader may take the whole process down with a damaged file
+
+@dataclass(frozen=True)
+class _Variable:
+    """A vector's ``values`` (K,), or in ``words`` what else it is."""
+
+    name: str
+    values: Array | None = None
+    words: str = ""
+
+
+def mat_vectors(path: Path) -> tuple[dict[str, Array], dict[str, float], dict[str, str]]:
+    """Real vectors (K,) of a ``.mat`` file, its finite scalars, and in words what else it holds.
+
+    Raises :class:`DataError`.
+    """
+    raw = path.read_bytes()
     if not raw.startswith((b"MATLAB 5.0", b"MATLAB 7.3")):
         raise DataError(f"{path}: not a MATLAB v5 file (no such header); save it in MATLAB with save(..., '-v7')")
-    if raw.startswith(b"MATLAB 5.0") and _damaged(raw):
-        raise DataError(f"{path}: not a MATLAB v5 file (a compressed variable is damaged)")
+    order = {b"IM": "<", b"MI": ">"}.get(raw[126:HEADER], "")
+    if raw.startswith(b"MATLAB 7.3") or (order and struct.unpack_from(f"{order}H", raw, 124)[0] == 0x0200):
+        raise DataError(f"{path}: a MATLAB v7.3 (HDF5) file; save it again in MATLAB with save(..., '-v7')")
     try:
-        content = {k: v for k, v in loadmat(path).items() if not k.startswith("__")}
-    except NotImplementedError:
-        raise DataError(f"{path}: a MATLAB v7.3 (HDF5) file; save it again in MATLAB with save(..., '-v7')") from None
-    except PermissionError:
-        raise
-    except Exception as error:  # a damaged file may raise anything (zlib, struct, the reader's own)
+        if not order:
+            raise _Damaged("its header does not say in which order bytes are")
+        found = _variables(memoryview(raw), order)
+    except _Damaged as error:
         raise DataError(f"{path}: not a MATLAB v5 file ({error})") from None
-    vectors = {k: v for k, v in content.items() if _is_vector(v)}
-    scalars = {k: float(v.flat[0]) for k, v in vectors.items() if v.size == 1 and np.isfinite(v.flat[0])}
-    return vectors, scalars, {k: _in_words(v) for k, v in content.items() if k not in vectors}
+    vectors = {v.name: v.values for v in found if v.values is not None}
+    scalars = {k: float(v[0]) for k, v in vectors.items() if v.size == 1 and np.isfinite(v[0])}
+    return vectors, scalars, {v.name: v.words for v in found if v.values is None}
 
 
-def _damaged(content: bytes) -> bool:
-    """Whether a compressed variable of a v5 file does not unpack to its end with the right checksum."""
-    order = "<" if content[126:128] == b"IM" else ">"
-    at = 128
-    while at + 8 <= len(content):
-        kind, size = struct.unpack_from(f"{order}II", content, at)
-        at += 8
+def _variables(raw: memoryview, order: str) -> list[_Variable]:
+    """Named variables of a file; of two with one name the last. Raises :class:`_Damaged`."""
+    elements, found, numbers = _Elements(raw[HEADER:], order), {}, 0
+    while elements.left >= 8:
+        kind, content = elements.long()
         if kind == 0:
             break  # padding
         if kind == COMPRESSED:
-            packed = zlib.decompressobj()
-            rest = content[at : at + size]
-            try:
-                while rest and not packed.eof:
-                    packed.decompress(rest, 1 << 20)
-                    rest = packed.unconsumed_tail
-            except zlib.error:
-                return True
-            if not packed.eof:
-                return True
-        at += size
-    return False
+            variable = _unpacked(content, order)
+        elif kind == MATRIX:
+            variable = _variable(content, order)
+        else:
+            raise _Damaged(f"an element of kind {kind} where a variable should be")
+        numbers += 0 if variable.values is None else variable.values.size
+        if numbers > MOST:
+            raise _Damaged(f"more than {MOST} numbers in vectors")
+        if variable.name and not variable.name.startswith("__"):
+            found[variable.name] = variable
+    return list(found.values())
 
 
-def _is_vector(value: Any) -> bool:
-    return isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and value.size == max(value.shape, default=0)
+def _unpacked(packed: memoryview, order: str) -> _Variable:
+    """A compressed variable; only a vector is unpacked to its end, where its checksum is."""
+    head, _ = _inflated(packed, HEAD)
+    if len(head) < 8:
+        raise _Damaged("a compressed variable is damaged")
+    kind, size = struct.unpack_from(f"{order}II", head)
+    if kind != MATRIX:
+        raise _Damaged("a compressed variable is damaged")
+    variable = _variable(memoryview(head)[8:], order, data=False)
+    if variable.words:
+        return variable
+    if size > 8 * MOST + HEAD:
+        raise _Damaged(f"{variable.name} would take {size / 2**20:.0f} MiB")
+    content, ended = _inflated(packed, 8 + size + 1)
+    if not ended or len(content) != 8 + size:
+        raise _Damaged("a compressed variable is damaged")
+    return _variable(memoryview(content)[8:], order)
 
 
-def _in_words(value: Any) -> str:
-    """What a variable of a ``.mat`` file is that is no vector."""
-    kinds = {"V": "a struct", "O": "a cell array", "U": "text", "S": "text", "b": "logical", "c": "complex"}
-    size = " x ".join(map(str, np.shape(value)))
-    kind = np.asarray(value).dtype.kind
-    return kinds.get(kind, f"an array of {size}")
+def _inflated(packed: memoryview, most: int) -> tuple[bytes, bool]:
+    """At most so many bytes, and whether they are all, with the right checksum."""
+    stream = zlib.decompressobj()
+    try:
+        return stream.decompress(packed, most), stream.eof
+    except zlib.error:
+        raise _Damaged("a compressed variable is damaged") from None
+
+
+def _variable(content: memoryview, order: str, data: bool = True) -> _Variable:
+    """What the content of a matrix element holds; without ``data`` a vector has no values."""
+    elements = _Elements(content, order)
+    _, flags = elements.next()
+    if len(flags) < 8:
+        raise _Damaged("a variable without a class")
+    (flag,) = struct.unpack_from(f"{order}I", flags)
+    kind = flag & 0xFF
+    if kind not in CLASSES and kind not in NUMERIC:
+        raise _Damaged(f"a variable of class {kind}")
+    shape = () if kind == OPAQUE else _shape(elements.next()[1], order)
+    name = bytes(elements.next()[1]).rstrip(b"\0").decode("latin-1")
+    if not name.isprintable():
+        raise _Damaged("a variable's name is damaged")
+    if kind in CLASSES or flag & COMPLEX:
+        return _Variable(name, words=CLASSES.get(kind, "complex"))
+    count = math.prod(shape)
+    if count != max(shape):
+        return _Variable(name, words=f"an array of {' x '.join(map(str, shape))}")
+    return _Variable(name, _numbers(elements, order, name, count) if data else None)
+
+
+def _shape(content: memoryview, order: str) -> tuple[int, ...]:
+    shape = struct.unpack_from(f"{order}{len(content) // 4}i", content)
+    if len(shape) < 2 or min(shape) < 0:
+        raise _Damaged("a variable with no valid size")
+    return shape
+
+
+def _numbers(elements: _Elements, order: str, name: str, count: int) -> Array:
+    """The next element as ``count`` numbers."""
+    if not count:
+        return np.empty(0)
+    kind, content = elements.next()
+    if kind not in NUMBERS:
+        raise _Damaged(f"{name} is stored as elements of kind {kind}, which are no numbers")
+    stored = np.dtype(f"{order}{NUMBERS[kind]}")
+    if len(content) != count * stored.itemsize:
+        raise _Damaged(f"{name} should hold {count} numbers, but there are {len(content) // stored.itemsize}")
+    return np.frombuffer(content, stored).astype(np.float64)
+
+
+class _Elements:
+    """Tagged elements one after the other. Raises :class:`_Damaged` where one is longer than what is left."""
+
+    def __init__(self, content: memoryview, order: str):
+        self.content, self.order, self.at = content, order, 0
+
+    @property
+    def left(self) -> int:
+        return len(self.content) - self.at
+
+    def long(self) -> tuple[int, memoryview]:
+        """Kind and content of an element with a tag of eight bytes."""
+        kind, size = self._words(8)
+        return kind, self._take(size)
+
+    def next(self) -> tuple[int, memoryview]:
+        """Kind and content of an element inside a variable, which may be small: four bytes that share the tag's."""
+        (tag,) = self._words(4)
+        size, kind = tag >> 16, tag & 0xFFFF
+        if size > 4:
+            raise _Damaged(f"a small element of {size} bytes")
+        if size:
+            content = self._take(4)[:size]
+            return kind, content
+        (size,) = self._words(4)
+        content = self._take(size)
+        self.at = min(self.at + -size % 8, len(self.content))
+        return kind, content
+
+    def _words(self, size: int) -> tuple[int, ...]:
+        return struct.unpack(f"{self.order}{size // 4}I", self._take(size))
+
+    def _take(self, size: int) -> memoryview:
+        if size > self.left:
+            raise _Damaged("it is cut short, or a size in it is damaged")
+        self.at += size
+        return self.content[self.at - size : self.at]

@@ -7,6 +7,8 @@ scalars collected.
 
 from __future__ import annotations
 
+import csv
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,9 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.errors import DataError
-from en4dvar.hints import no_such_file, suggest
+from en4dvar.hints import listed, no_such_file, suggest
 from en4dvar.inputs.matfile import mat_vectors
-from en4dvar.inputs.text_table import Decimal, Table, cells_of, delimiter_of, number_in, numbered_lines
+from en4dvar.inputs.text_table import Decimal, Table, cells_of, check_width, delimiter_of, number_in, numbered_lines
 from en4dvar.state import Array
 from en4dvar.units import convert
 
@@ -166,15 +168,8 @@ def read_covariance(matrix: Matrix) -> Array:
     """The covariance (K, K) of a CSV file: symmetric, positive variances. Raises :class:`DataError`."""
     path = matrix.path
     _require_file(path)
-    rows: list[list[float]] = []
-    delimiter = None
-    for number, line in numbered_lines(path):
-        delimiter = delimiter_of(line) if delimiter is None else delimiter
-        rows.append(
-            [number_in(cell, str(i), path, number, None) for i, cell in enumerate(cells_of(line, delimiter), 1)]
-        )
-        if len(rows[-1]) != len(rows[0]):
-            raise DataError(f"{path}:{number}: {len(rows[-1])} numbers, but {len(rows[0])} in the first row")
+    with _readable(path):
+        rows = _rows_of_numbers(path)
     if not rows or len(rows) != len(rows[0]):
         raise DataError(
             f"{path}: a covariance is square, but this has {len(rows)} rows of {len(rows[0]) if rows else 0}"
@@ -192,6 +187,22 @@ def read_covariance(matrix: Matrix) -> Array:
     return np.asarray(convert(0.5 * (values + values.T), matrix.unit, matrix.target))
 
 
+def _rows_of_numbers(path: Path) -> list[list[float]]:
+    """Rows of equally many numbers."""
+    rows: list[list[float]] = []
+    delimiter = None
+    for number, line in numbered_lines(path):
+        if delimiter is None:
+            delimiter = delimiter_of(line)
+            check_width(line, delimiter, path)
+        rows.append(
+            [number_in(cell, str(i), path, number, None) for i, cell in enumerate(cells_of(line, delimiter), 1)]
+        )
+        if len(rows[-1]) != len(rows[0]):
+            raise DataError(f"{path}:{number}: {len(rows[-1])} numbers, but {len(rows[0])} in the first row")
+    return rows
+
+
 @contextmanager
 def _opened(path: Path, format: Format | None) -> Iterator[Format]:
     """The format of a file that is there. Raises :class:`DataError`, also where reading inside fails."""
@@ -204,15 +215,22 @@ def _opened(path: Path, format: Format | None) -> Iterator[Format]:
             else f"write format: {' or '.join(get_args(Format))}"
         )
         raise DataError(f"{path}: the format cannot be told from the suffix {path.suffix!r}; {hint}")
-    try:
+    with _readable(path):
         yield kind
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror or error}") from None
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Whatever goes wrong in the system or in the csv module as :class:`DataError`."""
+    try:
+        yield
+    except (OSError, csv.Error) as error:
+        raise DataError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
 
 
 def _require_file(path: Path) -> None:
-    if not path.is_file():
-        raise DataError(f"{path}: is a directory" if path.is_dir() else no_such_file(path))
+    if not os.path.isfile(path):  # Path.is_file raises for a name that is too long, or in a closed folder
+        raise DataError(f"{path}: is a directory" if os.path.isdir(path) else no_such_file(path))
 
 
 def _check(times: Array, values: Array, name: str, path: Path) -> None:
@@ -268,6 +286,6 @@ def _of_mat(path: Path, wanted: Sequence[str]) -> tuple[dict[str, Array], dict[s
             kind = others.get(name)
             fault = f"is {kind}, not a row or column of real numbers" if kind else "is not in the file"
             rest = [f"{k} ({what})" for k, what in others.items() if k != name]
-            listed = f"{', '.join(sorted(vectors)) or 'none'}{'; no vectors: ' * bool(rest)}{', '.join(rest)}"
-            raise DataError(f"{path}: field {name!r} {fault}; the vectors are: {listed}")
+            there = f"{listed(sorted(vectors)) or 'none'}{'; no vectors: ' * bool(rest)}{listed(rest)}"
+            raise DataError(f"{path}: field {name!r} {fault}; the vectors are: {there}")
     return {name: np.asarray(vectors[name], dtype=float).ravel() for name in wanted}, scalars

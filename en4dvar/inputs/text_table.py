@@ -14,10 +14,12 @@ from typing import Literal
 import numpy as np
 
 from en4dvar.errors import DataError
+from en4dvar.hints import listed, short
 from en4dvar.state import Array
 
 Decimal = Literal[".", ","]
 COMMENT = ("#", "%", "//")
+WIDEST = 10_000  # columns
 BLANK = ("", "nan", "na", "n/a", "-")
 
 
@@ -46,6 +48,15 @@ def delimiter_of(line: str) -> str:
     return delimiter if delimiter in line else ""
 
 
+def check_width(line: str, delimiter: str, path: Path) -> None:
+    """Raise :class:`DataError` where a first line has more cells than a table has columns."""
+    signs = line.count(delimiter) if delimiter else len(line) // 2
+    if signs >= WIDEST and (count := signs + 1 if delimiter else len(line.split())) > WIDEST:
+        raise DataError(
+            f"{path}: {count} columns; at most {WIDEST} are read; if a line holds one column's numbers, transpose it"
+        )
+
+
 def cells_of(line: str, delimiter: str) -> list[str]:
     if not delimiter:
         return line.split()
@@ -61,6 +72,7 @@ class Table:
             raise DataError(f"{path}: the file holds no data")
         (_, header), *self.lines = lines
         delimiter = delimiter_of(header)
+        check_width(header, delimiter, path)
         self.names = cells_of(header, delimiter)
         if all(_is_number(name.replace(",", ".")) for name in self.names):
             proposed = ("t_us", "R_um", *(f"c{i}" for i in range(3, len(self.names) + 1)))[: len(self.names)]
@@ -78,7 +90,7 @@ class Table:
         fault = "more than one column" if alike else "no column"
         below = [n for n, line in self.lines if any(_same(cell, name) for cell in cells_of(line, delimiter_of(line)))]
         hint = f"; line {below[0]} names it: put # before the lines above" if below and not alike else ""
-        raise DataError(f"{self.path}: {fault} {name!r}; the columns are: {', '.join(self.names)}{hint}")
+        raise DataError(f"{self.path}: {fault} {name!r}; the columns are: {listed(self.names)}{hint}")
 
     def numbers(self, i: int, name: str) -> Array:
         """A column as numbers. Raises :class:`DataError`, which tells what to do about a second header."""
@@ -113,5 +125,5 @@ def number_in(cell: str, name: str, path: Path, line: int, decimal: Decimal | No
     if not _is_number(text):
         comma = decimal != "," and "," in cell and _is_number(cell.replace(",", "."))
         hint = "; write a decimal point" + (", or data.decimal: ','" if decimal else "") if comma else ""
-        raise DataError(f"{path}:{line}: {cell!r} in column {name!r} is not a number{hint}")
+        raise DataError(f"{path}:{line}: {short(cell)!r} in column {short(name)!r} is not a number{hint}")
     return float(text)

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from en4dvar.errors import DataError
+from en4dvar.hints import shown
 from en4dvar.state import Array
 from en4dvar.units import UnitError, parse_quantity
 
@@ -44,7 +45,9 @@ def parse_instant(text: str | float, time_unit: str, symbols: Collection[str] = 
         return Instant("minimum", int(minimum[1] or 1))
     if word[:1].isdigit() or word[:1] in "+-.":
         return Instant("time", time=parse_quantity(text, time_unit))
-    raise UnitError(f"{text!r} is not an instant; write start, end, maximum, 'minimum 2', or a time such as '3 us'")
+    raise UnitError(
+        f"{shown(text)} is not an instant; write start, end, maximum, 'minimum 2', or a time such as '3 us'"
+    )
 
 
 def select(times: Array, values: Array, start: Instant, end: Instant, prominence: float = 0.1) -> slice:

@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from en4dvar.compiled import kernel
 from en4dvar.prior import member_stream
 from en4dvar.sampling.emulator import Coordinates, Emulator
 from en4dvar.state import Array
@@ -108,7 +108,7 @@ def draw_interim(
     return out.reshape(len(likelihoods), -1, len(mean))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def log_likelihood(x, likelihood):  # type: ignore[no-untyped-def]
     """ln L̂ at one control vector (n,)."""
     values, weight = likelihood.values, likelihood.weight
@@ -133,7 +133,7 @@ def log_likelihood(x, likelihood):  # type: ignore[no-untyped-def]
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _walk(rng, likelihood, mean, std, temperature, out):  # type: ignore[no-untyped-def]
     """Draws ``out`` (D, W, n) of L̂(x) N(x; mean, std²) by W walkers with differential evolution (ter Braak 2006)."""
     count, walkers, n = out.shape
@@ -162,7 +162,7 @@ def _walk(rng, likelihood, mean, std, temperature, out):  # type: ignore[no-unty
             out[(step - BURN_IN) // THIN] = x
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _log_likelihoods(x, likelihood, out):  # type: ignore[no-untyped-def]
     for b in range(x.shape[0]):
         out[b] = log_likelihood(x[b], likelihood)

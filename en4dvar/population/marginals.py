@@ -16,9 +16,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from en4dvar.compiled import kernel
 from en4dvar.population.likelihoods import EmulatedLikelihood, log_likelihood
 from en4dvar.population.mixtures import Mixture, condition, draw_conditioned
 from en4dvar.prior import member_stream
@@ -78,7 +78,7 @@ def marginals(
     return Marginals(logs.T, relative.T, x.transpose(1, 0, 2, 3))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _marginals(rng, both, split, likelihood, mean, variance, count, few, out, relative, chosen):  # type: ignore[no-untyped-def]
     """One set: the first ``split`` components are its mixture's; ``few`` of ``count`` draws are of the population."""
     n_parts, n = both.linear.shape
@@ -120,7 +120,7 @@ def _marginals(rng, both, split, likelihood, mean, variance, count, few, out, re
             chosen[b, k] = x[min(np.searchsorted(cumulated_weights, at, side="right"), count - 1)]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _log_mixture(x, precision, linear, constant):  # type: ignore[no-untyped-def]
     n_parts, n = linear.shape
     logs = np.empty(n_parts)

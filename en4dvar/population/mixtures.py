@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from en4dvar.compiled import kernel
 from en4dvar.prior import member_stream
 from en4dvar.sampling.mixture import fit_gaussians
 from en4dvar.state import Array
@@ -85,7 +85,7 @@ def fit_mixtures(
         return list(pool.map(one, range(len(draws))))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def condition(precision, linear, mean, variance, middle, root):  # type: ignore[no-untyped-def]
     """A⁻¹b and the lower root of A; returns ½ bᵀA⁻¹b − ½ ln|DA| − ½ νᵀD⁻¹ν."""
     n = mean.size
@@ -111,7 +111,7 @@ def condition(precision, linear, mean, variance, middle, root):  # type: ignore[
     return value
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _back(root, z):  # type: ignore[no-untyped-def]
     """z ← root⁻ᵀ z."""
     n = z.size
@@ -122,7 +122,7 @@ def _back(root, z):  # type: ignore[no-untyped-def]
         z[i] = total / root[i, i]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def draw_conditioned(middle, root, z, out):  # type: ignore[no-untyped-def]
     """A draw of N(middle, (root rootᵀ)⁻¹) from standard normal z, which is overwritten."""
     _back(root, z)
@@ -130,7 +130,7 @@ def draw_conditioned(middle, root, z, out):  # type: ignore[no-untyped-def]
         out[i] = middle[i] + z[i]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _add_log_marginal(mixture, mean, variance, total):  # type: ignore[no-untyped-def]
     n_parts, n = mixture.linear.shape
     middle, root, logs = np.empty(n), np.zeros((n, n)), np.empty(n_parts)

@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 from en4dvar.errors import OutputError
 from en4dvar.executor import ProcessesExecutor, SerialExecutor, WorkerLostError
-from en4dvar.files import make_folder, write_text
+from en4dvar.files import inside, make_folder, write_text
 from en4dvar.hints import suggest
 from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import SetSummary, overview_figures, render_overview
@@ -46,7 +46,7 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     if files == [whole]:
         result = load_stored(whole)
         write_text(run_dir / "summary.csv", summary_csv([(result.name, result.summary(), result.cautions)], {}))
-        figures = draw(all_figures(result), run_dir / "figures", identifiers=IDENTIFIERS)
+        figures = draw(all_figures(result), inside(run_dir, "figures"), identifiers=IDENTIFIERS)
         return write_text(run_dir / "report.html", render_set(result, figures))
     sets = [SetSummary.of(load_stored(path), path.stem) for path in files]
     failures = failed_datasets(whole)
@@ -66,7 +66,7 @@ def _asked(run_dir: Path, sets: Sequence[SetSummary], names: Sequence[str]) -> f
 def _write_campaign(
     run_dir: Path, sets: Sequence[SetSummary], failures: Mapping[str, str], asked: frozenset[str], workers: int
 ) -> Path:
-    folder = make_folder(run_dir / "pages")
+    folder = make_folder(inside(run_dir, "pages"))
     first = {s.stem for s in sorted(sets, key=lambda s: -s.gravity)[:PAGES]}
     paged = [s for s in sets if s.stem in asked | first or (folder / f"{s.stem}.html").is_file()]
     calls: list[tuple[Path, str, str | None, list[tuple[str, str]]]] = []
@@ -83,7 +83,7 @@ def _write_campaign(
                 _write_page(*calls[i])
             elif isinstance(value, Exception):
                 raise value
-    figures = draw(overview_figures(sets), run_dir / "figures")
+    figures = draw(overview_figures(sets), inside(run_dir, "figures"))
     pages = {s.stem: quote(f"pages/{s.stem}.html") for s in paged}
     return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures))
 
@@ -91,6 +91,6 @@ def _write_campaign(
 def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:
     """The page of one data set of a campaign; ``copies``: prefix of its figures as PDF and PNG, None for none."""
     result = load_stored(run_dir / "datasets" / f"{stem}.nc")
-    folder = None if copies is None else run_dir / "figures"
+    folder = None if copies is None else inside(run_dir, "figures")
     figures = draw(all_figures(result), folder, copies or "", IDENTIFIERS)
-    write_text(run_dir / "pages" / f"{stem}.html", render_set(result, figures, trail, copies is not None))
+    write_text(inside(run_dir, f"pages/{stem}.html"), render_set(result, figures, trail, copies is not None))

@@ -5,6 +5,7 @@ netCDF needs no export: ``posterior.nc`` follows the ArviZ schema as it is.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,12 +13,17 @@ from typing import Literal
 
 import numpy as np
 
+from en4dvar.config.symbols import GREEK
 from en4dvar.errors import OutputError
 from en4dvar.report.text import number_like
-from en4dvar.storage.store import StoredResult, load_stored, result_files
+from en4dvar.storage.store import StoredResult, load_stored, require_settled, result_files
 from en4dvar.summary import ParameterSummary, summary_csv
 from en4dvar.tables import csv_text
 
+_COMMANDS = (
+    f"{GREEK}|mathrm|mathit|mathbf|mathsf|mathcal|rm|it|text|frac|sqrt|hat|bar|tilde|dot|ddot|vec|overline|infty|partial|"
+    "nabla|ell|cdot|times|pm|prime|dagger|ast|star|perp|parallel|circ|left|right|langle|rangle|quad"
+)
 Kind = Literal["csv", "latex", "members"]
 _ESCAPES = {c: f"\\{c}" for c in "#$%&_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
 
@@ -49,6 +55,7 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
 def posterior_file(run_dir: str | Path) -> Path:
     """The netCDF file of a run or campaign, in the ArviZ schema as it is. Raises :class:`OutputError`."""
     path = Path(run_dir) / "posterior.nc"
+    require_settled(path.parent)
     if not path.is_file():
         raise OutputError(f"{run_dir}: holds no posterior.nc; is it the directory of a finished run?")
     return path
@@ -127,8 +134,25 @@ def _tex(number: str) -> str:
 
 
 def latex_symbol(row: ParameterSummary) -> str:
-    """Matplotlib's mathtext is LaTeX; a bare name is escaped text."""
-    return row.symbol if re.fullmatch(r"\$[^$]+\$", row.symbol) else escaped(row.symbol)
+    r"""Matplotlib's mathtext is LaTeX as far as it is letters, indices and known commands; anything else is text.
+
+    A result file may come from anybody, and LaTeX reads and writes files for who asks (``\input``).
+    """
+    return row.symbol if is_math(row.symbol) else escaped(row.symbol)
+
+
+def is_math(text: str) -> bool:
+    r"""Whether ``text`` is one formula between dollars that does nothing but print.
+
+    >>> is_math(r"$\mu_{max}$"), is_math(r"$\frac{1}{2}R^2$"), is_math(r"$\input{x}$"), is_math("$a}b{c$")
+    (True, True, False, False)
+    """
+    if not re.fullmatch(
+        rf"\$(?:[A-Za-z0-9_^{{}}()\[\],.+\-*/=' <>|]|\\(?:{_COMMANDS})(?![A-Za-z])|\\[,;:! ])+\$", text
+    ):
+        return False
+    depths = list(itertools.accumulate((c == "{") - (c == "}") for c in text))
+    return min(depths) == 0 == depths[-1]
 
 
 def latex_unit(unit: str) -> str:
@@ -146,5 +170,5 @@ def latex_unit(unit: str) -> str:
 
 
 def escaped(text: str) -> str:
-    """``text`` as LaTeX prints it."""
-    return "".join(_ESCAPES.get(character, character) for character in text)
+    """``text`` as LaTeX prints it, without what cannot be printed."""
+    return "".join(_ESCAPES.get(c, c if c.isprintable() else " ") for c in text)

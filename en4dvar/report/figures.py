@@ -17,6 +17,7 @@ from en4dvar.storage.store import StoredResult
 from en4dvar.units import convert
 
 MAX_PAIRS = 6
+MANY = 5000  # marks: beyond, they are drawn as pixels, for a vector each would make a page of many megabytes
 
 
 @styled
@@ -28,7 +29,8 @@ def histograms(result: StoredResult) -> Figure:
         prior, posterior = result.members("prior", row.name), result.members("posterior", row.name)
         scaled_histogram(ax, prior, LIGHT["prior"], alpha=0.35)
         scaled_histogram(ax, posterior, LIGHT["posterior"], alpha=0.6)
-        ax.plot(posterior, np.full(posterior.shape, -0.06), "|", color=LIGHT["posterior"], ms=3, mew=0.5)
+        marks = ax.plot(posterior, np.full(posterior.shape, -0.06), "|", color=LIGHT["posterior"], ms=3, mew=0.5)
+        marks[0].set_rasterized(len(posterior) > MANY)
         ax.plot([row.q05, row.q95], [1.07, 1.07], color=LIGHT["posterior"], lw=2, solid_capstyle="butt")
         ax.axvline(row.centre, ymax=0.85, color=LIGHT["centre"], lw=0.9, ls="--")
         ax.set(yticks=[], ylim=(-0.14, 1.2), xlabel=with_unit(row.symbol, row.unit), xlim=_reach(prior, posterior))
@@ -50,9 +52,14 @@ def history(result: StoredResult) -> Figure:
     _band(top, result, "prior_predictive", (0.05, 0.95), "prior", 0.28, "prior 90 %")
     _band(top, result, "posterior_predictive", (0.05, 0.95), "posterior", 0.3, "posterior 90 %")
     _band(top, result, "posterior_predictive", (0.25, 0.75), "posterior", 0.6, "posterior 50 %")
-    size = 2.2 if len(time) <= 150 else 1.2
-    top.errorbar(time, data, std, fmt="o", ms=size, lw=0.6, color=LIGHT["ink"], label="data ± std", zorder=4)
-    top.plot(time, centre, lw=0.9, color=LIGHT["centre"], label="centre", zorder=3)
+    size, many = 2.2 if len(time) <= 150 else 1.2, len(time) > MANY
+    if many:  # one path instead of a bar for each, and pixels below the centre
+        band = top.fill_between(time, data - std, data + std, color=LIGHT["ink"], alpha=0.3, lw=0, label="data ± std")
+        band.set_rasterized(True)
+        top.plot(time, data, ",", alpha=0.3, color=LIGHT["ink"], zorder=1.5, rasterized=True)
+    else:
+        top.errorbar(time, data, std, fmt="o", ms=size, lw=0.6, color=LIGHT["ink"], label="data ± std", zorder=4)
+    top.plot(time, centre, lw=0.9, color=LIGHT["centre"], label="centre", zorder=3, rasterized=many)
     attrs = observed[name].attrs
     label = str(attrs["long_name"]).removesuffix(", observed")
     label = label if label == attrs["symbol"] else f"{label} {attrs['symbol']}"
@@ -63,7 +70,7 @@ def history(result: StoredResult) -> Figure:
     for limit, alpha in ((2, 0.12), (1, 0.16)):
         bottom.axhspan(-limit, limit, color=LIGHT["posterior"], alpha=alpha, lw=0)
     bottom.axhline(0, color=LIGHT["muted"], lw=0.6)
-    bottom.plot(time, residual, "o", ms=size, color=LIGHT["ink"])
+    bottom.plot(time, residual, "," if many else "o", ms=size, color=LIGHT["ink"], rasterized=many)
     reach = 1.15 * max(3.0, float(np.max(np.abs(residual))))
     span = time[-1] - time[0]
     bottom.set(ylim=(-reach, reach), ylabel="residual / std", xlim=(time[0] - 0.03 * span, time[-1] + 0.03 * span))
@@ -200,7 +207,7 @@ def _pair(ax: Axes, i: int, j: int, x: Array, y: Array) -> None:
         ax.set_yticks([])
         ax.spines["left"].set_visible(False)
     elif i > j:
-        ax.plot(x, y, "o", ms=2, color=LIGHT["posterior"], alpha=0.7, mew=0)
+        ax.plot(x, y, "o", ms=2, color=LIGHT["posterior"], alpha=0.7, mew=0, rasterized=len(x) > MANY)
     else:
         ax.set_axis_off()
         known = np.ptp(x) > 0 and np.ptp(y) > 0

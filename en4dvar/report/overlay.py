@@ -16,7 +16,7 @@ from en4dvar.files import make_folder, write_text
 from en4dvar.report.compare import ComparedEstimate, Comparison, ModelScore
 from en4dvar.report.html import render
 from en4dvar.report.style import COLUMN, LIGHT, inline_svg, panels, save_figure, scaled_histogram, styled
-from en4dvar.report.text import with_unit
+from en4dvar.report.text import figure_text, with_unit
 from en4dvar.state import Array
 from en4dvar.tables import csv_text
 from en4dvar.units import UnitError, convert
@@ -36,7 +36,8 @@ def overlay(comparison: Comparison) -> Figure:
     figure, axes = panels(len(names), width, 4.0 / 2.54, above=0.14 * len(comparison.runs))
     for ax, name in zip(axes, names, strict=True):
         _panel(ax, [e for e in comparison.estimates if e.summary.name == name], comparison.runs)
-    handles = [axes[0].plot([], [], color=_colour(i), label=run)[0] for i, run in enumerate(comparison.runs)]
+    labels = map(figure_text, comparison.runs)
+    handles = [axes[0].plot([], [], color=_colour(i), label=label)[0] for i, label in enumerate(labels)]
     figure.legend(handles=handles, loc="outside upper center", ncols=min(3, len(handles)))
     return figure
 

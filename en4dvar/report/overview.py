@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from en4dvar.caution import SEVERITIES, Caution, codes, worst_first
 from en4dvar.report.html import render
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, Captioned, Drawing, styled
-from en4dvar.report.text import number_like, pretty_unit, symbol_html, with_unit
+from en4dvar.report.text import figure_text, number_like, pretty_unit, symbol_html, with_unit
 from en4dvar.storage.store import StoredResult
 from en4dvar.summary import ParameterSummary
 
@@ -118,7 +118,7 @@ def estimates(sets: Sequence[SetSummary]) -> Figure:
         ax.set_ylabel(with_unit(rows[0].symbol, rows[0].unit))
     if few:
         panels[-1].set_xlim(-0.6, len(sets) - 0.4)
-        panels[-1].set_xticks(range(len(sets)), [_plain(one.name) for one in sets], rotation=90)
+        panels[-1].set_xticks(range(len(sets)), [figure_text(one.name) for one in sets], rotation=90)
     return figure
 
 
@@ -171,9 +171,3 @@ def _tally(sets: Sequence[SetSummary]) -> list[dict[str, Any]]:
         }
         for c in worst_first(tuple(c for c, _ in first.values()))
     ]
-
-
-def _plain(name: str) -> str:
-    """A data set's name as text of a figure: no mathtext, not longer than a label can be."""
-    short = name if len(name) <= 24 else f"{name[:11]}…{name[-12:]}"
-    return short.replace("$", r"\$")

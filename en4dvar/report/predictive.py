@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from en4dvar.descent.preview import Preview
 from en4dvar.report.style import COLUMN, LIGHT, panels, styled
-from en4dvar.report.text import with_unit
+from en4dvar.report.text import figure_text, with_unit
 from en4dvar.units import convert
 
 PANELS = 6
@@ -51,7 +51,7 @@ def _panel(ax: Axes, one: Preview, titled: bool) -> None:
     low = min(float(data.min()), float(np.quantile(paths, 0.05)) if len(paths) else 0.0)
     ax.set_ylim(low - 0.05 * (top - low), top + 0.08 * (top - low))
     if titled:
-        ax.set_title(y.name)
+        ax.set_title(figure_text(y.name))
 
 
 def _math(symbol: str) -> str:

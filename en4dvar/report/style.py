@@ -21,7 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 
-from en4dvar.files import atomic_path, make_folder
+from en4dvar.files import make_folder, write_bytes
 from en4dvar.state import Array
 
 P = ParamSpec("P")
@@ -125,15 +125,17 @@ def _settle(figure: Figure) -> None:
 def save_figure(figure: Figure, folder: Path, name: str) -> None:
     """``folder/name.pdf`` (vectors) and ``folder/name.png`` (200 dots an inch), undated, each by atomic rename."""
     _settle(figure)
-    # to the canvases directly: ``savefig`` would draw all of it once more, for a layout that is settled
-    with atomic_path(folder / f"{name}.pdf") as partial:
-        FigureCanvasPdf(figure).print_pdf(partial, metadata={"CreationDate": None})
+    # to the canvases directly: ``savefig`` would draw all of it once more, for a layout that is settled; and in memory:
+    # the PDF writer has no words for a disk that is full
+    pdf, png = io.BytesIO(), io.BytesIO()
+    FigureCanvasPdf(figure).print_pdf(pdf, metadata={"CreationDate": None})
     dots, figure.dpi = figure.dpi, 200
     try:
-        with atomic_path(folder / f"{name}.png") as partial:
-            FigureCanvasAgg(figure).print_png(partial, metadata={"Software": None})
+        FigureCanvasAgg(figure).print_png(png, metadata={"Software": None})
     finally:
         figure.dpi = dots
+    write_bytes(folder / f"{name}.pdf", pdf.getvalue())
+    write_bytes(folder / f"{name}.png", png.getvalue())
 
 
 @styled

@@ -94,6 +94,12 @@ def fixed(value: float, places: int) -> str:
     return f"{value:.{places}f}" if math.isfinite(value) else "–"
 
 
+def figure_text(name: str) -> str:
+    """A name as text of a figure: no mathtext, not longer than a label can be."""
+    short = name if len(name) <= 24 else f"{name[:11]}…{name[-12:]}"
+    return "".join(c if c.isprintable() else " " for c in short).replace("$", r"\$")
+
+
 def symbol_html(symbol: str) -> Markup:
     r"""A mathtext symbol as HTML: Greek letters, sub- and superscripts; everything else is escaped text.
 

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from en4dvar.errors import OutputError
-from en4dvar.files import write_text
+from en4dvar.files import inside, write_text
 from en4dvar.report.html import render
 from en4dvar.report.page import provenance_rows
 from en4dvar.report.style import COLUMN, LIGHT, Captioned, draw, styled
@@ -44,7 +44,7 @@ def write_twin_report(run_dir: Path) -> Path:
         facts=_facts(data),
         scores=_scores(data),
         unit=_unit(data),
-        figures=draw(twin_figures(data), run_dir / "figures"),
+        figures=draw(twin_figures(data), inside(run_dir, "figures")),
         warnings=_lines(a.get("warnings", "")),
         lost=_lines(a["members_lost_why"]),
         provenance=provenance_rows(a),

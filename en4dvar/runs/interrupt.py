@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the run stops, keeps what it has, and says how to go on."""
+"""Ctrl-C, SIGTERM and SIGHUP: the run stops, keeps what it has, and says how to go on."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def terminate_as_interrupt() -> Iterator[None]:
-    """Within, SIGTERM (a batch system's time limit) acts like Ctrl-C; only the main thread can arrange it."""
+    """Within, SIGTERM (a batch system's time limit) and SIGHUP (the terminal is gone) act like Ctrl-C.
+
+    Only the main thread can arrange it. A signal that is ignored, as under ``nohup``, stays so.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -23,11 +26,13 @@ def terminate_as_interrupt() -> Iterator[None]:
     def stop(*_: Any) -> None:
         raise KeyboardInterrupt("terminated")
 
-    before = signal.signal(signal.SIGTERM, stop)
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {n: signal.signal(n, stop) for n in numbers if signal.getsignal(n) != signal.SIG_IGN}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

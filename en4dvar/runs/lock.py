@@ -10,12 +10,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
 
 from en4dvar.errors import OutputError
+from en4dvar.files import inside, own_file
 
 LOCK = ".en4dvar-lock"
 PATIENCE = 3.0  # s for the lock of a dead process to go
+_LONGEST = 500  # bytes of a lock's text
 _OTHER = "another process"
 _UNSUPPORTED = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)  # some network file systems
 
@@ -29,7 +30,8 @@ def locked(directory: Path) -> Iterator[None]:
 
     Raises
     ------
-    OutputError: another run holds it (says which process on which machine). OSError: the directory cannot be written.
+    OutputError: another run holds it (says which process on which machine), or it is no plain file. OSError: the
+        directory cannot be written.
     """
     file = _acquire(directory)
     try:
@@ -38,37 +40,44 @@ def locked(directory: Path) -> Iterator[None]:
         if _is_at(file, directory / LOCK):
             with suppress(OSError):
                 (directory / LOCK).unlink()
-        file.close()
+        os.close(file)
 
 
-def _acquire(directory: Path) -> IO[str]:
-    path, patience = directory / LOCK, time.monotonic() + PATIENCE
+def _acquire(directory: Path) -> int:
+    """Descriptor of the locked file. A buffer, which a full disk cannot take, would be written again at its end."""
+    path, patience = inside(directory, LOCK), time.monotonic() + PATIENCE
     while True:
-        file = path.open("a+", encoding="utf-8")
+        file = own_file(path)
         try:
             _lock(file)
         except OSError as error:
             if error.errno not in _UNSUPPORTED:
-                file.seek(0)
-                owner = file.read().strip() or _OTHER
-                file.close()
+                os.lseek(file, 0, os.SEEK_SET)
+                owner = os.read(file, _LONGEST).decode("utf-8", "replace").strip() or _OTHER
+                os.close(file)
                 if not _is_dead(owner) or time.monotonic() > patience:
                     advice = "wait for it to end, or give another --out"
                     raise OutputError(f"{directory}: in use by {owner}; {advice}") from None
                 time.sleep(0.02)
                 continue
-        if _is_at(file, path):
-            file.truncate(0)
-            file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-            file.flush()
-            return file
-        file.close()  # the run before removed the file between our opening and locking it
+        if not _is_at(file, path):
+            os.close(file)  # the run before removed the file between our opening and locking it
+            continue
+        try:
+            os.ftruncate(file, 0)
+            os.write(file, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+        except OSError:
+            with suppress(OSError):
+                path.unlink()
+            os.close(file)
+            raise
+        return file
 
 
-def _is_at(file: IO[str], path: Path) -> bool:
+def _is_at(file: int, path: Path) -> bool:
     """Whether the open file is the one at ``path``, which another run may have removed, and made again."""
     try:
-        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+        return os.path.samestat(os.fstat(file), path.stat())
     except OSError:
         return False
 
@@ -81,11 +90,11 @@ def _is_dead(owner: str) -> bool:
     if owner == _OTHER:  # not written yet
         return True
     number, _, host = owner.removeprefix("process ").partition(" on ")
-    if host != socket.gethostname() or not number.isdigit() or sys.platform == "win32":
+    if host != socket.gethostname() or not number.isdecimal() or sys.platform == "win32":
         return False
     try:
         os.kill(int(number), 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):  # the second: no process can have this number
         return True
     except OSError:
         pass
@@ -95,11 +104,11 @@ def _is_dead(owner: str) -> bool:
 if sys.platform == "win32":
     import msvcrt
 
-    def _lock(file: IO[str]) -> None:
-        file.seek(1 << 20)  # beyond the text, so that others can read it
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    def _lock(file: int) -> None:
+        os.lseek(file, 1 << 20, os.SEEK_SET)  # beyond the text, so that others can read it
+        msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
 else:
     import fcntl
 
-    def _lock(file: IO[str]) -> None:
+    def _lock(file: int) -> None:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -13,6 +14,7 @@ from typing import Any, Self
 
 from en4dvar.analysis import ChainRecord, Record, StartRecord
 from en4dvar.errors import OutputError
+from en4dvar.files import own_file
 from en4dvar.runs.interrupt import Interrupted
 
 TYPICAL_ITERATIONS = 8.0
@@ -47,7 +49,10 @@ class RunLog:
 
     def __init__(self, path: Path, append: bool = False):
         try:
-            self._file = path.open("a" if append else "w", encoding="utf-8", errors="backslashreplace", buffering=1)
+            handle = own_file(path)
+            if not append:
+                os.ftruncate(handle, 0)
+            self._file = os.fdopen(handle, "a", encoding="utf-8", errors="backslashreplace", buffering=1)
         except OSError as error:
             raise OutputError(f"{path}: cannot be written: {error.strerror}") from None
         self._path = path
@@ -152,8 +157,19 @@ def terminal_progress(n_datasets: int) -> Iterator[LiveProgress | None]:
         TimeElapsedColumn(),
         TextColumn("{task.fields[left]}"),
     )
-    with Bar(*columns, console=console, transient=True) as bar:
+    with shown(Bar(*columns, console=console, transient=True)) as bar:
         yield LiveProgress(bar, n_datasets)
+
+
+@contextmanager
+def shown(bar: Any) -> Iterator[Any]:
+    """Within, a bar of ``rich`` is on the terminal; one that is gone at the end (SIGHUP) ends nothing else."""
+    bar.start()
+    try:
+        yield bar
+    finally:
+        with suppress(OSError):
+            bar.stop()
 
 
 @contextmanager
@@ -166,7 +182,7 @@ def cycle_progress(cycles: int) -> Iterator[Callable[[int], None] | None]:
     if not console.is_terminal:
         yield None
         return
-    with Bar(console=console, transient=True) as bar:
+    with shown(Bar(console=console, transient=True)) as bar:
         task = bar.add_task("cycles", total=cycles)
         yield lambda cycle: bar.update(task, completed=cycle + 1)
 

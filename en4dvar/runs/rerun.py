@@ -19,10 +19,12 @@ from en4dvar.config.load import resolve
 from en4dvar.errors import OutputError
 from en4dvar.executor import choose_executor, one_blas_thread
 from en4dvar.report.result import Result, load_result
+from en4dvar.runs.trust import Ask, of_strangers
 from en4dvar.storage.campaign_file import failed_datasets
 from en4dvar.storage.checkpoint import file_digest
 from en4dvar.storage.fingerprint import Identity, identity
 from en4dvar.storage.provenance import provenance
+from en4dvar.storage.store import result_files
 
 SURROUNDINGS = ("python_version", "package_versions", "platform", "cpu", "git_commit")
 
@@ -64,26 +66,30 @@ class Rerun:
         return "\n".join([*lines, *self.surroundings])
 
 
-def rerun(run_dir: str | Path, workers: int | None = None) -> Rerun:
+def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = False, ask: Ask | None = None) -> Rerun:
     """Repeat every estimate of a run and compare.
 
     Parameters
     ----------
     run_dir: of ``en4dvar run``. workers: as of a run; the numbers do not depend on it.
+    trust: run whatever code the files name, a law or a model of a stranger's too. By default that is code below the
+        working directory and of installed packages alone; for other code ``ask`` is asked, which gets the question.
 
     Raises
     ------
+    RefusedError: the files name other code, which is not trusted; nothing of it has run.
     OutputError: there is no result, or it is damaged. ConfigError: the recorded configuration cannot be used any more,
         for instance because the file of a user's own model is gone. TooFewMembersError: the ensemble is lost.
     """
     run_dir = Path(run_dir)
     campaign = run_dir / "posterior.nc"
-    files = sorted((run_dir / "datasets").glob("*.nc")) or [campaign]
+    files = result_files(run_dir)
     first = load_result(files[0])
     if "identity" not in first.attributes:
         raise OutputError(f"{files[0]}: does not record all that a run is made of; it was written by a program")
     document = parse_document(str(first.attributes["configuration_resolved"]), f"{files[0]}: configuration_resolved")
-    config = resolve(document, run_dir.absolute())
+    with of_strangers(run_dir, ask, trust):
+        config = resolve(document, run_dir.absolute())
     now = provenance("", None)
     was = {key: str(first.attributes[key]) for key in SURROUNDINGS}
     repeated = []

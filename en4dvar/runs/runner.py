@@ -40,7 +40,7 @@ def run(
     config: a loaded configuration, or the path of a YAML file.
     overrides: of dotted keys, when ``config`` is a path; e.g. ``{"data.path": "/data/gel.csv"}``.
     force: replace the files of an earlier run in the same directory, once this run is complete.
-    resume: continue an interrupted run in the same directory, to the same bits.
+    resume: continue an interrupted run in the same directory, to the same bits; where none has begun, begin.
     progress: called with the data set's name and the record of each iteration as it ends, in the calling thread; its
         ``members`` are empty where data sets are estimated side by side.
     command: what the user typed, for the file's history.
@@ -78,7 +78,6 @@ def run_campaign(
     config = _loaded(config, overrides)
     mode = directory_mode(force, resume)
     files = data_files(inverse_plan(config))
-    _require_one_usable(config, files)
     ended: dict[str, DatasetOutcome] = {}
 
     def kept() -> str:
@@ -89,19 +88,20 @@ def run_campaign(
     with (
         one_blas_thread(),
         terminate_as_interrupt(),
-        _executor(config) as executor,
-        session(config, files, mode, command, kept) as run,
+        RunDirectory.open(config.directory, mode) as directory,  # first: what follows may compile the model
     ):
-        work = Worklist(config, run, datasets(files), progress, ended)
-        try:
-            _begin(work)
-            work.work(executor)
-            _finish(work, report_workers)
-        except BaseException:  # no worker writes once the directory is free for others
-            work.stop.set()
-            with suppress(KeyboardInterrupt):  # of an impatient user: on to the next step
-                executor.kill()
-            raise
+        _require_one_usable(config, files)
+        with _executor(config) as executor, session(config, files, directory, command, kept) as run:
+            work = Worklist(config, run, datasets(files), progress, ended)
+            try:
+                _begin(work)
+                work.work(executor)
+                _finish(work, report_workers)
+            except BaseException:  # no worker writes once the directory is free for others
+                work.stop.set()
+                with suppress(KeyboardInterrupt):  # of an impatient user: on to the next step
+                    executor.kill()
+                raise
     return Campaign(config.directory, work.outcomes(), tuple(run.notices))
 
 
@@ -157,12 +157,12 @@ def _begin(work: Worklist) -> None:
 def _finish(work: Worklist, report_workers: int) -> None:
     """The campaign's file and the report."""
     directory = work.run.directory
-    good = {d.name: directory.work / d.file for d in work.sets if not work.ended[d.name].failure}
+    good = {d.name: directory.at(d.file) for d in work.sets if not work.ended[d.name].failure}
     failures = {name: done.failure for name, done in work.ended.items() if done.failure}
     if good and len(work.sets) > 1:
         longest = max(work.ended[name].n_observations for name in good)
         attributes = {**work.run.attributes, "identity": work.run.identity.settings}
-        save_campaign(directory.work / "posterior.nc", good, longest, attributes, failures)
+        save_campaign(directory.at("posterior.nc"), good, longest, attributes, failures)
     if good and work.config.report:
         _report(directory, workers=report_workers)
     else:

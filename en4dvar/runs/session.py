@@ -42,7 +42,7 @@ class Session:
 
     def earlier(self) -> Identity | None:
         """The identity of the run that is resumed. Raises :class:`CheckpointError`."""
-        return read_checkpoint(self.directory.work / IDENTITY, "run", Identity) if self.resumed else None
+        return read_checkpoint(self.directory.at(IDENTITY), "run", Identity) if self.resumed else None
 
     def begin(self, *files: str, retried: Mapping[str, str] | None = None) -> None:
         """Write what the run is and claim the ``files`` it will write; a resumed run must be the same run.
@@ -62,15 +62,15 @@ class Session:
         for record in retried.values():
             directory.remove(record)
         directory.claim("run.log", "config.yaml", "config.resolved.yaml", IDENTITY, *files)
-        write_text(directory.work / "config.yaml", config.text)
-        write_text(directory.work / "config.resolved.yaml", config.resolved)
-        write_checkpoint(directory.work / IDENTITY, "run", self.identity)
+        write_text(directory.at("config.yaml"), config.text)
+        write_text(directory.at("config.resolved.yaml"), config.resolved)
+        write_checkpoint(directory.at(IDENTITY), "run", self.identity)
         self.begun = True
 
     def restore(self, file: str, fingerprint: str, kind: type[S], otherwise: str) -> S | None:
         """What a checkpoint holds; one that cannot be used is told, with what is done ``otherwise``."""
         try:
-            return read_checkpoint(self.directory.work / file, fingerprint, kind)
+            return read_checkpoint(self.directory.at(file), fingerprint, kind)
         except CheckpointError as error:
             self.notice(f"{error}; {otherwise}")
             return None
@@ -90,27 +90,30 @@ def directory_mode(force: bool, resume: bool) -> Mode:
 
 @contextmanager
 def session(
-    config: Config | TwinConfig, data: Mapping[str, Path], mode: Mode, command: str, kept: Callable[[], str]
+    config: Config | TwinConfig,
+    data: Mapping[str, Path],
+    directory: RunDirectory,
+    command: str,
+    kept: Callable[[], str],
 ) -> Iterator[Session]:
-    """Hold the run directory of ``config`` and its log, and put the result in place where the block ends well.
+    """Hold the log of a run in its ``directory``, and put the result in place where the block ends well.
 
     ``data``: name of each data set → its file; ``command``: what the user typed; ``kept``: says what the user has of a
     run that is stopped, which becomes part of the last words of an interrupt and of errors that a resumed run survives.
 
     Raises
     ------
-    OutputError: as :meth:`RunDirectory.open`. Interrupted: the block was.
+    OutputError: the log cannot be written, the result not put in place. Interrupted: the block was.
     """
     model = config.experiment.model if isinstance(config, TwinConfig) else config.model
-    resumed = mode == "resume"
-    with RunDirectory.open(config.directory, mode) as directory, tell_interrupt(kept):
+    with tell_interrupt(kept):
         who = identity(config.resolved, model, data)
         attributes = {
             **provenance(config.text, config.document.file, command),
             "configuration_resolved": config.resolved,
         }
-        with RunLog(directory.work / "run.log", append=resumed) as log:
-            run = Session(config, directory, resumed, log, who, attributes)
+        with RunLog(directory.at("run.log"), append=directory.resumed) as log:
+            run = Session(config, directory, directory.resumed, log, who, attributes)
             try:
                 log.write(attributes["history"])
                 yield run

@@ -16,6 +16,7 @@ from en4dvar.forward import Failure
 from en4dvar.inputs.readers import Column
 from en4dvar.state import TIME_SHIFT, Array
 from en4dvar.units import UnitError, convert
+from en4dvar.user_code import reason_of
 
 
 @dataclass(frozen=True)
@@ -80,12 +81,16 @@ def _forward(config: Config, theta: Mapping[str, float], times: Array) -> Array:
     try:
         own = {name: value for name, value in theta.items() if name in {p.name for p in model.parameters}}
         state = np.asarray(model.initial_state(own), dtype=float)
-    except ValueError as error:
-        raise En4dvarError(f"the model refuses its parameters: {error}") from None
+    except BaseException as error:
+        reason = error if isinstance(error, ValueError) else reason_of(error)
+        raise En4dvarError(f"the model refuses its parameters: {reason}") from None
     (path,) = run_chunk(model, state[None], times + shift)
     if isinstance(path, Failure):
         raise En4dvarError(f"the model failed: {path.reason}")
-    return np.asarray(config.observable.operator(path), dtype=float)
+    try:
+        return np.asarray(config.observable.operator(path), dtype=float)
+    except BaseException as error:
+        raise En4dvarError(f"{config.observable.name} cannot be read from the run: {reason_of(error)}") from None
 
 
 def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:

@@ -19,11 +19,12 @@ from en4dvar.config.synthetic import CampaignPlan, GroupSection
 from en4dvar.diagnostics import nrmse
 from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import run_chunk
-from en4dvar.files import write_text
+from en4dvar.files import make_folder, write_text
 from en4dvar.forward import Failure
 from en4dvar.prior import member_stream
 from en4dvar.state import TIME_SHIFT, Array
 from en4dvar.units import convert
+from en4dvar.user_code import reason_of
 
 ATTEMPTS = 100  # truths that cannot be integrated, or yield too few readings, are drawn again so often
 TRUTH = "truth.csv"
@@ -70,8 +71,8 @@ def _draw(plan: CampaignPlan, kind: str, group: GroupSection, number: int) -> Sy
         noise = asked.noise * stream.standard_normal(asked.most)
         try:
             state = np.asarray(model.initial_state(theta), dtype=float)
-        except ValueError as error:
-            reason = str(error)
+        except BaseException as error:
+            reason = str(error) if isinstance(error, ValueError) else reason_of(error)
             continue
         (path,) = run_chunk(model, state[None], times + shift)
         if isinstance(path, Failure):
@@ -94,10 +95,7 @@ def write_campaign(plan: CampaignPlan, sets: tuple[SyntheticSet, ...], command: 
     files = [folder / f"{s.name}.csv" for s in sets] + [folder / TRUTH]
     if not force and (there := [file for file in files if file.exists()]):
         raise OutputError(f"{there[0]}: exists; give --force to replace it")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be created: {error.strerror or error}") from None
+    make_folder(folder)
     for file, dataset in zip(files, sets, strict=False):
         write_text(file, _data_csv(plan, dataset, command))
     return write_text(folder / TRUTH, truth_csv(plan, sets))

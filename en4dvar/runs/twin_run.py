@@ -10,12 +10,12 @@ from en4dvar.config import TwinConfig, load_twin
 from en4dvar.cycling.sequential import SequentialState
 from en4dvar.cycling.twin import TwinResult, conduct
 from en4dvar.executor import make_executor
-from en4dvar.files import atomic_path, write_text
+from en4dvar.files import write_text
 from en4dvar.runs.interrupt import terminate_as_interrupt
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.runs.session import Session, directory_mode, session
 from en4dvar.storage.checkpoint import FOLDER, Keeper, digest
-from en4dvar.storage.seal import seal_file
+from en4dvar.storage.netcdf import netcdf_file
 from en4dvar.storage.twin_file import dataset, summary_csv
 from en4dvar.tables import table
 
@@ -40,17 +40,16 @@ def run_twin(
     kept = f"the cycles up to the last checkpoint are kept in {config.directory}"
     with (
         terminate_as_interrupt(),
-        session(config, {}, directory_mode(force, resume), command, lambda: kept) as run,
+        RunDirectory.open(config.directory, directory_mode(force, resume)) as directory,
+        session(config, {}, directory, command, lambda: kept) as run,
     ):
-        directory = run.directory
         run.begin("twin.nc", "summary.csv", STATE)
         result = _conduct(config, run, on_cycle)
         run.log.write("\n".join(f"member lost: {reason}" for reason in result.run.failures))
         attributes = {**run.attributes, "name": config.name, "scheme": config.scheme}
-        with atomic_path(directory.work / "twin.nc") as partial:
+        with netcdf_file(directory.at("twin.nc")) as partial:
             dataset(result, attributes).to_netcdf(partial, engine="netcdf4", format="NETCDF4")
-            seal_file(partial)
-        write_text(directory.work / "summary.csv", summary_csv(result))
+        write_text(directory.at("summary.csv"), summary_csv(result))
         if config.report:
             report_twin(directory)
     return result
@@ -73,7 +72,7 @@ def _conduct(config: TwinConfig, run: Session, on_cycle: Callable[[int], None] |
         resume = run.restore(STATE, fingerprint, SequentialState, "the experiment is conducted from the start")
     if resume is not None:
         run.log.write(f"continued after {resume.cycle} of {experiment.cycles} cycles")
-    keeper = Keeper(run.directory.work / STATE, fingerprint, config.execution.checkpoint_every)
+    keeper = Keeper(run.directory.at(STATE), fingerprint, config.execution.checkpoint_every)
     latest: list[Callable[[], SequentialState]] = []
 
     def keep(state: Callable[[], SequentialState]) -> None:

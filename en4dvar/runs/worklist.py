@@ -69,7 +69,7 @@ class Worklist:
 
     def outcomes(self) -> tuple[DatasetOutcome, ...]:
         """What came of each data set, in order."""
-        folder, ended = self.run.directory.path, [(d, self.ended[d.name]) for d in self.sets if d.name in self.ended]
+        folder, ended = self.run.directory.home, [(d, self.ended[d.name]) for d in self.sets if d.name in self.ended]
         return tuple(one if one.failure else replace(one, file=folder / d.file) for d, one in ended)
 
     def failed_earlier(self) -> dict[str, str]:
@@ -79,7 +79,7 @@ class Worklist:
         for d in self.sets:
             if earlier is not None and d.name in earlier.content:
                 with suppress(CheckpointError):
-                    done = read_checkpoint(self.run.directory.work / d.done, earlier.of_dataset(d.name), DatasetOutcome)
+                    done = read_checkpoint(self.run.directory.at(d.done), earlier.of_dataset(d.name), DatasetOutcome)
                     if done is not None and done.failure:
                         failed[d.name] = d.done
         return failed
@@ -91,7 +91,7 @@ class Worklist:
             done = self.run.restore(d.done, self._fingerprint(d), DatasetOutcome, f"{d.name} is estimated again")
             if done is None:
                 continue
-            if file_digest(directory.work / d.file) == done.sha256:
+            if file_digest(directory.at(d.file)) == done.sha256:
                 self.ended[d.name] = done
                 directory.remove(d.iteration)  # of a run killed between its last two steps
             else:
@@ -142,7 +142,7 @@ class Worklist:
         resume = self.run.restore(d.iteration, fingerprint, LoopState, f"{d.name} is estimated from the start")
         if resume is not None:
             self.run.log.write(f"{d.name}: continued {resume.reached}")
-        path = (self.run.directory.work / d.iteration).absolute()
+        path = self.run.directory.at(d.iteration)
         return Job(
             problem=build_one(config, d.name, d.source),
             settings=config.assimilation,
@@ -174,7 +174,7 @@ class Worklist:
     def _keep(self, d: Dataset, value: Estimate) -> None:
         warnings = [f"{warning.severity}: {warning}" for warning in value.outcome.warnings]
         self.run.log.write("\n".join(f"{d.name}: {line}" for line in (value.ending, *warnings)))
-        write_bytes(self.run.directory.work / d.file, value.content)
+        write_bytes(self.run.directory.at(d.file), value.content)
         self._end(d, value.outcome)
 
     def _fail(self, d: Dataset, error: Exception) -> None:
@@ -191,7 +191,7 @@ class Worklist:
         self._end(d, DatasetOutcome(d.name, failure=reason, exit_code=exit_code))
 
     def _end(self, d: Dataset, outcome: DatasetOutcome) -> None:
-        write_checkpoint(self.run.directory.work / d.done, self._fingerprint(d), outcome)
+        write_checkpoint(self.run.directory.at(d.done), self._fingerprint(d), outcome)
         self.run.directory.remove(d.iteration)
         self.ended[d.name] = outcome
         self._reached.pop(d.name, None)

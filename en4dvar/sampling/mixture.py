@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.compiled import kernel
 from en4dvar.state import Array
 
 DEGREES = 5.0  # of freedom of a proposal: heavier tails than any part of the density has
@@ -75,7 +75,7 @@ def fit_gaussians(x: Array, rng: np.random.Generator, components: int, rounds: i
     return share, middle + centre @ root.T, root @ covariance @ root.T
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _expect(z, share, centre, covariance, of_part):  # type: ignore[no-untyped-def]
     """Probability ``of_part`` (D, M) of the components for points (D, n)."""
     count, parts = of_part.shape
@@ -103,7 +103,7 @@ def _expect(z, share, centre, covariance, of_part):  # type: ignore[no-untyped-d
             of_part[d, m] /= total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _maximise(z, of_part, share, centre, covariance):  # type: ignore[no-untyped-def]
     """Share, centre and covariance of the components are overwritten with what their points say."""
     count, parts = of_part.shape

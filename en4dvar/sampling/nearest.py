@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from en4dvar.compiled import kernel
 from en4dvar.observations import Observations
 from en4dvar.state import Array
 
@@ -63,7 +63,7 @@ def best_over_shifts(traces: Array, aims: Targets) -> tuple[Array, Array]:
     return np.asarray(1 - np.sqrt(squares / aims.scale)), np.asarray(steps * aims.step)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _least_squares(traces, values, nearest, offsets, reach, squares, steps):  # type: ignore[no-untyped-def]
     last = traces.shape[1] - 1
     for b in range(traces.shape[0]):

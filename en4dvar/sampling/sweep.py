@@ -14,12 +14,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
+from zipfile import BadZipFile
 
 import numpy as np
 
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.executor import Executor, SerialExecutor
-from en4dvar.files import atomic_path
+from en4dvar.files import atomic_path, inside, open_plain
 from en4dvar.prior import Prior, member_stream
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.forward_runs import Predictor
@@ -210,9 +211,8 @@ class _Score:
 
     def chunk(self, x: Array, file: Path | None) -> Best:
         """The best fits among coordinates (B, n), from ``file`` where they are, or kept there."""
-        if file is not None and file.exists():
-            with np.load(file) as stored:
-                return Best(**stored)
+        if file is not None and (kept := _kept(file)) is not None:
+            return kept
         best = self._best(x[:BATCH])
         for i in range(BATCH, len(x), BATCH):
             best = best.merged(self._best(x[i : i + BATCH]))
@@ -289,4 +289,13 @@ def _results(
 
 
 def _file(folder: Path | None, number: int) -> Path | None:
-    return folder / f"chunk_{number:05d}.npz" if folder else None
+    return inside(folder, f"chunk_{number:05d}.npz") if folder else None
+
+
+def _kept(file: Path) -> Best | None:
+    """What a chunk holds; None where it is missing, or damaged as by a loss of power: it is computed again."""
+    try:
+        with open_plain(file) as stream, np.load(stream) as stored:
+            return Best(**stored)
+    except (OSError, ValueError, TypeError, EOFError, BadZipFile):
+        return None

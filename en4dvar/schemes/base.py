@@ -26,7 +26,10 @@ Draw = Callable[[str], Array]  # standard normal numbers (N, K') by the name of 
 
 @dataclass(frozen=True)
 class Weights:
-    """An ensemble in weight space: ensemble weights ``w`` (N,) and ensemble transform ``T`` (N, N)."""
+    """An ensemble in weight space: ensemble weights ``w`` (N,) and ensemble transform ``T`` (N, N).
+
+    T is (0, 0) where members are many and the scheme does not read it.
+    """
 
     w: Array
     T: Array

@@ -8,10 +8,7 @@ observations and the iterations stay in ``datasets/``.
 
 from __future__ import annotations
 
-import errno
 import json
-import os
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,8 +17,8 @@ import netCDF4
 import numpy as np
 
 from en4dvar.errors import OutputError
-from en4dvar.files import atomic_path
-from en4dvar.storage.seal import check_seal, seal_file
+from en4dvar.storage.netcdf import netcdf_file
+from en4dvar.storage.seal import check_seal
 
 GROUPS = (
     "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "constant_data", "sample_stats",
@@ -29,7 +26,6 @@ GROUPS = (
 )  # fmt: skip
 LEFT_OUT = {"path_time", "iteration"}
 RENAMED = {"time": "observation", "time_column": "observation_column"}  # padded to the longest data set
-_LITTLE = 1 << 16  # bytes left on a disk that is full
 FAILURES = "failed_datasets"  # root attribute: JSON of name → reason
 
 
@@ -52,14 +48,8 @@ def save_campaign(
     ------
     OutputError: the file cannot be written.
     """
-    with atomic_path(path) as partial:
-        try:
-            _write(partial, sources, n_observations, {**attributes, FAILURES: json.dumps(failures, ensure_ascii=False)})
-        except RuntimeError as error:  # the library's own; of the operating system's reason it only tells "HDF error"
-            free = shutil.disk_usage(partial.parent).free
-            reason = os.strerror(errno.ENOSPC) if free < _LITTLE else str(error)
-            raise OutputError(f"{path}: cannot be written: {reason}") from None
-        seal_file(partial)
+    with netcdf_file(path) as partial:
+        _write(partial, sources, n_observations, {**attributes, FAILURES: json.dumps(failures, ensure_ascii=False)})
     return path
 
 

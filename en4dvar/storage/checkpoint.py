@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import ClassVar, TypeVar
 
 from en4dvar.errors import OutputError
-from en4dvar.files import atomic_path
+from en4dvar.files import atomic_path, open_plain
 from en4dvar.storage.codec import decode, encode
 
 D = TypeVar("D")
@@ -85,7 +85,8 @@ def read_checkpoint(path: Path, fingerprint: str, kind: type[D]) -> D | None:
     CheckpointError: the file is not a checkpoint, incomplete, altered, or of another version, run or kind.
     """
     try:
-        head, _, payload = path.read_bytes().partition(b"\n")
+        with open_plain(path) as file:
+            head, _, payload = file.read().partition(b"\n")
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -115,7 +116,7 @@ def digest(content: bytes) -> str:
 def file_digest(path: Path) -> str:
     """SHA-256 of a file, or "" where it cannot be read."""
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
         return ""

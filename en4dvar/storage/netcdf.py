@@ -9,18 +9,24 @@ sees the same. Everything happens in memory: a worker far away can do it, and a 
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import netCDF4
 import numpy as np
 import xarray as xr
 
-from en4dvar.storage.seal import sealed
+from en4dvar.errors import OutputError
+from en4dvar.files import atomic_path
+from en4dvar.storage.seal import seal_file, sealed
 
 _LOCK = threading.Lock()  # the netCDF library is not safe to use from several threads
+_MORE = 1 << 18  # bytes; more than the library had left to write
 _INITIAL_SIZE = 1 << 19  # bytes; grows as needed
 
 
@@ -79,6 +85,29 @@ def to_bytes(groups: Groups) -> bytes:
             raise
         memory = file.close()
     return sealed(bytes(memory))
+
+
+@contextmanager
+def netcdf_file(path: Path) -> Iterator[Path]:
+    """A partial file to be written through the netCDF library; on leaving it is sealed and takes its place.
+
+    Raises :class:`OutputError` as :func:`~en4dvar.files.atomic_path`.
+    """
+    with atomic_path(path) as partial:
+        try:
+            yield partial
+        except (RuntimeError, OSError) as error:  # of the operating system's reason the library tells "HDF error"
+            _write_more(partial)
+            raise OutputError(f"{path}: cannot be written: {error}") from None
+        seal_file(partial)
+
+
+def _write_more(partial: Path) -> None:
+    """Fail as the library did, with the operating system's reason: disk or quota full, a device that is broken."""
+    with partial.open("ab") as file:
+        file.write(bytes(_MORE))
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _define(file: netCDF4.Dataset, path: str, content: Group) -> Iterator[tuple[Any, Any]]:

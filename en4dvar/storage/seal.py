@@ -12,6 +12,7 @@ import os
 from pathlib import Path
 
 from en4dvar.errors import OutputError
+from en4dvar.files import open_plain
 
 FORMAT = "en4dvar-result"
 VERSION = "1"
@@ -40,7 +41,7 @@ def check_seal(path: Path) -> None:
     """
     found = hashlib.sha256()
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             left = max(os.fstat(file.fileno()).st_size - _LENGTH, 0)
             while left and (block := file.read(min(left, 1 << 20))):
                 found.update(block)

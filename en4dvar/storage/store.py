@@ -14,19 +14,20 @@ import xarray as xr
 from en4dvar.analysis import Analysis
 from en4dvar.caution import Caution
 from en4dvar.errors import OutputError
-from en4dvar.files import atomic_path
 from en4dvar.noise import noise_of_record
 from en4dvar.observations import Observations
 from en4dvar.state import Array, Parameter
+from en4dvar.storage.complete import check_complete
 from en4dvar.storage.groups import SCALAR, build_groups
-from en4dvar.storage.netcdf import tree_of
-from en4dvar.storage.seal import check_seal, seal_file
+from en4dvar.storage.netcdf import netcdf_file, tree_of
+from en4dvar.storage.seal import check_seal
 from en4dvar.summary import ParameterSummary, living, results_table
 
 if TYPE_CHECKING:
     import pandas as pd
 
-GROUPS = ("prior", "posterior", "posterior_predictive", "observed_data", "sample_stats", "iterations")
+NEXT = ".en4dvar-next"  # in a run directory: the run that replaces its result
+COMPLETE = ".en4dvar-complete"  # in that: it is being put in place
 
 
 @dataclass(frozen=True)
@@ -153,14 +154,26 @@ class StoredResult:
 
 def save(result: StoredResult, path: str | Path) -> Path:
     """Write ``path`` (NETCDF4) through xarray; it appears complete or not at all. Raises :class:`OutputError`."""
-    with atomic_path(path) as partial:
+    with netcdf_file(Path(path)) as partial:
         result.tree.to_netcdf(partial, engine="netcdf4")
-        seal_file(partial)
     return Path(path)
 
 
+def require_settled(run_dir: Path) -> None:
+    """Raise :class:`OutputError` where files of two runs may lie side by side."""
+    if (run_dir / NEXT / COMPLETE).exists():
+        raise OutputError(
+            f"{run_dir}: a run was killed while its files took the place of an earlier run's; 'en4dvar run' with "
+            "--resume finishes that"
+        )
+
+
 def result_files(run_dir: Path) -> list[Path]:
-    """The files of a run directory's data sets, by name; of a single one ``posterior.nc``, which need not exist."""
+    """The files of a run directory's data sets, by name; of a single one ``posterior.nc``, which need not exist.
+
+    Raises :class:`OutputError` as :func:`require_settled`.
+    """
+    require_settled(run_dir)
     return sorted((run_dir / "datasets").glob("*.nc")) or [run_dir / "posterior.nc"]
 
 
@@ -179,7 +192,5 @@ def load_stored(path: str | Path) -> StoredResult:
             nodes = {node.path: node.to_dataset(inherit=False).load() for node in tree.subtree}
     except OSError as error:
         raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
-    missing = [group for group in GROUPS if f"/{group}" not in nodes]
-    if missing:
-        raise OutputError(f"{path}: not a result of en4dvar: no group {', '.join(missing)}")
+    check_complete(path, nodes)
     return StoredResult(xr.DataTree.from_dict(nodes))

@@ -16,7 +16,7 @@ import yaml
 
 from en4dvar.config.build import data_files, inverse_plan
 from en4dvar.errors import OutputError
-from en4dvar.files import write_text
+from en4dvar.files import inside, write_text
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.storage.checkpoint import FOLDER, CheckpointError, digest, read_checkpoint, write_checkpoint
 from en4dvar.storage.fingerprint import Identity, identity, source_digest
@@ -42,22 +42,22 @@ class StudyCheckpoints:
         """
         who = identity_of(plan)
         folder = directory.folder(FOLDER)
-        earlier = read_checkpoint(directory.work / IDENTITY, "study", Identity)
+        earlier = read_checkpoint(directory.at(IDENTITY), "study", Identity)
         if earlier is not None and (difference := who.difference(earlier, frozenset())):
             raise OutputError(
                 f"{directory.path}: the study cannot be resumed to the same result, for this has changed:\n{difference}"
                 "\ngive --force to compute everything again, or another --out"
             )
-        write_checkpoint(directory.work / IDENTITY, "study", who)
+        write_checkpoint(directory.at(IDENTITY), "study", who)
         return cls(folder, digest(f"{who.settings}{who.data}".encode()))
 
     def sweep(self, *words: str) -> Path:
         """The folder of a sweep's chunks."""
-        return prepare_folder(self.folder / _file("sweep", *words), self.key, "resume")
+        return prepare_folder(inside(self.folder, _file("sweep", *words)), self.key, "resume")
 
     def of(self, kind: type[D], compute: Callable[[], D], *words: str) -> D:
         """The dataclass kept under ``words``, or what ``compute`` gives, then kept."""
-        path = self.folder / _file(kind.__name__, *words)
+        path = inside(self.folder, _file(kind.__name__, *words))
         try:
             found = read_checkpoint(path, self.key, kind)
         except CheckpointError:  # damaged: computed again
@@ -98,10 +98,10 @@ def prepare_folder(folder: Path, key: str, mode: str) -> Path:
     ------
     OutputError: it holds another sweep, or cannot be written.
     """
-    mark = folder / "sweep.key"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        stored = mark.read_text(encoding="utf-8") if mark.exists() else ""
+        mark = inside(folder, "sweep.key")
+        stored = mark.read_bytes().decode("utf-8", "replace") if mark.exists() else ""
         if mode == "force":
             for file in (mark, *folder.glob("*.npz")):
                 file.unlink(missing_ok=True)

@@ -9,6 +9,8 @@ from typing import Any
 
 import click
 
+from en4dvar.commands.common import note_beginning
+
 
 @click.command()
 @click.argument("configs", metavar="CONFIG...", nargs=-1, required=True, type=click.Path())
@@ -46,8 +48,8 @@ def sweep(
     from en4dvar.config import load_config
     from en4dvar.config.build import build
     from en4dvar.executor import available_cores, make_executor
-    from en4dvar.files import write_text
-    from en4dvar.runs.interrupt import tell_interrupt
+    from en4dvar.files import inside, write_text
+    from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
     from en4dvar.sampling.sweep import SweepSettings, refinement_size, run_sweep
     from en4dvar.units import UnitError, parse_quantity
     from en4dvar_agarose.checkpoints import prepare_folder
@@ -68,8 +70,9 @@ def sweep(
     folder = out or Path("runs") / f"{loaded[0].name}_sweep"
     readings = b"".join(p.observations.times.tobytes() + p.observations.values.tobytes() for p in problems)
     key = hashlib.sha256(f"{[c.resolved for c in loaded]}{chosen}".encode() + readings).hexdigest()
-    chunks = prepare_folder(folder / "chunks", key, "force" if force else "resume" if resume else "new")
+    chunks = prepare_folder(inside(folder, "chunks"), key, "force" if force else "resume" if resume else "new")
     with (
+        terminate_as_interrupt(),
         tell_interrupt(lambda: _to_continue(f"finished chunks are kept in {chunks}")),
         _bar(trajectories + refinement_size(chosen, len(problems))) as progress,
         make_executor(problems[0].model, workers or available_cores()) as executor,
@@ -111,6 +114,7 @@ def study(
         raise click.UsageError("--force and --resume exclude each other")
     plan = load_study(config, _overrides(settings, None))
     folder = out or Path("runs") / plan.name
+    note_beginning(folder, resume)
     with (
         terminate_as_interrupt(),
         RunDirectory.open(folder, "force" if force else "resume" if resume else "new") as directory,
@@ -149,13 +153,15 @@ def _bar(total: int) -> Any:
     from rich.console import Console
     from rich.progress import Progress
 
+    from en4dvar.runs.progress import shown as on_terminal
+
     @contextmanager
     def shown() -> Any:
         console = Console(stderr=True)
         if not console.is_terminal:
             yield None
             return
-        with Progress(console=console, transient=True) as bar:
+        with on_terminal(Progress(console=console, transient=True)) as bar:
             task = bar.add_task("trajectories", total=total)
             yield lambda done, _: bar.update(task, completed=done)
 

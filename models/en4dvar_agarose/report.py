@@ -9,8 +9,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from en4dvar.errors import OutputError
-from en4dvar.files import write_bytes, write_text
+from en4dvar.files import inside, make_folder, write_bytes, write_text
 from en4dvar.population import HyperPrior
 from en4dvar.report.style import COLUMN, DARK, LIGHT, css_variables, inline_svg, save_figure
 from en4dvar_agarose import measured, tables
@@ -26,11 +25,7 @@ Rows = list[list[str]]
 
 def write_study(study: Study, directory: Path) -> Path:
     """Write everything; returns the page. Raises :class:`OutputError`."""
-    figures_folder = directory / "figures"
-    try:
-        figures_folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{figures_folder}: cannot be created: {error.strerror or error}") from None
+    figures_folder = make_folder(inside(directory, "figures"))
     for number, route in enumerate(ROUTE_KEYS, 1):
         rows = tables.table(study, route)
         write_text(directory / f"table{number}.csv", tables.as_csv(study, rows, route))

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import csv
-import io
-
 from en4dvar.sampling.sweep import SweepResult
+from en4dvar.tables import csv_text
 from en4dvar.units import convert
 
 
 def sweep_csv(result: SweepResult) -> str:
     """One line a data set: best fit, time shift, NRMSE."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
     heads = [p.name if p.unit == "1" else f"{p.name} ({p.display_unit or p.unit})" for p in result.parameters]
-    writer.writerow(["dataset", *heads, "t_s (us)", "NRMSE"])
+    lines = [["dataset", *heads, "t_s (us)", "NRMSE"]]
     for i, name in enumerate(result.names):
         values = [
             convert(float(v), p.unit, p.display_unit or p.unit)
             for v, p in zip(result.theta[i], result.parameters, strict=True)
         ]
-        writer.writerow([name, *(f"{v:.6g}" for v in values), f"{result.shift[i] * 1e6:.4g}", f"{result.nrmse[i]:.6f}"])
-    return out.getvalue()
+        lines.append([name, *(f"{v:.6g}" for v in values), f"{result.shift[i] * 1e6:.4g}", f"{result.nrmse[i]:.6f}"])
+    return csv_text(lines)
 
 
 def sweep_text(result: SweepResult) -> str:

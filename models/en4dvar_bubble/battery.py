@@ -17,6 +17,7 @@ from en4dvar.errors import En4dvarError
 from en4dvar.hints import suggest
 from en4dvar.state import Array
 from en4dvar.units import parse_unit
+from en4dvar.user_code import reason_of
 from en4dvar_bubble.laws.base import ConstitutiveLaw, columns
 from en4dvar_bubble.laws.response import Cycle, respond
 from en4dvar_bubble.laws.tabulate import GRID, differentiate
@@ -178,9 +179,10 @@ def _reason(check: Check, law: ConstitutiveLaw) -> str:
         check(law)
     except AssertionError as error:
         return str(error)
-    except Exception as error:
+    except BaseException as error:
+        reason = reason_of(error)
         frame = traceback.extract_tb(error.__traceback__)[-1]
-        return f"{type(error).__name__}: {error} ({frame.filename}:{frame.lineno})"
+        return f"{reason} ({frame.filename}:{frame.lineno})"
     return ""
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from en4dvar.errors import En4dvarError
+from en4dvar.user_file import is_from_file
 
 if TYPE_CHECKING:
     from en4dvar_bubble.laws import ConstitutiveLaw
@@ -63,7 +64,7 @@ def _check(chosen: Sequence[ConstitutiveLaw]) -> list[str]:
             if finding.reason:
                 click.echo(f"        {finding.reason}")
         click.echo(f"  At small strain: {small_strain(law)}")
-        if "limits" not in type(law).__dict__ and type(law).reference is not None:
+        if "limits" not in type(law).__dict__ and is_from_file(type(law)):
             click.echo("  No parent law is declared (limits): a wrong factor or unit shows in the line above alone")
         if wrong:
             failing.append(f"{law.name}: {len(wrong)} of {len(findings)} checks fail")

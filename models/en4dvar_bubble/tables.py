@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 
+from en4dvar.compiled import kernel
 from en4dvar.state import Array
 
 HALO = 4
@@ -39,7 +39,7 @@ class Grid:
         return np.array([self.origin, self.origin + self.step * self.cells, 1.0 / self.step, float(self.cells)])
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def quintic(out, a, da, dda, b, db, ddb):
     """Quintic on s ∈ [0, 1] from values and derivatives scaled by the cell width."""
     rise = b - a - da - 0.5 * dda
@@ -62,7 +62,7 @@ def from_values(samples: Array) -> Array:
     return out
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def fill(samples, factor, out):
     """Write the coefficients of :func:`from_values`, of ``factor`` times the samples, to ``out`` (N, cells, 8)."""
     n, total = samples.shape
@@ -84,7 +84,7 @@ def fill(samples, factor, out):
             a, da, dda = b, db, ddb
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def from_slopes(slopes, step, zero):
     """Coefficients (N, cells, 8) of the antiderivative that vanishes at node ``zero``, from samples of the
     derivative.
@@ -118,12 +118,12 @@ def from_slopes(slopes, step, zero):
     return out
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _area(first, second, third, j):
     return 0.5 * (first[j] + first[j + 1]) + 0.1 * (second[j] - second[j + 1]) + (third[j] + third[j + 1]) / 120.0
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def evaluate(table, span, x):
     """Values (N, K) of the tables (N, cells, 8) at ``x`` (N, K); NaN where ``x`` is NaN."""
     n, k = x.shape

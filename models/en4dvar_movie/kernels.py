@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
+
+from en4dvar.compiled import kernel
 
 NAMES = ("x", "y", "R", "w", "b", "c", "g", "rho_g")
 SHAPE = len(NAMES)  # the first mode's place
@@ -21,12 +22,12 @@ _ROOT_HALF = math.sqrt(0.5)
 _DENSITY = 1 / math.sqrt(2 * math.pi)
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _normal(z):  # Φ and its derivative
     return 0.5 * math.erfc(-z * _ROOT_HALF), _DENSITY * math.exp(-0.5 * z * z)
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _row(j, i, p, modes, row):
     """The model at a pixel; ``row`` (P,) gets its derivatives."""
     dx, dy = i - p[0], j - p[1]
@@ -60,13 +61,13 @@ def _row(j, i, p, modes, row):
     return p[4] + p[5] * F + p[6] * G
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _weight(u):
     """Tukey's bisquare of a residual in units of its cutoff."""
     return (1 - u * u) ** 2 if abs(u) < 1 else 0.0
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _bounds(shape, x, y, reach):
     return (
         max(0, math.floor(y - reach)),
@@ -76,7 +77,7 @@ def _bounds(shape, x, y, reach):
     )
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def residuals(image, p, modes, ring):
     """Residuals (n,) of the pixels whose distance from ``ring[:2]`` lies between ``ring[2]`` and ``ring[3]``."""
     row = np.zeros(8 + 2 * (modes - 1))
@@ -92,7 +93,7 @@ def residuals(image, p, modes, ring):
     return found[:n]
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def normal_equations(image, p, modes, ring, cutoff):
     """JᵀWJ (P, P), JᵀWr (P,), Σ w r², Σ w and the robust cost, W of Tukey's bisquare with ``cutoff``."""
     size = 8 + 2 * (modes - 1)
@@ -125,7 +126,7 @@ def normal_equations(image, p, modes, ring, cutoff):
     return A, g, squares, total, cost * cutoff * cutoff / 6
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def influence(image, p, modes, ring, cutoff, weights, sectors):
     """What moves the radius: Σ of u_i = (weights·J_i) ψ_i by sector (S,), Σ u_i² over pixels, and Σ ψ'_i / Σ w_i."""
     row = np.zeros(8 + 2 * (modes - 1))
@@ -151,7 +152,7 @@ def influence(image, p, modes, ring, cutoff, weights, sectors):
     return sums, squares, slopes / total
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def normalise(frame, level, gain, step):
     """(frame − level) gain (H, W), and its means over tiles of ``step`` × ``step`` pixels."""
     height, width = frame.shape

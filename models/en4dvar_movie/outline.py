@@ -47,7 +47,8 @@ class Outline:
 
     ``width`` is the std of the edge's blur, ``modes`` (2, M−1) are A_n and B_n, ``variance`` that of R if pixels were
     independent and ``ratio`` what sectors of the outline say in units of it, ``common`` the variance that comes from
-    the contrast of the movie; ``mode_std`` is the std of a mode's amplitude. ``seen`` is the share of the outline inside the frame.
+    the contrast of the movie; ``mode_std`` is the std of a mode's amplitude. ``seen`` is the share of the
+    outline inside the frame.
     """
 
     circle: Circle

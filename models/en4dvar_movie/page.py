@@ -38,7 +38,7 @@ def page_text(movie: Movie, found: Track, scale: Scale, command: str) -> str:
         scale=f"{1e6 * scale.pixel:.6g} µm a pixel, {scale.rate:.6g} frames a second",
         background=found.background.frames,
         common=f"{float(np.median([r.errors.common for r in used])) * 1e6 * scale.pixel:.2g}" if used else "",
-        figures=[inline_svg(_radius(used, scale), "radius", "radius"), inline_svg(_shape(used, scale), "shape", "shape")],
+        figures=[inline_svg(draw(used, scale), name, name) for name, draw in (("radius", _radius), ("shape", _shape))],
         strip=_strip(movie, found),
         left_out=[r for r in found.readings if not r.used],
         remarks=[r for r in used if r.reason],

@@ -132,6 +132,7 @@ def test_what_decides_the_numbers_of_a_study(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.long
+@pytest.mark.fault("kill-commands")
 def test_a_study_killed_at_random_moments_and_resumed_has_the_same_bits(tmp_path):
     """One gel, two laws; killed up to half a second after one to twelve more files were written."""
     for model in ("nh", "qlkv"):

@@ -45,6 +45,7 @@ def test_command(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.fault("kill-commands")
 def test_a_killed_sweep_is_resumed_to_the_same_numbers(tmp_path):
     call = [sys.executable, "-c", "from en4dvar.cli import main; main()", "sweep"]
     call += [str(CONFIGS / "agarose_03_nh.yaml"), "--trajectories", "16384"]

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # The modules of one line are a layer together; a package is a layer by itself.
 LAYERS = (
     ("errors",),
-    ("state", "hints", "files", "tables", "caution"),
+    ("state", "hints", "files", "tables", "caution", "compiled", "user_code", "user_file"),
     ("units", "prior", "forward", "noise"),
     ("batch", "observations"),
     ("problem", "diagnostics"),

@@ -190,3 +190,21 @@ def test_the_lowest_descent_is_gone_once(seed):
         return  # another member than that of lowest J had the lower minimum
     assert all(np.array_equal(a.members, b.members) for a, b in zip(two.iterations, one.iterations, strict=True))
     assert two.forward_runs > one.forward_runs
+
+
+@pytest.mark.parametrize("change", [{}, {"step_control": "levenberg-marquardt"}, {"linearisation": "transform"},
+                                    {"start": "prior-mean"}])  # fmt: skip
+def test_many_members_are_treated_as_few_but_for_rounding(monkeypatch, change):
+    """Beyond a number of members nothing of N × N is made; here beyond 4."""
+    problem, settings = make_problem(Decay(), [1.5, 1.2]), AssimilationSettings(members=24, **change)
+    few = assimilate(problem, settings, 1)
+    for module in ("ensemble.linalg", "descent.weight_space"):
+        monkeypatch.setattr(f"en4dvar.{module}.FEW", 4)
+    if not change:
+        monkeypatch.setattr("en4dvar.descent.weight_space.np.eye", None)
+        monkeypatch.setattr("en4dvar.ensemble.linalg.ThinTransform.dense", property(lambda thin: 1 / 0))
+    many = assimilate(problem, settings, 1)
+    assert len(many.iterations) == len(few.iterations) > 2
+    assert many.posterior == pytest.approx(few.posterior, rel=1e-9)
+    assert many.centre == pytest.approx(few.centre, rel=1e-9)
+    assert many.iterations[1].members == pytest.approx(few.iterations[1].members, rel=1e-9)

@@ -1,19 +1,26 @@
 """Disks that are full or read-only, directories that go away, files that were damaged."""
 
 import errno
+import gc
 import os
 import random
+import resource
 import shutil
 import subprocess
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
+import xarray as xr
+from matplotlib.figure import Figure
 from rows import row
 from run_files import assert_same_results, configuration, interrupt, make_campaign, run_cli
 
 from en4dvar.errors import OutputError
 from en4dvar.report.result import load_result
+from en4dvar.report.style import save_figure
 from en4dvar.runs.runner import run_campaign, write_report
+from en4dvar.storage.netcdf import netcdf_file
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +67,50 @@ def test_writes_that_fail(quiet, tmp_path, monkeypatch, room):
     if (tmp_path / "run" / ".en4dvar-files").exists():
         run_campaign(config, resume=True)
         assert_same_results(tmp_path / "run", run)
+
+
+def full(*_, **__):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.fault("disk-failing")
+def test_no_room_for_the_lock(quiet, tmp_path, monkeypatch, capfd):
+    """Its file can often be made on a full disk, but not written."""
+    monkeypatch.setattr(os, "write", full)
+    with pytest.raises(OutputError, match="cannot be used as run directory: No space left on device"):
+        run_campaign(configuration(quiet[0], tmp_path / "run", executor="serial"))
+    monkeypatch.undo()
+    gc.collect()
+    assert not (tmp_path / "run").exists()
+    assert "ignored" not in capfd.readouterr().err
+
+
+@pytest.mark.fault("disk-failing")
+def test_no_room_for_a_figure(tmp_path, monkeypatch):
+    """Whichever way the PDF writer is stopped, it ends in an error of its own."""
+    limited = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300, limited[1]))
+    try:
+        with pytest.raises(OutputError, match=r"a\.pdf: cannot be written: File too large"):
+            save_figure(Figure(), tmp_path, "a")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limited)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.fault("disk-failing")
+def test_no_room_for_a_twin(tmp_path):
+    """The netCDF library tells "HDF error"; the operating system's reason is asked for again."""
+    limited = resource.getrlimit(resource.RLIMIT_FSIZE)
+    data = xr.Dataset({"x": ("t", np.arange(100_000.0))})
+    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, limited[1]))
+    try:
+        with pytest.raises(OutputError, match=r"a\.nc: cannot be written: File too large"):  # noqa: SIM117
+            with netcdf_file(tmp_path / "a.nc") as partial:
+                data.to_netcdf(partial, engine="netcdf4")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limited)
+    assert not list(tmp_path.iterdir())
 
 
 @contextmanager

@@ -11,7 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from cheap_model import write_campaign
+from first_starts import start_together
+from growth import measured
 from many import estimate_many
 from run_files import assert_same_results, command, configuration, environment, make_campaign, run_cli
 from toy_config import csv_text, write_toy
@@ -74,6 +77,30 @@ def test_a_long_data_file(tmp_path, rows):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "set00000" in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.fault("many-members")
+def test_memory_grows_with_the_members_not_with_their_square(tmp_path):
+    """A matrix of 5000 members by 5000 has 200 MB; a run took several. The posterior is that of 500 members."""
+    path = write_campaign(tmp_path, 1)
+    peaks, spreads = [], []
+    for members in (500, 5000):
+        words = ("run", path, "--out", tmp_path / f"{members}", "--set", "execution.executor=serial")
+        done = command(*words, "--set", f"assimilation.members={members}")
+        peaks.append(measured(done)[1])
+        with xr.open_dataset(tmp_path / f"{members}" / "posterior.nc", group="posterior") as posterior:
+            spreads.append(posterior.std())
+    assert peaks[1] - peaks[0] < 100, "MB"
+    for name in "ab":  # exact sampling and a linear model: the same moments
+        assert float(spreads[1][name]) == pytest.approx(float(spreads[0][name]), rel=1e-2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [3, pytest.param(20, marks=pytest.mark.long)])
+@pytest.mark.fault("first-starts")
+def test_first_starts_at_once(tmp_path, count):
+    assert start_together(tmp_path, count) == count
 
 
 @pytest.mark.fault("paths")

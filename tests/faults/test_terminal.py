@@ -15,6 +15,7 @@ import pytest
 from rows import row
 from run_files import assert_same_results, command, configuration, environment, make_campaign, run_cli
 
+from en4dvar.runs.interrupt import terminate_as_interrupt
 from en4dvar.runs.runner import run_campaign
 
 CTRL_C = b"\x03"
@@ -91,6 +92,33 @@ def test_ctrl_c_at_a_terminal(tmp_path, kind, presses):
     assert done.returncode == 0, done.stderr
     run_campaign(configuration(path, tmp_path / "quiet", executor="serial"))
     assert_same_results(out, tmp_path / "quiet")
+
+
+@pytest.mark.parametrize("kind", [pytest.param("processes", marks=pytest.mark.slow), "serial"])
+@pytest.mark.fault("interrupt")
+def test_a_terminal_that_is_gone(tmp_path, kind):
+    """SIGHUP comes when it is closed, and nothing can be told any more: the exit code and the run say it."""
+    path, out = make_campaign(tmp_path, 4, "execution_models:Waits"), tmp_path / "run"
+    again = words(path, out, kind)
+    terminal = Terminal(command(*again), EN4DVAR_TEST_FLAG=tmp_path / "never")
+    assert terminal.read_until(r"set\d iteration 2: J")
+    os.close(terminal.end)
+    assert terminal.process.wait(60) == int(row("interrupt").exit_code)
+    assert "interrupted" in (out / "run.log").read_text()
+    assert not (out / ".en4dvar-lock").exists()
+    done = run_cli(*again, "--resume", EN4DVAR_TEST_FLAG=path)
+    assert done.returncode == 0, done.stderr
+
+
+def test_nohup_stays_in_force():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with terminate_as_interrupt():
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert signal.getsignal(signal.SIGTERM) != signal.SIG_DFL
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 @pytest.mark.parametrize("kind", ["processes", "dask"])

@@ -12,6 +12,32 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SERIES = b"t_us,R_um\n" + b"\n".join(b"%g,%g" % (5 + 1.5 * k, 40 + 3 * k - 0.2 * k * k) for k in range(12)) + b"\n"
 
 
+FULL = """\
+name: toy
+seed: 3
+data:
+  path: toy.csv
+  columns:
+    time: {name: t_us, unit: us}
+    position: {name: R_um, unit: um}
+  window: {from: 0 us, to: 140 us, prominence: 10 %}
+  time_zero: 0 us
+  error: {position_std: 2 um, time_std: 0.01 us, robust: huber, threshold: 1.5}
+model: {name: "toy_models:Oscillator", mass: 2 g}
+parameters:
+  A: {prior: normal, mean: 100 um, std: 1 %}
+  k: {prior: lognormal, median: 3 N/m, log_std: 0.3}
+  c: {prior: logit, lower: 0 N s/m, upper: 1 N s/m, median: 0.02 N s/m, logit_std: 0.1}
+  t_s: {prior: normal, mean: 0 us, std: 1 us}
+  sigma: {prior: lognormal, mean: 1, std: 10 %}
+initial_state: {v: {std: 0.1 m/s}}
+assimilation: {members: 8, epsilon: 0.001, starts: 2, step_tolerance: 1.0e-3, min_active_fraction: 0.5}
+execution: {executor: serial, workers: 1, checkpoint_every: 0.2}
+output: {directory: runs/x, report: false}
+simulate: {times: {from: 0 us, to: 100 us, step: 1 us}}
+"""  # every section, every kind of prior, on SERIES
+
+
 def of(target: str) -> Iterator[bytes]:
     """Inputs of a target that its reader accepts."""
     match target:

@@ -10,9 +10,13 @@ import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from en4dvar.config import Config
+from en4dvar.config.build import build
 from en4dvar.config.document import read_document
 from en4dvar.config.synthetic import resolve_campaign
+from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.errors import ConfigError, DataError, En4dvarError
+from en4dvar.executor import SerialExecutor
 from en4dvar.inputs.readers import Column, Matrix, TimeStep, read_contents, read_covariance, read_series
 from en4dvar.report.result import load_result
 from en4dvar.runs.checks import validate
@@ -20,14 +24,23 @@ from en4dvar.units import UnitError, parse_quantity
 
 TIME, RADIUS = Column("t_us", "us", "s"), Column("R_um", "um", "m")
 LEAK = re.compile(r"Traceback|object at 0x|<class |NoneType|KeyError|AttributeError|not subscriptable")
-LONGEST = 20_000  # characters of a message: every fault is told, but a wall of text helps nobody
+LONGEST = 2_500  # characters of a line: every fault is told, but a wall of text helps nobody
+MOST = 500  # members of an ensemble that is drawn
 
 
 def configuration(content: bytes, folder: Path) -> bool:
-    """A YAML file, the data it names and the inverse problems it means."""
+    """A YAML file, the data it names, the inverse problems it means and the ensembles these begin with."""
     path = folder / "case.yaml"
     path.write_bytes(content)
-    return _accepted(lambda: validate(path), ConfigError, path)
+    return _accepted(lambda: _ready(path), ConfigError, path)
+
+
+def _ready(path: Path) -> None:
+    config = validate(path)
+    if not isinstance(config, Config) or config.assimilation.members > MOST:
+        return
+    for problem in build(config)[:1]:
+        WeightSpace(problem, config.assimilation, config.seed, SerialExecutor())
 
 
 def campaign(content: bytes, folder: Path) -> bool:
@@ -101,4 +114,5 @@ def _check(message: str, where: str) -> None:
     assert where in message, f"does not say where: {message!r}"
     leak = LEAK.search(message)
     assert leak is None, f"a Python detail: {message!r}"
-    assert len(message) < LONGEST, f"{len(message)} characters"
+    longest = max(map(len, message.splitlines()))
+    assert longest < LONGEST, f"{longest} characters"

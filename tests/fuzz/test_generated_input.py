@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from pathlib import Path
 
@@ -47,6 +48,26 @@ def test_configurations_of_the_right_shape(folder, data):
     document = data.draw(mutations.mutated(data.draw(st.sampled_from(CONFIGS))))
     text = yaml.safe_dump(document, allow_unicode=True, sort_keys=False)
     TARGETS["configuration"](text.encode("utf-8", "surrogatepass"), folder)
+
+
+def _one_place(folder, places):
+    """Told where it is wrong, with every warning of numpy an error."""
+    (folder / "toy.csv").write_bytes(seeds.SERIES)
+    for path, document in places:
+        text = yaml.safe_dump(document, allow_unicode=True, sort_keys=False)
+        try:
+            TARGETS["configuration"](text.encode("utf-8", "surrogatepass"), folder)
+        except Exception as error:
+            raise AssertionError(f"{'.'.join(map(str, path))}: {text[:2000]}") from error
+
+
+def test_one_odd_value_here_and_there(folder):
+    _one_place(folder, itertools.islice(mutations.one_changed(yaml.safe_load(seeds.FULL)), 0, None, 97))
+
+
+@pytest.mark.slow
+def test_every_odd_value_in_every_place(folder):
+    _one_place(folder, mutations.one_changed(yaml.safe_load(seeds.FULL)))
 
 
 @given(st.binary(max_size=200) | st.text(max_size=200).map(lambda s: s.encode("utf-8", "surrogatepass")))

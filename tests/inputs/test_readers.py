@@ -169,8 +169,8 @@ def test_bad_mat(tmp_path: Path) -> None:
         read_series(tmp_path / "cut.mat", TIME, RADIUS)
 
 
-def test_a_damaged_compressed_variable_is_told_before_scipy_reads_it(tmp_path: Path) -> None:
-    """scipy 1.16's reader ends the process (SIGSEGV) at some of these; found by fuzzing."""
+def test_a_damaged_compressed_variable_is_told(tmp_path: Path) -> None:
+    """Found by fuzzing: scipy's reader ends the process (SIGSEGV) at some of these."""
     path = tmp_path / "a.mat"
     savemat(path, {"t": np.arange(50.0), "R": 1 + np.arange(50.0) ** 2}, do_compression=True)
     good = path.read_bytes()

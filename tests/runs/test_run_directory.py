@@ -7,10 +7,13 @@ import sys
 import time
 
 import pytest
+from click.testing import CliRunner
+from rows import row
 from run_files import assert_same_results, command, configuration, environment, make_campaign
 from toy_config import write_toy
 
-from en4dvar.errors import OutputError, TooFewMembersError
+from en4dvar.cli import main
+from en4dvar.errors import DataError, OutputError, TooFewMembersError
 from en4dvar.runs import rundir
 from en4dvar.runs.lock import LOCK, locked
 from en4dvar.runs.rundir import NEXT, RunDirectory
@@ -106,18 +109,18 @@ def test_replacement_interrupted_anywhere_is_finished_later(earlier, monkeypatch
     for at in range(1, 30):
         shutil.rmtree(out)
         shutil.copytree(kept, out)
-        monkeypatch.setattr(rundir, "_replace_earlier_run", lambda path: None)
+        monkeypatch.setattr(rundir, "replace_earlier_run", lambda path: None)
         run_campaign(configuration(path, out), force=True)  # complete, but not yet in place
         monkeypatch.undo()
         steps = at
         monkeypatch.setattr(rundir.Path, "replace", dies)
         try:
-            with RunDirectory.open(out, "report"):
+            with RunDirectory.open(out, "resume"):
                 pass
         except KeyboardInterrupt:
             interrupted += 1
         monkeypatch.undo()
-        with RunDirectory.open(out, "report"):
+        with RunDirectory.open(out, "resume"):
             pass
         assert contents(out).keys() == expected.keys()
         assert not (out / NEXT).exists()
@@ -145,10 +148,72 @@ def test_resume_continues_an_interrupted_replacement(earlier, monkeypatch):
     assert_same_results(out, quiet)
 
 
-def test_resume_needs_a_run(tmp_path):
-    path = write_toy(tmp_path)
-    with pytest.raises(OutputError, match="no such run directory"):
-        run(configuration(path, tmp_path / "nowhere"), resume=True)
+@pytest.mark.fault("requeued")
+@pytest.mark.parametrize("left", ["nothing", "an empty folder", "an empty list and a lock"])
+def test_resume_of_a_job_killed_before_it_began(tmp_path, left):
+    path, out = write_toy(tmp_path), tmp_path / "run"
+    if left != "nothing":
+        out.mkdir()
+    if left == "an empty list and a lock":
+        (out / rundir.LISTING).write_text("")
+        (out / LOCK).write_text("process 1 on nowhere\n")
+        assert run(configuration(path, out)).name == "toy"  # without --resume, too
+        shutil.rmtree(out)
+    found = CliRunner().invoke(main, ["run", str(path), "--out", str(out), "--no-report", "--resume"])
+    assert found.exit_code == int(row("requeued").exit_code), found.stderr
+    assert row("requeued").told(found.stderr)
+    again = CliRunner().invoke(main, ["run", str(path), "--out", str(out), "--no-report", "--resume"])
+    assert again.exit_code == 0
+    assert "note: " not in again.stderr
+
+
+def test_resume_needs_a_run_or_nothing(tmp_path):
     (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match="holds no run"):
-        run(configuration(path, tmp_path / "mine"), resume=True)
+        run(configuration(write_toy(tmp_path), tmp_path / "mine"), resume=True)
+
+
+def test_the_directory_is_there_before_the_model_is(tmp_path, monkeypatch):
+    """What follows may compile for a minute. Data that cannot be used leave nothing, as before."""
+    path, out = write_toy(tmp_path), tmp_path / "runs" / "run"
+
+    def looks(*_):
+        assert (out / rundir.LISTING).exists()
+        raise DataError("unusable")
+
+    monkeypatch.setattr("en4dvar.runs.runner.build_one", looks)
+    with pytest.raises(DataError, match="unusable"):
+        run(configuration(path, out))
+    assert not out.exists()
+    monkeypatch.undo()
+    run(configuration(path, out))
+    before = contents(out)
+    monkeypatch.setattr("en4dvar.runs.runner.build_one", lambda *_: looks())
+    with pytest.raises(DataError, match="unusable"):
+        run(configuration(path, out), force=True)
+    assert contents(out) == before
+
+
+@pytest.mark.fault("chdir")
+@pytest.mark.parametrize("at_import", [False, True])
+def test_a_model_that_leaves_the_folder(tmp_path, monkeypatch, at_import):
+    """A relative --out stays where it was when the command was given."""
+    folder = tmp_path / "here"
+    folder.mkdir()
+    (tmp_path / "there").mkdir()
+    leave = f"import os; os.chdir({str(tmp_path / 'there')!r})"
+    (tmp_path / f"leaving{at_import}.py").write_text(
+        "from toy_models import Oscillator\n"
+        + (f"{leave}\n" if at_import else "")
+        + f"class Leaves(Oscillator):\n    def step(self, *a, **k):\n        {leave}\n"
+        "        return super().step(*a, **k)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    path = write_toy(folder, ("toy_models:Oscillator", f"leaving{at_import}:Leaves"))
+    monkeypatch.chdir(folder)
+    words = ["run", str(path), "--out", "run", "--no-report", "--set", "execution.executor=serial"]
+    done = CliRunner().invoke(main, words)
+    assert done.exit_code == 0, done.stderr
+    assert (folder / "run" / "posterior.nc").is_file()
+    assert not list((tmp_path / "there").iterdir())

@@ -17,6 +17,7 @@ import numpy as np
 
 from en4dvar.errors import ConfigError
 from en4dvar.state import Array, Parameter
+from en4dvar.user_file import is_from_file
 from en4dvar_bubble.laws.memory import MemoryTables, MemoryVariable
 from en4dvar_bubble.laws.parameters import MU
 from en4dvar_bubble.laws.tabulate import (
@@ -30,8 +31,6 @@ from en4dvar_bubble.laws.tabulate import (
 from en4dvar_bubble.tables import evaluate, from_values
 
 REGISTRY: dict[str, type[ConstitutiveLaw]] = {}
-FILE_MODULE = "_en4dvar_bubble_law_"
-"""Module names of laws loaded from a file; such laws are not registered."""
 _TOGETHER = 48  # members sampled at once: their temporary arrays fit in the cache
 _EXAMPLE_BY_NAME = {"G": 5e3, "alpha": 0.03, "mu": 0.1}
 _EXAMPLE_BY_UNIT = {"Pa": 5e3, "Pa s": 0.1, "s": 1e-6, "1": 0.5}
@@ -63,25 +62,16 @@ class ConstitutiveLaw:
     """Whether J_e falls with the stretch everywhere, so that it always opposes the strain."""
     stretch_range: ClassVar[tuple[float, float]] = (0.2, 400.0)
     """Stretches over which the battery tests the law at the example values."""
-    reference: ClassVar[Any] = None
-    """Of a class from a file: what makes an instance of it again when it is called, see ``loading.FileReference``."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         own = cls.__dict__.get("name")
         cls.name = own or cls.__name__
-        if own and not cls.__module__.startswith(FILE_MODULE):
+        if own and not is_from_file(cls):  # a law from a file is not registered: two files may name theirs alike
             present = REGISTRY.get(cls.name, cls)
             if (present.__module__, present.__qualname__) != (cls.__module__, cls.__qualname__):
                 raise ConfigError(f"two laws are called {cls.name!r}: {present.__module__} and {cls.__module__}")
             REGISTRY[cls.name] = cls
-
-    def __reduce_ex__(self, protocol: Any) -> Any:
-        """A law from a file is pickled by reference: a spawned worker cannot import its module."""
-        reference = type(self).__dict__.get("reference")
-        if reference is None:
-            return super().__reduce_ex__(protocol)
-        return reference, (), self.__dict__ or None
 
     def stress(self, stretch: Array, p: Any) -> Array:
         """J_e(λ) (N, K) in Pa at stretches (K,): the elastic part of the stress integral; ``p.G`` is (N, 1)."""

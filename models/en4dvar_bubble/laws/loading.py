@@ -2,39 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
-import sys
-import traceback
-from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
+from en4dvar import user_file
 from en4dvar.errors import ConfigError
-from en4dvar.hints import no_such_file, suggest
-from en4dvar_bubble.laws.base import FILE_MODULE, REGISTRY, ConstitutiveLaw
+from en4dvar.hints import suggest
+from en4dvar.user_code import file_of, loading, require_permission
+from en4dvar_bubble.laws.base import REGISTRY, ConstitutiveLaw
 from en4dvar_bubble.laws.validity import check_law
 
 GROUP = "en4dvar_bubble.laws"
-
-
-@dataclass(frozen=True)
-class FileReference:
-    """Where a law was loaded from: absolute path, class name and hash of the source."""
-
-    path: str
-    name: str
-    digest: str
-
-    def __call__(self) -> ConstitutiveLaw:
-        """The unpickled law, loaded again. Raises :class:`ConfigError` if the file is no longer the same."""
-        path = Path(self.path)
-        if path.is_file() and _digest(path, path.read_bytes()) != self.digest:
-            raise ConfigError(f"{path}: the file has changed since the law {self.name} was loaded from it")
-        law: ConstitutiveLaw = _from_file(path, self.name)()
-        return law
 
 
 def get_law(name: str, base: Path | None = None) -> ConstitutiveLaw:
@@ -49,10 +29,11 @@ def get_law(name: str, base: Path | None = None) -> ConstitutiveLaw:
     if name in REGISTRY:
         return REGISTRY[name]()
     where, colon, attribute = name.rpartition(":")
-    if colon and (where.endswith(".py") or "/" in where or "\\" in where):
-        path = ((base or Path.cwd()) / Path(where).expanduser()).resolve()
-        found = _from_file(path, attribute)
+    if user_file.is_file_reference(name):
+        require_permission(f"law {name!r}", Path(where))
+        found = user_file.load(user_file.absolute(name, base))
     elif colon:
+        require_permission(f"law {name!r}", file_of(where))
         found = _from_module(where, attribute)
     else:
         found = _from_entry_point(name)
@@ -61,8 +42,7 @@ def get_law(name: str, base: Path | None = None) -> ConstitutiveLaw:
 
 def qualified(name: str, base: Path | None = None) -> str:
     """``name`` with the path of a ``file.py:Class`` made absolute, so that it means the same from any folder."""
-    reference = type(get_law(name, base)).reference
-    return f"{reference.path}:{reference.name}" if reference else name
+    return user_file.absolute(name, base) if user_file.is_from_file(type(get_law(name, base))) else name
 
 
 def available() -> dict[str, type[ConstitutiveLaw] | ConfigError]:
@@ -76,32 +56,9 @@ def available() -> dict[str, type[ConstitutiveLaw] | ConfigError]:
     return dict(sorted((laws | REGISTRY).items()))
 
 
-def _from_file(path: Path, attribute: str) -> Any:
-    if not path.is_file():
-        raise ConfigError(no_such_file(path))
-    source = path.read_bytes()
-    digest = _digest(path, source)
-    key = f"{FILE_MODULE}{digest[:20]}"
-    if key not in sys.modules:
-        module = ModuleType(key)
-        module.__file__ = str(path)
-        sys.modules[key] = module
-        try:
-            exec(compile(source, str(path), "exec"), module.__dict__)
-        except Exception as error:
-            del sys.modules[key]
-            raise ConfigError(f"{_line(error, path)}: {type(error).__name__}: {error}") from error
-    found = _attribute(sys.modules[key], attribute, str(path))
-    if isinstance(found, type) and issubclass(found, ConstitutiveLaw) and found.__module__ == key:
-        found.reference = FileReference(str(path), attribute, digest)
-    return found
-
-
 def _from_module(where: str, attribute: str) -> Any:
-    try:
-        return _attribute(import_module(where), attribute, where)
-    except ImportError as error:
-        raise ConfigError(f"law '{where}:{attribute}' cannot be imported: {error}") from error
+    with loading(f"law '{where}:{attribute}' cannot be imported"):
+        return user_file.class_of(import_module(where), attribute, where)
 
 
 def _from_entry_point(name: str) -> Any:
@@ -110,26 +67,5 @@ def _from_entry_point(name: str) -> Any:
         known = sorted({*REGISTRY, *registered})
         own = "; a class of your own is my_law.py:ClassName" if name.endswith(".py") else ""
         raise ConfigError(f"unknown law {name!r}{own or suggest(name, known)}")
-    try:
+    with loading(f"law {name!r}: entry point {registered[name].value!r} cannot be loaded"):
         return registered[name].load()
-    except Exception as error:
-        raise ConfigError(f"law {name!r}: entry point {registered[name].value!r} cannot be loaded: {error}") from error
-
-
-def _attribute(module: ModuleType, name: str, where: str) -> Any:
-    if not hasattr(module, name):
-        classes = [n for n, v in vars(module).items() if isinstance(v, type) and v.__module__ == module.__name__]
-        raise ConfigError(f"{where}: no class {name!r}{suggest(name, classes)}")
-    return getattr(module, name)
-
-
-def _digest(path: Path, source: bytes) -> str:
-    return hashlib.sha256(str(path).encode() + b"\0" + source).hexdigest()
-
-
-def _line(error: Exception, path: Path) -> str:
-    """``file:line`` of the error in the user's file."""
-    if isinstance(error, SyntaxError) and error.filename == str(path):
-        return f"{path}:{error.lineno}"
-    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
-    return f"{path}:{lines[-1]}" if lines else str(path)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numba as nb
 import numpy as np
 
+from en4dvar.compiled import kernel
 from en4dvar.state import Array
 from en4dvar_bubble.tables import HALO, Grid, from_slopes, from_values, quintic
 
@@ -56,7 +56,7 @@ def from_strain_energy(rate: Function, n: int) -> Array:
     return np.asarray(_coarsen(from_slopes(slopes, _FINE.step, _UNSTRETCHED - HALO), _REFINE, GRID.cells))
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def _coarsen(fine, ratio, cells):  # type: ignore[no-untyped-def]
     """Cells as wide as ``ratio`` fine ones, with value, slope and curvature of the fine table at their ends."""
     n = fine.shape[0]

@@ -12,6 +12,7 @@ import numpy as np
 from en4dvar.errors import ConfigError
 from en4dvar.hints import suggest
 from en4dvar.state import Parameter
+from en4dvar.user_code import reason_of
 from en4dvar_bubble.laws.base import ConstitutiveLaw, columns
 from en4dvar_bubble.laws.memory import MemoryVariable
 
@@ -30,6 +31,8 @@ def check_law(found: Any, name: str) -> ConstitutiveLaw:
         law = found()
     except TypeError as error:
         raise ConfigError(f"{name}: cannot be created without arguments: {error}") from error
+    except BaseException as error:
+        raise ConfigError(f"{name}: cannot be created: {reason_of(error)}") from error
     _probe(law, name)
     return law
 
@@ -97,13 +100,12 @@ def _run(call: Callable[[], Any], where: str) -> Any:
     try:
         with np.errstate(all="ignore"):
             return call()
-    except Exception as error:
+    except BaseException as error:
+        reason = reason_of(error)
         frame = traceback.extract_tb(error.__traceback__)[-1]
         hint = ""
         if isinstance(error, AttributeError) and isinstance(error.obj, SimpleNamespace):
             hint = f"; p has no {error.name!r}{suggest(error.name, vars(error.obj))}"
         elif isinstance(error, ValueError) and "truth value" in str(error):
             hint = "; the arguments are arrays: write np.where instead of if, np.minimum instead of min"
-        raise ConfigError(
-            f"{where}: {type(error).__name__}: {error}{hint} ({frame.filename}:{frame.lineno})"
-        ) from error
+        raise ConfigError(f"{where}: {reason}{hint} ({frame.filename}:{frame.lineno})") from error

@@ -10,6 +10,7 @@ import numba as nb
 import numpy as np
 from numba.core import types
 
+from en4dvar.compiled import kernel
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.arrays import Lanes, Loaded, Workspace
 from en4dvar_bubble.solver.lanes import WIDTH, peek, take
@@ -245,7 +246,7 @@ def _march(members, lanes, eq, control, w, out):
                 running -= 1
 
 
-@nb.njit(cache=True, nogil=True)
+@kernel
 def integrate(members, eq, control, out):
     """Integrate all members and write their states at the output times; the arguments are those of :mod:`arrays`."""
     w = _workspace(eq.dims.gas, members.initial.shape[1])

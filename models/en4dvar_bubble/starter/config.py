@@ -12,6 +12,7 @@ from en4dvar.config import resolve
 from en4dvar.config.build import build_one, find_files
 from en4dvar.config.document import parse_document
 from en4dvar.errors import ConfigError, DataError
+from en4dvar.files import expanded
 from en4dvar.inputs.readers import Column, TimeStep, read_series
 from en4dvar.inputs.text_table import Decimal
 from en4dvar.state import Array
@@ -137,13 +138,13 @@ def _unit_in(name: str) -> str:
 
 def path_from(folder: Path, data: str) -> str:
     """``data`` as a file in ``folder`` says it: relative where both share more than the root."""
-    path, here = Path(data).expanduser().absolute(), folder.absolute()
+    path, here = expanded(data).absolute(), folder.absolute()
     near = path.parts[:2] == here.parts[:2] and len(here.parts) > 1
     return Path(os.path.relpath(path, here)).as_posix() if near else path.as_posix()
 
 
 def run_name(data: str) -> str:
     """Name of a run from the path of its data (or of its file): letters, digits, dots and dashes."""
-    path = Path(data).expanduser().absolute()
+    path = expanded(data).absolute()
     stem = path.parent.name if any(sign in path.name for sign in "*?[") else path.name if path.is_dir() else path.stem
     return re.sub(r"[^\w.+-]", "_", stem).lstrip(".-+") or "bubble"

@@ -1,0 +1,75 @@
+"""Kernels: functions that numba compiles once and keeps on disk for later processes.
+
+Numba writes beside the source file, or below the user's cache folder; where neither can be written (an installation and
+a HOME that are read-only, as on many clusters) it refuses to declare the function at all. Kernels are then kept in a
+folder of the user's own below the system's temporary one. ``NUMBA_CACHE_DIR`` goes before all of these.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+
+from en4dvar.errors import OutputError
+
+F = TypeVar("F", bound=Callable[..., Any])
+CACHE = "NUMBA_CACHE_DIR"
+
+
+def kernel(function: F) -> F:
+    """``function`` compiled by numba, kept on disk, without the interpreter's lock.
+
+    Raises
+    ------
+    OutputError: nowhere can compiled code be kept.
+    """
+    compile_: Callable[[F], Any] = numba.njit(cache=True, nogil=True)
+    try:
+        compiled: F = compile_(function)
+    except RuntimeError:  # numba found no folder
+        _keep_in_a_temporary_folder()
+        compiled = compile_(function)
+    return compiled
+
+
+def _keep_in_a_temporary_folder() -> None:
+    """Tell numba of a folder that can be written, here and in processes that start from here; say so."""
+    try:
+        folder = _own_folder(Path(tempfile.gettempdir()))
+    except OSError as error:
+        raise OutputError(
+            f"no folder can be written to keep compiled code in ({error.strerror}); set {CACHE} to one"
+        ) from None
+    asked = os.environ.get(CACHE)
+    os.environ[CACHE] = str(folder)
+    numba.config.reload_config()
+    places = f"{CACHE}={asked}" if asked else "neither the program's folder nor the user's cache folder"
+    print(
+        f"note: {places} cannot be written; compiled code is kept in {folder}, and compiled again where that is gone"
+        f" (set {CACHE} to a folder that stays)",
+        file=sys.stderr,
+    )
+
+
+def _own_folder(temporary: Path) -> Path:
+    """A folder that nobody else can write: numba runs what it finds there.
+
+    It has the same name for every process of the user; where somebody else holds that name, a new one is made.
+    """
+    user = os.getuid() if hasattr(os, "getuid") else None
+    folder = temporary / f"en4dvar-numba-{'user' if user is None else user}"
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    found = folder.lstat()
+    foreign = user is not None and (found.st_uid != user or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
+    if foreign or not stat.S_ISDIR(found.st_mode) or not os.access(folder, os.W_OK):
+        return Path(tempfile.mkdtemp(prefix="en4dvar-numba-", dir=temporary))
+    return folder

@@ -1,0 +1,69 @@
+"""Whether a model gives the same numbers again: two members of an ensemble are run a second time, in another order.
+
+Noise in a model is not part of the observation errors: differences of members that are close measure it instead of the
+slope, and the posterior is far too sure of itself. A state that a model keeps between members makes its numbers depend
+on their order, and so on the number of workers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from en4dvar.errors import ConfigError
+from en4dvar.forward import ForwardModel
+from en4dvar.state import Array
+
+ROUNDING = 1e-9  # of the largest value: what members of a batch may owe to those beside them
+NOT_THE_MODEL = ("TimeLimitError: ", "MemoryError: ", "a worker process died")  # reasons that depend on the machine
+
+
+def check_repeats(
+    model: ForwardModel,
+    first: Array,
+    failures: Sequence[str],
+    run_again: Callable[[list[int]], tuple[Array, Sequence[str]]],
+    name: str = "",
+) -> None:
+    """Run the last and the first of the members that are alive again, in this order, and compare.
+
+    Parameters
+    ----------
+    first: (N, ...) what the members gave, ``failures`` (N,) reasons, "" for those alive.
+    run_again: members → the same of these.
+
+    Raises
+    ------
+    ConfigError: they differ: at all where the model runs members one by one, by more than rounding where it runs
+        batches.
+    """
+    alive = [i for i, reason in enumerate(failures) if not reason]
+    again = list(dict.fromkeys((alive[-1], alive[0]))) if alive else []
+    if not again:
+        return
+    second, reasons = run_again(again)
+    for i, values, reason in zip(again, second, reasons, strict=True):
+        if reason.startswith(NOT_THE_MODEL) or (not reason and np.array_equal(values, first[i], equal_nan=True)):
+            continue
+        if reason:
+            difference = f"fails the second time: {reason}"
+        else:
+            largest = float(np.max(np.abs(first[i]), initial=0.0))
+            apart = float(np.max(np.abs(values - first[i]), initial=0.0))
+            if apart <= (ROUNDING * largest if _in_batches(model) else 0.0):
+                continue
+            difference = f"differs by up to {apart / largest if largest else apart:.2g} of its largest value"
+        where = f"{name}: " if name else ""
+        raise ConfigError(
+            f"{where}the model gives other numbers when a member is run again (member {i + 1} {difference}); noise or "
+            "a state that it keeps makes posteriors wrong and results different each time. Seed it in each member and "
+            "keep nothing between members, or accept it with assimilation: {stochastic_model: true}"
+        )
+
+
+def _in_batches(model: ForwardModel) -> bool:
+    """Whether the model has its own way with many members, where rounding may depend on those beside a member."""
+    kind = type(model)
+    own = (kind.trajectories, kind.initial_states)
+    return own != (ForwardModel.trajectories, ForwardModel.initial_states)

@@ -1,0 +1,88 @@
+"""The files of a run directory: the list of what a run wrote, and a new run's taking the place of an earlier one's.
+
+The directory may be a stranger's: every name, of the list or of ours, goes through :func:`en4dvar.files.inside`.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+from en4dvar.errors import OutputError
+from en4dvar.files import inside, open_plain, write_text
+from en4dvar.storage.store import COMPLETE, NEXT
+
+LISTING = ".en4dvar-files"
+OLD = ".en4dvar-old"
+FOLDERS = ("datasets", "figures", "pages", "checkpoints")
+PARTIAL = re.compile(r"\..+\.\d+\.tmp")  # of en4dvar.files, left by a process that was killed
+
+
+def finish_replacement(path: Path) -> None:
+    """Put in place what an earlier run had completed, and clear away what it had not begun."""
+    following = inside(path, NEXT)
+    remove_folder(inside(path, OLD))
+    if (following / COMPLETE).exists():
+        replace_earlier_run(path)
+    if not (following / LISTING).exists():  # of a run that ended before it began
+        remove_folder(following)
+
+
+def replace_earlier_run(path: Path) -> None:
+    """Move the files of ``.en4dvar-next`` into place. Can be repeated after it was interrupted anywhere."""
+    following = inside(path, NEXT)
+    names = listed_files(following)
+    targets = [inside(path, name) for name in names]
+    _remove(path, set(listed_files(path)) - set(names))
+    for name, target in zip(names, targets, strict=True):
+        if (following / name).exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            (following / name).replace(target)
+    write_list(path, names)
+    following.rename(path / OLD)  # at once: half of this folder would look like an interrupted run
+    remove_folder(path / OLD)
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder and what is in it, if it is there; links in it are removed, not followed."""
+    if folder.is_dir():
+        shutil.rmtree(folder)
+
+
+def _remove(path: Path, names: Iterable[str]) -> None:
+    for name in names:
+        if (file := inside(path, name)).is_file():
+            file.unlink()
+    for name in FOLDERS:
+        if (folder := inside(path, name)).is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+
+
+def remove_partial(work: Path) -> None:
+    """Remove what a process that was killed had half written."""
+    for folder in (work, *(inside(work, name) for name in FOLDERS)):
+        for file in folder.glob(".*.tmp"):
+            if PARTIAL.fullmatch(file.name):
+                file.unlink()
+
+
+def write_list(work: Path, names: Iterable[str]) -> None:
+    """List the files of a run. Raises :class:`OutputError`."""
+    write_text(work / LISTING, "".join(f"{name}\n" for name in names))
+
+
+def listed_files(work: Path) -> tuple[str, ...]:
+    """The names in the list of ``work``, each of a place in ``work``. Raises :class:`OutputError`."""
+    listing = inside(work, LISTING)
+    try:
+        with open_plain(listing) as file:
+            names = tuple(file.read().decode("utf-8").splitlines())
+    except FileNotFoundError:
+        return ()
+    except UnicodeDecodeError:
+        raise OutputError(f"{listing}: damaged; it is no list of files") from None
+    for name in names:
+        inside(work, name)
+    return names

@@ -1,0 +1,87 @@
+"""Whether a file with a good seal holds what a result consists of: anybody can seal a file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import xarray as xr
+
+from en4dvar.config.symbols import symbol_fault
+from en4dvar.errors import OutputError
+from en4dvar.units import UnitError, convert
+
+_GROUPS = (
+    "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "constant_data", "sample_stats",
+    "log_likelihood", "iterations",
+)  # fmt: skip
+_ATTRIBUTES = {
+    "/": ("dataset", "warnings", "assimilation_settings"),
+    "/observed_data": ("data_source",),
+    "/sample_stats": (
+        "n_members", "n_active", "n_observations", "n_weighted", "nrmse", "chi2_per_observation", "dfs",
+        "n_iterations", "converged", "stop_reason", "forward_runs",
+    ),
+}  # fmt: skip
+# Variables that are read, * for each parameter and % for the observable.
+_VARIABLES = {
+    "/prior": "*",
+    "/prior_predictive": "%_path path_time",
+    "/posterior_predictive": "%_path path_time",
+    "/observed_data": "% %_std %_reading_std time_std weights time",
+    "/sample_stats": "active failure_reason centre dfs %_centre parameter",
+    "/iterations": "J J_background J_observation step_norm step_length chi2_per_observation dfs spread active *"
+    " *_centre",
+}
+_SHOWN = ("", "_std", "_reading_std", "_path")  # of the observable, in its display unit
+_NAMED = ("/prior", "/posterior", "/constant_data")  # groups whose variables go into tables and labels
+
+
+def check_complete(path: Path, nodes: Mapping[str, xr.Dataset]) -> None:
+    """Check the groups of a file, by their path in it. Raises :class:`OutputError`, which names what is missing."""
+    for fault in _faults(nodes):
+        raise OutputError(f"{path}: not a result of en4dvar: {fault}")
+
+
+def _faults(nodes: Mapping[str, xr.Dataset]) -> Iterator[str]:
+    if missing := [group for group in _GROUPS if f"/{group}" not in nodes]:
+        yield f"no group {', '.join(missing)}"
+    for group, attributes in _ATTRIBUTES.items():
+        if missing := [name for name in attributes if name not in nodes[group].attrs]:
+            yield f"{group} has no attribute {', '.join(missing)}"
+    parameters, observables = map(str, nodes["/posterior"].data_vars), list(nodes["/log_likelihood"].data_vars)
+    if len(observables) != 1:
+        yield "/log_likelihood has no variable"
+    named = {"*": list(parameters), "%": [str(observables[0])]}
+    for group, names in {**_VARIABLES, "/posterior": "*", "/constant_data": ""}.items():
+        held, group_needs = nodes[group].variables, list(_expanded(names, named))
+        if missing := [name for name in group_needs if name not in held]:
+            yield f"{group} has no variable {', '.join(missing)}"
+        yield from _label_faults(group, nodes[group], named["%"][0])
+
+
+def _expanded(names: str, named: Mapping[str, list[str]]) -> Iterator[str]:
+    for name in names.split():
+        yield from (name.replace(name[0], one, 1) for one in named.get(name[0], [name[0]]))
+
+
+def _label_faults(group: str, dataset: xr.Dataset, observable: str) -> Iterator[str]:
+    """What keeps variables with a display unit or a symbol from being shown."""
+    for name, variable in dataset.variables.items():
+        about = variable.attrs
+        wanted = ["units"]
+        if group in _NAMED and name not in ("chain", "draw"):
+            wanted += ["display_units", "long_name", "symbol"]
+        elif name in ("time", "path_time", *(observable + end for end in _SHOWN)) or "symbol" in about:
+            wanted += ["display_units"]
+        if group == "/observed_data" and name == observable:
+            wanted += ["long_name", "symbol"]
+        if missing := [key for key in wanted if key not in about]:
+            yield f"{group}/{name} has no attribute {', '.join(missing)}"
+        try:
+            convert(1.0, str(about["units"]), str(about.get("display_units", about["units"])))
+        except UnitError as error:
+            yield f"{group}/{name}: {error}"
+        for key in ("symbol", "long_name"):
+            if reason := symbol_fault(str(about.get(key, ""))):
+                yield f"{group}/{name}: its {key} cannot be written in a figure: {reason}"

@@ -1,0 +1,125 @@
+"""Commands in forked children: on a disk that takes files up to a size only, with a failing call, killed half-way.
+
+``python children.py`` has imported everything, so that a child costs tenths of a second; it reads tasks as JSON and
+writes what came of them.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import traceback
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+TESTS = Path(__file__).resolve().parents[1]
+
+
+@dataclass
+class Task:
+    """``words`` of the command line. ``copy`` is put in place of ``to`` before.
+
+    ``limit``: bytes that a file may have (the kernel's own refusal, EFBIG); ``fails``: a function of ``os`` that ends
+    in ``error``; ``kill_at``: number of the operation on files at which the process is gone.
+    """
+
+    words: list[str]
+    copy: str = ""
+    to: str = ""
+    limit: int | None = None
+    fails: str = ""
+    error: str = ""
+    kill_at: int = 0
+
+
+@dataclass
+class Outcome:
+    """``code``: exit code, negative for a signal; ``operations`` on files, where the end was reached."""
+
+    code: int
+    told: str
+    operations: int
+
+
+def attempt(tasks: list[Task], timeout: float = 300) -> list[Outcome]:
+    """What came of each task, in order."""
+    environment = {**os.environ, "PYTHONPATH": str(TESTS), "EN4DVAR_TEST_PAUSE": "0", "MPLBACKEND": "agg"}
+    done = subprocess.run(
+        [sys.executable, __file__], input=json.dumps([asdict(t) for t in tasks]), capture_output=True, text=True,
+        env=environment, timeout=timeout,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-4000:]
+    return [Outcome(**found) for found in json.loads(done.stdout)]
+
+
+def _child(task: Task, told: int) -> None:
+    """Ends the process; its last line is the number of operations."""
+    from killing import Boundary
+
+    from en4dvar.cli import main
+
+    boundary = Boundary(task.kill_at)
+    os.dup2(told, 2)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    if task.limit is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (task.limit, task.limit))
+    if task.fails:
+        _break(task.fails, getattr(errno, task.error))
+    else:
+        boundary.install()
+    sys.argv = ["en4dvar", *task.words]
+    code = 99
+    try:
+        main(task.words)
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    except BaseException:
+        traceback.print_exc()
+    sys.stderr.flush()
+    os.write(2, f"{len(boundary.seen)}\n".encode())
+    os._exit(code)
+
+
+def _break(name: str, number: int) -> None:
+    def broken(path: Any, *_: Any, **__: Any) -> None:
+        raise OSError(number, os.strerror(number), path if isinstance(path, str | Path) else None)
+
+    setattr(os, name, broken)
+
+
+def _do(task: Task) -> Outcome:
+    if task.to:
+        shutil.rmtree(task.to, ignore_errors=True)
+    if task.copy:
+        shutil.copytree(task.copy, task.to)
+    read, write = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        _child(task, write)
+    os.close(write)
+    with os.fdopen(read) as pipe:
+        told = pipe.read()
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    told, _, operations = told.rstrip("\n").rpartition("\n") if code >= 0 else (told, "", "0")
+    return Outcome(code, told, int(operations))
+
+
+def main() -> None:
+    sys.path.insert(0, str(TESTS))
+    import en4dvar.report.overlay
+    import en4dvar.report.twin
+    import en4dvar.runs.runner  # noqa: F401
+    from en4dvar.storage.fingerprint import source_digest
+
+    source_digest("en4dvar")
+    print(json.dumps([asdict(_do(Task(**task))) for task in json.loads(sys.stdin.read())]))
+
+
+if __name__ == "__main__":
+    main()

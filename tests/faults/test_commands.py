@@ -1,0 +1,164 @@
+"""Every command on a disk, or with a quota, that is full, on one that fails, and killed: what it says and leaves."""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from children import Task, attempt
+from rows import row
+from run_files import command, environment, make_campaign, run_cli
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+TWIN = """\
+name: twin
+model: {name: lorenz96, size: 12}
+twin: {cycles: 5, burn_in: 1, interval: 0.05, error: {x_std: 1}, initial_std: {x: 0.1}}
+assimilation: {scheme: etkf, members: 15, inflation: 1.02}
+"""
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reason="limits and forks of POSIX")]
+
+
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory):
+    return prepare(tmp_path_factory.mktemp("quiet"))
+
+
+def prepare(folder):
+    """A folder with configurations and what the commands make of them on a good disk."""
+    make_campaign(folder, 2)
+    (folder / "twin.yaml").write_text(TWIN)
+    tasks = [
+        Task(["run", str(folder / f"{config}.yaml"), "--out", str(folder / name), "--no-report"])
+        for config, name in (("toy", "done"), ("toy", "other"), ("twin", "twin"))
+    ]
+    for found in attempt(tasks):
+        assert found.code == 0, found.told
+    return folder
+
+
+def calls(folder, out):
+    """Words of each command that writes, and the folder that it starts from."""
+    toy, done, twin, other = (str(folder / name) for name in ("toy.yaml", "done", "twin", "other"))
+    quick = str(CONFIGS / "quickstart.yaml")
+    study = str(CONFIGS / "agarose_study.yaml")
+    return {
+        "run": (["run", toy, "--out", out], ""),
+        "run --force": (["run", toy, "--out", out, "--force", "--no-report"], done),
+        "run --resume": (["run", toy, "--out", out, "--resume", "--no-report"], done),
+        "run of a twin": (["run", f"{folder}/twin.yaml", "--out", out], ""),
+        "report": (["report", out], done),
+        "report of a twin": (["report", out], twin),
+        "compare": (["compare", done, other, "--out", out], ""),
+        "export": (["export", done, "--out", f"{out}.csv"], ""),
+        "simulate": (["simulate", toy, "--set", "parameters.A=1 mm", "--out", f"{out}.csv"], ""),
+        "simulate a campaign": (["simulate", str(CONFIGS / "agarose_twin.yaml"), "--out", out], ""),
+        "validate --plot": (["validate", toy, "--plot", "--set", f"output.directory={out}/x"], ""),
+        "schema": (["schema", "--out", f"{out}.json"], ""),
+        "init": (["init", "--out", f"{out}.yaml"], ""),
+        "sweep": (["sweep", quick, "--trajectories", "64", "--step", "0.2 us", "--out", out], ""),
+        "study": (["study", study, "--out", out], ""),
+    }
+
+
+def files(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in Path(folder).rglob("*") if p.is_file()}
+
+
+def assert_told(task, found, reason):
+    """Exit code 2 with one reason, no half-written file, and what was there still there."""
+    assert found.code == int(row("disk-failing").exit_code), (task.words, found.told)
+    assert reason in found.told, (task.words, found.told)
+    assert "Traceback" not in found.told, found.told
+    assert "Exception ignored" not in found.told, found.told
+    assert not [p for p in Path(task.to).parent.rglob("*") if p.name.endswith(".tmp") or p.name == ".en4dvar-lock"]
+    if task.copy:
+        after = files(task.to)
+        assert all(after[name] for name in files(task.copy) if name.suffix != ".log")
+
+
+@pytest.mark.parametrize("fault", [("fsync", "EIO"), ("replace", "EDQUOT"), ("fsync", "ENOSPC")], ids="-".join)
+@pytest.mark.fault("disk-failing")
+def test_a_call_that_fails(quiet, tmp_path, fault):
+    """Injected where the operating system is asked; every command flushes and renames what it writes."""
+    tasks = []
+    for number, name in enumerate(calls(quiet, "")):
+        words, before = calls(quiet, str(tmp_path / f"out{number}"))[name]
+        if name in ("run", "run of a twin", "report", "compare") or (fault[1] == "EIO" and name != "study"):
+            tasks.append(Task(words, before, str(tmp_path / f"out{number}"), fails=fault[0], error=fault[1]))
+    reason = {"EIO": "Input/output error", "EDQUOT": "Disk quota exceeded", "ENOSPC": "No space left on device"}
+    for task, found in zip(tasks, attempt(tasks), strict=True):
+        assert_told(task, found, reason[fault[1]])
+        assert row("disk-failing").told(found.told) or "cannot be used as run directory" in found.told
+
+
+@pytest.mark.parametrize("limit", [0, 300, 9000])
+@pytest.mark.fault("disk-failing")
+def test_no_room(quiet, tmp_path, limit):
+    """The kernel refuses bytes beyond a size, also those of libraries (HDF5, PDF)."""
+    tasks = []
+    for number, name in enumerate(calls(quiet, "")):
+        words, before = calls(quiet, str(tmp_path / f"out{number}"))[name]
+        if name != "study" or limit < 9000:  # it would be computed first
+            tasks.append(Task(words, before, str(tmp_path / f"out{number}"), limit=limit))
+    for task, found in zip(tasks, attempt(tasks), strict=True):
+        if limit == 0 or found.code:
+            assert_told(task, found, "File too large")
+    begun = [t for t in tasks if t.words[0] == "run" and t.copy == ""]
+    for found in attempt([Task([*task.words, "--resume", "--no-report"]) for task in begun]):
+        assert found.code == 0, found.told
+
+
+@pytest.mark.parametrize("words", [("export", "done"), ("schema",), ("models",), ("run", "toy.yaml", "--no-report")])
+@pytest.mark.fault("output-full")
+def test_output_that_cannot_be_written(quiet, tmp_path, words):
+    """A log on a full disk; nothing is told twice, and the exit code says it even where nothing can be told."""
+    given = [str(quiet / w) if w in ("done", "toy.yaml") else w for w in words]
+    given += ["--out", str(tmp_path / "out")] if words[0] == "run" else []
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command(*given), stdout=full, stderr=subprocess.PIPE, text=True, env=environment())
+        assert done.returncode == int(row("output-full").exit_code), done.stderr
+        assert done.stderr == "standard output: cannot be written: No space left on device\n"
+        if words[0] in ("export", "run"):
+            shutil.rmtree(tmp_path / "out", ignore_errors=True)
+            assert subprocess.run(command(*given), stdout=full, stderr=full, env=environment()).returncode == 2
+    if words[0] == "run":  # what was computed is there
+        assert run_cli(*given, "--resume").returncode == 0
+
+
+@pytest.mark.parametrize("name", ["report", "report of a twin", "export", "compare"])
+@pytest.mark.fault("kill-commands")
+def test_killed_commands_are_given_again(quiet, tmp_path, name):
+    """At every so many of their operations on files."""
+    out = tmp_path / "out"
+    words, before = calls(quiet, str(out))[name]
+    whole, base = tmp_path / "whole", attempt([Task(words, before, str(out))])[0]
+    assert base.code == 0
+    target = out if out.exists() else Path(f"{out}.csv")
+    shutil.copytree(out, whole) if out.is_dir() else shutil.copy(target, whole)
+    every = range(1, base.operations + 1, max(1, base.operations // 4))
+    again = [*words, *(["--force"] if name == "export" else [])]
+    for number in every:
+        killed, repeated = attempt([Task(again, before, str(out), kill_at=number), Task(again)])
+        assert killed.code == -9
+        assert repeated.code == 0, repeated.told
+        if out.is_dir():
+            ours = {p: c for p, c in files(out).items() if not p.name.startswith(".")}
+            wanted = {p: c for p, c in files(whole).items() if not p.name.startswith(".")}
+            assert ours.keys() == wanted.keys()
+            assert all(ours[p] == wanted[p] for p in ours if p.suffix in (".nc", ".csv", ".png", ".pdf"))
+        else:
+            assert target.read_bytes() == whole.read_bytes()
+
+
+@pytest.mark.fault("kill-commands")
+def test_a_killed_rerun_leaves_everything(quiet, tmp_path):
+    shutil.copytree(quiet / "done", tmp_path / "run")
+    before = files(tmp_path / "run")
+    process = subprocess.Popen(command("rerun", tmp_path / "run"), env=environment(), stdout=subprocess.DEVNULL)
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(1.5)
+    process.kill()
+    process.wait()
+    assert files(tmp_path / "run") == before

@@ -1,0 +1,36 @@
+"""Turkish, where the capital of i is İ, and German, where a comma is the decimal sign."""
+
+import shutil
+import subprocess
+
+import pytest
+from run_files import TESTS, assert_same_results, make_campaign, run_cli
+
+SET_AT_START = """\
+import locale, pathlib
+locale.setlocale(locale.LC_ALL, "")  # as a model or a plug-in may do: from here on C code sees the user's locale
+pathlib.Path(__file__).with_name("numbers").write_text(locale.str(1.5))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "number"), [("tr_TR", "1,5"), ("de_DE", "1,5")])
+@pytest.mark.fault("locale")
+def test_a_run_in_another_locale(tmp_path, name, number):
+    localedef = shutil.which("localedef")
+    made = localedef and subprocess.run([localedef, "-i", name, "-f", "UTF-8", tmp_path / f"{name}.UTF-8"], check=False)
+    if not (tmp_path / f"{name}.UTF-8").exists():
+        pytest.skip(f"the locale {name} cannot be made here ({made})")
+    (tmp_path / "sitecustomize.py").write_text(SET_AT_START)
+    path = make_campaign(tmp_path, 2)
+    there = {"LC_ALL": f"{name}.UTF-8", "LOCPATH": tmp_path}
+    done = run_cli("run", path, "--out", tmp_path / "plain", LC_ALL="C.UTF-8")
+    assert done.returncode == 0, done.stderr
+    done = run_cli("run", path, "--out", tmp_path / "run", **there, PYTHONPATH=f"{tmp_path}:{TESTS}")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "numbers").read_text() == number
+    assert_same_results(tmp_path / "run", tmp_path / "plain")
+    assert (tmp_path / "run" / "report.html").exists()
+    assert (tmp_path / "run" / "summary.csv").read_bytes() == (tmp_path / "plain" / "summary.csv").read_bytes()
+    again = run_cli("report", tmp_path / "run", **there, PYTHONPATH=f"{tmp_path}:{TESTS}")
+    assert again.returncode == 0, again.stderr

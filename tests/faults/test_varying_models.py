@@ -1,0 +1,164 @@
+"""Models that give other numbers when a member is run again: told at the start, or accepted by a key."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import twin_models
+from faulty_models import Counts, Fails, Remembers
+from rows import row
+from run_files import configuration, run_cli
+from toy_config import write_toy
+
+from en4dvar.assimilate import assimilate
+from en4dvar.config.build import build
+from en4dvar.cycling.sequential import SequentialSettings
+from en4dvar.cycling.twin import TwinExperiment, conduct
+from en4dvar.errors import ConfigError
+from en4dvar.forward import ForwardModel
+from en4dvar.runs.rerun import rerun
+from en4dvar.runs.runner import run
+from en4dvar.runs.twin_run import run_twin
+from en4dvar.schemes.etkf import ETKF
+
+TWIN = """\
+name: ring
+model: {name: "test_varying_models:NoisyRing"}
+twin: {cycles: 3, interval: 0.1, error: {x_std: 0.1}, initial_std: {x: 0.2, v: 0.2}}
+assimilation: {scheme: etkf, members: 6}
+"""
+AGAIN = "the model gives other numbers when a member is run again"
+
+
+@pytest.fixture(autouse=True)
+def _as_at_the_start():
+    Counts.runs, Remembers.last, Fails.runs = 0, 0.0, 0
+
+
+def varying(folder, model, **assimilation):
+    keys = "".join(f"{key}: {value}\n  " for key, value in assimilation.items())
+    return write_toy(
+        folder,
+        ("toy_models:Oscillator", f"{'execution' if model == 'Noisy' else 'faulty'}_models:{model}"),
+        ("members: 8", f"{keys}members: 8"),
+    )
+
+
+@pytest.mark.parametrize("executor", ["serial", "threads", "processes"])
+@pytest.mark.parametrize("model", ["Noisy", "Counts", "Remembers"])
+@pytest.mark.fault("model-varies")
+def test_it_is_told_before_anything_is_estimated(tmp_path, model, executor):
+    with pytest.raises(ConfigError) as told:
+        run(configuration(varying(tmp_path, model), tmp_path / "run", executor=executor, workers=2))
+    assert row("model-varies").told(str(told.value))
+    assert "toy: the model gives" in str(told.value)
+    assert "differs by up to" in str(told.value)
+    assert "assimilation: {stochastic_model: true}" in str(told.value)
+    assert not (tmp_path / "run" / "posterior.nc").exists()
+
+
+@pytest.mark.fault("model-varies")
+def test_a_member_that_fails_the_second_time(tmp_path):
+    with pytest.raises(ConfigError, match=rf"{AGAIN} \(member 8 fails the second time: ArithmeticError: not again\)"):
+        run(configuration(varying(tmp_path, "Fails"), tmp_path / "run", executor="serial"))
+
+
+@pytest.mark.fault("model-varies")
+def test_it_can_be_accepted(tmp_path):
+    path = varying(tmp_path, "Noisy", stochastic_model="true")
+    assert "stochastic_model: true" in configuration(path, tmp_path / "run").resolved
+    result = run(configuration(path, tmp_path / "run", executor="serial"))
+    assert np.isfinite(result.posterior["k"]).all()
+    assert not rerun(tmp_path / "run").same  # which is what was accepted
+
+
+@pytest.mark.fault("model-varies")
+def test_the_command_line_ends_with_one_line(tmp_path):
+    path = write_toy(tmp_path, ("toy_models:Oscillator", "execution_models:Noisy"))
+    done = run_cli("run", path, "--out", tmp_path / "run", "--no-report")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert AGAIN in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+class Counted(Counts):
+    """Counts its runs and is the same each time."""
+
+    def initial_state(self, theta):
+        type(self).runs += 1
+        return super(Counts, self).initial_state(theta)
+
+
+@pytest.mark.fault("model-varies")
+def test_two_runs_more_and_the_same_numbers(tmp_path):
+    """From Python; the two are not among the forward runs of the result."""
+    config = configuration(write_toy(tmp_path), tmp_path / "run")
+    (problem,) = build(config)
+    problem = replace(problem, model=Counted.from_settings(config.model.Settings(mass="2 g")))
+    runs = []
+    for accepted in (False, True):
+        Counted.runs = 0
+        settings = replace(config.assimilation, stochastic_model=accepted)
+        runs.append((assimilate(problem, settings, 3), Counted.runs))
+    (checked, n_checked), (accepted, n_accepted) = runs
+    assert n_checked == n_accepted + 2
+    assert checked.forward_runs == accepted.forward_runs == n_accepted
+    assert np.array_equal(checked.posterior, accepted.posterior)
+
+
+class NoisyRing(twin_models.Ring):
+    def trajectories(self, x, times):
+        return super().trajectories(x + 1e-6 * np.random.default_rng().standard_normal(x.shape), times)
+
+
+class SteppingRing(twin_models.Ring):
+    """Member by member, each a little off by the number of steps made."""
+
+    steps = 0
+    trajectories = ForwardModel.trajectories
+
+    def step(self, x, t0, t1):
+        type(self).steps += 1
+        there = super().trajectories(x[None], np.array([t1 - t0])).states[0, 0]
+        return there * (1 + 1e-12 * type(self).steps)
+
+
+def twin(model, **more):
+    return TwinExperiment(
+        model=model, sequential=SequentialSettings(ETKF(), **more), members=6, cycles=3, interval=0.1,
+        error_std={"x": 0.1}, initial_std={"x": 0.2, "v": 0.2},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", [NoisyRing, SteppingRing], ids=["noise", "state"])
+@pytest.mark.fault("model-varies")
+def test_a_series(kind):
+    with pytest.raises(ConfigError, match=AGAIN):
+        conduct(twin(kind()), 1)
+    result = conduct(twin(kind(), stochastic_model=True), 1)
+    assert np.isfinite(result.run.members).all()
+
+
+@pytest.mark.fault("model-varies")
+def test_a_series_resumed_is_asked_again():
+    states = []
+    quiet = conduct(twin(twin_models.Ring()), 1, keep=lambda state: states.append(state()))
+    again = conduct(twin(twin_models.Ring()), 1, resume=states[0])
+    assert np.array_equal(again.run.members, quiet.run.members)
+    assert again.run.forward_runs == quiet.run.forward_runs
+    with pytest.raises(ConfigError, match=AGAIN):
+        conduct(twin(NoisyRing()), 1, resume=states[0])
+
+
+@pytest.mark.fault("model-varies")
+def test_the_key_in_a_twin_file(tmp_path):
+    path = tmp_path / "twin.yaml"
+    path.write_text(TWIN)
+    with pytest.raises(ConfigError, match=AGAIN):
+        run_twin(path, overrides={"output.directory": str(tmp_path / "a"), "output.report": False})
+    accepted = {
+        "assimilation.stochastic_model": "true",
+        "output.directory": str(tmp_path / "b"),
+        "output.report": False,
+    }
+    assert run_twin(path, overrides=accepted).run.failures == ()

@@ -1,0 +1,55 @@
+"""The reader of MATLAB files against scipy's, on files that nothing has damaged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from mat_damage import RADIUS, seeds
+from scipy.io import loadmat, savemat
+
+from en4dvar.inputs.matfile import mat_vectors
+
+KINDS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "c16", "?", ">f8")
+VALUES = st.sampled_from(KINDS).flatmap(
+    lambda kind: arrays.arrays(kind, arrays.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=5))
+)
+WORDS = {"V": "a struct", "O": "a cell array", "U": "text", "c": "complex"}
+
+
+def assert_same(path: Path) -> None:
+    """Every variable is what scipy says: a vector with these numbers, or the same words."""
+    expected = {k: v for k, v in loadmat(path).items() if not k.startswith("__")}
+    vectors, scalars, others = mat_vectors(path)
+    assert vectors.keys() | others.keys() == expected.keys()
+    for name, value in expected.items():
+        if hasattr(value, "toarray"):
+            assert others[name] == "a sparse matrix"
+        elif value.dtype.kind in WORDS:
+            assert others[name] == WORDS[value.dtype.kind]
+        elif value.size == max(value.shape):
+            assert np.array_equal(vectors[name], value.ravel().astype(float), equal_nan=True)
+            if value.size == 1 and np.isfinite(value.flat[0]):
+                assert scalars[name] == float(value.flat[0])
+        else:
+            assert others[name] == f"an array of {' x '.join(map(str, value.shape))}"
+
+
+@given(st.dictionaries(st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,20}", fullmatch=True), VALUES, max_size=4), st.booleans())
+@settings(max_examples=60, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+def test_any_arrays(tmp_path, content, compressed):
+    savemat(tmp_path / "a.mat", content, do_compression=compressed)
+    assert_same(tmp_path / "a.mat")
+
+
+@pytest.mark.parametrize("number", range(17))
+def test_every_kind_of_variable_in_both_byte_orders(tmp_path, number):
+    (tmp_path / "a.mat").write_bytes(seeds()[number])
+    assert_same(tmp_path / "a.mat")
+    vectors, scalars, _ = mat_vectors(tmp_path / "a.mat")
+    assert len(vectors["R"]) == len(RADIUS)
+    assert "dt" in scalars
