@@ -28,6 +28,7 @@ def test_radii_of_every_class_of_frame_are_the_true_ones(kind):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", CLASSES)
 def test_stated_errors_are_the_real_ones(kind):
     scores, wrong = (np.concatenate(part) for part in zip(*(rendered(kind, n) for n in range(40)), strict=True))
