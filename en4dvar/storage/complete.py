@@ -71,7 +71,7 @@ def _label_faults(group: str, dataset: xr.Dataset, observable: str) -> Iterator[
         about = variable.attrs
         wanted = ["units"]
         if group in _NAMED and name not in ("chain", "draw"):
-            wanted += ["display_units", "long_name", "symbol"]
+            wanted += ["long_name", "symbol", *["display_units"] * (group != "/constant_data")]
         elif name in ("time", "path_time", *(observable + end for end in _SHOWN)) or "symbol" in about:
             wanted += ["display_units"]
         if group == "/observed_data" and name == observable:
