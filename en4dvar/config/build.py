@@ -6,13 +6,14 @@ import glob
 import itertools
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from en4dvar.config import Config
+from en4dvar.config.context import Spread
 from en4dvar.config.data import Data
 from en4dvar.config.parameters import Fixed, Uncertain
 from en4dvar.ensemble.forecast import check_problem
@@ -142,7 +143,11 @@ def _unique_names(paths: list[Path]) -> list[str]:
 def read_observations(plan: Data, path: Path, name: str, weights: str = "sum") -> Observations:
     """The observations (y, t, R) of one file inside the window. Raises :class:`DataError`."""
     columns, asked = plan.columns, plan.window
-    series = read_series(path, columns.time, columns.observable, plan.format, plan.decimal)
+    clock = columns.time if isinstance(columns.time, Column) else columns.time.column
+    stds = plan.error.column("std", columns.observable.unit)
+    timing = plan.error.column("time_std", clock.unit if clock else "")
+    errors = [column for column in (stds, timing) if column]
+    series = read_series(path, columns.time, columns.observable, plan.format, plan.decimal, errors)
     try:
         window = select(series.times, series.values, asked.start, asked.end, asked.prominence)
     except DataError as error:
@@ -155,7 +160,8 @@ def read_observations(plan: Data, path: Path, name: str, weights: str = "sum") -
     if times[0] < 0:
         raise DataError(f"{path}: the first observation used lies {-times[0]:g} before time zero; see data.time_zero")
     try:
-        noise = _noise(plan, times, values, np.arange(len(series.times))[window])
+        stated = {key: series.errors[c.name][window] for key, c in (("std", stds), ("time_std", timing)) if c}
+        noise = _noise(plan, times, values, np.arange(len(series.times))[window], stated)
     except ValueError as error:
         raise DataError(f"{readable(path)}: {error}") from None
     count = len(times)
@@ -179,14 +185,18 @@ def _span(times: Array, plan: Data) -> str:
     return f"; the readings go from {first:g} to {last:g} {column.unit}"
 
 
-def _noise(plan: Data, times: Array, values: Array, samples: npt.NDArray[np.intp]) -> Noise:
+def _noise(
+    plan: Data, times: Array, values: Array, samples: npt.NDArray[np.intp], stated: Mapping[str, Array]
+) -> Noise:
     """The observation errors; ``samples`` (K,) are the places of the observations in the series.
+
+    ``stated``: ``std`` and ``time_std`` (K,) where columns of the file hold them.
 
     A covariance file holds one row an observation of the window, or one a usable sample of the whole series.
     """
     error, correlation = plan.error, None
     kernel = error.discrepancy.kernel_at(times) if error.discrepancy else None
-    time_std = np.full(len(times), error.time_std)
+    time_std = stated["time_std"] if "time_std" in stated else np.full(len(times), error.time_std)
     if error.covariance is not None:
         covariance = read_covariance(error.covariance)
         if len(covariance) > samples[-1] and len(covariance) != len(times):
@@ -199,7 +209,10 @@ def _noise(plan: Data, times: Array, values: Array, samples: npt.NDArray[np.intp
         return noise_of(std, time_std, correlation, discrepancy=kernel)
     if error.std is None:
         raise ConfigError("data.error: neither a std nor a covariance")
-    std = np.full(len(times), error.std.absolute(float(values.max())))
+    if isinstance(error.std, Spread):
+        std = np.full(len(times), error.std.absolute(float(values.max())))
+    else:
+        std = stated["std"]
     if error.correlation_time is not None:
         correlation = np.exp(-np.abs(np.subtract.outer(times, times)) / error.correlation_time)
     return noise_of(std, time_std, correlation, error.huber, kernel)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_v
 
 from en4dvar.config.context import (
     PLACEHOLDER,
+    TEXT,
     Context,
     Made,
     OfObservable,
@@ -34,7 +35,7 @@ from en4dvar.inputs.window import Instant, parse_instant
 from en4dvar.noise import SMOOTHNESS, Kernel
 from en4dvar.prior import PriorTerm
 from en4dvar.state import Array, Parameter
-from en4dvar.units import UnitError, parse_quantity
+from en4dvar.units import UnitError, convert, parse_quantity
 
 _RELATIVE = re.compile(r"(.*%)\s+of\s+(?:the\s+)?maximum")
 _OF_WINDOW = re.compile(r"(.*%)\s+of\s+(?:the\s+)?window")
@@ -168,7 +169,25 @@ def parse_error_std(text: Any, unit: str) -> Spread:
         raise UnitError(f"{error}{hint}") from None
 
 
-def _error_std(text: Any, context: Context) -> Spread:
+class ErrorColumn(Section):
+    """A column of standard deviations, one a reading."""
+
+    column: Annotated[str, Field(min_length=1)]
+    """Header of the column (CSV) or name of the field (.mat)."""
+    unit: str | None = None
+    """Unit of the numbers in it; default: that of the readings' own column."""
+
+
+def _error_column(given: Any, context: Context, target: str) -> Column:
+    chosen = ErrorColumn.model_validate(given, context=context)
+    if chosen.unit is not None:
+        convert(1.0, chosen.unit, target)
+    return Column(chosen.column, chosen.unit or "", target)
+
+
+def _error_std(text: Any, context: Context) -> Spread | Column:
+    if isinstance(text, Mapping):
+        return _error_column(text, context, observable_unit(context))
     spread = parse_error_std(text, observable_unit(context))
     require_sign(spread.value, "positive", text)
     return spread
@@ -239,16 +258,27 @@ def _estimated(given: Any) -> Any:
     if given is not None and not isinstance(given, dict):
         raise ValueError("write estimated, or the priors of its amplitude and length")
     return given
+def _time_std(text: Any, context: Context) -> float | Column:
+    if isinstance(text, Mapping):
+        return _error_column(text, context, time_unit(context))
+    value = parse_quantity(text, time_unit(context))
+    require_sign(value, "not negative", text)
+    return value
+
+
+_QUANTITY_OR_COLUMN = {"anyOf": [TEXT, ErrorColumn.model_json_schema()]}
 
 
 class Error(Section):
     """Observation errors: a std or a covariance, of the times, correlation, a robust cost, what the model misses."""
 
     model_config = ConfigDict(populate_by_name=False)
-    std: Annotated[Spread | None, Made(_error_std)] = Field(None, alias=f"{PLACEHOLDER}_std")
-    """Std of the observation error: a quantity, or e.g. '1 % of maximum'."""
-    time_std: Annotated[float, quantity(time_unit, "not negative")] = 0.0
-    """Std of the observation times: adds (rate × time_std)²."""
+    std: Annotated[Spread | Column | None, Made(_error_std, json=_QUANTITY_OR_COLUMN)] = Field(
+        None, alias=f"{PLACEHOLDER}_std"
+    )
+    """Std of the observation error: a quantity, e.g. '1 % of maximum', or ``{column: NAME}``, one a reading."""
+    time_std: Annotated[float | Column, Made(_time_std, json=_QUANTITY_OR_COLUMN)] = 0.0
+    """Std of the observation times, a quantity or ``{column: NAME}``: adds (rate × time_std)²."""
     correlation_time: Annotated[float | None, quantity(time_unit, "positive")] = None
     """Errors are correlated as exp(−|Δt|/τ)."""
     covariance: Annotated[Matrix | None, Made(_matrix, CovarianceFile)] = None
@@ -278,6 +308,11 @@ class Error(Section):
             faults.add(("threshold",), "is that of the robust cost; write robust: huber as well", at_key=True)
         if context.observed and not given.keys() & {std, "covariance"}:
             faults.add((std,), "required: the standard deviation of the observation error")
+
+    def column(self, which: Literal["std", "time_std"], readings: str) -> Column | None:
+        """The column of errors, in the unit ``readings`` where it has none of its own; None: no column."""
+        chosen = getattr(self, which)
+        return replace(chosen, unit=chosen.unit or readings) if isinstance(chosen, Column) else None
 
     @property
     def huber(self) -> float | None:

@@ -58,24 +58,35 @@ class Matrix:
 
 @dataclass(frozen=True)
 class Readings:
-    """One observable in time, in the model's units, times increasing; ``scalars`` as the file has them."""
+    """One observable in time, in the model's units, times increasing; ``scalars`` as the file has them.
+
+    ``errors`` are the columns that were asked for besides, by name, one number a reading.
+    """
 
     times: Array
     values: Array
     source: str
     scalars: Mapping[str, float] = field(default_factory=dict)
+    errors: Mapping[str, Array] = field(default_factory=dict)
 
 
 def read_series(
-    path: Path, time: Column | TimeStep, value: Column, format: Format | None = None, decimal: Decimal = "."
+    path: Path,
+    time: Column | TimeStep,
+    value: Column,
+    format: Format | None = None,
+    decimal: Decimal = ".",
+    errors: Sequence[Column] = (),
 ) -> Readings:
     """Read one data set. ``format`` defaults to the one of the suffix; ``decimal`` is the decimal sign of a CSV file.
+
+    ``errors`` are columns of standard deviations, each as long as that of the values.
 
     Raises
     ------
     DataError: the file cannot be used.
     """
-    wanted = [c.name for c in (value, time) if isinstance(c, Column)]
+    wanted = [c.name for c in (value, time, *errors) if isinstance(c, Column)]
     with _opened(path, format) as kind:
         table = Table(path, decimal) if kind == "csv" else None
         columns, scalars = (_of_table(table, wanted), {}) if table else _of_mat(path, wanted)
@@ -95,7 +106,21 @@ def read_series(
     if len(wrong) and isinstance(time, Column):
         lines = [line for line, _ in table.rows] if table else []
         _tell_disorder(columns[time.name], kept, int(wrong[0]), time.unit, lines, path)
-    return Readings(times[kept], values[kept], str(path), scalars)
+    stated = {column.name: _stds(columns[column.name], column, kept, len(values), path) for column in errors}
+    return Readings(times[kept], values[kept], str(path), scalars, stated)
+
+
+def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int, path: Path) -> Array:
+    """The standard deviations of the kept readings. Raises :class:`DataError` where one is missing or not positive."""
+    if len(written) != count:
+        raise DataError(f"{path}: {len(written)} values of {column.name!r} but {count} readings")
+    stds = np.asarray(convert(written[kept], column.unit, column.target))
+    wrong = np.flatnonzero(~(np.isfinite(stds) & (stds > 0)))
+    if len(wrong):
+        said = written[kept[wrong[0]]]
+        what = "is blank" if np.isnan(said) else f"is {said:g}, not positive"
+        raise DataError(f"{path}: the error of reading {kept[wrong[0]] + 1} in column {column.name!r} {what}")
+    return stds
 
 
 @dataclass(frozen=True)

@@ -116,11 +116,14 @@ def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
     from en4dvar.config.build import find_files
     from en4dvar.errors import ConfigError
     from en4dvar.units import convert
+    from en4dvar_bubble.starter.page import TRACKED, TRACKED_COLUMNS
 
     first, contents, decimal = _first_with_columns(list(find_files(Path.cwd(), [data]).values()))
     shown = {name: f"{len(v)} values, {_range(v)}" for name, v in contents.columns.items()}
     commas = ", decimal commas" if decimal == "," else ""
     click.echo(f"{first}{commas}: {'; '.join(f'{name} ({words})' for name, words in shown.items())}", err=True)
+    if {*TRACKED_COLUMNS} <= shown.keys() and asked == _Asked(*[None] * 5):
+        return {"radius": TRACKED.radius, "time": TRACKED.time, "decimal": decimal, "errors": TRACKED.errors}
     time, radius, missing = _columns(asked, shown)
     time_unit, radius_unit = asked.time_unit, asked.radius_unit
     if _interactive():

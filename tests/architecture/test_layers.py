@@ -47,6 +47,13 @@ BUBBLE = (
 )  # fmt: skip
 
 
+# and inside the reader of movies
+MOVIE = (
+    "frames", "kernels", "outline", "locate", "background", "corrections", "uncertainty", "tracking", "table", "page",
+    "scene", "commands",
+)  # fmt: skip
+
+
 def modules(top: Path) -> dict[str, Path]:
     """Dotted name → file of every module below a folder that lies on the import path."""
     found = {}
@@ -103,6 +110,16 @@ def test_imports_of_the_framework_point_down():
 def test_imports_of_the_bubble_point_down():
     floors = {name: floor for floor, name in enumerate(BUBBLE)}
     assert upward(graph(ROOT / "models" / "en4dvar_bubble"), floors) == []
+
+
+def test_imports_of_the_movies_point_down():
+    floors = {name: floor for floor, name in enumerate(MOVIE)}
+    assert upward(graph(ROOT / "models" / "en4dvar_movie"), floors) == []
+
+
+def test_movies_do_not_know_the_bubble():
+    sources = [p.read_text(encoding="utf-8") for p in (ROOT / "models" / "en4dvar_movie").rglob("*.py")]
+    assert [source for source in sources if "en4dvar_bubble" in source or "en4dvar_agarose" in source] == []
 
 
 def test_the_bubble_does_not_know_the_paper():

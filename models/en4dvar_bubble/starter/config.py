@@ -19,7 +19,7 @@ from en4dvar.state import Array
 from en4dvar.units import UnitError, parse_quantity, parse_unit
 from en4dvar_bubble.starter.look import Start
 from en4dvar_bubble.starter.page import Source, yaml_text
-from en4dvar_bubble.starter.proposal import Proposal, propose
+from en4dvar_bubble.starter.proposal import Proposal, propose, with_columns
 
 _NAMED_UNIT = re.compile(r"[_ \[(/]([a-zA-Zµμ]+)[\])]?$")
 _FRAMES = re.compile(r"(?i)(frame|bild|image|index|#|n$|nr)")
@@ -46,6 +46,7 @@ def propose_config(
     law: str | None = None,
     folder: str | Path = ".",
     name: str | None = None,
+    errors: tuple[str, ...] = (),
     command: str = "en4dvar_bubble.starter.propose_config",
 ) -> Proposed:
     """A commented configuration for radius histories that loads and whose data can be read.
@@ -59,6 +60,7 @@ def propose_config(
     start, law: instead of what the data suggest.
     folder: where the file will be; the path of the data inside it is relative to this folder.
     name: of the run, whose results go to ``runs/<name>``; default: that of the data.
+    errors: columns of the standard deviations of radii and times, in the units of ``radius`` and ``time``.
     command: told in the head of the file.
 
     Raises
@@ -69,10 +71,12 @@ def propose_config(
     """
     if (time is None) == (time_step is None):
         raise ConfigError("give either the column of times and its unit, or a constant time step")
-    source = Source(path_from(Path(folder), str(data)), time, time_step, radius, decimal)
+    source = Source(path_from(Path(folder), str(data)), time, time_step, radius, decimal, errors)
     files = find_files(Path.cwd(), [str(data)])
     found, unusable = histories(files, source)
     proposal = propose(found, start, law)
+    if errors:
+        proposal = with_columns(proposal, errors)
     proposal = replace(proposal, warnings=(*proposal.warnings, *doubts(source), *unusable))
     text = yaml_text(name or run_name(str(data)), source, proposal, command)
     config = resolve(parse_document(text), Path(folder).absolute())

@@ -17,13 +17,17 @@ _WORDS = ("true", "false", "null", "yes", "no", "on", "off")
 
 @dataclass(frozen=True)
 class Source:
-    """How the data are read: ``path`` as the file says it, the column (or constant step) of times, that of radii."""
+    """How the data are read: ``path`` as the file says it, the column (or constant step) of times, that of radii.
+
+    ``errors``: columns of the standard deviations of radii and times, where the file states them.
+    """
 
     path: str
     time: tuple[str, str] | None
     time_step: str | None
     radius: tuple[str, str]
     decimal: Decimal = "."
+    errors: tuple[str, ...] = ()
 
     @property
     def time_entry(self) -> str:
@@ -36,6 +40,11 @@ class Source:
     def radius_entry(self) -> str:
         """The ``radius`` column as YAML."""
         return f"{{name: {quoted(self.radius[0])}, unit: {quoted(self.radius[1])}}}"
+
+
+# the table that 'en4dvar track' writes: its columns say their units
+TRACKED = Source("", ("t_us", "us"), None, ("R_um", "um"), errors=("R_std_um", "t_std_us"))
+TRACKED_COLUMNS = ("t_us", "R_um", "R_std_um", "t_std_us")
 
 
 def quoted(text: str) -> str:

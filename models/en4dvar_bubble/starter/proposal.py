@@ -108,6 +108,16 @@ def starter(start: Start, law: str | None) -> Proposal:
     return Proposal(tuple(data), _model(law_name, start, None), tuple(lines))
 
 
+def with_columns(proposal: Proposal, errors: Sequence[str]) -> Proposal:
+    """The proposal with the errors that the data file states: columns of the std of radii and of times."""
+    kept = [entry for entry in proposal.data if entry.key not in ("  radius_std", "  time_std", "  # time_std")]
+    told = [
+        Entry("  radius_std", f"{{column: {errors[0]}}}", "each reading's own; a model is rarely better than 1 %"),
+        Entry("  time_std", f"{{column: {errors[1]}}}", "of the exposure"),
+    ]
+    return replace(proposal, data=(*kept, *told))
+
+
 def _built(start: Start, law: str | None) -> tuple[BubbleModel, str]:
     """The model, and how the file names its law. Raises :class:`ConfigError` where there is no such law."""
     name = qualified(law) if law else LAWS[start]

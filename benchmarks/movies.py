@@ -1,0 +1,113 @@
+"""How good ``en4dvar track`` is: against a person on a real movie, against the truth on rendered ones, and its speed.
+
+python benchmarks/movies.py real          needs ../shared/data
+python benchmarks/movies.py rendered      bias and coverage in each class of frame
+python benchmarks/movies.py speed         1000 frames of 512 × 512
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from en4dvar.state import Array
+from en4dvar_movie.frames import Frame, Movie, open_movie
+from en4dvar_movie.scene import Scene, render
+from en4dvar_movie.tracking import Track, track
+
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+CLASSES = {
+    "in focus": {},
+    "blurred": {"blur": 3.0},
+    "moving fast": {},
+    "bright centre": {"centre": 0.45},
+    "drift": {"drift": 0.4},
+    "ellipse": {"ellipticity": 0.03},
+    "overflow": {"shape": (64, 128), "bubble": (63.3, 31.6)},
+    "dirt": {"dirt": 24},
+}
+FRAMES = 12
+
+
+def against_a_person() -> tuple[Track, Array]:
+    """The real movie's track, and its radii minus those fitted by hand (98,), in pixels; NaN where not read."""
+    import scipy.io
+
+    by_hand = scipy.io.loadmat(SHARED / "PAstiff_xy002_RofT.mat")["Rnew"].ravel()
+    found = track(open_movie(SHARED / "PAstiff_xy002.mp4"), 2)
+    return found, np.array([r.radius - by_hand[r.found.frame] for r in found.readings if by_hand[r.found.frame] > 0])
+
+
+def movie_of(frames: list[Frame]) -> Movie:
+    """A movie in memory."""
+
+    def read() -> Iterator[Frame]:
+        yield from frames
+
+    return Movie(Path("rendered"), read, len(frames), 1e-6, 1e5)
+
+
+def rendered(kind: str, number: int) -> tuple[Array, Array]:
+    """Errors of the radii of one rendered movie in stated std, and in pixels; NaN where a frame was not read."""
+    rng = np.random.default_rng([number, list(CLASSES).index(kind)])
+    scene = Scene(**CLASSES[kind])  # type: ignore[arg-type]
+    ratio = float(np.exp(rng.uniform(np.log(3), np.log(30))))
+    scene = Scene(**{**scene.__dict__, "noise": scene.contrast * scene.level / ratio})
+    low, high = (36, 58) if kind == "overflow" else (8 if kind != "blurred" else 12, 42)
+    middle = rng.uniform(low, high, FRAMES)
+    within = np.linspace(-0.5, 0.5, 9)
+    speed = rng.uniform(2, 5, FRAMES) if kind == "moving fast" else np.zeros(FRAMES)
+    radii = middle[:, None] + np.minimum(speed, 0.2 * middle)[:, None] * within
+    found = track(movie_of(list(render(radii, scene, rng))))
+    readings = found.readings[scene.before :]
+    wrong = np.array([r.radius for r in readings]) - middle
+    return wrong / np.array([r.errors.std for r in readings]), wrong
+
+
+def tell_rendered(movies: int, kinds: Iterable[str] = CLASSES) -> None:
+    for kind in kinds:
+        pairs = [rendered(kind, number) for number in range(movies)]
+        scores, wrong = (np.concatenate(part) for part in zip(*pairs, strict=True))
+        read = np.isfinite(scores)
+        held = np.mean(np.abs(scores[read]) < 1.6449)
+        print(
+            f"{kind:14s} read {read.mean():6.1%}  bias {np.mean(wrong[read]):+.3f} px  "
+            f"rms {np.sqrt(np.mean(wrong[read] ** 2)):.3f} px  90 % intervals hold {held:.1%} of {read.sum()}",
+            flush=True,
+        )
+
+
+def tell_speed(count: int = 1000) -> None:
+    import tifffile
+
+    rng = np.random.default_rng(1)
+    radii = 60 + 40 * np.sin(np.arange(20) / 3)
+    few = list(render(radii[:, None], Scene(shape=(512, 512), bubble=(255.2, 256.1)), rng))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "movie.tif"
+        with tifffile.TiffWriter(path) as file:
+            for k in range(count):
+                file.write(few[k if k < 3 else 3 + (k - 3) % 20], contiguous=True)
+        for n in (2, 1):
+            begun, busy = time.perf_counter(), time.process_time()
+            track(open_movie(path), n)
+            took, busy = time.perf_counter() - begun, time.process_time() - busy
+            print(f"{n} workers: {took:.1f} s, {busy:.1f} s of processors")
+
+
+if __name__ == "__main__":
+    what = sys.argv[1] if len(sys.argv) > 1 else "rendered"
+    if what == "real":
+        _, off = against_a_person()
+        size = np.abs(off)
+        print(f"{len(off)} frames: median difference {np.median(off):+.3f} px, of its size {np.median(size):.3f} px")
+        print(f"within 1 px {np.mean(size < 1):.1%}, within 2 px {np.mean(size < 2):.2%}, worst {size.max():.1f} px")
+    elif what == "speed":
+        tell_speed()
+    else:
+        tell_rendered(int(sys.argv[2]) if len(sys.argv) > 2 else 40, sys.argv[3:] or CLASSES)

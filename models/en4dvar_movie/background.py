@@ -1,0 +1,194 @@
+"""What a movie shows without the bubble, and what its frames share: sign, noise, contrast, sharpness."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from en4dvar.errors import DataError
+from en4dvar.state import Array
+from en4dvar_movie.frames import Frame, Movie
+from en4dvar_movie.kernels import normalise
+from en4dvar_movie.locate import TILE, locate
+from en4dvar_movie.outline import Circle, Optics, fit_outline
+
+Image = npt.NDArray[Any]  # brightness (H, W), of any precision
+LEADING = 40  # frames looked at for the background
+SAMPLES = 24  # frames looked at for what they share
+SMOOTH = 12.0  # pixels: the brightness that contrasts are relative to varies slowly
+LEAST_SPREAD = 0.002  # of the contrast
+NOISY = 0.1  # of a pixel's noise: what a contrast can be uncertain by for the noise
+SPECK = 100  # pixels: the largest change that is no bubble
+LEAST_CONTRAST = 0.08  # of the background's brightness
+BRIGHT = 0.25  # of the contrast: how much brighter a flash is
+CHANGED = 0.3  # share of tiles that a flash changes
+
+
+@dataclass(frozen=True)
+class Background:
+    """``level`` and ``gain`` (H, W): a frame becomes (frame − level) gain, zero without a bubble and negative inside.
+
+    ``noise`` is the std of a pixel so normalised; ``frames`` how many the level is made of, 0 where none is empty.
+    """
+
+    level: Array
+    gain: Array
+    noise: float
+    frames: int
+    relative: bool = True
+
+    def normalised(self, frame: Frame) -> tuple[Array, Array]:
+        """The image (H, W) and its tiles."""
+        image, tiles = normalise(frame, self.level, self.gain, TILE)
+        return image, tiles
+
+    def steadied(self, image: Array, tiles: Array, bubble: Circle) -> Array:
+        """The image at the background's own brightness: what the light does far from the bubble is taken out."""
+        y, x = TILE * np.indices(tiles.shape)
+        outside = tiles[np.hypot(x - bubble.x, y - bubble.y) > 1.4 * bubble.R + 8]
+        if len(outside) < 0.05 * tiles.size:
+            return image
+        change = np.float32(np.median(outside))
+        return (image - change) / (1 + change if self.relative else np.float32(1))
+
+
+def find_background(movie: Movie) -> tuple[Background, Optics]:
+    """Background and optics of a movie, from its first frames and some along it. Raises :class:`DataError`."""
+    leading, samples = _look(movie)
+    first = leading[0].astype(np.float32)
+    if not any(float(np.ptp(frame)) > 0 for frame in (*leading, *samples)):
+        words = "black" if not np.any(first) else "white" if _is_white(leading[0]) else "of one brightness"
+        raise DataError(f"{movie.path}: every frame is {words}; no bubble can be seen")
+    noise = pixel_noise(first)
+    empty = 0 if _holds_a_blob(first, noise) else _quiet(leading, first, noise)
+    level = np.mean(np.array(leading[:empty], dtype=np.float32), axis=0) if empty else smooth_surface(samples)
+    if empty > 2:
+        noise = pixel_noise(np.array([f - level for f in leading[:empty]])) * float(np.sqrt(empty / (empty - 1)))
+    background = _with_sign(level, samples, noise, empty)
+    if empty:
+        background = _refined(background, samples)
+    return background, _optics(background, samples, movie)
+
+
+def _look(movie: Movie) -> tuple[list[Frame], list[Frame]]:
+    """The leading frames, and some along the movie: every n-th, n doubled whenever there are too many."""
+    leading: list[Frame] = []
+    samples: list[Frame] = []
+    every = 1
+    for number, frame in enumerate(movie.frames()):
+        if number < LEADING:
+            leading.append(frame)
+        if number % every == 0:
+            samples.append(frame)
+            if len(samples) == 2 * SAMPLES:
+                samples, every = samples[::2], 2 * every
+    return leading, samples
+
+
+def pixel_noise(image: Image) -> float:
+    """Std of the noise of an image (H, W) or of numbers (n,): robust, of differences between neighbours."""
+    return max(1.4826 * float(np.median(np.abs(np.diff(image)))) / np.sqrt(2), 0.3)
+
+
+def _is_white(frame: Frame) -> bool:
+    return bool(frame.dtype.kind in "ui" and frame.flat[0] == np.iinfo(frame.dtype).max)
+
+
+def smooth_surface(frames: Sequence[Frame]) -> Array:
+    """A quadratic surface (H, W) through the background of frames that all hold a bubble."""
+    typical = np.median(np.array(frames, dtype=np.float32), axis=0)
+    y, x = np.mgrid[-1 : 1 : typical.shape[0] * 1j, -1 : 1 : typical.shape[1] * 1j]
+    terms = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=-1).reshape(-1, 6)
+    values = typical.ravel().astype(float)
+    border = np.ones(typical.shape, dtype=bool)
+    rim = max(2, min(typical.shape) // 10)
+    border[rim:-rim, rim:-rim] = False
+    kept = border.ravel()
+    for _ in range(8):
+        fitted, *_ = np.linalg.lstsq(terms[kept], values[kept], rcond=None)
+        off = values - terms @ fitted
+        kept = np.abs(off) <= 3 * max(1.4826 * float(np.median(np.abs(off[kept]))), 0.5)
+    return (terms @ fitted).reshape(typical.shape).astype(np.float32)
+
+
+def _holds_a_blob(first: Image, noise: float) -> bool:
+    """Whether a frame differs from a smooth surface in one large patch."""
+    surface = smooth_surface([first])
+    far = np.abs(ndimage.uniform_filter(first - surface, 5)) > max(4 * noise, 0.25 * float(np.median(np.abs(surface))))
+    labels, count = ndimage.label(far)
+    return bool(count and np.bincount(labels.ravel())[1:].max() > max(60, 2e-4 * first.size))
+
+
+def _quiet(leading: Sequence[Frame], first: Image, noise: float) -> int:
+    """How many leading frames look like the first."""
+    for number, frame in enumerate(leading):
+        off = np.abs(ndimage.uniform_filter(frame - first, 5)) > max(2 * noise, 0.06 * float(np.median(first)))
+        labels, count = ndimage.label(off)
+        if count and np.bincount(labels.ravel())[1:].max() > SPECK:  # larger than dirt that drifts
+            return number
+    return len(leading)
+
+
+def _with_sign(level: Array, samples: Sequence[Frame], noise: float, empty: int) -> Background:
+    """Dark on bright, relative to the background; or bright on dark, as it is: by what differs most in most frames."""
+    votes = [float(np.percentile(d, 99.5) + np.percentile(d, 0.5)) for d in (f - level for f in samples)]
+    if float(np.median([v for v in votes if abs(v) > 4 * noise] or [-1.0])) > 0:
+        full = _full(samples, level)
+        return Background(level, np.full_like(level, -1.0 / full), noise / full, empty, relative=False)
+    smooth = ndimage.gaussian_filter(level, SMOOTH)
+    gain = (1 / np.maximum(smooth, max(float(np.median(smooth)) * 0.05, 1.0))).astype(np.float32)
+    return Background(level, gain, noise * float(np.median(gain)), empty)
+
+
+def _full(samples: Sequence[Frame], level: Array) -> float:
+    return max(float(np.median([np.percentile(f - level, 99.5) for f in samples])), 1.0)
+
+
+def _refined(background: Background, samples: Sequence[Frame]) -> Background:
+    """The background's level with the parts of later frames that lie outside the bubble: less noise."""
+    total = background.level * background.frames
+    count = np.full(total.shape, float(background.frames), dtype=np.float32)
+    y, x = np.mgrid[: total.shape[0], : total.shape[1]]
+    for frame in samples:
+        image, tiles = background.normalised(frame)
+        found = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
+        if found is None or share_changed(tiles, background.noise) > CHANGED:
+            continue
+        circle, _ = found
+        outside = np.hypot(x - circle.x, y - circle.y) > 1.3 * circle.R + 10
+        quiet = outside & (np.abs(image) < 5 * background.noise)
+        total[quiet] += frame[quiet]
+        count[quiet] += 1
+    return replace(background, level=(total / count).astype(np.float32))
+
+
+def share_changed(tiles: Array, noise: float) -> float:
+    """The share of tiles much brighter than the background, as those of a flash."""
+    return float(np.mean(tiles > max(4 * noise, BRIGHT)))
+
+
+def _optics(background: Background, samples: Sequence[Frame], movie: Movie) -> Optics:
+    """Contrast and sharpness that the sampled frames share. Raises :class:`DataError` where none shows a bubble."""
+    found = []
+    for frame in samples:
+        image, tiles = background.normalised(frame)
+        place = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
+        if place is None or share_changed(tiles, background.noise) > CHANGED:
+            continue
+        outline = fit_outline(background.steadied(image, tiles, place[0]), place[0], Optics(-place[1]))
+        if outline is not None and outline.seen > 0.15 and outline.contrast < 0:
+            found.append(outline)
+    if not found:
+        raise DataError(f"{movie.path}: no frame shows a bubble that differs from the background")
+    large = sorted(found, key=lambda o: o.circle.R / o.width)[3 * len(found) // 4 :]  # they show the full contrast
+    contrasts = np.array([o.contrast for o in large])
+    contrast = float(np.median(contrasts))
+    scatter = 1.2533 * float(np.std(contrasts)) / max(len(large) - 1, 1) ** 0.5  # of a median
+    width = float(np.percentile([o.width for o in found], 20))
+    scatter = min(scatter, NOISY * background.noise)  # more is not noise: bubbles differ in how bright their centre is
+    return Optics(contrast, width, max(scatter / -contrast, LEAST_SPREAD))

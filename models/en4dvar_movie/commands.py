@@ -1,0 +1,94 @@
+"""``en4dvar track``. Heavy imports stay inside the command."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("movie", type=click.Path(path_type=Path))
+@click.option("--pixel", metavar="LENGTH", help="Size of a pixel, e.g. '2.76 um'; needed where the file does not tell.")
+@click.option(
+    "--frame-rate", metavar="RATE", help="Frames per time, e.g. '270 kHz'; needed where the file does not tell."
+)
+@click.option(
+    "--exposure", metavar="TIME", help="Exposure of a frame, e.g. '500 ns': the timing error is a tenth of it."
+)
+@click.option("--raw", metavar="WxHxBITS", help="Shape of the frames of a file without header, e.g. 512x128x8.")
+@click.option(
+    "--corrections", type=click.Path(path_type=Path), help="Text file: FRAME out, or FRAME X Y RADIUS (pixels)."
+)
+@click.option("--out", type=click.Path(path_type=Path), help="CSV file to write; default <name of the movie>.csv.")
+@click.option("--page", type=click.Path(path_type=Path), help="HTML page to write; default beside the CSV file.")
+@click.option("--force", is_flag=True, help="Replace these files.")
+@click.option("--workers", type=click.IntRange(min=1), help="Threads; the numbers do not depend on it.")
+def track(
+    movie: Path, pixel: str | None, frame_rate: str | None, exposure: str | None, raw: str | None,
+    corrections: Path | None, out: Path | None, page: Path | None, force: bool, workers: int | None,
+) -> None:  # fmt: skip
+    """Read the bubble's radius and its error from every frame of a movie.
+
+    MOVIE is a TIFF stack, a folder of TIFF or PNG frames, an mp4 or avi file, or a raw file with --raw. The table is
+    read by 'en4dvar init' and 'en4dvar run' as it is; a page shows every outline and what was left out.
+
+    \b
+    Example:
+      en4dvar track bubble.mp4 --pixel '2.76 um' --frame-rate '270 kHz' --out bubble.csv
+      en4dvar init --data bubble.csv
+    """
+    from en4dvar.commands.common import command_line, refuse_to_replace
+    from en4dvar.executor import available_cores
+    from en4dvar.files import write_text
+    from en4dvar.units import parse_quantity
+    from en4dvar_movie.corrections import read_corrections
+    from en4dvar_movie.frames import open_movie, with_scale
+    from en4dvar_movie.page import page_text
+    from en4dvar_movie.table import Scale, to_csv
+    from en4dvar_movie.tracking import track as track_movie
+
+    def given(text: str | None, unit: str, option: str) -> float | None:
+        value = None if text is None else parse_quantity(text, unit)
+        if value is not None and not value > 0:
+            raise click.UsageError(f"{option} must be positive")
+        return value
+
+    length, rate = given(pixel, "m", "--pixel"), given(frame_rate, "1/s", "--frame-rate")
+    opened = with_scale(open_movie(movie, raw), length, rate)
+    shutter = given(exposure, "s", "--exposure")
+    scale = Scale(opened.pixel, opened.rate, float("nan") if shutter is None else shutter)
+    if shutter is not None and shutter * scale.rate > 1.001:
+        raise click.UsageError(f"--exposure {exposure} is longer than the {1e6 / scale.rate:g} us between two frames")
+    table = out or Path(f"{movie.stem}.csv")
+    shown = page or table.with_suffix(".html")
+    for target in (table, shown):
+        refuse_to_replace(target, force)
+    fixed = read_corrections(corrections) if corrections else {}
+    with _bar(opened.count) as progress:
+        found = track_movie(opened, workers or available_cores(), fixed, progress)
+    for note in opened.notes:
+        click.echo(f"note: {note}", err=True)
+    words = command_line()
+    write_text(table, to_csv(found.readings, scale, str(movie), words))
+    write_text(shown, page_text(opened, found, scale, words))
+    used = [r for r in found.readings if r.used]
+    click.echo(f"{len(used)} of {len(found.readings)} frames read; the others and why: see the page")
+    click.echo(f"readings: {table}\npage: {shown}\nnext: en4dvar init --data {table}")
+
+
+@contextmanager
+def _bar(total: int) -> Iterator[Callable[[int], None]]:
+    """Progress on a terminal."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda done: None
+        return
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("frames", total=total or None)
+        yield lambda done: bar.update(task, completed=done)

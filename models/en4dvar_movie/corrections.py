@@ -1,0 +1,52 @@
+"""Frames corrected by hand: a small text file, a line a frame.
+
+# frame  what
+12       out   blurred, two bubbles
+19       270.5 64.0 28.0   start here: x, y and radius in pixels
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from en4dvar.errors import DataError
+from en4dvar.inputs.text_table import numbered_lines
+from en4dvar_movie.outline import Circle
+
+
+@dataclass(frozen=True)
+class Correction:
+    """``out``: the frame is left out. Else the outline is looked for about ``start``."""
+
+    out: bool
+    start: Circle | None
+    words: str
+
+
+def read_corrections(path: Path) -> dict[int, Correction]:
+    """Frame → correction. Raises :class:`DataError` that names the line."""
+    if not path.is_file():
+        raise DataError(f"{path}: no such file")
+    found: dict[int, Correction] = {}
+    for line, text in numbered_lines(path):
+        where = f"{path}:{line}"
+        frame, *rest = text.split()
+        if not frame.isdigit() or not rest:
+            raise DataError(f"{where}: write FRAME out WORDS, or FRAME X Y RADIUS WORDS with numbers in pixels")
+        if int(frame) in found:
+            raise DataError(f"{where}: frame {frame} was corrected before")
+        found[int(frame)] = _correction(rest, where)
+    return found
+
+
+def _correction(rest: list[str], where: str) -> Correction:
+    if rest[0].lower() == "out":
+        return Correction(True, None, " ".join(rest[1:]))
+    try:
+        x, y, radius = map(float, rest[:3])
+    except ValueError:
+        raise DataError(f"{where}: {' '.join(rest[:3])!r} is neither 'out' nor X Y RADIUS in pixels") from None
+    if not radius > 0:
+        raise DataError(f"{where}: the radius {radius:g} is not positive")
+    return Correction(False, Circle(x, y, radius), " ".join(rest[3:]))

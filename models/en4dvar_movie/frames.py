@@ -1,0 +1,232 @@
+"""Reading movies frame by frame: TIFF stacks, folders of TIFF or PNG frames, mp4, avi, raw files of a stated shape.
+
+Frames are (H, W) arrays of brightness, 8 or 16 bit. Nothing is held: a movie is a way to run through its frames.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.errors import DataError
+from en4dvar.hints import no_such_file
+
+Frame = npt.NDArray[Any]
+TIFF, VIDEO, IMAGES = (".tif", ".tiff"), (".mp4", ".avi", ".mov", ".mkv"), (".png",)
+LEAST_SIDE = 16
+COLOUR = 0.08  # mean difference of the channels, as a share of the full scale, from which a frame is a coloured one
+
+
+@dataclass(frozen=True)
+class Movie:
+    """``open`` runs through the frames from the first; ``count`` is 0 where only reading tells.
+
+    ``pixel`` (m) and ``rate`` (1/s) are what the file itself says, NaN where it says nothing. ``notes`` are what
+    reading showed that a user should know.
+    """
+
+    path: Path
+    open: Callable[[], Iterator[Frame]]
+    count: int = 0
+    pixel: float = float("nan")
+    rate: float = float("nan")
+    notes: list[str] = field(default_factory=list)
+
+    def frames(self) -> Iterator[Frame]:
+        """Frames (H, W), all of one shape. Raises :class:`DataError`, which names the frame."""
+        shape: tuple[int, ...] = ()
+        number, channel = -1, 0
+        try:
+            for number, read in enumerate(self.open()):
+                if number == 0:
+                    channel = _channel(read)
+                    if _is_coloured(read) and not self.notes:
+                        name = ("red", "green", "blue")[channel]
+                        self.notes.append(
+                            f"{self.path}: frames are in colour; the channel with most light, {name}, is used"
+                        )
+                frame = _grey(read, channel, f"{self.path}: frame {number}")
+                shape = shape or frame.shape
+                if frame.shape != shape:
+                    raise DataError(f"{self.path}: frame {number} is {_size(frame.shape)}, the first {_size(shape)}")
+                yield frame
+        except (OSError, ValueError, RuntimeError, SyntaxError, EOFError, KeyError, IndexError) as error:
+            words = " ".join(str(error).split()) or type(error).__name__
+            raise DataError(f"{self.path}: frame {number + 1} cannot be read: {words}") from None
+        if number < 0:
+            raise DataError(f"{self.path}: the movie holds no frame")
+
+
+def open_movie(path: str | Path, raw: str | None = None) -> Movie:
+    """The movie in a file or folder; ``raw`` is the ``WIDTHxHEIGHTxBITS`` of a file without header.
+
+    Raises
+    ------
+    DataError: there is none, it cannot be read, or a library is missing.
+    """
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise DataError(no_such_file(path))
+    if raw is not None:
+        return _raw(path, raw)
+    if path.is_dir():
+        return _folder(path)
+    if not path.stat().st_size:
+        raise DataError(f"{path}: the file is empty")
+    suffix = path.suffix.lower()
+    if suffix in TIFF:
+        return _tiff(path)
+    if suffix in VIDEO:
+        return _video(path)
+    kinds = ", ".join((*TIFF, *VIDEO))
+    raise DataError(f"{path}: not a movie by its suffix ({kinds}, or a folder of frames); of a raw file say --raw")
+
+
+def _library(name: str) -> ModuleType:
+    from importlib import import_module
+
+    try:
+        return import_module(name)
+    except ImportError:
+        raise DataError(f"reading this movie needs {name}: pip install 'en4dvar[movie]'") from None
+
+
+def _grey(read: Any, channel: int, where: str) -> Frame:
+    """Brightness (H, W) of what a library gives. Raises :class:`DataError`."""
+    frame = np.asarray(read)
+    if frame.ndim == 3 and frame.shape[2] in (3, 4):
+        frame = np.ascontiguousarray(frame[..., channel])
+    if frame.ndim != 2 or min(frame.shape) < LEAST_SIDE:
+        raise DataError(
+            f"{where} has the shape {_size(frame.shape)}; frames are images of {LEAST_SIDE} pixels and more"
+        )
+    if frame.dtype.kind not in "uif":
+        raise DataError(f"{where} holds {frame.dtype}, not brightness")
+    return frame
+
+
+def _channel(read: Any) -> int:
+    """The channel with most light: in that of the lamp a bubble is darkest."""
+    frame = np.asarray(read)
+    return int(np.argmax(frame[..., :3].mean(axis=(0, 1)))) if frame.ndim == 3 and frame.shape[2] in (3, 4) else 0
+
+
+def _is_coloured(read: Any) -> bool:
+    frame = np.asarray(read)
+    if frame.ndim != 3 or frame.shape[2] not in (3, 4):
+        return False
+    full = np.iinfo(frame.dtype).max if frame.dtype.kind in "ui" else 1.0
+    return float(np.mean(np.ptp(frame[..., :3], axis=2))) > COLOUR * full
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return " × ".join(map(str, shape[1::-1] + shape[2:]))
+
+
+def _tiff(path: Path) -> Movie:
+    tifffile = _library("tifffile")
+    try:
+        with tifffile.TiffFile(path) as file:
+            pages = len(file.pages)
+            about = dict(file.imagej_metadata or {})
+            tags = file.pages[0].tags
+            pixel = _tiff_pixel(about, tags.get("XResolution"))
+    except (OSError, ValueError, IndexError, KeyError, tifffile.TiffFileError) as error:
+        raise DataError(f"{path}: cannot be read as TIFF: {error}") from None
+    step = about.get("finterval")
+
+    def read() -> Iterator[Frame]:
+        with tifffile.TiffFile(path) as file:
+            for page in file.pages:
+                try:
+                    yield page.asarray()
+                except tifffile.TiffFileError as error:
+                    raise ValueError(error) from None
+
+    return Movie(path, read, pages, pixel, 1 / float(step) if step else float("nan"))
+
+
+def _tiff_pixel(about: dict[str, Any], resolution: Any) -> float:
+    """Size of a pixel that ImageJ wrote, m."""
+    units = {"micron": 1e-6, "um": 1e-6, "µm": 1e-6, "\\u00B5m": 1e-6, "mm": 1e-3, "nm": 1e-9}
+    unit = units.get(str(about.get("unit", "")))
+    if unit is None or resolution is None:
+        return float("nan")
+    pixels, length = resolution.value
+    return unit * length / pixels if pixels else float("nan")
+
+
+def _folder(path: Path) -> Movie:
+    files = [p for p in path.iterdir() if p.suffix.lower() in (*TIFF, *IMAGES) and not p.name.startswith(".")]
+    if not files:
+        raise DataError(f"{path}: the folder holds no frame ({', '.join((*TIFF, *IMAGES))})")
+    files.sort(key=lambda p: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", p.name)])
+
+    def read() -> Iterator[Frame]:
+        for file in files:
+            if file.suffix.lower() in TIFF:
+                yield from _tiff(file).open()
+            else:
+                with _library("PIL.Image").open(file) as image:
+                    yield np.asarray(image)
+
+    return Movie(path, read, len(files))
+
+
+def _video(path: Path) -> Movie:
+    av = _library("av")
+
+    def read() -> Iterator[Frame]:
+        with av.open(str(path)) as file:
+            if not file.streams.video:
+                raise DataError(f"{path}: holds no video")
+            stream = file.streams.video[0]
+            stream.thread_type = "AUTO"
+            for frame in file.decode(stream):
+                if frame.interlaced_frame:
+                    raise DataError(f"{path}: the movie is interlaced; save whole frames (ffmpeg -vf yadif)")
+                yield frame.to_ndarray(format="gray" if frame.format.name.startswith("gray") else "rgb24")
+
+    try:
+        with av.open(str(path)) as file:
+            count = file.streams.video[0].frames if file.streams.video else 0
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as a movie: {error}") from None
+    return Movie(path, read, int(count))
+
+
+def _raw(path: Path, raw: str) -> Movie:
+    match = re.fullmatch(r"(\d+)x(\d+)x(8|10|12|14|16)", raw)
+    if match is None:
+        raise DataError(f"--raw {raw}: write WIDTHxHEIGHTxBITS, e.g. 512x128x8 (above 8 bit: two bytes, low one first)")
+    width, height, bits = map(int, match.groups())
+    kind = np.dtype("u1" if bits == 8 else "<u2")
+    frame = width * height * kind.itemsize
+    size = path.stat().st_size if path.is_file() else 0
+    if not frame or not size or size % frame:
+        raise DataError(f"{path}: {size} bytes are no whole number of frames of {raw} ({frame} bytes each)")
+
+    def read() -> Iterator[Frame]:
+        with path.open("rb") as file:
+            for _ in range(size // frame):
+                yield np.frombuffer(file.read(frame), kind).reshape(height, width)
+
+    return Movie(path, read, size // frame)
+
+
+def with_scale(movie: Movie, pixel: float | None, rate: float | None) -> Movie:
+    """The movie with the given scale, else the file's own. Raises :class:`DataError` where both are mute."""
+    pixel, rate = pixel or movie.pixel, rate or movie.rate
+    missing = ["--pixel '2.76 um'"] * (not pixel > 0) + ["--frame-rate '270 kHz'"] * (not rate > 0)
+    if missing:
+        raise DataError(
+            f"{movie.path}: the file does not tell its scale, which is never guessed: add {' '.join(missing)}"
+        )
+    return replace(movie, pixel=pixel, rate=rate)

@@ -1,0 +1,118 @@
+"""The page that shows the work: a strip of frames with their outlines, radius and shape in time, what was left out."""
+
+from __future__ import annotations
+
+import base64
+import io
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from en4dvar.report.style import DARK, LIGHT, css_variables, inline_svg, styled
+from en4dvar_movie.frames import Frame, Movie
+from en4dvar_movie.outline import MODES
+from en4dvar_movie.table import Scale
+from en4dvar_movie.tracking import Reading, Track
+
+SHOWN = 60  # frames of the strip
+SIDE = 240  # pixels of a picture, at most
+TURN = np.linspace(0, 2 * np.pi, 121)
+
+
+def page_text(movie: Movie, found: Track, scale: Scale, command: str) -> str:
+    """The page, one file without addresses."""
+    environment = Environment(
+        loader=PackageLoader("en4dvar_movie", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    used = [r for r in found.readings if r.used]
+    return environment.get_template("page.html.j2").render(
+        light=Markup(css_variables(LIGHT)),
+        dark=Markup(css_variables(DARK)),
+        movie=movie.path.name,
+        notes=movie.notes,
+        command=command,
+        count=len(found.readings),
+        used=len(used),
+        scale=f"{1e6 * scale.pixel:.6g} µm a pixel, {scale.rate:.6g} frames a second",
+        background=found.background.frames,
+        common=f"{float(np.median([r.errors.common for r in used])) * 1e6 * scale.pixel:.2g}" if used else "",
+        figures=[inline_svg(draw(used, scale), name, name) for name, draw in (("radius", _radius), ("shape", _shape))],
+        strip=_strip(movie, found),
+        left_out=[r for r in found.readings if not r.used],
+        remarks=[r for r in used if r.reason],
+    )  # fmt: skip
+
+
+@styled
+def _radius(used: list[Reading], scale: Scale) -> Figure:
+    figure = Figure(figsize=(6.8, 2.6), layout="constrained")
+    ax = figure.subplots()
+    um = 1e6 * scale.pixel
+    ax.errorbar(
+        [1e6 * r.found.frame / scale.rate for r in used], [um * r.radius for r in used],
+        yerr=[1.645 * um * r.errors.std for r in used],
+        fmt="o", ms=2.5, color=LIGHT["ink"], ecolor=LIGHT["centre"], elinewidth=1, capsize=1.5,
+    )  # fmt: skip
+    ax.set(xlabel="time (µs)", ylabel="radius (µm), 90 %")
+    return figure
+
+
+@styled
+def _shape(used: list[Reading], scale: Scale) -> Figure:
+    figure = Figure(figsize=(6.8, 2.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    times = [1e6 * r.found.frame / scale.rate for r in used]
+    outlines = [r.found.outline for r in used]
+    left.plot(times, [o.eccentricity if o else np.nan for o in outlines], ".", ms=3, color=LIGHT["ink"])
+    left.set(xlabel="time (µs)", ylabel="eccentricity")
+    for n in range(2, MODES + 1):
+        part = [o.amplitude(n) / o.circle.R if o else np.nan for o in outlines]
+        right.plot(
+            times,
+            part,
+            lw=0.9,
+            alpha=1 - 0.15 * (n - 2),
+            color=LIGHT["centre"],
+            ls=["-", "--", "-.", ":", "-"][n - 2],
+            label=f"{n}",
+        )
+    right.set(xlabel="time (µs)", ylabel="mode over radius")
+    right.legend(title="mode", ncols=2)
+    return figure
+
+
+def _strip(movie: Movie, found: Track) -> list[dict[str, str]]:
+    """Evenly chosen frames as pictures, each with its outline as a path over it."""
+    every = -(-len(found.readings) // SHOWN)
+    pictures = []
+    for reading, frame in zip(found.readings, movie.frames(), strict=False):
+        if reading.found.frame % every == 0:
+            pictures.append(_picture(frame, reading, found))
+    return pictures
+
+
+def _picture(frame: Frame, reading: Reading, found: Track) -> dict[str, str]:
+    step = -(-max(frame.shape) // SIDE)
+    full = 1.3 * float(np.percentile(found.background.level, 95))
+    small = np.clip(255.0 * frame[::step, ::step] / max(full, 1.0), 0, 255).astype(np.uint8)
+    outline = reading.found.outline
+    points = outline.points(TURN) / step if outline is not None and reading.used else np.empty((0, 2))
+    return {
+        "frame": str(reading.found.frame),
+        "png": png(small),
+        "width": str(small.shape[1]),
+        "height": str(small.shape[0]),
+        "points": " ".join(f"{x + 0.5:.2f},{y + 0.5:.2f}" for x, y in points),
+        "words": reading.reason,
+    }
+
+
+def png(picture: Frame) -> str:
+    """A picture of 8 bit as base64."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, format="PNG", optimize=False)
+    return base64.b64encode(buffer.getvalue()).decode()

@@ -1,0 +1,64 @@
+"""The readings as CSV: one line a frame, lengths in micrometres, times in microseconds."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+
+import numpy as np
+
+from en4dvar_movie.tracking import Reading
+
+COLUMNS = ("frame", "t_us", "R_um", "R_std_um", "t_std_us", "x_um", "y_um", "eccentricity", "used", "reason")
+STEADY = 0.1  # of the exposure: where its light may be centred
+UNKNOWN = 0.05  # of the step between frames, where no exposure is given
+
+
+@dataclass(frozen=True)
+class Scale:
+    """``pixel`` m, ``rate`` 1/s, ``exposure`` s (NaN where it is not known)."""
+
+    pixel: float
+    rate: float
+    exposure: float = float("nan")
+
+    @property
+    def time_std(self) -> float:
+        """Std of a frame's instant, s."""
+        return STEADY * self.exposure if self.exposure > 0 else UNKNOWN / self.rate
+
+
+def to_csv(readings: Sequence[Reading], scale: Scale, movie: str, command: str) -> str:
+    """The table with its comment. Radii of frames that are left out stay blank, so that no reader takes them."""
+    common = [r.errors.common for r in readings if r.used]
+    exposure = f"{1e6 * scale.exposure:g} us" if scale.exposure > 0 else "not given"
+    head = [
+        f"en4dvar track, version {version('en4dvar')}: {command}",
+        f"movie: {movie}; pixel: {1e6 * scale.pixel:.9g} um; frame rate: {scale.rate:.9g} Hz; exposure: {exposure}",
+        f"R_std_um is independent from frame to frame; the level of the edge moves all radii together, by "
+        f"{1e6 * scale.pixel * float(np.median(common)) if common else 0:.2g} um; the pixel's size scales them",
+    ]
+    out = io.StringIO()
+    out.writelines(f"# {' '.join(line.split())}\n" for line in head)
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows(_row(reading, scale) for reading in readings)
+    return out.getvalue()
+
+
+def _row(reading: Reading, scale: Scale) -> Iterable[str]:
+    um = 1e6 * scale.pixel
+    first = [str(reading.found.frame), f"{1e6 * reading.found.frame / scale.rate:.9g}"]
+    outline = reading.found.outline
+    last = [str(int(reading.used)), reading.reason]
+    if not reading.used or outline is None:
+        return [*first, *[""] * 6, *last]
+    numbers = [
+        f"{um * reading.radius:.4f}", f"{um * reading.errors.std:.4f}", f"{1e6 * scale.time_std:.4g}",
+        f"{um * outline.circle.x:.3f}", f"{um * outline.circle.y:.3f}",
+        f"{outline.eccentricity:.4f}".replace("nan", ""),
+    ]  # fmt: skip
+    return [*first, *numbers, *last]

@@ -1,0 +1,141 @@
+"""From a movie to readings: every frame by itself, in any order, then what neighbouring frames say of the errors."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+from en4dvar_movie.background import CHANGED, LEAST_CONTRAST, Background, find_background, share_changed
+from en4dvar_movie.corrections import Correction
+from en4dvar_movie.frames import Frame, Movie
+from en4dvar_movie.locate import TILE, locate
+from en4dvar_movie.outline import Circle, Optics, Outline, fit_outline
+from en4dvar_movie.uncertainty import Errors, errors_of
+
+LEAST_SEEN = 0.12  # share of the outline inside the frame
+LEAST_RADIUS = 2.5  # pixels
+ROUGH = 0.08  # of the contrast: scatter about a real outline, beside the noise of the camera
+MOST_BLUR = 0.12  # of the radius, of an outline that the frame cuts
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a frame shows: its outline, or the ``reason`` why there is none."""
+
+    frame: int
+    outline: Outline | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A frame's radius and its errors, in pixels, ready for the table; ``used`` False where ``reason`` says why."""
+
+    found: Found
+    radius: float
+    errors: Errors
+    used: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class Track:
+    """The readings of a movie and what its frames share."""
+
+    readings: tuple[Reading, ...]
+    background: Background
+    optics: Optics
+
+
+def track(
+    movie: Movie,
+    workers: int = 1,
+    corrections: Mapping[int, Correction] | None = None,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Track:
+    """Readings of every frame; the same numbers for any number of workers.
+
+    Raises
+    ------
+    DataError: the movie cannot be read or shows no bubble.
+    """
+    background, optics = find_background(movie)
+    fixed = corrections or {}
+
+    def look(numbered: tuple[int, Frame]) -> Found:
+        number, frame = numbered
+        return find_bubble(number, frame, background, optics, fixed.get(number))
+
+    found = []
+    for one in in_order(look, enumerate(movie.frames()), workers):
+        found.append(one)
+        progress(len(found))
+    return Track(tuple(readings_of(found, optics, fixed)), background, optics)
+
+
+def find_bubble(
+    number: int, frame: Frame, background: Background, optics: Optics, correction: Correction | None = None
+) -> Found:
+    """The bubble's outline in one frame."""
+    image, tiles = background.normalised(frame)
+    if correction is not None and correction.start is not None:
+        place: tuple[Circle, float] | None = (correction.start, -optics.contrast)
+    else:
+        if share_changed(tiles, background.noise) > CHANGED:
+            return Found(number, None, "flash: much of the frame is brighter than the background")
+        place = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
+    if place is None:
+        return Found(number, None, "no bubble: nothing differs from the background")
+    outline = fit_outline(background.steadied(image, tiles, place[0]), place[0], optics)
+    return Found(number, outline, _fault(outline, optics, background.noise))
+
+
+def _fault(outline: Outline | None, optics: Optics, noise: float) -> str:
+    """Why an outline is none; "" where it is one."""
+    if outline is None:
+        return "no circle fits the outline"
+    if outline.circle.R < LEAST_RADIUS:
+        return f"too small: the radius is below {LEAST_RADIUS:g} pixels"
+    if outline.seen < LEAST_SEEN:
+        return f"cut: {outline.seen:.0%} of the outline lies in the frame"
+    if outline.seen < 0.9 and outline.width > MOST_BLUR * outline.circle.R:
+        return f"cut and blurred: {outline.seen:.0%} of the outline lies in the frame, and it is no edge"
+    if outline.noise > 2.5 * noise + ROUGH * abs(optics.contrast):
+        return "the brightness next to the outline is not that of a bubble"
+    if outline.contrast > 0.25 * optics.contrast:
+        return "faint: the outline has no contrast"
+    return ""
+
+
+def in_order(
+    look: Callable[[tuple[int, Frame]], Found], frames: Iterable[tuple[int, Frame]], workers: int
+) -> Iterator[Found]:
+    """``look`` at each frame in threads; a few frames are held at a time."""
+    if workers == 1:
+        yield from map(look, frames)
+        return
+    waiting: deque[Future[Found]] = deque()
+    with ThreadPoolExecutor(workers) as pool:
+        for numbered in frames:
+            waiting.append(pool.submit(look, numbered))
+            if len(waiting) > 3 * workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+def readings_of(found: list[Found], optics: Optics, corrections: Mapping[int, Correction]) -> Iterator[Reading]:
+    """Radii with their errors, and what is left out by hand or for the neighbours' sake."""
+    good = [one.outline if not one.reason else None for one in found]
+    errors = errors_of(good, optics)
+    for one, outline, error in zip(found, good, errors, strict=True):
+        correction = corrections.get(one.frame)
+        if correction is not None and correction.out:
+            yield Reading(one, float("nan"), error, False, f"left out by hand: {correction.words}".rstrip(": "))
+        elif outline is None:
+            yield Reading(one, float("nan"), error, False, one.reason)
+        else:
+            words = f"by hand: {correction.words}".rstrip(": ") if correction is not None else error.words
+            yield Reading(one, error.radius, error, True, words)

@@ -1,0 +1,85 @@
+"""What the readings are worth: errors of each frame, from its own outline and from what neighbouring frames say.
+
+Independent part, per frame: pixel noise through the fit, times the factor by which sectors of the outline scatter more
+than pixels do (compression, jagged outlines), averaged over neighbouring frames of like sharpness.
+
+Shape: a bubble's extent along the line of sight is not seen. Were its outline an isotropic random surface of degree 2,
+the mean radius over the sphere would differ from that over the outline by a normal error of variance a²/6, where a is
+the amplitude of mode 2 (the mean of a degree-2 harmonic over a great circle has variance σ²/4, mode 2 itself the rest,
+3σ²/4 = a²/2). Two numbers tell a², so that 90 % intervals take Student's t with 2 degrees of freedom.
+
+Curvature: blur moves the half level of a disc inwards by w²/2R. It is given back for the blur that the movie's sharp
+frames share; what goes beyond it is the wall's motion during the exposure, which has no such shift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from en4dvar.state import Array
+from en4dvar_movie.outline import Optics, Outline
+
+NEIGHBOURS = 10  # frames to each side
+STUDENT = 2.92 / 1.645  # 95 % quantiles of t with 2 degrees of freedom and of the normal distribution
+FLOOR = 0.005  # pixels: what sampling by whole pixels leaves uncertain in the best of images
+SIGNIFICANT = 3.0  # std of a mode's amplitude from which it is one
+COLLAPSE = 0.2  # of the radius: blur from which the bubble has collapsed within the exposure
+THRESHOLD = 0.05  # of the contrast: what the level of the edge can be off by in all frames alike
+
+
+@dataclass(frozen=True)
+class Errors:
+    """In pixels: the corrected ``radius``, its independent std, how far all radii move together by the edge's level."""
+
+    radius: float
+    std: float
+    common: float
+    words: str = ""
+
+
+NOTHING = Errors(float("nan"), float("nan"), float("nan"))
+
+
+def errors_of(outlines: Sequence[Outline | None], optics: Optics) -> list[Errors]:
+    """Errors of each frame; of those without an outline :data:`NOTHING`."""
+    ratios = _smoothed(outlines)
+    return [_errors(o, ratio, optics) if o is not None else NOTHING for o, ratio in zip(outlines, ratios, strict=True)]
+
+
+def _smoothed(outlines: Sequence[Outline | None]) -> Array:
+    """Sector scatter over pixel scatter, averaged over neighbours whose edge is as sharp and as complete."""
+    where = [k for k, o in enumerate(outlines) if o is not None]
+    logs = {k: (np.log(o.width), o.seen, o.ratio) for k in where if (o := outlines[k]) is not None}
+    found = np.ones(len(outlines))
+    for k in where:
+        near = [j for j in range(k - NEIGHBOURS, k + NEIGHBOURS + 1) if j in logs]
+        alike = [
+            np.exp(-(((logs[j][0] - logs[k][0]) / 0.2) ** 2) - ((logs[j][1] - logs[k][1]) / 0.1) ** 2) for j in near
+        ]
+        found[k] = float(np.average([logs[j][2] for j in near], weights=alike))
+    return found
+
+
+def _errors(outline: Outline, ratio: float, optics: Optics) -> Errors:
+    sharp = min(outline.width, optics.width)
+    radius = outline.circle.R + 0.5 * sharp**2 / outline.circle.R
+    variance = outline.variance * ratio + outline.common + _hidden(outline) + FLOOR**2
+    words = ""
+    if outline.width > COLLAPSE * outline.circle.R:
+        variance += (0.25 * outline.width) ** 2
+        words = "blurred over much of its radius: the bubble moved within the exposure, or is out of focus"
+    elif outline.seen < 0.9:
+        words = f"{outline.seen:.0%} of the outline lies in the frame"
+    # the edge's profile has the slope 1/(√(2π) w) at its half level
+    return Errors(radius, float(np.sqrt(variance)), float(THRESHOLD * np.sqrt(2 * np.pi) * outline.width), words)
+
+
+def _hidden(outline: Outline) -> float:
+    """Variance of the radius for the extent along the line of sight."""
+    amplitude = outline.amplitude(2)
+    if not amplitude > SIGNIFICANT * outline.mode_std:
+        return 0.0
+    return STUDENT**2 * (amplitude**2 - 2 * outline.mode_std**2) / 6

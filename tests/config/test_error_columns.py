@@ -1,0 +1,52 @@
+"""Errors of readings from columns of the data file."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from en4dvar.config import load_config
+from en4dvar.config.build import build
+from en4dvar.errors import ConfigError, DataError
+
+ROWS = [(0, 100, 2, 0.1), (5, 80, 1, 0.2), (10, "", "", ""), (15, 60, 4, 0.3), (20, 50, 3, 0.1)]
+CONFIG = """
+name: columns
+seed: 1
+data:
+  path: d.csv
+  columns: {{time: {{name: t, unit: us}}, radius: {{name: R, unit: um}}}}
+  window: {{from: 5 us}}
+  error: {error}
+model: {{name: bubble, law: neo-hookean-kelvin-voigt, start: laser}}
+parameters:
+  G: {{prior: lognormal, median: 2 kPa, log_std: 0.5}}
+  mu: 0.1 Pa s
+  R_eq: 20 um
+  R_max: 100 um
+"""
+
+
+def problem(folder, error, rows=ROWS):
+    (folder / "d.csv").write_text("t,R,s,j\n" + "\n".join(",".join(map(str, row)) for row in rows))
+    (folder / "c.yaml").write_text(CONFIG.format(error=error))
+    return build(load_config(folder / "c.yaml"))[0]
+
+
+def test_each_reading_has_its_own_error_in_the_unit_of_its_column(tmp_path):
+    noise = problem(tmp_path, "{radius_std: {column: s}, time_std: {column: j, unit: ns}}").observations.noise
+    np.testing.assert_allclose(noise.std, [1e-6, 4e-6, 3e-6])
+    np.testing.assert_allclose(noise.time_std, [2e-10, 3e-10, 1e-10])
+
+
+@pytest.mark.parametrize(("value", "words"), [("", "is blank"), (0, "is 0, not positive"), (-1, "is -1, not positive")])
+def test_an_error_that_is_none_is_refused(tmp_path, value, words):
+    with pytest.raises(DataError, match=f"reading 5 in column 's' {words}"):
+        problem(tmp_path, "{radius_std: {column: s}}", [*ROWS[:4], (20, 50, value, 0.1)])
+
+
+def test_a_column_that_is_missing_and_a_unit_of_another_kind_are_told(tmp_path):
+    with pytest.raises(DataError, match="no column 'std'"):
+        problem(tmp_path, "{radius_std: {column: std}}")
+    with pytest.raises(ConfigError, match=r"c.yaml:8:.*us"):
+        problem(tmp_path, "{radius_std: {column: s, unit: us}}")

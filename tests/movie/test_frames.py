@@ -1,0 +1,120 @@
+"""Reading movies: each format gives the same frames, each fault one message."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from en4dvar.errors import DataError
+from en4dvar_movie.corrections import read_corrections
+from en4dvar_movie.frames import open_movie, with_scale
+
+FRAMES = np.random.default_rng(2).integers(0, 256, (4, 32, 48), dtype=np.uint8)
+
+
+def read(path, raw=None):
+    return np.array(list(open_movie(path, raw).frames()))
+
+
+def test_tiff_png_and_raw_give_the_frames(tmp_path):
+    tifffile.imwrite(tmp_path / "m.tif", FRAMES, photometric="minisblack")
+    (tmp_path / "folder").mkdir()
+    for k in (2, 0, 1, 3):
+        Image.fromarray(FRAMES[k]).save(tmp_path / "folder" / f"frame{k + 8}.png")  # 8, 9, 10, 11: not as text
+    (tmp_path / "m.raw").write_bytes(FRAMES.tobytes())
+    for path, raw in (("m.tif", None), ("folder", None), ("m.raw", "48x32x8")):
+        assert np.array_equal(read(tmp_path / path, raw), FRAMES)
+
+
+def test_sixteen_bits(tmp_path):
+    deep = FRAMES.astype(np.uint16) * 16
+    tifffile.imwrite(tmp_path / "m.tif", deep, photometric="minisblack")
+    (tmp_path / "m.raw").write_bytes(deep.tobytes())
+    assert np.array_equal(read(tmp_path / "m.tif"), deep)
+    assert np.array_equal(read(tmp_path / "m.raw", "48x32x12"), deep)
+
+
+def test_video(tmp_path):
+    import av
+
+    smooth = np.stack([np.add.outer(np.arange(32), np.arange(48)) * 2 + 10 * k for k in range(4)]).astype(np.uint8)
+    with av.open(str(tmp_path / "m.avi"), "w") as file:
+        stream = file.add_stream("mjpeg", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuvj420p"
+        for frame in smooth:
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(np.stack([frame] * 3, -1), format="rgb24")))
+        file.mux(stream.encode())
+    assert np.abs(read(tmp_path / "m.avi").astype(int) - smooth).mean() < 3
+
+
+def test_scale_is_the_files_own_or_asked_for(tmp_path):
+    tifffile.imwrite(
+        tmp_path / "m.tif", FRAMES, imagej=True, resolution=(0.5, 0.5), metadata={"unit": "um", "finterval": 1e-5}
+    )
+    found = with_scale(open_movie(tmp_path / "m.tif"), None, None)
+    assert found.pixel == pytest.approx(2e-6)
+    assert found.rate == pytest.approx(1e5)
+    tifffile.imwrite(tmp_path / "n.tif", FRAMES, photometric="minisblack")
+    with pytest.raises(DataError, match=r"never guessed: add --pixel '2.76 um' --frame-rate"):
+        with_scale(open_movie(tmp_path / "n.tif"), None, None)
+
+
+def test_a_coloured_movie_is_read_in_the_colour_of_its_lamp(tmp_path):
+    tifffile.imwrite(tmp_path / "m.tif", np.stack([FRAMES, FRAMES // 4, FRAMES // 8], axis=-1), photometric="rgb")
+    movie = open_movie(tmp_path / "m.tif")
+    assert np.array_equal(np.array(list(movie.frames())), FRAMES)
+    assert "red" in movie.notes[0]
+
+
+def damaged(folder, kind):
+    path = folder / {"folder": "empty", "video": "m.mp4", "kind": "m.pdf"}.get(kind, "m.tif")
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "shapes":
+        with tifffile.TiffWriter(path) as file:
+            for k in range(3):
+                file.write(FRAMES[k, : 32 - 4 * (k == 2)])
+    else:
+        path.write_bytes({"empty": b"", "cut": b"II*\0\x08\0\0\0\xff", "video": b"no movie" * 9, "kind": b"%PDF"}[kind])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("empty", "the file is empty"),
+        ("cut", "cannot be read"),
+        ("video", "cannot be read as a movie"),
+        ("kind", "not a movie by its suffix"),
+        ("folder", "holds no frame"),
+        ("shapes", "frame 2 is 48 × 28, the first 48 × 32"),
+    ],
+)
+def test_what_cannot_be_read_is_told_in_one_message(tmp_path, kind, words):
+    path = damaged(tmp_path, kind)
+    with pytest.raises(DataError, match=words) as error:
+        read(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_raw_of_another_length(tmp_path):
+    (tmp_path / "m.raw").write_bytes(FRAMES.tobytes()[:-1])
+    with pytest.raises(DataError, match="no whole number of frames"):
+        open_movie(tmp_path / "m.raw", "48x32x8")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("3 out\n3 out", "c.txt:2: frame 3 was corrected"),
+        ("x out", "c.txt:1: write FRAME"),
+        ("4 1 2", "c.txt:1: '1 2'"),
+    ],
+)
+def test_faults_of_corrections_name_the_line(tmp_path, text, words):
+    (tmp_path / "c.txt").write_text(text)
+    with pytest.raises(DataError, match=words):
+        read_corrections(tmp_path / "c.txt")

@@ -1,0 +1,58 @@
+"""``en4dvar track``: its table goes through ``init`` into a configuration whose errors are those of each reading."""
+
+from __future__ import annotations
+
+import numpy as np
+import tifffile
+from click.testing import CliRunner
+
+from en4dvar.cli import main
+from en4dvar.config import load_config
+from en4dvar.config.build import build
+from en4dvar_movie.scene import Scene, render
+
+PIXEL, RATE = 2.5, 4e5  # µm, 1/s
+
+
+def history():
+    """Radii (K,) in pixels of a collapse and a rebound."""
+    t = np.linspace(0, 2.6, 27)
+    return 3 + 38 * np.abs(np.cos(np.pi * t / 2)) ** 0.7 * np.where(t < 1, 1, 0.6)
+
+
+def tracked(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    frames = list(render(np.maximum(history(), 5)[:, None], Scene(), np.random.default_rng(3)))
+    tifffile.imwrite(folder / "gel.tif", np.array(frames), photometric="minisblack")
+    words = ["track", "gel.tif", "--pixel", f"{PIXEL} um", "--frame-rate", "400 kHz", "--out", "gel.csv"]
+    return CliRunner().invoke(main, words)
+
+
+def test_from_the_movie_to_observations(tmp_path, monkeypatch):
+    outcome = tracked(tmp_path, monkeypatch)
+    assert outcome.exit_code == 0, outcome.output
+    assert "27 of 30 frames read" in outcome.output
+    lines = (tmp_path / "gel.csv").read_text().splitlines()
+    comment = [line for line in lines if line.startswith("#")]
+    assert "pixel: 2.5 um; frame rate: 400000 Hz" in " ".join(comment)
+    assert lines[len(comment)] == "frame,t_us,R_um,R_std_um,t_std_us,x_um,y_um,eccentricity,used,reason"
+    assert lines[len(comment) + 1].endswith(",,,,,,,0,no bubble: nothing differs from the background")
+    page = (tmp_path / "gel.html").read_text()
+    assert page.count("<polygon") == 27
+    assert CliRunner().invoke(main, ["init", "--data", "gel.csv", "--start", "laser"]).exit_code == 0
+    (problem,) = build(load_config(tmp_path / "gel.yaml"))
+    readings = np.genfromtxt(lines[len(comment) + 1 :], delimiter=",", usecols=(2, 3))[3:] * 1e-6
+    count = len(problem.observations.times)
+    np.testing.assert_allclose(problem.observations.values, readings[:count, 0])
+    np.testing.assert_allclose(problem.observations.noise.std, readings[:count, 1])
+    np.testing.assert_allclose(problem.observations.noise.time_std, 0.05 / RATE)
+
+
+def test_nothing_is_replaced_and_the_scale_is_asked_for(tmp_path, monkeypatch):
+    assert tracked(tmp_path, monkeypatch).exit_code == 0
+    again = tracked(tmp_path, monkeypatch)
+    assert again.exit_code == 2
+    assert "exists" in again.output
+    mute = CliRunner().invoke(main, ["track", "gel.tif", "--out", "b.csv"])
+    assert mute.exit_code == 2
+    assert "never guessed" in mute.output

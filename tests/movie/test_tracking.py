@@ -1,0 +1,96 @@
+"""Radii read from rendered movies, whose truth is known, and from a real one that a person has read."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from movies import CLASSES, SHARED, against_a_person, movie_of, rendered
+
+from en4dvar.errors import DataError
+from en4dvar_movie.background import find_background
+from en4dvar_movie.corrections import Correction
+from en4dvar_movie.scene import Scene, render
+from en4dvar_movie.tracking import track
+
+RADII = np.array([12.3, 20.0, 31.7, 40.2, 25.5, 9.1])
+
+
+def frames(scene=Scene(), radii=RADII, seed=1):  # noqa: B008  # a frozen value
+    return list(render(radii[:, None], scene, np.random.default_rng(seed)))
+
+
+@pytest.mark.parametrize("kind", [kind for kind in CLASSES if kind != "ellipse"])
+def test_radii_of_every_class_of_frame_are_the_true_ones(kind):
+    scores, wrong = rendered(kind, 4)
+    assert np.isfinite(wrong).mean() == 1
+    assert abs(np.mean(wrong)) < 0.1
+    assert np.sqrt(np.mean(scores**2)) < 3
+
+
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.parametrize("kind", CLASSES)
+def test_stated_errors_are_the_real_ones(kind):
+    scores, wrong = (np.concatenate(part) for part in zip(*(rendered(kind, n) for n in range(40)), strict=True))
+    read = np.isfinite(scores)
+    assert read.mean() > 0.98
+    assert abs(np.mean(wrong[read])) < 0.1
+    assert 0.8 < np.mean(np.abs(scores[read]) < 1.6449) < 0.99
+
+
+def test_bright_on_dark_is_read_alike():
+    found = track(movie_of([255 - frame for frame in frames()]))
+    off = np.array([r.radius for r in found.readings[3:]]) - RADII
+    assert np.abs(off).max() < 0.2
+    assert not any(r.used for r in found.readings[:3])
+
+
+def test_a_movie_that_begins_with_the_bubble():
+    found = track(movie_of(frames(Scene(before=0, uneven=0.0))))
+    assert found.background.frames == 0
+    assert np.abs(np.array([r.radius for r in found.readings]) - RADII).max() < 0.3
+
+
+def test_same_bits_for_any_number_of_workers():
+    movie = movie_of(frames())
+    one, three = (np.array([(r.radius, r.errors.std) for r in track(movie, n).readings]) for n in (1, 3))
+    assert np.isfinite(one[3:]).all()
+    assert one.tobytes() == three.tobytes()
+
+
+def test_a_flash_is_named_and_left_out():
+    shown = frames()
+    shown[4] = np.full_like(shown[4], 255)
+    found = track(movie_of(shown))
+    assert not found.readings[4].used
+    assert "flash" in found.readings[4].reason
+    assert sum(r.used for r in found.readings) == 5
+
+
+def test_corrections_by_hand():
+    movie = movie_of(frames())
+    found = track(movie, corrections={5: Correction(True, None, "two bubbles")})
+    assert found.readings[5].reason == "left out by hand: two bubbles"
+    assert not found.readings[5].used
+
+
+@pytest.mark.parametrize(("level", "words"), [(0, "black"), (255, "white"), (77, "one brightness")])
+def test_movies_of_nothing(level, words):
+    with pytest.raises(DataError, match=words):
+        find_background(movie_of([np.full((64, 64), level, np.uint8)] * 5))
+
+
+def test_a_movie_without_a_bubble():
+    noise = np.random.default_rng(0)
+    with pytest.raises(DataError, match="no frame shows a bubble"):
+        track(movie_of([noise.normal(100, 3, (64, 64)).astype(np.uint8) for _ in range(8)]))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared/data")
+def test_the_real_movie_agrees_with_a_person():
+    found, off = against_a_person()
+    assert len(off) == 98
+    assert abs(np.median(off)) < 0.25
+    assert np.mean(np.abs(off) < 2) > 0.97  # two frames of a collapse within the exposure are read smaller
+    assert [r.found.frame for r in found.readings if not r.used] == [0, 1, 2]
