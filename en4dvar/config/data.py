@@ -258,6 +258,8 @@ def _estimated(given: Any) -> Any:
     if given is not None and not isinstance(given, dict):
         raise ValueError("write estimated, or the priors of its amplitude and length")
     return given
+
+
 def _time_std(text: Any, context: Context) -> float | Column:
     if isinstance(text, Mapping):
         return _error_column(text, context, time_unit(context))
