@@ -27,6 +27,7 @@ from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem, discrepancy_parameters
 from en4dvar.state import Array
 from en4dvar.units import UnitError, convert
+from en4dvar.varying import RandomWalk
 
 
 def build(config: Config) -> tuple[InverseProblem, ...]:
@@ -69,13 +70,32 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
     terms, fixed = resolve_parameters(config, observations)
     terms = (*terms, *(perturbed.term for perturbed in config.initial_state), *_discrepancy(config, observations))
     perturbations = tuple(perturbed.perturbation for perturbed in config.initial_state)
-    asked = config.assimilation
-    if asked.sampling == "exact" and asked.members <= len(terms):
-        message = f"{asked.members} are too few for {len(terms)} parameters; at least {len(terms) + 1}"
+    walks = _random_walks(config, observations, terms)
+    asked, count = config.assimilation, len(terms) + sum(len(walk.changes) for walk in walks)
+    if asked.sampling == "exact" and asked.members <= count:
+        message = f"{asked.members} are too few for {count} parameters; at least {count + 1}"
         raise ConfigError([config.document.fault(("assimilation", "members"), message)])
     problem = InverseProblem(config.model, config.observable, observations, Prior(terms), fixed, perturbations)
+    if walks:
+        problem = problem.varied(walks)
     check_problem(problem)
     return problem
+
+
+def _random_walks(config: Config, observations: Observations, terms: Sequence[PriorTerm]) -> list[RandomWalk]:
+    """Of the parameters that vary. Raises :class:`ConfigError`: a walk that does not suit the observations."""
+    by_name, walks = {term.parameter.name: term for term in terms}, []
+    for entry in config.parameters:
+        try:
+            if isinstance(entry, Uncertain):
+                walks.append(entry.walk(config.model, by_name[entry.parameter.name], observations.times))
+        except ConfigError as error:
+            name = entry.parameter.name
+            faults = [
+                config.document.fault(("parameters", name, *f.path.split(".")), f.message) for f in error.problems
+            ]
+            raise ConfigError(faults) from None
+    return [walk for walk in walks if walk is not None]
 
 
 def _discrepancy(config: Config, observations: Observations) -> tuple[PriorTerm, ...]:
