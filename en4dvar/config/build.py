@@ -86,16 +86,14 @@ def _random_walks(config: Config, observations: Observations, terms: Sequence[Pr
     """Of the parameters that vary. Raises :class:`ConfigError`: a walk that does not suit the observations."""
     by_name, walks = {term.parameter.name: term for term in terms}, []
     for entry in config.parameters:
+        name = entry.parameter.name
         try:
-            if isinstance(entry, Uncertain):
-                walks.append(entry.walk(config.model, by_name[entry.parameter.name], observations.times))
+            walk = isinstance(entry, Uncertain) and entry.walk(config.model, by_name[name], observations.times)
         except ConfigError as error:
-            name = entry.parameter.name
-            faults = [
-                config.document.fault(("parameters", name, *f.path.split(".")), f.message) for f in error.problems
-            ]
-            raise ConfigError(faults) from None
-    return [walk for walk in walks if walk is not None]
+            places = [(("parameters", name, *f.path.split(".")), f.message) for f in error.problems]
+            raise ConfigError([config.document.fault(*place) for place in places]) from None
+        walks += [walk] if walk else []
+    return walks
 
 
 def _discrepancy(config: Config, observations: Observations) -> tuple[PriorTerm, ...]:

@@ -116,7 +116,7 @@ class JoinedBatch(Batch):
     def __len__(self) -> int:
         return len(self.times)
 
-    def __getitem__(self, index: int | slice | str) -> Trajectory | list[Trajectory | Failure] | Array:  # type: ignore[override]
+    def __getitem__(self, index: int | slice | str) -> Trajectory | list[Trajectory | Failure] | Array:
         if isinstance(index, slice):
             return [self.walk.path(i) for i in range(*index.indices(len(self)))]
         if not isinstance(index, str):
