@@ -207,14 +207,14 @@ class _Assimilation:
         values, observations = descent.newton.hessian.singular_values, self.problem.observations
         return diag.log_evidence(descent.iterate.cost, values, len(self.space.members), observations)
 
-    def log_evidence_constant(self) -> float:
-        """ln p(y) where no parameter varies, from iterations of its own; NaN where none varies, or they cannot be run.
+    def log_evidence_constant(self) -> float | None:
+        """ln p(y) with constant parameters, from iterations of its own, NaN if they fail; None where none varies.
 
         A second minimum is found as the first is. The posterior at zero changes (Savage & Dickey) would spare the runs,
         but extrapolates the quadratic form of J from one minimum to the other, which may be far away.
         """
         if not self.problem.varying:
-            return np.nan
+            return None
         other = _Assimilation(self.problem.constant, self.settings, self.seed, self.space.executor, None, None)
         try:
             return other.log_evidence(other.descend()[-1])

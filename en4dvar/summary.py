@@ -76,7 +76,7 @@ def remarks(a: Analysis) -> tuple[str, ...]:
     large = [shift for shift in a.what_if if shift.exceeds]
     lines = [f"what if {shift.words}: {_moved(a.parameters, shift)}" for shift in large[:MOST_REMARKS]]
     more = len(large) - len(lines)
-    if a.problem.varying:
+    if a.log_evidence_change is not None:
         names = " and ".join(walk.name for walk in a.problem.varying)
         lines.insert(0, change_words(names, a.log_evidence_change))
     return (*lines, *([f"what if: {more} more exceed the error bar, or may; see the report"] if more else []))

@@ -44,6 +44,6 @@ def piece_coordinates(a: Analysis) -> dict[str, Variable]:
 
 def change_scalars(a: Analysis) -> dict[str, float]:
     """The evidence against constant parameters."""
-    if not a.problem.varying:
+    if a.log_evidence_constant is None or a.log_evidence_change is None:
         return {}
     return {"log_evidence_constant": a.log_evidence_constant, "log_evidence_change": a.log_evidence_change}

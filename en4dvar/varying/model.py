@@ -83,7 +83,7 @@ class PiecewiseModel(ForwardModel):
                 return self.model.resumed(inner[members], since[members], asked)
 
             ends = walk.run(begin, end, integrate)
-            inner[walk.alive] = ends
+            inner[walk.alive] = ends.reshape(-1, inner.shape[1])
         return walk.outcomes()
 
 

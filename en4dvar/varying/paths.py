@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -99,7 +100,7 @@ class JoinedTrajectory(Trajectory):
         return max(path.largest(name) for path, _ in self._parts)
 
     @property
-    def states(self) -> Array:  # type: ignore[override]
+    def states(self) -> Array:
         """(K, n_state)."""
         inner = np.concatenate([path.states[asked] for path, asked in self._parts])
         own = self._x[inner.shape[1] :]
@@ -116,7 +117,7 @@ class JoinedBatch(Batch):
     def __len__(self) -> int:
         return len(self.times)
 
-    def __getitem__(self, index: int | slice | str) -> Trajectory | list[Trajectory | Failure] | Array:
+    def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
             return [self.walk.path(i) for i in range(*index.indices(len(self)))]
         if not isinstance(index, str):
