@@ -43,7 +43,9 @@ class Batched(Ramp):
     def resumed(self, x, start, times):
         since = np.maximum(times - start[:, None], 0.0)
         y = x[:, :1] + x[:, 1:] * since
-        return Batch(np.maximum(times, start[:, None]), np.stack([y, np.broadcast_to(x[:, 1:], y.shape)], -1), self.layout)
+        return Batch(
+            np.maximum(times, start[:, None]), np.stack([y, np.broadcast_to(x[:, 1:], y.shape)], -1), self.layout
+        )
 
 
 class Ending(Batched):

@@ -62,7 +62,7 @@ class VariesSection(Section):
     """A parameter that varies in time: constant pieces, and at each knot between two a random change."""
 
     every: Annotated[float | None, quantity(time_unit, "positive")] = None
-    """Length of a piece, e.g. 5 us: knots at its multiples, counted from time zero, within the window."""
+    """Length of a piece, e.g. 5 us: knots at its multiples, from the model's time zero to the last observation."""
     at: tuple[Annotated[float, quantity(time_unit, "positive")], ...] | None = None
     """The knots, in increasing order, from the model's time zero; instead of ``every``."""
     std: Annotated[Spread, Made(lambda text, context: parse_spread(text, subject_unit(context)))]
@@ -84,7 +84,7 @@ class VariesSection(Section):
 
     def knots(self, times: Array) -> tuple[float, ...]:
         """Those for a window of observations at ``times`` (K,). Raises :class:`ConfigError`: none is of use."""
-        first, last = float(times[0]), float(times[-1])
+        last = float(times[-1])
         if self.at is not None:
             if not self.at[0] < last:
                 raise ConfigError([Fault("all knots lie after the last observation", "at")])
@@ -92,9 +92,9 @@ class VariesSection(Section):
         count, width = int(min(last // self.every, MOST_KNOTS + 1)) if self.every else 0, self.every or 1.0
         if count > MOST_KNOTS:
             raise ConfigError([Fault(f"more than {MOST_KNOTS} pieces in the window", "every")])
-        found = tuple(k * width for k in range(1, count + 1) if first < k * width < last)
+        found = tuple(k * width for k in range(1, count + 1) if k * width < last)
         if not found:
-            raise ConfigError([Fault("no multiple of it lies within the window of the observations", "every")])
+            raise ConfigError([Fault("the last observation comes before the end of the first piece", "every")])
         return found
 
 

@@ -75,6 +75,11 @@ def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
     )
 
 
+def piece_lines(result: StoredResult) -> list[tuple[object, ...]]:
+    """Lines of ``varying.csv``, the name of the data set first."""
+    return [(result.name, *cells) for walk in stored_walks(result) for cells in walk.cells]
+
+
 def verdict(result: StoredResult) -> str:
     """What the evidence says of all that varies, in a sentence; "" where nothing does."""
     difference = result.sample_stats.attrs.get("log_evidence_change")

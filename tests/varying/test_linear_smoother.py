@@ -47,7 +47,7 @@ def smoother(values, q):
         jump = np.diag([0.0, q**2]) if t in KNOTS else np.zeros((2, 2))
         mean, covariance = step @ mean, step @ (covariance + jump) @ step.T
         predicted.append((mean, covariance))
-        maps.append((step, jump))
+        maps.append(step)
         if event in TIMES:
             innovation, s = values[TIMES.tolist().index(event)] - mean[0], covariance[0, 0] + STD**2
             gain = covariance[:, 0] / s
@@ -56,7 +56,7 @@ def smoother(values, q):
         filtered.append((mean, covariance))
         t = event
     smooth = [filtered[-1]]
-    for (m, p), (m_next, p_next), (step, jump) in zip(filtered[-2::-1], predicted[::-1], maps[::-1], strict=True):
+    for (m, p), (m_next, p_next), step in zip(filtered[-2::-1], predicted[::-1], maps[::-1], strict=True):
         # the state just before the jump from that at the next event
         gain = p @ step.T @ np.linalg.inv(p_next)
         after, spread = smooth[0]
