@@ -2,6 +2,7 @@
 
     python benchmarks/varies.py                  60 twins of each kind of truth, about four minutes on one core
     python benchmarks/varies.py --minutes 2      a piece of it: records are kept, the next call goes on
+    python benchmarks/varies.py --example PATH   readings of one bubble whose viscosity is halved, as a CSV file
 
 A laser bubble in a neo-Hookean solid with rebounds: truths are drawn from the priors of G, μ, R_eq and R_max, the
 readings have an error of 1.5 µm, the knots lie at ½, 1, 1½ and 2 times the time of the first collapse. The viscosity
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +26,7 @@ from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.varying import RandomWalk
+from en4dvar.varying import PiecewiseModel, RandomWalk
 from en4dvar_bubble.laws import get_law
 from en4dvar_bubble.model import BubbleModel
 
@@ -53,6 +55,13 @@ def changes_of(truth: str, rng: np.random.Generator) -> np.ndarray:
     return np.where(KNOTS == 1.0, -math.log(2), 0.0) if truth == "halved" else np.zeros(len(KNOTS))
 
 
+def readings(theta: Mapping[str, np.ndarray], walk: RandomWalk, noise: float, rng: np.random.Generator) -> np.ndarray:
+    """(K,) m, of the bubble with the parameters and changes ``theta``, each (1,)."""
+    varied = PiecewiseModel(MODEL, [walk])
+    (path,) = varied.trajectories(varied.initial_states(theta), TIMES)
+    return path["R"] + noise * rng.standard_normal(len(TIMES))
+
+
 def experiment(key: str) -> Record:
     """Which pieces the bands cover, z-scores of ln μ, and ln of the Bayes factor of a change; of one twin."""
     truth, seed = key.split()
@@ -65,11 +74,7 @@ def experiment(key: str) -> Record:
     changes = changes_of(truth, rng)
     theta |= {f"mu_change_{k}": np.array([change]) for k, change in enumerate(changes, 1)}
     noise = noise_of(np.full(len(TIMES), NOISE), np.zeros(len(TIMES)))
-    blank = Observations(TIMES, np.ones(len(TIMES)), noise, np.ones(len(TIMES)))
-    varied = InverseProblem(MODEL, MODEL.observables[0], blank, PRIOR).varied([walk]).model
-    (path,) = varied.trajectories(varied.initial_states(theta), TIMES)
-    readings = path["R"] + NOISE * rng.standard_normal(len(TIMES))
-    observations = Observations(TIMES, readings, noise, np.ones(len(TIMES)))
+    observations = Observations(TIMES, readings(theta, walk, NOISE, rng), noise, np.ones(len(TIMES)))
     problem = InverseProblem(MODEL, MODEL.observables[0], observations, PRIOR).varied([walk])
     a = assimilate(problem, SETTINGS, int(seed))
     true, pieces = np.log(walk.pieces(theta)[0]), np.log(a.pieces(walk, a.posterior))
@@ -84,12 +89,31 @@ def experiment(key: str) -> Record:
     }
 
 
+def write_example(path: Path) -> None:
+    """One bubble at the medians of the priors, readings with an error of 0.5 µm, μ halved at 22.4 µs."""
+    walk = RandomWalk.of(MODEL, PRIOR.terms[1], (22.4e-6,), STD)
+    theta = dict(zip(PRIOR.names, PRIOR.to_physical(PRIOR.mean)[:, None], strict=True))
+    radii = readings(theta | {"mu_change_1": np.array([-math.log(2)])}, walk, 0.5e-6, np.random.default_rng(2026))
+    head = [
+        f"# python benchmarks/varies.py --example {path}",
+        "# laser, neo-Hookean: G = 4 kPa, mu = 0.06 Pa s, halved at the first collapse (22.4 us), R_eq = 35 um,",
+        "# R_max = 250 um; errors of 0.5 um",
+        "t_us,R_um",
+    ]
+    rows = [f"{1e6 * t:.9g},{1e6 * r:.9g}" for t, r in zip(TIMES, radii, strict=True)]
+    path.write_text("\n".join([*head, *rows]) + "\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n", type=int, default=60, help="twins of each kind of truth")
     parser.add_argument("--minutes", type=float, default=np.inf, help="start no twin after so long")
     parser.add_argument("--records", type=Path, default=Path("runs/varies"), help="folder of the records")
+    parser.add_argument("--example", type=Path, help="write readings of one twin to this file, and nothing else")
     options = parser.parse_args()
+    if options.example:
+        write_example(options.example)
+        return
     keys = [f"{truth} {seed}" for seed in range(options.n) for truth in TRUTHS]
     found = fill(options.records / "twins.jsonl", keys, experiment, options.minutes)
     print("| truth | twins | pieces covered by 5–95 % | by piece | z mean, std | change told | constant told |")

@@ -90,6 +90,7 @@ def _moved(parameters: Iterable[Parameter], shift: Shift) -> str:
     for p, change, relative, in_std in zip(parameters, shift.change, shift.relative, shift.in_std, strict=True):
         if abs(in_std) > 1:
             value = f"{convert(float(change), p.unit, p.display_unit):+.2g} {p.display_unit}"
+            value = value.removesuffix(" 1")
             shown = value if np.isnan(relative) else f"{100 * relative:+.2g} %"
             words.append(f"{p.name} {shown} ({abs(in_std):.1f} std)")
     return ", ".join(words)

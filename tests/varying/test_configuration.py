@@ -15,7 +15,7 @@ from en4dvar.errors import ConfigError
 from en4dvar.report.result import load_result
 from en4dvar.report.varying import stored_walks, verdict
 from en4dvar.runs.checks import validate
-from en4dvar.runs.runner import run, run_campaign
+from en4dvar.runs.runner import run, run_campaign, write_report
 
 K = "k: {prior: lognormal, median: 3 N/m, log_std: 0.3}"
 
@@ -132,11 +132,11 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("varying")
     path = varying(folder, "{at: [40 ms, 80 ms], std: 40 %}", data=halved())
     out = folder / "out"
-    run(load_config(path, {"output.directory": str(out), "assimilation.members": 24}))
+    run(load_config(path, {"output.directory": str(out), "output.report": False, "assimilation.members": 24}))
     return out
 
 
-def test_pieces_in_the_file_and_in_the_report(finished):
+def test_pieces_in_the_file(finished):
     result = load_result(finished / "posterior.nc")
     pieces = result.dataset("posterior")["k_pieces"]
     assert pieces.dims == ("chain", "draw", "k_piece")
@@ -153,6 +153,11 @@ def test_pieces_in_the_file_and_in_the_report(finished):
     assert np.all(np.diff(walk.posterior, axis=0) > 0)
     assert result.sample_stats.attrs["log_evidence_change"] > 3
     assert verdict(result).startswith("stiffness: the data speak for a change (log evidence +")
+
+
+@pytest.mark.slow
+def test_pieces_in_the_report(finished):
+    write_report(finished)
     page = (finished / "report.html").read_text(encoding="utf-8")
     assert "What varies in time" in page
     assert (finished / "figures" / "varying.png").is_file()
@@ -161,6 +166,7 @@ def test_pieces_in_the_file_and_in_the_report(finished):
     assert len(lines) == 4
 
 
+@pytest.mark.slow
 def test_a_campaign_of_windows_of_different_length_with_any_executor(tmp_path):
     path = make_campaign(tmp_path, 2)
     text = path.read_text().replace(K, K[:-1] + ", varies: {every: 40 ms, std: 20 %}}")
