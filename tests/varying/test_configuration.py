@@ -11,7 +11,9 @@ from toy_config import csv_text, write_toy
 
 from en4dvar.config import load_config
 from en4dvar.config.build import build
+from en4dvar.descent.preview import preview
 from en4dvar.errors import ConfigError
+from en4dvar.problem import AssimilationSettings
 from en4dvar.report.result import load_result
 from en4dvar.report.varying import stored_walks, verdict
 from en4dvar.runs.checks import validate
@@ -193,3 +195,9 @@ def test_resolved_configuration_and_validate(tmp_path):
     again.write_text(config.resolved)
     assert walk_of(again)[1] == walk_of(path)[1]
     assert validate(path) is not None
+
+
+def test_a_preview_counts_the_second_fit(tmp_path):
+    problem, _ = walk_of(varying(tmp_path))
+    varied, constant = (preview(p, AssimilationSettings(members=24), 1).runs for p in (problem, problem.constant))
+    assert varied > 2 * constant
