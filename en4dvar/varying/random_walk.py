@@ -20,7 +20,7 @@ from en4dvar.prior import PriorTerm
 from en4dvar.state import Array, Parameter
 from en4dvar.units import convert
 
-SCALE = {"normal": ("", ""), "lognormal": ("ln ", r"\ln "), "logit": ("logit ", r"\mathrm{logit}\, ")}
+SCALE = {"normal": "", "lognormal": "ln", "logit": "logit"}  # what a change is one of
 
 
 @dataclass(frozen=True)
@@ -74,16 +74,20 @@ class RandomWalk:
 
 def _change(model: ForwardModel, first: PriorTerm, k: int, knot: float) -> Parameter:
     """The change at the k-th knot, counted from one."""
-    p, (words, function) = first.parameter, SCALE[first.transform]
+    p, scale = first.parameter, SCALE[first.transform]
     unit, shown = (p.unit, p.display_unit) if first.transform == "normal" else ("1", "1")
-    symbol = p.symbol[1:-1] if len(p.symbol) > 2 and p.symbol[0] == p.symbol[-1] == "$" else rf"\mathrm{{{p.symbol}}}"
+    if len(p.symbol) > 2 and p.symbol[0] == p.symbol[-1] == "$":
+        function = rf"\mathrm{{{scale}}} " if scale else ""
+        symbol = rf"$\Delta_{{{k}}}({function}{p.symbol[1:-1]})$"
+    else:
+        symbol = f"Δ{k} {scale} {p.symbol}".replace("  ", " ")
     clock = "" if model.time_display_unit == "1" else f" {model.time_display_unit}"
     at = f"{convert(knot, model.time_unit, model.time_display_unit):.6g}{clock}"
     return Parameter(
         f"{p.name}_change_{k}",
         unit,
-        label=f"change of {words}{p.label} at {at}",
-        symbol=rf"$\Delta_{{{k}}}{function}{symbol}$",
+        label=f"change of {scale} {p.label} at {at}".replace("  ", " "),
+        symbol=symbol,
         display_unit=shown,
         source="random walk of a parameter that varies in time",
     )

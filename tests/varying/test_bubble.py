@@ -13,6 +13,8 @@ from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.report.export import is_math
+from en4dvar.report.text import symbol_html
 from en4dvar.response.what_if import changed_problem
 from en4dvar.varying import PiecewiseModel, RandomWalk
 from en4dvar_bubble.laws import get_law
@@ -112,3 +114,11 @@ def test_what_if_is_answered(halved):
     assert changed.varying == halved.problem.varying
     assert replace(changed, model=halved.problem.model).varying == halved.problem.varying
     assert any(shift.settled for shift in halved.what_if)
+
+
+def test_symbols_of_changes_can_be_printed():
+    """As figures, pages and tables of papers have them."""
+    symbol = varied(BubbleModel()).parameters[-1].symbol
+    assert symbol == r"$\Delta_{1}(\mathrm{ln} \mu)$"
+    assert is_math(symbol)
+    assert symbol_html(symbol) == "<i>Δ</i><sub>1</sub><i>(ln μ)</i>"

@@ -104,6 +104,7 @@ def test_a_logarithm_walks_and_stays_within_bounds():
     assert [change.parameter.label for change in walk.changes] == [
         "change of ln stiffness at 0.01 s", "change of ln stiffness at 0.02 s",
     ]  # fmt: skip
+    assert [change.parameter.symbol for change in walk.changes] == ["Δ1 ln k", "Δ2 ln k"]
     varied = PiecewiseModel(model, [walk])
     given = {"A": np.array([1e-4]), "k": np.array([3.0]), "c": np.array([0.0]), "k_change_2": np.array([0.0])}
     assert varied.initial_states(given | {"k_change_1": np.array([0.1])}).shape == (1, 7)
