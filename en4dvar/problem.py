@@ -12,7 +12,7 @@ from en4dvar.forward import ForwardModel, Observable
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior
 from en4dvar.state import DISCREPANCY, NOISE_SCALE, Parameter
-from en4dvar.varying import PiecewiseModel, RandomWalk
+from en4dvar.varying import PiecewiseModel, RandomWalk, Varying
 
 
 @dataclass(frozen=True)
@@ -60,21 +60,26 @@ class InverseProblem:
         return discrepancy_parameters(self.model, self.observable)
 
     @property
-    def varying(self) -> tuple[RandomWalk, ...]:
-        """The parameters that vary in time."""
+    def varying(self) -> tuple[Varying, ...]:
+        """The parameters, and fields of the state, that vary in time."""
         return self.model.varying if isinstance(self.model, PiecewiseModel) else ()
 
-    def varied(self, walks: Sequence[RandomWalk]) -> InverseProblem:
-        """The same with parameters that vary; their changes join the control vector at its end."""
-        changes = (change for walk in walks for change in walk.changes)
-        return replace(self, model=PiecewiseModel(self.model, walks), prior=Prior((*self.prior.terms, *changes)))
+    @property
+    def walks(self) -> tuple[RandomWalk, ...]:
+        """The parameters that vary in time."""
+        return self.model.walks if isinstance(self.model, PiecewiseModel) else ()
+
+    def varied(self, varying: Sequence[Varying]) -> InverseProblem:
+        """The same with what varies; the changes join the control vector at its end."""
+        changes = (change for one in varying for change in one.changes)
+        return replace(self, model=PiecewiseModel(self.model, varying), prior=Prior((*self.prior.terms, *changes)))
 
     @property
     def constant(self) -> InverseProblem:
-        """The same with every parameter constant."""
+        """The same with every parameter constant, and a model without error."""
         if not isinstance(self.model, PiecewiseModel):
             return self
-        changes = {change.parameter.name for walk in self.varying for change in walk.changes}
+        changes = {change.parameter.name for one in self.varying for change in one.changes}
         terms = tuple(term for term in self.prior.terms if term.parameter.name not in changes)
         return replace(self, model=self.model.model, prior=Prior(terms))
 

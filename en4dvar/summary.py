@@ -77,7 +77,7 @@ def remarks(a: Analysis) -> tuple[str, ...]:
     lines = [f"what if {shift.words}: {_moved(a.parameters, shift)}" for shift in large[:MOST_REMARKS]]
     more = len(large) - len(lines)
     if a.log_evidence_change is not None:
-        names = " and ".join(walk.name for walk in a.problem.varying)
+        names = " and ".join(one.name for one in a.problem.varying)
         lines.insert(0, change_words(names, a.log_evidence_change))
     return (*lines, *([f"what if: {more} more exceed the error bar, or may; see the report"] if more else []))
 

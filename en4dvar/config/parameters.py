@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from en4dvar.config.context import (
     Context,
     Made,
     Spread,
     parse_spread,
-    quantity,
     read_each,
     subject_unit,
-    time_unit,
     unit_of,
 )
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
+from en4dvar.config.varies import VariesSection
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel
 from en4dvar.hints import brief, shown, suggest
@@ -53,49 +51,6 @@ Location = Annotated[
     float | Literal["maximum"] | None,
     Made(lambda text, context: text if text == "maximum" else _bounded(text, context.subject)),
 ]
-
-
-MOST_KNOTS = 1000
-
-
-class VariesSection(Section):
-    """A parameter that varies in time: constant pieces, and at each knot between two a random change."""
-
-    every: Annotated[float | None, quantity(time_unit, "positive")] = None
-    """Length of a piece, e.g. 5 us: knots at its multiples, from the model's time zero to the last observation."""
-    at: tuple[Annotated[float, quantity(time_unit, "positive")], ...] | None = None
-    """The knots, in increasing order, from the model's time zero; instead of ``every``."""
-    std: Annotated[Spread, Made(lambda text, context: parse_spread(text, subject_unit(context)))]
-    """Standard deviation of each change: in % of the value (lognormal: of its logarithm), or in the parameter's
-    unit, which holds at the centre of the prior."""
-
-    @classmethod
-    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        if ("every" in given) == ("at" in given):
-            faults.add((), "give either every (length of a piece) or at (list of knots)")
-
-    @model_validator(mode="after")
-    def _increasing(self) -> Self:
-        at = self.at if self.at is None or None not in self.at else None
-        with Faults() as faults:
-            if at is not None and (not at or any(b <= a for a, b in itertools.pairwise(at))):
-                faults.add(("at",), "give at least one knot, and each later than the one before it")
-        return self
-
-    def knots(self, times: Array) -> tuple[float, ...]:
-        """Those for a window of observations at ``times`` (K,). Raises :class:`ConfigError`: none is of use."""
-        last = float(times[-1])
-        if self.at is not None:
-            if not self.at[0] < last:
-                raise ConfigError([Fault("all knots lie after the last observation", "at")])
-            return self.at
-        count, width = int(min(last // self.every, MOST_KNOTS + 1)) if self.every else 0, self.every or 1.0
-        if count > MOST_KNOTS:
-            raise ConfigError([Fault(f"more than {MOST_KNOTS} pieces in the window", "every")])
-        found = tuple(k * width for k in range(1, count + 1) if k * width < last)
-        if not found:
-            raise ConfigError([Fault("the last observation comes before the end of the first piece", "every")])
-        return found
 
 
 class PriorSection(Section):

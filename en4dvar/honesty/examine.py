@@ -78,7 +78,7 @@ def examine(
 
 def _to_be_informed(a: Analysis) -> tuple[list[str], Array]:
     """Names and DFS of the parameters; not of the changes of one that varies, of which data may say little."""
-    changes = {change.parameter.name for walk in a.problem.varying for change in walk.changes}
+    changes = {change.parameter.name for one in a.problem.varying for change in one.changes}
     told = [j for j, name in enumerate(a.problem.prior.names) if name not in changes]
     return [a.problem.prior.names[j] for j in told], a.dfs_per_parameter[told]
 

@@ -82,9 +82,10 @@ def piece_lines(result: StoredResult) -> list[tuple[object, ...]]:
 
 def verdict(result: StoredResult) -> str:
     """What the evidence says of all that varies, in a sentence; "" where nothing does."""
-    difference = result.sample_stats.attrs.get("log_evidence_change")
-    names = " and ".join(walk.label for walk in stored_walks(result))
-    return change_words(names, float(difference)) if difference is not None else ""
+    stats = result.sample_stats.attrs
+    if "log_evidence_change" not in stats:
+        return ""
+    return change_words(str(stats["varying"]), float(stats["log_evidence_change"]))
 
 
 @styled

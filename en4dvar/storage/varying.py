@@ -26,7 +26,7 @@ def pieces(a: Analysis, members: Array) -> dict[str, Variable]:
 
     return {
         walk.pieces_name: variable(("chain", "draw", walk.name + PIECE), a.pieces(walk, members)[None], **about(walk))
-        for walk in a.problem.varying
+        for walk in a.problem.walks
     }
 
 
@@ -38,12 +38,16 @@ def piece_coordinates(a: Analysis) -> dict[str, Variable]:
         walk.name + PIECE: variable(
             walk.name + PIECE, (0.0, *walk.knots), model.time_unit, "begin of the piece", fill=False, **about
         )
-        for walk in a.problem.varying
+        for walk in a.problem.walks
     }
 
 
-def change_scalars(a: Analysis) -> dict[str, float]:
+def change_scalars(a: Analysis) -> dict[str, Any]:
     """The evidence against constant parameters."""
     if a.log_evidence_constant is None or a.log_evidence_change is None:
         return {}
-    return {"log_evidence_constant": a.log_evidence_constant, "log_evidence_change": a.log_evidence_change}
+    return {
+        "varying": " and ".join(one.label for one in a.problem.varying),
+        "log_evidence_constant": a.log_evidence_constant,
+        "log_evidence_change": a.log_evidence_change,
+    }

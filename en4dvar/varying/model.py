@@ -1,4 +1,4 @@
-"""A model whose parameters vary in time, run piece by piece.
+"""A model whose parameters vary in time, or whose state changes at knots, run piece by piece.
 
 Its state at a knot goes on with the value of the next piece in the field that has the parameter's name. Any model whose
 state carries the parameter, and that can be resumed from a state, can be run like this.
@@ -14,13 +14,17 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.forward import Alternative, Failure, ForwardModel
-from en4dvar.state import Array, Field, StateLayout
+from en4dvar.state import Array, StateLayout
 from en4dvar.varying.paths import Outcomes, Walk
 from en4dvar.varying.random_walk import RandomWalk
+from en4dvar.varying.state_changes import StateChanges
 
 ATTRIBUTES = (
     "observables", "time_unit", "time_display_unit", "batch", "compiled", "validity", "path_quantities",
 )  # fmt: skip
+
+
+Varying = RandomWalk | StateChanges
 
 
 def can_vary(model: ForwardModel, name: str) -> bool:
@@ -30,14 +34,15 @@ def can_vary(model: ForwardModel, name: str) -> bool:
 
 
 class PiecewiseModel(ForwardModel):
-    """``model`` with parameters that vary; the changes are parameters of its own, the pieces fields of its state."""
+    """``model`` with what varies; the changes are parameters of its own, and its state carries their values along."""
 
-    def __init__(self, model: ForwardModel, varying: Sequence[RandomWalk]):
+    def __init__(self, model: ForwardModel, varying: Sequence[Varying]):
         self.model, self.varying = model, tuple(varying)
-        self.parameters = (*model.parameters, *(c.parameter for walk in self.varying for c in walk.changes))
-        own = (Field(v.pieces_name, len(v.knots) + 1, v.parameter.unit) for v in self.varying)
-        self.layout = StateLayout((*model.layout.fields, *own))
-        varied = {walk.name for walk in self.varying}
+        self.walks = tuple(one for one in self.varying if isinstance(one, RandomWalk))
+        self.state_changes = tuple(one for one in self.varying if isinstance(one, StateChanges))
+        self.parameters = (*model.parameters, *(c.parameter for one in self.varying for c in one.changes))
+        self.layout = StateLayout((*model.layout.fields, *(one.own for one in self.varying)))
+        varied = {walk.name for walk in self.walks}
         self.path_parameters = tuple(name for name in model.path_parameters if name not in varied)
         for name in ATTRIBUTES:
             setattr(self, name, getattr(model, name))
@@ -56,7 +61,7 @@ class PiecewiseModel(ForwardModel):
     def initial_states(self, theta: Mapping[str, Array]) -> Array:
         """As of the model. Raises ValueError where a piece lies outside of the parameter's bounds."""
         inner = self.model.initial_states({p.name: theta[p.name] for p in self.model.parameters})
-        return np.hstack([inner, *(_within_bounds(walk, walk.pieces(theta)) for walk in self.varying)])
+        return np.hstack([inner, *(one.values(theta) for one in self.varying)])
 
     def step(self, x: Array, t0: float, t1: float) -> Array:
         """Raises RuntimeError with the model's reason where it fails."""
@@ -74,7 +79,7 @@ class PiecewiseModel(ForwardModel):
         for begin, end in zip((-math.inf, *knots), (*knots, math.inf), strict=True):
             if not len(walk.alive) or begin >= times[:, -1].max():
                 break
-            for one in self.varying:
+            for one in self.walks:
                 piece = int(np.searchsorted(one.knots, begin, side="right"))
                 inner[:, self.model.layout[one.name]] = x[:, [self.layout[one.pieces_name].start + piece]]
             since = np.maximum(start, begin)
@@ -84,11 +89,18 @@ class PiecewiseModel(ForwardModel):
 
             ends = walk.run(begin, end, integrate)
             inner[walk.alive] = ends.reshape(-1, inner.shape[1])
+            self._change(walk, inner, end, start <= end)
         return walk.outcomes()
 
-
-def _within_bounds(walk: RandomWalk, pieces: Array) -> Array:
-    p = walk.parameter
-    if not np.all((pieces >= p.bounds[0]) & (pieces <= p.bounds[1]) & np.isfinite(pieces)):
-        raise ValueError(f"a piece of {p.name} outside [{p.bounds[0]:g}, {p.bounds[1]:g}] {p.unit}")
-    return pieces
+    def _change(self, walk: Walk, inner: Array, knot: float, concerned: npt.NDArray[np.bool_]) -> None:
+        """Change the states (N, n_state) at a knot, of the members (N,) ``concerned``; some may not survive it."""
+        for one in self.state_changes:
+            if knot not in one.knots:
+                continue
+            members, where = walk.alive[concerned[walk.alive]], self.model.layout[one.name]
+            change = walk.x[members, self.layout[one.own.name].start + one.knots.index(knot)]
+            inner[members, where], inside = one.applied(inner[members, where], change)
+            for i in members[~inside].tolist():
+                low, high = one.field.bounds
+                reason = f"{one.name} outside ({low:g}, {high:g}) {one.field.unit} after its change"
+                walk.failures[i] = Failure(reason, knot)

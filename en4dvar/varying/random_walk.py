@@ -17,7 +17,7 @@ import numpy as np
 
 from en4dvar.forward import ForwardModel
 from en4dvar.prior import PriorTerm
-from en4dvar.state import Array, Parameter
+from en4dvar.state import Array, Field, Parameter
 from en4dvar.units import convert
 
 SCALE = {"normal": "", "lognormal": "ln", "logit": "logit"}  # what a change is one of
@@ -58,6 +58,23 @@ class RandomWalk:
         """Of the values of all pieces, in the state and in result files."""
         return f"{self.name}_pieces"
 
+    @property
+    def label(self) -> str:
+        """What varies, in words."""
+        return self.parameter.label
+
+    @property
+    def own(self) -> Field:
+        """Where the state of a run keeps the values of the pieces."""
+        return Field(self.pieces_name, len(self.knots) + 1, self.parameter.unit)
+
+    def values(self, theta: Mapping[str, Array]) -> Array:
+        """:meth:`pieces`. Raises ValueError where one lies outside of the parameter's bounds."""
+        p, pieces = self.parameter, self.pieces(theta)
+        if not np.all((pieces >= p.bounds[0]) & (pieces <= p.bounds[1]) & np.isfinite(pieces)):
+            raise ValueError(f"a piece of {p.name} outside [{p.bounds[0]:g}, {p.bounds[1]:g}] {p.unit}")
+        return pieces
+
     def pieces(self, theta: Mapping[str, Array]) -> Array:
         """Physical values (…, m + 1) of the pieces, from those of the parameter and of its changes, (…,) by name.
 
@@ -72,6 +89,12 @@ class RandomWalk:
         return self.first.to_physical(np.cumsum(np.stack([first, *changes], axis=-1), axis=-1))
 
 
+def clock(model: ForwardModel, knot: float) -> str:
+    """An instant of the model in words."""
+    unit = "" if model.time_display_unit == "1" else f" {model.time_display_unit}"
+    return f"{convert(knot, model.time_unit, model.time_display_unit):.6g}{unit}"
+
+
 def _change(model: ForwardModel, first: PriorTerm, k: int, knot: float) -> Parameter:
     """The change at the k-th knot, counted from one."""
     p, scale = first.parameter, SCALE[first.transform]
@@ -81,12 +104,10 @@ def _change(model: ForwardModel, first: PriorTerm, k: int, knot: float) -> Param
         symbol = rf"$\Delta_{{{k}}}({function}{p.symbol[1:-1]})$"
     else:
         symbol = f"Δ{k} {scale} {p.symbol}".replace("  ", " ")
-    clock = "" if model.time_display_unit == "1" else f" {model.time_display_unit}"
-    at = f"{convert(knot, model.time_unit, model.time_display_unit):.6g}{clock}"
     return Parameter(
         f"{p.name}_change_{k}",
         unit,
-        label=f"change of {scale} {p.label} at {at}".replace("  ", " "),
+        label=f"change of {scale} {p.label} at {clock(model, knot)}".replace("  ", " "),
         symbol=symbol,
         display_unit=shown,
         source="random walk of a parameter that varies in time",

@@ -94,6 +94,49 @@ def test_parameters_that_cannot_vary(tmp_path):
         build(load_config(varying(tmp_path, prior=mean)))
 
 
+def with_error(folder, section):
+    return write_toy(folder, ("assimilation:\n", f"model_error:\n  {section}\nassimilation:\n"))
+
+
+def test_model_error(tmp_path):
+    (problem,) = build(load_config(with_error(tmp_path, "v: {every: 60 ms, std: 1 mm/s}")))
+    assert problem.prior.names == ("A", "k", "v_change_1", "v_change_2")
+    assert problem.prior.std[2:] == pytest.approx([1e-3] * 2)
+    assert problem.walks == ()
+    assert problem.constant.prior.names == ("A", "k")
+    (problem,) = build(load_config(with_error(tmp_path, "x: {at: [0.1 s], std: 2 %}")))
+    assert [one.parameter.label for one in problem.prior.terms][-1] == "model error: change of ln x at 0.1 s"
+    assert problem.prior.std[-1] == 0.02
+
+
+@pytest.mark.parametrize(
+    ("section", "words"),
+    [
+        ("y: {every: 60 ms, std: 1 mm}", r"17:3: model_error\.y: unknown field 'y' of the state"),
+        ("k: {every: 60 ms, std: 1 %}", r"17:3: model_error\.k: k is a parameter: write varies behind its prior"),
+        ("x: {std: 1 mm}", r"17:\d+: model_error\.x: give either every"),
+        ("x: {every: 60 ms, std: 1 s}", r"17:\d+: model_error\.x\.std: "),
+        ("x: {at: [1 s], std: 1 mm}", r"17:\d+: model_error\.x\.at: all knots lie after the last observation"),
+    ],
+)
+def test_what_is_wrong_with_a_model_error(tmp_path, section, words):
+    with pytest.raises(ConfigError, match=rf"toy\.yaml:{words}"):
+        build(load_config(with_error(tmp_path, section)))
+
+
+@pytest.mark.slow
+def test_a_run_with_a_model_error(tmp_path):
+    path = with_error(tmp_path, "v: {at: [80 ms], std: 1 m/s}")
+    out = tmp_path / "out"
+    run(load_config(path, {"output.directory": str(out)}))
+    result = load_result(out / "posterior.nc")
+    assert "v_change_1" in result.posterior
+    assert stored_walks(result) == ()
+    assert verdict(result).startswith("v of the state: the data ")
+    assert "What varies in time" in (out / "report.html").read_text(encoding="utf-8")
+    assert not (out / "varying.csv").exists()
+
+
 BUBBLE = """\
 name: bubble
 model: {name: bubble, start: laser, law: neo-hookean-kelvin-voigt}

@@ -14,14 +14,14 @@ from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem, StatePerturbation
 from en4dvar.state import Parameter
 from en4dvar.storage.codec import decode, encode
-from en4dvar.varying import RandomWalk
+from en4dvar.varying import RandomWalk, StateChanges
 
 TIMES = np.linspace(0.25, 5.0, 20)
 START, RATE, Q, STD = (1.0, 0.3), (0.8, 0.5), 0.4, 0.1
 SETTINGS = AssimilationSettings(members=16)
 
 
-def problem(truth=(1.2, 1.2, 0.6, 0.6), seed=0, knots=KNOTS):
+def problem(truth=(1.2, 1.2, 0.6, 0.6), seed=0, knots=KNOTS, state=0.0):
     """Observations of a rate with these pieces, and a prior of what the smoother below knows."""
     path = np.concatenate([[1.0], 1.0 + np.cumsum(np.diff([0.0, *KNOTS, TIMES[-1]]) * truth)])
     values = np.interp(TIMES, [0.0, *KNOTS, TIMES[-1]], path)
@@ -31,20 +31,22 @@ def problem(truth=(1.2, 1.2, 0.6, 0.6), seed=0, knots=KNOTS):
     perturbed = (StatePerturbation(offset, "y"),)
     observations = make_observations(TIMES, values, STD)
     constant = InverseProblem(model, model.observables[0], observations, Prior(terms), {}, perturbed)
-    return constant.varied([RandomWalk.of(model, terms[0], knots, Q)]) if knots else constant
+    varying = [RandomWalk.of(model, terms[0], knots, Q)] if knots else []
+    varying += [StateChanges.of(model, model.layout.fields[0], KNOTS, state, relative=False)] if state else []
+    return constant.varied(varying) if varying else constant
 
 
-def smoother(values, q):
+def smoother(values, q, q_state=0.0):
     """Mean and covariance of (y, r) at time zero, at the knots (before the change) and at the end, and ln p(y).
 
-    The state is propagated from event to event; the rate changes just after a knot by N(0, q²).
+    The state is propagated from event to event; just after a knot y and r change by N(0, q_state²) and N(0, q²).
     """
     events = sorted({*TIMES.tolist(), *KNOTS})
     mean, covariance, log_evidence = np.array([START[0], RATE[0]]), np.diag([START[1] ** 2, RATE[1] ** 2]), 0.0
     filtered, predicted, maps, t = [(mean, covariance)], [], [], 0.0
     for event in events:
         step = np.array([[1.0, event - t], [0.0, 1.0]])
-        jump = np.diag([0.0, q**2]) if t in KNOTS else np.zeros((2, 2))
+        jump = np.diag([q_state**2, q**2]) if t in KNOTS else np.zeros((2, 2))
         mean, covariance = step @ mean, step @ (covariance + jump) @ step.T
         predicted.append((mean, covariance))
         maps.append(step)
@@ -80,6 +82,25 @@ def test_pieces_are_those_of_the_rauch_tung_striebel_smoother(step_control):
     assert together == pytest.approx(expected[0][1], abs=1e-10)
     assert a.log_evidence == pytest.approx(log_evidence, abs=1e-8)
     assert a.log_evidence_constant == pytest.approx(smoother(p.observations.values, 0.0)[1], abs=1e-8)
+
+
+@pytest.mark.parametrize("walks", [True, False])
+def test_the_state_may_change_as_well(walks):
+    """Weak constraint: a model error of y at the knots, with and without a rate that walks."""
+    p = problem(knots=KNOTS if walks else (), state=0.3)
+    a = assimilate(p, SETTINGS, 1)
+    expected, log_evidence = smoother(p.observations.values, Q if walks else 0.0, 0.3)
+    assert a.log_evidence == pytest.approx(log_evidence, abs=1e-8)
+    assert a.log_evidence_constant == pytest.approx(smoother(p.observations.values, 0.0)[1], abs=1e-8)
+    rate = a.pieces(p.walks[0], a.posterior)[:, -1] if walks else a.posterior[:, 0]
+    assert rate.mean() == pytest.approx(expected[-1][0][1], abs=1e-10)
+    assert rate.var(ddof=1) == pytest.approx(expected[-1][1][1, 1], abs=1e-10)
+    # y at the end: what it was plus what it moved
+    rates = a.pieces(p.walks[0], a.posterior) if walks else np.repeat(a.posterior[:, :1], len(KNOTS) + 1, axis=1)
+    end = START[0] + a.posterior[:, 1] + rates @ np.diff([0.0, *KNOTS, TIMES[-1]]) + a.posterior[:, -3:].sum(axis=1)
+    assert end.mean() == pytest.approx(expected[-1][0][0], abs=1e-10)
+    assert end.var(ddof=1) == pytest.approx(expected[-1][1][0, 0], abs=1e-10)
+    assert a.posterior_predictions[:, -1] == pytest.approx(end, abs=1e-10)
 
 
 def test_evidence_of_constant_values_is_that_of_a_run_without():

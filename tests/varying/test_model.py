@@ -10,7 +10,8 @@ from varying_models import KNOTS, Batched, Ending, Ramp, Steep
 from en4dvar.batch import Batch
 from en4dvar.forward import Failure, Trajectory
 from en4dvar.prior import PriorTerm
-from en4dvar.varying import PiecewiseModel, RandomWalk
+from en4dvar.state import Field
+from en4dvar.varying import PiecewiseModel, RandomWalk, StateChanges
 
 TIMES = np.array([0.25, 1.0, 1.5, 3.0, 4.0, 5.0])
 
@@ -112,3 +113,26 @@ def test_a_logarithm_walks_and_stays_within_bounds():
         varied.initial_states(given | {"k_change_1": np.array([1e4])})
     outside = walk.pieces({"k": np.array([-1.0, np.nan]), "k_change_1": np.zeros(2), "k_change_2": np.zeros(2)})
     assert np.isnan(outside).all()
+
+
+def test_a_state_that_changes():
+    """y' = r with steps of y at 1 and 2: by an amount, by a factor, out of its bounds, and resumed anywhere."""
+    model = Ramp()
+    for relative in (False, True):
+        steps = StateChanges.of(model, model.layout.fields[0], (1.0, 2.0), 0.5, relative)
+        varied = PiecewiseModel(model, [steps])
+        change = {f"y_change_{k}": np.array([value]) for k, value in ((1, 0.5), (2, -0.2))}
+        x = varied.initial_states({"r": np.array([2.0])} | change)
+        (path,) = varied.trajectories(x, TIMES)
+        at_1 = 3.0 * np.exp(0.5) if relative else 3.5
+        at_2 = (at_1 + 2.0) * np.exp(-0.2) if relative else at_1 + 1.8
+        assert path["y"] == pytest.approx([1.5, 3.0, at_1 + 1.0, at_2 + 2.0, at_2 + 4.0, at_2 + 6.0])
+        for k in range(len(TIMES)):
+            (rest,) = varied.resumed(path.states[[k]], TIMES[[k]], TIMES[None])
+            assert rest["y"][k:] == pytest.approx(path["y"][k:])
+    bounded = StateChanges(Field("y", unit="m", bounds=(0.0, np.inf)), False, (1.0, 2.0), steps.changes)
+    varied = PiecewiseModel(model, [bounded])
+    change = {"y_change_1": np.array([0.1, -9.0]), "y_change_2": np.array([0.1, 0.1])}
+    well, lost = varied.trajectories(varied.initial_states({"r": np.array([2.0, 2.0])} | change), TIMES)
+    assert isinstance(well, Trajectory)
+    assert lost == Failure("y outside (0, inf) m after its change", 1.0)
