@@ -226,18 +226,21 @@ def test_a_known_discrepancy_is_a_correlated_error():
 
 
 class Leading(LinearResponse):
-    """Leads to an amplitude that no number holds."""
+    """Leads to an amplitude beside which the errors are lost in rounding."""
 
-    def step(self, *arguments):
-        return np.array([0.0, 0.0, 1e3, 0.0]), 0.0
+    def step(self, observations, predicted, moved, prior_shift):
+        if not moved.any():
+            return np.array([0.0, 0.0, 40.0, 0.0]), 0.0
+        return super().step(observations, predicted, moved, prior_shift)
 
 
 def test_an_alternative_that_leads_to_no_covariance_is_beyond_linear_response():
     problem = with_discrepancy(make_problem(Linear(("a", "b")), [1.0, 1.3]))
     problem.model.alternatives = (Alternative("other", "it were so", Linear(("a", "b"))),)
     x = problem.prior.mean
-    run = forecast(problem, x[None])
-    response = Leading(x, Linearisation(run.predicted[0], np.ones((2, K))), np.eye(2, 4), 11.0, problem.observations)
+    like = forecast(problem, x[None]).predicted[0]
+    linear = Linearisation.of_stacked(like, like.stacked, np.ones((2, like.stacked.shape[0])))
+    response = Leading(x, linear, np.eye(2, 4), 11.0, problem.observations)
     (shift,) = what_if(problem, response, np.ones(4), 0.0, SerialExecutor())
     assert shift.reason == "beyond linear response"
     assert shift.runs == 2
