@@ -226,11 +226,11 @@ def test_a_known_discrepancy_is_a_correlated_error():
 
 
 class Leading(LinearResponse):
-    """Leads to an amplitude beside which the errors are lost in rounding."""
+    """Leads to a large amplitude and a long time, beside which the errors are lost in rounding."""
 
     def step(self, observations, predicted, moved, prior_shift):
         if not moved.any():
-            return np.array([0.0, 0.0, 40.0, 0.0]), 0.0
+            return np.array([0.0, 0.0, 40.0, 100.0]), 0.0
         return super().step(observations, predicted, moved, prior_shift)
 
 
