@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
 from statistics import median
 
 import numpy as np
@@ -29,7 +28,7 @@ Findings = Iterator[Caution]
 def rank(prior: Prior, members: Array, posterior: Array) -> Findings:
     """Ensembles (N, n), (N', n) whose anomalies span fewer directions than there are parameters."""
     n = members.shape[1]
-    spanned = _rank(members.tobytes(), prior.std.tobytes())
+    spanned = _rank((members - members.mean(axis=0)) / prior.std)
     if spanned < n:
         words = f"the {len(members)} prior members span {spanned} of {n} directions"
         yield caution(
@@ -169,10 +168,6 @@ def down_weighted(analysis: Analysis, most: int = 6) -> Findings:
     yield caution("down-weighted", words)
 
 
-@lru_cache(maxsize=4)  # the data sets of a campaign share their prior members
-def _rank(members_: bytes, scale_: bytes) -> int:
-    """Of the anomalies of members (N, n) in units of a scale (n,)."""
-    scale = np.frombuffer(scale_)
-    members = np.frombuffer(members_).reshape(-1, len(scale))
-    values = np.linalg.svd((members - members.mean(axis=0)) / scale, compute_uv=False)
+def _rank(anomalies: Array) -> int:
+    values = np.linalg.svd(anomalies, compute_uv=False)
     return int(np.sum(values > SAME_DIRECTION * values[0])) if values.size and values[0] > 0 else 0
