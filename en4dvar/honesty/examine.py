@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from en4dvar.analysis import Analysis
 from en4dvar.caution import CATALOGUE, Caution, caution, worst_first
-from en4dvar.diagnostics import active_members, shape_warnings
+from en4dvar.diagnostics import UNSEEN, active_members, shape_warnings
 from en4dvar.honesty import checks
 from en4dvar.honesty.lost import loss
 from en4dvar.prior import Prior
@@ -95,13 +95,14 @@ def _fit(a: Analysis, odd: Sequence[Caution]) -> checks.Findings:
 
 
 def unfinished(analysis: Analysis) -> checks.Findings:
-    """Iterations that stopped before their own criterion; a note where the next step would have been short.
+    """Iterations that stopped before their own criterion; a note where the next step would have been short, and nothing
+    where no user would see it.
 
     A gradient regressed over the ensemble need not vanish where J is smallest, so that variant often ends like this.
     """
-    if analysis.converged:
-        return
     step_norm = analysis.iterations[-1].step_norm  # of the next step, had there been one
+    if analysis.converged or step_norm <= UNSEEN:
+        return
     words = f"not converged: {analysis.stop_reason}"
     if step_norm <= SHORT_STEP:
         words = f"{words}; the next step would be {step_norm:.2g} posterior standard deviations"

@@ -120,8 +120,7 @@ class _Parts:
         config = self.plan.configs[fit.gel][fit.model]
         seeds = (own_seed(config.seed, name) for name in fit.names)
         analyses = tuple(
-            assimilate(p, config.assimilation, seed, self.executor)
-            for p, seed in zip(fit.problems, seeds, strict=True)
+            assimilate(p, config.assimilation, seed, self.executor) for p, seed in zip(fit.problems, seeds, strict=True)
         )
         return replace(fit, analyses=analyses)
 

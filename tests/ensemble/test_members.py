@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from same_bits import assert_same_bits
-from toys import Linear, Vectorised, make_problem
+from toys import Vectorised, make_problem
 
 from en4dvar import Batch
 from en4dvar.assimilate import assimilate

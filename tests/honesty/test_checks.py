@@ -136,13 +136,13 @@ def test_a_tenth_of_the_members_may_leave_the_validity(beyond, told):
 def test_iterations_that_end_next_to_their_criterion_are_a_note_without_alarm():
     analysis, control = gaussian()
 
-    def ended(step_norm: float) -> Caution:
+    def ended(step_norm: float) -> tuple[Caution, ...]:
         last = replace(analysis.iterations[-1], step_norm=step_norm)
         reason = "no decrease possible along the step"
-        (found,) = examine(replace(analysis, converged=False, stop_reason=reason, iterations=(last,)), control)
-        return found
+        return examine(replace(analysis, converged=False, stop_reason=reason, iterations=(last,)), control)
 
-    near, far, unknown = ended(0.05), ended(0.6), ended(np.nan)
+    (near,), (far,), (unknown,) = ended(0.15), ended(0.6), ended(np.nan)
+    assert ended(0.08) == ()  # another step would move nothing that a user sees
     assert (near.code, near.severity) == ("not-converged", "note")
     assert near.advice.startswith("no action is needed")
     assert (far.severity, unknown.severity) == ("serious", "serious")
