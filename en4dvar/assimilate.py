@@ -189,6 +189,7 @@ class _Assimilation:
                 descent.iterate.cost, descent.newton.hessian.singular_values, len(space.members), observations
             ),
             extremes=after.extremes,
+            beyond=after.beyond,
             residuals=self.residuals(descent),
             discrepancy=self.discrepancy(descent, last.predicted[0]),
             what_if=shifts,

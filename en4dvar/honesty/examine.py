@@ -52,7 +52,7 @@ def examine(
     ``worst_loss`` (N,) are the reasons of failure, "" for a member alive, in the iteration that lost most; ``found``
     are warnings met on the way.
     """
-    a, problem, prior = analysis, analysis.problem, analysis.problem.prior
+    a, prior = analysis, analysis.problem.prior
     alive = active_members(a.posterior_failures)
     odd = _structure(a)
     return worst_first(
@@ -69,7 +69,7 @@ def examine(
             *odd,
             *checks.conflict(prior, control.centre),
             *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
-            *(checks.validity(problem.model.validity, a.extremes[alive]) if problem.model.validity else ()),
+            *_validity(a, alive),
             *(caution("non-gaussian", words) for words in shape_warnings(a.shape)),
             *checks.information(prior.names, a.dfs_per_parameter),
         )
@@ -82,6 +82,16 @@ def _structure(a: Analysis) -> tuple[Caution, ...]:
     robust = math.isfinite(observations.noise.counts_within)
     found = tuple(checks.structure(a.residuals, robust, model.time_display_unit, times))
     return tuple(replace(c, advice=OTHER_KERNEL) for c in found) if a.discrepancy else found
+
+
+def _validity(a: Analysis, alive: npt.NDArray[np.bool_]) -> checks.Findings:
+    """Without a linearisation every reading that counts is taken to inform."""
+    limits, observations, found = a.problem.model.validity, a.problem.observations, a.residuals
+    which, leverage = (
+        (observations.used, np.ones(len(observations.used))) if found is None else (found.which, found.leverage)
+    )
+    if limits:
+        yield from checks.validity(limits, a.extremes[alive], a.beyond[alive], observations.times[which], leverage)
 
 
 def _fit(a: Analysis, odd: Sequence[Caution]) -> checks.Findings:

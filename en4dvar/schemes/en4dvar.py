@@ -45,7 +45,7 @@ class En4DVar:
         return self.linearisation == "bundle" and 0 < rank < n_members - 1
 
     def members(self, weights: Weights, basis: Array | None = None) -> Array:
-        """Rows (r or 2r, N) along the directions of the basis where these are few, else those of 1wᵀ + εI or 1wᵀ + T."""
+        """Rows (r or 2r, N) along directions of the basis where these are few, else those of 1wᵀ + εI or 1wᵀ + T."""
         if basis is not None and self.economical(basis):
             rows = self._short(weights) * basis.T
             return np.asarray(weights.w + (np.vstack([rows, -rows]) if self._on_both_sides(weights, basis) else rows))
@@ -89,5 +89,5 @@ class En4DVar:
         return weights.wider > 1 and 2 * basis.shape[1] < len(basis)
 
     def _short(self, weights: Weights) -> float:
-        """Step along a unit direction of the weights that moves the state by ε (times wider) prior standard deviations."""
+        """Step along a unit direction of the weights that moves the state by ε, or more, prior standard deviations."""
         return self.epsilon * weights.wider / math.sqrt(len(weights.w) - 1)

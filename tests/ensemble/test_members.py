@@ -56,7 +56,7 @@ def test_batch_and_list_have_the_same_bits(time_std, limit):
     assert lost.any() == np.isfinite(limit)
     assert batch.failures == listed.failures
     assert batch.failures == tuple("non-finite state" if i else "" for i in lost)
-    for name in ("predictions", "path", "extremes"):
+    for name in ("predictions", "path", "extremes", "beyond"):
         np.testing.assert_array_equal(getattr(batch, name), getattr(listed, name))
     if batch.predicted.rates is not None:
         np.testing.assert_array_equal(batch.predicted.rates, listed.predicted.rates)
