@@ -29,6 +29,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import stdtrit
 
 from en4dvar.errors import DataError
 from en4dvar.state import Array
@@ -41,16 +42,22 @@ STIFF = 20e3  # Pa; published: 7.7 kPa (Estrada et al. 2018), stiff polyacrylami
 THICK = 0.3  # Pa s; published: 0.19 (Yang et al. 2020)
 SOFT = 1.02  # r of a large bubble in a soft gel, whose gas and viscosity prolong its collapse a little
 APART = 1.05  # noise and physics that the model lacks move r by less than this
+SURE = 0.99  # one-sided probability, by the scatter of the samples
 SAME_FACTOR = 1.12  # a factor that is this close to that of a known mistake may be it
 
 
 @dataclass(frozen=True)
 class Lobe:
-    """The bubble's largest excursion; SI. ``t_c`` is from the maximum to the collapse."""
+    """The bubble's largest excursion; SI. ``t_c`` is from the maximum to the collapse.
+
+    ``margin``: t_c/R_max lies within this factor less one, by the scatter of the samples about the parabola (99 % to
+    either side).
+    """
 
     R_max: float
     t_max: float
     t_c: float
+    margin: float = 0.0
 
     def rayleigh_ratio(self, medium: Medium) -> float:
         """The collapse time over Rayleigh's."""
@@ -71,7 +78,21 @@ def lobe(times: Array, radius: Array) -> Lobe:
     middle = -b / (2 * c)
     peak = a - b**2 / (4 * c)
     t_max = times[int(np.argmax(radius))] + scale * middle
-    return Lobe(float(radius.max() * peak**0.4), float(t_max), float(scale * np.sqrt(-peak / c)))
+    margin = _margin(z, y, np.array([c, b, a]))
+    return Lobe(float(radius.max() * peak**0.4), float(t_max), float(scale * np.sqrt(-peak / c)), margin)
+
+
+def _margin(z: Array, y: Array, fit: Array) -> float:
+    """Of t_c/R_max = √(−peak/c)/peak^{2/5}, to first order in the errors of the coefficients (c, b, a) = ``fit``."""
+    weight = y**-1.5
+    X = np.vander(z, 3) * weight[:, None]
+    residual = weight * y**2.5 - X @ fit
+    left = len(z) - 3
+    covariance = np.linalg.pinv(X.T @ X) * float(residual @ residual) / left
+    c, b, a = fit
+    slope = np.array([b**2 / (4 * c**2), -b / (2 * c), 1.0]) * 0.1 / (a - b**2 / (4 * c))  # of ln peak^{1/10}
+    slope[0] -= 0.5 / c
+    return float(stdtrit(left, SURE) * np.sqrt(slope @ covariance @ slope))
 
 
 def _falling(radius: Array) -> slice:
@@ -95,17 +116,19 @@ def doubt(view: Lobe, medium: Medium, expected: Sequence[float] = ()) -> str:
     """Why the scales of a history cannot be right, and what would explain it; "" where they can.
 
     ``expected`` are the ratios of the prior members: a ratio that none of them comes near is doubted, and one outside
-    :func:`bounds` unless half of them are there as well.
+    :func:`bounds`, beyond its margin, unless half of them are there as well.
     """
     ratio, (least, largest) = view.rayleigh_ratio(medium), bounds(view.R_max, medium)
-    short, long = ratio < least, ratio > largest
+    sure = 1 + view.margin
+    short, long = ratio * sure < least, ratio > largest * sure
     like_it = sum(r < least if short else r > largest for r in expected)
     if (short or long) and 2 * like_it <= len(expected):
         limit = f"{STIFF / 1e3:g} kPa allows no less than {least:.2f}"
         if long:
             limit = f"{THICK:g} Pa s allows no more than {largest:.2f}"
         return f"{_measured(ratio)}; a gel of {limit}: {_explained(SOFT / ratio)}"
-    if len(expected) and not min(expected) / APART <= ratio <= max(expected) * APART:
+    apart = max(APART, sure)
+    if len(expected) and not min(expected) / apart <= ratio <= max(expected) * apart:
         usual = float(np.median(expected))
         span = f"{min(expected):.2f} to {max(expected):.2f}"
         return f"{_measured(ratio)}; the prior expects {span}: {_explained(usual / ratio)}, or the prior is wrong"

@@ -92,6 +92,18 @@ def test_a_prior_that_expects_it_is_believed() -> None:
     assert doubt(usual(1.0), WATER_25C, [0.9, 0.94, 0.98]) == ""
 
 
+def test_the_margin_is_that_of_the_scatter() -> None:
+    """99 % to either side: of 400 noisy collapses some 4 lie beyond it on each."""
+    rng, view = np.random.default_rng(1), usual(0.9)
+    t = np.linspace(-0.2, 0.95, 9) * view.t_c
+    R = view.R_max * (1 - (t / view.t_c) ** 2) ** 0.4
+    found = [lobe(t, R + 0.01 * view.R_max * rng.standard_normal(9)) for _ in range(400)]
+    z = [np.log(one.rayleigh_ratio(WATER_25C) / 0.9) / one.margin for one in found]
+    assert 0 < np.sum(np.greater(z, 1)) < 14
+    assert 0 < np.sum(np.less(z, -1)) < 14
+    assert lobe(t, R).margin < 1e-9
+
+
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
 def test_a_wrong_unit_is_asked_for(factor: float) -> None:
     assert "are the units of both columns right?" in doubt(usual(factor), WATER_25C)
