@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.batch import Batch
-from en4dvar.forward import Failure, Trajectory
+from en4dvar.forward import Failure, Trajectory, ValidityLimit
 from en4dvar.state import Array, StateLayout
 
 Outcomes = Sequence[Trajectory | Failure]
@@ -99,6 +99,10 @@ class JoinedTrajectory(Trajectory):
         """The largest of all pieces."""
         return max(path.largest(name) for path, _ in self._parts)
 
+    def beyond(self, limit: ValidityLimit) -> float:
+        """The earliest of all pieces."""
+        return min(path.beyond(limit) for path, _ in self._parts)
+
     @property
     def states(self) -> Array:
         """(K, n_state)."""
@@ -149,6 +153,10 @@ class JoinedBatch(Batch):
     def largest(self, name: str) -> Array:
         """(N,) the largest of all pieces."""
         return np.max([batch.largest(name) for batch in self._batches()], axis=0)
+
+    def beyond(self, limit: ValidityLimit) -> Array:
+        """(N,) the earliest of all pieces."""
+        return np.min([batch.beyond(limit) for batch in self._batches()], axis=0)
 
     @property
     def states(self) -> Array:  # type: ignore[override]

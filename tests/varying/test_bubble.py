@@ -47,6 +47,9 @@ def test_without_a_change_the_path_is_that_of_the_constant_model():
     (whole,) = fine.trajectories(fine.initial_states({k: np.array([v]) for k, v in TRUTH.items()}), TIMES)
     assert paths["R"][0] == pytest.approx(whole["R"], rel=1e-6)
     assert paths.largest("wall_mach")[0] == pytest.approx(whole.largest("wall_mach"), rel=1e-3)
+    (limit,) = fine.validity
+    assert paths.beyond(limit) == pytest.approx(np.full(3, whole.beyond(limit)), rel=1e-4)
+    assert paths[0].beyond(limit) == paths.beyond(limit)[0]
     assert paths["strain_rate"].shape == (3, len(TIMES))
 
 
