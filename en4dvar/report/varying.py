@@ -103,7 +103,7 @@ def bands(result: StoredResult) -> Figure:
             if words == "posterior":
                 ax.step(walk.edges, median, where="post", color=LIGHT[colour], label="median")
         least, most = float(np.nanmin(walk.posterior)), float(np.nanmax(walk.prior))
-        if least > 0 and math.isfinite(most) and most > 20 * least:
+        if least > 0 and math.isfinite(most) and most > 5 * least:
             ax.set_yscale("log")
         ax.set(xlabel=with_unit("time", walk.time_unit), ylabel=with_unit(walk.symbol, walk.unit))
         ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
