@@ -155,7 +155,10 @@ class StateField:
 
 @dataclass(frozen=True)
 class Observable:
-    """A quantity that can be measured: its name in YAML and netCDF, its units, and the operator H that predicts it."""
+    """A quantity that can be measured: its name in YAML and netCDF, its units, and the operator H that predicts it.
+
+    ``positive``: it cannot be zero, so that zeros before the first reading of a file say that there was nothing yet.
+    """
 
     name: str
     unit: str
@@ -163,6 +166,7 @@ class Observable:
     symbol: str = ""
     display_unit: str = ""
     label: str = ""
+    positive: bool = False
 
     def __post_init__(self) -> None:
         for key, value in (("symbol", self.name), ("display_unit", self.unit), ("label", self.name)):
@@ -188,7 +192,8 @@ class ForwardModel(ABC):
     fast path likes to get at once (executors cut chunks at multiples of it); ``compiled`` says that ``trajectories``
     releases the interpreter lock, so that threads serve it. ``autonomous`` says that F depends on elapsed time alone:
     sequential schemes may start ``trajectories`` at any instant, where otherwise they repeat ``step``. ``validity``
-    names quantities and the limits beyond which the equations do not hold. ``alternatives`` are assumptions that could
+    names quantities and the limits beyond which the equations do not hold; :meth:`doubts` judges observations before a
+    run. ``alternatives`` are assumptions that could
     be otherwise, for :mod:`en4dvar.response.what_if`; ``path_quantities`` and ``path_parameters``, names
     of fields of the state that act along the path and not only at its start, are for :mod:`en4dvar.response.ledger`.
 
@@ -249,6 +254,14 @@ class ForwardModel(ABC):
     def share(self, x: Array, times: Array) -> Shared | None:
         """:meth:`trajectories` of states (N, n_state) as work that threads share, where the model can; else None."""
         return None
+
+    def doubts(self, observable: str, times: Array, values: Array, predicted: Array) -> Sequence[str]:
+        """Why observations ``values`` (K,) at ``times`` (K,) cannot be what they say, in words; by default nothing.
+
+        ``predicted`` (N, K) is the same of the prior members that could be run. Asked before a run and told with its
+        warnings: the place for scales and units that only the model can judge.
+        """
+        return ()
 
     def _march(self, x: Array, times: Array, start: float = 0.0) -> Trajectory | Failure:
         states = np.empty((len(times), self.layout.size))

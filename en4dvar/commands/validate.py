@@ -64,10 +64,14 @@ def _panels() -> int:
 
 def _warn(one: Preview) -> None:
     """What the prior ensemble shows that a run would stumble over."""
+    from en4dvar.honesty import doubts
+
     name, reasons = one.problem.observations.name, [reason for reason in one.run.failures if reason]
     if reasons:
         lost = f"{len(reasons)} of {len(one.run.failures)} prior members cannot be run"
         click.echo(f"warning: {name}: {lost}, e.g.: {reasons[0]}", err=True)
+    for words in doubts(one.problem, one.run.predictions):
+        click.echo(f"warning: {name}: {words}", err=True)
     if one.outside > 0.1:
         share = f"{100 * one.outside:.0f} % of the observations lie outside everything the prior expects"
         click.echo(f"warning: {name}: {share}; check units, clock and window (--plot shows them)", err=True)

@@ -15,6 +15,7 @@ from en4dvar.diagnostics import UNSEEN, active_members, shape_warnings
 from en4dvar.honesty import checks
 from en4dvar.honesty.lost import loss
 from en4dvar.prior import Prior
+from en4dvar.problem import InverseProblem
 from en4dvar.state import Array
 from en4dvar.units import convert
 
@@ -58,6 +59,7 @@ def examine(
     return worst_first(
         (
             *found,
+            *(caution("implausible-data", words) for words in doubts(problem, a.prior_predictions)),
             *checks.down_weighted(a),
             *unfinished(a),
             *checks.rank(prior, control.prior, control.posterior[alive]),
@@ -74,6 +76,12 @@ def examine(
             *checks.information(prior.names, a.dfs_per_parameter),
         )
     )
+
+
+def doubts(problem: InverseProblem, predicted: Array) -> Sequence[str]:
+    """The model's doubts about the observations beside predictions (N, K) of prior members, NaN where one failed."""
+    y, alive = problem.observations, np.all(np.isfinite(predicted), axis=1)
+    return problem.model.doubts(problem.observable.name, y.times, y.values, predicted[alive])
 
 
 def _structure(a: Analysis) -> tuple[Caution, ...]:

@@ -22,6 +22,7 @@ from en4dvar.forward import (
 )
 from en4dvar.state import Array
 from en4dvar_bubble.alternatives import alternatives
+from en4dvar_bubble.collapse import doubts
 from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics
 from en4dvar_bubble.packing import pack
 from en4dvar_bubble.paths import Paths
@@ -39,7 +40,13 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
     compiled: ClassVar[bool] = True
     observables = (
         Observable(
-            "radius", "m", StateField("R", rate_of="Rdot"), symbol="R", display_unit="um", label="bubble radius"
+            "radius",
+            "m",
+            StateField("R", rate_of="Rdot"),
+            symbol="R",
+            display_unit="um",
+            label="bubble radius",
+            positive=True,
         ),
     )
 
@@ -79,6 +86,10 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
     def alternatives(self) -> tuple[Alternative, ...]:  # type: ignore[override]
         """See :mod:`en4dvar_bubble.alternatives`."""
         return alternatives(self)
+
+    def doubts(self, observable: str, times: Array, values: Array, predicted: Array) -> Sequence[str]:
+        """Whether the collapse time can be right, see :mod:`en4dvar_bubble.collapse`."""
+        return doubts(times, values, predicted, self.medium)
 
     def initial_state(self, theta: Mapping[str, float]) -> Array:
         return np.asarray(self.initial_states({p.name: np.array([theta[p.name]]) for p in self.parameters})[0])
