@@ -59,7 +59,7 @@ def examine(
     return worst_first(
         (
             *found,
-            *(caution("implausible-data", words) for words in doubts(problem, a.prior_predictions)),
+            *(caution("implausible-data", words) for words in doubts(a.problem, a.prior_predictions)),
             *checks.down_weighted(a),
             *unfinished(a),
             *checks.rank(prior, control.prior, control.posterior[alive]),
