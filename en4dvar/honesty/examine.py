@@ -53,7 +53,7 @@ def examine(
     ``worst_loss`` (N,) are the reasons of failure, "" for a member alive, in the iteration that lost most; ``found``
     are warnings met on the way.
     """
-    a, problem, prior = analysis, analysis.problem, analysis.problem.prior
+    a, prior = analysis, analysis.problem.prior
     alive = active_members(a.posterior_failures)
     odd = _structure(a)
     return worst_first(
