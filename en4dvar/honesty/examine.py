@@ -73,9 +73,16 @@ def examine(
             *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
             *_validity(a, alive),
             *(caution("non-gaussian", words) for words in shape_warnings(a.shape)),
-            *checks.information(prior.names, a.dfs_per_parameter),
+            *checks.information(*_to_be_informed(a)),
         )
     )
+
+
+def _to_be_informed(a: Analysis) -> tuple[list[str], Array]:
+    """Names and DFS of the parameters; not of the changes of one that varies, of which data may say little."""
+    changes = {change.parameter.name for one in a.problem.varying for change in one.changes}
+    told = [j for j, name in enumerate(a.problem.prior.names) if name not in changes]
+    return [a.problem.prior.names[j] for j in told], a.dfs_per_parameter[told]
 
 
 def doubts(problem: InverseProblem, predicted: Array) -> Sequence[str]:
