@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.analysis import Analysis
-from en4dvar.caution import CATALOGUE, Caution, caution, worst_first
-from en4dvar.diagnostics import active_members, shape_warnings
+from en4dvar.caution import CATALOGUE, Caution, caution, doubts, worst_first
+from en4dvar.diagnostics import active_members
 from en4dvar.honesty import checks
 from en4dvar.honesty.lost import loss
 from en4dvar.prior import Prior
@@ -55,25 +55,26 @@ def examine(
     a, problem, prior = analysis, analysis.problem, analysis.problem.prior
     alive = active_members(a.posterior_failures)
     odd = _structure(a)
-    return worst_first(
-        (
-            *found,
-            *checks.down_weighted(a),
-            *unfinished(a),
-            *checks.rank(prior, control.prior, control.posterior[alive]),
-            *collapse(prior, control, alive),
-            *loss("prior forecast", a.prior_failures, prior, control.prior),
-            *loss("iterations", worst_loss, prior),
-            *loss("posterior forecast", a.posterior_failures, prior, control.posterior),
-            *_fit(a, odd),
-            *odd,
-            *checks.conflict(prior, control.centre),
-            *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
-            *(checks.validity(problem.model.validity, a.extremes[alive]) if problem.model.validity else ()),
-            *(caution("non-gaussian", words) for words in shape_warnings(a.shape)),
-            *checks.information(prior.names, a.dfs_per_parameter),
-        )
+    members = a.posterior[alive]
+    warnings = (
+        *found,
+        *checks.down_weighted(a),
+        *unfinished(a),
+        *checks.rank(prior, control.prior, control.posterior[alive]),
+        *collapse(prior, control, alive),
+        *loss("prior forecast", a.prior_failures, prior, control.prior),
+        *loss("iterations", worst_loss, prior),
+        *loss("posterior forecast", a.posterior_failures, prior, control.posterior),
+        *_fit(a, odd),
+        *odd,
+        *checks.conflict(prior, control.centre),
+        *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
+        *(checks.validity(problem.model.validity, a.extremes[alive]) if problem.model.validity else ()),
+        *checks.gaussian(prior, members, a.shape),
     )
+    doubted = [name for name in prior.names if doubts(warnings, name)]
+    little = checks.information(prior, control.posterior[alive], a.dfs_per_parameter, doubted)
+    return worst_first((*warnings, *little))
 
 
 def _structure(a: Analysis) -> tuple[Caution, ...]:
@@ -122,7 +123,8 @@ def collapse(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool
     narrow = control.posterior[alive].std(axis=0) <= NO_SPREAD * prior.std
     if narrow.any():
         names = ", ".join(name for name, no_spread in zip(prior.names, narrow, strict=True) if no_spread)
-        yield caution("ensemble-collapse", f"the ensemble has collapsed: all members have the same {names}")
+        words = f"the ensemble has collapsed: all members have the same {names}"
+        yield caution("ensemble-collapse", words, parameters=tuple(names.split(", ")))
         return
     lowest = min(control.centre_cost, float(control.costs[alive].min()))
     allowed = float(np.mean(2 * (control.costs[alive] - lowest))) / len(control.centre)
