@@ -221,7 +221,7 @@ class _Assimilation:
         conditional = observations.log_conditional(run.predicted)
         if conditional is None:
             return None
-        alive = run.active & np.isfinite(conditional).all(axis=1)
+        alive = diag.active_members(run.failures) & np.isfinite(conditional).all(axis=1)
         if alive.sum() < members.shape[1] + 2:
             return None
         log_weights = np.zeros(alive.sum()) if costs is None else gaussian_log_weights(members[alive], costs[alive])

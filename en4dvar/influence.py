@@ -40,7 +40,7 @@ WEIGHTED, LINEAR, UNKNOWN = 0, 1, 2  # how a change was found
 
 
 @dataclass(frozen=True)
-class Tangent:
+class ReadingTangent:
     """The tangent of K readings of independent errors: ``d`` (K, m) and ``S`` (K, m, r) are the whitened rows of each,
     where N members have ``coordinates`` (N, r); ``directions`` (r, n) is what these change in the control vector.
     """
@@ -89,7 +89,7 @@ class Influence:
 
     @classmethod
     def of(
-        cls, prior: Prior, members: Array, log_weights: Array, log_ratios: Array, tangent: Tangent | None = None
+        cls, prior: Prior, members: Array, log_weights: Array, log_ratios: Array, tangent: ReadingTangent | None = None
     ) -> Self:
         """From members (N, n), transformed, and the log (N, K) of 1/p(y_k | y_{−k}, θ)^β.
 

@@ -20,7 +20,7 @@ from en4dvar.units import convert
 MOST_REMARKS = 3
 INTERVAL = ("std", "q05", "q50", "q95", "dfs")  # what is not printed where it is not to be trusted
 DFS_WORDS = (
-    (HARDLY_INFORMED, "moved by the data, not narrowed"),
+    (HARDLY_INFORMED, "not narrowed by the data"),
     (0.5, "weakly informed"),
     (0.9, "informed"),
     (math.inf, "determined by the data"),
@@ -135,9 +135,9 @@ def results_table(summaries: Mapping[str, Iterable[ParameterSummary]]) -> str:
 
 
 def estimate_cells(row: ParameterSummary) -> tuple[str, ...]:
-    """Mean, std, 5, 50 and 95 % for a terminal; a mean of two digits alone where no interval is to be trusted."""
+    """Mean, std, 5, 50 and 95 % for a terminal; a mean of three digits alone where no interval is to be trusted."""
     if row.untrusted:
-        return (f"{row.mean:.2g}", "-", "-", "-", "-")
+        return (f"{row.mean:.3g}", "-", "-", "-", "-")
     return tuple(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q50, row.q95))
 
 

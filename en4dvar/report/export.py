@@ -17,7 +17,7 @@ import numpy as np
 from en4dvar.caution import Caution, codes
 from en4dvar.config.symbols import GREEK
 from en4dvar.errors import OutputError
-from en4dvar.report.text import number_like, rough_number, untrusted_words
+from en4dvar.report.text import number_like, plain_number, untrusted_words
 from en4dvar.storage.store import StoredResult, load_stored, require_settled, result_files
 from en4dvar.summary import ParameterSummary, summary_csv
 from en4dvar.tables import csv_text
@@ -158,7 +158,7 @@ def _tabular(columns: str, head: str, lines: list[str], notes: Notes) -> list[st
 
 def _estimate(row: ParameterSummary, notes: Notes) -> str:
     """Mean ± std, or the mean alone, with the mark of its footnote."""
-    value = f"${_tex(rough_number(row.mean))}$" if row.untrusted else _plus_minus(row.mean, row.std)
+    value = f"${_tex(plain_number(row.mean, 3))}$" if row.untrusted else _plus_minus(row.mean, row.std)
     return f"{value}{notes.mark(row)}"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -49,7 +50,7 @@ def influence(result: StoredResult) -> Figure:
     return figure
 
 
-def _stems(ax: Axes, time: Array, values: Array, hollow: Array, colour: str) -> None:
+def _stems(ax: Axes, time: Array, values: Array, hollow: npt.NDArray[np.bool_], colour: str) -> None:
     many = len(time) > 500
     ax.axhline(0, color=LIGHT["muted"], lw=0.6)
     if not many:

@@ -88,8 +88,8 @@ def plus_minus(mean: float, std: float) -> str:
 
 
 def estimate(row: ParameterSummary, mark: str = ", not to be trusted") -> str:
-    """Mean and spread; a mean of two digits, marked, where they are not to be trusted."""
-    return f"{rough_number(row.mean)}{mark}" if row.untrusted else plus_minus(row.mean, row.std)
+    """Mean and spread; a mean of three digits, marked, where they are not to be trusted."""
+    return f"{plain_number(row.mean, 3)}{mark}" if row.untrusted else plus_minus(row.mean, row.std)
 
 
 def untrusted_words(row: ParameterSummary) -> str:

@@ -88,7 +88,7 @@ def test_the_summary_follows():
 def test_words_of_the_data_are_for_the_check_to_find():
     little = (some("not-informed", "G"),)
     assert informed_words("G", 0.05, little) == "data say little"
-    assert informed_words("mu", 0.05, little) == "moved by the data, not narrowed"
+    assert informed_words("mu", 0.05, little) == "not narrowed by the data"
     assert informed_words("G", 0.05, (*little, some("misfit"))) == ""
     assert informed_words("G", float("nan"), ()) == ""
     assert [informed_words("G", dfs, ()) for dfs in (0.3, 0.7, 0.95)] == [
@@ -108,7 +108,7 @@ def test_words_of_the_data_are_for_the_check_to_find():
     ],
 )
 def test_little_is_said_only_where_it_is_so(shift, dfs, doubted, told):
-    x = PRIOR.sample(48, 1, "exact") + [shift, 0.0]
+    x = PRIOR.sample(48, 1, "exact") + np.array([shift, 0.0])
     found = list(information(PRIOR, x, np.array([dfs, 0.9]), doubted))
     assert [c.parameters for c in found] == [("G",)] * told
 
