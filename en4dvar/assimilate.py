@@ -21,7 +21,7 @@ from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, l
 from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.honesty import ControlEnsembles, examine
-from en4dvar.influence import Influence, gaussian_log_weights
+from en4dvar.influence import Influence
 from en4dvar.noise import Predicted
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.residuals import Residuals
@@ -155,7 +155,6 @@ class _Assimilation:
         centre_cost = float(self.costs(ends[-1:], last)[0])
         shape = {} if refinement else examine_shape(space, posterior, mode, costs, self.seed)
         observations, prior = problem.observations, problem.prior
-        drawn = not refinement and not problem.discrepancy  # from a Gaussian
         response, std = self.response(descent, mode, last), posterior.std(axis=0, ddof=1)
         shifts = what_if(problem, response, std, centre_cost, space.executor) if self.settings.what_if else ()
         path = ledger(problem, response, std) if self.settings.what_if else None
@@ -192,7 +191,7 @@ class _Assimilation:
             extremes=after.extremes,
             residuals=self.residuals(descent),
             discrepancy=self.discrepancy(descent, last.predicted[0]),
-            influence=self.influence(after, posterior, costs if drawn else None, response),
+            influence=self.influence(after, posterior, response, gaussian=not refinement),
             what_if=shifts,
             ledger=path,
         )
@@ -210,12 +209,10 @@ class _Assimilation:
         white, sensitivity = observations.whiten(linear)
         return Residuals.of(white, sensitivity, len(self.space.members) - 1, np.abs(rates), observations.used)
 
-    def influence(
-        self, run: Forecast, members: Array, costs: Array | None, response: LinearResponse
-    ) -> Influence | None:
+    def influence(self, run: Forecast, members: Array, response: LinearResponse, gaussian: bool) -> Influence | None:
         """Of each reading on the posterior ``members`` (N, n), whose ``run`` it is; None where it cannot be told.
 
-        ``costs`` (N,) of members that are draws of a Gaussian, None where they are draws of the posterior.
+        ``gaussian``: they are draws of the Gaussian about the mode.
         """
         observations, prior = self.problem.observations, self.problem.prior
         conditional = observations.log_conditional(run.predicted)
@@ -224,11 +221,10 @@ class _Assimilation:
         alive = diag.active_members(run.failures) & np.isfinite(conditional).all(axis=1)
         if alive.sum() < members.shape[1] + 2:
             return None
-        log_weights = np.zeros(alive.sum()) if costs is None else gaussian_log_weights(members[alive], costs[alive])
+        if gaussian and observations.noise.independent and response.defined:
+            return Influence.by_tangent(prior, members[alive], response.tangent(members[alive]))
         ratios = -observations.weights * conditional[alive]
-        has_rows = observations.noise.independent and response.defined
-        tangent = response.tangent(members[alive]) if has_rows else None
-        return Influence.of(prior, members[alive], log_weights, ratios, tangent)
+        return Influence.by_weights(prior.to_physical(members[alive]), ratios)
 
     def discrepancy(self, descent: Descent, central: Predicted) -> Discrepancy | None:
         """Of the model, where the observations allow for one."""

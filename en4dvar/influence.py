@@ -1,21 +1,16 @@
 r"""What each reading does to a posterior, and how far it lies from what the prior expects.
 
-Leaving reading k out changes the posterior by the factor 1/p(y_k | y_{−k}, θ)^β, with independent errors
-1/p(y_k | θ)^β, so the members θ_i, weighted by it, stand for the posterior without k (Gelfand, Dey & Chang 1992).
-Members that are draws of a Gaussian get the ratio of posterior and Gaussian as a weight before: to divide by p alone
-would add the opposite of a nonlinearity that they lack. The largest weights become quantiles of a generalised Pareto
-distribution fitted to them, whose shape k̂ tells whether the weighted mean is to be believed (Vehtari, Simpson, Gelman,
-Yao & Gabry 2024, J. Mach. Learn. Res. 25, 72; fit: Zhang & Stephens 2009, Technometrics 51, 316): with N draws where
-k̂ < min(0.7, 1 − 1/log₁₀ N).
-
-The linear Gaussian posterior knows the answer exactly: with rows S_k, d_k of the whitened arrays that belong to
-reading k, members of mean c̄ and covariance P in the coordinates of the tangent become members of
+The linear Gaussian posterior knows it exactly: with rows S_k, d_k of the whitened arrays that belong to reading k, one
+of independent errors, members of mean c̄ and covariance P in the coordinates of the tangent become members of
 
     P₋ₖ = (P⁻¹ − S_kᵀS_k)⁻¹,     c̄ − P₋ₖ S_kᵀ (d_k − S_k c̄).
 
-Weights are corrected by it: to its change is added the difference of the changes by the weights of the model and by
-those of its tangent, whose errors of sampling are nearly the same, so that k̂ < 0.7 will do. It stands alone beyond,
-where the reading all but decides a parameter. Errors that are not independent have no such rows, and weights alone.
+Members that are draws of the Gaussian about the mode are told by it. Draws of a Markov chain, and errors that are not
+independent, are told by importance weights: leaving reading k out changes the posterior by 1/p(y_k | y_{−k}, θ)^β, so
+the members, weighted by it, stand for the posterior without k (Gelfand, Dey & Chang 1992). The largest weights become
+quantiles of a generalised Pareto distribution fitted to them, whose shape k̂ tells whether the weighted mean is to be
+believed (Vehtari, Simpson, Gelman, Yao & Gabry 2024, J. Mach. Learn. Res. 25, 72; fit: Zhang & Stephens 2009,
+Technometrics 51, 316): with N draws where k̂ < min(0.7, 1 − 1/log₁₀ N). Elsewhere only another fit tells.
 """
 
 from __future__ import annotations
@@ -50,11 +45,6 @@ class ReadingTangent:
     coordinates: Array
     directions: Array
 
-    def log_ratios(self, part: slice) -> Array:
-        """ln of 1/p(y_k | θ) (N, K') of some readings, up to a constant of each."""
-        residual = self.d[part] - np.einsum("kmr,ir->ikm", self.S[part], self.coordinates)
-        return 0.5 * np.sum(residual**2, axis=-1)
-
     def without(self, part: slice) -> Array:
         """What is added to the control vectors (K', N, n) of the members if a reading is left out; NaN where nothing is
         known without it.
@@ -79,7 +69,8 @@ class Influence:
     """Of n parameters and K readings: the change of the posterior mean if one reading is left out.
 
     ``change`` (n, K), physical and SI, NaN where it cannot be told; ``in_std`` (n, K) in posterior standard deviations.
-    ``pareto_shape`` (K,) is k̂; ``how`` (K,) is 0 by importance weights, 1 by linear response, 2 unknown.
+    ``pareto_shape`` (K,) is k̂, NaN without weights; ``how`` (K,) is 0 by importance weights, 1 by the tangent, 2 where
+    only another fit tells.
     """
 
     change: Array
@@ -88,44 +79,35 @@ class Influence:
     how: npt.NDArray[np.intp]
 
     @classmethod
-    def of(
-        cls, prior: Prior, members: Array, log_weights: Array, log_ratios: Array, tangent: ReadingTangent | None = None
-    ) -> Self:
-        """From members (N, n), transformed, and the log (N, K) of 1/p(y_k | y_{−k}, θ)^β.
-
-        ``log_weights`` (N,), up to a constant, are those with which the members stand for the posterior.
-        """
+    def by_weights(cls, theta: Array, log_ratios: Array) -> Self:
+        """From physical members (N, n), draws of the posterior, and the log (N, K) of 1/p(y_k | y_{−k}, θ)^β."""
         draws, k = log_ratios.shape
-        theta = prior.to_physical(members)
-        change, shape, how = np.empty((theta.shape[1], k)), np.empty(k), np.empty(k, dtype=np.intp)
+        change, shape = np.empty((theta.shape[1], k)), np.empty(k)
         for begin in range(0, k, AT_ONCE):
             part = slice(begin, begin + AT_ONCE)
-            change[:, part], shape[part] = weighted_change(theta, log_weights, log_ratios[:, part])
-            how[part] = np.where(shape[part] < believed_shape(draws), WEIGHTED, UNKNOWN)
-            if tangent is not None:
-                moved = prior.to_physical(members + tangent.without(part)).mean(axis=1) - theta.mean(axis=0)
-                by_tangent, _ = weighted_change(theta, np.zeros(draws), tangent.log_ratios(part))
-                weighted = (shape[part] < BELIEVED) & np.isfinite(moved).all(axis=1)
-                change[:, part] = np.where(weighted, change[:, part] - by_tangent + moved.T, moved.T)
-                how[part] = np.where(weighted, WEIGHTED, LINEAR)
-        how[~np.isfinite(change).all(axis=0)] = UNKNOWN
-        change[:, how == UNKNOWN] = math.nan
+            log_weights, shape[part] = pareto_smoothed(log_ratios[:, part])
+            change[:, part] = theta.T @ np.exp(log_weights) - theta.mean(axis=0)[:, None]
+        change[:, ~(shape < believed_shape(draws))] = math.nan
+        return cls._of(change, theta, shape, WEIGHTED)
+
+    @classmethod
+    def by_tangent(cls, prior: Prior, members: Array, tangent: ReadingTangent) -> Self:
+        """From members (N, n), transformed, draws of the Gaussian about the mode."""
+        theta, k = prior.to_physical(members), len(tangent.d)
+        change = np.empty((theta.shape[1], k))
+        for begin in range(0, k, AT_ONCE):
+            part = slice(begin, begin + AT_ONCE)
+            moved = prior.to_physical(members + tangent.without(part)).mean(axis=1)
+            change[:, part] = (moved - theta.mean(axis=0)).T
+        return cls._of(change, theta, np.full(k, math.nan), LINEAR)
+
+    @classmethod
+    def _of(cls, change: Array, theta: Array, shape: Array, how: int) -> Self:
+        known = np.isfinite(change).all(axis=0)
+        change[:, ~known] = math.nan
         with np.errstate(divide="ignore", invalid="ignore"):
-            return cls(change, change / theta.std(axis=0, ddof=1)[:, None], shape, how)
-
-
-def weighted_change(theta: Array, log_weights: Array, log_ratios: Array) -> tuple[Array, Array]:
-    """Change (n, K) of the weighted mean of draws (N, n) when ratios (N, K) join their weights (N,), and the shapes."""
-    before, _ = pareto_smoothed(log_weights[:, None])
-    after, shape = pareto_smoothed(log_weights[:, None] + log_ratios)
-    return theta.T @ np.exp(after) - theta.T @ np.exp(before), shape
-
-
-def gaussian_log_weights(members: Array, costs: Array) -> Array:
-    """ln of posterior over Gaussian (N,), up to a constant, of draws (N, n) of a Gaussian and their J (N,)."""
-    around = members - members.mean(axis=0)
-    P = around.T @ around / (len(members) - 1)
-    return np.asarray(0.5 * np.einsum("ij,ji->i", around, np.linalg.solve(P, around.T)) - costs)
+            in_std = change / theta.std(axis=0, ddof=1)[:, None]
+        return cls(change, in_std, shape, np.where(known, how, UNKNOWN))
 
 
 def believed_shape(draws: int) -> float:

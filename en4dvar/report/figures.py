@@ -34,8 +34,8 @@ def histograms(result: StoredResult) -> Figure:
             ax.plot([row.q05, row.q95], [1.07, 1.07], color=LIGHT["posterior"], lw=2, solid_capstyle="butt")
         ax.axvline(row.centre, ymax=0.85, color=LIGHT["centre"], lw=0.9, ls="--")
         ax.set(yticks=[], ylim=(-0.14, 1.2), xlabel=with_unit(row.symbol, row.unit), xlim=_reach(prior, posterior))
-        value = estimate(row, " (not to be trusted)")
-        ax.set_title(f"{value} {pretty_unit(row.unit)}".rstrip(), color=LIGHT["posterior"])
+        value, doubt = f"{estimate(row, '')} {pretty_unit(row.unit)}".rstrip(), " (?)" if row.untrusted else ""
+        ax.set_title(f"{value}{doubt}", color=LIGHT["posterior"])
         ax.spines["left"].set_visible(False)
         ax.xaxis.set_major_locator(MaxNLocator(4))
     return figure
@@ -179,9 +179,8 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
     """Everything that the result has enough members for."""
     yield (
         "posterior",
-        "Posterior (blue) over prior (grey), each scaled to its peak. Bar: 5–95 % of the posterior, where it is to be "
-        "trusted; ticks: members; "
-        "dashed: the centre, where J is smallest.",
+        "Posterior (blue) over prior (grey), each scaled to its peak. Bar: 5–95 % of the posterior, none and (?) where "
+        "it is not to be trusted; ticks: members; dashed: the centre, where J is smallest.",
         histograms(result),
     )
     yield (

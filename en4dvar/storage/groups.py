@@ -200,7 +200,7 @@ def _readings(a: Analysis) -> Variables:
         return found
     of_each = ("parameter", "time")
     what = "change of the posterior mean if the reading is left out"
-    how = "0 by importance weights, 1 by linear response, 2 unknown"
+    how = "0 by importance weights, 1 by linear response, 2: only another fit tells"
     return found | {
         "influence_change": _variable(of_each, a.influence.change, "1", f"{what}, each in the unit of its parameter"),
         "influence_in_std": _variable(of_each, a.influence.in_std, "1", f"{what}, in posterior standard deviations"),

@@ -190,8 +190,8 @@ def influenced(analysis):
     in_std[1, 7] = -0.82
     change = in_std * analysis.posterior[np.arange(24) != 3].std(axis=0, ddof=1)[:, None]
     shape = np.zeros(40)
-    how = np.zeros(40, dtype=int)
-    how[7] = 1
+    how = np.ones(40, dtype=int)
+    how[30:] = 2
     return replace(analysis, influence=Influence(change, in_std, shape, how))
 
 
@@ -203,12 +203,14 @@ def test_page_names_the_reading_that_decides(tmp_path, analysis):
     assert "0.8 posterior standard deviations" in moving
     size = marked.influence.change[1, 7]
     assert f"by {size:.2g} Pa·s".replace("-", "−") in moving
+    assert moving.endswith("For 10 of 40 readings only another fit tells.")
     assert "from what the prior predicts" in far
     figure = influence(result)
     assert len(figure.axes) == 5
     assert [ax.get_ylabel() for ax in figure.axes][:2] == ["$G$", r"$\mu$"]
-    hollow = [line for line in figure.axes[1].lines if line.get_markerfacecolor() == "#ffffff"]
-    assert list(hollow[0].get_xdata()) == pytest.approx([16.0])
+    drawn = figure.axes[1].lines[-1]
+    assert drawn.get_xdata()[7] == pytest.approx(16.0)
+    assert list(drawn.get_ydata()) == list(marked.influence.in_std[1])
 
 
 def test_page_says_why_influence_is_not_told(analysis):
