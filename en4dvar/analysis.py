@@ -118,6 +118,7 @@ class Analysis:
     residuals: Residuals | None = None  # whitened, at the centre, with what is expected of them
     discrepancy: Discrepancy | None = None  # of the model, at the centre; None where none is allowed for
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) of the model's limits, by the posterior
+    beyond: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) since when it exceeds them; +inf: never
     what_if: tuple[Shift, ...] = ()  # under the model's alternatives; the largest first
     influence: Influence | None = None  # of each reading; None where it cannot be told
     ledger: Ledger | None = None  # what the path went through where it informed the parameters

@@ -86,7 +86,8 @@ def assimilate(
 
     Parameters
     ----------
-    seed: of the prior ensemble; the same seed gives the same bits for any executor.
+    seed: of every random number; the same seed gives the same bits for any executor. In a run it is
+        :func:`~en4dvar.prior.own_seed` of the run's seed and the data set's name.
     executor: where members run; default in this process.
     progress: called with the name of the data set and the record of each round of the start, each iteration and each
         look at the chain.
@@ -189,6 +190,7 @@ class _Assimilation:
                 descent.iterate.cost, descent.newton.hessian.singular_values, len(space.members), observations
             ),
             extremes=after.extremes,
+            beyond=after.beyond,
             residuals=self.residuals(descent),
             discrepancy=self.discrepancy(descent, last.predicted[0]),
             influence=self.influence(after, posterior, response, gaussian=not refinement),

@@ -7,7 +7,7 @@ from typing import overload
 
 import numpy as np
 
-from en4dvar.forward import Failure, Trajectory
+from en4dvar.forward import Failure, Trajectory, ValidityLimit
 from en4dvar.state import Array, StateLayout
 
 
@@ -45,3 +45,7 @@ class Batch(Sequence[Trajectory | Failure]):
     def largest(self, name: str) -> Array:
         """(N,) what a quantity of the model's ``validity`` reached, see :meth:`~en4dvar.forward.Trajectory.largest`."""
         return np.array([path.largest(name) if isinstance(path, Trajectory) else np.nan for path in self])
+
+    def beyond(self, limit: ValidityLimit) -> Array:
+        """(N,) when the paths first exceed a limit, see :meth:`~en4dvar.forward.Trajectory.beyond`."""
+        return np.array([path.beyond(limit) if isinstance(path, Trajectory) else np.nan for path in self])

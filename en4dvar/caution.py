@@ -16,6 +16,11 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
     "not-converged": ("serious", "raise assimilation.max_iterations, or narrow the priors and start again"),
     "chain-not-converged": ("serious", "run again with more data or narrower priors; do not quote these intervals"),
     "prior-conflict": ("serious", "check units and data; if both are right, widen the prior and say so"),
+    "implausible-data": (
+        "serious",
+        "check units, pixel size and frame rate: a fit can look perfect and tell a wrong value; if they are right, "
+        "say what you know in the prior",
+    ),
     "misfit": ("serious", "look at the residuals: model, window or stated observation error must change"),
     "residual-structure": (
         "serious",
@@ -125,7 +130,7 @@ def codes(cautions: Iterable[Caution]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(c.code for c in cautions))
 
 
-def doubts(cautions: Iterable[Caution], parameter: str) -> tuple[str, ...]:
+def untrusted(cautions: Iterable[Caution], parameter: str) -> tuple[str, ...]:
     """Codes of the warnings for which no interval of a parameter is to be quoted, the worst first; () where one is.
 
     The one place that decides it: page, tables, CSV and LaTeX follow.

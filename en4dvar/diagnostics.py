@@ -17,6 +17,7 @@ TAIL = 0.0005  # each tail of the central 99.9 % interval
 MEAN_OFF, SPREAD_OFF = 0.5, 0.3  # in posterior standard deviations, as a fraction: beyond, a posterior is non-Gaussian
 EMULATED_ENOUGH = 0.2  # effective share of its runs below which an emulator is not believed
 GAUSSIAN_ENOUGH = 0.35  # the same of the members: the criterion where there is no emulator to believe
+UNSEEN = 0.1  # posterior standard deviations: a step that is within what so few members tell of the posterior
 HARDLY_INFORMED = 0.1  # DFS of a parameter below which its posterior is said to be its prior
 
 

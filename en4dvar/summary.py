@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.analysis import Analysis
-from en4dvar.caution import Caution, codes, doubts
+from en4dvar.caution import Caution, codes, untrusted
 from en4dvar.diagnostics import HARDLY_INFORMED, active_members
 from en4dvar.response.what_if import Shift
 from en4dvar.state import Array, Parameter
@@ -32,7 +32,7 @@ class ParameterSummary:
     """One row of the summary table; all values in ``unit``, the display unit.
 
     ``informed`` says what the data told of it; ``untrusted`` are the codes of the warnings for which its interval is
-    not to be quoted (:func:`en4dvar.caution.doubts`), worst first.
+    not to be quoted (:func:`en4dvar.caution.untrusted`), worst first.
     """
 
     name: str
@@ -60,9 +60,9 @@ class ParameterSummary:
         mean, std = _moments(posterior)
         q05, q50, q95 = map(float, np.quantile(posterior, (0.05, 0.5, 0.95)) if posterior.size else (np.nan,) * 3)
         centre = convert(centre, p.unit, p.display_unit)
-        told, untrusted = informed_words(p.name, dfs, cautions), doubts(cautions, p.name)
+        words, doubted = informed_words(p.name, dfs, cautions), untrusted(cautions, p.name)
         numbers = (prior_mean, prior_std, mean, std, q05, q50, q95, centre, dfs)
-        return cls(p.name, p.label, p.symbol, p.display_unit, *numbers, told, untrusted)
+        return cls(p.name, p.label, p.symbol, p.display_unit, *numbers, words, doubted)
 
 
 def informed_words(name: str, dfs: float, cautions: Sequence[Caution]) -> str:
@@ -71,7 +71,7 @@ def informed_words(name: str, dfs: float, cautions: Sequence[Caution]) -> str:
     That the data say little is for the check of the posterior to find: a variance as large as the prior's does not
     mean it, where the posterior has moved or is not the one reported.
     """
-    if dfs != dfs or doubts(cautions, name):
+    if dfs != dfs or untrusted(cautions, name):
         return ""
     if any(c.code == "not-informed" and name in c.parameters for c in cautions):
         return "data say little"

@@ -9,7 +9,7 @@ import pytest
 from honesty.provoked import PROVOKED, linear, run
 from toys import make_problem
 
-from en4dvar.caution import CATALOGUE, SEVERITIES, Caution, caution, doubts, gravity, worst_first
+from en4dvar.caution import CATALOGUE, SEVERITIES, Caution, caution, gravity, untrusted, worst_first
 from en4dvar.honesty.checks import conflict, gaussian, information
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.state import Parameter
@@ -52,13 +52,13 @@ def test_data_sets_sort_by_their_worst_warning_first():
 
 def test_whose_interval_is_not_to_be_quoted():
     found = (some("at-bound", "G"), some("not-informed", "mu"), some("odd-residuals"))
-    assert doubts(found, "G") == ("at-bound",)
-    assert doubts(found, "mu") == ()
-    assert doubts((*found, some("misfit")), "mu") == ("misfit",)
-    assert doubts((*found, some("misfit")), "G") == ("misfit", "at-bound")
-    assert doubts((some("not-converged", severity="note"),), "G") == ()
-    assert doubts((some("non-gaussian", "G"),), "mu") == ()
-    assert doubts((some("non-gaussian"),), "mu") == ("non-gaussian",)
+    assert untrusted(found, "G") == ("at-bound",)
+    assert untrusted(found, "mu") == ()
+    assert untrusted((*found, some("misfit")), "mu") == ("misfit",)
+    assert untrusted((*found, some("misfit")), "G") == ("misfit", "at-bound")
+    assert untrusted((some("not-converged", severity="note"),), "G") == ()
+    assert untrusted((some("non-gaussian", "G"),), "mu") == ()
+    assert untrusted((some("non-gaussian"),), "mu") == ("non-gaussian",)
 
 
 def test_a_line_keeps_whose_it_is():
