@@ -16,6 +16,7 @@ Technometrics 51, 316): with N draws where k̂ < min(0.7, 1 − 1/log₁₀ N). 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Self
 
@@ -25,7 +26,7 @@ import numpy.typing as npt
 from en4dvar.prior import Prior
 from en4dvar.state import Array
 
-AT_ONCE = 500  # readings
+AT_ONCE = 24_000  # draws times readings
 FEWEST_IN_TAIL = 5  # weights a Pareto distribution is fitted to
 BELIEVED = 0.7  # k̂ below which a weighted mean is believed, of however many draws
 SHAPE, COUNT = 0.5, 10  # of a weak prior on k̂: where it lies, and how many draws it is worth
@@ -58,7 +59,10 @@ class ReadingTangent:
         left[~known] = np.eye(S.shape[1])
         after = P + gain.transpose(0, 2, 1) @ np.linalg.solve(left, gain)
         moved = -np.einsum("krs,kms,km->kr", after, S, self.d[part] - S @ mean)
-        wider = np.linalg.cholesky(after) @ np.linalg.inv(np.linalg.cholesky(P)) - np.eye(len(P))
+        try:
+            wider = np.linalg.cholesky(after) @ np.linalg.inv(np.linalg.cholesky(P)) - np.eye(len(P))
+        except np.linalg.LinAlgError:  # members that do not differ in a direction
+            wider = np.full_like(after, math.nan)
         change = moved[:, None] + np.einsum("krs,is->kir", wider, around)
         change[~known] = math.nan
         return np.asarray(change @ self.directions)
@@ -83,8 +87,7 @@ class Influence:
         """From physical members (N, n), draws of the posterior, and the log (N, K) of 1/p(y_k | y_{−k}, θ)^β."""
         draws, k = log_ratios.shape
         change, shape = np.empty((theta.shape[1], k)), np.empty(k)
-        for begin in range(0, k, AT_ONCE):
-            part = slice(begin, begin + AT_ONCE)
+        for part in _parts(k, draws):
             log_weights, shape[part] = pareto_smoothed(log_ratios[:, part])
             change[:, part] = theta.T @ np.exp(log_weights) - theta.mean(axis=0)[:, None]
         change[:, ~(shape < believed_shape(draws))] = math.nan
@@ -95,8 +98,7 @@ class Influence:
         """From members (N, n), transformed, draws of the Gaussian about the mode."""
         theta, k = prior.to_physical(members), len(tangent.d)
         change = np.empty((theta.shape[1], k))
-        for begin in range(0, k, AT_ONCE):
-            part = slice(begin, begin + AT_ONCE)
+        for part in _parts(k, len(members)):
             moved = prior.to_physical(members + tangent.without(part)).mean(axis=1)
             change[:, part] = (moved - theta.mean(axis=0)).T
         return cls._of(change, theta, np.full(k, math.nan), LINEAR)
@@ -108,6 +110,12 @@ class Influence:
         with np.errstate(divide="ignore", invalid="ignore"):
             in_std = change / theta.std(axis=0, ddof=1)[:, None]
         return cls(change, in_std, shape, np.where(known, how, UNKNOWN))
+
+
+def _parts(k: int, draws: int) -> Iterator[slice]:
+    """Some of K readings at a time, so that memory does not grow with them."""
+    size = max(1, AT_ONCE // draws)
+    return (slice(begin, begin + size) for begin in range(0, k, size))
 
 
 def believed_shape(draws: int) -> float:

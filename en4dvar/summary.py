@@ -19,6 +19,7 @@ from en4dvar.units import convert
 
 MOST_REMARKS = 3
 INTERVAL = ("std", "q05", "q50", "q95", "dfs")  # what is not printed where it is not to be trusted
+LITTLE = "data say little"
 DFS_WORDS = (
     (HARDLY_INFORMED, "not narrowed by the data"),
     (0.5, "weakly informed"),
@@ -74,7 +75,7 @@ def informed_words(name: str, dfs: float, cautions: Sequence[Caution]) -> str:
     if dfs != dfs or untrusted(cautions, name):
         return ""
     if any(c.code == "not-informed" and name in c.parameters for c in cautions):
-        return "data say little"
+        return LITTLE
     return next(words for limit, words in DFS_WORDS if dfs < limit or limit == math.inf)
 
 

@@ -19,12 +19,13 @@ from en4dvar.config.symbols import GREEK
 from en4dvar.errors import OutputError
 from en4dvar.report.text import number_like, plain_number, untrusted_words
 from en4dvar.storage.store import StoredResult, load_stored, require_settled, result_files
-from en4dvar.summary import ParameterSummary, summary_csv
+from en4dvar.summary import LITTLE, ParameterSummary, summary_csv
 from en4dvar.tables import csv_text
 
 _COMMANDS = (
     f"{GREEK}|mathrm|mathit|mathbf|mathsf|mathcal|rm|it|text|frac|sqrt|hat|bar|tilde|dot|ddot|vec|overline|infty|partial|"
-    "nabla|ell|cdot|times|pm|prime|dagger|ast|star|perp|parallel|circ|left|right|langle|rangle|quad"
+    "nabla|ell|cdot|times|pm|prime|dagger|ast|star|perp|parallel|circ|left|right|langle|rangle|quad|"
+    "max|min"
 )
 Kind = Literal["csv", "latex", "members"]
 _ESCAPES = {c: f"\\{c}" for c in "#$%&_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
@@ -83,7 +84,7 @@ def _members_csv(results: Iterable[StoredResult]) -> str:
 
 
 Found = tuple[str, tuple[ParameterSummary, ...], tuple[Caution, ...]]
-LITTLE = "the data say little about it: its posterior is close to its prior"
+LITTLE_NOTE = "the data say little about it: its posterior is close to its prior"
 
 
 def _latex(found: Sequence[Found]) -> str:
@@ -102,18 +103,20 @@ class Notes:
 
     def mark(self, row: ParameterSummary) -> str:
         """What follows a number: the letter of its footnote, or nothing."""
-        words = LITTLE if row.informed == "data say little" else ""
+        words = LITTLE_NOTE if row.informed == LITTLE else ""
         if row.untrusted:
             words = f"not to be trusted: {untrusted_words(row)}"
         if not words:
             return ""
         letter = self._letters.setdefault(words, string.ascii_lowercase[len(self._letters) % 26])
-        return f"$^\\mathrm{{{letter}}}$"
+        return f"\\textsuperscript{{{letter}}}"
 
     def lines(self, columns: int) -> list[str]:
         """Rows below the table."""
         start = f"  \\multicolumn{{{columns}}}{{l}}{{\\footnotesize "
-        return [f"{start}$^\\mathrm{{{letter}}}$ {escaped(words)}}} \\\\" for words, letter in self._letters.items()]
+        return [
+            f"{start}\\textsuperscript{{{letter}}} {escaped(words)}}} \\\\" for words, letter in self._letters.items()
+        ]
 
 
 def _one_set(rows: tuple[ParameterSummary, ...], notes: Notes) -> list[str]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from honesty.provoked import PROVOKED, linear, run
-from toys import make_problem
+from toys import Decay, make_problem
 
 from en4dvar.caution import CATALOGUE, SEVERITIES, Caution, caution, gravity, untrusted, worst_first
 from en4dvar.honesty.checks import conflict, gaussian, information
@@ -160,3 +160,15 @@ def test_a_bound_is_told_as_it_is_printed():
     )
     (found,) = (c for c in run(problem).cautions if c.code == "at-bound")
     assert "its upper bound (1e+03 mm)" in found.words
+
+
+@pytest.mark.slow
+def test_after_a_chain_the_words_are_those_of_the_chain():
+    """Its draws have another spread than the Gaussian about the mode."""
+    problem = make_problem(Decay(), (1.0, 0.8), std=0.3, k=8, scale=0.5)
+    refined, plain = (run(problem, refine=refine, what_if=False) for refine in ("mcmc", "none"))
+    x = problem.prior.from_physical(refined.posterior)
+    np.testing.assert_allclose(refined.dfs_per_parameter, 1 - x.var(axis=0) / problem.prior.std**2, atol=0.03)
+    assert np.abs(refined.dfs_per_parameter - plain.dfs_per_parameter).max() > 0.05
+    for row, dfs in zip(summarise(refined), refined.dfs_per_parameter, strict=True):
+        assert row.informed == informed_words(row.name, float(dfs), refined.cautions)

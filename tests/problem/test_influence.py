@@ -15,6 +15,7 @@ from en4dvar.influence import (
     UNKNOWN,
     WEIGHTED,
     Influence,
+    ReadingTangent,
     believed_shape,
     pareto_smoothed,
     prior_distance,
@@ -105,6 +106,24 @@ def test_of_a_linear_model_against_refits():
     assert np.all(found.how == LINEAR)
     assert np.abs(change).max() > 0.5
     np.testing.assert_allclose(found.in_std, change, rtol=0, atol=1e-6)
+
+
+def test_members_that_do_not_differ_tell_nothing():
+    problem = make_problem(Vectorised(("a", "b")), [1.0, 0.5])
+    analysis = assimilate(problem, SETTINGS, 1)
+    coordinates = analysis.posterior - analysis.centre
+    coordinates[:, 1] = 0.0
+    flat = ReadingTangent(np.zeros((9, 1)), np.ones((9, 1, 2)), coordinates, np.eye(2))
+    found = Influence.by_tangent(problem.prior, analysis.posterior, flat)
+    assert np.all(found.how == UNKNOWN)
+    assert np.isnan(found.in_std).all()
+
+
+def test_parts_of_readings_agree_with_all_of_them_at_once(monkeypatch):
+    analysis = assimilate(make_problem(Vectorised(("a", "b")), [1.0, 0.5], k=11), SETTINGS, 1)
+    monkeypatch.setattr("en4dvar.influence.AT_ONCE", 3 * 48)
+    again = assimilate(make_problem(Vectorised(("a", "b")), [1.0, 0.5], k=11), SETTINGS, 1)
+    np.testing.assert_allclose(again.influence.in_std, analysis.influence.in_std, rtol=0, atol=1e-12)
 
 
 def test_weights_alone_tell_a_linear_model_roughly():
