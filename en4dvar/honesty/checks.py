@@ -223,7 +223,8 @@ def _both(p: Parameter, members: Array, shape: Mapping[str, float]) -> str:
     """Mean ± std of the members and of the emulated posterior, in the display unit."""
     si = (members.mean(), members.std(ddof=1), shape[f"emulated_mean_{p.name}"], shape[f"emulated_std_{p.name}"])
     mean, std, found, spread = (convert(float(v), p.unit, p.display_unit) for v in si)
-    return f"{p.name} = {mean:.2g} ± {shown(std, p)} where it should be about {found:.2g} ± {shown(spread, p)}"
+    unit = "" if p.display_unit == "1" else f" {p.display_unit}"
+    return f"{p.name} = {mean:.2g} ± {std:.2g}{unit} where it should be about {found:.2g} ± {spread:.2g}{unit}"
 
 
 def down_weighted(analysis: Analysis, most: int = 6) -> Findings:
