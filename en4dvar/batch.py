@@ -42,6 +42,11 @@ class Batch(Sequence[Trajectory | Failure]):
             return Failure("non-finite state", float(times[np.argmin(finite)]))
         return Trajectory(times, states, self.layout)
 
+    @property
+    def last(self) -> Array:
+        """States (N, n_state) at the last instant."""
+        return self.states[:, -1]
+
     def largest(self, name: str) -> Array:
         """(N,) what a quantity of the model's ``validity`` reached, see :meth:`~en4dvar.forward.Trajectory.largest`."""
         return np.array([path.largest(name) if isinstance(path, Trajectory) else np.nan for path in self])

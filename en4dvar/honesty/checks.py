@@ -183,15 +183,15 @@ def validity(limits: Sequence[ValidityLimit], extremes: Array, since: Array, tim
             yield replace(caution("model-validity", words, "note"), advice=EXTRAPOLATED)
 
 
-def information(prior: Prior, posterior: Array, per_parameter: Array, doubted: Collection[str] = ()) -> Findings:
+def information(prior: Prior, posterior: Array, per_parameter: Array, silent: Collection[str] = ()) -> Findings:
     """Parameters of which the data say little: neither spread nor mean of the posterior (N, n) differ from the prior's.
 
-    ``per_parameter`` (n,) is 1 − posterior over prior variance. Nothing is said of the ``doubted`` names, whose members
-    may not be the posterior.
+    ``per_parameter`` (n,) is 1 − posterior over prior variance. Nothing is said of ``silent`` names: their members
+    may not be the posterior, or they need not be informed.
     """
     moved = np.abs(posterior.mean(axis=0) - prior.mean) / prior.std
     for name, value, far in zip(prior.names, per_parameter, moved, strict=True):
-        if name not in doubted and -WIDENED < value < HARDLY_INFORMED and far < MOVED:
+        if name not in silent and -WIDENED < value < HARDLY_INFORMED and far < MOVED:
             words = f"{name} is hardly informed by the data (DFS {value:.2f}): its posterior is close to its prior"
             yield caution("not-informed", words, parameters=(name,))
 

@@ -74,9 +74,14 @@ def examine(
         *_validity(a, alive),
         *checks.gaussian(prior, members, a.shape),
     )
-    doubted = [name for name in prior.names if untrusted(warnings, name)]
-    little = checks.information(prior, control.posterior[alive], a.dfs_per_parameter, doubted)
+    silent = {name for name in prior.names if untrusted(warnings, name)} | _changes(a)
+    little = checks.information(prior, control.posterior[alive], a.dfs_per_parameter, silent)
     return worst_first((*warnings, *little))
+
+
+def _changes(a: Analysis) -> set[str]:
+    """Names of the changes of parameters that vary, of which data may say little."""
+    return {change.parameter.name for one in a.problem.varying for change in one.changes}
 
 
 def doubts(problem: InverseProblem, predicted: Array) -> Sequence[str]:

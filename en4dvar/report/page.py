@@ -13,6 +13,7 @@ from en4dvar.report.readings import reading_words
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
 from en4dvar.report.style import Drawing
 from en4dvar.report.text import number_like, plain_number
+from en4dvar.report.varying import stored_walks, verdict
 from en4dvar.storage.groups import ITERATION_SCALARS, SHARES
 from en4dvar.storage.store import StoredResult
 from en4dvar.units import convert
@@ -54,6 +55,8 @@ def render_set(
         exceeding=exceeding(what_if),
         entries=stored_ledger(result),
         readings=reading_words(result),
+        walks=stored_walks(result),
+        verdict=verdict(result),
         identifiers=IDENTIFIERS,
         figures=figures,
         lost=[(i, str(reason)) for i, reason in enumerate(reasons) if reason],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
@@ -79,6 +79,12 @@ class Paths(Batch):
         """Full state vectors (N, K, n_state) in the model's layout."""
         blocks = [self[f.name].reshape(*self.times.shape, -1) for f in self.model.layout]
         return np.concatenate(blocks, axis=2)
+
+    @property
+    def last(self) -> Array:
+        """States (N, n_state) at the last instant."""
+        solution = replace(self.solution, states=self.solution.states[:, -1:])
+        return replace(self, times=self.times[:, -1:], solution=solution, _fields={}).states[:, 0]
 
     def _constant(self, name: str) -> Array:
         return np.broadcast_to(self.initial[:, self.model.layout[name].start, None], self.times.shape)

@@ -94,7 +94,7 @@ def write_straight(folder):
 
 @pytest.mark.slow
 def test_ranks_of_a_linear_campaign_are_uniform_with_one_seed(tmp_path):
-    """With draws common to all sets the 48 draws' own histogram is what is found (p below 1e-4)."""
+    """With draws common to all sets the 48 draws' own histogram is what is found (p = 9e-4 for a)."""
     path, truths = write_straight(tmp_path)
     assert run_campaign(configuration(path, tmp_path / "run", checkpoint_every=60)).exit_code == 0
     with xr.open_datatree(tmp_path / "run" / "posterior.nc") as tree:
