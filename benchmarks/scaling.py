@@ -76,8 +76,8 @@ def make(folder: Path, n_sets: int) -> Path:
 
 def jobs(config: Config) -> list[Job]:
     return [
-        Job(build_one(config, name, path), config.assimilation, config.seed, {})
-        for name, path in data_files(inverse_plan(config)).items()
+        Job(build_one(config, name, file), config.assimilation, config.seed, {})
+        for name, file in data_files(inverse_plan(config)).items()
     ]
 
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from en4dvar.errors import DataError
 from en4dvar.hints import listed, no_such_file, suggest
-from en4dvar.inputs.matfile import mat_vectors
+from en4dvar.inputs.matfile import element, first_elements, indexed, mat_vectors
 from en4dvar.inputs.text_table import Decimal, Table, cells_of, check_width, delimiter_of, number_in, numbered_lines
 from en4dvar.state import Array
 from en4dvar.units import convert
@@ -49,6 +49,14 @@ class TimeStep:
 
     column: Column | None = None
     value: float = 0.0
+
+
+@dataclass(frozen=True)
+class DataFile:
+    """Where one data set is: a file, or of a file that holds several the ``part``, as :func:`parts_of` names it."""
+
+    path: Path
+    part: str = ""
 
 
 @dataclass(frozen=True)
@@ -81,10 +89,11 @@ def read_series(
     format: Format | None = None,
     decimal: Decimal = ".",
     errors: Sequence[Column] = (),
+    part: str = "",
 ) -> Readings:
     """Read one data set. ``format`` defaults to the one of the suffix; ``decimal`` is the decimal sign of a CSV file.
 
-    ``errors`` are columns of standard deviations, each as long as that of the values.
+    ``errors`` are columns of standard deviations, each as long as that of the values. ``part``: see :func:`parts_of`.
 
     Raises
     ------
@@ -93,7 +102,7 @@ def read_series(
     wanted = [c.name for c in (value, time, *errors) if isinstance(c, Column)]
     with _opened(path, format) as kind:
         table = Table(path, decimal) if kind == "csv" else None
-        columns, scalars = (_of_table(table, wanted), {}) if table else _of_mat(path, wanted)
+        columns, scalars = (_of_table(table, wanted), {}) if table else _of_mat(path, wanted, part)
     values = convert(columns[value.name], value.unit, value.target)
     if isinstance(time, Column):
         times = convert(columns[time.name], time.unit, time.target)
@@ -127,11 +136,25 @@ def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int
     return stds
 
 
+def parts_of(path: Path, value: Column, format: Format | None = None) -> tuple[str, ...]:
+    """The parts of a file that each hold a data set: elements of a struct array or a cell array, as ``1``, ``2``, ….
+
+    They are found by the column of the values, ``expts.R`` for what MATLAB calls ``expts(1).R``, ``expts(2).R``, …; ()
+    where the file is one data set. Raises :class:`DataError`.
+    """
+    if (format or SUFFIXES.get(path.suffix.lower())) != "mat":
+        return ()
+    with _opened(path, format):
+        names = mat_vectors(path)[0]
+    return () if value.name in names else tuple(i for name, i in map(indexed, names) if i and name == value.name)
+
+
 @dataclass(frozen=True)
 class Contents:
     """What a data file holds: columns (or vectors) with numbers, as written, and scalars; no units applied.
 
-    ``others``: why what else is in the file cannot be a column, by name.
+    ``others``: why what else is in the file cannot be a column, by name. Of the elements of a struct array or a cell
+    array the first stands for all, as ``expts.R`` and ``C``.
     """
 
     columns: Mapping[str, Array]
@@ -147,8 +170,11 @@ def read_contents(path: Path, format: Format | None = None, decimal: Decimal = "
 
 def _mat_contents(path: Path) -> Contents:
     vectors, scalars, others = mat_vectors(path)
+    vectors, scalars, others = first_elements(vectors), first_elements(scalars), first_elements(others)
     columns = {k: np.asarray(v, dtype=float).ravel() for k, v in vectors.items() if v.size > 1}
     words = {name: f"{path}: {name} is {kind}; save what is in it as vectors" for name, kind in others.items()}
+    for name in columns:  # a struct of which something can be read is no fault
+        words.pop(name.partition(".")[0], None)
     return Contents(columns, scalars, words)
 
 
@@ -283,8 +309,9 @@ def _of_table(table: Table, wanted: Sequence[str]) -> dict[str, Array]:
     return columns
 
 
-def _of_mat(path: Path, wanted: Sequence[str]) -> tuple[dict[str, Array], dict[str, float]]:
+def _of_mat(path: Path, wanted: Sequence[str], part: str = "") -> tuple[dict[str, Array], dict[str, float]]:
     vectors, scalars, others = mat_vectors(path)
+    vectors, scalars, others = element(vectors, part), element(scalars, part), element(others, part)
     for name in wanted:
         if name not in vectors:
             kind = others.get(name)

@@ -96,3 +96,40 @@ def test_refused(tmp_path: Path) -> None:
     path.write_text(text[: text.index("data:")] + text[text.index("model:") :])
     with pytest.raises(ConfigError, match="data: required"):
         build(load_config(path))
+
+
+def test_a_struct_array_is_a_campaign(tmp_path: Path) -> None:
+    """One bubble an element, each with its own scalars; what stands beside the array is shared."""
+    from scipy.io import savemat
+
+    array = np.empty(3, dtype=[("R", object), ("Req", object)])
+    for k in range(3):
+        array[k] = (1e2 * np.exp(-np.arange(6.0) / (k + 2)), 10.0 + k)
+    savemat(tmp_path / "gel.mat", {"expts": array, "t": np.arange(6.0)})
+    text = """
+name: many
+data:
+  path: gel.mat
+  columns: {time: {name: t, unit: us}, radius: {name: expts.R, unit: um}}
+  window: {from: R_max, to: end}
+  time_zero: window
+  error: {radius_std: 1 um}
+model: {name: bubble, law: neo-hookean-kelvin-voigt, start: laser}
+parameters:
+  G: {prior: lognormal, median: 2 kPa, log_std: 0.5}
+  mu: 0.1 Pa s
+  R_eq: {from_file: expts.Req, unit: um}
+  R_max: {prior: normal, mean: maximum, std: 1 %}
+  t_s: 0 us
+"""
+    (tmp_path / "c.yaml").write_text(text, encoding="utf-8")
+    problems = build(load_config(tmp_path / "c.yaml"))
+    assert [p.observations.name for p in problems] == ["gel_1", "gel_2", "gel_3"]
+    assert [p.fixed["R_eq"] for p in problems] == pytest.approx([10e-6, 11e-6, 12e-6])
+    assert problems[2].observations.values == pytest.approx(1e-4 * np.exp(-np.arange(6.0) / 4))
+    one = load_config(tmp_path / "c.yaml", {"data.columns.radius.name": "expts(2).R", "parameters.R_eq": "12 um"})
+    (problem,) = build(one)
+    assert problem.observations.values == pytest.approx(problems[1].observations.values)
+    missing = load_config(tmp_path / "c.yaml", {"data.columns.radius.name": "expts.Roft", "parameters.R_eq": "12 um"})
+    with pytest.raises(DataError, match=r"field 'expts.Roft' is not in the file"):
+        build(missing)
