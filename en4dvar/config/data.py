@@ -50,13 +50,29 @@ class Files:
     texts: tuple[str, ...]
 
 
+class Pixel(Section):
+    """Lengths that were measured in pixels."""
+
+    pixel: QuantityText
+    """What one is long, e.g. 2.76 um."""
+
+
+def _unit_text(given: Any) -> Any:
+    if not isinstance(given, Mapping):
+        return given
+    number, _, unit = str(given.get("pixel", "")).strip().partition(" ")
+    if given.keys() != {"pixel"} or not unit:
+        raise ValueError("write a unit such as um, or {pixel: 2.76 um}")
+    return f"{number}*{unit}"
+
+
 class ValueColumn(Section):
     """A column of a CSV file or a field of a ``.mat`` file; the unit is required, never guessed."""
 
     name: Annotated[str, Field(min_length=1)]
     """Header of the column (CSV) or name of the field (.mat)."""
-    unit: Annotated[str, unit_of(observable_unit)]
-    """Unit of the numbers in the file, e.g. um; required, never guessed."""
+    unit: Annotated[str, unit_of(observable_unit), BeforeValidator(_unit_text, json_schema_input_type=str | Pixel)]
+    """Unit of the numbers in the file, e.g. um, or ``{pixel: 2.76 um}``; required, never guessed."""
 
 
 class TimeColumn(Section):

@@ -133,3 +133,13 @@ parameters:
     missing = load_config(tmp_path / "c.yaml", {"data.columns.radius.name": "expts.Roft", "parameters.R_eq": "12 um"})
     with pytest.raises(DataError, match=r"field 'expts.Roft' is not in the file"):
         build(missing)
+
+
+def test_lengths_in_pixels(tmp_path: Path) -> None:
+    path = write_toy(tmp_path)
+    (plain,) = build(load_config(path))
+    (found,) = build(load_config(path, {"data.columns.position.unit": {"pixel": "2.5 um"}}))
+    assert found.observations.values == pytest.approx(2.5 * plain.observations.values)
+    for wrong in ({"pixel": "2.5"}, {"pixel": "-2 um"}, {"pixels": "2 um"}, {"pixel": "0 um"}, {"pixel": "2 us"}):
+        with pytest.raises(ConfigError, match="unit"):
+            load_config(path, {"data.columns.position.unit": wrong})

@@ -148,7 +148,9 @@ def test_bad_mat(tmp_path: Path) -> None:
         ("radius", "text"),
         (1j * np.ones(3), "complex"),
     ):
-        with pytest.raises(DataError, match=f"field 'R' is {words}, not a row or column of real numbers; .* are: t$"):
+        with pytest.raises(
+            DataError, match=f"field 'R' is {words}, not a row or column of real numbers; .* are: (R.1., R.2., )?t"
+        ):
             mat(tmp_path, R=value, t=np.arange(4.0))
     with pytest.raises(DataError, match="'R' is empty"):
         mat(tmp_path, R=np.ones((0, 0)), t=np.ones((0, 0)))

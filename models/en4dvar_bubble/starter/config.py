@@ -146,7 +146,7 @@ def doubts(source: Source) -> list[str]:
             continue
         name, unit = column
         if _PIXELS.search(name):
-            found.append(f"{name!r} seems to hold pixels; convert them to a length (the size of a pixel is no unit)")
+            found.append(f"{name!r} seems to hold pixels; then give --radius-unit as the size of one, such as 2.76*um")
         if what == "times" and _FRAMES.match(name):
             found.append(f"{name!r} seems to count frames; then give --time-step with the time between two of them")
         if what == "radii" and _DIAMETER.match(name):
