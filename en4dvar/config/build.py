@@ -20,6 +20,7 @@ from en4dvar.ensemble.forecast import check_problem
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.files import PathError, expanded, readable
 from en4dvar.inputs.readers import SUFFIXES, Column, DataFile, Format, parts_of, read_covariance, read_series
+from en4dvar.inputs.text_table import Decimal
 from en4dvar.inputs.window import select
 from en4dvar.noise import Noise, noise_of
 from en4dvar.observations import Observations
@@ -90,25 +91,33 @@ def _discrepancy(config: Config, observations: Observations) -> tuple[PriorTerm,
 def data_files(plan: Data) -> dict[str, DataFile]:
     """Name of the data set → file: the file's stem, made unique by its folders, then by a number.
 
-    Data sets of one file have the number of their part behind the name.
+    Data sets of one file have the name of their part behind its name.
 
     Raises
     ------
     DataError: no file matches a pattern, or a file is named twice.
     """
-    return with_parts(find_files(plan.path.base, plan.path.texts), plan.columns.observable, plan.format)
+    return with_parts(
+        find_files(plan.path.base, plan.path.texts), plan.columns.observable, plan.format, plan.decimal, plan.by
+    )
 
 
-def with_parts(files: Mapping[str, Path], value: Column, format: Format | None = None) -> dict[str, DataFile]:
-    """Every data set that the files hold, by the column of the values."""
+def with_parts(
+    files: Mapping[str, Path],
+    value: Column,
+    format: Format | None = None,
+    decimal: Decimal = ".",
+    by: str | None = None,
+) -> dict[str, DataFile]:
+    """Every data set that the files hold, see :func:`~en4dvar.inputs.readers.parts_of`."""
     found: dict[str, DataFile] = {}
     for name, path in files.items():
         try:
-            parts = parts_of(path, value, format)
+            parts = parts_of(path, value, format, decimal, by)
         except DataError:  # told with its reason where it is read
             parts = ()
         for part in parts or ("",):
-            found[f"{name}_{part}" if part else name] = DataFile(path, part)
+            found[readable(f"{name}_{part}") if part else name] = DataFile(path, part)
     return found
 
 
@@ -162,7 +171,7 @@ def read_observations(plan: Data, file: DataFile, name: str, weights: str = "sum
     stds = plan.error.column("std", columns.observable.unit)
     timing = plan.error.column("time_std", clock.unit if clock else "")
     errors = [column for column in (stds, timing) if column]
-    series = read_series(path, columns.time, columns.observable, plan.format, plan.decimal, errors, file.part)
+    series = read_series(path, columns.time, columns.observable, plan.format, plan.decimal, errors, file.part, plan.by)
     try:
         window = select(series.times, series.values, asked.start, asked.end, asked.prominence)
     except DataError as error:

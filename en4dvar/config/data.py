@@ -70,7 +70,7 @@ class ValueColumn(Section):
     """A column of a CSV file or a field of a ``.mat`` file; the unit is required, never guessed."""
 
     name: Annotated[str, Field(min_length=1)]
-    """Header of the column (CSV) or name of the field (.mat)."""
+    """Header of the column (CSV) or name of the field (.mat); ``R_*`` is a data set a column."""
     unit: Annotated[str, unit_of(observable_unit), BeforeValidator(_unit_text, json_schema_input_type=str | Pixel)]
     """Unit of the numbers in the file, e.g. um, or ``{pixel: 2.76 um}``; required, never guessed."""
 
@@ -371,6 +371,8 @@ class Data(Section):
     """Format of the files; default: by their suffix."""
     decimal: Decimal = "."
     """Decimal sign of the numbers in a CSV file."""
+    by: Annotated[str | None, Field(min_length=1)] = None
+    """Column of a CSV file that says which data set a row belongs to: each is estimated by itself."""
     columns: Annotated[Columns, OfObservable("column role")]
     """Which columns hold the time and the observable, each with its unit: ``time: {name: t, unit: us}``."""
     window: WindowSection = Field({}, validate_default=True)

@@ -8,10 +8,11 @@ scalars collected. Leading zeros of a column that cannot be zero are dropped fro
 from __future__ import annotations
 
 import csv
+import fnmatch
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -90,18 +91,27 @@ def read_series(
     decimal: Decimal = ".",
     errors: Sequence[Column] = (),
     part: str = "",
+    by: str | None = None,
 ) -> Readings:
     """Read one data set. ``format`` defaults to the one of the suffix; ``decimal`` is the decimal sign of a CSV file.
 
-    ``errors`` are columns of standard deviations, each as long as that of the values. ``part``: see :func:`parts_of`.
+    ``errors`` are columns of standard deviations, each as long as that of the values. ``part``, ``by``: see
+    :func:`parts_of`.
 
     Raises
     ------
     DataError: the file cannot be used.
     """
+    if part and by is None and "*" in value.name:
+        value = replace(value, name=part)
     wanted = [c.name for c in (value, time, *errors) if isinstance(c, Column)]
     with _opened(path, format) as kind:
         table = Table(path, decimal) if kind == "csv" else None
+        if by is not None and part not in _groups(table, by, path):
+            raise DataError(f"{path}: no row belongs to {part!r} by column {by!r}")
+        if table and by is not None:
+            at = table.position(by)
+            table.rows = [(line, row) for line, row in table.rows if _cell(row, at) == part]
         columns, scalars = (_of_table(table, wanted), {}) if table else _of_mat(path, wanted, part)
     values = convert(columns[value.name], value.unit, value.target)
     if isinstance(time, Column):
@@ -136,17 +146,25 @@ def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int
     return stds
 
 
-def parts_of(path: Path, value: Column, format: Format | None = None) -> tuple[str, ...]:
-    """The parts of a file that each hold a data set: elements of a struct array or a cell array, as ``1``, ``2``, ….
+def parts_of(
+    path: Path, value: Column, format: Format | None = None, decimal: Decimal = ".", by: str | None = None
+) -> tuple[str, ...]:
+    """The parts of a file that each hold a data set; () where the file is one data set.
 
-    They are found by the column of the values, ``expts.R`` for what MATLAB calls ``expts(1).R``, ``expts(2).R``, …; ()
-    where the file is one data set. Raises :class:`DataError`.
+    They are the columns that a name with ``*`` stands for; the elements of a struct array or a cell array, as ``1``,
+    ``2``, …, for the column ``expts.R`` of what MATLAB calls ``expts(1).R``, ``expts(2).R``, …; or what the column
+    ``by`` of a CSV file says. Raises :class:`DataError`.
     """
-    if (format or SUFFIXES.get(path.suffix.lower())) != "mat":
+    with _opened(path, format) as kind:
+        table = Table(path, decimal) if kind == "csv" else None
+        names = table.names if table else [*mat_vectors(path)[0]]
+    if by is not None:
+        return _groups(table, by, path)
+    if "*" in value.name and value.name not in names:
+        return tuple(name for name in names if fnmatch.fnmatchcase(name, value.name))
+    if table or value.name in names:
         return ()
-    with _opened(path, format):
-        names = mat_vectors(path)[0]
-    return () if value.name in names else tuple(i for name, i in map(indexed, names) if i and name == value.name)
+    return tuple(i for name, i in map(indexed, names) if i and name == value.name)
 
 
 @dataclass(frozen=True)
@@ -296,6 +314,20 @@ def _step(step: TimeStep, scalars: Mapping[str, float], path: Path) -> float:
     if not value > 0:
         raise DataError(f"{path}: the time step {value:g} is not positive")
     return value
+
+
+def _groups(table: Table | None, by: str, path: Path) -> tuple[str, ...]:
+    """What the column ``by`` says, in the order of the rows. Raises :class:`DataError`."""
+    if table is None:
+        raise DataError(f"{path}: data.by is for text files; elements of a struct array are data sets without it")
+    cells = [_cell(row, table.position(by)) for _, row in table.rows]
+    if "" in cells:
+        raise DataError(f"{path}:{table.rows[cells.index('')][0]}: column {by!r} does not say which data set this is")
+    return tuple(dict.fromkeys(cells))
+
+
+def _cell(row: Sequence[str], i: int) -> str:
+    return row[i] if i < len(row) else ""
 
 
 def _of_table(table: Table, wanted: Sequence[str]) -> dict[str, Array]:

@@ -143,3 +143,30 @@ def test_lengths_in_pixels(tmp_path: Path) -> None:
     for wrong in ({"pixel": "2.5"}, {"pixel": "-2 um"}, {"pixels": "2 um"}, {"pixel": "0 um"}, {"pixel": "2 us"}):
         with pytest.raises(ConfigError, match="unit"):
             load_config(path, {"data.columns.position.unit": wrong})
+
+
+def test_a_column_a_data_set(tmp_path: Path) -> None:
+    rows = "".join(f"{k},{10 - k},{20 - k if k < 8 else ''}\n" for k in range(10))
+    path = write_toy(tmp_path, ("name: x_um", "name: x_*"), data=f"t_ms,x_a,x_b\n{rows}")
+    a, b = build(load_config(path))
+    assert [p.observations.name for p in (a, b)] == ["toy_x_a", "toy_x_b"]
+    assert a.observations.values == pytest.approx((10 - np.arange(10)) * 1e-6)
+    assert b.observations.values == pytest.approx((20 - np.arange(8)) * 1e-6)
+    with pytest.raises(DataError, match=r"toy.csv: no column 'z_\*'; the columns are: t_ms, x_a, x_b"):
+        build(load_config(path, {"data.columns.position.name": "z_*"}))
+
+
+def test_rows_that_say_which_data_set(tmp_path: Path) -> None:
+    rows = "".join(f"{name},{k},{10 * n - k}\n" for n, name in ((2, "b 1"), (1, "a")) for k in range(5))
+    path = write_toy(tmp_path, ("  path: toy.csv", "  path: toy.csv\n  by: bubble"), data=f"bubble,t_ms,x_um\n{rows}")
+    b, a = build(load_config(path))
+    assert [p.observations.name for p in (b, a)] == ["toy_b 1", "toy_a"]
+    assert b.observations.values == pytest.approx((20 - np.arange(5)) * 1e-6)
+    assert a.observations.values == pytest.approx((10 - np.arange(5)) * 1e-6)
+    for by, text, message in (
+        ("bubbles", "", r"no column 'bubbles'; the columns are: bubble, t_ms, x_um"),
+        ("bubble", ",9,1\n", r"toy.csv:12: column 'bubble' does not say which data set this is"),
+    ):
+        (tmp_path / "toy.csv").write_text(f"bubble,t_ms,x_um\n{rows}{text}")
+        with pytest.raises(DataError, match=message):
+            build(load_config(path, {"data.by": by}))
