@@ -77,8 +77,8 @@ def make(folder: Path, n_sets: int) -> Path:
 
 def jobs(config: Config) -> list[Job]:
     return [
-        Job(build_one(config, name, path), config.assimilation, own_seed(config.seed, name), {})
-        for name, path in data_files(inverse_plan(config)).items()
+        Job(build_one(config, name, file), config.assimilation, own_seed(config.seed, name), {})
+        for name, file in data_files(inverse_plan(config)).items()
     ]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from en4dvar_bubble.starter.proposal import Proposal
 
 _TIME = re.compile(r"(?i)t|time|t[ _(\[].*|time[ _(\[].*")
+_STEP = re.compile(r"(?i)delta_?t|dt|t_?step|time_?step")
 _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 
 
@@ -122,14 +123,22 @@ def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
     shown = {name: f"{len(v)} values, {_range(v)}" for name, v in contents.columns.items()}
     commas = ", decimal commas" if decimal == "," else ""
     click.echo(f"{first}{commas}: {'; '.join(f'{name} ({words})' for name, words in shown.items())}", err=True)
+    if contents.scalars:
+        told = ", ".join(f"{name} {value:g}" for name, value in contents.scalars.items())
+        click.echo(f"others in the file: {told}", err=True)
     if {*TRACKED_COLUMNS} <= shown.keys() and asked == _Asked(*[None] * 5):
         return {"radius": TRACKED.radius, "time": TRACKED.time, "decimal": decimal, "errors": TRACKED.errors}
     time, radius, missing = _columns(asked, shown)
     time_unit, radius_unit = asked.time_unit, asked.radius_unit
+    step = None if time or asked.time_step else _only(_STEP, contents.scalars)
+    if step is not None:
+        missing = [option for option in missing if "time" not in option]
     if _interactive():
         missing = []
         radius = radius or _ask_column("radii", shown)
-        if asked.time_step is None:
+        if step is not None:
+            time_unit = time_unit or _ask_unit(step, {step: f"{contents.scalars[step]:g}"}, "s", "us, ms or s")
+        elif asked.time_step is None:
             time = time or _ask_column("times", shown)
             time_unit = time_unit or _ask_unit(time, shown, "s", "us, ms or s")
         radius_unit = radius_unit or _ask_unit(radius, shown, "m", "um, mm or m")
@@ -143,6 +152,8 @@ def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
     if asked.time_step is not None:
         return {"radius": (radius, radius_unit), "time_step": asked.time_step, "decimal": decimal}
     convert(1.0, str(time_unit), "s")
+    if step is not None:
+        return {"radius": (radius, radius_unit), "time_step": step, "step_unit": time_unit, "decimal": decimal}
     return {"radius": (radius, radius_unit), "time": (time, time_unit), "decimal": decimal}
 
 
@@ -184,8 +195,8 @@ def _columns(asked: _Asked, shown: Mapping[str, str]) -> tuple[str | None, str |
     return time, radius, missing
 
 
-def _only(pattern: re.Pattern[str], names: Mapping[str, str]) -> str | None:
-    fitting = [name for name in names if pattern.fullmatch(name)]
+def _only(pattern: re.Pattern[str], names: Iterable[str]) -> str | None:
+    fitting = [name for name in names if pattern.fullmatch(name.rpartition(".")[2])]
     return fitting[0] if len(fitting) == 1 else None
 
 
