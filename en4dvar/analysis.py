@@ -81,6 +81,18 @@ class Discrepancy:
 
 
 @dataclass(frozen=True)
+class Mode:
+    """A minimum of J with some of the probability: ``centre`` (n,) physical, SI, J there, how many descents from
+    different members ended in it, and its weight in the posterior.
+    """
+
+    centre: Array
+    cost: float
+    descents: int
+    weight: float
+
+
+@dataclass(frozen=True)
 class Analysis:
     """The outcome for one data set: members in order, physical SI values, NaN where a member failed.
 
@@ -118,6 +130,7 @@ class Analysis:
     discrepancy: Discrepancy | None = None  # of the model, at the centre; None where none is allowed for
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) of the model's limits, by the posterior
     what_if: tuple[Shift, ...] = ()  # under the model's alternatives; the largest first
+    modes: tuple[Mode, ...] = ()  # minima of J that count, the lowest first; () of a scheme that does not search
     ledger: Ledger | None = None  # what the path went through where it informed the parameters
 
     @property

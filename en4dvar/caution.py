@@ -36,6 +36,14 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
     ),
     "at-bound": ("caution", "widen the bound if physics allows it; else quote a limit, not mean ± std"),
     "non-gaussian": ("caution", "set assimilation.refine: mcmc, which samples the posterior as it is"),
+    "several-modes": (
+        "caution",
+        "look at the members, not at mean ± std; data or prior knowledge that tell the modes apart are worth most",
+    ),
+    "starts-disagree": (
+        "caution",
+        "raise assimilation.starts, or narrow the priors: a lower minimum may not have been found",
+    ),
     "overstated-error": ("caution", "state the observation error as it is (or estimate sigma); intervals are too wide"),
     "odd-residuals": (
         "caution",
