@@ -2,7 +2,7 @@
 
     python benchmarks/calibration.py a                 30 % priors, En4D-Var alone; 20 of them against a Markov chain
     python benchmarks/calibration.py b                 wide priors, ``refine: mcmc``
-    python benchmarks/calibration.py laser             laser-induced bubbles through collapse and rebounds, default settings
+    python benchmarks/calibration.py laser             laser-induced bubbles with rebounds, default settings
     python benchmarks/calibration.py b --minutes 4     a piece of it: records are kept and the next call goes on
 
 Over ``--n`` experiments: rank histograms of every parameter uniform (chi-squared, p > 0.01), central 50 and 90 %

@@ -1,8 +1,8 @@
 """Does the assimilation end at the global minimum of J? Counts and forward runs of several ways to start.
 
     python benchmarks/mode_finding.py --set narrow --n 48      acoustic, priors of 30 %
-    python benchmarks/mode_finding.py --set wide --n 400       acoustic, spread 1.0 in ln G, ln alpha; 0.7 in ln mu, ln R0
-    python benchmarks/mode_finding.py --set laser --n 240      laser-induced bubbles through collapse and rebounds
+    python benchmarks/mode_finding.py --set wide --n 400       acoustic, std 1.0 in ln G, ln alpha; 0.7 in ln mu, ln R0
+    python benchmarks/mode_finding.py --set laser --n 240      laser-induced bubbles with rebounds
     python benchmarks/mode_finding.py --set wide --minutes 4   a piece of it: records are kept, the next call goes on
 
 The reference is the lowest J among all ways, twenty starts of another, random ensemble of 120 members, and a Markov

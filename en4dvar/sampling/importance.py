@@ -10,6 +10,8 @@ on the posterior from outside. q is the mixture of all rounds (Cornuet, Marin, M
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
@@ -27,13 +29,15 @@ def standard(n: int) -> StudentMixture:
 class Importance:
     """The draws and proposals of one data set, ``count`` in a round, the first of them from ``first``.
 
+    Proposals are ``wider`` by that factor than what they are fitted to, so that thin tails are found as well.
+
     ``z`` (D, n) are all draws, ``log_weights`` (D,) their weights, ``log`` is ln ∫ L N dz and ``effective`` the number
     of draws behind it.
     """
 
-    def __init__(self, first: StudentMixture, stream: np.random.Generator, count: int):
+    def __init__(self, first: StudentMixture, stream: np.random.Generator, count: int, wider: float = 1.0):
         n = first.centre.shape[1]
-        self.stream, self.count = stream, count
+        self.stream, self.count, self.wider = stream, count, wider
         self.proposals = [first]
         self.z, self.target, self.mixture = np.empty((0, n)), np.empty(0), np.empty(0)  # mixture: ln Σ_t q_t
         self.log_weights, self.log, self.effective = np.empty(0), -np.inf, 0.0
@@ -76,4 +80,5 @@ class Importance:
             power *= 0.8
             weights = np.exp(power * logs)
         where = resampled(weights / weights.sum(), self.count, self.stream)
-        return StudentMixture.fitted(self.z[where], self.stream, COMPONENTS)
+        fitted = StudentMixture.fitted(self.z[where], self.stream, COMPONENTS)
+        return replace(fitted, root=self.wider * fitted.root)
