@@ -83,12 +83,13 @@ class Discrepancy:
 @dataclass(frozen=True)
 class Mode:
     """A minimum of J with some of the probability: ``centre`` (n,) physical, SI, J there, how many descents from
-    different members ended in it, and its weight in the posterior.
+    different members ended in it, by how much J of these differs, and its weight in the posterior.
     """
 
     centre: Array
     cost: float
     descents: int
+    spread: float
     weight: float
 
 

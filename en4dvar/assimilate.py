@@ -329,7 +329,7 @@ class _Assimilation:
         weights = sampled.weights if sampled else np.exp(logs - np.logaddexp.reduce(logs))
         return (
             tuple(
-                Mode(prior.to_physical(m.x), m.cost, m.descents, float(weight))
+                Mode(prior.to_physical(m.x), m.cost, m.descents, m.spread, float(weight))
                 for m, weight in zip(minima, weights, strict=True)
             )
             if minima

@@ -19,14 +19,15 @@ SLOPE = 4.0  # as many, within which one that ended early on the slope of a mini
 
 @dataclass(frozen=True)
 class Minimum:
-    """A minimum ``x`` (n,) of J, transformed, the covariance (n, n) of the Gaussian about it, J there, and how many
-    descents from different members ended in it.
+    """A minimum ``x`` (n,) of J, transformed, the covariance (n, n) of the Gaussian about it, J there, how many
+    descents from different members ended in it, and by how much J of these differs.
     """
 
     x: Array
     covariance: Array
     cost: float
     descents: int = 1
+    spread: float = 0.0
 
     @classmethod
     def at(cls, space: WeightSpace, w: Array, hessian: Hessian, cost: float, descents: int = 1) -> Minimum:
@@ -55,7 +56,8 @@ def merged(minima: Sequence[Minimum]) -> tuple[Minimum, ...]:
             distance = lower.distance(one.x)
             on_slope = distance < SLOPE and one.cost - lower.cost > 0.25 * distance**2
             if distance < REACHED or on_slope:
-                found[place] = replace(lower, descents=lower.descents + one.descents)
+                spread = max(lower.spread, one.cost + one.spread - lower.cost)
+                found[place] = replace(lower, descents=lower.descents + one.descents, spread=spread)
                 break
         else:
             found.append(one)
