@@ -26,6 +26,11 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
         "shorter window; a larger error or sigma would hide it and leave the estimates where they are",
     ),
     "prior-conflict": ("serious", "check units and data; if both are right, widen the prior and say so"),
+    "implausible-data": (
+        "serious",
+        "check units, pixel size and frame rate: a fit can look perfect and tell a wrong value; if they are right, "
+        "say what you know in the prior",
+    ),
     "model-validity": (
         "serious",
         "end the window before the model leaves its validity, or choose a model that is valid there",

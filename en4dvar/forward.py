@@ -6,6 +6,7 @@ A model that can integrate many members at once overrides ``trajectories``, the 
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,6 +36,19 @@ class Trajectory:
         A model whose quantity peaks between the stored instants overrides this.
         """
         return float(np.max(np.abs(self[name])))
+
+    def beyond(self, limit: ValidityLimit) -> float:
+        """When the path first exceeds a limit, +inf where it does not: the first stored instant that does.
+
+        Where it does between them only, or the quantity is no field, the whole path counts. A model that knows better
+        overrides this.
+        """
+        if not self.largest(limit.name) > limit.value:
+            return math.inf
+        if limit.name not in self.layout.names:
+            return -math.inf
+        over = np.abs(self[limit.name]).reshape(len(self.times), -1).max(axis=1) > limit.value
+        return float(self.times[np.argmax(over)]) if over.any() else -math.inf
 
 
 @dataclass(frozen=True)
@@ -141,7 +155,10 @@ class StateField:
 
 @dataclass(frozen=True)
 class Observable:
-    """A quantity that can be measured: its name in YAML and netCDF, its units, and the operator H that predicts it."""
+    """A quantity that can be measured: its name in YAML and netCDF, its units, and the operator H that predicts it.
+
+    ``positive``: it cannot be zero, so that zeros before the first reading of a file say that there was nothing yet.
+    """
 
     name: str
     unit: str
@@ -149,6 +166,7 @@ class Observable:
     symbol: str = ""
     display_unit: str = ""
     label: str = ""
+    positive: bool = False
 
     def __post_init__(self) -> None:
         for key, value in (("symbol", self.name), ("display_unit", self.unit), ("label", self.name)):
@@ -174,7 +192,8 @@ class ForwardModel(ABC):
     fast path likes to get at once (executors cut chunks at multiples of it); ``compiled`` says that ``trajectories``
     releases the interpreter lock, so that threads serve it. ``autonomous`` says that F depends on elapsed time alone:
     sequential schemes may start ``trajectories`` at any instant, where otherwise they repeat ``step``. ``validity``
-    names quantities and the limits beyond which the equations do not hold. ``alternatives`` are assumptions that could
+    names quantities and the limits beyond which the equations do not hold; :meth:`doubts` judges observations before a
+    run. ``alternatives`` are assumptions that could
     be otherwise, for :mod:`en4dvar.response.what_if`; ``path_quantities`` and ``path_parameters``, names
     of fields of the state that act along the path and not only at its start, are for :mod:`en4dvar.response.ledger`.
 
@@ -243,6 +262,14 @@ class ForwardModel(ABC):
     def share(self, x: Array, times: Array) -> Shared | None:
         """:meth:`trajectories` of states (N, n_state) as work that threads share, where the model can; else None."""
         return None
+
+    def doubts(self, observable: str, times: Array, values: Array, predicted: Array) -> Sequence[str]:
+        """Why observations ``values`` (K,) at ``times`` (K,) cannot be what they say, in words; by default nothing.
+
+        ``predicted`` (N, K) is the same of the prior members that could be run. Asked before a run and told with its
+        warnings: the place for scales and units that only the model can judge.
+        """
+        return ()
 
     def _march(self, x: Array, times: Array, start: float = 0.0) -> Trajectory | Failure:
         states = np.empty((len(times), self.layout.size))

@@ -28,12 +28,13 @@ FREQUENCIES = np.expm1(np.linspace(np.log1p(1e-4), np.log1p(400.0), 700))
 
 @dataclass(frozen=True)
 class Residuals:
-    """Of the K readings that count: whitened residuals ``white`` e (K,), their covariance ``expected`` Q (K, K), and
-    the ``speed`` |ṁ| (K,) of the observable there. ``which`` (K,) are their places in the data.
+    """Of the K readings that count: whitened residuals ``white`` e (K,), what the fit ``absorbed`` of their noise,
+    L (K, r) with I − Q = L Lᵀ, and the ``speed`` |ṁ| (K,) of the observable there. ``which`` (K,) are their places in
+    the data.
     """
 
     white: Array
-    expected: Array
+    absorbed: Array
     speed: Array
     which: npt.NDArray[np.intp]
 
@@ -47,19 +48,23 @@ class Residuals:
         """
         k = len(speed)
         hessian = prior_precision * np.eye(sensitivity.shape[1]) + sensitivity.T @ sensitivity
-        own = sensitivity[:k]
-        expected = np.eye(k) - own @ np.linalg.solve(hessian, own.T)
-        return cls(white[:k][which], expected[np.ix_(which, which)], speed[which], which)
+        absorbed = np.linalg.solve(np.linalg.cholesky(hessian), sensitivity[:k].T).T
+        return cls(white[:k][which], absorbed[which], speed[which], which)
 
     @cached_property
     def leverage(self) -> Array:
         """(K,) share of each reading in its own prediction."""
-        return np.asarray(1 - np.diag(self.expected))
+        return np.asarray(np.sum(self.absorbed**2, axis=1))
+
+    @cached_property
+    def expected(self) -> Array:
+        """Q (K, K); of many readings it would fill the memory."""
+        return np.eye(len(self.white)) - self.absorbed @ self.absorbed.T
 
     @cached_property
     def studentised(self) -> Array:
         """Residuals (K,) over their own expected std."""
-        return np.asarray(self.white / np.sqrt(np.maximum(np.diag(self.expected), 1e-12)))
+        return np.asarray(self.white / np.sqrt(np.maximum(1 - self.leverage, 1e-12)))
 
     @property
     def enough(self) -> bool:

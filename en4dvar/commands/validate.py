@@ -42,11 +42,13 @@ def validate(source: Source, plot: bool) -> None:
     from en4dvar.commands.describe import cost_summary, problem_summary
     from en4dvar.config.build import build
     from en4dvar.descent.preview import preview
+    from en4dvar.prior import own_seed
 
     problems = build(loaded)
     click.echo(problem_summary(loaded, problems))
     chosen = problems[: _panels()] if plot else problems[:1]
-    previews = [preview(problem, loaded.assimilation, loaded.seed, whole=plot) for problem in chosen]
+    seeds = [own_seed(loaded.seed, problem.observations.name) for problem in chosen]
+    previews = [preview(p, loaded.assimilation, seed, whole=plot) for p, seed in zip(chosen, seeds, strict=True)]
     click.echo(cost_summary(loaded, previews[0], len(problems)))
     for one in previews:
         _warn(one)
@@ -62,10 +64,14 @@ def _panels() -> int:
 
 def _warn(one: Preview) -> None:
     """What the prior ensemble shows that a run would stumble over."""
+    from en4dvar.honesty import doubts
+
     name, reasons = one.problem.observations.name, [reason for reason in one.run.failures if reason]
     if reasons:
         lost = f"{len(reasons)} of {len(one.run.failures)} prior members cannot be run"
         click.echo(f"warning: {name}: {lost}, e.g.: {reasons[0]}", err=True)
+    for words in doubts(one.problem, one.run.predictions):
+        click.echo(f"warning: {name}: {words}", err=True)
     if one.outside > 0.1:
         share = f"{100 * one.outside:.0f} % of the observations lie outside everything the prior expects"
         click.echo(f"warning: {name}: {share}; check units, clock and window (--plot shows them)", err=True)

@@ -95,7 +95,12 @@ def _times(given: TimeColumn, context: Context) -> Column | TimeStep:
         raise ConfigError([Fault(str(error), "step")]) from None
 
 
-_VALUES = Made(lambda given, context: Column(given.name, given.unit, observable_unit(context)), ValueColumn)
+def _values(given: ValueColumn, context: Context) -> Column:
+    positive = context.observed is not None and context.observed.positive
+    return Column(given.name, given.unit, observable_unit(context), positive)
+
+
+_VALUES = Made(_values, ValueColumn)
 
 
 class Columns(Section):

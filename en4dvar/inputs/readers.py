@@ -2,7 +2,7 @@
 
 Rows that hold NaN or a blank are dropped; every remaining number must be finite and the times must increase. Fields of
 ``.mat`` files may be rows or columns; their leading zeros and NaN (frames before nucleation) are dropped and their
-scalars collected.
+scalars collected. Leading zeros of a column that cannot be zero are dropped from CSV files too.
 """
 
 from __future__ import annotations
@@ -32,11 +32,15 @@ SHEETS = (".xlsx", ".xls", ".xlsm", ".ods")
 
 @dataclass(frozen=True)
 class Column:
-    """A column or field ``name`` written in ``unit``, wanted in ``target``."""
+    """A column or field ``name`` written in ``unit``, wanted in ``target``.
+
+    ``positive``: zeros before its first reading are none.
+    """
 
     name: str
     unit: str
     target: str
+    positive: bool = False
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,7 @@ def read_series(
         raise DataError(f"{path}: {value.name!r} is empty")
     if len(times) != len(values):
         raise DataError(f"{path}: {len(times)} times but {len(values)} values of {value.name!r}")
-    first = 0 if table else int(np.argmax(np.nan_to_num(values) != 0))
+    first = 0 if table and not value.positive else int(np.argmax(np.nan_to_num(values) != 0))
     kept = np.arange(first, len(values))[~(np.isnan(times) | np.isnan(values))[first:]]
     _check(times[kept], values[kept], value.name, path)
     wrong = np.flatnonzero(np.diff(times[kept]) <= 0)

@@ -78,10 +78,10 @@ def mode_cautions(
 
 
 def samples(space: WeightSpace) -> bool:
-    """Whether a doubt is settled by sampling: ``refine: auto`` with a cheap model of few parameters."""
-    n = len(space.mean)
-    few = needed_runs(n) is not None and space.basis.shape[1] == n
-    return space.settings.refine == "auto" and space.problem.model.cheap and few and not space.settings.stochastic_model
+    """Whether a doubt is settled by sampling: ``refine: auto`` with a cheap model of few parameters, all constant."""
+    n, problem, settings = len(space.mean), space.problem, space.settings
+    few = needed_runs(n) is not None and space.basis.shape[1] == n and not problem.varying
+    return settings.refine == "auto" and problem.model.cheap and few and not settings.stochastic_model
 
 
 def in_doubt(minima: Sequence[Minimum], agree: bool, shape: Mapping[str, float]) -> bool:

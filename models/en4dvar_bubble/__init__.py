@@ -1,7 +1,8 @@
 """A bubble in a viscoelastic medium, driven by an acoustic pulse or released from its maximum radius.
 
 From the bottom up, each importing only what stands before it: ``tables`` (smooth functions), ``medium`` (constants),
-``gas``, ``driving``, ``laws``, ``solver`` (compiled), ``dynamics`` (what is assumed, and the state at the start),
+``collapse`` (beside Rayleigh's), ``gas``, ``driving``, ``laws``, ``solver`` (compiled), ``dynamics`` (what is assumed,
+and the state at the start),
 ``alternatives`` (what could be otherwise), ``packing`` (states to the solver's arrays), ``paths`` (and back),
 ``settings`` (YAML), ``model`` (the forward model), ``api`` (``simulate``), ``battery`` (checks of a law), ``starter``
 (``en4dvar init``), ``examples``, commands.

@@ -18,6 +18,7 @@ LAYERS = (
     ("state", "hints", "files", "tables", "caution", "compiled", "user_code", "user_file"),
     ("units", "prior", "forward", "noise"),
     ("batch", "observations"),
+    ("varying",),
     ("problem", "diagnostics", "residuals"),
     ("executor",),
     ("ensemble",),
@@ -42,8 +43,8 @@ FLOOR = {name: floor for floor, layer in enumerate(LAYERS) for name in layer}
 
 # the same inside the bubble, as the docstring of its package states
 BUBBLE = (
-    "tables", "medium", "gas", "driving", "laws", "solver", "dynamics", "alternatives", "packing", "paths", "settings",
-    "model", "api", "battery", "starter", "examples", "commands", "commands_init",
+    "tables", "medium", "collapse", "gas", "driving", "laws", "solver", "dynamics", "alternatives", "packing", "paths",
+    "settings", "model", "api", "battery", "starter", "examples", "commands", "commands_init",
 )  # fmt: skip
 
 

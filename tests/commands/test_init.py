@@ -10,17 +10,19 @@ import pytest
 from click.testing import CliRunner, Result
 from jsonschema import Draft202012Validator
 from scipy.integrate import solve_ivp
-from scipy.io import savemat
+from scipy.io import loadmat, savemat
 
 from en4dvar.cli import main
 from en4dvar.config import Config, load_config, resolve
 from en4dvar.config.build import build
 from en4dvar.config.document import parse_document, read_document
 from en4dvar.errors import DataError
+from en4dvar.inputs.readers import Column, read_series
 from en4dvar.report.result import load_result
 from en4dvar_bubble import commands_init
+from en4dvar_bubble.collapse import RAYLEIGH, lobe
 from en4dvar_bubble.laws import REGISTRY
-from en4dvar_bubble.starter.look import RAYLEIGH, lobe, look, noise
+from en4dvar_bubble.starter.look import look, noise
 from en4dvar_bubble.starter.page import Source, quoted, yaml_text
 from en4dvar_bubble.starter.proposal import starter
 
@@ -349,17 +351,60 @@ def test_names_are_quoted_where_yaml_needs_it() -> None:
         assert parse_document(f"x: {{name: {quoted(text)}, unit: m}}").data == {"x": {"name": text, "unit": "m"}}
 
 
+def rescaled(path: Path, factor: float) -> Path:
+    data = loadmat(path)
+    savemat(path.name, {"t": data["t"], "Rnew": factor * data["Rnew"]})
+    return Path(path.name)
+
+
+def test_a_scale_that_cannot_be_is_told_and_no_prior_is_taken_from_it(tmp_path: Path) -> None:
+    """At 0.7 of its collapse time a laser bubble is one in a very stiff gel: G is not guessed from it."""
+    data = simulate("laser", "0 us:70 us:0.63 us", "1 um", tmp_path / "bubble.csv")
+    done = call("init", "--data", data, *UNITS)
+    assert "Rayleigh time 0.915" not in done.stderr
+    assert "first guess from collapse time" in Path("bubble.yaml").read_text()
+    series = read_series(data, Column("t_us", "us", "us"), Column("radius_um", "um", "um"))
+    t, R = series.times, series.values
+    rows = "".join(f"{a},{b}\n" for a, b in zip(0.68 * t, R, strict=True))
+    Path("fast.csv").write_text(f"t_us,radius_um\n{rows}")
+    done = call("init", "--data", "fast.csv", *UNITS)
+    assert "or the time step 1.38" in done.stderr
+    written = Path("fast.yaml").read_text()
+    assert "first guess from collapse time" not in written
+    assert "# MIND: the collapse takes 0.7" in written
+    done = call("validate", "fast.yaml")
+    assert "warning: fast: the collapse takes 0.7" in done.stderr
+
+
+def test_zeros_before_the_bubble_are_no_readings(tmp_path: Path) -> None:
+    data = simulate("laser", "0 us:70 us:0.63 us", "1 um", tmp_path / "bubble.csv")
+    series = read_series(data, Column("t_us", "us", "us"), Column("radius_um", "um", "um"))
+    t, R = series.times, series.values
+    t, R = np.append(np.arange(-3, 0) * 0.63, t), np.append(np.zeros(3), R)
+    Path("film.csv").write_text("t_us,R_um\n" + "".join(f"{a},{b}\n" for a, b in zip(t, R, strict=True)))
+    done = call("init", "--data", "film.csv", *UNITS)
+    assert "start: laser (the history begins at" in done.stdout
+    (problem,) = build(load_config("film.yaml", {"data.window": {"from": "start", "to": "end"}}))
+    assert problem.observations.values.min() > 0
+
+
 @pytest.mark.parametrize(
-    ("file", "radius_unit", "G", "rest"),
-    [("A_E2_002.mat", "um", 1.9e3, 21.8e-6), ("PA1_exp2_RofTdata_0.mat", "m", 40e3, 63e-6)],
+    ("file", "unit", "G", "rest"),
+    [
+        ("A_E2_002.mat", "um", 1.9e3, 21.8e-6),
+        ("PA1_exp2_RofTdata_0.mat", "0.7452 m", 5.1e3, 47e-6),  # 2.76 µm a pixel, not 3.7037 µs
+    ],
 )
-def test_measured_films(file: str, radius_unit: str, G: float, rest: float) -> None:
+def test_measured_films(file: str, unit: str, G: float, rest: float) -> None:
     """G of a least-squares fit, R_eq of the file: within what the proposed prior expects."""
     path = MEASURED / file
     if not path.exists():
         pytest.skip(f"measured data not present: {path}")
-    done = call("init", "--data", path, "--time-unit", "s", "--radius-unit", radius_unit)
+    if unit.startswith("0"):
+        path, unit = rescaled(path, float(unit.split()[0])), "m"
+    done = call("init", "--data", path, "--time-unit", "s", "--radius-unit", unit)
     assert done.exit_code == 0, done.output
+    assert "Rayleigh time 0.915" not in done.stderr
     config = proposed(Path(f"{path.stem}.yaml"))
     assert config.document.data["model"]["start"] == "laser"
     (problem,) = build(config)

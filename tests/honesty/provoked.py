@@ -24,6 +24,14 @@ class Violent(Vectorised):
     validity = (ValidityLimit("y", 0.9, "m", "largest excursion", "a test"),)
 
 
+class Doubtful(Vectorised):
+    """Does not believe a reading that no prior member comes near."""
+
+    def doubts(self, observable, times, values, predicted):
+        assert (len(times), len(times)) == (len(values), predicted.shape[1])
+        return [f"no {observable} is like this"] * bool(len(predicted))
+
+
 class Product(Toy):
     """y = a b: the data know the product alone, so the posterior is a bent ridge."""
 
@@ -103,6 +111,7 @@ PROVOKED: dict[str, Callable[[], Analysis]] = {
     "misfit": lambda: run(replace_std(linear(scale=100.0), 0.01)),
     "overstated-error": lambda: run(replace_std(linear(scale=100.0), 10.0)),
     "prior-conflict": lambda: run(linear(scale=0.02, std=0.001)),
+    "implausible-data": lambda: run(make_problem(Doubtful(TWO), (1.0, 0.5))),
     "model-validity": lambda: run(make_problem(Violent(TWO), (1.0, 0.5))),
     "members-lost": lambda: run(
         make_problem(Fragile(0.2, names=TWO), (-1.0, 0.5)), members=40, min_active_fraction=0.2

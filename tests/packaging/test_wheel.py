@@ -62,7 +62,8 @@ def test_the_wheel_holds_the_packages_and_what_lies_beside_them(built):
         metadata = email.message_from_bytes(wheel.read(next(n for n in names if n.endswith("/METADATA"))))
     tops = {name.partition("/")[0] for name in names}
     info = {top for top in tops if top.endswith(".dist-info")}
-    assert tops - info == {"en4dvar", "en4dvar_bubble", "en4dvar_lorenz"}
+    assert tops - info == {"en4dvar", *(p.parent.name for p in (ROOT / "models").glob("*/__init__.py"))}
+    assert {"en4dvar_agarose", "en4dvar_bubble", "en4dvar_lorenz"} <= tops
     made = (".pyc", ".nbi", ".nbc")
     for package, root in (("en4dvar", ROOT), ("en4dvar_*", ROOT / "models")):
         here = {p.relative_to(root).as_posix() for p in root.glob(f"{package}/**/*") if p.is_file()}
@@ -79,7 +80,7 @@ def test_the_sdist_can_be_tested_and_documented(built):
         names = {name.partition("/")[2] for name in sdist.getnames()}
     assert {"pyproject.toml", "LICENSE", "README.md", "mkdocs.yml", "tests/conftest.py"} <= names
     assert {"docs/index.md", "configs/quickstart.yaml", "configs/data/agarose_synthetic.csv"} <= names
-    assert not [name for name in names if "shared" in name or name.endswith((".nbi", ".nbc", ".pyc"))]
+    assert not [name for name in names if name.startswith("shared/") or name.endswith((".nbi", ".nbc", ".pyc"))]
 
 
 def test_the_quick_start_runs_from_the_wheel_alone(installed, tmp_path):

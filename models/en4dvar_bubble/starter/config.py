@@ -98,7 +98,7 @@ def histories(files: Mapping[str, Path], source: Source) -> tuple[dict[str, tupl
     unusable: list[str] = []
     for name, file in files.items():
         try:
-            series = read_series(file, time, Column(*source.radius, "m"), decimal=source.decimal)
+            series = read_series(file, time, Column(*source.radius, "m", positive=True), decimal=source.decimal)
         except DataError as error:
             unusable.append(str(error))
         else:

@@ -4,7 +4,7 @@ Acoustic start: R_max and the collapse time (the driving is known, so both follo
 collapse time and the rebound's height over R_max (R_max is where the model starts). The model is run on a grid of G and
 μ, every other parameter at the centre of its prior; each node is weighted by exp(−½ Σ (ln feature − ln observed)²/s²)
 and the guess is the weighted geometric mean. Collapse times of model and data are taken in the same way
-(:func:`~en4dvar_bubble.starter.look.lobe`).
+(:func:`~en4dvar_bubble.collapse.lobe`).
 
 A guess is an order of magnitude to centre a wide prior on: it has seen the data that the prior is then confronted with.
 """
@@ -20,8 +20,9 @@ import numpy as np
 from en4dvar.errors import DataError
 from en4dvar.forward import Trajectory
 from en4dvar.state import Array
+from en4dvar_bubble.collapse import lobe
 from en4dvar_bubble.model import BubbleModel
-from en4dvar_bubble.starter.look import lobe, second_maximum
+from en4dvar_bubble.starter.look import second_maximum
 
 GRID: Mapping[str, Array] = {"G": np.geomspace(50.0, 2e5, 25), "mu": np.geomspace(3e-3, 1.0, 18)}  # Pa, Pa s
 TOLERANCE = {"R_max": 0.05, "t_c": 0.05, "rebound": 0.15}  # s, of the logarithm

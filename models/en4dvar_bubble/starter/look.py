@@ -1,14 +1,6 @@
 """What a radius history shows by itself: maximum, collapse, start, noise, radius at rest.
 
-The collapse time is that of Rayleigh's solution in the closed form of Obreschkow, Bruderer & Farhat (2012), Phys. Rev.
-E 85, 066303, for an empty bubble in a liquid:
-
-    R(t) = R_max [1 − ((t − t_max)/t_c)²]^{2/5},        t_c = 0.9147 R_max √(ρ/p_∞),
-
-so that R^{5/2} is a parabola in t: three numbers by linear least squares from the samples between the maximum and 40 %
-of it, whether the collapse itself was seen or fell between two frames (2 % late, as Rayleigh's exact solution tells).
-In a gel t_c/0.9147 R_max √(ρ/p_∞) differs from
-one: elasticity shortens the collapse, viscosity and gas prolong it.
+The collapse beside Rayleigh's: :mod:`en4dvar_bubble.collapse`.
 """
 
 from __future__ import annotations
@@ -19,28 +11,16 @@ from typing import Literal
 
 import numpy as np
 
-from en4dvar.errors import DataError
 from en4dvar.inputs.window import minima
 from en4dvar.state import Array
-from en4dvar_bubble.medium import Medium
+from en4dvar_bubble.collapse import Lobe, lobe
 
 Start = Literal["acoustic", "laser"]
-RAYLEIGH = 0.914681  # of the empty bubble: Rayleigh (1917)
-LOWEST = 0.4  # of R_max: the part of the collapse that R^{5/2} is fitted to
 NEAR_TOP = 0.7  # of R_max: the part of the history that the noise is estimated from
 LASER_BEGINS = 0.8  # of R_max: a history that begins above is one of a released bubble
 COLLAPSED = 0.2  # of R_max: from here on the wall of an acoustic bubble is too fast for the model
 SETTLED = 0.15  # std of ln R in the last quarter of a history that has come to rest
 ACOUSTIC_BEGINS = 0.1  # of R_max: one that begins below has grown from a nucleus
-
-
-@dataclass(frozen=True)
-class Lobe:
-    """The bubble's largest excursion; SI. ``t_c`` is from the maximum to the collapse."""
-
-    R_max: float
-    t_max: float
-    t_c: float
 
 
 @dataclass(frozen=True)
@@ -68,10 +48,6 @@ class Look:
     start: Start
     reason: str
     clear: bool
-
-    def rayleigh_ratio(self, medium: Medium) -> float:
-        """The collapse time over Rayleigh's."""
-        return self.lobe.t_c / (RAYLEIGH * self.lobe.R_max * float(np.sqrt(medium.rho / medium.p_inf)))
 
 
 def look(times: Array, radius: Array, start: Start | None = None) -> Look:
@@ -108,33 +84,6 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
         reason=reason,
         clear=clear,
     )
-
-
-def lobe(times: Array, radius: Array) -> Lobe:
-    """Maximum and collapse time, see the head of the module. Raises :class:`DataError`."""
-    where = _falling(radius)
-    if where.stop - where.start < 4:
-        raise DataError("fewer than four samples between the maximum and its collapse; is this a radius history?")
-    t, r = times[where], radius[where]
-    scale = max(float(np.ptp(t)), 1e-300)
-    z, y = (t - times[int(np.argmax(radius))]) / scale, np.clip(r / radius.max(), 1e-3, None)
-    c, b, a = np.polyfit(z, y**2.5, 2, w=y**-1.5)  # an error of R is one of 5/2 R^{3/2} in R^{5/2}
-    if not c < 0:
-        raise DataError("the radius does not turn at its maximum: no collapse can be told")
-    middle = -b / (2 * c)
-    peak = a - b**2 / (4 * c)
-    t_max = times[int(np.argmax(radius))] + scale * middle
-    return Lobe(float(radius.max() * peak**0.4), float(t_max), float(scale * np.sqrt(-peak / c)))
-
-
-def _falling(radius: Array) -> slice:
-    """From just before the maximum down to ``LOWEST`` of it, or to the end of the descent."""
-    top = first = last = int(np.argmax(radius))
-    while first > 0 and radius[first - 1] > 0.95 * radius[top]:
-        first -= 1
-    while last + 1 < len(radius) and LOWEST * radius[top] < radius[last + 1] <= radius[last] + 0.1 * radius[top]:
-        last += 1
-    return slice(first, last + 1)
 
 
 def _minima(radius: Array, scatter: float) -> tuple[float, int]:

@@ -10,12 +10,13 @@ import numpy as np
 from en4dvar.errors import DataError
 from en4dvar.state import Array, Parameter
 from en4dvar.units import convert
+from en4dvar_bubble.collapse import Lobe, doubt, lobe
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX
 from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter.guess import Guess, first_guess
-from en4dvar_bubble.starter.look import Lobe, Look, Start, lobe, look, typical
+from en4dvar_bubble.starter.look import Look, Start, look, typical
 
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
 MODEL: Mapping[Start, Mapping[str, str]] = {
@@ -28,7 +29,6 @@ NUCLEUS = 0.5e-6  # m: order of the stress-free radii in Mancia et al. (2021), T
 GAS_FRACTION = 0.12  # R_eq/R_max of laser-induced bubbles, where no radius at rest is seen
 WIDTHS = {"G": (1.0, 1.5), "mu": (0.7, 1.2)}  # bounds of the log_std of a guess
 SAME_CLOCK = 2e-6  # s: what a first guess can be off by
-PLAUSIBLE = (0.3, 2.0)  # collapse time over Rayleigh's
 BUBBLES = (1e-7, 0.1)  # m: between these radii
 
 
@@ -69,7 +69,7 @@ def propose(
     others = _others(model, look)
     observed = {"R_max": look.lobe.R_max, "t_c": look.lobe.t_c, "rebound": look.rebound}
     guess = first_guess(model, others, observed)
-    ratio = look.rayleigh_ratio(model.medium)
+    ratio = look.lobe.rayleigh_ratio(model.medium)
     told = [
         f"R_max {_text(look.lobe.R_max, 'm', 'um', 3)}, collapse {_text(look.lobe.t_c, 's', 'us', 3)} later, "
         f"{ratio:.2f} of the Rayleigh time (elasticity shortens it, viscosity and gas prolong it)"
@@ -78,8 +78,9 @@ def propose(
     other = "laser" if chosen == "acoustic" else "acoustic"
     doubt = f"start: {chosen} is only a proposal ({look.reason}); if it was {other}, say --start {other}"
     warnings = [doubt] * (not look.clear)
-    if not PLAUSIBLE[0] < ratio < PLAUSIBLE[1]:
-        warnings.append(f"the collapse takes {ratio:.3g} of the Rayleigh time; are the units of both columns right?")
+    doubted = _doubted(looks, model)
+    if doubted:
+        warnings += doubted
     elif not BUBBLES[0] < look.lobe.R_max < BUBBLES[1]:
         warnings.append("no bubble has such a radius; are the units of both columns right?")
     elif guess.far:
@@ -90,10 +91,19 @@ def propose(
     return Proposal(
         _data(chosen, look, model, {**others, **guess.values}),
         _model(law_name, chosen, look),
-        _parameters(model, chosen, look, guess),
+        _parameters(model, chosen, look, Guess({}, {}, 0.0) if doubted else guess),
         tuple(told),
         tuple(warnings),
     )
+
+
+def _doubted(looks: Mapping[str, Look], model: BubbleModel) -> list[str]:
+    """Data sets whose scales cannot be right, one line for those with the same words."""
+    found: dict[str, list[str]] = {}
+    for name, view in looks.items():
+        if words := doubt(view.lobe, model.medium):
+            found.setdefault(words, []).append(name)
+    return [words if len(looks) == 1 else f"{', '.join(names)}: {words}" for words, names in found.items()]
 
 
 def starter(start: Start, law: str | None) -> Proposal:

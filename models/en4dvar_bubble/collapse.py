@@ -1,0 +1,167 @@
+"""The collapse of a bubble beside Rayleigh's, and whether the scales of a radius history can be what they say.
+
+The collapse time is that of Rayleigh's solution in the closed form of Obreschkow, Bruderer & Farhat (2012), Phys. Rev.
+E 85, 066303, for an empty bubble in a liquid:
+
+    R(t) = R_max [1 − ((t − t_max)/t_c)²]^{2/5},        t_c = 0.9147 R_max √(ρ/p_∞),
+
+so that R^{5/2} is a parabola in t: three numbers by linear least squares from the samples between the maximum and 40 %
+of it, whether the collapse itself was seen or fell between two frames (2 % late, as Rayleigh's exact solution tells).
+
+In a gel the ratio r = t_c/(0.9147 R_max √(ρ/p_∞)) differs from one: elasticity and surface tension shorten the
+collapse, viscosity, gas and vapour prolong it. The energy of an incompressible liquid bounds it from below: a
+neo-Hookean spring adds G/2 (5 − 4/λ − 1/λ⁴) < 5/2 G to the pressure, surface tension over the whole collapse at most
+3 S/R_max, and what adds at most q to p_∞ cannot shorten the collapse by more than √(1 + q/p_∞):
+
+    r > [1 + (5/2 G + 3 S/R_max)/p_∞]^{−1/2}.
+
+From above it is bounded by r < 1.1 + 2.2/(Re − 3), Re = R_max √(ρ p_∞)/μ (none below Re = 3), an envelope of forward
+runs (20 to 500 µm, R_max/R_eq of 5 to 12, G from 0.1 to 42 kPa; tests/bubble/test_collapse.py holds it to them).
+
+How stiff or thick a gel can be no formula says: :data:`STIFF` and :data:`THICK` are what is taken for granted, well
+above what has been published of gels that bubbles were used on. A prior that expects more is believed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import stdtrit
+
+from en4dvar.errors import DataError
+from en4dvar.state import Array
+from en4dvar_bubble.medium import Medium
+
+RAYLEIGH = 0.914681  # of the empty bubble: Rayleigh (1917)
+LOWEST = 0.4  # of R_max: the part of the collapse that R^{5/2} is fitted to
+TOLD = 0.6  # of R_max: a window that ends above does not tell the collapse time
+STIFF = 20e3  # Pa; published: 7.7 kPa (Estrada et al. 2018), stiff polyacrylamide
+THICK = 0.3  # Pa s; published: 0.19 (Yang et al. 2020)
+SOFT = 1.02  # r of a large bubble in a soft gel, whose gas and viscosity prolong its collapse a little
+APART = 1.05  # noise and physics that the model lacks move r by less than this
+SURE = 0.99  # one-sided probability, by the scatter of the samples
+SAME_FACTOR = 1.12  # a factor that is this close to that of a known mistake may be it
+
+
+@dataclass(frozen=True)
+class Lobe:
+    """The bubble's largest excursion; SI. ``t_c`` is from the maximum to the collapse.
+
+    ``margin``: t_c/R_max lies within this factor less one, by the scatter of the samples about the parabola (99 % to
+    either side).
+    """
+
+    R_max: float
+    t_max: float
+    t_c: float
+    margin: float = 0.0
+
+    def rayleigh_ratio(self, medium: Medium) -> float:
+        """The collapse time over Rayleigh's."""
+        return self.t_c / (RAYLEIGH * self.R_max * math.sqrt(medium.rho / medium.p_inf))
+
+
+def lobe(times: Array, radius: Array) -> Lobe:
+    """Maximum and collapse time, see the head of the module. Raises :class:`DataError`."""
+    where = _falling(radius)
+    if where.stop - where.start < 4:
+        raise DataError("fewer than four samples between the maximum and its collapse; is this a radius history?")
+    t, r = times[where], radius[where]
+    scale = max(float(np.ptp(t)), 1e-300)
+    z, y = (t - times[int(np.argmax(radius))]) / scale, np.clip(r / radius.max(), 1e-3, None)
+    c, b, a = np.polyfit(z, y**2.5, 2, w=y**-1.5)  # an error of R is one of 5/2 R^{3/2} in R^{5/2}
+    if not c < 0:
+        raise DataError("the radius does not turn at its maximum: no collapse can be told")
+    middle = -b / (2 * c)
+    peak = a - b**2 / (4 * c)
+    t_max = times[int(np.argmax(radius))] + scale * middle
+    margin = _margin(z, y, np.array([c, b, a]))
+    return Lobe(float(radius.max() * peak**0.4), float(t_max), float(scale * np.sqrt(-peak / c)), margin)
+
+
+def _margin(z: Array, y: Array, fit: Array) -> float:
+    """Of t_c/R_max = √(−peak/c)/peak^{2/5}, to first order in the errors of the coefficients (c, b, a) = ``fit``."""
+    weight = y**-1.5
+    X = np.vander(z, 3) * weight[:, None]
+    residual = weight * y**2.5 - X @ fit
+    left = len(z) - 3
+    covariance = np.linalg.pinv(X.T @ X) * float(residual @ residual) / left
+    c, b, a = fit
+    slope = np.array([b**2 / (4 * c**2), -b / (2 * c), 1.0]) * 0.1 / (a - b**2 / (4 * c))  # of ln peak^{1/10}
+    slope[0] -= 0.5 / c
+    return float(stdtrit(left, SURE) * np.sqrt(slope @ covariance @ slope))
+
+
+def _falling(radius: Array) -> slice:
+    """From just before the maximum down to ``LOWEST`` of it, or to the end of the descent."""
+    top = first = last = int(np.argmax(radius))
+    while first > 0 and radius[first - 1] > 0.95 * radius[top]:
+        first -= 1
+    while last + 1 < len(radius) and LOWEST * radius[top] < radius[last + 1] <= radius[last] + 0.1 * radius[top]:
+        last += 1
+    return slice(first, last + 1)
+
+
+def bounds(R_max: float, medium: Medium) -> tuple[float, float]:
+    """Least and largest ratio of collapse time and Rayleigh time that are taken for granted; ``R_max`` in m."""
+    least = (1 + (2.5 * STIFF + 3 * medium.S / R_max) / medium.p_inf) ** -0.5
+    reynolds = R_max * math.sqrt(medium.rho * medium.p_inf) / THICK
+    return least, 1.1 + 2.2 / (reynolds - 3) if reynolds > 3 else math.inf
+
+
+def doubt(view: Lobe, medium: Medium, expected: Sequence[float] = ()) -> str:
+    """Why the scales of a history cannot be right, and what would explain it; "" where they can.
+
+    ``expected`` are the ratios of the prior members: a ratio that none of them comes near is doubted, and one outside
+    :func:`bounds`, beyond its margin, unless half of them are there as well.
+    """
+    ratio, (least, largest) = view.rayleigh_ratio(medium), bounds(view.R_max, medium)
+    sure = 1 + view.margin
+    short, long = ratio * sure < least, ratio > largest * sure
+    like_it = sum(r < least if short else r > largest for r in expected)
+    if (short or long) and 2 * like_it <= len(expected):
+        limit = f"{STIFF / 1e3:g} kPa allows no less than {least:.2f}"
+        if long:
+            limit = f"{THICK:g} Pa s allows no more than {largest:.2f}"
+        return f"{_measured(ratio)}; a gel of {limit}: {_explained(SOFT / ratio)}"
+    apart = max(APART, sure)
+    if len(expected) and not min(expected) / apart <= ratio <= max(expected) * apart:
+        usual = float(np.median(expected))
+        span = f"{min(expected):.2f} to {max(expected):.2f}"
+        return f"{_measured(ratio)}; the prior expects {span}: {_explained(usual / ratio)}, or the prior is wrong"
+    return ""
+
+
+def _measured(ratio: float) -> str:
+    return f"the collapse takes {ratio:.2g} of the Rayleigh time 0.915 R_max √(ρ/p∞)"
+
+
+def _explained(factor: float) -> str:
+    """What would make the history that of a usual bubble; ``factor`` is what its collapse time falls short by."""
+    if 2 / SAME_FACTOR < factor < 2 * SAME_FACTOR:
+        return "diameters given as radii? Or a time step, a pixel or a unit is wrong by a factor of 2"
+    by = factor if factor > 1 else 1 / factor
+    size, step = ("large", "short") if factor > 1 else ("small", "long")
+    words = f"radii {by:.3g} times too {size}, or the time step {by:.3g} times too {step}"
+    return f"{words}; are the units of both columns right?" if by > 30 else f"{words} (pixel size, frame rate, units)"
+
+
+def doubts(times: Array, radius: Array, predicted: Array, medium: Medium) -> tuple[str, ...]:
+    """:func:`doubt` of a window ``times`` (K,) s, ``radius`` (K,) m; ``predicted`` (N, K) m are the prior members."""
+    if radius[int(np.argmax(radius)) :].min() > TOLD * radius.max():
+        return ()
+    try:
+        view = lobe(times, radius)
+    except DataError:
+        return ()
+    expected = []
+    for path in predicted:
+        try:
+            expected.append(lobe(times, path).rayleigh_ratio(medium))
+        except DataError:
+            continue
+    found = doubt(view, medium, expected)
+    return (found,) if found else ()

@@ -1,0 +1,120 @@
+"""Scales that cannot be: the collapse time beside Rayleigh's, in public data and in forward runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from en4dvar_bubble import BubbleModel, collapse
+from en4dvar_bubble.collapse import RAYLEIGH, Lobe, bounds, doubt, doubts, lobe
+from en4dvar_bubble.medium import WATER_25C
+from en4dvar_bubble.settings import BubbleSettings
+
+MEASURED = Path(__file__).resolve().parents[3] / "shared" / "data"
+FRAME, PIXEL = 3.7037e-6, 2.76e-6
+
+
+def measured(name: str) -> Path:
+    if not (MEASURED / name).exists():
+        pytest.skip(f"{MEASURED / name} is not here")
+    return MEASURED / name
+
+
+def usual(ratio: float, R_max: float = 400e-6) -> Lobe:
+    return Lobe(R_max, 0.0, ratio * RAYLEIGH * R_max * np.sqrt(WATER_25C.rho / WATER_25C.p_inf))
+
+
+def test_metres_that_are_pixels_times_seconds_are_noticed_and_explained() -> None:
+    """PA1_exp2 as stored: 3.7037/2.76 = 1.342 times too large."""
+    data = loadmat(measured("PA1_exp2_RofTdata_0.mat"))
+    t, R = data["t"].ravel(), data["Rnew"].ravel()
+    told = doubt(lobe(t, R), WATER_25C)
+    assert "0.76 of the Rayleigh time" in told
+    factor = float(told.split("radii ")[1].split()[0])
+    assert factor == pytest.approx(FRAME / PIXEL, rel=0.02)
+    assert doubt(lobe(t, R * PIXEL / FRAME), WATER_25C) == ""
+
+
+def test_diameters_given_as_radii_are_noticed() -> None:
+    data = loadmat(measured("PAstiff_xy002_RofT.mat"))
+    R = data["Rnew"].ravel()
+    R = R[np.argmax(R > 0) :] * PIXEL
+    t = FRAME * np.arange(len(R))
+    assert doubt(lobe(t, R), WATER_25C) == ""
+    assert "diameters given as radii?" in doubt(lobe(t, 2 * R), WATER_25C)
+    assert "radii 2.62 times" in doubt(lobe(t, R / PIXEL * 1e-6), WATER_25C)  # pixels taken for micrometres
+    assert "too small" in doubt(lobe(t, R / PIXEL * 1e-6), WATER_25C)
+
+
+def test_correct_public_data_are_believed() -> None:
+    data = loadmat(measured("A_E2_002.mat"))
+    t, R = data["t"].ravel(), data["R"].ravel() * 1e-6
+    ok = np.isfinite(R) & np.isfinite(t)
+    assert doubt(lobe(t[ok], R[ok]), WATER_25C) == ""
+    diameters = doubt(lobe(t[ok], 2 * R[ok]), WATER_25C)
+    assert "0.52 of the Rayleigh time" in diameters
+    assert "diameters given as radii?" in diameters
+    for name in ("LHS-simpool-x36_KV.mat", "pIMR_PA_10_Refined.mat"):
+        for R_max, _, t_c in loadmat(measured(name))["pIMR_array"]:
+            assert doubt(Lobe(R_max, 0.0, t_c), WATER_25C) == ""
+
+
+@pytest.mark.parametrize("radius", [20e-6, 50e-6, 200e-6, 500e-6])
+def test_no_forward_run_of_a_gel_is_doubted(radius: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bounds are those of the model itself, for stiffnesses and viscosities in turn taken for the largest."""
+    settings = {
+        "start": "laser",
+        "law": "neo-hookean-kelvin-voigt",
+        "gas": "polytropic",
+        "vapour_pressure": "saturated",
+    }
+    model = BubbleModel.from_settings(BubbleSettings.model_validate(settings))
+    times = np.linspace(0, 4 * RAYLEIGH * radius * np.sqrt(998 / 101325), 400)
+    for G, mu, stretch in [(g, m, s) for g in (100.0, 2e4, 4.2e4) for m in (1e-3, 0.03, 0.1, 0.3) for s in (5.0, 12.0)]:
+        theta = {"G": G, "mu": mu, "R_eq": radius / stretch, "R_max": radius}
+        (path,) = model.trajectories(model.initial_states({k: np.array([v]) for k, v in theta.items()}), times)
+        monkeypatch.setattr(collapse, "STIFF", G)
+        monkeypatch.setattr(collapse, "THICK", mu)
+        low, high = bounds(radius, model.medium)
+        if radius * np.sqrt(998 * 101325) / mu > 5:  # below, the bubble creeps back and does not collapse
+            assert low < lobe(times, path["R"]).rayleigh_ratio(model.medium) < high, theta
+
+
+def test_a_prior_that_expects_it_is_believed() -> None:
+    assert "radii 1.34 times too large, or the time step 1.34 times too short" in doubt(usual(0.76), WATER_25C)
+    assert "1.34 times" in doubt(usual(0.76), WATER_25C, [0.74, 0.9, 0.95])  # wide enough to hold it is not enough
+    assert doubt(usual(0.76), WATER_25C, [0.7, 0.76, 0.95]) == ""
+    assert "the prior expects 0.90 to 0.98" in doubt(usual(1.05), WATER_25C, [0.9, 0.94, 0.98])
+    assert doubt(usual(1.0), WATER_25C, [0.9, 0.94, 0.98]) == ""
+
+
+def test_the_margin_is_that_of_the_scatter() -> None:
+    """99 % to either side: of 400 noisy collapses some 4 lie beyond it on each."""
+    rng, view = np.random.default_rng(1), usual(0.9)
+    t = np.linspace(-0.2, 0.95, 9) * view.t_c
+    R = view.R_max * (1 - (t / view.t_c) ** 2) ** 0.4
+    found = [lobe(t, R + 0.01 * view.R_max * rng.standard_normal(9)) for _ in range(400)]
+    z = [np.log(one.rayleigh_ratio(WATER_25C) / 0.9) / one.margin for one in found]
+    assert 0 < np.sum(np.greater(z, 1)) < 14
+    assert 0 < np.sum(np.less(z, -1)) < 14
+    assert lobe(t, R).margin < 1e-9
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-3])
+def test_a_wrong_unit_is_asked_for(factor: float) -> None:
+    assert "are the units of both columns right?" in doubt(usual(factor), WATER_25C)
+
+
+def test_a_window_that_ends_before_the_collapse_tells_nothing() -> None:
+    view = usual(0.5)
+    t = np.linspace(0, view.t_c, 40)
+    R = view.R_max * (1 - (t / view.t_c) ** 2) ** 0.4
+    predicted = np.stack([R, R])
+    medium = replace(WATER_25C, S=0.07)
+    assert doubts(t, R, predicted[:0], medium)
+    assert doubts(t[:20], R[:20], predicted[:0, :20], medium) == ()
+    assert doubts(t, R, predicted, medium) == ()
