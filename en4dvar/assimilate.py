@@ -349,7 +349,10 @@ class _Assimilation:
         minima = merged([*minima, *found])
         if descent.cost <= other.cost:
             return descent, minima
-        iterate(DataWindow(self.space, self.seed, lambda: None, self.tell), self.scheme, [other])
+        try:
+            iterate(DataWindow(self.space, self.seed, lambda: None, self.tell), scheme, [other])
+        except TooFewMembersError:  # the model does not run about it
+            return descent, minima
         if other.cost > descent.cost - SAME_COST:
             return descent, minima
         return other, merged([self.minimum(other), *minima])
@@ -357,15 +360,12 @@ class _Assimilation:
     def modes(self, minima: Sequence[Minimum], sampled: Refined | None) -> tuple[Mode, ...]:
         """The minima that count, with their weights; by Laplace where the posterior was not sampled."""
         prior = self.problem.prior
-        logs = np.array([m.log_evidence(prior) for m in minima])
-        weights = sampled.weights if sampled else np.exp(logs - np.logaddexp.reduce(logs))
-        return (
-            tuple(
-                Mode(prior.to_physical(m.x), m.cost, m.descents, m.spread, float(weight))
-                for m, weight in zip(minima, weights, strict=True)
-            )
-            if minima
-            else ()
+        logs = np.array([m.log_evidence(prior) - minima[0].log_evidence(prior) for m in minima[1:]])
+        relative = np.append(1.0, np.exp(logs))[: len(minima)]
+        weights = sampled.weights if sampled and minima else relative / relative.sum()
+        return tuple(
+            Mode(prior.to_physical(m.x), m.cost, m.descents, m.spread, float(weight))
+            for m, weight in zip(minima, weights, strict=True)
         )
 
     def refine(self, posterior: Array, minima: Sequence[Minimum], earlier: Refinement | None) -> Refined:
