@@ -203,7 +203,7 @@ class _Assimilation:
             beyond=after.beyond,
             residuals=self.residuals(descent),
             discrepancy=self.discrepancy(descent, last.predicted[0]),
-            influence=self.influence(after, posterior, response, gaussian=not refinement),
+            influence=self.influence(after, posterior, response, gaussian=sampled is None),
             what_if=shifts,
             ledger=path,
         )
