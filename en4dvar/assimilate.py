@@ -232,16 +232,17 @@ class _Assimilation:
         return diag.log_evidence(descent.iterate.cost, values, len(self.space.members), observations)
 
     def log_evidence_constant(self) -> float | None:
-        """ln p(y) with constant parameters, from iterations of its own, NaN if they fail; None where none varies.
+        """ln p(y) with constant parameters, NaN where these lose the ensemble; None where none varies.
 
-        A second minimum is found as the first is. The posterior at zero changes (Savage & Dickey) would spare the runs,
+        It is that of an assimilation of its own, searched and, in doubt, sampled like this one. The posterior at zero changes (Savage & Dickey) would spare the runs,
         but extrapolates the quadratic form of J from one minimum to the other, which may be far away.
         """
         if not self.problem.varying:
             return None
-        other = _Assimilation(self.problem.constant, self.settings, self.seed, self.space.executor, None, None)
+        settings = replace(self.settings, what_if=False)
+        other = _Assimilation(self.problem.constant, settings, self.seed, self.space.executor, None, None)
         try:
-            return other.log_evidence(other.descend()[-1])
+            return other.run(None).log_evidence
         except TooFewMembersError:
             return np.nan
         finally:
