@@ -234,8 +234,9 @@ class _Assimilation:
     def log_evidence_constant(self) -> float | None:
         """ln p(y) with constant parameters, NaN where these lose the ensemble; None where none varies.
 
-        It is that of an assimilation of its own, searched and, in doubt, sampled like this one. The posterior at zero changes (Savage & Dickey) would spare the runs,
-        but extrapolates the quadratic form of J from one minimum to the other, which may be far away.
+        It is that of an assimilation of its own, searched and, in doubt, sampled like this one. The posterior at zero
+        changes (Savage & Dickey) would spare the runs, but extrapolates the quadratic form of J from one minimum to the
+        other, which may be far away.
         """
         if not self.problem.varying:
             return None
