@@ -22,6 +22,7 @@ from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, l
 from en4dvar.errors import ConfigError, TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.honesty import ControlEnsembles, examine
+from en4dvar.influence import Influence
 from en4dvar.noise import Predicted
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.residuals import Residuals
@@ -202,6 +203,7 @@ class _Assimilation:
             beyond=after.beyond,
             residuals=self.residuals(descent),
             discrepancy=self.discrepancy(descent, last.predicted[0]),
+            influence=self.influence(after, posterior, response, gaussian=sampled is None),
             what_if=shifts,
             ledger=path,
         )
@@ -254,6 +256,23 @@ class _Assimilation:
         rates = np.gradient(at.values, observations.times) if at.rates is None else at.rates
         white, sensitivity = observations.whiten(linear)
         return Residuals.of(white, sensitivity, len(self.space.members) - 1, np.abs(rates), observations.used)
+
+    def influence(self, run: Forecast, members: Array, response: LinearResponse, gaussian: bool) -> Influence | None:
+        """Of each reading on the posterior ``members`` (N, n), whose ``run`` it is; None where it cannot be told.
+
+        ``gaussian``: they are draws of the Gaussian about the mode.
+        """
+        observations, prior = self.problem.observations, self.problem.prior
+        conditional = observations.log_conditional(run.predicted)
+        if conditional is None:
+            return None
+        alive = diag.active_members(run.failures) & np.isfinite(conditional).all(axis=1)
+        if alive.sum() < members.shape[1] + 2:
+            return None
+        if gaussian and observations.noise.independent and response.defined:
+            return Influence.by_tangent(prior, members[alive], response.tangent(members[alive]))
+        ratios = -observations.weights * conditional[alive]
+        return Influence.by_weights(prior.to_physical(members[alive]), ratios)
 
     def discrepancy(self, descent: Descent, central: Predicted) -> Discrepancy | None:
         """Of the model, where the observations allow for one."""
