@@ -37,6 +37,14 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
     ),
     "rank-deficient": ("serious", "give more members than parameters (assimilation.members), or sampling: exact"),
     "non-gaussian": ("caution", "set assimilation.refine: mcmc, which samples the posterior as it is"),
+    "several-modes": (
+        "caution",
+        "look at the members, not at mean ± std; data or prior knowledge that tell the modes apart are worth most",
+    ),
+    "starts-disagree": (
+        "caution",
+        "raise assimilation.starts, or narrow the priors: a lower minimum may not have been found",
+    ),
     "members-lost": (
         "caution",
         "the posterior holds only where the model runs: narrow the prior there, or find out why the model fails",

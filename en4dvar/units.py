@@ -79,6 +79,7 @@ PREFIXES = {"T": 12, "G": 9, "M": 6, "k": 3, "h": 2, "d": -1, "c": -2, "m": -3, 
 
 LARGEST_POWER, LONGEST = 12, 100  # of a symbol; characters of a unit
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?(?![\d.])")
+_SCALED = re.compile(r"\s*((?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*\*\s*(?=[A-Za-z%(])")
 _TOKEN = re.compile(r"\s*(?:(?P<symbol>[A-Za-z%]+|1(?![\d.]))(?:(?:\^|\*\*)?(?P<power>[+-]?\d+))?|(?P<op>[*/()]))\s*")
 _SUPERSCRIPT = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 
@@ -106,11 +107,18 @@ def _did_you_mean(name: str) -> str:
 def parse_unit(text: str) -> Unit:
     """The unit written as ``text``: ``"Pa s"``, ``"W/(m K^2)"``, ``"1/us"``, ``"m s-1"``, ``"%"``, ``"1"``.
 
+    ``"2.76*um"`` is a unit as well, such as a pixel.
+
     A product after a quotient (``"W/m K"``) is refused as ambiguous. Raises :class:`UnitError`.
     """
     if len(text) > LONGEST:
         raise UnitError(f"cannot read unit {text[:20]!r}…: {len(text)} characters")
     clean = text.replace("µ", "u").replace("μ", "u").replace("·", "*").translate(_SUPERSCRIPT)
+    scaled = _SCALED.match(clean)
+    if scaled and scaled[1] != "1":
+        if not 1e-30 < float(scaled[1]) < 1e30:
+            raise UnitError(f"cannot read unit {text!r}: a unit is a positive multiple of another")
+        return Unit(Fraction(scaled[1]), ONE.powers) * parse_unit(clean[scaled.end() :])
     tokens: list[re.Match[str]] = []
     at = 0
     while at < len(clean):

@@ -14,7 +14,7 @@ def assert_same_bits(a: Any, b: Any) -> None:
             assert np.array_equal(left, right, equal_nan=True), field.name
         elif is_dataclass(left) and field.name == "ledger":
             assert_same_bits(left, right)
-        elif field.name in ("iterations", "what_if"):
+        elif field.name in ("iterations", "what_if", "modes"):
             assert len(left) == len(right)
             for x, y in zip(left, right, strict=True):
                 assert_same_bits(x, y)

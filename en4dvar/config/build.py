@@ -20,7 +20,8 @@ from en4dvar.config.parameters import Fixed, Uncertain
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.files import PathError, expanded, readable
-from en4dvar.inputs.readers import SUFFIXES, Column, read_covariance, read_series
+from en4dvar.inputs.readers import SUFFIXES, Column, DataFile, Format, parts_of, read_covariance, read_series
+from en4dvar.inputs.text_table import Decimal
 from en4dvar.inputs.window import select
 from en4dvar.noise import Noise, noise_of
 from en4dvar.observations import Observations
@@ -42,9 +43,9 @@ def build(config: Config) -> tuple[InverseProblem, ...]:
     plan = inverse_plan(config)
     problems: list[InverseProblem] = []
     unusable: list[DataError] = []
-    for name, path in data_files(plan).items():
+    for name, file in data_files(plan).items():
         try:
-            problems.append(build_one(config, name, path))
+            problems.append(build_one(config, name, file))
         except DataError as error:
             unusable.append(error)
     if unusable:
@@ -61,9 +62,9 @@ def inverse_plan(config: Config) -> Data:
     return config.data
 
 
-def build_one(config: Config, name: str, path: Path) -> InverseProblem:
+def build_one(config: Config, name: str, file: DataFile) -> InverseProblem:
     """The inverse problem of one of :func:`data_files`. Raises :class:`ConfigError`, :class:`DataError`."""
-    return problem_of(config, read_observations(inverse_plan(config), path, name, config.weights))
+    return problem_of(config, read_observations(inverse_plan(config), file, name, config.weights))
 
 
 def problem_of(config: Config, observations: Observations) -> InverseProblem:
@@ -112,14 +113,37 @@ def _discrepancy(config: Config, observations: Observations) -> tuple[PriorTerm,
     return asked.terms(parameters, float(observations.values.max()), float(times[-1] - times[0]))
 
 
-def data_files(plan: Data) -> dict[str, Path]:
+def data_files(plan: Data) -> dict[str, DataFile]:
     """Name of the data set → file: the file's stem, made unique by its folders, then by a number.
+
+    Data sets of one file have the name of their part behind its name.
 
     Raises
     ------
     DataError: no file matches a pattern, or a file is named twice.
     """
-    return find_files(plan.path.base, plan.path.texts)
+    return with_parts(
+        find_files(plan.path.base, plan.path.texts), plan.columns.observable, plan.format, plan.decimal, plan.by
+    )
+
+
+def with_parts(
+    files: Mapping[str, Path],
+    value: Column,
+    format: Format | None = None,
+    decimal: Decimal = ".",
+    by: str | None = None,
+) -> dict[str, DataFile]:
+    """Every data set that the files hold, see :func:`~en4dvar.inputs.readers.parts_of`."""
+    found: dict[str, DataFile] = {}
+    for name, path in files.items():
+        try:
+            parts = parts_of(path, value, format, decimal, by)
+        except DataError:  # told with its reason where it is read
+            parts = ()
+        for part in parts or ("",):
+            found[readable(f"{name}_{part}") if part else name] = DataFile(path, part)
+    return found
 
 
 def find_files(base: Path, texts: Sequence[str]) -> dict[str, Path]:
@@ -165,14 +189,14 @@ def _unique_names(paths: list[Path]) -> list[str]:
     return list(map(readable, names))
 
 
-def read_observations(plan: Data, path: Path, name: str, weights: str = "sum") -> Observations:
-    """The observations (y, t, R) of one file inside the window. Raises :class:`DataError`."""
-    columns, asked = plan.columns, plan.window
+def read_observations(plan: Data, file: DataFile, name: str, weights: str = "sum") -> Observations:
+    """The observations (y, t, R) of one data set inside the window. Raises :class:`DataError`."""
+    columns, asked, path = plan.columns, plan.window, file.path
     clock = columns.time if isinstance(columns.time, Column) else columns.time.column
     stds = plan.error.column("std", columns.observable.unit)
     timing = plan.error.column("time_std", clock.unit if clock else "")
     errors = [column for column in (stds, timing) if column]
-    series = read_series(path, columns.time, columns.observable, plan.format, plan.decimal, errors)
+    series = read_series(path, columns.time, columns.observable, plan.format, plan.decimal, errors, file.part, plan.by)
     try:
         window = select(series.times, series.values, asked.start, asked.end, asked.prominence)
     except DataError as error:

@@ -50,13 +50,29 @@ class Files:
     texts: tuple[str, ...]
 
 
+class Pixel(Section):
+    """Lengths that were measured in pixels."""
+
+    pixel: QuantityText
+    """What one is long, e.g. 2.76 um."""
+
+
+def _unit_text(given: Any) -> Any:
+    if not isinstance(given, Mapping):
+        return given
+    number, _, unit = str(given.get("pixel", "")).strip().partition(" ")
+    if given.keys() != {"pixel"} or not unit:
+        raise ValueError("write a unit such as um, or {pixel: 2.76 um}")
+    return f"{number}*{unit}"
+
+
 class ValueColumn(Section):
     """A column of a CSV file or a field of a ``.mat`` file; the unit is required, never guessed."""
 
     name: Annotated[str, Field(min_length=1)]
-    """Header of the column (CSV) or name of the field (.mat)."""
-    unit: Annotated[str, unit_of(observable_unit)]
-    """Unit of the numbers in the file, e.g. um; required, never guessed."""
+    """Header of the column (CSV) or name of the field (.mat); ``R_*`` is a data set a column."""
+    unit: Annotated[str, unit_of(observable_unit), BeforeValidator(_unit_text, json_schema_input_type=str | Pixel)]
+    """Unit of the numbers in the file, e.g. um, or ``{pixel: 2.76 um}``; required, never guessed."""
 
 
 class TimeColumn(Section):
@@ -355,6 +371,8 @@ class Data(Section):
     """Format of the files; default: by their suffix."""
     decimal: Decimal = "."
     """Decimal sign of the numbers in a CSV file."""
+    by: Annotated[str | None, Field(min_length=1)] = None
+    """Column of a CSV file that says which data set a row belongs to: each is estimated by itself."""
     columns: Annotated[Columns, OfObservable("column role")]
     """Which columns hold the time and the observable, each with its unit: ``time: {name: t, unit: us}``."""
     window: WindowSection = Field({}, validate_default=True)

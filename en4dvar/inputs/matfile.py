@@ -1,24 +1,30 @@
-"""Vectors and scalars of MATLAB v5 files, read here rather than by a library.
+"""Vectors and scalars of MATLAB v5 files, also inside structs and cell arrays, read here rather than by a library.
 
 One flipped bit in a file takes the process down inside scipy's compiled reader, which trusts sizes it finds in the
 file. To check all that it trusts is to read the file, so this does: every size is compared with the bytes that are
-there before it is used, and bytes become numbers by ``numpy.frombuffer`` alone. Of a struct, a cell array or text only
-the name is read. MathWorks, *MAT-File Format* (R2019b), chapter 1.
+there before it is used, and bytes become numbers by ``numpy.frombuffer`` alone. Of text or an object only the name is
+read. What is in a struct or a cell array has the name MATLAB has for it: ``film.R``, ``expts(2).R``, ``R{3}``.
+MathWorks, *MAT-File Format* (R2019b), chapter 1.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import struct
 import zlib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from en4dvar.errors import DataError
 from en4dvar.state import Array
 
+T = TypeVar("T")
+_INDEX = re.compile(r"\((\d+)\)|\{(\d+)\}")
 HEADER = 128  # bytes
 MOST = 1 << 25  # numbers in all vectors of a file: 256 MiB, whatever a small compressed file may unpack to
 MATRIX, COMPRESSED = 14, 15  # kinds of elements
@@ -27,6 +33,8 @@ NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8
 OPAQUE = 17  # class of tables, strings and objects: no size is stored, the second element is the name
 CLASSES = {1: "a cell array", 2: "a struct", 3: "an object", 4: "text", 5: "a sparse matrix", 16: "a function"}
 CLASSES |= {OPAQUE: "an object"}
+CELL, STRUCT = 1, 2
+DEEPEST = 4  # structs inside structs
 NUMERIC = range(6, 16)  # classes of arrays of numbers
 COMPLEX = 0x800
 
@@ -42,6 +50,7 @@ class _Variable:
     name: str
     values: Array | None = None
     words: str = ""
+    holds: bool = False  # a struct or a cell array
 
 
 def mat_vectors(path: Path) -> tuple[dict[str, Array], dict[str, float], dict[str, str]]:
@@ -66,6 +75,26 @@ def mat_vectors(path: Path) -> tuple[dict[str, Array], dict[str, float], dict[st
     return vectors, scalars, {v.name: v.words for v in found if v.values is None}
 
 
+def indexed(name: str) -> tuple[str, str]:
+    """``expts(2).R`` as ``expts.R`` and ``2``, ``C{3}`` as ``C`` and ``3``; by the first index, "" without one."""
+    found = _INDEX.search(name)
+    return (name[: found.start()] + name[found.end() :], found[1] or found[2]) if found else (name, "")
+
+
+def element(found: Mapping[str, T], part: str) -> dict[str, T]:
+    """What is not inside an array, and of arrays the element ``part`` under names without the index."""
+    inside = {name: value for whole, value in found.items() for name, i in (indexed(whole),) if i and i == part}
+    return {**found, **inside}
+
+
+def first_elements(found: Mapping[str, T]) -> dict[str, T]:
+    """Each array by its first element, under names without the index."""
+    kept: dict[str, T] = {}
+    for whole, value in found.items():
+        kept.setdefault(indexed(whole)[0], value)
+    return kept
+
+
 def _variables(raw: memoryview, order: str) -> list[_Variable]:
     """Named variables of a file; of two with one name the last. Raises :class:`_Damaged`."""
     elements, found, numbers = _Elements(raw[HEADER:], order), {}, 0
@@ -74,31 +103,34 @@ def _variables(raw: memoryview, order: str) -> list[_Variable]:
         if kind == 0:
             break  # padding
         if kind == COMPRESSED:
-            variable = _unpacked(content, order)
+            variables = _unpacked(content, order)
         elif kind == MATRIX:
-            variable = _variable(content, order)
+            variables = _variable(content, order)
         else:
             raise _Damaged(f"an element of kind {kind} where a variable should be")
-        numbers += 0 if variable.values is None else variable.values.size
-        if numbers > MOST:
-            raise _Damaged(f"more than {MOST} numbers in vectors")
-        if variable.name and not variable.name.startswith("__"):
-            found[variable.name] = variable
+        for variable in variables:
+            numbers += 0 if variable.values is None else variable.values.size
+            if numbers > MOST:
+                raise _Damaged(f"more than {MOST} numbers in vectors")
+            if variable.name and not variable.name.startswith("__"):
+                found[variable.name] = variable
     return list(found.values())
 
 
-def _unpacked(packed: memoryview, order: str) -> _Variable:
-    """A compressed variable; only a vector is unpacked to its end, where its checksum is."""
+def _unpacked(packed: memoryview, order: str) -> list[_Variable]:
+    """A compressed variable; what holds no vector is not unpacked to its end, where its checksum is."""
     head, _ = _inflated(packed, HEAD)
     if len(head) < 8:
         raise _Damaged("a compressed variable is damaged")
     kind, size = struct.unpack_from(f"{order}II", head)
     if kind != MATRIX:
         raise _Damaged("a compressed variable is damaged")
-    variable = _variable(memoryview(head)[8:], order, data=False)
-    if variable.words:
-        return variable
+    variable, *_ = _variable(memoryview(head)[8:], order, data=False)
+    if variable.words and not variable.holds:
+        return [variable]
     if size > 8 * MOST + HEAD:
+        if variable.holds:
+            return [variable]
         raise _Damaged(f"{variable.name} would take {size / 2**20:.0f} MiB")
     content, ended = _inflated(packed, 8 + size + 1)
     if not ended or len(content) != 8 + size:
@@ -115,8 +147,11 @@ def _inflated(packed: memoryview, most: int) -> tuple[bytes, bool]:
         raise _Damaged("a compressed variable is damaged") from None
 
 
-def _variable(content: memoryview, order: str, data: bool = True) -> _Variable:
-    """What the content of a matrix element holds; without ``data`` a vector has no values."""
+def _variable(content: memoryview, order: str, data: bool = True, within: str = "", depth: int = 0) -> list[_Variable]:
+    """What the content of a matrix element holds, and what is in that; without ``data`` a vector has no values.
+
+    ``within``: the name of one inside another, which has none of its own.
+    """
     elements = _Elements(content, order)
     _, flags = elements.next()
     if len(flags) < 8:
@@ -126,15 +161,53 @@ def _variable(content: memoryview, order: str, data: bool = True) -> _Variable:
     if kind not in CLASSES and kind not in NUMERIC:
         raise _Damaged(f"a variable of class {kind}")
     shape = () if kind == OPAQUE else _shape(elements.next()[1], order)
-    name = bytes(elements.next()[1]).rstrip(b"\0").decode("latin-1")
-    if not name.isprintable():
-        raise _Damaged("a variable's name is damaged")
+    name = _name(elements.next()[1])
+    name = within or name
+    if kind in (CELL, STRUCT):
+        container = _Variable(name, words=CLASSES[kind], holds=True)
+        return [container, *(_held(elements, order, kind, name, math.prod(shape), depth + 1) if data else ())]
     if kind in CLASSES or flag & COMPLEX:
-        return _Variable(name, words=CLASSES.get(kind, "complex"))
+        return [_Variable(name, words=CLASSES.get(kind, "complex"))]
     count = math.prod(shape)
     if count != max(shape):
-        return _Variable(name, words=f"an array of {' x '.join(map(str, shape))}")
-    return _Variable(name, _numbers(elements, order, name, count) if data else None)
+        return [_Variable(name, words=f"an array of {' x '.join(map(str, shape))}")]
+    return [_Variable(name, _numbers(elements, order, name, count) if data else None)]
+
+
+def _name(raw: memoryview) -> str:
+    name = bytes(raw).partition(b"\0")[0].decode("latin-1")
+    if not name.isprintable():
+        raise _Damaged("a variable's name is damaged")
+    return name
+
+
+def _held(elements: _Elements, order: str, kind: int, name: str, count: int, depth: int) -> Iterator[_Variable]:
+    """What is in a struct array or a cell array of ``count`` elements, element by element."""
+    if depth > DEEPEST:
+        return
+    fields = _fields(elements, order) if kind == STRUCT else [""]
+    if not fields:
+        return
+    for index in range(1, count + 1):
+        of = f"{name}{{{index}}}" if kind == CELL else name if count == 1 else f"{name}({index})"
+        for field in fields:
+            tag, content = elements.long()
+            if tag != MATRIX:
+                raise _Damaged(f"an element of kind {tag} in {name}")
+            if len(content):
+                yield from _variable(content, order, within=f"{of}.{field}" if field else of, depth=depth)
+
+
+def _fields(elements: _Elements, order: str) -> list[str]:
+    """Names of the fields of a struct, all stored with the same length."""
+    _, length = elements.next()
+    if len(length) != 4:
+        raise _Damaged("a struct without the length of its names")
+    (size,) = struct.unpack(f"{order}i", length)
+    _, names = elements.next()
+    if size <= 0 or len(names) % size:
+        raise _Damaged("a struct whose names have no length")
+    return [_name(names[at : at + size]) for at in range(0, len(names), size)]
 
 
 def _shape(content: memoryview, order: str) -> tuple[int, ...]:

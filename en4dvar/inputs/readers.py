@@ -8,10 +8,11 @@ scalars collected. Leading zeros of a column that cannot be zero are dropped fro
 from __future__ import annotations
 
 import csv
+import fnmatch
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -20,7 +21,7 @@ import numpy.typing as npt
 
 from en4dvar.errors import DataError
 from en4dvar.hints import listed, no_such_file, suggest
-from en4dvar.inputs.matfile import mat_vectors
+from en4dvar.inputs.matfile import element, first_elements, indexed, mat_vectors
 from en4dvar.inputs.text_table import Decimal, Table, cells_of, check_width, delimiter_of, number_in, numbered_lines
 from en4dvar.state import Array
 from en4dvar.units import convert
@@ -49,6 +50,14 @@ class TimeStep:
 
     column: Column | None = None
     value: float = 0.0
+
+
+@dataclass(frozen=True)
+class DataFile:
+    """Where one data set is: a file, or of a file that holds several the ``part``, as :func:`parts_of` names it."""
+
+    path: Path
+    part: str = ""
 
 
 @dataclass(frozen=True)
@@ -81,19 +90,29 @@ def read_series(
     format: Format | None = None,
     decimal: Decimal = ".",
     errors: Sequence[Column] = (),
+    part: str = "",
+    by: str | None = None,
 ) -> Readings:
     """Read one data set. ``format`` defaults to the one of the suffix; ``decimal`` is the decimal sign of a CSV file.
 
-    ``errors`` are columns of standard deviations, each as long as that of the values.
+    ``errors`` are columns of standard deviations, each as long as that of the values. ``part``, ``by``: see
+    :func:`parts_of`.
 
     Raises
     ------
     DataError: the file cannot be used.
     """
+    if part and by is None and "*" in value.name:
+        value = replace(value, name=part)
     wanted = [c.name for c in (value, time, *errors) if isinstance(c, Column)]
     with _opened(path, format) as kind:
         table = Table(path, decimal) if kind == "csv" else None
-        columns, scalars = (_of_table(table, wanted), {}) if table else _of_mat(path, wanted)
+        if by is not None and part not in _groups(table, by, path):
+            raise DataError(f"{path}: no row belongs to {part!r} by column {by!r}")
+        if table and by is not None:
+            at = table.position(by)
+            table.rows = [(line, row) for line, row in table.rows if _cell(row, at) == part]
+        columns, scalars = (_of_table(table, wanted), {}) if table else _of_mat(path, wanted, part)
     values = convert(columns[value.name], value.unit, value.target)
     if isinstance(time, Column):
         times = convert(columns[time.name], time.unit, time.target)
@@ -127,11 +146,33 @@ def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int
     return stds
 
 
+def parts_of(
+    path: Path, value: Column, format: Format | None = None, decimal: Decimal = ".", by: str | None = None
+) -> tuple[str, ...]:
+    """The parts of a file that each hold a data set; () where the file is one data set.
+
+    They are the columns that a name with ``*`` stands for; the elements of a struct array or a cell array, as ``1``,
+    ``2``, …, for the column ``expts.R`` of what MATLAB calls ``expts(1).R``, ``expts(2).R``, …; or what the column
+    ``by`` of a CSV file says. Raises :class:`DataError`.
+    """
+    with _opened(path, format) as kind:
+        table = Table(path, decimal) if kind == "csv" else None
+        names = table.names if table else [*mat_vectors(path)[0]]
+    if by is not None:
+        return _groups(table, by, path)
+    if "*" in value.name and value.name not in names:
+        return tuple(name for name in names if fnmatch.fnmatchcase(name, value.name))
+    if table or value.name in names:
+        return ()
+    return tuple(i for name, i in map(indexed, names) if i and name == value.name)
+
+
 @dataclass(frozen=True)
 class Contents:
     """What a data file holds: columns (or vectors) with numbers, as written, and scalars; no units applied.
 
-    ``others``: why what else is in the file cannot be a column, by name.
+    ``others``: why what else is in the file cannot be a column, by name. Of the elements of a struct array or a cell
+    array the first stands for all, as ``expts.R`` and ``C``.
     """
 
     columns: Mapping[str, Array]
@@ -147,8 +188,11 @@ def read_contents(path: Path, format: Format | None = None, decimal: Decimal = "
 
 def _mat_contents(path: Path) -> Contents:
     vectors, scalars, others = mat_vectors(path)
+    vectors, scalars, others = first_elements(vectors), first_elements(scalars), first_elements(others)
     columns = {k: np.asarray(v, dtype=float).ravel() for k, v in vectors.items() if v.size > 1}
     words = {name: f"{path}: {name} is {kind}; save what is in it as vectors" for name, kind in others.items()}
+    for name in columns:  # a struct of which something can be read is no fault
+        words.pop(name.partition(".")[0], None)
     return Contents(columns, scalars, words)
 
 
@@ -272,6 +316,20 @@ def _step(step: TimeStep, scalars: Mapping[str, float], path: Path) -> float:
     return value
 
 
+def _groups(table: Table | None, by: str, path: Path) -> tuple[str, ...]:
+    """What the column ``by`` says, in the order of the rows. Raises :class:`DataError`."""
+    if table is None:
+        raise DataError(f"{path}: data.by is for text files; elements of a struct array are data sets without it")
+    cells = [_cell(row, table.position(by)) for _, row in table.rows]
+    if "" in cells:
+        raise DataError(f"{path}:{table.rows[cells.index('')][0]}: column {by!r} does not say which data set this is")
+    return tuple(dict.fromkeys(cells))
+
+
+def _cell(row: Sequence[str], i: int) -> str:
+    return row[i] if i < len(row) else ""
+
+
 def _of_table(table: Table, wanted: Sequence[str]) -> dict[str, Array]:
     where = {name: table.position(name) for name in wanted}
     if not table.rows:
@@ -283,8 +341,9 @@ def _of_table(table: Table, wanted: Sequence[str]) -> dict[str, Array]:
     return columns
 
 
-def _of_mat(path: Path, wanted: Sequence[str]) -> tuple[dict[str, Array], dict[str, float]]:
+def _of_mat(path: Path, wanted: Sequence[str], part: str = "") -> tuple[dict[str, Array], dict[str, float]]:
     vectors, scalars, others = mat_vectors(path)
+    vectors, scalars, others = element(vectors, part), element(scalars, part), element(others, part)
     for name in wanted:
         if name not in vectors:
             kind = others.get(name)

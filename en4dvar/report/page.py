@@ -59,6 +59,7 @@ def render_set(
         verdict=verdict(result),
         identifiers=IDENTIFIERS,
         figures=figures,
+        modes=_modes(result),
         lost=[(i, str(reason)) for i, reason in enumerate(reasons) if reason],
         iterations=_iterations(result),
         fixed_values=_fixed(result),
@@ -120,6 +121,25 @@ def _shares(result: StoredResult) -> list[tuple[str, str, str, list[str]]]:
         shares = [float(stats[f"variance_from_{source}"].sel(parameter=row.name)) for source in SHARES]
         parts = [number_like(row.std * math.sqrt(max(0.0, share)), row.std) for share in shares]
         rows.append((row.symbol, number_like(row.std, row.std), row.unit, parts))
+    return rows
+
+
+def _modes(result: StoredResult) -> list[tuple[str, ...]]:
+    """One line a minimum of J: its weight, J, descents that ended there, and its centre in display units."""
+    stats = result.sample_stats
+    if "mode_cost" not in stats:
+        return []
+    rows = []
+    for k in range(stats.sizes["mode"]):
+        of = {key: float(stats[f"mode_{key}"][k]) for key in ("weight", "cost", "cost_spread", "descents")}
+        centre = [
+            number_like(convert(float(stats["mode_centre"][k, j]), a["units"], a["display_units"]), row.std)
+            for j, (row, a) in enumerate(
+                zip(result.summary(), (v.attrs for v in result.posterior.data_vars.values()), strict=True)
+            )
+        ]
+        spread = f" (J within {of['cost_spread']:.2g})" if of["cost_spread"] else ""
+        rows.append((f"{of['weight']:.2f}", f"{of['cost']:.2f}", f"{of['descents']:.0f}{spread}", *centre))
     return rows
 
 

@@ -14,6 +14,7 @@ from en4dvar.config.document import Document, override, read_document
 from en4dvar.config.load import context_of, in_order
 from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, DataError, Fault
+from en4dvar.inputs.readers import DataFile
 
 
 def validate(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config | TwinConfig:
@@ -62,7 +63,7 @@ def _data_faults(path: Path, overrides: Mapping[str, Any] | None) -> Iterator[Fa
         yield from _file_faults(document, plan, lambda name, file: read_observations(plan, file, name))
 
 
-def _file_faults(document: Document, plan: Data, read: Callable[[str, Path], object]) -> Iterator[Fault]:
+def _file_faults(document: Document, plan: Data, read: Callable[[str, DataFile], object]) -> Iterator[Fault]:
     """What keeps data files from being read; a file's fault is told at the place that names the file."""
     try:
         files = data_files(plan)

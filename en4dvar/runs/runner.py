@@ -13,6 +13,7 @@ from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.executor import Executor, choose_executor, one_blas_thread
 from en4dvar.files import write_text
+from en4dvar.inputs.readers import DataFile
 from en4dvar.report import TABLES, write_pages
 from en4dvar.report.result import Result
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
@@ -120,13 +121,13 @@ def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 
         return _report(directory, datasets, workers)
 
 
-def _require_one_usable(config: Config, files: Mapping[str, Path]) -> None:
+def _require_one_usable(config: Config, files: Mapping[str, DataFile]) -> None:
     """Raise what is wrong with the data files where none of them can be used, before anything is written."""
     faults: list[Fault] = []
     unusable: list[DataError] = []
-    for name, path in files.items():
+    for name, file in files.items():
         try:
-            build_one(config, name, path)
+            build_one(config, name, file)
         except ConfigError as error:
             faults += error.problems
         except DataError as error:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TypeVar
 
 from en4dvar.config import Config, TwinConfig
 from en4dvar.errors import ConfigError, OutputError
 from en4dvar.executor import ExecutorError
 from en4dvar.files import write_text
+from en4dvar.inputs.readers import DataFile
 from en4dvar.runs.interrupt import Interrupted, tell_interrupt
 from en4dvar.runs.progress import RunLog
 from en4dvar.runs.rundir import Mode, RunDirectory
@@ -91,7 +91,7 @@ def directory_mode(force: bool, resume: bool) -> Mode:
 @contextmanager
 def session(
     config: Config | TwinConfig,
-    data: Mapping[str, Path],
+    data: Mapping[str, DataFile],
     directory: RunDirectory,
     command: str,
     kept: Callable[[], str],

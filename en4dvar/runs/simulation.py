@@ -47,8 +47,8 @@ def simulate(config: Config, times: Array | None = None) -> Simulation:
     times = config.simulate_times if times is None else times
     observations = None
     if config.data is not None and (times is None or any(entry.needs_data for entry in config.parameters)):
-        name, path = next(iter(data_files(config.data).items()))
-        observations = read_observations(config.data, path, name)
+        name, file = next(iter(data_files(config.data).items()))
+        observations = read_observations(config.data, file, name)
     if times is None:
         if observations is None:
             raise ConfigError("no instants to simulate: give simulate.times in the file, or --times FROM:TO:STEP")

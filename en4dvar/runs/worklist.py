@@ -7,7 +7,6 @@ import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from en4dvar.analysis import ChainRecord, Progress, Record, StartRecord
 from en4dvar.assimilate import LoopState
@@ -16,6 +15,7 @@ from en4dvar.config.build import build_one
 from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
 from en4dvar.files import readable, write_bytes
+from en4dvar.inputs.readers import DataFile
 from en4dvar.prior import own_seed
 from en4dvar.runs.campaign import DatasetOutcome, file_names
 from en4dvar.runs.jobs import Estimate, Job, Records, estimate, estimate_and_tell
@@ -29,24 +29,24 @@ class Dataset:
     """A data set of the run: its data file, and where its results go, relative to the run directory."""
 
     name: str
-    source: Path
+    source: DataFile
     file: str
     iteration: str
     done: str
 
 
-def datasets(files: Mapping[str, Path]) -> tuple[Dataset, ...]:
+def datasets(files: Mapping[str, DataFile]) -> tuple[Dataset, ...]:
     """Where the results of each data set go: ``posterior.nc`` for a single one, else ``datasets/*.nc``."""
     stems = file_names(files)
     return tuple(
         Dataset(
             name,
-            path,
+            file,
             f"datasets/{stems[name]}.nc" if len(files) > 1 else "posterior.nc",
             f"{FOLDER}/{stems[name]}.iteration",
             f"{FOLDER}/{stems[name]}.done",
         )
-        for name, path in files.items()
+        for name, file in files.items()
     )
 
 

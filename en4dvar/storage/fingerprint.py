@@ -19,6 +19,7 @@ from typing import Any
 import yaml
 
 from en4dvar.forward import ForwardModel
+from en4dvar.inputs.readers import DataFile
 from en4dvar.storage.checkpoint import digest, file_digest
 from en4dvar.storage.provenance import package_versions
 
@@ -52,8 +53,8 @@ class Identity:
         return "\n".join(difflib.unified_diff(lines(earlier), lines(self), "earlier run", "now", lineterm="", n=1))
 
 
-def identity(resolved: str, model: ForwardModel, data: Mapping[str, Path]) -> Identity:
-    """The identity of a run of the resolved configuration (YAML) on ``data`` (name → file)."""
+def identity(resolved: str, model: ForwardModel, data: Mapping[str, DataFile]) -> Identity:
+    """The identity of a run of the resolved configuration (YAML) on ``data`` (name → where it is)."""
     content = yaml.safe_load(resolved)
     settings = {key: value for key, value in content.items() if key not in _NO_NUMBERS}
     software = {"python": f"{sys.version_info.major}.{sys.version_info.minor}", **package_versions(PACKAGES)}
@@ -63,7 +64,7 @@ def identity(resolved: str, model: ForwardModel, data: Mapping[str, Path]) -> Id
     text = yaml.safe_dump(
         {**settings, "software": software, "sources": sources}, sort_keys=False, allow_unicode=True, width=120
     )
-    return Identity(text, tuple((name, file_digest(path)) for name, path in data.items()))
+    return Identity(text, tuple((name, file_digest(file.path)) for name, file in data.items()))
 
 
 @functools.cache  # the code that runs is that of the first import

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,11 +18,16 @@ if TYPE_CHECKING:
     from en4dvar_bubble.starter.proposal import Proposal
 
 _TIME = re.compile(r"(?i)t|time|t[ _(\[].*|time[ _(\[].*")
+_STEP = re.compile(r"(?i)delta_?t|dt|t_?step|time_?step")
 _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 
 
 @click.command()
 @click.option("--data", metavar="PATH", help="CSV or .mat file, a folder or a pattern; without it, an empty starter.")
+@click.option("--movie", type=click.Path(path_type=Path), help="Movie, read first as by 'en4dvar track'.")
+@click.option("--pixel", metavar="LENGTH", help="Size of a pixel of the movie, e.g. '2.76 um'.")
+@click.option("--frame-rate", metavar="RATE", help="Frame rate of the movie, e.g. '270 kHz'.")
+@click.option("--exposure", metavar="TIME", help="Exposure of a frame of the movie, e.g. '500 ns'.")
 @click.option("--example", type=click.Choice(["quickstart"]), help="An example and its synthetic data instead.")
 @click.option("--time-unit", metavar="UNIT", help="Unit of the times in the file, e.g. us.")
 @click.option("--radius-unit", metavar="UNIT", help="Unit of the radii in the file, e.g. um.")
@@ -35,6 +40,10 @@ _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 @click.option("--force", is_flag=True, help="Replace that file.")
 def init(
     data: str | None,
+    movie: Path | None,
+    pixel: str | None,
+    frame_rate: str | None,
+    exposure: str | None,
     example: str | None,
     time_unit: str | None,
     radius_unit: str | None,
@@ -53,7 +62,12 @@ def init(
     \b
     Example:
       en4dvar init --data bubble.csv --time-unit us --radius-unit um
+      en4dvar init --movie bubble.mp4 --pixel '2.76 um' --frame-rate '270 kHz'
     """
+    if movie is not None and (data is not None or example is not None):
+        raise click.UsageError("--movie makes the data; not together with --data or --example")
+    if movie is None and (pixel or frame_rate or exposure):
+        raise click.UsageError("--pixel, --frame-rate and --exposure are of a --movie")
     if example is not None:
         if data is not None or out is not None:
             raise click.UsageError("--example comes with its own data and file names")
@@ -66,13 +80,16 @@ def init(
     from en4dvar_bubble.starter.page import SCHEMA_FILE, Source, yaml_text
     from en4dvar_bubble.starter.proposal import starter
 
-    name = run_name(str(out) if out else data or "bubble")  # a file that is called my_gel is run as my_gel
+    name = run_name(str(out or data or movie or "bubble"))  # a file that is called my_gel is run as my_gel
     words = shlex.join(["en4dvar", *sys.argv[1:]])
     target = out or Path(f"{name}.yaml")
     if target.exists() and not force:
         raise OutputError(f"{target}: exists; give --force to replace it, or another --out")
     if not target.absolute().parent.is_dir():
         raise OutputError(f"{target}: the folder {target.parent} does not exist")
+    if movie is not None:
+        scale = {"--pixel": pixel, "--frame-rate": frame_rate, "--exposure": exposure}
+        data = str(_tracked(movie, target, scale, force))
     if data is None:
         proposal = starter(start or "acoustic", law)
         text = yaml_text(name, Source("bubble.csv", ("t_us", "us"), None, ("R_um", "um")), proposal, words)
@@ -83,6 +100,21 @@ def init(
     write_text(target, text)
     write_text(target.parent / SCHEMA_FILE, schema_text())
     _tell(target, proposal, example_only=data is None)
+
+
+def _tracked(movie: Path, target: Path, scale: Mapping[str, str | None], force: bool) -> Path:
+    """The table of a movie beside the configuration ``target``, by the command ``track`` of whoever provides it."""
+    context = click.get_current_context()
+    root = context.find_root()
+    command = root.command.get_command(root, "track") if isinstance(root.command, click.Group) else None
+    if command is None:
+        raise click.UsageError("no command 'track' is installed, which reads movies")
+    table = target.with_suffix(".csv")
+    given = [word for option, text in scale.items() if text is not None for word in (option, text)]
+    words = ["--out", str(table), *given, *["--force"] * force, "--", str(movie)]
+    with command.make_context("track", words, parent=context) as inner:
+        inner.command.invoke(inner)
+    return table
 
 
 def _write_example(name: str, force: bool) -> None:
@@ -122,14 +154,22 @@ def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
     shown = {name: f"{len(v)} values, {_range(v)}" for name, v in contents.columns.items()}
     commas = ", decimal commas" if decimal == "," else ""
     click.echo(f"{first}{commas}: {'; '.join(f'{name} ({words})' for name, words in shown.items())}", err=True)
+    if contents.scalars:
+        told = ", ".join(f"{name} {value:g}" for name, value in contents.scalars.items())
+        click.echo(f"others in the file: {told}", err=True)
     if {*TRACKED_COLUMNS} <= shown.keys() and asked == _Asked(*[None] * 5):
         return {"radius": TRACKED.radius, "time": TRACKED.time, "decimal": decimal, "errors": TRACKED.errors}
     time, radius, missing = _columns(asked, shown)
     time_unit, radius_unit = asked.time_unit, asked.radius_unit
+    step = None if time or asked.time_step else _only(_STEP, contents.scalars)
+    if step is not None:
+        missing = [option for option in missing if "time" not in option]
     if _interactive():
         missing = []
         radius = radius or _ask_column("radii", shown)
-        if asked.time_step is None:
+        if step is not None:
+            time_unit = time_unit or _ask_unit(step, {step: f"{contents.scalars[step]:g}"}, "s", "us, ms or s")
+        elif asked.time_step is None:
             time = time or _ask_column("times", shown)
             time_unit = time_unit or _ask_unit(time, shown, "s", "us, ms or s")
         radius_unit = radius_unit or _ask_unit(radius, shown, "m", "um, mm or m")
@@ -143,6 +183,8 @@ def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
     if asked.time_step is not None:
         return {"radius": (radius, radius_unit), "time_step": asked.time_step, "decimal": decimal}
     convert(1.0, str(time_unit), "s")
+    if step is not None:
+        return {"radius": (radius, radius_unit), "time_step": step, "step_unit": time_unit, "decimal": decimal}
     return {"radius": (radius, radius_unit), "time": (time, time_unit), "decimal": decimal}
 
 
@@ -184,8 +226,8 @@ def _columns(asked: _Asked, shown: Mapping[str, str]) -> tuple[str | None, str |
     return time, radius, missing
 
 
-def _only(pattern: re.Pattern[str], names: Mapping[str, str]) -> str | None:
-    fitting = [name for name in names if pattern.fullmatch(name)]
+def _only(pattern: re.Pattern[str], names: Iterable[str]) -> str | None:
+    fitting = [name for name in names if pattern.fullmatch(name.rpartition(".")[2])]
     return fitting[0] if len(fitting) == 1 else None
 
 

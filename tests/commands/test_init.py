@@ -302,7 +302,7 @@ def test_decimal_commas_are_noticed(tmp_path: Path) -> None:
 
 
 def test_vectors_that_a_mat_file_hides_are_told(tmp_path: Path) -> None:
-    savemat("b.mat", {"film": {"t": np.arange(9.0), "R": np.ones(9)}})
+    savemat("b.mat", {"film": {"note": "by hand"}})
     done = call("init", "--data", "b.mat", *UNITS)
     assert (done.exit_code, done.stderr) == (2, f"{tmp_path}/b.mat: film is a struct; save what is in it as vectors\n")
     savemat("b.mat", {"t": np.arange(9.0), "R": np.ones((3, 9))})
@@ -388,6 +388,27 @@ def test_zeros_before_the_bubble_are_no_readings(tmp_path: Path) -> None:
     assert problem.observations.values.min() > 0
 
 
+def laser_film(**scalars: float) -> None:
+    t = np.arange(0, 90, 0.63)
+    R = 194 * np.maximum(0.14, np.abs(np.cos(np.pi * t / 37)) ** 0.6 * np.exp(-t / 90))
+    savemat("film.mat", {"R": R, **scalars})
+
+
+def test_the_radius_at_rest_is_that_of_the_file(tmp_path: Path) -> None:
+    laser_film(Req=21.79, deltat=0.63)
+    done = call("init", "--data", "film.mat", *UNITS)
+    assert done.exit_code == 0, done.output
+    assert "others in the file: Req 21.79, deltat 0.63" in done.stderr
+    (problem,) = build(load_config("film.yaml"))
+    assert problem.fixed["R_eq"] == pytest.approx(21.79e-6)
+    assert np.diff(problem.observations.times) == pytest.approx(0.63e-6)  # no column of times: the file's step
+    laser_film(Req=21.79e-6, deltat=0.63)  # in another unit than the radii, which is not guessed
+    done = call("init", "--data", "film.mat", *UNITS, "--force")
+    assert "Req 2.179e-05 of the file is not used: it is no radius at rest in um" in done.stderr
+    (problem,) = build(load_config("film.yaml"))
+    assert "R_eq" in problem.prior.names
+
+
 @pytest.mark.parametrize(
     ("file", "unit", "G", "rest"),
     [
@@ -409,5 +430,9 @@ def test_measured_films(file: str, unit: str, G: float, rest: float) -> None:
     assert config.document.data["model"]["start"] == "laser"
     (problem,) = build(config)
     terms = {term.parameter.name: term for term in problem.prior.terms}
+    if "R_eq" in problem.fixed:  # that of the file
+        assert problem.fixed["R_eq"] == pytest.approx(rest, rel=1e-3)
     for name, value in {"G": G, "R_eq": rest}.items():
+        if name in problem.fixed:
+            continue
         assert abs(np.log(value) - terms[name].mean) < 2 * terms[name].std, name

@@ -96,3 +96,77 @@ def test_refused(tmp_path: Path) -> None:
     path.write_text(text[: text.index("data:")] + text[text.index("model:") :])
     with pytest.raises(ConfigError, match="data: required"):
         build(load_config(path))
+
+
+def test_a_struct_array_is_a_campaign(tmp_path: Path) -> None:
+    """One bubble an element, each with its own scalars; what stands beside the array is shared."""
+    from scipy.io import savemat
+
+    array = np.empty(3, dtype=[("R", object), ("Req", object)])
+    for k in range(3):
+        array[k] = (1e2 * np.exp(-np.arange(6.0) / (k + 2)), 10.0 + k)
+    savemat(tmp_path / "gel.mat", {"expts": array, "t": np.arange(6.0)})
+    text = """
+name: many
+data:
+  path: gel.mat
+  columns: {time: {name: t, unit: us}, radius: {name: expts.R, unit: um}}
+  window: {from: R_max, to: end}
+  time_zero: window
+  error: {radius_std: 1 um}
+model: {name: bubble, law: neo-hookean-kelvin-voigt, start: laser}
+parameters:
+  G: {prior: lognormal, median: 2 kPa, log_std: 0.5}
+  mu: 0.1 Pa s
+  R_eq: {from_file: expts.Req, unit: um}
+  R_max: {prior: normal, mean: maximum, std: 1 %}
+  t_s: 0 us
+"""
+    (tmp_path / "c.yaml").write_text(text, encoding="utf-8")
+    problems = build(load_config(tmp_path / "c.yaml"))
+    assert [p.observations.name for p in problems] == ["gel_1", "gel_2", "gel_3"]
+    assert [p.fixed["R_eq"] for p in problems] == pytest.approx([10e-6, 11e-6, 12e-6])
+    assert problems[2].observations.values == pytest.approx(1e-4 * np.exp(-np.arange(6.0) / 4))
+    one = load_config(tmp_path / "c.yaml", {"data.columns.radius.name": "expts(2).R", "parameters.R_eq": "12 um"})
+    (problem,) = build(one)
+    assert problem.observations.values == pytest.approx(problems[1].observations.values)
+    missing = load_config(tmp_path / "c.yaml", {"data.columns.radius.name": "expts.Roft", "parameters.R_eq": "12 um"})
+    with pytest.raises(DataError, match=r"field 'expts.Roft' is not in the file"):
+        build(missing)
+
+
+def test_lengths_in_pixels(tmp_path: Path) -> None:
+    path = write_toy(tmp_path)
+    (plain,) = build(load_config(path))
+    (found,) = build(load_config(path, {"data.columns.position.unit": {"pixel": "2.5 um"}}))
+    assert found.observations.values == pytest.approx(2.5 * plain.observations.values)
+    for wrong in ({"pixel": "2.5"}, {"pixel": "-2 um"}, {"pixels": "2 um"}, {"pixel": "0 um"}, {"pixel": "2 us"}):
+        with pytest.raises(ConfigError, match="unit"):
+            load_config(path, {"data.columns.position.unit": wrong})
+
+
+def test_a_column_a_data_set(tmp_path: Path) -> None:
+    rows = "".join(f"{k},{10 - k},{20 - k if k < 8 else ''}\n" for k in range(10))
+    path = write_toy(tmp_path, ("name: x_um", "name: x_*"), data=f"t_ms,x_a,x_b\n{rows}")
+    a, b = build(load_config(path))
+    assert [p.observations.name for p in (a, b)] == ["toy_x_a", "toy_x_b"]
+    assert a.observations.values == pytest.approx((10 - np.arange(10)) * 1e-6)
+    assert b.observations.values == pytest.approx((20 - np.arange(8)) * 1e-6)
+    with pytest.raises(DataError, match=r"toy.csv: no column 'z_\*'; the columns are: t_ms, x_a, x_b"):
+        build(load_config(path, {"data.columns.position.name": "z_*"}))
+
+
+def test_rows_that_say_which_data_set(tmp_path: Path) -> None:
+    rows = "".join(f"{name},{k},{10 * n - k}\n" for n, name in ((2, "b 1"), (1, "a")) for k in range(5))
+    path = write_toy(tmp_path, ("  path: toy.csv", "  path: toy.csv\n  by: bubble"), data=f"bubble,t_ms,x_um\n{rows}")
+    b, a = build(load_config(path))
+    assert [p.observations.name for p in (b, a)] == ["toy_b 1", "toy_a"]
+    assert b.observations.values == pytest.approx((20 - np.arange(5)) * 1e-6)
+    assert a.observations.values == pytest.approx((10 - np.arange(5)) * 1e-6)
+    for by, text, message in (
+        ("bubbles", "", r"no column 'bubbles'; the columns are: bubble, t_ms, x_um"),
+        ("bubble", ",9,1\n", r"toy.csv:12: column 'bubble' does not say which data set this is"),
+    ):
+        (tmp_path / "toy.csv").write_text(f"bubble,t_ms,x_um\n{rows}{text}")
+        with pytest.raises(DataError, match=message):
+            build(load_config(path, {"data.by": by}))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import tifffile
 from click.testing import CliRunner
 
@@ -46,6 +47,26 @@ def test_from_the_movie_to_observations(tmp_path, monkeypatch):
     np.testing.assert_allclose(problem.observations.values, readings[:count, 0])
     np.testing.assert_allclose(problem.observations.noise.std, readings[:count, 1])
     np.testing.assert_allclose(problem.observations.noise.time_std, 0.05 / RATE)
+
+
+@pytest.mark.slow
+def test_from_the_movie_to_the_configuration_in_one_step(tmp_path, monkeypatch):
+    assert tracked(tmp_path, monkeypatch).exit_code == 0
+    scale = ["--pixel", f"{PIXEL} um", "--frame-rate", "400 kHz"]
+    words = ["init", "--movie", "gel.tif", *scale, "--start", "laser", "--out", "own.yaml"]
+    outcome = CliRunner().invoke(main, words)
+    assert outcome.exit_code == 0, outcome.output
+    readings = [(tmp_path / f"{name}.csv").read_text().split("\nframe,")[1] for name in ("gel", "own")]
+    assert readings[0] == readings[1]
+    (problem,) = build(load_config(tmp_path / "own.yaml"))
+    assert problem.observations.source.endswith("own.csv")
+    mute = CliRunner().invoke(main, ["init", "--movie", "gel.tif", "--out", "mute.yaml"])
+    assert mute.exit_code == 2
+    assert "never guessed" in mute.output
+    for wrong, words in ((["--data", "gel.csv", "--movie", "gel.tif"], "not together"), (scale, "are of a --movie")):
+        refused = CliRunner().invoke(main, ["init", *wrong])
+        assert refused.exit_code == 2
+        assert words in refused.output
 
 
 def test_nothing_is_replaced_and_the_scale_is_asked_for(tmp_path, monkeypatch):

@@ -86,3 +86,11 @@ def test_units_that_would_take_for_ever_are_refused(text: str) -> None:
     """The first was found by fuzzing: the parser was raising 1/1000 to the power."""
     with pytest.raises(UnitError, match="cannot read unit"):
         parse_unit(text)
+
+
+def test_a_multiple_is_a_unit() -> None:
+    assert convert(2.0, "2.76*um", "m") == 5.52e-6
+    assert convert(2.0, "1e-6 * m", "um") == 2.0
+    for wrong in ("0*um", "2.76um", "2.76 um", "-1*um", "1e99*um", "2*3*um*"):
+        with pytest.raises(UnitError):
+            convert(1.0, wrong, "m")

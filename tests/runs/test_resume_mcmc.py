@@ -10,6 +10,7 @@ import pytest
 from run_files import assert_same_results, configuration, kill_after_writes, make_campaign, resumed_until_done, run_cli
 
 from en4dvar.assimilate import LoopState, mcmc
+from en4dvar.inputs.readers import DataFile
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.runner import run_campaign
 from en4dvar.storage.checkpoint import read_checkpoint
@@ -49,7 +50,9 @@ def test_interrupted_in_the_chain(tmp_path, monkeypatch):
         run_campaign(configuration(path, out))
     assert looks == [20, 40]
     config = configuration(path, out)
-    fingerprint = identity(config.resolved, config.model, {"set0": tmp_path / "data" / "set0.csv"}).of_dataset("set0")
+    fingerprint = identity(
+        config.resolved, config.model, {"set0": DataFile(tmp_path / "data" / "set0.csv")}
+    ).of_dataset("set0")
     state = read_checkpoint(out / "checkpoints" / "set0.iteration", fingerprint, LoopState)
     assert state is not None
     assert state.refinement is not None

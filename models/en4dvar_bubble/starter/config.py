@@ -9,21 +9,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from en4dvar.config import resolve
-from en4dvar.config.build import build_one, find_files
+from en4dvar.config.build import build_one, find_files, with_parts
 from en4dvar.config.document import parse_document
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.files import expanded
-from en4dvar.inputs.readers import Column, TimeStep, read_series
+from en4dvar.inputs.readers import Column, DataFile, Readings, TimeStep, read_series
 from en4dvar.inputs.text_table import Decimal
-from en4dvar.state import Array
-from en4dvar.units import UnitError, parse_quantity, parse_unit
+from en4dvar.units import UnitError, convert, parse_quantity, parse_unit
 from en4dvar_bubble.starter.look import Start
-from en4dvar_bubble.starter.page import Source, yaml_text
-from en4dvar_bubble.starter.proposal import Proposal, propose, with_columns
+from en4dvar_bubble.starter.page import Source, quoted, yaml_text
+from en4dvar_bubble.starter.proposal import Entry, Proposal, propose, with_columns
 
 _NAMED_UNIT = re.compile(r"[_ \[(/]([a-zA-Zµμ]+)[\])]?$")
 _FRAMES = re.compile(r"(?i)(frame|bild|image|index|#|n$|nr)")
 _DIAMETER = re.compile(r"(?i)(d|diam\w*|durchmesser)([ _(\[].*)?$")
+_REST = re.compile(r"(?i)(.*\.)?r_?eq")
+AT_REST = (0.02, 0.9)  # of R_max
 _PIXELS = re.compile(r"(?i)(?<![a-z])(px|pix|pixels?)(?![a-z])|_(px|pix)")
 
 
@@ -48,6 +49,7 @@ def propose_config(
     name: str | None = None,
     errors: tuple[str, ...] = (),
     command: str = "en4dvar_bubble.starter.propose_config",
+    step_unit: str | None = None,
 ) -> Proposed:
     """A commented configuration for radius histories that loads and whose data can be read.
 
@@ -55,7 +57,7 @@ def propose_config(
     ----------
     data: a CSV or ``.mat`` file, a folder or a pattern, relative to the current folder.
     radius, time: name of the column and its unit, never guessed; ``time_step`` instead of ``time``: a quantity such
-        as ``"3.7 us"``.
+        as ``"3.7 us"``, or with ``step_unit`` the name of a scalar of the file.
     decimal: decimal sign of the numbers in CSV files.
     start, law: instead of what the data suggest.
     folder: where the file will be; the path of the data inside it is relative to this folder.
@@ -71,10 +73,11 @@ def propose_config(
     """
     if (time is None) == (time_step is None):
         raise ConfigError("give either the column of times and its unit, or a constant time step")
-    source = Source(path_from(Path(folder), str(data)), time, time_step, radius, decimal, errors)
-    files = find_files(Path.cwd(), [str(data)])
+    source = Source(path_from(Path(folder), str(data)), time, time_step, radius, decimal, errors, step_unit)
+    files = with_parts(find_files(Path.cwd(), [str(data)]), Column(*source.radius, "m"))
     found, unusable = histories(files, source)
-    proposal = propose(found, start, law)
+    proposal = propose({name: (series.times, series.values) for name, series in found.items()}, start, law)
+    proposal = _with_rest(proposal, found, source.radius[1])
     if errors:
         proposal = with_columns(proposal, errors)
     proposal = replace(proposal, warnings=(*proposal.warnings, *doubts(source), *unusable))
@@ -85,27 +88,54 @@ def propose_config(
     return Proposed(text, proposal)
 
 
-def histories(files: Mapping[str, Path], source: Source) -> tuple[dict[str, tuple[Array, Array]], list[str]]:
-    """Times (K,) s and radii (K,) m of each file, and why others cannot be used.
+def histories(files: Mapping[str, DataFile], source: Source) -> tuple[dict[str, Readings], list[str]]:
+    """Readings in s and m of each data set, and why others cannot be used.
 
     Raises
     ------
     DataError: none can be used. UnitError: a unit that is not of its kind.
     """
-    step = TimeStep(value=parse_quantity(source.time_step, "s")) if source.time_step else None
-    time = step or Column(*(source.time or ("", "s")), "s")
-    found: dict[str, tuple[Array, Array]] = {}
+    time = _times(source)
+    found: dict[str, Readings] = {}
     unusable: list[str] = []
     for name, file in files.items():
         try:
-            series = read_series(file, time, Column(*source.radius, "m", positive=True), decimal=source.decimal)
+            series = read_series(
+                file.path, time, Column(*source.radius, "m", positive=True), decimal=source.decimal, part=file.part
+            )
         except DataError as error:
             unusable.append(str(error))
         else:
-            found[name] = (series.times, series.values)
+            found[name] = series
     if not found:
         raise DataError("\n".join(unusable))
     return found, unusable
+
+
+def _times(source: Source) -> Column | TimeStep:
+    if source.step_unit is not None:
+        return TimeStep(Column(source.time_step or "", source.step_unit, "s"))
+    if source.time_step:
+        return TimeStep(value=parse_quantity(source.time_step, "s"))
+    return Column(*(source.time or ("", "s")), "s")
+
+
+def _with_rest(proposal: Proposal, found: Mapping[str, Readings], unit: str) -> Proposal:
+    """The radius at rest of the files, where every one has such a scalar that suits its radii in their unit."""
+    names = {name for series in found.values() for name in series.scalars if _REST.fullmatch(name)}
+    if len(names) != 1:
+        return proposal
+    (name,) = names
+    for series in found.values():
+        value = series.scalars.get(name, float("nan"))
+        share = convert(value, unit, "m") / float(series.values.max())
+        if not AT_REST[0] < share < AT_REST[1]:
+            words = f"{name} {value:g} of the file is not used: it is no radius at rest in {unit}, as its radii are"
+            return replace(proposal, warnings=(*proposal.warnings, words))
+    words = f"the file's, in the unit of its radii: without it G is uncertain; is it really {unit}?"
+    entry = Entry("R_eq", f"{{from_file: {quoted(name)}, unit: {quoted(unit)}}}", words)
+    lines = tuple(entry if line.key == "R_eq" else line for line in proposal.parameters)
+    return replace(proposal, parameters=lines)
 
 
 def doubts(source: Source) -> list[str]:
@@ -116,7 +146,7 @@ def doubts(source: Source) -> list[str]:
             continue
         name, unit = column
         if _PIXELS.search(name):
-            found.append(f"{name!r} seems to hold pixels; convert them to a length (the size of a pixel is no unit)")
+            found.append(f"{name!r} seems to hold pixels; then give --radius-unit as the size of one, such as 2.76*um")
         if what == "times" and _FRAMES.match(name):
             found.append(f"{name!r} seems to count frames; then give --time-step with the time between two of them")
         if what == "radii" and _DIAMETER.match(name):

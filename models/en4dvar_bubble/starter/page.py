@@ -19,7 +19,8 @@ _WORDS = ("true", "false", "null", "yes", "no", "on", "off")
 class Source:
     """How the data are read: ``path`` as the file says it, the column (or constant step) of times, that of radii.
 
-    ``errors``: columns of the standard deviations of radii and times, where the file states them.
+    ``errors``: columns of the standard deviations of radii and times, where the file states them. ``step_unit``: that
+    of a constant step which is a scalar of the file.
     """
 
     path: str
@@ -28,10 +29,13 @@ class Source:
     radius: tuple[str, str]
     decimal: Decimal = "."
     errors: tuple[str, ...] = ()
+    step_unit: str | None = None
 
     @property
     def time_entry(self) -> str:
         """The ``time`` column as YAML."""
+        if self.step_unit is not None:
+            return f"{{step: {quoted(self.time_step or '')}, unit: {quoted(self.step_unit)}}}"
         if self.time is None:
             return f"{{step: {quoted(self.time_step or '')}}}"
         return f"{{name: {quoted(self.time[0])}, unit: {quoted(self.time[1])}}}"
