@@ -82,7 +82,9 @@ def structure(residuals: Residuals | None, robust: bool, unit: str, times: Array
             f"have {runs} runs of one sign where about {expected:.0f} are expected (probability {_chance(chance)} "
             "where the model is right): error bars are those of independent errors"
         )
-        yield caution("residual-structure", words)
+        # what is missed moves an estimate by no more than |e| of its standard deviations
+        small = float(residuals.white @ residuals.white) < 1
+        yield caution("residual-structure", words, "caution" if small else None)
     if residuals.collapse_chance < ODD:
         words = (
             "the residuals are larger where the observable changes fast (probability "

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from honesty.provoked import PROVOKED, linear, run
+from honesty.provoked import PROVOKED, bent, linear, run
 from toys import Decay, make_problem
 
 from en4dvar.caution import CATALOGUE, SEVERITIES, Caution, caution, gravity, untrusted, worst_first
 from en4dvar.honesty.checks import conflict, gaussian, information
+from en4dvar.noise import noise_of
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.state import Parameter
 from en4dvar.summary import informed_words, summarise
@@ -160,6 +161,19 @@ def test_a_bound_is_told_as_it_is_printed():
     )
     (found,) = (c for c in run(problem).cautions if c.code == "at-bound")
     assert "its upper bound (1e+03 mm)" in found.words
+
+
+@pytest.mark.parametrize(("std", "severity"), [(0.05, "serious"), (5.0, "caution")])
+def test_a_structure_far_below_the_errors_spoils_no_interval(std, severity):
+    """The same curve that the model lacks, read with the errors it comes near to, and with errors a hundred times so
+    large: all residuals together are less than one standard deviation then.
+    """
+    problem = bent()
+    wide = replace(problem.observations, noise=noise_of(np.full(40, std)))
+    analysis = run(replace(problem, observations=wide))
+    (found,) = (c for c in analysis.cautions if c.code == "residual-structure")
+    assert found.severity == severity
+    assert all(("residual-structure" in row.untrusted) == (severity == "serious") for row in summarise(analysis))
 
 
 @pytest.mark.slow
