@@ -20,7 +20,7 @@ import numpy as np
 from cheap_model import YAML
 
 HERE = Path(__file__).resolve().parent
-SIZES = {"observations": (10_000, 100_000, 1_000_000), "members": (1000, 3000, 10_000)}
+SIZES = {"observations": (10_000, 100_000, 1_000_000), "members": (10_000, 30_000, 100_000)}
 
 
 def run(folder: Path, observations: int = 100, members: int = 48) -> tuple[float, float]:

@@ -14,6 +14,7 @@ from en4dvar.residuals import Residuals
 from en4dvar.response.ledger import Ledger
 from en4dvar.response.what_if import Shift
 from en4dvar.state import Array, Parameter
+from en4dvar.varying import RandomWalk
 
 
 @dataclass(frozen=True)
@@ -111,12 +112,14 @@ class Analysis:
     forward_runs: int
     cautions: tuple[Caution, ...] = ()  # why not to trust the posterior, the worst first
     log_evidence: float = float("nan")  # ln p(y), Laplace approximation
+    log_evidence_constant: float | None = None  # the same with constant parameters, NaN if unknown; None if none varies
     shape: Mapping[str, float] = field(default_factory=dict)  # how Gaussian the posterior is (en4dvar.sampling.shape)
     down_weights: Array | None = None  # (K,) of observations in a robust cost, at the centre; None with Gaussian errors
     refinement: Mapping[str, float] = field(default_factory=dict)  # summary of the Markov chain, if any
     residuals: Residuals | None = None  # whitened, at the centre, with what is expected of them
     discrepancy: Discrepancy | None = None  # of the model, at the centre; None where none is allowed for
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) of the model's limits, by the posterior
+    beyond: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) since when it exceeds them; +inf: never
     what_if: tuple[Shift, ...] = ()  # under the model's alternatives; the largest first
     ledger: Ledger | None = None  # what the path went through where it informed the parameters
 
@@ -134,6 +137,16 @@ class Analysis:
     def parameters(self) -> tuple[Parameter, ...]:
         """What was estimated, (n,)."""
         return self.problem.prior.parameters
+
+    @property
+    def log_evidence_change(self) -> float | None:
+        """ln of the Bayes factor of parameters that vary against constant ones; None where none varies."""
+        return None if self.log_evidence_constant is None else self.log_evidence - self.log_evidence_constant
+
+    def pieces(self, walk: RandomWalk, members: Array) -> Array:
+        """Values (N, m + 1) over the pieces of a parameter that varies, of ``members`` (N, n)."""
+        names = self.problem.prior.names
+        return walk.pieces({name: members[:, j] for j, name in enumerate(names)})
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from en4dvar.descent.variance import shares_of_variance
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, log_posterior
-from en4dvar.errors import ConfigError
+from en4dvar.errors import ConfigError, TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.honesty import ControlEnsembles, examine
 from en4dvar.noise import Predicted
@@ -85,7 +85,8 @@ def assimilate(
 
     Parameters
     ----------
-    seed: of the prior ensemble; the same seed gives the same bits for any executor.
+    seed: of every random number; the same seed gives the same bits for any executor. In a run it is
+        :func:`~en4dvar.prior.own_seed` of the run's seed and the data set's name.
     executor: where members run; default in this process.
     progress: called with the name of the data set and the record of each round of the start, each iteration and each
         look at the chain.
@@ -129,12 +130,7 @@ class _Assimilation:
 
     def run(self, resume: LoopState | None) -> Analysis:
         problem, space, noise = self.problem, self.space, self.problem.observations.noise
-        prior_run = space.forecast(np.vstack([space.members, space.mean]), self.grid)
-        space.require_members(prior_run[:-1].failures, "prior forecast")
-        if not self.settings.stochastic_model:
-            space.check_repeats(prior_run, self.grid)
-        start = self.start(prior_run, resume) if resume is None or resume.descent is None else resume
-        descent = self.iterate(start, prior_run)
+        prior_run, start, descent = self.descend(resume)
 
         transform = descent.newton.hessian.economical_transform if self.scheme.searches else descent.weights.T
         ends = space.ensemble(descent.weights.w, transform)
@@ -153,7 +149,8 @@ class _Assimilation:
         costs = self.costs(ends[:-1], after)
         centre_cost = float(self.costs(ends[-1:], last)[0])
         shape = {} if refinement else examine_shape(space, posterior, mode, costs, self.seed)
-        observations, prior = problem.observations, problem.prior
+        log_evidence_constant, prior = self.log_evidence_constant(), problem.prior
+        observations = problem.observations
         response, std = self.response(descent, mode, last), posterior.std(axis=0, ddof=1)
         shifts = what_if(problem, response, std, centre_cost, space.executor) if self.settings.what_if else ()
         path = ledger(problem, response, std) if self.settings.what_if else None
@@ -184,10 +181,10 @@ class _Assimilation:
             shape=shape,
             down_weights=observations.noise.down_weights(observations.values, last.predicted[0]),
             refinement=refinement,
-            log_evidence=diag.log_evidence(
-                descent.iterate.cost, descent.newton.hessian.singular_values, len(space.members), observations
-            ),
+            log_evidence=self.log_evidence(descent),
+            log_evidence_constant=log_evidence_constant,
             extremes=after.extremes,
+            beyond=after.beyond,
             residuals=self.residuals(descent),
             discrepancy=self.discrepancy(descent, last.predicted[0]),
             what_if=shifts,
@@ -196,6 +193,37 @@ class _Assimilation:
         control = ControlEnsembles(space.members, posterior, mode, costs, centre_cost)
         found = (*start.warnings, *refine_warnings)
         return replace(analysis, cautions=examine(analysis, control, descent.worst_loss, found))
+
+    def descend(self, resume: LoopState | None = None) -> tuple[Forecast, LoopState, Descent]:
+        """The prior forecast, where the iterations started, and their end."""
+        space = self.space
+        prior_run = space.forecast(np.vstack([space.members, space.mean]), self.grid)
+        space.require_members(prior_run[:-1].failures, "prior forecast")
+        if not self.settings.stochastic_model:
+            space.check_repeats(prior_run, self.grid)
+        start = self.start(prior_run, resume) if resume is None or resume.descent is None else resume
+        return prior_run, start, self.iterate(start, prior_run)
+
+    def log_evidence(self, descent: Descent) -> float:
+        """ln p(y), by Laplace's approximation at the end of the iterations."""
+        values, observations = descent.newton.hessian.singular_values, self.problem.observations
+        return diag.log_evidence(descent.iterate.cost, values, len(self.space.members), observations)
+
+    def log_evidence_constant(self) -> float | None:
+        """ln p(y) with constant parameters, from iterations of its own, NaN if they fail; None where none varies.
+
+        A second minimum is found as the first is. The posterior at zero changes (Savage & Dickey) would spare the runs,
+        but extrapolates the quadratic form of J from one minimum to the other, which may be far away.
+        """
+        if not self.problem.varying:
+            return None
+        other = _Assimilation(self.problem.constant, self.settings, self.seed, self.space.executor, None, None)
+        try:
+            return other.log_evidence(other.descend()[-1])
+        except TooFewMembersError:
+            return np.nan
+        finally:
+            self.space.forward_runs += other.space.forward_runs
 
     def residuals(self, descent: Descent) -> Residuals | None:
         """Of the linearisation at the end."""

@@ -7,7 +7,7 @@ from typing import overload
 
 import numpy as np
 
-from en4dvar.forward import Failure, Trajectory
+from en4dvar.forward import Failure, Trajectory, ValidityLimit
 from en4dvar.state import Array, StateLayout
 
 
@@ -42,6 +42,15 @@ class Batch(Sequence[Trajectory | Failure]):
             return Failure("non-finite state", float(times[np.argmin(finite)]))
         return Trajectory(times, states, self.layout)
 
+    @property
+    def last(self) -> Array:
+        """States (N, n_state) at the last instant."""
+        return self.states[:, -1]
+
     def largest(self, name: str) -> Array:
         """(N,) what a quantity of the model's ``validity`` reached, see :meth:`~en4dvar.forward.Trajectory.largest`."""
         return np.array([path.largest(name) if isinstance(path, Trajectory) else np.nan for path in self])
+
+    def beyond(self, limit: ValidityLimit) -> Array:
+        """(N,) when the paths first exceed a limit, see :meth:`~en4dvar.forward.Trajectory.beyond`."""
+        return np.array([path.beyond(limit) if isinstance(path, Trajectory) else np.nan for path in self])

@@ -17,6 +17,8 @@ TAIL = 0.0005  # each tail of the central 99.9 % interval
 MEAN_OFF, SPREAD_OFF = 0.5, 0.3  # in posterior standard deviations, as a fraction: beyond, a posterior is non-Gaussian
 EMULATED_ENOUGH = 0.2  # effective share of its runs below which an emulator is not believed
 GAUSSIAN_ENOUGH = 0.35  # the same of the members: the criterion where there is no emulator to believe
+DECISIVE = 20.0  # ratio of two evidences from which on the data are said to speak for one of the models
+UNSEEN = 0.1  # posterior standard deviations: a step that is within what so few members tell of the posterior
 HARDLY_INFORMED = 0.1  # DFS of a parameter below which its posterior is said to be its prior
 
 
@@ -58,6 +60,21 @@ def log_evidence(cost: float, singular_values: Array, n_members: int, observatio
     """
     log_det = float(np.sum(np.log1p(singular_values**2 / (n_members - 1))))
     return float(-cost - 0.5 * log_det - observations.log_normalisation())
+
+
+def change_words(names: str, log_factor: float) -> str:
+    """What the evidence says of parameters that vary: ``log_factor`` is ln p(y | they vary) − ln p(y | constant).
+
+    Where they are constant, a Bayes factor of :data:`DECISIVE` or more comes up in at most one set of data in as many.
+    """
+    if math.isnan(log_factor):
+        return f"the evidence for a change of {names} is not known: no fit with constant values could be made"
+    against = f"(log evidence {log_factor:+.1f} against constant values)"
+    if log_factor > math.log(DECISIVE):
+        return f"{names}: the data speak for a change {against}"
+    if log_factor < -math.log(DECISIVE):
+        return f"{names}: the data speak for constant values {against}"
+    return f"{names}: the data do not tell whether there is a change {against}"
 
 
 @lru_cache(maxsize=256)  # every start and every examination asks for the same few

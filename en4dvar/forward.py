@@ -6,6 +6,7 @@ A model that can integrate many members at once overrides ``trajectories``, the 
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,6 +36,19 @@ class Trajectory:
         A model whose quantity peaks between the stored instants overrides this.
         """
         return float(np.max(np.abs(self[name])))
+
+    def beyond(self, limit: ValidityLimit) -> float:
+        """When the path first exceeds a limit, +inf where it does not: the first stored instant that does.
+
+        Where it does between them only, or the quantity is no field, the whole path counts. A model that knows better
+        overrides this.
+        """
+        if not self.largest(limit.name) > limit.value:
+            return math.inf
+        if limit.name not in self.layout.names:
+            return -math.inf
+        over = np.abs(self[limit.name]).reshape(len(self.times), -1).max(axis=1) > limit.value
+        return float(self.times[np.argmax(over)]) if over.any() else -math.inf
 
 
 @dataclass(frozen=True)

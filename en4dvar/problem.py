@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
@@ -12,6 +12,7 @@ from en4dvar.forward import ForwardModel, Observable
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior
 from en4dvar.state import DISCREPANCY, NOISE_SCALE, Parameter
+from en4dvar.varying import PiecewiseModel, RandomWalk, Varying
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,30 @@ class InverseProblem:
         if not self.observations.noise.discrepant:
             return ()
         return discrepancy_parameters(self.model, self.observable)
+
+    @property
+    def varying(self) -> tuple[Varying, ...]:
+        """The parameters, and fields of the state, that vary in time."""
+        return self.model.varying if isinstance(self.model, PiecewiseModel) else ()
+
+    @property
+    def walks(self) -> tuple[RandomWalk, ...]:
+        """The parameters that vary in time."""
+        return self.model.walks if isinstance(self.model, PiecewiseModel) else ()
+
+    def varied(self, varying: Sequence[Varying]) -> InverseProblem:
+        """The same with what varies; the changes join the control vector at its end."""
+        changes = (change for one in varying for change in one.changes)
+        return replace(self, model=PiecewiseModel(self.model, varying), prior=Prior((*self.prior.terms, *changes)))
+
+    @property
+    def constant(self) -> InverseProblem:
+        """The same with every parameter constant, and a model without error."""
+        if not isinstance(self.model, PiecewiseModel):
+            return self
+        changes = {change.parameter.name for one in self.varying for change in one.changes}
+        terms = tuple(term for term in self.prior.terms if term.parameter.name not in changes)
+        return replace(self, model=self.model.model, prior=Prior(terms))
 
 
 def discrepancy_parameters(model: ForwardModel, observable: Observable) -> tuple[Parameter, Parameter]:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from en4dvar.analysis import Analysis
 from en4dvar.caution import Caution, codes
-from en4dvar.diagnostics import active_members
+from en4dvar.diagnostics import active_members, change_words
 from en4dvar.response.what_if import Shift
 from en4dvar.state import Array, Parameter
 from en4dvar.tables import csv_text, table
@@ -70,10 +70,15 @@ def summarise(a: Analysis) -> tuple[ParameterSummary, ...]:
 
 
 def remarks(a: Analysis) -> tuple[str, ...]:
-    """What the terminal says below the table: the alternatives that move a parameter beyond its error bar."""
+    """What the terminal says below the table: whether there is a change in what may vary, and the alternatives that
+    move a parameter beyond its error bar.
+    """
     large = [shift for shift in a.what_if if shift.exceeds]
     lines = [f"what if {shift.words}: {_moved(a.parameters, shift)}" for shift in large[:MOST_REMARKS]]
     more = len(large) - len(lines)
+    if a.log_evidence_change is not None:
+        names = " and ".join(one.name for one in a.problem.varying)
+        lines.insert(0, change_words(names, a.log_evidence_change))
     return (*lines, *([f"what if: {more} more exceed the error bar, or may; see the report"] if more else []))
 
 
@@ -85,6 +90,7 @@ def _moved(parameters: Iterable[Parameter], shift: Shift) -> str:
     for p, change, relative, in_std in zip(parameters, shift.change, shift.relative, shift.in_std, strict=True):
         if abs(in_std) > 1:
             value = f"{convert(float(change), p.unit, p.display_unit):+.2g} {p.display_unit}"
+            value = value.removesuffix(" 1")
             shown = value if np.isnan(relative) else f"{100 * relative:+.2g} %"
             words.append(f"{p.name} {shown} ({abs(in_std):.1f} std)")
     return ", ".join(words)

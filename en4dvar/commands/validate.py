@@ -42,11 +42,13 @@ def validate(source: Source, plot: bool) -> None:
     from en4dvar.commands.describe import cost_summary, problem_summary
     from en4dvar.config.build import build
     from en4dvar.descent.preview import preview
+    from en4dvar.prior import own_seed
 
     problems = build(loaded)
     click.echo(problem_summary(loaded, problems))
     chosen = problems[: _panels()] if plot else problems[:1]
-    previews = [preview(problem, loaded.assimilation, loaded.seed, whole=plot) for problem in chosen]
+    seeds = [own_seed(loaded.seed, problem.observations.name) for problem in chosen]
+    previews = [preview(p, loaded.assimilation, seed, whole=plot) for p, seed in zip(chosen, seeds, strict=True)]
     click.echo(cost_summary(loaded, previews[0], len(problems)))
     for one in previews:
         _warn(one)

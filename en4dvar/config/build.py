@@ -6,7 +6,8 @@ import glob
 import itertools
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem, discrepancy_parameters
 from en4dvar.state import Array
 from en4dvar.units import UnitError, convert
+from en4dvar.varying import Varying
 
 
 def build(config: Config) -> tuple[InverseProblem, ...]:
@@ -70,13 +72,36 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
     terms, fixed = resolve_parameters(config, observations)
     terms = (*terms, *(perturbed.term for perturbed in config.initial_state), *_discrepancy(config, observations))
     perturbations = tuple(perturbed.perturbation for perturbed in config.initial_state)
-    asked = config.assimilation
-    if asked.sampling == "exact" and asked.members <= len(terms):
-        message = f"{asked.members} are too few for {len(terms)} parameters; at least {len(terms) + 1}"
+    varying = _varying(config, observations, terms)
+    asked, count = config.assimilation, len(terms) + sum(len(one.changes) for one in varying)
+    if asked.sampling == "exact" and asked.members <= count:
+        message = f"{asked.members} are too few for {count} parameters; at least {count + 1}"
         raise ConfigError([config.document.fault(("assimilation", "members"), message)])
     problem = InverseProblem(config.model, config.observable, observations, Prior(terms), fixed, perturbations)
+    if varying:
+        problem = problem.varied(varying)
     check_problem(problem)
     return problem
+
+
+def _varying(config: Config, observations: Observations, terms: Sequence[PriorTerm]) -> list[Varying]:
+    """What varies in time. Raises :class:`ConfigError`: knots that do not suit the observations."""
+    model, times, by_name = config.model, observations.times, {term.parameter.name: term for term in terms}
+    asked: list[tuple[tuple[str, ...], Callable[[], Varying | None]]] = [
+        (("parameters", e.parameter.name), partial(e.walk, model, by_name[e.parameter.name], times))
+        for e in config.parameters
+        if isinstance(e, Uncertain)
+    ]
+    asked += [(("model_error", one.field.name), partial(one.changes, model, times)) for one in config.model_error]
+    found: list[Varying] = []
+    for path, make in asked:
+        try:
+            one = make()
+        except ConfigError as error:
+            places = [((*path, *f.path.split(".")) if f.path else path, f.message) for f in error.problems]
+            raise ConfigError([config.document.fault(*place) for place in places]) from None
+        found += [] if one is None else [one]
+    return found
 
 
 def _discrepancy(config: Config, observations: Observations) -> tuple[PriorTerm, ...]:

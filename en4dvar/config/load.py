@@ -20,6 +20,7 @@ from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, entries
 from en4dvar.config.schema import Assimilation, Execution, File, Output, QuantityText, Section
 from en4dvar.config.validate import Faults, check
+from en4dvar.config.varies import MODEL_ERROR, ErrorOf
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.problem import AssimilationSettings
@@ -70,6 +71,8 @@ class Estimation(File):
     """For each parameter a prior (estimated), a quantity (fixed), or a scalar of the data file (fixed)."""
     initial_state: Annotated[tuple[Perturbed, ...], PERTURBED] | None = None
     """Fields of the initial state that are uncertain, each with its ``std``."""
+    model_error: Annotated[tuple[ErrorOf, ...], MODEL_ERROR] | None = None
+    """Fields of the state that change at knots by what the model does not know, each with its ``std``."""
     assimilation: Assimilation = Assimilation()
     """Scheme, ensemble size and stopping rules; the defaults are the recommended ones."""
     execution: Execution = Execution()
@@ -106,6 +109,7 @@ class Config:
     simulate_times: Array | None
     resolved: str
     initial_state: tuple[Perturbed, ...] = ()
+    model_error: tuple[ErrorOf, ...] = ()
 
     @property
     def text(self) -> str:
@@ -151,6 +155,7 @@ def resolve(document: Document, base: Path) -> Config:
         simulate_times=file.simulate.times if file.simulate else None,
         resolved=read.resolved(file.parameters),
         initial_state=file.initial_state or (),
+        model_error=file.model_error or (),
     )
 
 

@@ -6,16 +6,29 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from pydantic import Field
 
-from en4dvar.config.context import Context, Made, Spread, parse_spread, read_each, subject_unit, unit_of
+from en4dvar.config.context import (
+    Context,
+    Made,
+    Spread,
+    parse_spread,
+    read_each,
+    subject_unit,
+    unit_of,
+)
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
+from en4dvar.config.varies import VariesSection
 from en4dvar.errors import ConfigError, Fault
+from en4dvar.forward import ForwardModel
 from en4dvar.hints import brief, shown, suggest
 from en4dvar.prior import PriorTerm
-from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Parameter
+from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Array, Parameter
 from en4dvar.units import parse_quantity
+from en4dvar.varying import RandomWalk
+from en4dvar.varying.model import can_vary
 
 _RECIPES = {
     "normal": "mean and std",
@@ -59,6 +72,8 @@ class PriorSection(Section):
     """Lower bound with its unit; never reached."""
     upper: Value = None
     """Upper bound with its unit; never reached."""
+    varies: VariesSection | None = None
+    """The parameter varies in time; the prior is that of its first piece."""
 
 
 class FromFile(Section):
@@ -118,7 +133,7 @@ class Uncertain:
 
     def _term(self, mean: float, median: float) -> PriorTerm:
         spec, parameter = self.spec, self.parameter
-        given = spec.model_fields_set - {"prior"}
+        given = spec.model_fields_set - {"prior", "varies"}
         if spec.prior == "normal" and given == {"mean", "std"}:
             return PriorTerm.normal(parameter, mean, self._std(mean))
         if spec.prior == "lognormal" and given == {"mean", "std"}:
@@ -129,6 +144,25 @@ class Uncertain:
             return PriorTerm.logit(parameter, (spec.lower or 0.0, spec.upper or 0.0), median, spec.logit_std)
         takes, has = _RECIPES[spec.prior], ", ".join(sorted(given)) or "none of these"
         raise ConfigError(f"a {spec.prior} prior takes {takes}; given: {has}")
+
+    def walk(self, model: ForwardModel, term: PriorTerm, times: Array) -> RandomWalk | None:
+        """How it varies over a window of observations at ``times`` (K,); None where it does not.
+
+        Raises :class:`ConfigError`, its path the faulty key.
+        """
+        varies = self.spec.varies
+        if varies is None:
+            return None
+        centre = float(term.to_physical(np.array(term.mean)))
+        if varies.std.relative and centre == 0:
+            message = f"relative to the mean, which is zero; give it in {self.parameter.unit}"
+            raise ConfigError([Fault(message, "varies.std")])
+        try:
+            return RandomWalk.of(model, term, varies.knots(times), varies.std.absolute(centre) / _slope(term, centre))
+        except ConfigError as error:
+            raise ConfigError(
+                [replace(f, path=f"varies.{f.path}" if f.path else "varies") for f in error.problems]
+            ) from None
 
     def _location(self, key: Literal["mean", "median"], maximum: float | None) -> float:
         value: float | Literal["maximum"] | None = getattr(self.spec, key)
@@ -148,6 +182,14 @@ class Uncertain:
         return std.absolute(mean)
 
 
+def _slope(term: PriorTerm, theta: float) -> float:
+    """dθ/dx of the transform."""
+    if term.transform == "logit":
+        low, high = term.bounds
+        return (theta - low) * (high - theta) / (high - low)
+    return theta if term.transform == "lognormal" else 1.0
+
+
 Entry = Fixed | Scalar | Uncertain
 
 
@@ -160,11 +202,22 @@ def _entry(given: Any, context: Context) -> Entry:
         scalar = FromFile.model_validate(given, context=context)
         return Scalar(parameter, scalar.from_file, scalar.unit)
     entry = Uncertain(parameter, PriorSection.model_validate(given, context=context))
+    if entry.spec.varies is not None and not can_vary(context.model, parameter.name):
+        raise ConfigError([Fault(f"{parameter.name} cannot vary: {_why_not(context.model, parameter)}", "varies")])
     if not entry.needs_data:
         entry.term()
     elif entry.spec.prior != "logit":
         entry.term(maximum=1.0)  # the other values do not wait for the data
     return entry
+
+
+def _why_not(model: ForwardModel, parameter: Parameter) -> str:
+    if parameter not in model.parameters:
+        return "it is no parameter of the model"
+    if parameter.name not in model.layout.names:
+        return f"the state of the model has no field {parameter.name!r} that could be changed on the way"
+    acting = ", ".join(model.path_parameters)
+    return f"it acts at the start alone; those that act along the path are {acting}"
 
 
 def _missing(parameter: Parameter) -> str:
@@ -197,6 +250,8 @@ def entries(kind: str = "") -> Made:
             for name, entry in found.items():
                 if kind and entry.needs_data:
                     faults.add((name,), f"{kind} has no data file to take a value from")
+                if kind and isinstance(entry, Uncertain) and entry.spec.varies is not None:
+                    faults.add((name, "varies"), f"{kind} has constant parameters")
             for parameter in model.parameters:
                 if parameter.name not in {**given, **defaults}:
                     faults.add((parameter.name,), _missing(parameter))

@@ -111,7 +111,8 @@ class File(Section):
     name: Name
     """Name of the run; its results go to runs/<name>."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Seed of every random number; the same seed gives the same bits on any machine and number of workers."""
+    """Seed of every random number; the same seed gives the same bits on any machine and number of workers. Each data
+    set draws from its own streams, by its name."""
     model: Annotated[dict[str, Any], WithJsonSchema({"x-definition": "model"})]  # see config.models
     """The forward model: its ``name`` (see ``en4dvar models``) and its settings."""
 

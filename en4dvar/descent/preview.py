@@ -63,7 +63,10 @@ def preview(problem: InverseProblem, settings: AssimilationSettings, seed: int, 
         seconds, count = _seconds_per_run(problem, space.members, executor)
         members = space.members if whole or seconds * len(space.members) < LONGEST else space.members[:count]
         run = forecast(problem, members, executor, grid)
-    return Preview(problem, grid, run, seconds, expected_runs(space))
+        runs = expected_runs(space)
+        if problem.varying:  # its evidence takes a second fit
+            runs += expected_runs(WeightSpace(problem.constant, settings, seed, executor))
+    return Preview(problem, grid, run, seconds, runs)
 
 
 def _seconds_per_run(problem: InverseProblem, members: Array, executor: Executor) -> tuple[float, int]:

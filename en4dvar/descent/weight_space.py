@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 
@@ -54,15 +54,11 @@ class PriorEnsemble:
         return np.asarray(self.basis @ self.basis.T)
 
 
-@lru_cache(maxsize=4)
 def prior_ensemble(prior: Prior, n_members: int, seed: int, sampling: Sampling) -> PriorEnsemble:
-    """The ensemble that every data set of a campaign starts from: drawn once, read-only."""
+    """The ensemble that a data set starts from."""
     members = prior.sample(n_members, seed, sampling)
     mean, anomalies = centre(members)
-    drawn = PriorEnsemble(members, mean, anomalies, members.var(axis=0), anomaly_basis(anomalies))
-    for array in vars(drawn).values():
-        array.flags.writeable = False
-    return drawn
+    return PriorEnsemble(members, mean, anomalies, members.var(axis=0), anomaly_basis(anomalies))
 
 
 class WeightSpace:

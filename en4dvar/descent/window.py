@@ -17,6 +17,7 @@ from en4dvar import diagnostics as diag
 from en4dvar.analysis import IterationRecord, Record
 from en4dvar.descent.step_control import STEP_CONTROLS, Move, Point, Tangent, run_searches
 from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.diagnostics import UNSEEN
 from en4dvar.ensemble.forecast import NO_TIMES, Forecast
 from en4dvar.ensemble.linalg import ThinTransform
 from en4dvar.errors import TooFewMembersError
@@ -25,6 +26,9 @@ from en4dvar.prior import member_stream
 from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights, gauss_newton
 from en4dvar.schemes.en4dvar import En4DVar
 from en4dvar.state import Array
+
+WIDER, WIDEST = 5.0, 25.0  # factors of a bundle where J does not fall along the step: of each further look, in all
+FAKED = 3.0  # posterior standard deviations: a longer step does not come from the model's own error
 
 
 @dataclass(frozen=True)
@@ -178,7 +182,7 @@ class DataWindow:
 
     def _minimise(self, scheme: Scheme, descent: Descent) -> None:
         settings, at, step = self.settings, descent.iterate, descent.newton
-        move, contracted = None, self.space.onwards(descent.weights.w, step.hessian)
+        move, again = None, None
         if not descent.stop:
             if step.norm <= settings.step_tolerance:
                 descent.stop, descent.converged = f"step of {step.norm:.2g} posterior standard deviations", True
@@ -186,20 +190,38 @@ class DataWindow:
                 descent.stop = f"iteration limit ({settings.max_iterations}) reached"
             else:
                 (move,) = self.search([descent])
-                if move is None and self._same_members(scheme, contracted, descent.weights):
+                again = None if move else self._look_again(scheme, descent)
+                if move is None and again is None:
                     descent.stop = "no decrease possible along the step"
-                    descent.converged = step.predicted_decrease <= self.small(at.cost)
+                    least = max(self.small(at.cost), 0.5 * UNSEEN**2)
+                    descent.converged = step.predicted_decrease <= least
         self.record(descent, step.hessian.economical_transform, move.step_length if move else 0.0)
         descent.ended = bool(descent.stop)
-        if descent.ended:
-            return
-        if move is None:  # a regression over a narrower ensemble may still show the way down
-            descent.weights = contracted
+        if again is not None:
+            descent.weights = again
+        if move is None:
             return
         if at.cost - move.cost <= self.small(at.cost) and step.predicted_decrease <= self.small(at.cost):
             # one more forecast, to linearise at the end point
             descent.stop, descent.converged = f"relative decrease of J below {settings.cost_tolerance:g}", True
-        descent.weights = self.space.onwards(move.w, step.hessian)
+        descent.weights = self._onwards(descent, move.w)
+
+    def _look_again(self, scheme: Scheme, descent: Descent) -> Weights | None:
+        """The same centre with members that may show the way down, where J does not fall along the step; else None.
+
+        For a regression that is a narrower ensemble. Of finite differences the step may come from the model's own
+        error, which jumps where its solver takes other time steps: a wider bundle feels that less.
+        """
+        weights = descent.weights
+        onwards = self._onwards(descent, weights.w)
+        if self.settings.linearisation == "bundle":
+            doubtful = UNSEEN < descent.newton.norm < FAKED and weights.wider < WIDEST
+            return replace(onwards, wider=WIDER * weights.wider) if doubtful else None
+        return None if self._same_members(scheme, onwards, weights) else onwards
+
+    def _onwards(self, descent: Descent, w: Array) -> Weights:
+        """Weights at w (N,), with the transform of where the descent comes from and a bundle as wide."""
+        return replace(self.space.onwards(w, descent.newton.hessian), wider=descent.weights.wider)
 
     def _take(self, scheme: Scheme, descent: Descent) -> None:
         """The whole step; the iterate after the last one is recorded, too."""

@@ -25,14 +25,15 @@ class Forecast:
 
     ``predicted`` (B, …) at the observations: predictions (B, K), their rates where R depends on them, the noise scale
     and the discrepancy where there is one; ``path`` (B, M) at the extra times, ``failures`` (B,) reasons, "" for
-    members alive, ``extremes`` (B, V) what the members reached of the model's V limits of validity (empty without extra
-    times).
+    members alive, ``extremes`` (B, V) what the members reached of the model's V limits of validity, ``beyond`` (B, V)
+    since when they exceed these, on the clock of the observations (both empty without extra times).
     """
 
     predicted: Predicted
     path: Array
     failures: tuple[str, ...]
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))
+    beyond: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
     def predictions(self) -> Array:
@@ -48,7 +49,13 @@ class Forecast:
         return len(self.failures)
 
     def __getitem__(self, members: slice) -> Forecast:
-        return Forecast(self.predicted[members], self.path[members], self.failures[members], self.extremes[members])
+        return Forecast(
+            self.predicted[members],
+            self.path[members],
+            self.failures[members],
+            self.extremes[members],
+            self.beyond[members],
+        )
 
 
 class Composite:
@@ -79,16 +86,17 @@ class Composite:
         physical = problem.prior.to_physical(x)
         failures = out_of_bounds(problem.prior, physical)
         alive, states = self._initial_states(physical, failures)
-        shifted = times + _of_framework(problem, physical, TIME_SHIFT, 0.0)[alive, None]
+        shift = _of_framework(problem, physical, TIME_SHIFT, 0.0)
+        shifted = times + shift[alive, None]
         outcomes = self.executor.trajectories(problem.model, states, shifted) if len(states) else ()
-        observed, extremes, reasons = reading.observe(outcomes, len(times))
+        observed, limits, reasons = reading.observe(outcomes, len(times))
         if alive is EVERYONE:
             failures = reasons
         else:
-            read = observed, extremes
+            read = observed, limits
             observed = np.full((len(observed), len(x), len(times)), np.nan)
-            extremes = np.full((len(x), len(reading.largest)), np.nan)
-            observed[:, alive], extremes[alive] = read
+            limits = np.full((len(x), len(reading.limits), 2), np.nan)
+            observed[:, alive], limits[alive] = read
             for i, reason in zip(np.arange(len(x))[alive], reasons, strict=True):
                 failures[i] = reason
         predicted = Predicted(
@@ -99,7 +107,8 @@ class Composite:
             if self._discrepancy
             else None,
         )
-        return Forecast(predicted, observed[0][:, at_extra], tuple(failures), extremes)
+        extremes, beyond = limits[..., 0], limits[..., 1] - shift[:, None]
+        return Forecast(predicted, observed[0][:, at_extra], tuple(failures), extremes, beyond)
 
 
 def forecast(
@@ -158,14 +167,14 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
 def _reading(problem: InverseProblem, limits: bool) -> Reading:
     """H; its rate where R depends on it; the model's limits of validity where asked for."""
     operator = problem.observable.operator
-    largest = tuple(limit.name for limit in problem.model.validity) if limits else ()
+    validity = tuple(problem.model.validity) if limits else ()
     batched = getattr(operator, "batched", False)
     if not problem.observations.noise.needs_rates:
-        return Reading((operator,), largest, batched)
+        return Reading((operator,), validity, batched)
     if not isinstance(operator, RateOperator):
         what = "a timing error" if problem.observations.noise.timed else "a discrepancy that grows with the rate"
         raise ConfigError(f"{what} needs the rate of {problem.observable.name}, which the model does not provide")
-    return Reading((operator, operator.rate), largest, batched)
+    return Reading((operator, operator.rate), validity, batched)
 
 
 def _of_framework(problem: InverseProblem, physical: Array, parameter: Parameter, default: float) -> Array:

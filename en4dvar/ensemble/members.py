@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from en4dvar.batch import Batch
 from en4dvar.executor import Outcome
-from en4dvar.forward import Failure
+from en4dvar.forward import Failure, ValidityLimit
 from en4dvar.prior import Prior
 from en4dvar.problem import InverseProblem
 from en4dvar.state import Array
@@ -105,17 +105,20 @@ def _without(failures: list[str]) -> Indices:
 
 @dataclass(frozen=True)
 class Reading:
-    """What is read from a path: ``quantities`` (T,) each, H and, where it is needed, its rate; ``largest`` by name.
+    """What is read from a path: ``quantities`` (T,) each, H and, where it is needed, its rate; what becomes of
+    ``limits`` of the model.
 
     ``batched``: the quantities take a :class:`~en4dvar.batch.Batch` as well and give (B, T).
     """
 
     quantities: tuple[Callable[[Any], Array], ...]
-    largest: tuple[str, ...] = ()
+    limits: tuple[ValidityLimit, ...] = ()
     batched: bool = False
 
     def observe(self, outcomes: Sequence[Outcome], n_times: int) -> tuple[Array, Array, list[str]]:
-        """Quantities (Q, B, T) and largest values (B, V) of B outcomes, NaN where a member failed, and reasons (B,)."""
+        """Quantities (Q, B, T) of B outcomes, how far and since when they are beyond the limits (B, V, 2), both NaN
+        where a member failed, and reasons (B,).
+        """
         if (isinstance(outcomes, Batch) and outcomes.whole) or not any(isinstance(o, Failure) for o in outcomes):
             try:
                 read = self._all(outcomes)
@@ -124,7 +127,7 @@ class Reading:
             except BaseException as error:  # of some member: find out which, one by one
                 own_fault(error)
         values = np.full((len(self.quantities), len(outcomes), n_times), np.nan)
-        largest = np.full((len(outcomes), len(self.largest)), np.nan)
+        beyond = np.full((len(outcomes), len(self.limits), 2), np.nan)
         reasons = [""] * len(outcomes)
         for i, outcome in enumerate(outcomes):
             if isinstance(outcome, Failure):
@@ -140,17 +143,20 @@ class Reading:
             elif not np.isfinite(one[0]).all():
                 reasons[i] = "non-finite prediction"
             else:
-                values[:, i], largest[i] = one[0][:, 0], one[1][0]
-        return values, largest, reasons
+                values[:, i], beyond[i] = one[0][:, 0], one[1][0]
+        return values, beyond, reasons
 
     def _all(self, outcomes: Sequence[Any]) -> tuple[Array, Array]:
         values: list[Any]
-        largest: list[Any]
+        beyond: list[Any]
         if isinstance(outcomes, Batch) and self.batched:
             values = [read(outcomes) for read in self.quantities]
-            largest = [outcomes.largest(name) for name in self.largest]
+            beyond = [(outcomes.largest(limit.name), outcomes.beyond(limit)) for limit in self.limits]
         else:
             values = [[read(path) for path in outcomes] for read in self.quantities]
-            largest = [[path.largest(name) for path in outcomes] for name in self.largest]
-        shape = (len(self.largest), len(outcomes))
-        return np.array(values, dtype=np.float64), np.array(largest, dtype=np.float64).reshape(shape).T
+            beyond = [
+                ([path.largest(limit.name) for path in outcomes], [path.beyond(limit) for path in outcomes])
+                for limit in self.limits
+            ]
+        shape = (len(self.limits), 2, len(outcomes))
+        return np.array(values, dtype=np.float64), np.array(beyond, dtype=np.float64).reshape(shape).transpose(2, 0, 1)

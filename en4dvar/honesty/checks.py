@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from dataclasses import replace
 from statistics import median
 
 import numpy as np
@@ -23,13 +23,15 @@ NEAR = 0.05  # of the width of an interval
 PILED_UP = 0.2  # share of members near a bound
 ODD = 1e-3  # probability below which residuals are told to be odd
 BEYOND = 0.1  # share of members beyond a limit of the model
+SILENT = 0.1  # DFS of all readings beyond it that count as none
+EXTRAPOLATED = "no action is needed for the parameters; paths beyond the limit are extrapolated"
 Findings = Iterator[Caution]
 
 
 def rank(prior: Prior, members: Array, posterior: Array) -> Findings:
     """Ensembles (N, n), (N', n) whose anomalies span fewer directions than there are parameters."""
     n = members.shape[1]
-    spanned = _rank(members.tobytes(), prior.std.tobytes())
+    spanned = _rank((members - members.mean(axis=0)) / prior.std)
     if spanned < n:
         words = f"the {len(members)} prior members span {spanned} of {n} directions"
         yield caution(
@@ -130,18 +132,30 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
                 yield caution("at-bound", f"{words} ({bound:g} {parameter.unit})".replace(" 1)", ")"))
 
 
-def validity(limits: Sequence[ValidityLimit], extremes: Array) -> Findings:
-    """Posterior members (N, V) whose path leaves what the model's equations assume."""
-    for limit, reached in zip(limits, extremes.T, strict=True) if extremes.size else ():
+def validity(limits: Sequence[ValidityLimit], extremes: Array, since: Array, times: Array, leverage: Array) -> Findings:
+    """Posterior members (N, V) whose path leaves what the model's equations assume, ``since`` (N, V) when.
+
+    Serious where readings that lie beyond inform: ``leverage`` (K,) at ``times`` (K,) is the share of each in its own
+    prediction, and sums to the DFS of the data. A bubble at rest after its collapse, say, tells nothing.
+    """
+    for v, limit in enumerate(limits if extremes.size else ()):
+        reached = extremes[:, v]
         beyond = reached > limit.value
-        if np.mean(beyond) > BEYOND:
-            unit = "" if limit.unit == "1" else f" {limit.unit}"
-            words = (
-                f"{beyond.sum()} of {len(reached)} posterior members leave the model's validity: {limit.label} reaches "
-                f"{np.max(reached):.3g}{unit} (median {median(reached.tolist()):.3g}), the limit is "
-                f"{limit.value:g}{unit}"
-            )
+        if np.mean(beyond) <= BEYOND:
+            continue
+        unit = "" if limit.unit == "1" else f" {limit.unit}"
+        words = (
+            f"{beyond.sum()} of {len(reached)} posterior members leave the model's validity: {limit.label} reaches "
+            f"{np.max(reached):.3g}{unit} (median {median(reached.tolist()):.3g}), the limit is "
+            f"{limit.value:g}{unit}"
+        )
+        later = np.mean(times >= since[:, v, None], axis=0) > BEYOND
+        informed = float(leverage[later].sum())
+        words += f"; {later.sum()} of {len(times)} readings lie beyond, with {informed:.2g} of {leverage.sum():.2g} DFS"
+        if informed > SILENT:
             yield caution("model-validity", words)
+        else:
+            yield replace(caution("model-validity", words, "note"), advice=EXTRAPOLATED)
 
 
 def information(names: Sequence[str], per_parameter: Array) -> Findings:
@@ -169,10 +183,6 @@ def down_weighted(analysis: Analysis, most: int = 6) -> Findings:
     yield caution("down-weighted", words)
 
 
-@lru_cache(maxsize=4)  # the data sets of a campaign share their prior members
-def _rank(members_: bytes, scale_: bytes) -> int:
-    """Of the anomalies of members (N, n) in units of a scale (n,)."""
-    scale = np.frombuffer(scale_)
-    members = np.frombuffer(members_).reshape(-1, len(scale))
-    values = np.linalg.svd((members - members.mean(axis=0)) / scale, compute_uv=False)
+def _rank(anomalies: Array) -> int:
+    values = np.linalg.svd(anomalies, compute_uv=False)
     return int(np.sum(values > SAME_DIRECTION * values[0])) if values.size and values[0] > 0 else 0

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from en4dvar.analysis import Analysis
 from en4dvar.caution import CATALOGUE, Caution, caution, worst_first
-from en4dvar.diagnostics import active_members, shape_warnings
+from en4dvar.diagnostics import UNSEEN, active_members, shape_warnings
 from en4dvar.honesty import checks
 from en4dvar.honesty.lost import loss
 from en4dvar.prior import Prior
@@ -53,13 +53,13 @@ def examine(
     ``worst_loss`` (N,) are the reasons of failure, "" for a member alive, in the iteration that lost most; ``found``
     are warnings met on the way.
     """
-    a, problem, prior = analysis, analysis.problem, analysis.problem.prior
+    a, prior = analysis, analysis.problem.prior
     alive = active_members(a.posterior_failures)
     odd = _structure(a)
     return worst_first(
         (
             *found,
-            *(caution("implausible-data", words) for words in doubts(problem, a.prior_predictions)),
+            *(caution("implausible-data", words) for words in doubts(a.problem, a.prior_predictions)),
             *checks.down_weighted(a),
             *unfinished(a),
             *checks.rank(prior, control.prior, control.posterior[alive]),
@@ -71,11 +71,18 @@ def examine(
             *odd,
             *checks.conflict(prior, control.centre),
             *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
-            *(checks.validity(problem.model.validity, a.extremes[alive]) if problem.model.validity else ()),
+            *_validity(a, alive),
             *(caution("non-gaussian", words) for words in shape_warnings(a.shape)),
-            *checks.information(prior.names, a.dfs_per_parameter),
+            *checks.information(*_to_be_informed(a)),
         )
     )
+
+
+def _to_be_informed(a: Analysis) -> tuple[list[str], Array]:
+    """Names and DFS of the parameters; not of the changes of one that varies, of which data may say little."""
+    changes = {change.parameter.name for one in a.problem.varying for change in one.changes}
+    told = [j for j, name in enumerate(a.problem.prior.names) if name not in changes]
+    return [a.problem.prior.names[j] for j in told], a.dfs_per_parameter[told]
 
 
 def doubts(problem: InverseProblem, predicted: Array) -> Sequence[str]:
@@ -92,6 +99,16 @@ def _structure(a: Analysis) -> tuple[Caution, ...]:
     return tuple(replace(c, advice=OTHER_KERNEL) for c in found) if a.discrepancy else found
 
 
+def _validity(a: Analysis, alive: npt.NDArray[np.bool_]) -> checks.Findings:
+    """Without a linearisation every reading that counts is taken to inform."""
+    limits, observations, found = a.problem.model.validity, a.problem.observations, a.residuals
+    which, leverage = (
+        (observations.used, np.ones(len(observations.used))) if found is None else (found.which, found.leverage)
+    )
+    if limits:
+        yield from checks.validity(limits, a.extremes[alive], a.beyond[alive], observations.times[which], leverage)
+
+
 def _fit(a: Analysis, odd: Sequence[Caution]) -> checks.Findings:
     """The size of the residuals; where they have a structure, no scale of the errors is offered as a cure."""
     last, n_used = a.iterations[-1], len(a.problem.observations.used)
@@ -103,13 +120,14 @@ def _fit(a: Analysis, odd: Sequence[Caution]) -> checks.Findings:
 
 
 def unfinished(analysis: Analysis) -> checks.Findings:
-    """Iterations that stopped before their own criterion; a note where the next step would have been short.
+    """Iterations that stopped before their own criterion; a note where the next step would have been short, and nothing
+    where no user would see it.
 
     A gradient regressed over the ensemble need not vanish where J is smallest, so that variant often ends like this.
     """
-    if analysis.converged:
-        return
     step_norm = analysis.iterations[-1].step_norm  # of the next step, had there been one
+    if analysis.converged or step_norm <= UNSEEN:
+        return
     words = f"not converged: {analysis.stop_reason}"
     if step_norm <= SHORT_STEP:
         words = f"{words}; the next step would be {step_norm:.2g} posterior standard deviations"

@@ -20,14 +20,15 @@ from en4dvar.report.overview import SetSummary, overview_figures, render_overvie
 from en4dvar.report.page import IDENTIFIERS, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, Lines, response_lines
 from en4dvar.report.style import draw
+from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
 from en4dvar.storage.campaign_file import failed_datasets
-from en4dvar.storage.store import load_stored, result_files
+from en4dvar.storage.store import StoredResult, load_stored, result_files
 from en4dvar.summary import summary_csv
 from en4dvar.tables import csv_text
 
 PAGES = 40  # data sets of a campaign with a page from the start
 SHARE = 4  # pages that are worth the start of a process
-TABLES = ("what_if.csv", "ledger.csv")
+TABLES = {"what_if.csv": SHIFT_COLUMNS, "ledger.csv": ENTRY_COLUMNS, "varying.csv": PIECE_COLUMNS}
 COPIES = 12  # data sets of a campaign up to which figures are also kept as PDF and PNG
 
 
@@ -49,23 +50,28 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     if files == [whole]:
         result = load_stored(whole)
         write_text(run_dir / "summary.csv", summary_csv([(result.name, result.summary(), result.cautions)], {}))
-        _write_tables(run_dir, [response_lines(result)])
+        _write_tables(run_dir, [_lines(result)])
         figures = draw(all_figures(result), inside(run_dir, "figures"), identifiers=IDENTIFIERS)
         return write_text(run_dir / "report.html", render_set(result, figures))
     sets, lines = [], []
     for path in files:
         result = load_stored(path)
         sets.append(SetSummary.of(result, path.stem))
-        lines.append(response_lines(result))
+        lines.append(_lines(result))
     _write_tables(run_dir, lines)
     failures = failed_datasets(whole)
     write_text(run_dir / "summary.csv", summary_csv(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
     return _write_campaign(run_dir, sets, failures, _asked(run_dir, sets, datasets), workers)
 
 
-def _write_tables(run_dir: Path, sets: Sequence[tuple[Lines, Lines]]) -> None:
-    """``what_if.csv`` and ``ledger.csv`` of the data sets, where there is something to write."""
-    for name, columns, part in zip(TABLES, (SHIFT_COLUMNS, ENTRY_COLUMNS), zip(*sets, strict=True), strict=True):
+def _lines(result: StoredResult) -> tuple[Lines, ...]:
+    """Of each of :data:`TABLES`, the name of the data set first."""
+    return *response_lines(result), piece_lines(result)
+
+
+def _write_tables(run_dir: Path, sets: Sequence[tuple[Lines, ...]]) -> None:
+    """The :data:`TABLES` of the data sets, where there is something to write."""
+    for (name, columns), part in zip(TABLES.items(), zip(*sets, strict=True), strict=True):
         lines = [line for of_set in part for line in of_set]
         if lines:
             write_text(run_dir / name, csv_text([("dataset", *columns), *lines]))

@@ -62,18 +62,17 @@ def posterior_file(run_dir: str | Path) -> Path:
 
 
 def _members_csv(results: Iterable[StoredResult]) -> str:
-    """Living members; the header is that of the first data set, columns missing elsewhere stay empty."""
-    lines: list[list[object]] = []
-    names: list[str] = []
+    """Living members; columns that a data set lacks stay empty."""
+    lines: list[tuple[object, object, dict[str, float]]] = []
+    header: dict[str, str] = {}
     for result in results:
-        if not lines:
-            rows = result.summary()
-            names = [row.name for row in rows]
-            lines.append(["dataset", "member", *(f"{r.name} ({r.unit})" if r.unit != "1" else r.name for r in rows)])
-        values = {name: result.members("posterior", name) for name in names if name in result.posterior}
+        for row in result.summary():
+            header.setdefault(row.name, f"{row.name} ({row.unit})" if row.unit != "1" else row.name)
+        values = {str(name): result.members("posterior", str(name)) for name in result.posterior.data_vars}
         for i, member in enumerate(np.flatnonzero(result.alive)):
-            lines.append([result.name, member, *(values[n][i] if n in values else "" for n in names)])
-    return csv_text(lines)
+            lines.append((result.name, member, {name: of[i] for name, of in values.items()}))
+    rows = ([dataset, member, *(own.get(name, "") for name in header)] for dataset, member, own in lines)
+    return csv_text([["dataset", "member", *header.values()], *rows])
 
 
 def _latex(found: list[tuple[str, tuple[ParameterSummary, ...]]]) -> str:

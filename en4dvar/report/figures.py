@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from en4dvar.report import varying
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, Captioned, panels, scaled_histogram, styled
 from en4dvar.report.text import plus_minus, pretty_unit, with_unit
 from en4dvar.state import Array
@@ -189,6 +190,12 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
         "residual of the centre over its standard deviation.",
         history(result),
     )
+    if varying.stored_walks(result):
+        yield (
+            "varying",
+            "What varies in time: median and 5–95 % of the posterior (blue) over 5–95 % of the prior (grey).",
+            varying.bands(result),
+        )
     if f"{result.observable}_whitened_residual" in result.sample_stats:
         yield (
             "residuals",

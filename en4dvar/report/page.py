@@ -12,6 +12,7 @@ from en4dvar.report.html import render
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
 from en4dvar.report.style import Drawing
 from en4dvar.report.text import number_like, plain_number
+from en4dvar.report.varying import stored_walks, verdict
 from en4dvar.storage.groups import ITERATION_SCALARS, SHARES
 from en4dvar.storage.store import StoredResult
 from en4dvar.units import convert
@@ -47,6 +48,8 @@ def render_set(
         what_if=(what_if := stored_shifts(result)),
         exceeding=exceeding(what_if),
         entries=stored_ledger(result),
+        walks=stored_walks(result),
+        verdict=verdict(result),
         identifiers=IDENTIFIERS,
         figures=figures,
         lost=[(i, str(reason)) for i, reason in enumerate(reasons) if reason],

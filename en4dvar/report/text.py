@@ -114,12 +114,13 @@ def figure_text(name: str) -> str:
 def symbol_html(symbol: str) -> Markup:
     r"""A mathtext symbol as HTML: Greek letters, sub- and superscripts; everything else is escaped text.
 
-    >>> str(symbol_html(r"$\mu$")), str(symbol_html("$R_0$")), str(symbol_html("<b>"))
-    ('<i>μ</i>', '<i>R</i><sub>0</sub>', '&lt;b&gt;')
+    >>> str(symbol_html(r"$\mu$")), str(symbol_html(r"$R_{\mathrm{eq}}$")), str(symbol_html("<b>"))
+    ('<i>μ</i>', '<i>R</i><sub>eq</sub>', '&lt;b&gt;')
     """
     if not (len(symbol) > 2 and symbol.startswith("$") and symbol.endswith("$")):
         return escape(symbol)
-    body = re.sub(r"\\(?:mathrm|text|rm|mathit)\b\s*", "", symbol[1:-1])
+    body = re.sub(r"(?<![_^])\\(?:mathrm|text|mathit)\s*\{([^{}]*)\}", r"\1", symbol[1:-1])
+    body = re.sub(r"\\(?:mathrm|text|rm|mathit)\b\s*", "", body)
     body = re.sub(r"\\([A-Za-z]+)\s?", lambda m: _GREEK.get(m[1], m[1]), body)
     pieces = re.findall(r"([_^])(\{[^{}]*\}|.)|([^_^]+)", body)
     tags = {"_": "sub", "^": "sup", "": "i"}

@@ -121,6 +121,9 @@ def _shift(
             if run.failures[0]:
                 return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be run: {run.failures[0]}")
             predicted = run.predicted[0]
+        misfit = float(changed.observations.cost(predicted))
+        if not np.isfinite(misfit):  # parameters of R can be led where it cannot be factored
+            break
         step, decrease = response.step(changed.observations, predicted, moved, of_prior)
         moved = moved + step
         correction = float(np.max(np.abs(step / std)))
@@ -134,7 +137,7 @@ def _shift(
         return Shift(*about, unknown, unknown, unknown, np.nan, runs, reason)
     prior = problem.prior
     z = (response.at + moved - step - prior.mean - of_prior) / prior.std
-    there = 0.5 * float(z @ z) + float(changed.observations.cost(predicted)) - decrease
+    there = 0.5 * float(z @ z) + misfit - decrease
     mode, positive = prior.to_physical(response.at), prior.bounds[0] >= 0
     change = prior.to_physical(response.at + moved) - mode
     relative = np.divide(change, mode, out=unknown.copy(), where=positive & (mode > 0))

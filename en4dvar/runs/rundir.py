@@ -32,7 +32,7 @@ from en4dvar.storage.store import COMPLETE, NEXT, require_settled
 
 FIXED = (
     "config.yaml", "config.resolved.yaml", "posterior.nc", "twin.nc", "run.log", "report.html", "summary.csv",
-    "what_if.csv", "ledger.csv",
+    "what_if.csv", "ledger.csv", "varying.csv",
 )  # fmt: skip
 Mode = Literal["new", "force", "resume", "report"]
 

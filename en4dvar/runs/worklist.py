@@ -16,6 +16,7 @@ from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
 from en4dvar.files import readable, write_bytes
 from en4dvar.inputs.readers import DataFile
+from en4dvar.prior import own_seed
 from en4dvar.runs.campaign import DatasetOutcome, file_names
 from en4dvar.runs.jobs import Estimate, Job, Records, estimate, estimate_and_tell
 from en4dvar.runs.progress import LiveProgress, describe
@@ -146,7 +147,7 @@ class Worklist:
         return Job(
             problem=build_one(config, d.name, d.source),
             settings=config.assimilation,
-            seed=config.seed,
+            seed=own_seed(config.seed, d.name),
             attributes={
                 **self.run.attributes,
                 "identity": identity.settings,

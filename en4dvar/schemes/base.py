@@ -28,12 +28,13 @@ Draw = Callable[[str], Array]  # standard normal numbers (N, K') by the name of 
 class Weights:
     """An ensemble in weight space: ensemble weights ``w`` (N,) and ensemble transform ``T`` (N, N).
 
-    T is (0, 0) where members are many and the scheme does not read it.
+    T is (0, 0) where members are many and the scheme does not read it. A bundle has ``wider`` times its size ε.
     """
 
     w: Array
     T: Array
     inverse: Array | None = None  # T⁻¹, where it was at hand
+    wider: float = 1.0
 
     @classmethod
     def prior(cls, n_members: int) -> Weights:

@@ -26,7 +26,8 @@ class En4DVar:
 
     ``bundle``: ε away from w, for finite differences about the central prediction (a tangent linearisation). It needs
     no more runs than the anomalies have directions: where r = rank X0 < N − 1, members at w + ε' u_j, u_j the columns
-    of the basis, give the same as N members at w + ε e_i, up to O(ε).
+    of the basis, give the same as N members at w + ε e_i, up to O(ε). A bundle that is made wider (``Weights.wider``)
+    has members on both sides, at w ± ε' u_j, where these are still fewer than N: its error is O(ε²).
     ``transform``: at the rows of 1wᵀ + T, regression about the ensemble mean at posterior spread.
     """
 
@@ -44,11 +45,13 @@ class En4DVar:
         return self.linearisation == "bundle" and 0 < rank < n_members - 1
 
     def members(self, weights: Weights, basis: Array | None = None) -> Array:
-        """Rows (r, N) along the directions of the basis where these are few, else those of 1wᵀ + εI or 1wᵀ + T."""
+        """Rows (r or 2r, N) along directions of the basis where these are few, else those of 1wᵀ + εI or 1wᵀ + T."""
         if basis is not None and self.economical(basis):
-            return np.asarray(weights.w + self._short(basis) * basis.T)
-        spread = weights.T if self.linearisation == "transform" else self.epsilon * np.eye(len(weights.w))
-        return np.asarray(weights.w + spread)
+            rows = self._short(weights) * basis.T
+            return np.asarray(weights.w + (np.vstack([rows, -rows]) if self._on_both_sides(weights, basis) else rows))
+        if self.linearisation == "transform":
+            return weights.rows
+        return np.asarray(weights.w + self.epsilon * weights.wider * np.eye(len(weights.w)))
 
     def linearise(self, weights: Weights, runs: Runs) -> tuple[Array, Array]:
         """Reference prediction (Ky,) and anomalies Y = T⁻¹(P − p̄) or (P − p_c)/ε, projected on the prior anomalies.
@@ -62,7 +65,10 @@ class En4DVar:
         if basis is None or central is None or active is None:
             raise ValueError("en4dvar needs the central run and the basis of one window; on a series use ienks")
         if len(runs.predictions) < len(weights.w):
-            return central, (runs.predictions - central) / self._short(basis)
+            if self._on_both_sides(weights, basis):
+                ahead, behind = np.split(runs.predictions, 2)
+                return central, (ahead - behind) / (2 * self._short(weights))
+            return central, (runs.predictions - central) / self._short(weights)
         coordinates = ((self.members(weights) - weights.w) @ basis)[active]
         survivors = runs.predictions[active]
         if self.linearisation == "bundle":
@@ -79,6 +85,9 @@ class En4DVar:
         """Not asked: J tells (:mod:`en4dvar.descent.loop`)."""
         return False
 
-    def _short(self, basis: Array) -> float:
-        """Step along a unit direction of the weights that moves the state by ε prior standard deviations."""
-        return self.epsilon / math.sqrt(len(basis) - 1)
+    def _on_both_sides(self, weights: Weights, basis: Array) -> bool:
+        return weights.wider > 1 and 2 * basis.shape[1] < len(basis)
+
+    def _short(self, weights: Weights) -> float:
+        """Step along a unit direction of the weights that moves the state by ε, or more, prior standard deviations."""
+        return self.epsilon * weights.wider / math.sqrt(len(weights.w) - 1)

@@ -26,6 +26,7 @@ GROUPS = (
 )  # fmt: skip
 LEFT_OUT = {"path_time", "iteration"}
 RENAMED = {"time": "observation", "time_column": "observation_column"}  # padded to the longest data set
+PARAMETER = "parameter"
 FAILURES = "failed_datasets"  # root attribute: JSON of name → reason
 
 
@@ -56,14 +57,21 @@ def save_campaign(
 def _write(path: Path, sources: Mapping[str, Path], n_observations: int, attributes: Mapping[str, Any]) -> None:
     with netCDF4.Dataset(path, "w", format="NETCDF4") as target:
         target.setncatts(attributes)
+        with netCDF4.Dataset(max(sources.values(), key=_parameters)) as widest:
+            widest.set_auto_maskandscale(False)
+            _define(target, widest, len(sources), n_observations)
         for i, (name, file) in enumerate(sources.items()):
             with netCDF4.Dataset(file) as source:
                 source.set_auto_maskandscale(False)
-                if i == 0:
-                    _define(target, source, len(sources), n_observations)
                 for group in GROUPS:
                     target[group]["dataset"][i] = name
                     _copy(target[group], source[group], i)
+
+
+def _parameters(file: Path) -> int:
+    """How many a data set has: one that varies in time has the more changes the longer the window."""
+    with netCDF4.Dataset(file) as source:
+        return len(source["sample_stats"].dimensions[PARAMETER])
 
 
 def failed_datasets(path: Path) -> dict[str, str]:
@@ -78,10 +86,10 @@ def failed_datasets(path: Path) -> dict[str, str]:
         raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
 
 
-def _define(target: netCDF4.Dataset, first: netCDF4.Dataset, n_datasets: int, n_observations: int) -> None:
-    """Groups, dimensions, variables and coordinates, as in the file of the first data set."""
+def _define(target: netCDF4.Dataset, widest: netCDF4.Dataset, n_datasets: int, n_observations: int) -> None:
+    """Groups, dimensions, variables and coordinates, as in the file of the (first) data set with most parameters."""
     for name in GROUPS:
-        source, group = first[name], target.createGroup(name)
+        source, group = widest[name], target.createGroup(name)
         group.createDimension("dataset", n_datasets)
         kept = [v for v in source.variables.values() if not LEFT_OUT & {*v.dimensions, v.name}]
         for dim in sorted({dim for variable in kept for dim in variable.dimensions}):
@@ -120,6 +128,7 @@ def _create(
 
 def _copy(group: netCDF4.Group, source: netCDF4.Group, i: int) -> None:
     """The values of data set ``i``; what it lacks stays missing."""
+    places = _places(group, source)
     for variable in group.variables.values():
         if variable.dimensions[:1] != ("dataset",) or variable.name == "dataset":
             continue
@@ -128,5 +137,16 @@ def _copy(group: netCDF4.Group, source: netCDF4.Group, i: int) -> None:
             if key in source.ncattrs():
                 variable[i] = source.getncattr(key)
         elif variable.name in source.variables:
-            values = source[variable.name][...]
-            variable[(i, *(slice(n) for n in np.shape(values)))] = values
+            given = source[variable.name]
+            where = (
+                places if dim == PARAMETER else slice(n) for dim, n in zip(given.dimensions, given.shape, strict=True)
+            )
+            variable[(i, *where)] = given[...]
+
+
+def _places(group: netCDF4.Group, source: netCDF4.Group) -> slice | list[int]:
+    """Where the parameters of a data set stand among those of the campaign."""
+    if PARAMETER not in source.variables:
+        return slice(None)
+    names = group[PARAMETER][...].tolist()
+    return [names.index(name) for name in source[PARAMETER][...].tolist()]

@@ -9,6 +9,7 @@ import xarray as xr
 
 from en4dvar.config.symbols import symbol_fault
 from en4dvar.errors import OutputError
+from en4dvar.storage.groups import MEMBER
 from en4dvar.units import UnitError, convert
 
 _GROUPS = (
@@ -43,13 +44,19 @@ def check_complete(path: Path, nodes: Mapping[str, xr.Dataset]) -> None:
         raise OutputError(f"{path}: not a result of en4dvar: {fault}")
 
 
+def of_members(dataset: xr.Dataset) -> xr.Dataset:
+    """A group of parameters without the values of pieces of time: what has one number a member."""
+    return dataset[[name for name, variable in dataset.data_vars.items() if variable.dims == MEMBER]]
+
+
 def _faults(nodes: Mapping[str, xr.Dataset]) -> Iterator[str]:
     if missing := [group for group in _GROUPS if f"/{group}" not in nodes]:
         yield f"no group {', '.join(missing)}"
     for group, attributes in _ATTRIBUTES.items():
         if missing := [name for name in attributes if name not in nodes[group].attrs]:
             yield f"{group} has no attribute {', '.join(missing)}"
-    parameters, observables = map(str, nodes["/posterior"].data_vars), list(nodes["/log_likelihood"].data_vars)
+    parameters = map(str, of_members(nodes["/posterior"]).data_vars)
+    observables = list(nodes["/log_likelihood"].data_vars)
     if len(observables) != 1:
         yield "/log_likelihood has no variable"
     named = {"*": list(parameters), "%": [str(observables[0])]}

@@ -22,6 +22,7 @@ from en4dvar.state import Array, Parameter
 from en4dvar.storage.netcdf import Group, Variable, netcdf_attributes
 from en4dvar.storage.netcdf import variable as _variable
 from en4dvar.storage.responses import response_coordinates, response_variables
+from en4dvar.storage.varying import change_scalars, piece_coordinates, pieces
 
 CONVENTIONS = "CF-1.11 ACDD-1.3"
 REFERENCES = (
@@ -57,8 +58,8 @@ def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]
     log_likelihood = _variable((*MEMBER, "time"), a.log_likelihood[None], "1", label)
     return {
         "/": Group(attrs=netcdf_attributes({**root, **attributes})),
-        "/prior": group(_parameters(a, a.prior)),
-        "/posterior": group(_parameters(a, a.posterior)),
+        "/prior": group({**_parameters(a, a.prior), **pieces(a, a.prior)}),
+        "/posterior": group({**_parameters(a, a.posterior), **pieces(a, a.posterior)}),
         "/prior_predictive": group(_predictive(a, a.prior_predictions, a.prior_trajectories)),
         "/posterior_predictive": group(_predictive(a, a.posterior_predictions, a.posterior_trajectories)),
         "/observed_data": group(*_observed(a)),
@@ -91,6 +92,7 @@ def _coordinates(a: Analysis) -> Variables:
         "parameter": _variable("parameter", names, "1", "estimated parameter", fill=False),
         "iteration": _variable("iteration", [r.iteration for r in a.iterations], "1", "iteration", fill=False),
         **response_coordinates(a),
+        **piece_coordinates(a),
     }
 
 
@@ -221,6 +223,7 @@ def _scalars(a: Analysis) -> dict[str, Any]:
         "cost": last.cost,
         "dfs": last.dfs,
         "log_evidence": a.log_evidence,
+        **change_scalars(a),
         "n_iterations": len(a.iterations),
         "converged": a.converged,
         "stop_reason": a.stop_reason,

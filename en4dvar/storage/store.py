@@ -17,7 +17,7 @@ from en4dvar.errors import OutputError
 from en4dvar.noise import noise_of_record
 from en4dvar.observations import Observations
 from en4dvar.state import Array, Parameter
-from en4dvar.storage.complete import check_complete
+from en4dvar.storage.complete import check_complete, of_members
 from en4dvar.storage.groups import SCALAR, build_groups
 from en4dvar.storage.netcdf import netcdf_file, tree_of
 from en4dvar.storage.seal import check_seal
@@ -47,12 +47,12 @@ class StoredResult:
     @property
     def prior(self) -> xr.Dataset:
         """Parameters (chain, draw) before the data."""
-        return self.dataset("prior")
+        return of_members(self.dataset("prior"))
 
     @property
     def posterior(self) -> xr.Dataset:
         """Parameters (chain, draw) given the data."""
-        return self.dataset("posterior")
+        return of_members(self.dataset("posterior"))
 
     @property
     def observed_data(self) -> xr.Dataset:

@@ -16,7 +16,7 @@ from en4dvar.config.build import build
 from en4dvar.executor import Executor, make_executor
 from en4dvar.forward import ForwardModel
 from en4dvar.population import Population, SharedFit, estimate_population, fit_shared
-from en4dvar.prior import Prior
+from en4dvar.prior import Prior, own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.evidence import Evidence, sampled_evidence
 from en4dvar.sampling.forward_runs import ForwardRuns
@@ -118,7 +118,10 @@ class _Parts:
 
     def _analysed(self, fit: Fit) -> Fit:
         config = self.plan.configs[fit.gel][fit.model]
-        analyses = tuple(assimilate(p, config.assimilation, config.seed, self.executor) for p in fit.problems)
+        seeds = (own_seed(config.seed, name) for name in fit.names)
+        analyses = tuple(
+            assimilate(p, config.assimilation, seed, self.executor) for p, seed in zip(fit.problems, seeds, strict=True)
+        )
         return replace(fit, analyses=analyses)
 
     def narrow(self, fit: Fit | None) -> Fit | None:

@@ -17,6 +17,14 @@ from en4dvar_bubble.laws.parameters import MANCIA, positive
 from en4dvar_bubble.medium import WATER_25C, Medium
 from en4dvar_bubble.solver.driver import Accuracy, Radial, Solver, System, preset
 
+FIRST_ORDER = "an expansion to first order in the Mach number: Prosperetti & Lezzi (1986), J. Fluid Mech. 168, 457"
+MACH_LIMITS: Mapping[Radial, tuple[float, str]] = {
+    "rayleigh-plesset": (0.3, "an incompressible liquid; 0.3 is the usual limit"),
+    "keller-miksis": (1.0, FIRST_ORDER),
+    "keller-miksis-enthalpy": (1.0, FIRST_ORDER),
+    "gilmore": (2.2, "the usual limit of the Kirkwood-Bethe hypothesis: Hickling & Plesset (1964), Phys. Fluids 7, 7"),
+}
+
 Gas = Literal["heat", "polytropic", "isothermal", "adiabatic"]
 Start = Literal["acoustic", "laser"]
 Vapour = Literal["none", "frozen", "transport"]
@@ -100,7 +108,8 @@ class Dynamics:
         hottest = np.inf
         if self.system.vapour and self.system.wall:
             hottest = float(kirchhoff(CRITICAL_TEMPERATURE / self.medium.T_inf, self.medium))
-        return Solver(self.system, self.driving, self.reading, self.accuracy, hottest)
+        valid, _ = MACH_LIMITS[self.radial]
+        return Solver(self.system, self.driving, self.reading, self.accuracy, hottest, valid)
 
     @property
     def exponent(self) -> float:

@@ -23,19 +23,11 @@ from en4dvar.forward import (
 from en4dvar.state import Array
 from en4dvar_bubble.alternatives import alternatives
 from en4dvar_bubble.collapse import doubts
-from en4dvar_bubble.dynamics import Dynamics
+from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics
 from en4dvar_bubble.packing import pack
 from en4dvar_bubble.paths import Paths
 from en4dvar_bubble.settings import BubbleSettings
-from en4dvar_bubble.solver.driver import Radial, Solution
-
-FIRST_ORDER = "an expansion to first order in the Mach number: Prosperetti & Lezzi (1986), J. Fluid Mech. 168, 457"
-MACH_LIMITS: Mapping[Radial, tuple[float, str]] = {
-    "rayleigh-plesset": (0.3, "an incompressible liquid; 0.3 is the usual limit"),
-    "keller-miksis": (1.0, FIRST_ORDER),
-    "keller-miksis-enthalpy": (1.0, FIRST_ORDER),
-    "gilmore": (2.2, "the usual limit of the Kirkwood-Bethe hypothesis: Hickling & Plesset (1964), Phys. Fluids 7, 7"),
-}
+from en4dvar_bubble.solver.driver import Solution
 
 
 @dataclass(frozen=True, eq=False)

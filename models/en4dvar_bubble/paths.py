@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
 
 from en4dvar.batch import Batch
-from en4dvar.forward import Failure, Trajectory
+from en4dvar.forward import Failure, Trajectory, ValidityLimit
 from en4dvar.state import Array, StateLayout
 from en4dvar_bubble.dynamics import Dynamics
 from en4dvar_bubble.gas import from_kirchhoff, mass_fraction, saturated_vapour_pressure
@@ -16,7 +16,7 @@ from en4dvar_bubble.laws.tabulate import GRID
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.collocation import ball
 from en4dvar_bubble.solver.driver import Solution
-from en4dvar_bubble.solver.integrate import END_TIME, MAX_MACH
+from en4dvar_bubble.solver.integrate import BEYOND, END_TIME, MAX_MACH
 from en4dvar_bubble.tables import evaluate
 
 
@@ -66,11 +66,25 @@ class Paths(Batch):
             return np.asarray(np.abs(self["Rdot"]).max(axis=1) / self.model.medium.c)
         return self.solution.record[:, MAX_MACH]
 
+    def beyond(self, limit: ValidityLimit) -> Array:
+        """(N,) since when (s) the wall is faster than the radial equation bears, +inf: never; see :meth:`largest`."""
+        if self.model.radial == "rayleigh-plesset":
+            over = np.abs(self["Rdot"]) / self.model.medium.c > limit.value
+            first = np.take_along_axis(self.times, np.argmax(over, axis=1)[:, None], axis=1)[:, 0]
+            return np.where(over.any(axis=1), first, np.inf)
+        return np.asarray(self.solution.record[:, BEYOND] * 1e-6)
+
     @property
     def states(self) -> Array:  # type: ignore[override]
         """Full state vectors (N, K, n_state) in the model's layout."""
         blocks = [self[f.name].reshape(*self.times.shape, -1) for f in self.model.layout]
         return np.concatenate(blocks, axis=2)
+
+    @property
+    def last(self) -> Array:
+        """States (N, n_state) at the last instant."""
+        solution = replace(self.solution, states=self.solution.states[:, -1:])
+        return replace(self, times=self.times[:, -1:], solution=solution, _fields={}).states[:, 0]
 
     def _constant(self, name: str) -> Array:
         return np.broadcast_to(self.initial[:, self.model.layout[name].start, None], self.times.shape)
@@ -163,6 +177,10 @@ class BubbleTrajectory(Trajectory):
     def largest(self, name: str) -> float:
         """See :meth:`Paths.largest`."""
         return float(self._paths.largest(name)[self._member])
+
+    def beyond(self, limit: ValidityLimit) -> float:
+        """See :meth:`Paths.beyond`."""
+        return float(self._paths.beyond(limit)[self._member])
 
     @property
     def states(self) -> Array:

@@ -18,6 +18,7 @@ LAYERS = (
     ("state", "hints", "files", "tables", "caution", "compiled", "user_code", "user_file"),
     ("units", "prior", "forward", "noise"),
     ("batch", "observations"),
+    ("varying",),
     ("problem", "diagnostics", "residuals"),
     ("executor",),
     ("ensemble",),

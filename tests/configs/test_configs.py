@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import en4dvar
@@ -42,6 +43,16 @@ def test_quickstart_recovers_the_synthetic_gel(tmp_path):
         assert abs(mean - value) < 2.5 * std, name
     for file in ("posterior.nc", "report.html", "summary.csv", "config.yaml", "config.resolved.yaml", "run.log"):
         assert (tmp_path / file).stat().st_size > 0
+
+
+def test_laser_with_a_viscosity_that_is_halved(tmp_path):
+    result = run("laser_varying", tmp_path, **{"output.report": False})
+    assert result.sample_stats.attrs["n_active"] == 48
+    assert result.sample_stats.attrs["log_evidence_change"] > 5
+    pieces = result.dataset("posterior")["mu_pieces"]
+    mean, std = pieces.mean(("chain", "draw")).values, pieces.std(("chain", "draw")).values
+    assert np.all(np.abs(mean - np.array([0.06, 0.03, 0.03])) < 2.5 * std)
+    assert mean[1] + 3 * std[1] < mean[0]
 
 
 def test_soft_polyacrylamide(tmp_path):

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from same_bits import assert_same_bits
-from toys import Linear, Vectorised, make_problem
+from toys import Vectorised, make_problem
 
 from en4dvar import Batch
 from en4dvar.assimilate import assimilate
-from en4dvar.descent.weight_space import prior_ensemble
 from en4dvar.ensemble.forecast import forecast
 from en4dvar.forward import Observable, ValidityLimit
 from en4dvar.problem import AssimilationSettings
@@ -57,7 +56,7 @@ def test_batch_and_list_have_the_same_bits(time_std, limit):
     assert lost.any() == np.isfinite(limit)
     assert batch.failures == listed.failures
     assert batch.failures == tuple("non-finite state" if i else "" for i in lost)
-    for name in ("predictions", "path", "extremes"):
+    for name in ("predictions", "path", "extremes", "beyond"):
         np.testing.assert_array_equal(getattr(batch, name), getattr(listed, name))
     if batch.predicted.rates is not None:
         np.testing.assert_array_equal(batch.predicted.rates, listed.predicted.rates)
@@ -88,14 +87,3 @@ def test_posterior_does_not_depend_on_how_paths_come():
     settings = AssimilationSettings(members=13)
     batch, listed = (assimilate(make_problem(model, TRUTH), settings, 3) for model in (Whole(), Listed()))
     assert_same_bits(batch, listed)
-
-
-def test_data_sets_share_the_prior_ensemble_and_cannot_change_it():
-    problem = make_problem(Linear(NAMES), TRUTH)
-    other = make_problem(Linear(NAMES), TRUTH, seed=2)  # the same prior, other data
-    ensembles = [prior_ensemble(p.prior, 13, 3, "exact") for p in (problem, other)]
-    assert ensembles[0] is ensembles[1]
-    np.testing.assert_array_equal(ensembles[0].members, problem.prior.sample(13, 3))
-    assert prior_ensemble(problem.prior, 13, 4, "exact") is not ensembles[0]
-    with pytest.raises(ValueError, match="read-only"):
-        ensembles[0].members[0] = 0

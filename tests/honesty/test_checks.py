@@ -126,23 +126,38 @@ def test_an_interior_posterior_does_not_pile_up():
 def test_a_tenth_of_the_members_may_leave_the_validity(beyond, told):
     limit = ValidityLimit("speed", 3.0, "m/s", "speed of the wall")
     reached = np.where(np.arange(40) < beyond, 3.5, 2.0)[:, None]
-    found = list(validity((limit,), reached))
+    since = np.where(reached > 3.0, 1.0, np.inf)
+    times, leverage = np.linspace(0.0, 2.0, 9), np.full(9, 0.3)
+    found = list(validity((limit,), reached, since, times, leverage))
     assert [c.code for c in found] == ["model-validity"] * told
     if told:
         assert "speed of the wall reaches 3.5 m/s (median 2), the limit is 3 m/s" in found[0].words
-    assert list(validity((), np.empty((40, 0)))) == []
+        assert "5 of 9 readings lie beyond, with 1.5 of 2.7 DFS" in found[0].words
+        assert found[0].severity == "serious"
+    assert list(validity((), np.empty((40, 0)), np.empty((40, 0)), times, leverage)) == []
+
+
+@pytest.mark.parametrize("since", [1.9, 2.1])
+def test_validity_is_serious_only_where_readings_beyond_it_inform(since):
+    """A reading of a bubble at rest after its collapse; and none after it."""
+    limit, times = ValidityLimit("speed", 3.0, "m/s"), np.linspace(0.0, 2.0, 9)
+    leverage = np.append(np.full(8, 0.3), 0.02)
+    (found,) = validity((limit,), np.full((40, 1), 3.5), np.full((40, 1), since), times, leverage)
+    assert found.severity == "note"
+    assert f"{since < 2:d} of 9 readings lie beyond, with {0.02 if since < 2 else 0:.2g} of 2.4 DFS" in found.words
+    assert found.advice.startswith("no action is needed for the parameters")
 
 
 def test_iterations_that_end_next_to_their_criterion_are_a_note_without_alarm():
     analysis, control = gaussian()
 
-    def ended(step_norm: float) -> Caution:
+    def ended(step_norm: float) -> tuple[Caution, ...]:
         last = replace(analysis.iterations[-1], step_norm=step_norm)
         reason = "no decrease possible along the step"
-        (found,) = examine(replace(analysis, converged=False, stop_reason=reason, iterations=(last,)), control)
-        return found
+        return examine(replace(analysis, converged=False, stop_reason=reason, iterations=(last,)), control)
 
-    near, far, unknown = ended(0.05), ended(0.6), ended(np.nan)
+    (near,), (far,), (unknown,) = ended(0.15), ended(0.6), ended(np.nan)
+    assert ended(0.08) == ()  # another step would move nothing that a user sees
     assert (near.code, near.severity) == ("not-converged", "note")
     assert near.advice.startswith("no action is needed")
     assert (far.severity, unknown.severity) == ("serious", "serious")

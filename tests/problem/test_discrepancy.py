@@ -13,11 +13,15 @@ from en4dvar.assimilate import assimilate, forecast, log_posterior
 from en4dvar.config import load_config
 from en4dvar.config.build import build
 from en4dvar.errors import ConfigError
+from en4dvar.executor import SerialExecutor
+from en4dvar.forward import Alternative
 from en4dvar.noise import Kernel, Linearisation, Predicted, RobustDiscrepancyNoise, noise_of
 from en4dvar.noise.kernel import NUGGET
 from en4dvar.noise.robust_discrepancy import _reweighted, solve_boxed
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, discrepancy_parameters
+from en4dvar.response.linear import LinearResponse
+from en4dvar.response.what_if import what_if
 from en4dvar.state import NOISE_SCALE
 
 K = 9
@@ -219,6 +223,27 @@ def test_a_known_discrepancy_is_a_correlated_error():
             mean + gain @ (problem.observations.values - h @ mean), abs=1e-7
         )
         assert np.cov(end.posterior.T) == pytest.approx((np.eye(2) - gain @ h) @ cov, abs=1e-7)
+
+
+class Leading(LinearResponse):
+    """Leads to a large amplitude and a long time, beside which the errors are lost in rounding."""
+
+    def step(self, observations, predicted, moved, prior_shift):
+        if not moved.any():
+            return np.array([0.0, 0.0, 40.0, 100.0]), 0.0
+        return super().step(observations, predicted, moved, prior_shift)
+
+
+def test_an_alternative_that_leads_to_no_covariance_is_beyond_linear_response():
+    problem = with_discrepancy(make_problem(Linear(("a", "b")), [1.0, 1.3]))
+    problem.model.alternatives = (Alternative("other", "it were so", Linear(("a", "b"))),)
+    x = problem.prior.mean
+    like = forecast(problem, x[None]).predicted[0]
+    linear = Linearisation.of_stacked(like, like.stacked, np.ones((2, like.stacked.shape[0])))
+    response = Leading(x, linear, np.eye(2, 4), 11.0, problem.observations)
+    (shift,) = what_if(problem, response, np.ones(4), 0.0, SerialExecutor())
+    assert shift.reason == "beyond linear response"
+    assert shift.runs == 2
 
 
 def known_posterior():

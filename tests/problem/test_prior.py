@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from en4dvar.errors import ConfigError
-from en4dvar.prior import Prior, PriorTerm
+from en4dvar.prior import Prior, PriorTerm, member_stream, own_seed, standard_normal
 from en4dvar.state import Parameter
 
 A, B, C = Parameter("a", "Pa"), Parameter("b", "m"), Parameter("c", "1")
@@ -78,6 +78,18 @@ def test_overflow_is_infinite_not_clipped():
 def test_growing_the_ensemble_leaves_first_members():
     prior = Prior(TERMS)
     assert np.array_equal(prior.sample(50, 7, "random")[:20], prior.sample(20, 7, "random"))
+
+
+def test_a_member_has_the_first_number_of_its_own_stream():
+    of_each = [member_stream(7, "a", member).standard_normal() for member in range(300)]
+    assert np.array_equal(standard_normal(7, "a", 300), of_each)
+
+
+def test_a_data_set_has_a_seed_of_its_own():
+    seeds = {own_seed(seed, f"set{i}") for seed in (0, 1, 2**63 - 1) for i in range(500)}
+    assert len(seeds) == 1500
+    assert max(seeds) < 2**48
+    assert own_seed(1, "ge\u0301l") == own_seed(1, "g\u00e9l") != own_seed(1, "gel")
 
 
 def test_adding_a_parameter_leaves_the_others_draws():

@@ -8,7 +8,6 @@ from toys import OBSERVABLE, Linear, Vectorised, make_observations, make_problem
 
 from en4dvar import diagnostics as diag
 from en4dvar.assimilate import assimilate
-from en4dvar.descent.weight_space import prior_ensemble
 from en4dvar.ensemble.linalg import Hessian, anomaly_basis, centre
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
@@ -123,9 +122,7 @@ def test_member_order_permutes_the_posterior(monkeypatch):
     order = np.random.default_rng(2).permutation(20)
     sample = Prior.sample
     monkeypatch.setattr(Prior, "sample", lambda *args: sample(*args)[order])
-    prior_ensemble.cache_clear()
     shuffled = run(problem)
-    prior_ensemble.cache_clear()
     close(shuffled.posterior, plain.posterior[order], 1e-12)
     close(shuffled.centre, plain.centre, 1e-12)
 

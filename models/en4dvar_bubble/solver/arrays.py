@@ -77,6 +77,7 @@ class Control(NamedTuple):
     mach_limit: float
     seconds: float  # of wall clock per member
     hottest_wall: float  # τ of the wall above which a breakdown is put down to it
+    valid_mach: float  # of the wall: since when it is exceeded is recorded
 
 
 class Output(NamedTuple):

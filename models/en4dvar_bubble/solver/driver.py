@@ -144,8 +144,8 @@ _ELASTIC_SPAN, _VISCOUS_SPAN = GRID.span, VISCOUS_GRID.span
 class Solution:
     """Raw solver output. ``states`` (N, K, n) in the rows of :class:`System`, NaN where a member did not get.
 
-    ``status`` (N,) integers, ``record`` (N, 6): steps, rejected steps, largest wall Mach number, largest τ at the
-    innermost node, smallest ln(R/µm), end time (µs).
+    ``status`` (N,) integers, ``record`` (N, 7): steps, rejected steps, largest wall Mach number, largest τ at the
+    innermost node, smallest ln(R/µm), end time (µs), since when (µs) the wall is faster than the equations bear.
     """
 
     states: Array
@@ -203,6 +203,8 @@ class Solver:
     accuracy: Accuracy
     hottest_wall: float = np.inf
     """τ of the wall above which there is no equilibrium with its vapour."""
+    valid_mach: float = np.inf
+    """Wall Mach number that the radial equation bears."""
 
     @cached_property
     def lengths(self) -> tuple[Any, Any]:
@@ -239,6 +241,7 @@ class Solver:
             mach_limit=float(accuracy.mach_limit),
             seconds=float(accuracy.time_limit),
             hottest_wall=float(self.hottest_wall),
+            valid_mach=float(self.valid_mach),
         )
 
     def prepared(self, members: Members, memory: Array, viscous: Array) -> tuple[Callable[[], object], Solution]:

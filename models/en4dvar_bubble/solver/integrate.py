@@ -21,8 +21,8 @@ from en4dvar_bubble.tables import fill
 # Status of a member; the reasons users read are made by ``driver.reason``.
 OK, STEP_LIMIT, NON_FINITE, STEP_UNDERFLOW, MACH_LIMIT, TIME_LIMIT, WALL_LIMIT = 0, 1, 2, 3, 4, 5, 6
 # Columns of the per-member record.
-STEPS, REJECTED, MAX_MACH, MAX_THETA, MIN_LOG_R, END_TIME = 0, 1, 2, 3, 4, 5
-RECORD = 6
+STEPS, REJECTED, MAX_MACH, MAX_THETA, MIN_LOG_R, END_TIME, BEYOND = 0, 1, 2, 3, 4, 5, 6
+RECORD = 7
 
 _SAFETY, _SHRINK, _GROW = 0.9, 0.15, 6.0
 _LEAST_ROOT = 1e-2 ** (1.0 / rodas5p.ORDER)
@@ -67,6 +67,7 @@ def _begin(i, lane, clock, members, lanes, control, out):
     out.record[i, :] = 0.0
     out.record[i, MIN_LOG_R] = members.initial[i, n - 1]
     out.record[i, END_TIME] = start
+    out.record[i, BEYOND] = np.inf
     out.status[i] = OK
     done = 0
     while done < n_times and members.times[i, done] <= start:
@@ -166,6 +167,8 @@ def _accept(lane, members, lanes, eq, control, w, have_dense, out):
     record[STEPS] += 1
     record[END_TIME] = end
     record[MAX_MACH] = max(record[MAX_MACH], w.norm[2, lane])
+    if w.norm[2, lane] > control.valid_mach:
+        record[BEYOND] = min(record[BEYOND], now)
     record[MIN_LOG_R] = min(record[MIN_LOG_R], lanes.y[-1, lane])
     if eq.dims.gas > 0:
         record[MAX_THETA] = max(record[MAX_THETA], lanes.y[0, lane])

@@ -1,0 +1,108 @@
+"""``varies:`` of a parameter and ``model_error:`` of the state: what changes at knots in time."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Self
+
+from pydantic import model_validator
+
+from en4dvar.config.context import Context, Made, Spread, parse_spread, quantity, read_each, subject_unit, time_unit
+from en4dvar.config.initial_state import dynamic_fields
+from en4dvar.config.schema import Section
+from en4dvar.config.validate import Faults
+from en4dvar.errors import ConfigError, Fault
+from en4dvar.forward import ForwardModel
+from en4dvar.hints import shown, suggest
+from en4dvar.state import Array, Field
+from en4dvar.varying import StateChanges
+
+MOST_KNOTS = 1000
+
+
+class Knots(Section):
+    """When something changes: at regular knots, or at given ones."""
+
+    every: Annotated[float | None, quantity(time_unit, "positive")] = None
+    """Length of a piece, e.g. 5 us: knots at its multiples, from the model's time zero to the last observation."""
+    at: tuple[Annotated[float, quantity(time_unit, "positive")], ...] | None = None
+    """The knots, in increasing order, from the model's time zero; instead of ``every``."""
+
+    @classmethod
+    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        if ("every" in given) == ("at" in given):
+            faults.add((), "give either every (length of a piece) or at (list of knots)")
+
+    @model_validator(mode="after")
+    def _increasing(self) -> Self:
+        at = self.at if self.at is None or None not in self.at else None
+        with Faults() as faults:
+            if at is not None and (not at or any(b <= a for a, b in itertools.pairwise(at))):
+                faults.add(("at",), "give at least one knot, and each later than the one before it")
+        return self
+
+    def knots(self, times: Array) -> tuple[float, ...]:
+        """Those for a window of observations at ``times`` (K,). Raises :class:`ConfigError`: none is of use."""
+        last = float(times[-1])
+        if self.at is not None:
+            if not self.at[0] < last:
+                raise ConfigError([Fault("all knots lie after the last observation", "at")])
+            return self.at
+        count, width = int(min(last // self.every, MOST_KNOTS + 1)) if self.every else 0, self.every or 1.0
+        if count > MOST_KNOTS:
+            raise ConfigError([Fault(f"more than {MOST_KNOTS} pieces in the window", "every")])
+        found = tuple(k * width for k in range(1, count + 1) if k * width < last)
+        if not found:
+            raise ConfigError([Fault("the last observation comes before the end of the first piece", "every")])
+        return found
+
+
+class VariesSection(Knots):
+    """A parameter that varies in time: constant pieces, and at each knot between two a random change."""
+
+    std: Annotated[Spread, Made(lambda text, context: parse_spread(text, subject_unit(context)))]
+    """Standard deviation of each change: in % of the value (lognormal: of its logarithm), or in the parameter's
+    unit, which holds at the centre of the prior."""
+
+
+class ModelErrorSection(Knots):
+    """A field of the state that changes at knots by what the model does not know."""
+
+    std: Annotated[Spread, Made(lambda text, context: parse_spread(text, subject_unit(context)))]
+    """Standard deviation of each change: in the field's unit (added to it), or in % (a factor)."""
+
+
+@dataclass(frozen=True)
+class ErrorOf:
+    """What a file says of the model error of a field of the state."""
+
+    field: Field
+    spec: ModelErrorSection
+
+    def changes(self, model: ForwardModel, times: Array) -> StateChanges:
+        """Over a window of observations at ``times`` (K,). Raises :class:`ConfigError`, its path the faulty key."""
+        std = self.spec.std
+        return StateChanges.of(model, self.field, self.spec.knots(times), std.value, std.relative)
+
+
+def _model_error(given: Mapping[str, Any], context: Context) -> tuple[ErrorOf, ...]:
+    """In the order of the file."""
+    fields = dynamic_fields(context.model)
+
+    def unknown(name: str) -> str:
+        if name in {p.name for p in context.model.parameters}:
+            return f"{name} is a parameter: write varies behind its prior"
+        return f"unknown field {shown(name)} of the state{suggest(name, fields)}"
+
+    def read(entry: Any, context: Context) -> ErrorOf:
+        return ErrorOf(context.subject, ModelErrorSection.model_validate(entry, context=context))
+
+    with Faults() as faults:
+        return tuple(read_each(given, fields, context, faults, read, unknown).values())
+
+
+MODEL_ERROR = Made(
+    _model_error, dict[str, Any], {"type": "object", "additionalProperties": ModelErrorSection.model_json_schema()}
+)

@@ -1,0 +1,110 @@
+"""Parameters that vary in time, read from a result: bands, rows of a table, and what the evidence says of a change."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from en4dvar.diagnostics import change_words
+from en4dvar.report.style import COLUMN, LIGHT, styled
+from en4dvar.report.text import with_unit
+from en4dvar.state import Array
+from en4dvar.storage.store import StoredResult
+from en4dvar.storage.varying import PIECE, PIECES
+from en4dvar.units import convert
+
+LEVELS = (0.05, 0.5, 0.95)
+PIECE_COLUMNS = ("parameter", "time_unit", "begin", "end", "unit", "q05", "q50", "q95", "prior_q05", "prior_q95")
+
+
+@dataclass(frozen=True)
+class StoredWalk:
+    """A parameter over m + 1 pieces in display units: ``edges`` (m + 2,) of the pieces, quantiles (3, m + 1)."""
+
+    name: str
+    label: str
+    symbol: str
+    unit: str
+    time_unit: str
+    edges: Array
+    posterior: Array
+    prior: Array
+
+    @property
+    def cells(self) -> list[tuple[object, ...]]:
+        """A line a piece, in the order of :data:`PIECE_COLUMNS`."""
+        rows = zip(self.edges, self.edges[1:], self.posterior.T, self.prior[[0, 2]].T, strict=False)
+        return [
+            (self.name, self.time_unit, float(begin), float(end), self.unit, *map(float, after), *map(float, before))
+            for begin, end, after, before in rows
+        ]
+
+
+def stored_walks(result: StoredResult) -> tuple[StoredWalk, ...]:
+    """The parameters that vary."""
+    group = result.dataset("posterior")
+    return tuple(
+        _stored_walk(result, str(name).removesuffix(PIECES))
+        for name, variable in group.data_vars.items()
+        if variable.dims[2:] == (f"{str(name).removesuffix(PIECES)}{PIECE}",)
+    )
+
+
+def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
+    variable = result.dataset("posterior")[name + PIECES]
+    about, time = variable.attrs, variable[name + PIECE]
+    shown, clock = about["display_units"], time.attrs["display_units"]
+    begins = np.asarray(time.values, dtype=float)
+    last = float(result.observed_data["time"].values[-1])
+    edges = np.append(begins, max(last, begins[-1] + 0.02 * (begins[-1] - begins[0])))
+
+    def quantiles(group: str) -> Array:
+        values = np.asarray(result.dataset(group)[name + PIECES].values[0], dtype=float)
+        values = values[result.alive] if group == "posterior" else values
+        values = values[np.isfinite(values).all(axis=1)]
+        found = np.quantile(values, LEVELS, axis=0) if len(values) else np.full((3, len(begins)), np.nan)
+        return convert(found, about["units"], shown)
+
+    label = str(result.posterior[name].attrs["long_name"])
+    shown_edges = convert(edges, time.attrs["units"], clock)
+    return StoredWalk(
+        name, label, about["symbol"], shown, clock, shown_edges, quantiles("posterior"), quantiles("prior")
+    )
+
+
+def piece_lines(result: StoredResult) -> list[tuple[object, ...]]:
+    """Lines of ``varying.csv``, the name of the data set first."""
+    return [(result.name, *cells) for walk in stored_walks(result) for cells in walk.cells]
+
+
+def verdict(result: StoredResult) -> str:
+    """What the evidence says of all that varies, in a sentence; "" where nothing does."""
+    stats = result.sample_stats.attrs
+    if "log_evidence_change" not in stats:
+        return ""
+    return change_words(str(stats["varying"]), float(stats["log_evidence_change"]))
+
+
+@styled
+def bands(result: StoredResult) -> Figure:
+    """Median and 5–95 % of each parameter that varies, over the prior's."""
+    walks = stored_walks(result)
+    figure = Figure(figsize=(COLUMN, len(walks) * 5.0 / 2.54), layout="constrained")
+    for ax, walk in zip(figure.subplots(len(walks), 1, squeeze=False).flat, walks, strict=True):
+        for quantiles, colour, alpha, words in (
+            (walk.prior, "prior", 0.3, "prior"),
+            (walk.posterior, "posterior", 0.35, "posterior"),
+        ):
+            low, median, high = np.column_stack([quantiles, quantiles[:, -1]])  # a step ends at its right edge
+            ax.fill_between(walk.edges, low, high, step="post", color=LIGHT[colour], alpha=alpha, lw=0, label=words)
+            if words == "posterior":
+                ax.step(walk.edges, median, where="post", color=LIGHT[colour], label="median")
+        least, most = float(np.nanmin(walk.posterior)), float(np.nanmax(walk.prior))
+        if least > 0 and math.isfinite(most) and most > 5 * least:
+            ax.set_yscale("log")
+        ax.set(xlabel=with_unit("time", walk.time_unit), ylabel=with_unit(walk.symbol, walk.unit))
+        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
+    return figure

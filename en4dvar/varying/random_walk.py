@@ -1,0 +1,114 @@
+"""A parameter that is constant between knots and changes there: a random walk from piece to piece.
+
+    x_0 ~ N(mean, std²),     x_k = x_{k−1} + c_k,     c_k ~ N(0, q²)
+
+in the transformed space of the parameter, whose prior is that of x_0. The changes c_k are parameters of the control
+vector like any other, independent of each other and of x_0, so that J, its minimisation, the ensemble and the evidence
+are what they are without; the values of the pieces are their sums.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from en4dvar.forward import ForwardModel
+from en4dvar.prior import PriorTerm
+from en4dvar.state import Array, Field, Parameter
+from en4dvar.units import convert
+
+SCALE = {"normal": "", "lognormal": "ln", "logit": "logit"}  # what a change is one of
+
+
+@dataclass(frozen=True)
+class RandomWalk:
+    """``first`` is the prior of the first piece, ``changes`` (m) are those of the changes at the ``knots`` (m,).
+
+    The knots are in the model's time, increasing and positive.
+    """
+
+    first: PriorTerm
+    knots: tuple[float, ...]
+    changes: tuple[PriorTerm, ...]
+
+    @classmethod
+    def of(cls, model: ForwardModel, first: PriorTerm, knots: Sequence[float], std: float) -> RandomWalk:
+        """With changes N(0, std²) in the transformed space of ``first``. Raises :class:`ConfigError`."""
+
+        def change(k: int, knot: float) -> PriorTerm:
+            return PriorTerm.normal(_change(model, first, k, knot), 0.0, std)
+
+        return cls(first, tuple(knots), tuple(change(k, knot) for k, knot in enumerate(knots, 1)))
+
+    @property
+    def parameter(self) -> Parameter:
+        """What varies."""
+        return self.first.parameter
+
+    @property
+    def name(self) -> str:
+        """Of the parameter."""
+        return self.parameter.name
+
+    @property
+    def pieces_name(self) -> str:
+        """Of the values of all pieces, in the state and in result files."""
+        return f"{self.name}_pieces"
+
+    @property
+    def label(self) -> str:
+        """What varies, in words."""
+        return self.parameter.label
+
+    @property
+    def own(self) -> Field:
+        """Where the state of a run keeps the values of the pieces."""
+        return Field(self.pieces_name, len(self.knots) + 1, self.parameter.unit)
+
+    def values(self, theta: Mapping[str, Array]) -> Array:
+        """:meth:`pieces`. Raises ValueError where one lies outside of the parameter's bounds."""
+        p, pieces = self.parameter, self.pieces(theta)
+        if not np.all((pieces >= p.bounds[0]) & (pieces <= p.bounds[1]) & np.isfinite(pieces)):
+            raise ValueError(f"a piece of {p.name} outside [{p.bounds[0]:g}, {p.bounds[1]:g}] {p.unit}")
+        return pieces
+
+    def pieces(self, theta: Mapping[str, Array]) -> Array:
+        """Physical values (…, m + 1) of the pieces, from those of the parameter and of its changes, (…,) by name.
+
+        NaN where the parameter is outside of the range of its transform.
+        """
+        term, value = self.first, np.asarray(theta[self.name], dtype=float)
+        low, high = (0.0, math.inf) if term.transform == "lognormal" else term.bounds
+        inside = (value > low) & (value < high)
+        centre = term.to_physical(np.array(term.mean))
+        first = np.where(inside, term.from_physical(np.where(inside, value, centre)), np.nan)
+        changes = [theta[term.parameter.name] for term in self.changes]
+        return self.first.to_physical(np.cumsum(np.stack([first, *changes], axis=-1), axis=-1))
+
+
+def clock(model: ForwardModel, knot: float) -> str:
+    """An instant of the model in words."""
+    unit = "" if model.time_display_unit == "1" else f" {model.time_display_unit}"
+    return f"{convert(knot, model.time_unit, model.time_display_unit):.6g}{unit}"
+
+
+def _change(model: ForwardModel, first: PriorTerm, k: int, knot: float) -> Parameter:
+    """The change at the k-th knot, counted from one."""
+    p, scale = first.parameter, SCALE[first.transform]
+    unit, shown = (p.unit, p.display_unit) if first.transform == "normal" else ("1", "1")
+    if len(p.symbol) > 2 and p.symbol[0] == p.symbol[-1] == "$":
+        function = rf"\mathrm{{{scale}}} " if scale else ""
+        symbol = rf"$\Delta_{{{k}}}({function}{p.symbol[1:-1]})$"
+    else:
+        symbol = f"Δ{k} {scale} {p.symbol}".replace("  ", " ")
+    return Parameter(
+        f"{p.name}_change_{k}",
+        unit,
+        label=f"change of {scale} {p.label} at {clock(model, knot)}".replace("  ", " "),
+        symbol=symbol,
+        display_unit=shown,
+        source="random walk of a parameter that varies in time",
+    )
