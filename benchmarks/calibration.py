@@ -2,6 +2,7 @@
 
     python benchmarks/calibration.py a                 30 % priors, En4D-Var alone; 20 of them against a Markov chain
     python benchmarks/calibration.py b                 wide priors, ``refine: mcmc``
+    python benchmarks/calibration.py laser             laser-induced bubbles with rebounds, default settings
     python benchmarks/calibration.py b --minutes 4     a piece of it: records are kept and the next call goes on
 
 Over ``--n`` experiments: rank histograms of every parameter uniform (chi-squared, p > 0.01), central 50 and 90 %
@@ -16,7 +17,8 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from acoustic_twin import NARROW, WIDE, make_twin, prior
+from acoustic_twin import NARROW, WIDE, Twin, make_twin, prior
+from laser_twin import laser_prior, make_laser_twin
 from records import Record, fill
 from scipy.stats import binomtest, chisquare
 
@@ -38,18 +40,23 @@ LEVEL = 0.01  # of every test
 
 def narrow(key: str) -> Record:
     """En4D-Var under 30 % priors and, for the first experiments, a chain."""
-    return experiment(int(key), NARROW, AssimilationSettings(), chain=int(key) < CHAINS)
+    settings = AssimilationSettings(refine="none")
+    return experiment(int(key), make_twin(int(key), prior(NARROW)), settings, chain=int(key) < CHAINS)
 
 
 def wide(key: str) -> Record:
     """Wide priors with refinement."""
-    return experiment(int(key), WIDE, AssimilationSettings(refine="mcmc"))
+    return experiment(int(key), make_twin(int(key), prior(WIDE)), AssimilationSettings(refine="mcmc"))
 
 
-def experiment(seed: int, widths: dict[str, float], settings: AssimilationSettings, chain: bool = False) -> Record:
+def laser(key: str) -> Record:
+    """As a user would run it."""
+    return experiment(int(key), make_laser_twin(int(key)), AssimilationSettings(what_if=False))
+
+
+def experiment(seed: int, twin: Twin, settings: AssimilationSettings, chain: bool = False) -> Record:
     """Ranks, moments (n,) of the posterior ensemble in transformed space, the truth, and what a chain says."""
-    of = prior(widths)
-    twin = make_twin(seed, of)
+    of = twin.problem.prior
     try:
         analysis = assimilate(twin.problem, settings, seed)
     except En4dvarError as error:  # counted: no run may fail
@@ -61,6 +68,7 @@ def experiment(seed: int, widths: dict[str, float], settings: AssimilationSettin
         "std": x.std(axis=0, ddof=1),
         "rank": np.sum(x < twin.truth, axis=0),
         "converged": analysis.converged,
+        "warned": [c.code for c in analysis.cautions],
         **analysis.refinement,
     }
     if chain:
@@ -72,6 +80,9 @@ def experiment(seed: int, widths: dict[str, float], settings: AssimilationSettin
             "chain_converged": sampled.converged,
         }
     return record
+
+
+CASES = {"a": (narrow, prior(NARROW)), "b": (wide, prior(WIDE)), "laser": (laser, laser_prior())}
 
 
 def verdict(passed: bool) -> str:
@@ -126,17 +137,17 @@ def chains(records: list[Record]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("case", choices=("a", "b"))
+    parser.add_argument("case", choices=tuple(CASES))
     parser.add_argument("--start", type=int, default=0, help="first experiment (its seed)")
     parser.add_argument("--n", type=int, default=500, help="number of experiments")
     parser.add_argument("--minutes", type=float, default=np.inf, help="start no experiment after so long")
     parser.add_argument("--records", type=Path, default=Path("runs/calibration"), help="folder of the records")
     options = parser.parse_args()
     keys = [str(seed) for seed in range(options.start, options.start + options.n)]
-    run, widths = (narrow, NARROW) if options.case == "a" else (wide, WIDE)
+    run, of = CASES[options.case]
     found = list(fill(options.records / f"{options.case}.jsonl", keys, run, options.minutes).values())
     print(f"case {options.case}: seeds {options.start} to {options.start + options.n - 1}, {len(found)} done")
-    table(found, prior(widths).names)
+    table(found, of.names)
     against_chain(found)
     chains(found)
 

@@ -32,7 +32,7 @@ from en4dvar.sampling.shape import guide
 
 OFF = (0.5, 0.3)  # mean by standard deviations of the chain, std by a fraction
 TARGET = 500.0  # effective sample size of a chain: its mean to 0.045, its std to 3 %
-SETTINGS = AssimilationSettings()
+SETTINGS = AssimilationSettings(refine="none")
 
 
 def wide(widen: float, few: int | None = None, **errors: float) -> Callable[[int], InverseProblem]:

@@ -31,6 +31,7 @@ from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.ensemble.members import Reading
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, ThreadsExecutor, one_blas_thread
 from en4dvar.files import write_bytes
+from en4dvar.prior import own_seed
 from en4dvar.runs.jobs import Job, estimate
 from en4dvar.runs.runner import run_campaign
 from en4dvar_bubble.model import BubbleModel
@@ -76,7 +77,7 @@ def make(folder: Path, n_sets: int) -> Path:
 
 def jobs(config: Config) -> list[Job]:
     return [
-        Job(build_one(config, name, file), config.assimilation, config.seed, {})
+        Job(build_one(config, name, file), config.assimilation, own_seed(config.seed, name), {})
         for name, file in data_files(inverse_plan(config)).items()
     ]
 

@@ -26,6 +26,7 @@ from en4dvar.executor import ThreadsExecutor
 from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.population import estimate_population
+from en4dvar.prior import own_seed
 from en4dvar.runs.synthetic import draw_campaign
 from en4dvar.sampling.forward_runs import ForwardRuns
 from en4dvar_agarose.measured import FOLDER, POPULATION_HEAD
@@ -51,7 +52,8 @@ def campaign(key: str, seed: int) -> list[list[object]]:
         observed = Observations(s.times, s.values, noise_of(only.noise * ones), ones, name=s.name)
         problems.append(replace(base, observations=observed))
     with ThreadsExecutor(THREADS) as executor:
-        analyses = [assimilate(p, config.assimilation, config.seed, executor) for p in problems]
+        seeds = [own_seed(config.seed, s.name) for s in sets]
+        analyses = [assimilate(p, config.assimilation, s, executor) for p, s in zip(problems, seeds, strict=True)]
         start = np.stack([base.prior.from_physical(a.posterior) for a in analyses])
         runs = ForwardRuns(problems, executor)
         found = estimate_population(runs, start, base.prior, POPULATION, seed, workers=THREADS)

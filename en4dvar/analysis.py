@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from en4dvar.caution import Caution
+from en4dvar.influence import Influence
 from en4dvar.observations import Observations
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.residuals import Residuals
@@ -82,6 +83,19 @@ class Discrepancy:
 
 
 @dataclass(frozen=True)
+class Mode:
+    """A minimum of J with some of the probability: ``centre`` (n,) physical, SI, J there, how many descents from
+    different members ended in it, by how much J of these differs, and its weight in the posterior.
+    """
+
+    centre: Array
+    cost: float
+    descents: int
+    spread: float
+    weight: float
+
+
+@dataclass(frozen=True)
 class Analysis:
     """The outcome for one data set: members in order, physical SI values, NaN where a member failed.
 
@@ -121,6 +135,8 @@ class Analysis:
     extremes: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) of the model's limits, by the posterior
     beyond: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, V) since when it exceeds them; +inf: never
     what_if: tuple[Shift, ...] = ()  # under the model's alternatives; the largest first
+    influence: Influence | None = None  # of each reading; None where it cannot be told
+    modes: tuple[Mode, ...] = ()  # minima of J that count, the lowest first; () of a scheme that does not search
     ledger: Ledger | None = None  # what the path went through where it informed the parameters
 
     @property

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from en4dvar import diagnostics as diag
-from en4dvar.analysis import Analysis, Discrepancy, Progress, Record
-from en4dvar.caution import Caution, caution
+from en4dvar.analysis import Analysis, Discrepancy, Mode, Progress, Record
+from en4dvar.caution import Caution
 from en4dvar.descent.loop import iterate
 from en4dvar.descent.marginal import marginal_members
+from en4dvar.descent.minima import Minimum, merged
 from en4dvar.descent.noise_scale import mean_beyond_mode
-from en4dvar.descent.start import StartState, choose_start
+from en4dvar.descent.start import AGREE, StartState, affordable, challenger, choose_start, search_on
 from en4dvar.descent.variance import shares_of_variance
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
@@ -21,6 +22,7 @@ from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, l
 from en4dvar.errors import ConfigError, TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.honesty import ControlEnsembles, examine
+from en4dvar.influence import Influence
 from en4dvar.noise import Predicted
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.residuals import Residuals
@@ -28,7 +30,8 @@ from en4dvar.response.ledger import ledger
 from en4dvar.response.linear import LinearResponse
 from en4dvar.response.what_if import what_if
 from en4dvar.sampling import mcmc
-from en4dvar.sampling.shape import examine_shape, guide
+from en4dvar.sampling.refine import Refined, in_doubt, mode_cautions, refined, samples, that_count
+from en4dvar.sampling.shape import CLEARED, examine_shape
 from en4dvar.schemes import window_scheme
 from en4dvar.schemes.base import Weights
 from en4dvar.schemes.en4dvar import En4DVar
@@ -37,6 +40,17 @@ from en4dvar.state import Array
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 
 GRID_POINTS = 200  # M, of the plotting grid
+SAME_COST = 0.01  # of J, by which a descent must end lower to be another one
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """An ensemble (N, n), transformed, about the ``mode`` (n,) of J, and what came of running both."""
+
+    members: Array
+    mode: Array
+    run: Forecast
+    central: Forecast
 
 
 @dataclass(frozen=True)
@@ -51,13 +65,15 @@ class Refinement:
 class LoopState:
     """All that the rest of an assimilation depends on, besides the problem, the settings and the seed.
 
-    ``comparison`` is there until the start is chosen, ``descent`` from then on, ``refinement`` once the iterations are
-    done and the Markov chain is under way.
+    ``comparison`` is there until the start is chosen; ``descent``, the other ``minima`` that descents ended in and from
+    how many members (``compared``) from then on, ``refinement`` once the Markov chain is under way.
     """
 
     forward_runs: int
     comparison: StartState | None = None
     descent: Descent | None = None
+    minima: tuple[Minimum, ...] = ()
+    compared: int = 1
     warnings: tuple[Caution, ...] = ()
     refinement: Refinement | None = None
 
@@ -132,23 +148,22 @@ class _Assimilation:
         problem, space, noise = self.problem, self.space, self.problem.observations.noise
         prior_run, start, descent = self.descend(resume)
 
-        transform = descent.newton.hessian.economical_transform if self.scheme.searches else descent.weights.T
-        ends = space.ensemble(descent.weights.w, transform)
-        posterior, mode = ends[:-1], ends[-1]
-        posterior = posterior + mean_beyond_mode(problem, mode, posterior, descent.records[-1].dfs)
-        if self.scheme.searches and problem.discrepancy and descent.iterate.linear is not None:
-            posterior = marginal_members(space, descent.iterate.linear, mode, posterior, self.seed)
-        posterior, refinement, refine_warnings = self.refine(posterior, start.refinement)
-        if self.scheme.searches or refinement:
-            ends = np.vstack([posterior, mode])
-            final = space.forecast(ends, self.grid)
-            after, last = final[:-1], final[-1:]
-        else:  # the last ensemble that was run is the posterior
-            after, last = descent.iterate.members, descent.iterate.central
+        descent, minima, gaussian = self.searched(start, descent, prior_run)
+        counting = that_count(minima, problem.prior)
+        posterior, mode, after, last = gaussian.members, gaussian.mode, gaussian.run, gaussian.central
+        sampled, shape = None, dict[str, float]()
+        if self.settings.refine != "mcmc":
+            shape = examine_shape(space, posterior, mode, self.costs(posterior, after), self.seed)
+        agree = start.compared < 2 or minima[0].descents >= AGREE
+        if self.settings.refine == "mcmc" or (samples(space) and minima and in_doubt(counting, agree, shape)):
+            sampled, shape = self.refine(posterior, counting, start.refinement), {}
+            posterior = sampled.members
+            after = space.forecast(posterior, self.grid)
+            if not self.scheme.searches:
+                last = space.forecast(mode[None], self.grid)
         space.require_members(after.failures, "posterior forecast")
-        costs = self.costs(ends[:-1], after)
-        centre_cost = float(self.costs(ends[-1:], last)[0])
-        shape = {} if refinement else examine_shape(space, posterior, mode, costs, self.seed)
+        costs = self.costs(posterior, after)
+        centre_cost = float(self.costs(mode[None], last)[0])
         log_evidence_constant, prior = self.log_evidence_constant(), problem.prior
         observations = problem.observations
         response, std = self.response(descent, mode, last), posterior.std(axis=0, ddof=1)
@@ -180,18 +195,23 @@ class _Assimilation:
             forward_runs=space.forward_runs,
             shape=shape,
             down_weights=observations.noise.down_weights(observations.values, last.predicted[0]),
-            refinement=refinement,
-            log_evidence=self.log_evidence(descent),
+            refinement=sampled.summary if sampled else {},
+            log_evidence=self.log_evidence(descent, sampled),
+            modes=self.modes(counting, sampled),
             log_evidence_constant=log_evidence_constant,
             extremes=after.extremes,
             beyond=after.beyond,
             residuals=self.residuals(descent),
             discrepancy=self.discrepancy(descent, last.predicted[0]),
+            influence=self.influence(after, posterior, response, gaussian=sampled is None),
             what_if=shifts,
             ledger=path,
         )
         control = ControlEnsembles(space.members, posterior, mode, costs, centre_cost)
-        found = (*start.warnings, *refine_warnings)
+        found = (*start.warnings, *(sampled.warnings if sampled else ()))
+        if counting:
+            weights = np.array([mode.weight for mode in analysis.modes])
+            found = (*found, *mode_cautions(prior, counting, weights, agree, sampled))
         return replace(analysis, cautions=examine(analysis, control, descent.worst_loss, found))
 
     def descend(self, resume: LoopState | None = None) -> tuple[Forecast, LoopState, Descent]:
@@ -204,9 +224,11 @@ class _Assimilation:
         start = self.start(prior_run, resume) if resume is None or resume.descent is None else resume
         return prior_run, start, self.iterate(start, prior_run)
 
-    def log_evidence(self, descent: Descent) -> float:
-        """ln p(y), by Laplace's approximation at the end of the iterations."""
+    def log_evidence(self, descent: Descent, sampled: Refined | None = None) -> float:
+        """ln p(y), by the draws where the posterior was sampled and they are enough, else by Laplace."""
         values, observations = descent.newton.hessian.singular_values, self.problem.observations
+        if sampled and np.isfinite(sampled.log_evidence):
+            return sampled.log_evidence - observations.log_normalisation()
         return diag.log_evidence(descent.iterate.cost, values, len(self.space.members), observations)
 
     def log_evidence_constant(self) -> float | None:
@@ -235,6 +257,23 @@ class _Assimilation:
         white, sensitivity = observations.whiten(linear)
         return Residuals.of(white, sensitivity, len(self.space.members) - 1, np.abs(rates), observations.used)
 
+    def influence(self, run: Forecast, members: Array, response: LinearResponse, gaussian: bool) -> Influence | None:
+        """Of each reading on the posterior ``members`` (N, n), whose ``run`` it is; None where it cannot be told.
+
+        ``gaussian``: they are draws of the Gaussian about the mode.
+        """
+        observations, prior = self.problem.observations, self.problem.prior
+        conditional = observations.log_conditional(run.predicted)
+        if conditional is None:
+            return None
+        alive = diag.active_members(run.failures) & np.isfinite(conditional).all(axis=1)
+        if alive.sum() < members.shape[1] + 2:
+            return None
+        if gaussian and observations.noise.independent and response.defined:
+            return Influence.by_tangent(prior, members[alive], response.tangent(members[alive]))
+        ratios = -observations.weights * conditional[alive]
+        return Influence.by_weights(prior.to_physical(members[alive]), ratios)
+
     def discrepancy(self, descent: Descent, central: Predicted) -> Discrepancy | None:
         """Of the model, where the observations allow for one."""
         observations, linear = self.problem.observations, descent.iterate.linear
@@ -255,10 +294,10 @@ class _Assimilation:
             self.keep(lambda: LoopState(space.forward_runs, comparison()))
 
         before = resume.comparison if resume else None
-        descent, warnings = choose_start(space, self.scheme, prior_run, self.seed, before, keep, self.tell)
-        for record in descent.records:
+        begun = choose_start(space, self.scheme, prior_run, self.seed, before, keep, self.tell)
+        for record in begun.descent.records:
             self.tell(record)
-        return LoopState(space.forward_runs, descent=descent, warnings=warnings)
+        return LoopState(space.forward_runs, None, begun.descent, begun.minima, begun.compared, begun.warnings)
 
     def iterate(self, state: LoopState, prior_run: Forecast) -> Descent:
         """The end of the iterations."""
@@ -268,7 +307,7 @@ class _Assimilation:
         descent = state.descent.kept
 
         def keep() -> None:
-            kept = LoopState(space.forward_runs, None, descent.kept, state.warnings, state.refinement)
+            kept = replace(state, forward_runs=space.forward_runs, descent=descent.kept)
             self.latest = kept
             self.keep(lambda: kept)
 
@@ -276,33 +315,96 @@ class _Assimilation:
         iterate(window, self.scheme, [descent])
         return descent
 
-    def refine(
-        self, posterior: Array, earlier: Refinement | None
-    ) -> tuple[Array, dict[str, float], tuple[Caution, ...]]:
-        """The posterior ensemble (N, n), the summary of the chain that replaced it, and warnings.
+    def gaussian(self, descent: Descent) -> Gaussian:
+        """The ensemble at the end of a descent, and its forecast."""
+        space, problem = self.space, self.problem
+        transform = descent.newton.hessian.economical_transform if self.scheme.searches else descent.weights.T
+        ends = space.ensemble(descent.weights.w, transform)
+        members, mode = ends[:-1], ends[-1]
+        members = members + mean_beyond_mode(problem, mode, members, descent.records[-1].dfs)
+        if not self.scheme.searches:  # the last ensemble that was run is the posterior
+            return Gaussian(members, mode, descent.iterate.members, descent.iterate.central)
+        if problem.discrepancy and descent.iterate.linear is not None:
+            members = marginal_members(space, descent.iterate.linear, mode, members, self.seed)
+        final = space.forecast(np.vstack([members, mode]), self.grid)
+        return Gaussian(members, mode, final[:-1], final[-1:])
 
-        ``earlier`` is where the chain was interrupted.
+    def minima(self, start: LoopState, end: Descent) -> tuple[Minimum, ...]:
+        """Those that descents ended in, the lowest first; none of a scheme that does not search."""
+        return merged([self.minimum(end), *start.minima]) if self.scheme.searches else ()
+
+    def minimum(self, end: Descent) -> Minimum:
+        """Where a descent has converged."""
+        return Minimum.at(self.space, end.weights.w, end.newton.hessian, end.cost, end.joined)
+
+    def searched(
+        self, start: LoopState, descent: Descent, prior_run: Forecast
+    ) -> tuple[Descent, tuple[Minimum, ...], Gaussian]:
+        """The lowest descent, all minima, and the ensemble about the lowest.
+
+        Of a cheap model, or for a chain, a descent from a member far from the minimum looks for another; where there is
+        one, or where J of the posterior members is not that of a Gaussian, further members are tried.
         """
-        if self.settings.refine == "none":
-            return posterior, {}, ()
+        space, minima, scheme = self.space, self.minima(start, descent), self.scheme
+        further = self.settings.refine == "mcmc" or samples(space)
+        if not isinstance(scheme, En4DVar) or start.compared < 2 or not further:
+            return descent, minima, self.gaussian(descent)
+        far = challenger(space, prior_run, minima[0])
+        lowest, minima = self.search_on(scheme, descent, minima, [far])
+        found = self.gaussian(lowest)
+        fit = diag.gaussianity(found.members, found.mode, self.costs(found.members, found.run))["gaussian_fit"]
+        rest = [i for i in affordable(space, scheme, prior_run)[start.compared :] if i != far]
+        if rest and (len(minima) > 1 or not fit >= CLEARED):
+            lower, minima = self.search_on(scheme, lowest, minima, rest)
+            found = found if lower is lowest else self.gaussian(lower)
+            lowest = lower
+        return lowest, minima, found
+
+    def search_on(
+        self, scheme: En4DVar, descent: Descent, minima: tuple[Minimum, ...], members: Sequence[int]
+    ) -> tuple[Descent, tuple[Minimum, ...]]:
+        """The lowest descent, converged, and all minima, with descents from further members."""
+        other, found = search_on(self.space, scheme, members, self.seed, minima, self.tell)
+        minima = merged([*minima, *found])
+        if descent.cost <= other.cost:
+            return descent, minima
+        try:
+            iterate(DataWindow(self.space, self.seed, lambda: None, self.tell), scheme, [other])
+        except TooFewMembersError:  # the model does not run about it
+            return descent, minima
+        if other.cost > descent.cost - SAME_COST:
+            return descent, minima
+        return other, merged([self.minimum(other), *minima])
+
+    def modes(self, minima: Sequence[Minimum], sampled: Refined | None) -> tuple[Mode, ...]:
+        """The minima that count, with their weights; by Laplace where the posterior was not sampled."""
+        prior = self.problem.prior
+        logs = np.array([m.log_evidence(prior) - minima[0].log_evidence(prior) for m in minima[1:]])
+        relative = np.append(1.0, np.exp(logs))[: len(minima)]
+        weights = sampled.weights if sampled and minima else relative / relative.sum()
+        return tuple(
+            Mode(prior.to_physical(m.x), m.cost, m.descents, m.spread, float(weight))
+            for m, weight in zip(minima, weights, strict=True)
+        )
+
+    def refine(self, posterior: Array, minima: Sequence[Minimum], earlier: Refinement | None) -> Refined:
+        """What takes the place of the posterior ensemble (N, n). ``earlier``: where a chain was interrupted."""
         space = self.space
 
-        def log_density(x: Array) -> Array:
-            space.forward_runs += len(x)
-            return log_posterior(self.problem, x, space.executor)
+        def cost(x: Array) -> Array:
+            return self.costs(x, space.forecast(x))
 
-        def keep(chain: mcmc.ChainState) -> None:
-            self.keep(lambda: replace(self.latest, refinement=Refinement(chain, space.forward_runs)))
+        def keep(state: mcmc.ChainState) -> None:
+            self.keep(lambda: replace(self.latest, refinement=Refinement(state, space.forward_runs)))
 
-        emulated = guide(space, posterior, self.seed)  # made again after an interruption, from the same runs
-        if earlier is not None:
+        def resume() -> mcmc.ChainState | None:
+            """What came before the chain is made again after an interruption, from the same runs."""
+            if earlier is None:
+                return None
             space.forward_runs = earlier.forward_runs
-        resume = earlier.chain if earlier else None
-        chain = mcmc.sample(
-            log_density, posterior, self.seed, resume=resume, keep=keep, look=self.tell, emulated=emulated
-        )
-        warnings = () if chain.converged else (caution("chain-not-converged", chain.warning()),)
-        return chain.thin(len(posterior), self.settings.sampling == "exact"), chain.summary(), warnings
+            return earlier.chain
+
+        return refined(space, cost, posterior, minima, self.seed, resume=resume, keep=keep, look=self.tell)
 
     def response(self, descent: Descent, mode: Array, central: Forecast) -> LinearResponse:
         """How the mode (n,), whose run is ``central``, follows what it was inferred from."""
@@ -315,7 +417,7 @@ class _Assimilation:
     def costs(self, members: Array, run: Forecast) -> Array:
         """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""
         z = (members - self.problem.prior.mean) / self.problem.prior.std
-        return np.asarray(0.5 * np.sum(z**2, axis=1) + self.space.observation_cost(run))
+        return np.where(run.active, 0.5 * np.sum(z**2, axis=1) + self.space.observation_cost(run), np.inf)
 
     def keep(self, state: Callable[[], LoopState]) -> None:
         if self._keep is not None:

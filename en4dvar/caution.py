@@ -3,66 +3,78 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 Severity = Literal["serious", "caution", "note"]
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)  # the worst first
 
-# code → (severity, what to do). Codes are part of the result's format: they may be added, never renamed.
+# code → (severity, what to do), those of a severity by what they do to the numbers, the worst first. Codes are part of
+# the result's format: they may be added, never renamed.
 CATALOGUE: dict[str, tuple[Severity, str]] = {
     "not-converged": ("serious", "raise assimilation.max_iterations, or narrow the priors and start again"),
     "chain-not-converged": ("serious", "run again with more data or narrower priors; do not quote these intervals"),
-    "ensemble-collapse": (
-        "serious",
-        "do not quote the intervals; use more members, scheme: en4dvar, or inflation in a sequential scheme",
-    ),
-    "rank-deficient": ("serious", "give more members than parameters (assimilation.members), or sampling: exact"),
-    "misfit": ("serious", "look at the residuals: model, window or stated observation error must change"),
-    "residual-structure": (
-        "serious",
-        "let the data tell what the model misses (data.error.discrepancy: estimated), choose another model, or a "
-        "shorter window; a larger error or sigma would hide it and leave the estimates where they are",
-    ),
     "prior-conflict": ("serious", "check units and data; if both are right, widen the prior and say so"),
     "implausible-data": (
         "serious",
         "check units, pixel size and frame rate: a fit can look perfect and tell a wrong value; if they are right, "
         "say what you know in the prior",
     ),
+    "misfit": ("serious", "look at the residuals: model, window or stated observation error must change"),
+    "residual-structure": (
+        "serious",
+        "let the data tell what the model misses (data.error.discrepancy: estimated), choose another model, or a "
+        "shorter window; a larger error or sigma would hide it and leave the estimates where they are",
+    ),
     "model-validity": (
         "serious",
         "end the window before the model leaves its validity, or choose a model that is valid there",
+    ),
+    "ensemble-collapse": (
+        "serious",
+        "do not quote the intervals; use more members, scheme: en4dvar, or inflation in a sequential scheme",
+    ),
+    "rank-deficient": ("serious", "give more members than parameters (assimilation.members), or sampling: exact"),
+    "non-gaussian": ("caution", "set assimilation.refine: mcmc, which samples the posterior as it is"),
+    "several-modes": (
+        "caution",
+        "look at the members, not at mean ± std; data or prior knowledge that tell the modes apart are worth most",
+    ),
+    "starts-disagree": (
+        "caution",
+        "raise assimilation.starts, or narrow the priors: a lower minimum may not have been found",
     ),
     "members-lost": (
         "caution",
         "the posterior holds only where the model runs: narrow the prior there, or find out why the model fails",
     ),
     "at-bound": ("caution", "widen the bound if physics allows it; else quote a limit, not mean ± std"),
-    "non-gaussian": ("caution", "set assimilation.refine: mcmc, which samples the posterior as it is"),
-    "overstated-error": ("caution", "state the observation error as it is (or estimate sigma); intervals are too wide"),
     "odd-residuals": (
         "caution",
         "look at the figure of the residuals and at these readings before quoting the intervals",
     ),
-    "start-moved": ("note", "no action is needed where the iterations converged"),
-    "down-weighted": ("note", "look at these observations; they count less than the others"),
+    "overstated-error": ("caution", "state the observation error as it is (or estimate sigma); intervals are too wide"),
     "not-informed": ("note", "do not quote it as measured: fix it, or add data that depend on it"),
+    "down-weighted": ("note", "look at these observations; they count less than the others"),
+    "start-moved": ("note", "no action is needed where the iterations converged"),
 }
-_LINE = re.compile(r"(serious|caution|note) \[([a-z-]+)\] (.*?)(?: — ([^—]*))?")
+SPOILS = {"non-gaussian", "at-bound"}  # mean ± std, though they are not serious; what is serious does in any case
+_LINE = re.compile(r"(serious|caution|note) \[([a-z-]+)(?:: ([\w ]+))?\] (.*?)(?: — ([^—]*))?")
 
 
 @dataclass(frozen=True)
 class Caution:
     """One warning. ``severity``: *serious* (do not trust the posterior before this is settled), *caution* (read it
-    with care), *note* (worth knowing). ``words`` say what was found, ``advice`` what to do.
+    with care), *note* (worth knowing). ``words`` say what was found, ``advice`` what to do. ``parameters`` are the
+    names of those it is about, () for all of them.
     """
 
     code: str
     severity: str
     words: str
     advice: str
+    parameters: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.words}; {self.advice} [{self.code}]" if self.advice else f"{self.words} [{self.code}]"
@@ -75,8 +87,8 @@ class Caution:
     @property
     def line(self) -> str:
         """One line of text that :meth:`parse` reads, the form kept in netCDF."""
-        words = " ".join(self.words.split())
-        return f"{self.severity} [{self.code}] {words} — {self.advice}"
+        about = f": {' '.join(self.parameters)}" if self.parameters else ""
+        return f"{self.severity} [{self.code}{about}] {' '.join(self.words.split())} — {self.advice}"
 
     @classmethod
     def parse(cls, line: str) -> Caution:
@@ -84,10 +96,22 @@ class Caution:
         match = _LINE.fullmatch(line)
         if match is None:
             return cls("other", "caution", line, "")
-        return cls(match[2], match[1], match[3], match[4] or "")
+        return cls(match[2], match[1], match[4], match[5] or "", tuple((match[3] or "").split()))
+
+    @property
+    def spoils(self) -> bool:
+        """Whether mean ± std of what it is about are not to be quoted."""
+        return self.severity == "serious" or (self.severity == "caution" and self.code in SPOILS)
+
+    @property
+    def rank(self) -> int:
+        """Place among all warnings by what they do to the numbers; the worst has the lowest."""
+        known, severities = list(CATALOGUE), list(SEVERITIES)
+        severity = severities.index(self.severity) if self.severity in severities else len(severities)
+        return severity * (len(known) + 1) + (known.index(self.code) if self.code in known else len(known))
 
 
-def caution(code: str, words: str, severity: Severity | None = None) -> Caution:
+def caution(code: str, words: str, severity: Severity | None = None, parameters: tuple[str, ...] = ()) -> Caution:
     """A warning of the catalogue; ``severity`` replaces the catalogue's where the finding is graver or milder.
 
     Raises
@@ -95,15 +119,29 @@ def caution(code: str, words: str, severity: Severity | None = None) -> Caution:
     KeyError: the code is not in :data:`CATALOGUE`.
     """
     usual, advice = CATALOGUE[code]
-    return Caution(code, severity or usual, words, advice)
+    return Caution(code, severity or usual, words, advice, parameters)
 
 
-def worst_first(cautions: tuple[Caution, ...]) -> tuple[Caution, ...]:
-    """Sorted by severity, otherwise in the order given."""
-    order: dict[str, int] = {severity: i for i, severity in enumerate(SEVERITIES)}
-    return tuple(sorted(cautions, key=lambda c: order.get(c.severity, len(order))))
+def worst_first(cautions: Iterable[Caution]) -> tuple[Caution, ...]:
+    """By :attr:`Caution.rank`, otherwise in the order given: the order of every output."""
+    return tuple(sorted(cautions, key=lambda c: c.rank))
+
+
+def gravity(cautions: Sequence[Caution]) -> float:
+    """Sorts data sets by their warnings: 0 without any; the worst of them counts most, then how many there are."""
+    lowest = len(SEVERITIES) * (len(CATALOGUE) + 1) + 1
+    return lowest - min(c.rank for c in cautions) + min(0.99, 0.01 * len(cautions)) if cautions else 0.0
 
 
 def codes(cautions: Iterable[Caution]) -> tuple[str, ...]:
     """The codes, each once."""
     return tuple(dict.fromkeys(c.code for c in cautions))
+
+
+def untrusted(cautions: Iterable[Caution], parameter: str) -> tuple[str, ...]:
+    """Codes of the warnings for which no interval of a parameter is to be quoted, the worst first; () where one is.
+
+    The one place that decides it: page, tables, CSV and LaTeX follow.
+    """
+    of_it = (c for c in worst_first(cautions) if c.spoils and (not c.parameters or parameter in c.parameters))
+    return codes(of_it)

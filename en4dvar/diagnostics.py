@@ -128,11 +128,7 @@ def shape_warnings(shape: Mapping[str, float]) -> tuple[str, ...]:
     if not is_non_gaussian(shape):
         return ()
     if shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH:
-        return (
-            "the posterior is far from Gaussian: the ensemble's mean is off by about "
-            f"{shape['mean_shift']:.1f} posterior standard deviations and its spread by a factor of about "
-            f"{shape['spread_ratio']:.2g} in the parameter where they are worst",
-        )
+        return ("the posterior is far from Gaussian: mean and spread of the ensemble are not the posterior's",)
     return (
         f"the posterior is far from Gaussian (effective share of members {shape['gaussian_fit']:.2f}): mean and spread "
         "of the ensemble may be off by more than they say",

@@ -215,6 +215,14 @@ class ForwardModel(ABC):
     path_quantities: tuple[PathQuantity, ...] = ()
     path_parameters: tuple[str, ...] = ()
 
+    @property
+    def cheap(self) -> bool:
+        """Whether ten thousand runs take seconds, so that a doubt about a posterior is settled by sampling it.
+
+        True of compiled models unless they say otherwise.
+        """
+        return self.compiled
+
     @abstractmethod
     def initial_state(self, theta: Mapping[str, float]) -> Array:
         """State vector (n_state,) at time zero for the physical parameters ``theta``, parameters appended."""

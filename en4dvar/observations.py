@@ -92,6 +92,10 @@ class Observations:
         """Normalised log density of each observation (…, K) in its own unit, unweighted."""
         return self.noise.log_likelihood(self.values, predicted)
 
+    def log_conditional(self, predicted: Predicted) -> Array | None:
+        """Log density of each observation given all others (…, K), unweighted; None where the errors have none."""
+        return self.noise.log_conditional(self.values, predicted)
+
     def log_normalisation(self) -> float:
         """What −Σ β_k ln p(y_k) exceeds J_o by."""
         return self.noise.log_normalisation(self.weights)

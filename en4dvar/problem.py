@@ -138,9 +138,9 @@ class AssimilationSettings:
         float, Gt(0), Le(1), "Fewer surviving members than this share of the ensemble end the run (exit code 3)."
     ] = 0.5
     refine: Annotated[
-        Literal["none", "mcmc"],
-        "mcmc: replace the posterior ensemble by draws of a Markov chain (extra 'mcmc').",
-    ] = "none"
+        Literal["auto", "none", "mcmc"],
+        "auto: sample the posterior where the ensemble leaves a doubt (cheap models); mcmc: by a Markov chain, always.",
+    ] = "auto"
     emulator: Annotated[
         Literal["auto", "on", "off"],
         "A few hundred more runs to tell how Gaussian the posterior is: auto (compiled models), on, or off.",

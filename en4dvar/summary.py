@@ -2,26 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
 
 from en4dvar.analysis import Analysis
-from en4dvar.caution import Caution, codes
-from en4dvar.diagnostics import active_members, change_words
+from en4dvar.caution import Caution, codes, untrusted
+from en4dvar.diagnostics import HARDLY_INFORMED, active_members, change_words
 from en4dvar.response.what_if import Shift
 from en4dvar.state import Array, Parameter
 from en4dvar.tables import csv_text, table
 from en4dvar.units import convert
 
 MOST_REMARKS = 3
+INTERVAL = ("std", "q05", "q50", "q95", "dfs")  # what is not printed where it is not to be trusted
+LITTLE = "data say little"
+DFS_WORDS = (
+    (HARDLY_INFORMED, "not narrowed by the data"),
+    (0.5, "weakly informed"),
+    (0.9, "informed"),
+    (math.inf, "determined by the data"),
+)
 
 
 @dataclass(frozen=True)
 class ParameterSummary:
-    """One row of the summary table; all values in ``unit``, the display unit."""
+    """One row of the summary table; all values in ``unit``, the display unit.
+
+    ``informed`` says what the data told of it; ``untrusted`` are the codes of the warnings for which its interval is
+    not to be quoted (:func:`en4dvar.caution.untrusted`), worst first.
+    """
 
     name: str
     label: str
@@ -36,17 +49,34 @@ class ParameterSummary:
     q95: float
     centre: float
     dfs: float
+    informed: str = ""
+    untrusted: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, p: Parameter, prior: Array, posterior: Array, centre: float, dfs: float) -> ParameterSummary:
-        """Of members (N',) that are alive, in the display unit; the centre is SI."""
+    def of(
+        cls, p: Parameter, prior: Array, posterior: Array, centre: float, dfs: float, cautions: Sequence[Caution]
+    ) -> ParameterSummary:
+        """Of members (N',) that are alive, in the display unit; the centre is SI. ``cautions`` are those of the run."""
         prior_mean, prior_std = _moments(prior)
         mean, std = _moments(posterior)
         q05, q50, q95 = map(float, np.quantile(posterior, (0.05, 0.5, 0.95)) if posterior.size else (np.nan,) * 3)
         centre = convert(centre, p.unit, p.display_unit)
-        return cls(
-            p.name, p.label, p.symbol, p.display_unit, prior_mean, prior_std, mean, std, q05, q50, q95, centre, dfs
-        )
+        words, doubted = informed_words(p.name, dfs, cautions), untrusted(cautions, p.name)
+        numbers = (prior_mean, prior_std, mean, std, q05, q50, q95, centre, dfs)
+        return cls(p.name, p.label, p.symbol, p.display_unit, *numbers, words, doubted)
+
+
+def informed_words(name: str, dfs: float, cautions: Sequence[Caution]) -> str:
+    """What the data told of a parameter: by its DFS share, and by what was found of it; "" where it cannot be said.
+
+    That the data say little is for the check of the posterior to find: a variance as large as the prior's does not
+    mean it, where the posterior has moved or is not the one reported.
+    """
+    if dfs != dfs or untrusted(cautions, name):
+        return ""
+    if any(c.code == "not-informed" and name in c.parameters for c in cautions):
+        return LITTLE
+    return next(words for limit, words in DFS_WORDS if dfs < limit or limit == math.inf)
 
 
 def living(values: Array, alive: npt.NDArray[np.bool_] | bool, p: Parameter) -> Array:
@@ -64,6 +94,7 @@ def summarise(a: Analysis) -> tuple[ParameterSummary, ...]:
             living(a.posterior[:, j], alive, p),
             float(a.centre[j]),
             float(a.dfs_per_parameter[j]),
+            a.cautions,
         )
         for j, p in enumerate(a.parameters)
     )
@@ -97,14 +128,24 @@ def _moved(parameters: Iterable[Parameter], shift: Shift) -> str:
 
 
 def results_table(summaries: Mapping[str, Iterable[ParameterSummary]]) -> str:
-    """Posterior mean, std and 5/50/95 % of every parameter (data set → its rows)."""
-    header = ("data set", "parameter", "unit", "mean", "std", "5 %", "50 %", "95 %")
+    """Posterior mean, std and 5/50/95 % of every parameter (data set → its rows).
+
+    Where these are not to be trusted the last column says why.
+    """
+    every = [(name, row) for name, summary in summaries.items() for row in summary]
+    doubted = any(row.untrusted for _, row in every)
+    header = ("data set", "parameter", "unit", "mean", "std", "5 %", "50 %", "95 %", *["not to be trusted"] * doubted)
     rows = [
-        (name, row.name, row.unit, *(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q50, row.q95)))
-        for name, summary in summaries.items()
-        for row in summary
+        (name, row.name, row.unit, *estimate_cells(row), *[", ".join(row.untrusted)] * doubted) for name, row in every
     ]
     return table([header, *rows])
+
+
+def estimate_cells(row: ParameterSummary) -> tuple[str, ...]:
+    """Mean, std, 5, 50 and 95 % for a terminal; a mean of three digits alone where no interval is to be trusted."""
+    if row.untrusted:
+        return (f"{row.mean:.3g}", "-", "-", "-", "-")
+    return tuple(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q50, row.q95))
 
 
 def summary_csv(
@@ -113,15 +154,25 @@ def summary_csv(
     """One line a data set and parameter, every digit kept; one line a data set that failed.
 
     ``summaries``: (name of the data set, its rows, its warnings: column ``warnings`` holds their codes);
-    ``failures``: name of the data set → reason, column ``failure``.
+    ``failures``: name of the data set → reason, column ``failure``. An interval that is not to be trusted is left out,
+    and column ``untrusted`` says for which warnings.
     """
-    columns = [f.name for f in fields(ParameterSummary) if f.name not in ("label", "symbol")]
-    lines: list[list[object]] = [["dataset", *columns, "failure", "warnings"]]
+    lines: list[list[object]] = [["dataset", *CSV_COLUMNS, "failure", "warnings"]]
     for name, summary, cautions in summaries:
         warned = " ".join(codes(cautions))
-        lines += [[name, *(getattr(row, column) for column in columns), "", warned] for row in summary]
-    lines += [[name, *("" for _ in columns), reason, ""] for name, reason in failures.items()]
+        lines += [[name, *csv_cells(row), "", warned] for row in summary]
+    lines += [[name, *("" for _ in CSV_COLUMNS), reason, ""] for name, reason in failures.items()]
     return csv_text(lines)
+
+
+CSV_COLUMNS = tuple(f.name for f in fields(ParameterSummary) if f.name not in ("label", "symbol"))
+
+
+def csv_cells(row: ParameterSummary) -> list[object]:
+    """The row in the order of :data:`CSV_COLUMNS`."""
+    hidden = INTERVAL if row.untrusted else ()
+    cells = {name: "" if name in hidden else getattr(row, name) for name in CSV_COLUMNS}
+    return list((cells | {"untrusted": " ".join(row.untrusted)}).values())
 
 
 def _moments(values: Array) -> tuple[float, float]:

@@ -14,11 +14,11 @@ def assert_same_bits(a: Any, b: Any) -> None:
             assert np.array_equal(left, right, equal_nan=True), field.name
         elif is_dataclass(left) and field.name == "ledger":
             assert_same_bits(left, right)
-        elif field.name in ("iterations", "what_if"):
+        elif field.name in ("iterations", "what_if", "modes"):
             assert len(left) == len(right)
             for x, y in zip(left, right, strict=True):
                 assert_same_bits(x, y)
-        elif is_dataclass(left) and field.name in ("residuals", "discrepancy"):
+        elif is_dataclass(left) and field.name in ("residuals", "discrepancy", "influence"):
             assert_same_bits(left, right)
         elif field.name not in ("problem", "observations", "observable"):
             assert left == right, field.name

@@ -215,6 +215,8 @@ def warnings_page() -> str:
         "# Warnings",
         "Generated. A result says what should keep you from trusting it: in the report, in `run.log`, "
         "on the terminal and in `posterior.nc` (`warnings`, `warning_codes`), each with a code that does not change. "
+        "They stand in the order of what they do to the numbers, the worst first. No interval is printed of the "
+        "parameters that a serious one, `non-gaussian` or `at-bound` is about. "
         "What is behind them: [What a posterior means](trusting_a_posterior.md#when-not-to-trust-it).",
     ]
     for severity in SEVERITIES:

@@ -92,7 +92,7 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
     for notice in campaign.notices:
         click.echo(f"warning: {notice}", err=True)
     found = [(o.name, warning) for o in campaign.outcomes for warning in o.warnings]
-    told = sorted(found, key=lambda of_set: of_set[1].kind == "note")  # notes are the first to be left out
+    told = sorted(found, key=lambda of_set: of_set[1].rank)  # the worst first; the mildest are left out
     for name, warning in told[:MOST_TOLD]:
         click.echo(f"{warning.kind}: {name}: {warning}", err=True)
     if len(told) > MOST_TOLD:

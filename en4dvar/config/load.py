@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
@@ -19,7 +18,7 @@ from en4dvar.config.initial_state import PERTURBED, Perturbed
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, entries
 from en4dvar.config.schema import Assimilation, Execution, File, Output, QuantityText, Section
-from en4dvar.config.validate import Faults, check
+from en4dvar.config.validate import check
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel, Observable
@@ -81,13 +80,6 @@ class Estimation(File):
     """Where results go."""
     simulate: Simulate | None = None
     """Settings of ``en4dvar simulate``."""
-
-    @classmethod
-    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        section = given.get("assimilation")
-        if isinstance(section, dict) and section.get("refine") == "mcmc" and find_spec("emcee") is None:
-            message = "mcmc needs emcee; install the extra: pip install 'en4dvar[mcmc]'"
-            faults.add(("assimilation", "refine"), message)
 
 
 @dataclass(frozen=True)

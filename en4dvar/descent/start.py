@@ -1,9 +1,9 @@
 """Where the iterations start: the prior forecast ranks its members, and a few descents tell which basin is lowest.
 
 J of a strongly nonlinear model has several minima. The descents go side by side, so each costs r + 5 or so runs an
-iteration, and stop as soon as they tell: converged roughly, or close to another one. The lowest is not descended again:
-its iterations are the first of the assimilation. Where even that J is higher than noise and prior explain, other
-members are tried, as many again and again while there are some left.
+iteration, and stop as soon as they tell: converged roughly, or close to another one. The lowest is not descended
+again: its iterations are the first of the assimilation. Where no other descent ended where the lowest did, or even that
+J is higher than noise and prior explain, other members are tried, as many again while there are some left.
 """
 
 from __future__ import annotations
@@ -17,27 +17,40 @@ from en4dvar import diagnostics as diag
 from en4dvar.analysis import Record, StartRecord
 from en4dvar.caution import Caution, caution
 from en4dvar.descent.loop import iterate
+from en4dvar.descent.minima import REACHED, Minimum, merged
 from en4dvar.descent.step_control import Move
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.ensemble.forecast import Forecast
-from en4dvar.schemes.base import Scheme
+from en4dvar.schemes.base import GaussNewtonStep, Scheme
 from en4dvar.schemes.en4dvar import En4DVar
 
 ROUGH = 1e-2  # relative decrease of J at which a descent stops that only has to tell basins apart
 SAME = 1.0  # posterior standard deviations between descents that have met
+AGREE = 2  # descents from different members that must have ended in the lowest minimum
 
 
 @dataclass(frozen=True)
 class StartState:
     """All that the rest of a comparison depends on: the descents of this round, the rank by J of the member where the
-    first of them started, the rounds of moves so far, and the lowest of the descents before.
+    first of them started, the rounds of moves so far, the lowest of the descents before, and where descents ended.
     """
 
     descents: tuple[Descent, ...] = ()
     first: int = 0
     rounds: int = 0
     lowest: Descent | None = None
+    minima: tuple[Minimum, ...] = ()
+
+
+@dataclass(frozen=True)
+class Start:
+    """The descent to go on with, the other minima that descents ended in, from how many members, and warnings."""
+
+    descent: Descent
+    minima: tuple[Minimum, ...] = ()
+    compared: int = 1
+    warnings: tuple[Caution, ...] = ()
 
 
 Keep = Callable[[Callable[[], StartState]], None]
@@ -46,44 +59,73 @@ Keep = Callable[[Callable[[], StartState]], None]
 def choose_start(
     space: WeightSpace, scheme: En4DVar, run: Forecast, seed: int, resume: StartState | None, keep: Keep,
     tell: Callable[[Record], None],
-) -> tuple[Descent, tuple[Caution, ...]]:  # fmt: skip
-    """The descent to go on with, and warnings. ``run``: forecast of the prior members and, last, of their mean.
+) -> Start:  # fmt: skip
+    """``run``: forecast of the prior members and, last, of their mean.
 
     ``start: best-member`` compares descents from the ``starts`` members of lowest J, where a linearisation takes so
     few runs that all of them cost no more than one bundle of N members; else it takes the member of lowest J.
     ``resume``: where the comparison was interrupted. ``keep`` is called before each round of moves with the state to
     resume from, ``tell`` after it.
     """
-    n_members, drawn = len(space.members), space.drawn
-
-    def descent_from(member: int) -> Descent:
-        return Descent(space.start(drawn.at_member(member)))
-
-    costs = drawn.background_costs + space.observation_cost(run)
     warnings: tuple[Caution, ...] = ()
     if space.settings.start == "prior-mean":
-        if np.isfinite(costs[-1]):
-            return descent_from(n_members), ()
+        if np.isfinite(space.observation_cost(run)[-1]):
+            return Start(_descent_from(space, len(space.members)))
         words = f"the prior mean cannot be run ({run.failures[-1]}); started from the best prior member"
         warnings = (caution("start-moved", words),)
-    best = np.argsort(costs, kind="stable")
-    affordable = n_members // (space.basis.shape[1] + 1) if scheme.economical(space.basis) else 1
-    starts = [i for i in best[:affordable].tolist() if np.isfinite(costs[i])]
+    starts = affordable(space, scheme, run)
     together = min(space.settings.starts, len(starts))
+    first = _descent_from(space, starts[0])
     if together < 2:
-        return descent_from(int(best[0])), warnings
-    comparison = resume or StartState(lowest=descent_from(starts[0]))
-    window = Rounds(space, seed, comparison, keep, tell)
+        return Start(first, warnings=warnings)
+    window = Rounds(space, seed, resume or StartState(lowest=first), keep, tell)
     while window.rank < len(starts):
         if not window.descents:
-            window.descents = [descent_from(i) for i in starts[window.rank : window.rank + together]]
+            window.begin_round([_descent_from(space, i) for i in starts[window.rank : window.rank + together]])
         iterate(window, scheme, window.descents)
-        window.lowest = min(window.lowest, *window.descents, key=lambda descent: descent.cost)
-        if window.lowest.cost <= window.plausible:
+        window.rank += together
+        if window.end_round():
             break
-        window.rank, window.descents = window.rank + together, []
+        window.descents = []
     window.lowest.ended = False  # it goes on, as the first iterations of the assimilation
-    return window.lowest, warnings
+    return Start(window.lowest, window.others(), min(window.rank, len(starts)), warnings)
+
+
+def search_on(
+    space: WeightSpace, scheme: En4DVar, members: Sequence[int], seed: int, known: tuple[Minimum, ...],
+    tell: Callable[[Record], None],
+) -> tuple[Descent, tuple[Minimum, ...]]:  # fmt: skip
+    """The lowest of the descents from further members, and where they ended: at the latest where they reach a known
+    minimum. Nothing is kept of it.
+    """
+    window = Rounds(space, seed, StartState(), lambda state: None, tell, known)
+    window.begin_round([_descent_from(space, i) for i in members])
+    iterate(window, scheme, window.descents)
+    window.end_round()
+    lowest = window.lowest
+    if lowest.joined and isinstance(lowest.step, GaussNewtonStep):
+        window.end_here(lowest)
+    lowest.ended = False
+    return lowest, tuple(window.minima)
+
+
+def challenger(space: WeightSpace, run: Forecast, minimum: Minimum) -> int:
+    """The member farthest from a minimum, in standard deviations of the Gaussian about it, of the half of lower J."""
+    costs = (space.drawn.background_costs + space.observation_cost(run))[:-1]
+    better = np.argsort(costs, kind="stable")[: max(1, int(np.isfinite(costs).sum()) // 2)]
+    return int(max(better, key=lambda i: minimum.distance(space.members[i])))
+
+
+def _descent_from(space: WeightSpace, member: int) -> Descent:
+    return Descent(space.start(space.drawn.at_member(member)))
+
+
+def affordable(space: WeightSpace, scheme: En4DVar, run: Forecast) -> list[int]:
+    """Members of lowest J, so many that a linearisation for each costs no more than one bundle of N; at least one."""
+    costs = space.drawn.background_costs + space.observation_cost(run)
+    best = np.argsort(costs, kind="stable").tolist()
+    count = len(space.members) // (space.basis.shape[1] + 1) if scheme.economical(space.basis) else 1
+    return [i for i in best[:count] if np.isfinite(costs[i])] or best[:1]
 
 
 def highest_plausible(space: WeightSpace) -> float:
@@ -97,22 +139,54 @@ def highest_plausible(space: WeightSpace) -> float:
 
 
 class Rounds(DataWindow):
-    """Descents side by side that only have to tell which gets lowest."""
+    """Descents side by side that only have to tell which gets lowest, and where they end."""
 
-    def __init__(self, space: WeightSpace, seed: int, before: StartState, keep: Keep, tell: Callable[[Record], None]):
+    def __init__(
+        self, space: WeightSpace, seed: int, before: StartState, keep: Keep, tell: Callable[[Record], None],
+        known: tuple[Minimum, ...] = (),
+    ):  # fmt: skip
         super().__init__(space, seed, lambda: keep(self.comparison), tell)
+        self.known = known
         self.descents, self.rank, self.rounds = [d.kept for d in before.descents], before.first, before.rounds
         self.lowest = before.lowest.kept if before.lowest else Descent(space.start(np.zeros(len(space.members))))
+        self.minima = list(before.minima)
         self.plausible = highest_plausible(space)
 
     def comparison(self) -> StartState:
         """As it is kept."""
-        return StartState(tuple(d.kept for d in self.descents), self.rank, self.rounds, self.lowest.kept)
+        descents = tuple(d.kept for d in self.descents)
+        return StartState(descents, self.rank, self.rounds, self.lowest.kept, tuple(self.minima))
+
+    def begin_round(self, descents: list[Descent]) -> None:
+        """Beside the lowest so far, where that has not ended in a minimum."""
+        unfinished = [self.lowest] if self.lowest.joined and np.isfinite(self.lowest.cost) else []
+        for descent in unfinished:
+            descent.ended = False
+        self.descents = [*unfinished, *descents]
+
+    def end_round(self) -> bool:
+        """Whether the comparison is over: enough descents agree on the lowest J, which noise and prior explain."""
+        self.lowest = min(*self.descents, self.lowest, key=lambda descent: descent.cost)
+        agreeing = self.lowest.joined or max((m.descents for m in merged(self.minima)[:1]), default=0)
+        return agreeing >= AGREE and self.lowest.cost <= self.plausible
+
+    def others(self) -> tuple[Minimum, ...]:
+        """The minima but that of the lowest, which takes its count along."""
+        minima = merged(self.minima)
+        if self.lowest.joined or not minima:
+            return minima
+        self.lowest.joined = minima[0].descents
+        return minima[1:]
 
     def move(self, scheme: Scheme, going: Sequence[Descent]) -> None:
         for descent in going:
             descent.ended = descent.step is None
         _end_those_that_met(going)
+        for descent in going:
+            x = self.space.control(descent.weights.w)
+            if not descent.ended and any(minimum.distance(x) < REACHED for minimum in self.known):
+                descent.ended = True
+                self.end_here(descent)
         going = [descent for descent in going if not descent.ended]
         for descent, move in zip(going, self.search(going), strict=True):
             self._follow(descent, move)
@@ -123,14 +197,22 @@ class Rounds(DataWindow):
             going[0].ended = True  # it can only go lower: the comparison is decided
 
     def _follow(self, descent: Descent, move: Move | None) -> None:
-        if move is None:
-            descent.ended = True
-            return
         step, before = descent.newton, descent.cost
-        self.record(descent, step.hessian.economical_transform, move.step_length)
-        descent.weights, descent.cost = self.space.onwards(move.w, step.hessian), move.cost
-        rough = max(before - move.cost, step.predicted_decrease) <= ROUGH * max(1.0, move.cost)
-        descent.ended = rough or descent.iteration == self.settings.max_iterations
+        if move is not None:
+            self.record(descent, step.hessian.economical_transform, move.step_length)
+            descent.weights, descent.cost = self.space.onwards(move.w, step.hessian), move.cost
+            rough = max(before - move.cost, step.predicted_decrease) <= ROUGH * max(1.0, move.cost)
+            descent.ended = rough or descent.iteration == self.settings.max_iterations
+        else:
+            descent.ended = True
+        if descent.ended:
+            self.end_here(descent)
+
+    def end_here(self, descent: Descent) -> None:
+        """A minimum, which takes over the count."""
+        w, hessian = descent.weights.w, descent.newton.hessian
+        self.minima.append(Minimum.at(self.space, w, hessian, descent.cost, descent.joined))
+        descent.joined = 0
 
 
 def _end_those_that_met(descents: Sequence[Descent]) -> None:
@@ -140,5 +222,5 @@ def _end_those_that_met(descents: Sequence[Descent]) -> None:
         if lower.ended:
             continue
         for higher in order[position + 1 :]:
-            if lower.newton.hessian.norm(higher.weights.w - lower.weights.w) < SAME:
-                higher.ended = True
+            if not higher.ended and lower.newton.hessian.norm(higher.weights.w - lower.weights.w) < SAME:
+                lower.joined, higher.joined, higher.ended = lower.joined + higher.joined, 0, True

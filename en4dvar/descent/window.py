@@ -56,7 +56,8 @@ class Descent:
 
     ``worst_loss`` are the reasons of failure in the iteration that lost most members, or empty. ``cost`` is J where it
     was last evaluated. A descent whose ``stop`` is set ends with the next iterate, which is recorded and not left.
-    ``at`` and ``step`` belong to the iteration under way and are not kept.
+    ``joined`` counts the descents that go on as this one: itself and those that met it. ``at`` and ``step``
+    belong to the iteration under way and are not kept.
     """
 
     weights: Weights
@@ -66,6 +67,7 @@ class Descent:
     stop: str = ""
     converged: bool = False
     ended: bool = False
+    joined: int = 1
     at: Iterate | None = None
     step: Step | GaussNewtonStep | None = None
 

@@ -57,6 +57,14 @@ def min_norm_fit(design: Array, values: Array) -> Array:
     return np.asarray(np.linalg.lstsq(design, values, rcond=None)[0])
 
 
+def with_moments(members: Array, mean: Array, covariance: Array) -> Array:
+    """Members (N, n), N > n, mapped linearly so that these (n,), (n, n) are their mean and covariance."""
+    anomalies = members - members.mean(axis=0)
+    target = np.linalg.cholesky(np.atleast_2d(covariance))
+    own = np.linalg.cholesky(np.atleast_2d(np.cov(members.T)))
+    return np.asarray(mean + np.linalg.solve(own, anomalies.T).T @ target.T)
+
+
 @dataclass(frozen=True)
 class ThinTransform:
     """T = I − Rᵀ diag(shrink) R of many members, without the matrix (N, N): ``rows`` R (m, N), ``shrink`` (m,)."""

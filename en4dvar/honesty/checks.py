@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from statistics import median
 
 import numpy as np
 
 from en4dvar.analysis import Analysis
-from en4dvar.caution import Caution, caution
-from en4dvar.diagnostics import HARDLY_INFORMED, chi2_interval
+from en4dvar.caution import Caution, Severity, caution
+from en4dvar.diagnostics import (
+    EMULATED_ENOUGH,
+    HARDLY_INFORMED,
+    MEAN_OFF,
+    SPREAD_OFF,
+    chi2_interval,
+    shape_warnings,
+)
 from en4dvar.forward import ValidityLimit
 from en4dvar.prior import Prior
 from en4dvar.residuals import Residuals
-from en4dvar.state import Array
+from en4dvar.state import Array, Parameter
 from en4dvar.units import convert
 
 SAME_DIRECTION = 1e-8  # relative singular value below which anomalies do not span a direction
@@ -23,6 +30,8 @@ NEAR = 0.05  # of the width of an interval
 PILED_UP = 0.2  # share of members near a bound
 ODD = 1e-3  # probability below which residuals are told to be odd
 BEYOND = 0.1  # share of members beyond a limit of the model
+MOVED, WIDENED = 0.3, 0.5  # mean in prior std, relative variance: beyond, a posterior is not its prior
+SERIOUS: Severity = "serious"
 SILENT = 0.1  # DFS of all readings beyond it that count as none
 EXTRAPOLATED = "no action is needed for the parameters; paths beyond the limit are extrapolated"
 Findings = Iterator[Caution]
@@ -100,10 +109,25 @@ def conflict(prior: Prior, centre: Array) -> Findings:
     if float(z @ z) <= chi2_interval(len(z))[1]:
         return
     worst = np.argsort(-np.abs(z))
-    names = prior.names
-    listed = ", ".join(f"{names[j]} by {z[j]:+.1f}" for j in worst if abs(z[j]) > 2) or f"{names[worst[0]]} most"
-    words = f"prior and data conflict: the minimum lies far from the prior mean ({listed} prior standard deviations)"
-    yield caution("prior-conflict", words)
+    far = [j for j in worst if abs(z[j]) > 2] or worst[:1]
+    places = "; ".join(_far(prior, z, j) for j in far)
+    yield caution("prior-conflict", f"prior and data conflict: the minimum lies far from the prior mean ({places})")
+
+
+def _far(prior: Prior, z: Array, j: int) -> str:
+    """Where the minimum lies and where the prior does, in the display unit."""
+    term, p = prior.terms[j], prior.parameters[j]
+    at = prior.mean[j] + prior.std[j] * np.array([z[j], -1.0, 1.0])
+    found, low, high = convert(term.to_physical(at), p.unit, p.display_unit)
+    return (
+        f"{p.name} at {shown(found, p)} where the prior says {low:.3g} to {shown(high, p)}: {z[j]:+.1f} prior standard "
+        "deviations"
+    )
+
+
+def shown(value: float, p: Parameter) -> str:
+    """A value in the display unit, with that unit."""
+    return f"{value:.3g} {p.display_unit}".removesuffix(" 1")
 
 
 def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[str]) -> Findings:
@@ -129,7 +153,8 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
             usual = float(np.mean(sign * (before - bound) <= NEAR * width))
             if share >= PILED_UP and share > 3 * usual:
                 words = f"{share:.0%} of the posterior members of {parameter.name} pile up at its {side} bound"
-                yield caution("at-bound", f"{words} ({bound:g} {parameter.unit})".replace(" 1)", ")"))
+                at = shown(convert(bound, parameter.unit, parameter.display_unit), parameter)
+                yield caution("at-bound", f"{words} ({at})", parameters=(parameter.name,))
 
 
 def validity(limits: Sequence[ValidityLimit], extremes: Array, since: Array, times: Array, leverage: Array) -> Findings:
@@ -158,12 +183,48 @@ def validity(limits: Sequence[ValidityLimit], extremes: Array, since: Array, tim
             yield replace(caution("model-validity", words, "note"), advice=EXTRAPOLATED)
 
 
-def information(names: Sequence[str], per_parameter: Array) -> Findings:
-    """Parameters the data hardly constrain; ``per_parameter`` (n,) is 1 − posterior over prior variance."""
-    for name, value in zip(names, per_parameter, strict=True):
-        if value < HARDLY_INFORMED:
+def information(prior: Prior, posterior: Array, per_parameter: Array, silent: Collection[str] = ()) -> Findings:
+    """Parameters of which the data say little: neither spread nor mean of the posterior (N, n) differ from the prior's.
+
+    ``per_parameter`` (n,) is 1 − posterior over prior variance. Nothing is said of ``silent`` names: their members
+    may not be the posterior, or they need not be informed.
+    """
+    moved = np.abs(posterior.mean(axis=0) - prior.mean) / prior.std
+    for name, value, far in zip(prior.names, per_parameter, moved, strict=True):
+        if name not in silent and -WIDENED < value < HARDLY_INFORMED and far < MOVED:
             words = f"{name} is hardly informed by the data (DFS {value:.2f}): its posterior is close to its prior"
-            yield caution("not-informed", words)
+            yield caution("not-informed", words, parameters=(name,))
+
+
+def gaussian(prior: Prior, members: Array, shape: Mapping[str, float]) -> Findings:
+    """Members (N, n), physical and alive, whose mean or spread are not the posterior's.
+
+    Sizes are those of the numbers that are printed, for G of G and not of ln G: ``shape`` holds mean and std of the
+    emulated posterior. The finding is about the parameters that are off, and serious where one is off by much.
+    """
+    if not (words := shape_warnings(shape)):
+        return
+    sizes, off, severity = [], [], None
+    believed = shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH
+    for j, p in enumerate(prior.parameters if believed else ()):
+        std = shape.get(f"emulated_std_{p.name}", math.nan)
+        shift = (float(members[:, j].mean()) - shape.get(f"emulated_mean_{p.name}", math.nan)) / std
+        ratio = float(members[:, j].std(ddof=1)) / std
+        if abs(shift) > MEAN_OFF or abs(ratio - 1) > SPREAD_OFF:
+            off.append(p.name)
+            sizes.append(_both(p, members[:, j], shape))
+            if abs(shift) > 1 or not 0.5 < ratio < 2:
+                severity = SERIOUS
+    more = f": {'; '.join(sizes)}" if sizes else ""
+    yield caution("non-gaussian", f"{words[0]}{more}", severity, tuple(off))
+
+
+def _both(p: Parameter, members: Array, shape: Mapping[str, float]) -> str:
+    """Mean ± std of the members and of the emulated posterior, in the display unit."""
+    si = (members.mean(), members.std(ddof=1), shape[f"emulated_mean_{p.name}"], shape[f"emulated_std_{p.name}"])
+    mean, std, found, spread = (convert(float(v), p.unit, p.display_unit) for v in si)
+    unit = "" if p.display_unit == "1" else f" {p.display_unit}"
+    return f"{p.name} = {mean:.2g} ± {std:.2g}{unit} where it should be about {found:.2g} ± {spread:.2g}{unit}"
 
 
 def down_weighted(analysis: Analysis, most: int = 6) -> Findings:

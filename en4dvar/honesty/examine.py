@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.analysis import Analysis
-from en4dvar.caution import CATALOGUE, Caution, caution, worst_first
-from en4dvar.diagnostics import UNSEEN, active_members, shape_warnings
+from en4dvar.caution import CATALOGUE, Caution, caution, untrusted, worst_first
+from en4dvar.diagnostics import UNSEEN, active_members
 from en4dvar.honesty import checks
 from en4dvar.honesty.lost import loss
 from en4dvar.prior import Prior
@@ -56,33 +56,32 @@ def examine(
     a, prior = analysis, analysis.problem.prior
     alive = active_members(a.posterior_failures)
     odd = _structure(a)
-    return worst_first(
-        (
-            *found,
-            *(caution("implausible-data", words) for words in doubts(a.problem, a.prior_predictions)),
-            *checks.down_weighted(a),
-            *unfinished(a),
-            *checks.rank(prior, control.prior, control.posterior[alive]),
-            *collapse(prior, control, alive),
-            *loss("prior forecast", a.prior_failures, prior, control.prior),
-            *loss("iterations", worst_loss, prior),
-            *loss("posterior forecast", a.posterior_failures, prior, control.posterior),
-            *_fit(a, odd),
-            *odd,
-            *checks.conflict(prior, control.centre),
-            *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
-            *_validity(a, alive),
-            *(caution("non-gaussian", words) for words in shape_warnings(a.shape)),
-            *checks.information(*_to_be_informed(a)),
-        )
+    members = a.posterior[alive]
+    warnings = (
+        *found,
+        *(caution("implausible-data", words) for words in doubts(a.problem, a.prior_predictions)),
+        *checks.down_weighted(a),
+        *unfinished(a),
+        *checks.rank(prior, control.prior, control.posterior[alive]),
+        *collapse(prior, control, alive),
+        *loss("prior forecast", a.prior_failures, prior, control.prior),
+        *loss("iterations", worst_loss, prior),
+        *loss("posterior forecast", a.posterior_failures, prior, control.posterior),
+        *_fit(a, odd),
+        *odd,
+        *checks.conflict(prior, control.centre),
+        *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
+        *_validity(a, alive),
+        *checks.gaussian(prior, members, a.shape),
     )
+    silent = {name for name in prior.names if untrusted(warnings, name)} | _changes(a)
+    little = checks.information(prior, control.posterior[alive], a.dfs_per_parameter, silent)
+    return worst_first((*warnings, *little))
 
 
-def _to_be_informed(a: Analysis) -> tuple[list[str], Array]:
-    """Names and DFS of the parameters; not of the changes of one that varies, of which data may say little."""
-    changes = {change.parameter.name for one in a.problem.varying for change in one.changes}
-    told = [j for j, name in enumerate(a.problem.prior.names) if name not in changes]
-    return [a.problem.prior.names[j] for j in told], a.dfs_per_parameter[told]
+def _changes(a: Analysis) -> set[str]:
+    """Names of the changes of parameters that vary, of which data may say little."""
+    return {change.parameter.name for one in a.problem.varying for change in one.changes}
 
 
 def doubts(problem: InverseProblem, predicted: Array) -> Sequence[str]:
@@ -148,7 +147,8 @@ def collapse(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool
     narrow = control.posterior[alive].std(axis=0) <= NO_SPREAD * prior.std
     if narrow.any():
         names = ", ".join(name for name, no_spread in zip(prior.names, narrow, strict=True) if no_spread)
-        yield caution("ensemble-collapse", f"the ensemble has collapsed: all members have the same {names}")
+        words = f"the ensemble has collapsed: all members have the same {names}"
+        yield caution("ensemble-collapse", words, parameters=tuple(names.split(", ")))
         return
     lowest = min(control.centre_cost, float(control.costs[alive].min()))
     allowed = float(np.mean(2 * (control.costs[alive] - lowest))) / len(control.centre)

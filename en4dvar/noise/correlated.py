@@ -67,6 +67,7 @@ class CorrelatedNoise(Noise):
     correlation: Correlation
 
     words: ClassVar[str] = ", correlated"
+    independent: ClassVar[bool] = False
 
     def check(self, weights: Array) -> None:
         super().check(weights)
@@ -77,6 +78,13 @@ class CorrelatedNoise(Noise):
     def precision_times(self, values: Array, weights: Array, at: Predicted, vectors: Array) -> Array:
         s, whitening = self.error_std(at), self.correlation.whitening
         return np.asarray(weights * ((vectors / s) @ whitening.T @ whitening) / s)
+
+    def log_conditional(self, values: Array, predicted: Predicted) -> Array:
+        """With the precision P = C⁻¹ it is N((Pz)_k/P_kk, 1/P_kk) of what is new in z_k beside all others."""
+        s, whitening = self.error_std(predicted), self.correlation.whitening
+        scaled = ((values - predicted.values) / s) @ whitening.T @ whitening
+        precision = np.sum(whitening**2, axis=0)
+        return np.asarray(-0.5 * scaled**2 / precision + 0.5 * np.log(precision) - np.log(s) - self._log_norm())
 
     def matrices(self) -> dict[str, tuple[Array, str]]:
         return {"correlation": (self.correlation.matrix, "correlation of the observation errors")}

@@ -49,6 +49,7 @@ class DiscrepancyNoise(Noise):
     correlation: Correlation | None = None
 
     discrepant: ClassVar[bool] = True
+    independent: ClassVar[bool] = False
 
     def check(self, weights: Array) -> None:
         super().check(weights)
@@ -124,6 +125,20 @@ class DiscrepancyNoise(Noise):
     def log_likelihood(self, values: Array, predicted: Predicted) -> Array:
         v, roots = self._innovations(values, predicted)
         return np.asarray(-0.5 * v * v - np.log(roots) - self._log_norm())
+
+    def log_conditional(self, values: Array, predicted: Predicted) -> Array | None:
+        """Of N(m, R + A), as of correlated errors; NaN where that is singular to rounding."""
+
+        def conditional(runs: Predicted) -> tuple[Array]:
+            try:
+                precision = np.linalg.inv(self.covariance(runs))
+            except np.linalg.LinAlgError:
+                return (np.full_like(runs.values, np.nan),)
+            scaled = np.einsum("bij,bj->bi", precision, values - runs.values)
+            own = np.diagonal(precision, axis1=1, axis2=2)
+            return (0.5 * (np.log(own) - scaled**2 / own) - self._log_norm(),)
+
+        return self._in_parts(predicted, 1, conditional)[0]
 
     def log_normalisation(self, weights: Array) -> float:
         return float(np.sum(weights * (np.log(self.std) + self._log_norm())))

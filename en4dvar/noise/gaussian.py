@@ -37,6 +37,7 @@ class Noise:
     time_std: Array
 
     words: ClassVar[str] = ""  # what a summary says of these errors, after their std
+    independent: ClassVar[bool] = True  # of each other, so that each whitened row is that of one reading
     discrepant: ClassVar[bool] = False  # whether amplitude and length of a discrepancy belong to the parameters
 
     def check(self, weights: Array) -> None:
@@ -119,6 +120,10 @@ class Noise:
         v = self.whitened_residual(values, predicted)
         density = -self._loss(v) - np.log(self.error_std(predicted)) - self._log_norm()
         return np.asarray(density - self._log_root())
+
+    def log_conditional(self, values: Array, predicted: Predicted) -> Array | None:
+        """Normalised log density (…, K) of each observation given all others; None where the errors have none."""
+        return self.log_likelihood(values, predicted)
 
     def log_normalisation(self, weights: Array) -> float:
         """What −Σ β_k ln p(y_k) exceeds J_o by: Σ β_k ln(std_k √2π), with correlated errors + ½ β ln det C."""

@@ -82,6 +82,9 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
         """Of each observation (…, K), a division of the joint density whose terms have no meaning of their own."""
         return -self._terms(values, predicted) - self._log_norm()
 
+    def log_conditional(self, values: Array, predicted: Predicted) -> None:
+        """None: the joint density is an approximation that knows no reading by itself."""
+
     def whiten(self, values: Array, weights: Array, at: Linearisation) -> tuple[Array, Array]:
         p = at.prediction
         u, light = self._solved(values, p)

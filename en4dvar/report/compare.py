@@ -8,20 +8,22 @@ do not compare: there the posteriors are shown, and no probabilities.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from en4dvar.caution import Caution, codes
 from en4dvar.errors import OutputError
 from en4dvar.observations import Observations
 from en4dvar.report.text import fixed
 from en4dvar.state import Array
 from en4dvar.storage.store import StoredResult, load_stored, result_files
-from en4dvar.summary import ParameterSummary
+from en4dvar.summary import ParameterSummary, estimate_cells
 from en4dvar.tables import table
 
+MOST_WARNINGS = 12  # on the terminal
 UNDECIDABLE = 1.0  # difference of log-evidence
 ALL = "all data sets"
 
@@ -33,7 +35,8 @@ class ModelScore:
     ``effective_parameters`` is p_WAIC, the sum over the observations of the posterior variance of their
     log-likelihood (Gelman, Hwang & Vehtari 2014, Stat. Comput. 24, 997); ``dfs`` is its linear counterpart.
     ``difference`` is the log-evidence minus that of the best model; NaN, as ``probability``, where the runs used
-    different data.
+    different data. ``warnings`` are the codes of its warnings, and ``doubted`` those for which neither its intervals
+    nor its evidence are to be trusted.
     """
 
     run: str
@@ -45,6 +48,8 @@ class ModelScore:
     dfs: float
     effective_parameters: float
     nrmse: float
+    warnings: str = ""
+    doubted: str = ""
 
 
 @dataclass(frozen=True)
@@ -58,14 +63,25 @@ class ComparedEstimate:
 
 
 @dataclass(frozen=True)
+class ComparedCaution:
+    """A warning of one run about one data set."""
+
+    run: str
+    dataset: str
+    caution: Caution
+
+
+@dataclass(frozen=True)
 class Comparison:
     """Scores and estimates of every data set in turn, runs in the order given; with several data sets the sums of the
-    scores come last. ``incomparable`` says why evidences do not compare; empty where they do.
+    scores come last. ``incomparable`` says why evidences do not compare; empty where they do. ``cautions`` are the
+    warnings of all runs, the worst first.
     """
 
     scores: tuple[ModelScore, ...]
     estimates: tuple[ComparedEstimate, ...] = ()
     incomparable: str = ""
+    cautions: tuple[ComparedCaution, ...] = ()
 
     @property
     def runs(self) -> tuple[str, ...]:
@@ -96,9 +112,13 @@ class Comparison:
         if self.incomparable:
             return f"not compared: {self.incomparable}"
         best, second = sorted(self.of(dataset), key=lambda score: -score.log_evidence)[:2]
+        words = f"{best.run} is preferred: log-evidence {-second.difference:.2f} above {second.run}"
         if -second.difference < UNDECIDABLE:
-            return f"undecidable: {best.run} and {second.run} differ by {-second.difference:.2f} in log-evidence"
-        return f"{best.run} is preferred: log-evidence {-second.difference:.2f} above {second.run}"
+            words = f"undecidable: {best.run} and {second.run} differ by {-second.difference:.2f} in log-evidence"
+        doubts = [f"{score.run} ({score.doubted})" for score in (best, second) if score.doubted]
+        return (
+            f"{words}; not to be trusted before the warnings of {' and '.join(doubts)} are settled" if doubts else words
+        )
 
 
 def compare_runs(runs: Sequence[str | Path]) -> Comparison:
@@ -119,13 +139,15 @@ def compare_runs(runs: Sequence[str | Path]) -> Comparison:
         for name, dataset, result in pairs
         for row in result.summary()
     )
+    found = [ComparedCaution(name, dataset, c) for name, dataset, result in pairs for c in result.cautions]
+    cautions = tuple(sorted(found, key=lambda one: one.caution.rank))
     if reason := _difference(results):
         scores = [_score(name, dataset, result) for name, held in results.items() for dataset, result in held.items()]
-        return Comparison(tuple(scores), estimates, reason)
+        return Comparison(tuple(scores), estimates, reason, cautions)
     of_each = [_ranked([_score(*pair) for pair in pairs if pair[1] == dataset]) for dataset in datasets]
     if len(datasets) > 1:
         of_each.append(_ranked([_total(run) for run in zip(*of_each, strict=True)]))
-    return Comparison(tuple(score for ranked in of_each for score in ranked), estimates)
+    return Comparison(tuple(score for ranked in of_each for score in ranked), estimates, "", cautions)
 
 
 def _difference(results: Mapping[str, Mapping[str, StoredResult]]) -> str:
@@ -170,17 +192,29 @@ def comparison_table(comparison: Comparison) -> str:
     verdicts = [f"{name}: {comparison.verdict(name)}" for name in comparison.datasets]
     if comparison.incomparable:
         verdicts = [comparison.verdict("")]
-    return "\n".join([table([header, *rows]), "", *verdicts])
+    return "\n".join([table([header, *rows]), "", *verdicts, *_warned(comparison.cautions)])
+
+
+def _warned(cautions: Sequence[ComparedCaution]) -> list[str]:
+    """Lines of the terminal: the worst warnings of all runs."""
+    lines = [f"{c.caution.kind}: {c.run}: {c.dataset}: {c.caution}" for c in cautions[:MOST_WARNINGS]]
+    more = len(cautions) - MOST_WARNINGS
+    return [*lines, *([f"and {more} more warnings and notes; see the report"] if more > 0 else [])]
 
 
 def estimates_table(comparison: Comparison) -> str:
-    """Posterior mean, std and 5–95 % of every parameter, runs below each other, in display units."""
-    header = ("parameter", "unit", "data set", "run", "mean", "std", "5 %", "95 %")
-    rows = [
-        (row.name, row.unit, e.dataset, e.run, *(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q95)))
-        for e in comparison.by_parameter
-        for row in [e.summary]
-    ]
+    """Posterior mean, std and 5–95 % of every parameter, runs below each other, in display units.
+
+    Where these are not to be trusted the last column says why.
+    """
+    every = comparison.by_parameter
+    doubted = any(e.summary.untrusted for e in every)
+    header = ("parameter", "unit", "data set", "run", "mean", "std", "5 %", "95 %", *["not to be trusted"] * doubted)
+    rows = []
+    for e in every:
+        mean, std, low, _, high = estimate_cells(e.summary)
+        why = [", ".join(e.summary.untrusted)] * doubted
+        rows.append((e.summary.name, e.summary.unit, e.dataset, e.run, mean, std, low, high, *why))
     return table([header, *rows])
 
 
@@ -231,6 +265,8 @@ def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:
         dfs=float(stats["dfs"]),
         effective_parameters=float(np.sum(np.var(likelihood[result.alive], axis=0, ddof=1))),
         nrmse=float(stats["nrmse"]),
+        warnings=" ".join(codes(result.cautions)),
+        doubted=" ".join(codes(c for c in result.cautions if c.spoils)),
     )
 
 
@@ -244,7 +280,14 @@ def _total(scores: Sequence[ModelScore]) -> ModelScore:
         dfs=sum(s.dfs for s in scores),
         effective_parameters=sum(s.effective_parameters for s in scores),
         nrmse=float(np.mean([s.nrmse for s in scores])),
+        warnings=_joined(s.warnings for s in scores),
+        doubted=_joined(s.doubted for s in scores),
     )
+
+
+def _joined(lists: Iterable[str]) -> str:
+    """The codes of several lists, each once."""
+    return " ".join(dict.fromkeys(code for one in lists for code in one.split()))
 
 
 def _ranked(scores: Sequence[ModelScore]) -> list[ModelScore]:

@@ -7,22 +7,25 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterable
+import string
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from en4dvar.caution import Caution, codes
 from en4dvar.config.symbols import GREEK
 from en4dvar.errors import OutputError
-from en4dvar.report.text import number_like
+from en4dvar.report.text import number_like, plain_number, untrusted_words
 from en4dvar.storage.store import StoredResult, load_stored, require_settled, result_files
-from en4dvar.summary import ParameterSummary, summary_csv
+from en4dvar.summary import LITTLE, ParameterSummary, summary_csv
 from en4dvar.tables import csv_text
 
 _COMMANDS = (
     f"{GREEK}|mathrm|mathit|mathbf|mathsf|mathcal|rm|it|text|frac|sqrt|hat|bar|tilde|dot|ddot|vec|overline|infty|partial|"
-    "nabla|ell|cdot|times|pm|prime|dagger|ast|star|perp|parallel|circ|left|right|langle|rangle|quad"
+    "nabla|ell|cdot|times|pm|prime|dagger|ast|star|perp|parallel|circ|left|right|langle|rangle|quad|"
+    "max|min"
 )
 Kind = Literal["csv", "latex", "members"]
 _ESCAPES = {c: f"\\{c}" for c in "#$%&_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
@@ -36,6 +39,8 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
     kind: ``csv``: a line for each data set and parameter (prior, mean, std, 5/50/95 %, centre, DFS), every digit kept;
         ``members``: a line for each data set and living posterior member, a column a parameter; ``latex``: mean ± std
         for a paper (package booktabs), a row a parameter, or with several data sets a row a data set.
+        Warnings come along: in a column of the CSV, as footnotes and comments in LaTeX. A number that is not to be
+        trusted stands without an interval.
 
     Raises
     ------
@@ -48,7 +53,7 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
     if kind == "members":
         return _members_csv(results)
     if kind == "latex":
-        return _latex([(r.name, r.summary()) for r in results])
+        return _latex([(r.name, r.summary(), r.cautions) for r in results])
     return summary_csv(((r.name, r.summary(), r.cautions) for r in results), {})
 
 
@@ -63,62 +68,112 @@ def posterior_file(run_dir: str | Path) -> Path:
 
 def _members_csv(results: Iterable[StoredResult]) -> str:
     """Living members; columns that a data set lacks stay empty."""
-    lines: list[tuple[object, object, dict[str, float]]] = []
+    lines: list[tuple[object, object, dict[str, float], str]] = []
     header: dict[str, str] = {}
     for result in results:
         for row in result.summary():
             header.setdefault(row.name, f"{row.name} ({row.unit})" if row.unit != "1" else row.name)
+        warned = " ".join(codes(result.cautions))
         values = {str(name): result.members("posterior", str(name)) for name in result.posterior.data_vars}
         for i, member in enumerate(np.flatnonzero(result.alive)):
-            lines.append((result.name, member, {name: of[i] for name, of in values.items()}))
-    rows = ([dataset, member, *(own.get(name, "") for name in header)] for dataset, member, own in lines)
-    return csv_text([["dataset", "member", *header.values()], *rows])
+            lines.append((result.name, member, {name: of[i] for name, of in values.items()}, warned))
+    rows = (
+        [dataset, member, *(own.get(name, "") for name in header), warned] for dataset, member, own, warned in lines
+    )
+    return csv_text([["dataset", "member", *header.values(), "warnings"], *rows])
 
 
-def _latex(found: list[tuple[str, tuple[ParameterSummary, ...]]]) -> str:
+Found = tuple[str, tuple[ParameterSummary, ...], tuple[Caution, ...]]
+LITTLE_NOTE = "the data say little about it: its posterior is close to its prior"
+
+
+def _latex(found: Sequence[Found]) -> str:
     header = "% en4dvar export: posterior mean and standard deviation; needs \\usepackage{booktabs}"
-    table = _one_set(found[0][1]) if len(found) == 1 else _many_sets(found)
-    return "\n".join([header, *table]) + "\n"
+    warned = [f"% {c.severity}: {name}: {c}" for name, _, cautions in found for c in cautions]
+    notes = Notes()
+    table = _one_set(found[0][1], notes) if len(found) == 1 else _many_sets(found, notes)
+    return "\n".join([header, *(_one_line(line) for line in warned), *table]) + "\n"
 
 
-def _one_set(rows: tuple[ParameterSummary, ...]) -> list[str]:
+class Notes:
+    """The footnotes of a table: each once, lettered in order of appearance."""
+
+    def __init__(self) -> None:
+        self._letters: dict[str, str] = {}
+
+    def mark(self, row: ParameterSummary) -> str:
+        """What follows a number: the letter of its footnote, or nothing."""
+        words = LITTLE_NOTE if row.informed == LITTLE else ""
+        if row.untrusted:
+            words = f"not to be trusted: {untrusted_words(row)}"
+        if not words:
+            return ""
+        letter = self._letters.setdefault(words, string.ascii_lowercase[len(self._letters) % 26])
+        return f"\\textsuperscript{{{letter}}}"
+
+    def lines(self, columns: int) -> list[str]:
+        """Rows below the table."""
+        start = f"  \\multicolumn{{{columns}}}{{l}}{{\\footnotesize "
+        return [
+            f"{start}\\textsuperscript{{{letter}}} {escaped(words)}}} \\\\" for words, letter in self._letters.items()
+        ]
+
+
+def _one_set(rows: tuple[ParameterSummary, ...], notes: Notes) -> list[str]:
     lines = [
         " & ".join(
             (
                 latex_symbol(row),
                 latex_unit(row.unit) or "--",
                 _plus_minus(row.prior_mean, row.prior_std),
-                _plus_minus(row.mean, row.std),
-                f"${_tex(number_like(row.q05, row.std))}$ to ${_tex(number_like(row.q95, row.std))}$",
+                _estimate(row, notes),
+                _interval(row),
             )
         )
         for row in rows
     ]
     head = "parameter & unit & prior & posterior & 5--95\\,\\%"
-    return _tabular("llrrr", head, lines)
+    return _tabular("llrrr", head, lines, notes)
 
 
-def _many_sets(found: list[tuple[str, tuple[ParameterSummary, ...]]]) -> list[str]:
-    first = {row.name: row for _, rows in found for row in reversed(rows)}
-    names = list(dict.fromkeys(row.name for _, rows in found for row in rows))
+def _many_sets(found: Sequence[Found], notes: Notes) -> list[str]:
+    first = {row.name: row for _, rows, _ in found for row in reversed(rows)}
+    names = list(dict.fromkeys(row.name for _, rows, _ in found for row in rows))
     units = {n: latex_unit(first[n].unit) for n in names}
     head = " & ".join(
         ["data set", *(f"{latex_symbol(first[n])}" + (f" ({units[n]})" if units[n] else "") for n in names)]
     )
     lines = []
-    for dataset, rows in found:
+    for dataset, rows, _ in found:
         own = {row.name: row for row in rows}
-        cells = [_plus_minus(own[n].mean, own[n].std) if n in own else "--" for n in names]
+        cells = [_estimate(own[n], notes) if n in own else "--" for n in names]
         lines.append(" & ".join([escaped(dataset), *cells]))
-    return _tabular("l" + "r" * len(names), head, lines)
+    return _tabular("l" + "r" * len(names), head, lines, notes)
 
 
-def _tabular(columns: str, head: str, lines: list[str]) -> list[str]:
+def _tabular(columns: str, head: str, lines: list[str], notes: Notes) -> list[str]:
     body = [f"  {line} \\\\" for line in lines]
     return [
         f"\\begin{{tabular}}{{{columns}}}", "  \\toprule", f"  {head} \\\\", "  \\midrule", *body,
-        "  \\bottomrule", "\\end{tabular}",
+        "  \\bottomrule", *notes.lines(len(columns)), "\\end{tabular}",
     ]  # fmt: skip
+
+
+def _estimate(row: ParameterSummary, notes: Notes) -> str:
+    """Mean ± std, or the mean alone, with the mark of its footnote."""
+    value = f"${_tex(plain_number(row.mean, 3))}$" if row.untrusted else _plus_minus(row.mean, row.std)
+    return f"{value}{notes.mark(row)}"
+
+
+def _interval(row: ParameterSummary) -> str:
+    if row.untrusted:
+        return "--"
+    return f"${_tex(number_like(row.q05, row.std))}$ to ${_tex(number_like(row.q95, row.std))}$"
+
+
+def _one_line(comment: str) -> str:
+    """A comment of LaTeX that ends where it should."""
+    return "".join(c if c.isprintable() else " " for c in comment)
 
 
 def _plus_minus(mean: float, std: float) -> str:

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from en4dvar.report import varying
+from en4dvar.report import readings, varying
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, Captioned, panels, scaled_histogram, styled
-from en4dvar.report.text import plus_minus, pretty_unit, with_unit
+from en4dvar.report.text import estimate, pretty_unit, shown, with_unit
 from en4dvar.state import Array
 from en4dvar.storage.store import StoredResult
-from en4dvar.units import convert
 
 MAX_PAIRS = 6
 MANY = 5000  # marks: beyond, they are drawn as pixels, for a vector each would make a page of many megabytes
@@ -32,10 +30,12 @@ def histograms(result: StoredResult) -> Figure:
         scaled_histogram(ax, posterior, LIGHT["posterior"], alpha=0.6)
         marks = ax.plot(posterior, np.full(posterior.shape, -0.06), "|", color=LIGHT["posterior"], ms=3, mew=0.5)
         marks[0].set_rasterized(len(posterior) > MANY)
-        ax.plot([row.q05, row.q95], [1.07, 1.07], color=LIGHT["posterior"], lw=2, solid_capstyle="butt")
+        if not row.untrusted:
+            ax.plot([row.q05, row.q95], [1.07, 1.07], color=LIGHT["posterior"], lw=2, solid_capstyle="butt")
         ax.axvline(row.centre, ymax=0.85, color=LIGHT["centre"], lw=0.9, ls="--")
         ax.set(yticks=[], ylim=(-0.14, 1.2), xlabel=with_unit(row.symbol, row.unit), xlim=_reach(prior, posterior))
-        ax.set_title(f"{plus_minus(row.mean, row.std)} {pretty_unit(row.unit)}".rstrip(), color=LIGHT["posterior"])
+        value, doubt = f"{estimate(row, '')} {pretty_unit(row.unit)}".rstrip(), " (?)" if row.untrusted else ""
+        ax.set_title(f"{value}{doubt}", color=LIGHT["posterior"])
         ax.spines["left"].set_visible(False)
         ax.xaxis.set_major_locator(MaxNLocator(4))
     return figure
@@ -46,8 +46,8 @@ def history(result: StoredResult) -> Figure:
     """Data ± std, prior and posterior predictive bands (50 and 90 %), the centre; below, residuals over their std."""
     name = result.observable
     observed = result.observed_data
-    time, data, std = (_shown(observed[key]) for key in ("time", name, f"{name}_std"))
-    centre = _shown(result.sample_stats[f"{name}_centre"])
+    time, data, std = (shown(observed[key]) for key in ("time", name, f"{name}_std"))
+    centre = shown(result.sample_stats[f"{name}_centre"])
     figure = Figure(figsize=(COLUMN, 9.5 / 2.54), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
     _band(top, result, "prior_predictive", (0.05, 0.95), "prior", 0.28, "prior 90 %")
@@ -87,7 +87,7 @@ def history(result: StoredResult) -> Figure:
 def residuals(result: StoredResult) -> Figure:
     """Whitened residuals in time, their autocorrelation, normal quantiles, leverages; the discrepancy if any."""
     name, stats = result.observable, result.sample_stats
-    time = _shown(result.observed_data["time"])
+    time = shown(result.observed_data["time"])
     white, studentised, leverage = (
         np.asarray(stats[f"{name}_{key}"].values) for key in ("whitened_residual", "studentised", "leverage")
     )
@@ -141,7 +141,7 @@ def traces(result: StoredResult) -> Figure:
     steps = result.iterations["iteration"].values
     figure, axes = panels(len(rows), COLUMN, 3.4 / 2.54)
     for ax, row in zip(axes, rows, strict=True):
-        members, centre = (_shown(result.iterations[key]) for key in (row.name, f"{row.name}_centre"))
+        members, centre = (shown(result.iterations[key]) for key in (row.name, f"{row.name}_centre"))
         alive = np.isfinite(members).all(axis=0)
         if alive.sum() > 1:
             mean, std = members[:, alive].mean(axis=1), members[:, alive].std(axis=1, ddof=1)
@@ -179,8 +179,8 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
     """Everything that the result has enough members for."""
     yield (
         "posterior",
-        "Posterior (blue) over prior (grey), each scaled to its peak. Bar: 5–95 % of the posterior; ticks: members; "
-        "dashed: the centre, where J is smallest.",
+        "Posterior (blue) over prior (grey), each scaled to its peak. Bar: 5–95 % of the posterior, none and (?) where "
+        "it is not to be trusted; ticks: members; dashed: the centre, where J is smallest.",
         histograms(result),
     )
     yield (
@@ -203,6 +203,8 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
             "autocorrelation (band: 95 % of independent numbers), against normal quantiles; leverages.",
             residuals(result),
         )
+    if f"{result.observable}_prior_distance" in result.sample_stats:
+        yield "influence", readings.CAPTION, readings.influence(result)
     yield "cost", "The cost J and its two terms at the iterate that starts each iteration.", cost(result)
     yield "iterations", "Parameters over the iterations: ensemble mean ± std (blue), centre (dashed).", traces(result)
     if 2 <= len(result.posterior.data_vars) <= MAX_PAIRS and result.alive.sum() > 2:
@@ -212,8 +214,8 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
 def _discrepancy(ax: Axes, result: StoredResult, time: Array, label: str) -> None:
     """Data less the centre, and mean ± std of what the model misses."""
     name, stats = result.observable, result.sample_stats
-    residual = _shown(result.observed_data[name]) - _shown(stats[f"{name}_centre"])
-    mean, std = _shown(stats[f"{name}_discrepancy"]), _shown(stats[f"{name}_discrepancy_std"])
+    residual = shown(result.observed_data[name]) - shown(stats[f"{name}_centre"])
+    mean, std = shown(stats[f"{name}_discrepancy"]), shown(stats[f"{name}_discrepancy_std"])
     ax.axhline(0, color=LIGHT["muted"], lw=0.6)
     ax.fill_between(time, mean - std, mean + std, color=LIGHT["posterior"], alpha=0.35, lw=0, label="discrepancy ± std")
     ax.plot(time, residual, "o", ms=2.2, color=LIGHT["ink"], label="data − centre")
@@ -250,21 +252,15 @@ def _reach(prior: Array, posterior: Array) -> tuple[float | None, float | None]:
     return (low - margin, high + margin) if margin > 0 else (None, None)
 
 
-def _shown(variable: xr.DataArray) -> Array:
-    """The values in the variable's display unit."""
-    values = np.asarray(variable.values, dtype=float)
-    return convert(values, variable.attrs["units"], variable.attrs["display_units"])
-
-
 def _band(
     ax: Axes, result: StoredResult, group: str, levels: tuple[float, float], colour: str, alpha: float, label: str
 ) -> None:
-    values = _shown(result.dataset(group)[f"{result.observable}_path"][0])
+    values = shown(result.dataset(group)[f"{result.observable}_path"][0])
     seen = np.isfinite(values).any(axis=0)
     if not seen.any():
         return
     low, high = np.nanquantile(values[:, seen], levels, axis=0)
-    time = _shown(result.dataset(group)["path_time"])[seen]
+    time = shown(result.dataset(group)["path_time"])[seen]
     ax.fill_between(time, low, high, color=LIGHT[colour], alpha=alpha, lw=0, label=label)
 
 

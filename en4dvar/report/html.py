@@ -15,8 +15,9 @@ from en4dvar.report import responses, text
 from en4dvar.report.style import DARK, LIGHT, css_variables
 
 WRITERS = (  # what templates call
-    text.fixed, text.informed_words, text.number_like, text.percent, text.plain_number, text.plus_minus,
-    text.pretty_unit, text.rough_number, text.symbol_html, responses.sentence, responses.shift_text,
+    text.estimate, text.fixed, text.number_like, text.percent, text.plain_number, text.plus_minus,
+    text.pretty_unit, text.rough_number, text.symbol_html, text.untrusted_words, responses.sentence,
+    responses.shift_text,
 )  # fmt: skip
 
 

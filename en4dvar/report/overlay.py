@@ -15,15 +15,18 @@ from en4dvar.errors import OutputError
 from en4dvar.files import make_folder, write_text
 from en4dvar.report.compare import ComparedEstimate, Comparison, ModelScore
 from en4dvar.report.html import render
+from en4dvar.report.page import DFS_WORDS
 from en4dvar.report.style import COLUMN, LIGHT, inline_svg, panels, save_figure, scaled_histogram, styled
 from en4dvar.report.text import figure_text, with_unit
 from en4dvar.state import Array
+from en4dvar.summary import CSV_COLUMNS, csv_cells
 from en4dvar.tables import csv_text
 from en4dvar.units import UnitError, convert
 
 COLOURS = (LIGHT["posterior"], LIGHT["centre"], LIGHT["background"], "#cc79a7", "#b58900", LIGHT["muted"])
 CAPTION = (
-    "Posterior of each run, scaled to its peak; bars hold 5–95 % of the members. Where a run has several data sets, "
+    "Posterior of each run, scaled to its peak; bars hold 5–95 % of the members, where these are to be trusted. "
+    "Where a run has several data sets, "
     "the members of all of them are taken together."
 )
 
@@ -49,6 +52,8 @@ def _panel(ax: Axes, estimates: Sequence[ComparedEstimate], runs: Sequence[str])
         if values.size < 2 or np.ptp(values) == 0:
             continue
         scaled_histogram(ax, values, _colour(i), alpha=0.25, lw=1.0)
+        if any(e.summary.untrusted for e in estimates if e.run == run):
+            continue
         bar = 1.08 + 0.09 * i
         ax.plot(np.quantile(values, (0.05, 0.95)), [bar, bar], color=_colour(i), lw=2, solid_capstyle="butt")
     ax.set(yticks=[], ylim=(0, 1.1 + 0.09 * len(runs)), xlabel=with_unit(row.symbol, row.unit))
@@ -89,14 +94,16 @@ def write_comparison(comparison: Comparison, out: str | Path) -> Path:
         verdicts=[(name, comparison.verdict(name)) for name in comparison.datasets],
         estimates=comparison.by_parameter,
         scores=comparison.scores,
+        cautions=[(c.caution, f"{c.run}, {c.dataset}: ") for c in comparison.cautions],
+        dfs_words=DFS_WORDS,
     )
     return write_text(out / "compare.html", page)
 
 
 def _estimates_csv(comparison: Comparison) -> str:
-    columns = ("name", "unit", "prior_mean", "prior_std", "mean", "std", "q05", "q50", "q95", "centre", "dfs")
-    rows = [[e.run, e.dataset, *(getattr(e.summary, c) for c in columns)] for e in comparison.by_parameter]
-    return csv_text([["run", "dataset", *columns], *rows])
+    warned = {(s.run, s.dataset): s.warnings for s in comparison.scores}
+    rows = [[e.run, e.dataset, *csv_cells(e.summary), warned[e.run, e.dataset]] for e in comparison.by_parameter]
+    return csv_text([["run", "dataset", *CSV_COLUMNS, "warnings"], *rows])
 
 
 def _evidence_csv(comparison: Comparison) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from en4dvar.caution import SEVERITIES, Caution, codes, worst_first
+from en4dvar.caution import Caution, codes, gravity, worst_first
 from en4dvar.report.html import render
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, Captioned, Drawing, styled
 from en4dvar.report.text import figure_text, number_like, pretty_unit, symbol_html, with_unit
@@ -48,10 +48,9 @@ class SetSummary:
         return worst_first(self.cautions)[0].severity if self.cautions else ""
 
     @property
-    def gravity(self) -> int:
-        """Sorts by warnings: 0 none; then the worst severity counts most, the number of warnings within it."""
-        order: tuple[str, ...] = ("", *reversed(SEVERITIES))
-        return 100 * order.index(self.worst) + len(self.cautions)
+    def gravity(self) -> float:
+        """Sorts by warnings: 0 none; what the worst of them does to the numbers counts most."""
+        return gravity(self.cautions)
 
     @property
     def codes(self) -> str:
@@ -98,20 +97,21 @@ def estimates(sets: Sequence[SetSummary]) -> Figure:
         x = np.array([i for i, one in enumerate(sets) if name in one.rows])
         rows = [sets[i].rows[name] for i in x]
         mean, low, high = (np.array([getattr(row, key) for row in rows]) for key in ("mean", "q05", "q95"))
+        trusted = np.array([not row.untrusted for row in rows], dtype=bool)
+        low, high = (np.where(trusted, bound, np.nan) for bound in (low, high))
         prior = rows[0].prior_mean + np.array([-1.0, 1.0]) * rows[0].prior_std
         ax.axhspan(*prior, color=LIGHT["prior"], alpha=0.2, lw=0)
         if few:
             ax.vlines(x, low, high, color=LIGHT["posterior"], lw=1.4, alpha=0.6)
             ax.plot(x, mean, "o", ms=3, color=LIGHT["posterior"])
-            warned = np.array([sets[i].worst == "serious" for i in x], dtype=bool)
-            ax.plot(x[warned], mean[warned], "o", ms=5.5, mfc="none", mew=0.9, color=LIGHT["centre"])
+            ax.plot(x[~trusted], mean[~trusted], "o", ms=5.5, mfc="none", mew=0.9, color=LIGHT["centre"])
         else:
             order = np.argsort(mean)
             ax.fill_between(np.arange(len(order)), low[order], high[order], color=LIGHT["posterior"], alpha=0.3, lw=0)
             ax.plot(np.arange(len(order)), mean[order], color=LIGHT["posterior"], lw=0.9)
             ax.set_xticks([])
             ax.set_xlabel(f"{len(order)} data sets, sorted")
-        reach = [*low[np.isfinite(low)], *high[np.isfinite(high)]]
+        reach = [v for values in (mean, low, high) for v in values[np.isfinite(values)]]
         if reach and max(reach) > min(reach):
             margin = 0.08 * (max(reach) - min(reach))
             ax.set_ylim(min(reach) - margin, max(reach) + margin)
@@ -125,9 +125,10 @@ def estimates(sets: Sequence[SetSummary]) -> Figure:
 def overview_figures(sets: Sequence[SetSummary]) -> list[Captioned]:
     caption = (
         "Each data set by itself: posterior mean and 5–95 % (blue), prior mean ± std (grey band; of the first data set "
-        "where priors depend on the data). Orange rings: posteriors with serious warnings."
+        "where priors depend on the data). Orange rings without a bar: not to be trusted, for their warnings."
         if len(sets) <= NAMED
-        else "Data sets sorted by the posterior mean, with 5–95 % (blue); prior mean ± std (grey band; of the first "
+        else "Data sets sorted by the posterior mean, with 5–95 % (blue, none where it is not to be "
+        "trusted); prior mean ± std (grey band; of the first "
         "data set where priors depend on the data)."
     )
     return [("estimates", caption, estimates(sets))]

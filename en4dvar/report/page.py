@@ -9,6 +9,7 @@ from typing import Any
 
 from en4dvar.diagnostics import chi2_interval
 from en4dvar.report.html import render
+from en4dvar.report.readings import reading_words
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
 from en4dvar.report.style import Drawing
 from en4dvar.report.text import number_like, plain_number
@@ -22,6 +23,10 @@ PROVENANCE = (
     "package_versions", "python_version", "platform", "cpu", "institution", "references", "Conventions",
 )  # fmt: skip
 IDENTIFIERS = "d0-"  # begin those of figures, which are addresses
+DFS_WORDS = (
+    "how much of the prior variance the data removed, one minus posterior over prior variance of the members shown, of "
+    "the logarithm where the prior is lognormal; at 0 % the width is the prior's, at 100 % the prior does not matter"
+)
 
 
 def render_set(
@@ -41,6 +46,7 @@ def render_set(
         configuration=str(attributes.get("configuration", "")),
         stats=result.sample_stats.attrs,
         rows=result.summary(),
+        dfs_words=DFS_WORDS,
         cautions=result.cautions,
         tiles=_tiles(result),
         shares=_shares(result),
@@ -48,10 +54,12 @@ def render_set(
         what_if=(what_if := stored_shifts(result)),
         exceeding=exceeding(what_if),
         entries=stored_ledger(result),
+        readings=reading_words(result),
         walks=stored_walks(result),
         verdict=verdict(result),
         identifiers=IDENTIFIERS,
         figures=figures,
+        modes=_modes(result),
         lost=[(i, str(reason)) for i, reason in enumerate(reasons) if reason],
         iterations=_iterations(result),
         fixed_values=_fixed(result),
@@ -67,12 +75,19 @@ def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
     chi2, dfs, nrmse = (float(s[key]) for key in ("chi2_per_observation", "dfs", "nrmse"))
     structured = any(c.code in ("residual-structure", "odd-residuals") for c in result.cautions)
     chi2_words, chi2_odd = judge_chi2(chi2, int(s["n_weighted"]), dfs, structured)
-    informed = f"of {n_estimated} parameters determined by the data"
+    rows = result.summary()
+    shares, doubted = sum(row.dfs for row in rows), any(row.untrusted for row in rows)  # of what is reported
+    informed = f"numbers determined by the data, of {n_estimated} estimated: the sum of the shares below"
+    information = (
+        ("–", "cannot be told where intervals are not to be trusted")
+        if doubted
+        else (plain_number(shares, 3), informed)
+    )
     ended = "by its own criterion" if s["converged"] else "not converged"
     return [
         ("Fit, NRMSE", number_like(nrmse, 0.01), "1 is perfect, 0 is no better than a constant", not nrmse >= 0.9),
         ("χ² per observation", plain_number(chi2, 3), chi2_words, chi2_odd),
-        ("Information, DFS", plain_number(dfs, 3), informed, False),
+        ("Information, DFS", *information, False),
         ("Members alive", f"{alive} of {members}", "of the posterior ensemble", alive < members),
         ("Iterations", str(s["n_iterations"]), f"{ended}: {s['stop_reason']}", not s["converged"]),
     ]
@@ -106,6 +121,25 @@ def _shares(result: StoredResult) -> list[tuple[str, str, str, list[str]]]:
         shares = [float(stats[f"variance_from_{source}"].sel(parameter=row.name)) for source in SHARES]
         parts = [number_like(row.std * math.sqrt(max(0.0, share)), row.std) for share in shares]
         rows.append((row.symbol, number_like(row.std, row.std), row.unit, parts))
+    return rows
+
+
+def _modes(result: StoredResult) -> list[tuple[str, ...]]:
+    """One line a minimum of J: its weight, J, descents that ended there, and its centre in display units."""
+    stats = result.sample_stats
+    if "mode_cost" not in stats:
+        return []
+    rows = []
+    for k in range(stats.sizes["mode"]):
+        of = {key: float(stats[f"mode_{key}"][k]) for key in ("weight", "cost", "cost_spread", "descents")}
+        centre = [
+            number_like(convert(float(stats["mode_centre"][k, j]), a["units"], a["display_units"]), row.std)
+            for j, (row, a) in enumerate(
+                zip(result.summary(), (v.attrs for v in result.posterior.data_vars.values()), strict=True)
+            )
+        ]
+        spread = f" (J within {of['cost_spread']:.2g})" if of["cost_spread"] else ""
+        rows.append((f"{of['weight']:.2f}", f"{of['cost']:.2f}", f"{of['descents']:.0f}{spread}", *centre))
     return rows
 
 

@@ -1,13 +1,17 @@
-"""Numbers, units and symbols as people read them. Pure functions of strings and floats."""
+"""Numbers, units and symbols as people read them. Pure functions."""
 
 from __future__ import annotations
 
 import math
 import re
 
+import numpy as np
+import xarray as xr
 from markupsafe import Markup, escape
 
-from en4dvar.diagnostics import HARDLY_INFORMED
+from en4dvar.state import Array
+from en4dvar.summary import ParameterSummary
+from en4dvar.units import convert
 
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _NAMES = (
@@ -15,13 +19,6 @@ _NAMES = (
     "Gamma Delta Theta Lambda Sigma Phi Psi Omega"
 )
 _GREEK = dict(zip(_NAMES.split(), "αβγδεζηθκλμνξρστφχψωπ∞ℓΓΔΘΛΣΦΨΩ", strict=True))
-
-DFS_WORDS = (
-    (HARDLY_INFORMED, "data say nothing"),
-    (0.5, "weakly informed"),
-    (0.9, "informed"),
-    (math.inf, "determined by the data"),
-)
 
 
 def pretty_unit(unit: str) -> str:
@@ -90,9 +87,23 @@ def plus_minus(mean: float, std: float) -> str:
     return f"{number_like(mean, std)} ± {number_like(std, std)}"
 
 
-def informed_words(dfs: float) -> str:
-    """What the DFS share of a parameter means; empty for NaN."""
-    return next((phrase for limit, phrase in DFS_WORDS if dfs < limit or limit == math.inf), "") if dfs == dfs else ""
+def estimate(row: ParameterSummary, mark: str = ", not to be trusted") -> str:
+    """Mean and spread; a mean of three digits, marked, where they are not to be trusted."""
+    return f"{plain_number(row.mean, 3)}{mark}" if row.untrusted else plus_minus(row.mean, row.std)
+
+
+def untrusted_words(row: ParameterSummary) -> str:
+    """What it is not to be trusted for, ``"misfit, at bound"``; "" where it is."""
+    return ", ".join(code.replace("-", " ") for code in row.untrusted)
+
+
+def signed(value: float) -> str:
+    """Two significant digits with their sign.
+
+    >>> signed(0.234), signed(-4.0)
+    ('+0.23', '−4')
+    """
+    return ("+" if value > 0 else "") + plain_number(value, 2)
 
 
 def percent(share: float) -> str:
@@ -103,6 +114,12 @@ def percent(share: float) -> str:
 def fixed(value: float, places: int) -> str:
     """A number of so many decimals; an en dash for NaN."""
     return f"{value:.{places}f}" if math.isfinite(value) else "–"
+
+
+def shown(variable: xr.DataArray) -> Array:
+    """The values of a variable of a result file in its display unit."""
+    values = np.asarray(variable.values, dtype=float)
+    return convert(values, variable.attrs["units"], variable.attrs["display_units"])
 
 
 def figure_text(name: str) -> str:

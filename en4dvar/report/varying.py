@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
+from en4dvar.caution import untrusted
 from en4dvar.diagnostics import change_words
 from en4dvar.report.style import COLUMN, LIGHT, styled
 from en4dvar.report.text import with_unit
@@ -22,7 +23,10 @@ PIECE_COLUMNS = ("parameter", "time_unit", "begin", "end", "unit", "q05", "q50",
 
 @dataclass(frozen=True)
 class StoredWalk:
-    """A parameter over m + 1 pieces in display units: ``edges`` (m + 2,) of the pieces, quantiles (3, m + 1)."""
+    """A parameter over m + 1 pieces in display units: ``edges`` (m + 2,) of the pieces, quantiles (3, m + 1).
+
+    Where the interval of the parameter is not to be trusted, the posterior has no outer quantiles (NaN).
+    """
 
     name: str
     label: str
@@ -68,11 +72,12 @@ def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
         found = np.quantile(values, LEVELS, axis=0) if len(values) else np.full((3, len(begins)), np.nan)
         return convert(found, about["units"], shown)
 
+    after = quantiles("posterior")
+    if untrusted(result.cautions, name):
+        after[[0, 2]] = np.nan  # the interval
     label = str(result.posterior[name].attrs["long_name"])
     shown_edges = convert(edges, time.attrs["units"], clock)
-    return StoredWalk(
-        name, label, about["symbol"], shown, clock, shown_edges, quantiles("posterior"), quantiles("prior")
-    )
+    return StoredWalk(name, label, about["symbol"], shown, clock, shown_edges, after, quantiles("prior"))
 
 
 def piece_lines(result: StoredResult) -> list[tuple[object, ...]]:

@@ -16,6 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
+from en4dvar.influence import ReadingTangent
 from en4dvar.noise import Linearisation, Predicted
 from en4dvar.observations import Observations
 from en4dvar.state import Array
@@ -69,6 +70,16 @@ class LinearResponse:
         gradient = self.precision * offset - tangent.T @ changed + S.T @ d
         step = -np.linalg.solve(self._hessian(tangent), gradient)
         return np.asarray(step @ self.directions), -0.5 * float(gradient @ step)
+
+    def tangent(self, members: Array) -> ReadingTangent:
+        """The rows of each reading, of independent errors, beside control vectors (N, n).
+
+        Rows of what moves R follow those of the observations, in the same order.
+        """
+        d, S = self.whitened
+        k = len(self.observations)
+        rows = d.reshape(-1, k).T, S.reshape(-1, k, S.shape[1]).transpose(1, 0, 2)
+        return ReadingTangent(*rows, self.coordinates(members - self.at), self.directions)
 
     def _hessian(self, S: Array) -> Array:
         return np.asarray(self.precision * np.eye(S.shape[1]) + S.T @ S)

@@ -8,6 +8,7 @@ computes it again.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -18,7 +19,9 @@ import numpy.typing as npt
 from en4dvar.analysis import Analysis
 from en4dvar.caution import codes
 from en4dvar.diagnostics import active_members, nrmse
+from en4dvar.influence import prior_distance
 from en4dvar.state import Array, Parameter
+from en4dvar.storage.modes import mode_variables
 from en4dvar.storage.netcdf import Group, Variable, netcdf_attributes
 from en4dvar.storage.netcdf import variable as _variable
 from en4dvar.storage.responses import response_coordinates, response_variables
@@ -31,6 +34,7 @@ REFERENCES = (
 )
 MEMBER = ("chain", "draw")
 SCALAR = "scalar_"  # begins the attribute of a number found beside the data
+UNTOLD = "with heavy tails beside a discrepancy no single reading has a density of its own given the others"
 Variables = dict[str, Variable]
 
 
@@ -164,12 +168,14 @@ def _sample_stats(a: Analysis) -> Variables:
         f"{name}_centre": _observable(a, ("time",), a.centre_predictions, "prediction at the minimum of J"),
         **_residuals(a),
         **_discrepancy(a),
+        **_readings(a),
         **{
             f"{v.name}_reached": _variable(
                 MEMBER, a.extremes[None, :, i], v.unit, v.label, limit=v.value, source=v.source
             )
             for i, v in enumerate(a.problem.model.validity)
         },
+        **mode_variables(a),
         **response_variables(a),
     }
 
@@ -185,6 +191,25 @@ def _residuals(a: Analysis) -> Variables:
         f"{name}_whitened_residual": _variable("time", white, "1", "whitened residual at the minimum of J"),
         f"{name}_studentised": _variable("time", studentised, "1", "whitened residual over its own expected std"),
         f"{name}_leverage": _variable("time", leverage, "1", "share of the reading in its own prediction"),
+    }
+
+
+def _readings(a: Analysis) -> Variables:
+    """What each reading does to the posterior (parameter, time), and how far it lies from the prior (time)."""
+    living = a.prior_predictions[active_members(a.prior_failures)]
+    distance = prior_distance(a.observations.values, living, a.error_std)
+    words = "distance of the reading from the prior's prediction, in the std of both"
+    found = {f"{a.problem.observable.name}_prior_distance": _variable("time", distance, "1", words)}
+    if a.influence is None:
+        return found
+    of_each = ("parameter", "time")
+    what = "change of the posterior mean if the reading is left out"
+    how = "0 by importance weights, 1 by linear response, 2: only another fit tells"
+    return found | {
+        "influence_change": _variable(of_each, a.influence.change, "1", f"{what}, each in the unit of its parameter"),
+        "influence_in_std": _variable(of_each, a.influence.in_std, "1", f"{what}, in posterior standard deviations"),
+        "influence_pareto_shape": _variable("time", a.influence.pareto_shape, "1", "Pareto shape of the weights"),
+        "influence_how": _variable("time", a.influence.how.astype(float), "1", how),
     }
 
 
@@ -228,9 +253,12 @@ def _scalars(a: Analysis) -> dict[str, Any]:
         "converged": a.converged,
         "stop_reason": a.stop_reason,
         "forward_runs": a.forward_runs,
+        "n_modes": len(a.modes),
+        "n_agreeing": a.modes[0].descents if a.modes else 1,
         "what_if_runs": sum(shift.runs for shift in a.what_if),
         "ledger_runs": a.ledger.runs if a.ledger else 0,
         "warning_codes": " ".join(codes(a.cautions)),
+        "influence_reason": _untold(a),
         **_judged_residuals(a),
         **a.shape,
         **a.refinement,
@@ -256,6 +284,14 @@ def _judged_residuals(a: Analysis) -> dict[str, Any]:
         left = residual - a.discrepancy.mean
         numbers["discrepancy_share"] = 1 - float(left @ left) / (float(residual @ residual) or np.nan)
     return numbers
+
+
+def _untold(a: Analysis) -> str:
+    """Why it is not known what leaving out a reading would change; "" where it is."""
+    noise = a.observations.noise
+    if a.influence is not None:
+        return ""
+    return UNTOLD if noise.discrepant and math.isfinite(noise.counts_within) else "too few members"
 
 
 def _text(strings: Sequence[str]) -> npt.NDArray[np.object_]:

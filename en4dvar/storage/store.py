@@ -12,7 +12,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from en4dvar.analysis import Analysis
-from en4dvar.caution import Caution
+from en4dvar.caution import Caution, worst_first
 from en4dvar.errors import OutputError
 from en4dvar.noise import noise_of_record
 from en4dvar.observations import Observations
@@ -87,7 +87,7 @@ class StoredResult:
     @property
     def cautions(self) -> tuple[Caution, ...]:
         """Why not to trust the posterior, or read it with care: code, severity, words, advice; the worst first."""
-        return tuple(map(Caution.parse, str(self.tree.attrs["warnings"]).splitlines()))
+        return worst_first(map(Caution.parse, str(self.tree.attrs["warnings"]).splitlines()))
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -125,11 +125,13 @@ class StoredResult:
 
     def summary(self) -> tuple[ParameterSummary, ...]:
         """One row a parameter, as of :func:`~en4dvar.summary.summarise`."""
+        cautions = self.cautions
 
         def row(name: str) -> ParameterSummary:
             prior, posterior = self.members("prior", name), self.members("posterior", name)
             at = self.sample_stats.sel(parameter=name)
-            return ParameterSummary.of(self._parameter(name), prior, posterior, float(at["centre"]), float(at["dfs"]))
+            centre, dfs = float(at["centre"]), float(at["dfs"])
+            return ParameterSummary.of(self._parameter(name), prior, posterior, centre, dfs, cautions)
 
         return tuple(row(str(name)) for name in self.posterior.data_vars)
 

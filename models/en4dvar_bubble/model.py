@@ -72,6 +72,11 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         )
 
     @property
+    def cheap(self) -> bool:
+        """All but the equations of vapour and of the medium's temperature, a run of which takes some 10 ms."""
+        return not (self.system.vapour or self.system.medium)
+
+    @property
     def validity(self) -> tuple[ValidityLimit, ...]:  # type: ignore[override]
         """The largest Mach number of the wall that the radial equation can bear, and where that is said."""
         value, source = MACH_LIMITS[self.radial]

@@ -19,7 +19,7 @@ LAYERS = (
     ("units", "prior", "forward", "noise"),
     ("batch", "observations"),
     ("varying",),
-    ("problem", "diagnostics", "residuals"),
+    ("problem", "diagnostics", "residuals", "influence"),
     ("executor",),
     ("ensemble",),
     ("response",),

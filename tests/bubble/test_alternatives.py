@@ -78,6 +78,21 @@ def test_the_predicted_change_is_that_of_a_fit_done_again(fits, start, name):
 
 
 @pytest.mark.parametrize("start", STARTS)
+def test_the_influence_of_a_reading_is_that_of_a_fit_without_it(fits, start):
+    """Of the three readings that move a parameter most."""
+    problem, analysis = fits[start]
+    o, mean, std = problem.observations, analysis.posterior.mean(axis=0), analysis.posterior.std(axis=0, ddof=1)
+    found = analysis.influence.in_std
+    for k in np.argsort(-np.abs(found).max(axis=0))[:3]:
+        kept = np.arange(len(o)) != k
+        rest = Observations(o.times[kept], o.values[kept], noise_of(o.std[kept]), o.weights[kept])
+        again = assimilate(replace(problem, observations=rest), replace(SETTINGS, what_if=False), 1)
+        change = (again.posterior.mean(axis=0) - mean) / std
+        assert np.abs(change).max() > 0.05
+        np.testing.assert_allclose(found[:, k], change, rtol=0, atol=0.02 if start == "acoustic" else 0.15)
+
+
+@pytest.mark.parametrize("start", STARTS)
 def test_every_alternative_is_told_or_has_a_reason(fits, start):
     problem, analysis = fits[start]
     offered = {one.name for one in problem.model.alternatives}

@@ -143,11 +143,3 @@ def test_simulate_grid(tmp_path: Path) -> None:
     assert faults(tmp_path, ("seed: 3\n", "seed: 3\n" + grid.replace("0.1 ms", "0 ms")))[0].startswith(
         "toy.yaml:3:19: simulate.times: no instants"
     )
-
-
-def test_refinement_without_emcee_is_told_before_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    change = ("members: 8", "members: 8\n  refine: mcmc")
-    assert load_config(write_toy(tmp_path, change)).assimilation.refine == "mcmc"
-    monkeypatch.setattr("en4dvar.config.load.find_spec", lambda name: None)
-    (fault,) = faults(tmp_path, change)
-    assert fault.startswith("toy.yaml:18:11: assimilation.refine: mcmc needs emcee")

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from same_bits import assert_same_bits
 from toys import Decay, Toy, make_problem
 
-from en4dvar.assimilate import assimilate
+from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.executor import SerialExecutor
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.schemes.base import Runs, Weights
 from en4dvar.schemes.en4dvar import En4DVar
+from en4dvar.storage.codec import decode, encode
 
 STD, JUMP, CELL = 0.05, 1e-4, 1e-3  # of the readings; of the predictions, 1e-4 of their size; in a parameter
-TRUTHS = np.random.default_rng(4).normal([1.2, 1.0], 0.2, (20, 2))
+TRUTHS = np.random.default_rng(4).normal([1.2, 1.0], 0.2, (14, 2))
 
 
 class Jumpy(Decay):
@@ -55,6 +57,16 @@ def test_solver_noise_is_no_lack_of_convergence_and_no_wrong_spread():
     assert told == []
     assert max(shifts) < 0.2
     assert np.quantile(ratios, 0.8) < 0.1
+
+
+def test_a_wide_bundle_is_resumed():
+    """From every state that is kept, as it comes back from a file."""
+    problem, settings, kept = experiment(Jumpy(), 0), AssimilationSettings(members=12), []
+    whole = assimilate(problem, settings, 0, keep=lambda state: kept.append(encode(state())))
+    states = [decode(state, LoopState) for state in kept]
+    assert {s.descent.weights.wider for s in states if s.descent} > {1.0}
+    for state in states:
+        assert_same_bits(assimilate(problem, settings, 0, resume=state), whole)
 
 
 def test_a_kink_is_still_told():

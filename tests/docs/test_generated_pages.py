@@ -52,7 +52,7 @@ def test_the_page_names_nothing_that_is_not_there(result):
         for group in groups:
             there = {named(result, v): set(map(str, d.dims)) for v, d in result.dataset(group).variables.items()}
             for name in set(re.findall(r"`(\w+)`", names)) - sometimes:
-                if name.startswith(("what_if_", "ledger_")):  # of models that offer them
+                if name.startswith(("what_if_", "ledger_", "influence_")):  # where they can be told
                     continue
                 assert name in there, f"{group}: {name}"
                 if name != "G_centre":

@@ -43,6 +43,20 @@ class Product(Toy):
         return 0.0
 
 
+class Signless(Toy):
+    """y = a² t: the data do not know the sign of a."""
+
+    def curve(self, theta, t):
+        return float(theta[0] ** 2 * t)
+
+    def rate(self, theta, t):
+        return float(theta[0] ** 2)
+
+
+def signless() -> InverseProblem:
+    return make_problem(Signless(("a",)), (1.0,), prior=(PriorTerm.normal(Parameter("a", "m"), 0.0, 1.0),))
+
+
 def run(problem: InverseProblem, **settings: object) -> Analysis:
     return assimilate(problem, AssimilationSettings(**settings), 1)  # type: ignore[arg-type]
 
@@ -104,6 +118,8 @@ PROVOKED: dict[str, Callable[[], Analysis]] = {
     ),
     "at-bound": lambda: run(bounded(1.6, lambda a: PriorTerm.logit(a, (0.0, 1.0), 0.5, 1.5), (0.0, 1.0))),
     "non-gaussian": lambda: run(make_problem(Product(TWO), (1.0, 1.0), std=0.1)),
+    "several-modes": lambda: run(signless(), members=16),
+    "starts-disagree": lambda: run(signless(), members=4),
     "residual-structure": lambda: run(bent()),
     "odd-residuals": lambda: run(spiked()),
     "start-moved": lambda: run(

@@ -71,7 +71,7 @@ def test_the_wheel_holds_the_packages_and_what_lies_beside_them(built):
     assert {"en4dvar/py.typed", "en4dvar_bubble/py.typed"} <= set(names)
     assert metadata["Requires-Python"] == ">=3.11"
     assert metadata["License-Expression"] == "BSD-3-Clause"
-    assert {"distributed", "mcmc", "docs", "dev"} <= set(metadata.get_all("Provides-Extra") or ())
+    assert {"distributed", "docs", "dev"} <= set(metadata.get_all("Provides-Extra") or ())
     assert metadata["Version"] in built["wheel"].name
 
 
@@ -94,6 +94,6 @@ def test_the_quick_start_runs_from_the_wheel_alone(installed, tmp_path):
 
 
 def test_the_extras_install_and_import(installed, built, tmp_path):
-    wanted = f"en4dvar[distributed,mcmc] @ {built['wheel'].as_uri()}"
+    wanted = f"en4dvar[distributed] @ {built['wheel'].as_uri()}"
     call(installed / "pip", "install", "-q", "--disable-pip-version-check", wanted, folder=tmp_path)
-    call(installed / "python", "-c", "import dask, distributed, emcee, en4dvar.executor.dask", folder=tmp_path)
+    call(installed / "python", "-c", "import dask, distributed, en4dvar.executor.dask", folder=tmp_path)

@@ -32,7 +32,7 @@ from en4dvar.report.style import draw
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.store import save
 
-FIGURES = ("posterior", "history", "cost", "iterations", "pairs")
+FIGURES = ("posterior", "history", "influence", "cost", "iterations", "pairs")
 VOID = {"meta", "link", "br", "img", "path", "use"}
 
 
@@ -116,7 +116,7 @@ def test_page_is_well_formed_and_self_contained(html):
 def test_page_says_what_was_estimated_and_how_well(html):
     result_text = " ".join("".join(Page(html).text).split())
     for phrase in (
-        "2.80", "kPa", "Pa·s", "µm", "determined by the data", "data say nothing", "collapse too violent",
+        "2.80", "kPa", "Pa·s", "µm", "determined by the data", "not narrowed by the data", "collapse too violent",
         "step norm below 1e-3", "23 of 24", "far-field pressure", "101.325", "name: test",
     ):  # fmt: skip
         assert phrase in result_text, phrase

@@ -31,15 +31,6 @@ def test_plus_minus(mean, std, shown):
 
 
 @pytest.mark.parametrize(
-    ("dfs", "phrase"),
-    [(-0.2, "data say nothing"), (0.09, "data say nothing"), (0.3, "weakly informed"), (0.7, "informed"),
-     (0.95, "determined by the data"), (1.0, "determined by the data"), (float("nan"), "")],
-)  # fmt: skip
-def test_share_in_words(dfs, phrase):
-    assert text.informed_words(dfs) == phrase
-
-
-@pytest.mark.parametrize(
     ("symbol", "html"),
     [
         (r"$p_{\infty}$", "<i>p</i><sub>∞</sub>"),

@@ -143,7 +143,7 @@ def test_shift_and_ratio_are_those_of_the_posterior(nothing_cleared):
     std = np.sqrt(p @ (grid - mean) ** 2)
     shifts, ratios = [], []
     for seed in range(12):
-        analysis = assimilate(problem, AssimilationSettings(members=24), seed)
+        analysis = assimilate(problem, AssimilationSettings(members=24, refine="none"), seed)
         x = problem.prior.from_physical(analysis.posterior)
         ratio = x.std(axis=0, ddof=1) / std
         shape = analysis.shape
@@ -156,7 +156,7 @@ def test_shift_and_ratio_are_those_of_the_posterior(nothing_cleared):
 
 
 def test_the_emulator_is_for_cheap_models_unless_asked_for(nothing_cleared):
-    settings = AssimilationSettings(members=24)
+    settings = AssimilationSettings(members=24, refine="none")
     slow, fast = skewed(compiled=False), skewed()
     runs = 2 * needed_runs(2)[1]
     without, with_ = assimilate(slow, settings, 1), assimilate(fast, settings, 1)

@@ -1,6 +1,5 @@
 """The Markov chain: its own diagnostics on series with known answers, and the refinement of a skewed posterior."""
 
-import builtins
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,7 @@ from toys import Decay, make_problem
 
 from en4dvar.analysis import ChainRecord, IterationRecord
 from en4dvar.assimilate import assimilate, log_posterior
-from en4dvar.errors import ConfigError, En4dvarError
+from en4dvar.errors import En4dvarError
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import AssimilationSettings
@@ -136,16 +135,3 @@ def test_refinement_has_the_same_bits_for_any_workers(monkeypatch):
     assert not np.array_equal(other.posterior, one.posterior)
     plain = assimilate(problem, replace(settings, refine="none"), 1)
     assert plain.refinement == {}
-
-
-def test_refinement_without_emcee_names_the_extra(monkeypatch):
-    imports = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name == "emcee":
-            raise ImportError(name)
-        return imports(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ConfigError, match=r"en4dvar\[mcmc\]"):
-        mcmc.sample(lambda x: -np.sum(x**2, axis=1), np.eye(4), 1)

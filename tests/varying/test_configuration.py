@@ -9,12 +9,15 @@ import yaml
 from run_files import assert_same_results, configuration, make_campaign
 from toy_config import csv_text, write_toy
 
+from en4dvar.caution import caution
 from en4dvar.config import load_config
 from en4dvar.config.build import build
 from en4dvar.descent.preview import preview
 from en4dvar.errors import ConfigError
 from en4dvar.problem import AssimilationSettings
+from en4dvar.report.page import render_set
 from en4dvar.report.result import load_result
+from en4dvar.report.varying import bands as varying_figure
 from en4dvar.report.varying import stored_walks, verdict
 from en4dvar.runs.checks import validate
 from en4dvar.runs.runner import run, run_campaign, write_report
@@ -193,11 +196,22 @@ def test_pieces_in_the_file(finished):
     assert pieces.values[0, :, 2] == pytest.approx(walked.values[0])
     off = pieces.mean(("chain", "draw")) - np.array([2.0, 2.0, 1.2])
     assert np.all(np.abs(off) < 2 * pieces.std(("chain", "draw")))
+    result.tree.attrs["warnings"] = ""  # data without noise have residuals of a structure: no interval would stand
     (walk,) = stored_walks(result)
     assert walk.edges == pytest.approx([0.0, 0.04, 0.08, 0.15])
     assert np.all(np.diff(walk.posterior, axis=0) > 0)
     assert result.sample_stats.attrs["log_evidence_change"] > 3
     assert verdict(result).startswith("stiffness: the data speak for a change (log evidence +")
+
+
+def test_pieces_of_what_is_not_to_be_trusted_have_no_interval(finished):
+    result = load_result(finished / "posterior.nc")
+    result.tree.attrs["warnings"] = caution("at-bound", "piles up", parameters=("k",)).line
+    (walk,) = stored_walks(result)
+    assert np.isnan(walk.posterior[[0, 2]]).all()
+    assert np.isfinite(walk.posterior[1]).all()
+    assert varying_figure(result).axes
+    assert "not to be trusted: at bound" in render_set(result, [])
 
 
 @pytest.mark.slow

@@ -1,0 +1,64 @@
+"""Where descents ended: minima of J, as far as a rough descent tells, and the Gaussians about them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.ensemble.linalg import Hessian
+from en4dvar.prior import Prior
+from en4dvar.state import Array
+
+REACHED = 2.0  # posterior standard deviations between a minimum and a descent that ended in it
+SLOPE = 4.0  # as many, within which one that ended early on the slope of a minimum is told from another minimum
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """A minimum ``x`` (n,) of J, transformed, the covariance (n, n) of the Gaussian about it, J there, how many
+    descents from different members ended in it, and by how much J of these differs.
+    """
+
+    x: Array
+    covariance: Array
+    cost: float
+    descents: int = 1
+    spread: float = 0.0
+
+    @classmethod
+    def at(cls, space: WeightSpace, w: Array, hessian: Hessian, cost: float, descents: int = 1) -> Minimum:
+        """At weights w (N,), whose Hessian of J is known there or close by."""
+        covariance = space.anomalies.T @ hessian.solve(space.anomalies.T).T
+        return cls(space.control(w), np.asarray(covariance), cost, descents)
+
+    def distance(self, x: Array) -> float:
+        """Of a control vector (n,), in posterior standard deviations."""
+        apart = x - self.x
+        return math.sqrt(max(0.0, float(apart @ np.linalg.lstsq(self.covariance, apart, rcond=None)[0])))
+
+    def log_evidence(self, prior: Prior) -> float:
+        """Laplace's approximation of ln ∫ exp(−J_o) N(x; prior) dx over this minimum alone."""
+        return float(-self.cost + 0.5 * np.linalg.slogdet(self.covariance)[1] - np.sum(np.log(prior.std)))
+
+
+def merged(minima: Sequence[Minimum]) -> tuple[Minimum, ...]:
+    """One for each place, the lowest first: a minimum that lies within the reach of a lower one is the lower one.
+
+    So is one on its slope, where J exceeds that of the lower one by half of what the Gaussian about it has there.
+    """
+    found: list[Minimum] = []
+    for one in sorted(minima, key=lambda minimum: minimum.cost):
+        for place, lower in enumerate(found):
+            distance = lower.distance(one.x)
+            on_slope = distance < SLOPE and one.cost - lower.cost > 0.25 * distance**2
+            if distance < REACHED or on_slope:
+                spread = max(lower.spread, one.cost + one.spread - lower.cost)
+                found[place] = replace(lower, descents=lower.descents + one.descents, spread=spread)
+                break
+        else:
+            found.append(one)
+    return tuple(found)

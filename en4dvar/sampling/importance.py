@@ -1,0 +1,84 @@
+r"""A posterior as weighted draws, by adaptive importance sampling with forward runs.
+
+    p(y) = ∫ L(x) N(x; prior) dx ≈ (1/TM) Σ_i L(x_i) N(x_i) / q(x_i),     q = (1/T) Σ_t q_t
+
+The draws of the first round come from a proposal given from outside. Those of a later round come from a mixture of
+Student t fitted to all before, whose weights are tempered as long as few of them count, so that the proposals close in
+on the posterior from outside. q is the mixture of all rounds (Cornuet, Marin, Mira & Robert 2012, Scand. J. Stat. 39,
+798). Coordinates z are those in which the prior is N(0, 1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
+from en4dvar.state import Array
+
+FEWEST = 60.0  # effective draws that a proposal is fitted to: with fewer, to tempered weights
+COMPONENTS = 4
+
+
+def standard(n: int) -> StudentMixture:
+    """The prior in its own coordinates, with the tails of a proposal."""
+    return StudentMixture(np.ones(1), np.zeros((1, n)), np.eye(n)[None])
+
+
+class Importance:
+    """The draws and proposals of one data set, ``count`` in a round, the first of them from ``first``.
+
+    Proposals are ``wider`` by that factor than what they are fitted to, so that thin tails are found as well.
+
+    ``z`` (D, n) are all draws, ``log_weights`` (D,) their weights, ``log`` is ln ∫ L N dz and ``effective`` the number
+    of draws behind it.
+    """
+
+    def __init__(self, first: StudentMixture, stream: np.random.Generator, count: int, wider: float = 1.0):
+        n = first.centre.shape[1]
+        self.stream, self.count, self.wider = stream, count, wider
+        self.proposals = [first]
+        self.z, self.target, self.mixture = np.empty((0, n)), np.empty(0), np.empty(0)  # mixture: ln Σ_t q_t
+        self.log_weights, self.log, self.effective = np.empty(0), -np.inf, 0.0
+
+    @property
+    def shares(self) -> Array:
+        """Weights (D,) of the draws, which sum to one; some draw must have one."""
+        weights = np.exp(self.log_weights - self.log_weights.max())
+        return np.asarray(weights / weights.sum())
+
+    def draw(self) -> Array:
+        """(M, n) draws of the next round."""
+        if len(self.z):
+            self.proposals.append(self.next_proposal())
+        return self.proposals[-1].draw(self.count, self.stream)
+
+    def add(self, z: Array, log_likelihood: Array) -> None:
+        """Draws (M, n) and what came of them (M,); weights and evidence of all draws follow."""
+        n = z.shape[1]
+        target = log_likelihood - 0.5 * np.sum(z**2, axis=1) - 0.5 * n * np.log(2 * np.pi)
+        if len(self.z):
+            self.mixture = np.logaddexp(self.mixture, self.proposals[-1].log_density(self.z))
+        here = np.logaddexp.reduce([q.log_density(z) for q in self.proposals], axis=0)
+        self.z, self.target = np.concatenate([self.z, z]), np.concatenate([self.target, target])
+        self.mixture = np.concatenate([self.mixture, here])
+        self.log_weights = self.target - self.mixture + np.log(len(self.proposals))
+        top = float(self.log_weights.max())
+        if np.isfinite(top):
+            weights = np.exp(self.log_weights - top)
+            self.log = top + float(np.log(weights.mean()))
+            self.effective = effective_number(weights)
+
+    def next_proposal(self) -> StudentMixture:
+        """Fitted to the draws so far; the first one while none of them has a weight."""
+        if not np.isfinite(self.log):
+            return self.proposals[0]
+        logs, power = self.log_weights - self.log_weights.max(), 1.0
+        weights = np.exp(logs)
+        while effective_number(weights) < FEWEST and power > 1e-4:
+            power *= 0.8
+            weights = np.exp(power * logs)
+        where = resampled(weights / weights.sum(), self.count, self.stream)
+        fitted = StudentMixture.fitted(self.z[where], self.stream, COMPONENTS)
+        return replace(fitted, root=self.wider * fitted.root)

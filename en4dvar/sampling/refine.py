@@ -1,0 +1,165 @@
+"""When an ensemble about one minimum of J leaves a doubt, and the sampled posterior that takes its place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from en4dvar import diagnostics as diag
+from en4dvar.analysis import ChainRecord
+from en4dvar.caution import Caution, caution
+from en4dvar.descent.minima import Minimum
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.prior import Prior, member_stream
+from en4dvar.sampling import mcmc
+from en4dvar.sampling.emulated_cost import needed_runs
+from en4dvar.sampling.modes import TOO_FEW, WeightedDraws, nearest, sample_modes
+from en4dvar.sampling.shape import guide
+from en4dvar.state import Array
+from en4dvar.units import convert
+
+COUNTS = math.log(1e-3)  # evidence of a minimum relative to that of the lowest, by Laplace, from which it may matter
+
+MISSED = 0.5  # of J, by which a draw must be lower than all minima to be told
+SEEN = 0.02  # weight of a mode that is told
+SHIFT, SPREAD = 0.25, 0.15  # of the ensemble, by the emulator: half of what is warned of
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Members (N, n), transformed, that take the ensemble's place, and what judges them.
+
+    ``weights`` (M,) of the modes; ``log_evidence`` ln ∫ exp(−J_o) N(x; prior) dx, NaN where it is not known;
+    ``lowest`` J that was met.
+    """
+
+    members: Array
+    summary: Mapping[str, float]
+    weights: Array = field(default_factory=lambda: np.ones(1))
+    log_evidence: float = math.nan
+    lowest: float = math.inf
+    warnings: tuple[Caution, ...] = ()
+
+
+def that_count(minima: Sequence[Minimum], prior: Prior) -> tuple[Minimum, ...]:
+    """The lowest, and the others that may hold some of the probability."""
+    logs = [m.log_evidence(prior) for m in minima]
+    return tuple(m for i, m in enumerate(minima) if i == 0 or logs[i] - logs[0] > COUNTS)
+
+
+def mode_cautions(
+    prior: Prior, minima: Sequence[Minimum], weights: Array, agree: bool, result: Refined | None
+) -> Iterator[Caution]:
+    """What there is to say of the minima that count, of these weights; ``result`` is there where sampled."""
+    lowest = minima[0].cost
+    if result is not None and result.lowest < lowest - MISSED:
+        words = f"a draw has J = {result.lowest:.1f}, lower than the lowest minimum that descents found, {lowest:.1f}"
+        yield caution("starts-disagree", words)
+    elif result is None and not agree:
+        costs = ", ".join(f"{m.cost:.1f}" for m in minima[1:]) or "elsewhere"
+        words = f"of all descents one alone ended in the lowest minimum, J = {lowest:.1f}; others ended at {costs}"
+        yield caution("starts-disagree", words)
+    seen = [m for m, weight in zip(minima, weights, strict=True) if weight >= SEEN]
+    if len(seen) < 2:
+        return
+    centres = [prior.to_physical(m.x) for m in seen]
+    shares = " and ".join(f"{weight:.2f}" for weight in weights if weight >= SEEN)
+    apart = np.argmax(np.abs((seen[1].x - seen[0].x) / prior.std))
+    p = prior.parameters[apart]
+    at = " and ".join(f"{convert(float(c[apart]), p.unit, p.display_unit):.3g}" for c in centres)
+    unit = "" if p.display_unit == "1" else f" {p.display_unit}"
+    drawn = "members are drawn from all of them" if result else "members describe the first alone"
+    yield caution(
+        "several-modes", f"the posterior has {len(seen)} modes, {p.name} = {at}{unit}, of weights {shares}; {drawn}"
+    )
+
+
+def samples(space: WeightSpace) -> bool:
+    """Whether a doubt is settled by sampling: ``refine: auto`` with a cheap model of few parameters, all constant."""
+    n, problem, settings = len(space.mean), space.problem, space.settings
+    few = needed_runs(n) is not None and space.basis.shape[1] == n and not problem.varying
+    return settings.refine == "auto" and problem.model.cheap and few and not settings.stochastic_model
+
+
+def in_doubt(minima: Sequence[Minimum], agree: bool, shape: Mapping[str, float]) -> bool:
+    """Whether the Gaussian about the lowest of the minima that count may not be the posterior.
+
+    ``agree``: whether descents from different members ended there. ``shape`` is that of
+    :func:`~en4dvar.sampling.shape.examine_shape`.
+    """
+    off = shape.get("mean_shift", 0.0) > SHIFT or abs(shape.get("spread_ratio", 1.0) - 1) > SPREAD
+    unclear = shape.get("emulator_fit", 1.0) < diag.EMULATED_ENOUGH
+    return not agree or len(minima) > 1 or bool(shape.get("non_gaussian")) or off or unclear
+
+
+def refined(
+    space: WeightSpace,
+    cost: Callable[[Array], Array],
+    posterior: Array,
+    minima: Sequence[Minimum],
+    seed: int,
+    *,
+    resume: Callable[[], mcmc.ChainState | None],
+    keep: Callable[[mcmc.ChainState], None],
+    look: Callable[[ChainRecord], None],
+) -> Refined:
+    """Members of the posterior that ``minima`` are the modes of, in place of ``posterior`` (N, n).
+
+    ``cost``: J (B,) of control vectors (B, n), by the model. By a Markov chain where the settings want one or
+    weighted draws are too few. ``resume`` is asked when the chain begins; it, ``keep``, ``look``: see
+    :func:`~en4dvar.sampling.mcmc.sample`.
+    """
+    prior, exact = space.problem.prior, space.settings.sampling == "exact"
+    chain = space.settings.refine == "mcmc"
+    draws = sample_modes(cost, prior, minima, seed) if len(minima) > 1 or not chain else None
+    if draws is not None and not chain and draws.effective >= TOO_FEW:
+        members = draws.members(len(posterior), member_stream(seed, "members of the modes"), exact)
+        summary = _summary(draws, posterior)
+        return Refined(members, summary, draws.weights(len(minima)), draws.log_evidence, draws.lowest)
+    several = draws is not None and len(minima) > 1
+    start = _in_all(minima, len(posterior), seed) if several else posterior
+    emulated = None if several else guide(space, posterior, seed)
+    walked = mcmc.sample(
+        lambda x: -cost(x),
+        start,
+        seed,
+        resume=resume(),
+        keep=keep,
+        look=look,
+        emulated=emulated,
+        proposal=draws.proposal if several and draws is not None else None,
+    )
+    shares = np.bincount(nearest(prior, minima, walked.flat)) / len(walked.flat) if several else np.ones(1)
+    known = draws is not None and draws.effective >= TOO_FEW
+    return Refined(
+        walked.thin(len(posterior), exact),
+        walked.summary(),
+        shares,
+        draws.log_evidence if draws is not None and known else math.nan,
+        float(-walked.log_density.max()),
+        () if walked.converged else (caution("chain-not-converged", walked.warning()),),
+    )
+
+
+def _in_all(minima: Sequence[Minimum], count: int, seed: int) -> Array:
+    """(N, n) draws about each minimum in turn."""
+    normal = member_stream(seed, "start in all modes").standard_normal((count, len(minima[0].x)))
+    roots = [np.linalg.cholesky(m.covariance) for m in minima]
+    every = range(count)
+    return np.stack([minima[i % len(minima)].x + roots[i % len(minima)] @ normal[i] for i in every])
+
+
+def _summary(draws: WeightedDraws, posterior: Array) -> dict[str, float]:
+    """The numbers that judge weighted draws, and how far they are from the ensemble they replace, for the result."""
+    std = np.sqrt(np.diag(draws.covariance))
+    moved = (draws.mean - posterior.mean(axis=0)) / std
+    widened = np.log(std / posterior.std(axis=0, ddof=1))
+    return {
+        "importance_draws": len(draws.x),
+        "importance_effective_sample_size": draws.effective,
+        "importance_largest_shift": float(np.max(np.abs(moved))),
+        "importance_largest_spread_ratio": float(np.exp(np.max(np.abs(widened)))),
+    }
