@@ -138,7 +138,7 @@ def _modes(result: StoredResult) -> list[tuple[str, ...]]:
                 zip(result.summary(), (v.attrs for v in result.posterior.data_vars.values()), strict=True)
             )
         ]
-        spread = f" (J within {of['cost_spread']:.2g})" if of["cost_spread"] else ""
+        spread = f" (they were ended within {of['cost_spread']:.2g} of its J)" if of["cost_spread"] else ""
         rows.append((f"{of['weight']:.2f}", f"{of['cost']:.2f}", f"{of['descents']:.0f}{spread}", *centre))
     return rows
 
