@@ -313,6 +313,7 @@ def test_single_parameter_has_no_pairs(write_run, analysis):
         posterior=analysis.posterior[:, :1],
         centre=analysis.centre[:1],
         dfs_per_parameter=analysis.dfs_per_parameter[:1],
+        modes=(),
         iterations=tuple(replace(r, members=r.members[:, :1], centre=r.centre[:1]) for r in analysis.iterations),
     )
     run_dir = write_run(one)
