@@ -140,7 +140,7 @@ def test_warnings_speak_of_what_they_see():
     assert "larger than the scatter" in " ".join(assimilate(optimistic, AssimilationSettings(), 1).warnings)
     conflict = make_problem(Vectorised(("a", "b")), [1.0, 0.5], scale=0.02, std=0.001)
     (warning,) = assimilate(conflict, AssimilationSettings(), 1).warnings
-    assert warning.startswith("prior and data conflict: the minimum lies far from the prior mean (a by +10")
+    assert warning.startswith("prior and data conflict: the minimum lies far from the prior mean (a at 1 m")
     vague = make_problem(Vectorised(("a", "b")), [1.0, 0.5], scale=0.01, std=0.5)
     assert [w.split(" (")[0] for w in assimilate(vague, AssimilationSettings(), 1).warnings] == [
         "a is hardly informed by the data",
