@@ -106,13 +106,14 @@ class Swift(Oscillator):
 
 
 class Waits(Oscillator):
-    """Call number 9 of its thread, in the first iterations of a data set, waits for the file ``EN4DVAR_TEST_FLAG``."""
+    """Call number ``at`` of its thread, in the first iterations of a data set, waits for ``EN4DVAR_TEST_FLAG``, a file."""
 
     calls = threading.local()
+    at = 9
 
     def trajectories(self, x, times):
         self.calls.n = getattr(self.calls, "n", 0) + 1
-        if self.calls.n == 9:
+        if self.calls.n == self.at:
             self.wait(Path(os.environ["EN4DVAR_TEST_FLAG"]))
         return super().trajectories(x, times)
 
@@ -136,6 +137,8 @@ class WaitsTwice(Waits):
 
 class WaitsAndDies(Waits):
     """Waits so in the data set of large amplitude only, whose iterations that file is about, and dies there, once."""
+
+    at = 11  # its start takes two calls more
 
     def trajectories(self, x, times):
         return super().trajectories(x, times) if is_large(x) else Oscillator.trajectories(self, x, times)

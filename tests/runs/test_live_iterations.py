@@ -11,13 +11,13 @@ from en4dvar.runs.runner import run_campaign
 
 
 class Listener:
-    """Lets the waiting models go on once the last iteration before is in the log, which came fast upon another.
+    """Lets the waiting models go on once the ``last`` iteration before is in the log, which came fast upon another.
 
     With ``of``, that of the data set of this name.
     """
 
-    def __init__(self, out, flag, of=None):
-        self.out, self.flag, self.of, self.heard = out, flag, of, []
+    def __init__(self, out, flag, of=None, last=2):
+        self.out, self.flag, self.of, self.last, self.heard = out, flag, of, last, []
 
     def __call__(self, name, record):
         lines = log(self.out)
@@ -29,7 +29,7 @@ class Listener:
             assert any(f"{name}: iteration {record.iteration:2d}  J " in line for line in lines)
             assert not any(f"{name}: converged" in line for line in lines)
         self.heard.append((name, record.iteration))
-        if record.iteration == 2 and self.of in (name, None):
+        if record.iteration == self.last and self.of in (name, None):
             self.flag.touch()
 
 
@@ -70,10 +70,10 @@ def test_an_iteration_is_told_before_its_data_set_ends(quiet, tmp_path, monkeypa
 @pytest.mark.parametrize("kind", ["processes", pytest.param("dask", marks=pytest.mark.slow)])
 @pytest.mark.fault("worker-killed")
 def test_iterations_of_a_killed_worker_are_told_again(tmp_path, monkeypatch, kind):
-    """It dies as soon as three of them have been heard here: by then none of them is on its way."""
+    """It dies as soon as four of them have been heard here: by then none of them is on its way."""
     monkeypatch.setenv("EN4DVAR_TEST_FLAG", str(tmp_path / "heard"))
     path, out = make_campaign(tmp_path, 3, "execution_models:WaitsAndDies", large=1), tmp_path / "run"
-    listener = Listener(out, tmp_path / "heard", of="set1")
+    listener = Listener(out, tmp_path / "heard", of="set1", last=3)
     campaign = run_campaign(configuration(path, out, executor=kind, workers=2), progress=listener)
     assert (tmp_path / "heard.died").exists()
     assert campaign.exit_code == 0
@@ -84,7 +84,7 @@ def test_iterations_of_a_killed_worker_are_told_again(tmp_path, monkeypatch, kin
     assert lost.endswith(" set1: its worker was lost; another one repeats it")
     for result in campaign:
         whole = list(range(result.iterations.sizes["iteration"]))
-        told_before = [0, 1, 2] if result.name == "set1" else []
+        told_before = [0, 1, 2, 3] if result.name == "set1" else []
         assert iterations(lines, result.name) == told_before + whole
 
 
