@@ -104,6 +104,18 @@ def test_synthetic_data_to_a_run(tmp_path: Path, start: str, times: str, noise_s
     assert abs(rows["mu"].mean - TRUTH[start]["mu"]) < 4 * rows["mu"].std
 
 
+def test_the_lines_to_be_uncommented_are_right(tmp_path: Path) -> None:
+    data = simulate("laser", "0 us:70 us:0.63 us", "2 um", tmp_path / "bubble.csv")
+    call("init", "--data", data, "--time-unit", "us", "--radius-unit", "um")
+    text = Path("bubble.yaml").read_text(encoding="utf-8")
+    for line in ("discrepancy: estimated", "sigma: {prior"):
+        assert text.count(f"# {line}") == 1
+        text = text.replace(f"# {line}", line)
+    Path("bubble.yaml").write_text(text, encoding="utf-8")
+    (problem,) = build(load_config(Path("bubble.yaml")))
+    assert {"sigma", "discrepancy_amplitude", "discrepancy_length"} < set(problem.prior.names)
+
+
 def test_the_collapse_time_is_rayleigh_s() -> None:
     """In a liquid without viscosity, gas and surface tension the lobe is Rayleigh's, integrated here."""
     rho, p, radius = 998.0, 101325.0, 200e-6

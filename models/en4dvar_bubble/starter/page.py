@@ -77,12 +77,14 @@ def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> st
         f"    radius: {source.radius_entry}",
     ]
     tail = [
-        "# Estimate the noise as well: uncomment this line.",
+        "# The size of the readings' errors, where it is not known: uncomment this line.",
         "# sigma: {prior: lognormal, median: 1, log_std: 0.5}",
     ]
     lines = [
         *head,
         *_section(proposal.data),
+        "    # What the model misses, where the report finds a structure in the residuals: uncomment this line.",
+        "    # discrepancy: estimated",
         "model:",
         *_section(proposal.model),
         "parameters: # a prior is estimated, a quantity such as 'mu: 0.1 Pa s' is fixed",
