@@ -106,7 +106,7 @@ class Swift(Oscillator):
 
 
 class Waits(Oscillator):
-    """Call number ``at`` of its thread, in the first iterations of a data set, waits for ``EN4DVAR_TEST_FLAG``, a file."""
+    """Call number ``at`` of its thread, in the first iterations of a data set, waits for the file of a variable."""
 
     calls = threading.local()
     at = 9
