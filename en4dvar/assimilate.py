@@ -44,7 +44,7 @@ SAME_COST = 0.01  # of J, by which a descent must end lower to be another one
 
 
 @dataclass(frozen=True)
-class Gaussian:
+class Ends:
     """An ensemble (N, n), transformed, about the ``mode`` (n,) of J, and what came of running both."""
 
     members: Array
@@ -150,17 +150,9 @@ class _Assimilation:
 
         descent, minima, gaussian = self.searched(start, descent, prior_run)
         counting = that_count(minima, problem.prior)
-        posterior, mode, after, last = gaussian.members, gaussian.mode, gaussian.run, gaussian.central
-        sampled, shape = None, dict[str, float]()
-        if self.settings.refine != "mcmc":
-            shape = examine_shape(space, posterior, mode, self.costs(posterior, after), self.seed)
         agree = start.compared < 2 or minima[0].descents >= AGREE
-        if self.settings.refine == "mcmc" or (samples(space) and minima and in_doubt(counting, agree, shape)):
-            sampled, shape = self.refine(posterior, counting, start.refinement), {}
-            posterior = sampled.members
-            after = space.forecast(posterior, self.grid)
-            if not self.scheme.searches:
-                last = space.forecast(mode[None], self.grid)
+        ends, sampled, shape = self.sampled(gaussian, counting, agree, start.refinement)
+        posterior, mode, after, last = ends.members, ends.mode, ends.run, ends.central
         space.require_members(after.failures, "posterior forecast")
         costs = self.costs(posterior, after)
         centre_cost = float(self.costs(mode[None], last)[0])
@@ -317,7 +309,7 @@ class _Assimilation:
         iterate(window, self.scheme, [descent])
         return descent
 
-    def gaussian(self, descent: Descent) -> Gaussian:
+    def gaussian(self, descent: Descent) -> Ends:
         """The ensemble at the end of a descent, and its forecast."""
         space, problem = self.space, self.problem
         transform = descent.newton.hessian.economical_transform if self.scheme.searches else descent.weights.T
@@ -325,11 +317,11 @@ class _Assimilation:
         members, mode = ends[:-1], ends[-1]
         members = members + mean_beyond_mode(problem, mode, members, descent.records[-1].dfs)
         if not self.scheme.searches:  # the last ensemble that was run is the posterior
-            return Gaussian(members, mode, descent.iterate.members, descent.iterate.central)
+            return Ends(members, mode, descent.iterate.members, descent.iterate.central)
         if problem.discrepancy and descent.iterate.linear is not None:
             members = marginal_members(space, descent.iterate.linear, mode, members, self.seed)
         final = space.forecast(np.vstack([members, mode]), self.grid)
-        return Gaussian(members, mode, final[:-1], final[-1:])
+        return Ends(members, mode, final[:-1], final[-1:])
 
     def minima(self, start: LoopState, end: Descent) -> tuple[Minimum, ...]:
         """Those that descents ended in, the lowest first; none of a scheme that does not search."""
@@ -341,7 +333,7 @@ class _Assimilation:
 
     def searched(
         self, start: LoopState, descent: Descent, prior_run: Forecast
-    ) -> tuple[Descent, tuple[Minimum, ...], Gaussian]:
+    ) -> tuple[Descent, tuple[Minimum, ...], Ends]:
         """The lowest descent, all minima, and the ensemble about the lowest.
 
         Of a cheap model, or for a chain, a descent from a member far from the minimum looks for another; where there is
@@ -388,6 +380,23 @@ class _Assimilation:
             Mode(prior.to_physical(m.x), m.cost, m.descents, m.spread, float(weight))
             for m, weight in zip(minima, weights, strict=True)
         )
+
+    def sampled(
+        self, ends: Ends, minima: Sequence[Minimum], agree: bool, earlier: Refinement | None
+    ) -> tuple[Ends, Refined | None, dict[str, float]]:
+        """The ensemble, sampled where that is asked for or there is a doubt, and the shape of one that is not.
+
+        ``agree``: descents from different members ended in the lowest of the minima that count.
+        """
+        space, shape = self.space, dict[str, float]()
+        if self.settings.refine != "mcmc":
+            shape = examine_shape(space, ends.members, ends.mode, self.costs(ends.members, ends.run), self.seed)
+            if not (samples(space) and minima and in_doubt(minima, agree, shape)):
+                return ends, None, shape
+        sampled = self.refine(ends.members, minima, earlier)
+        run = space.forecast(sampled.members, self.grid)
+        central = ends.central if self.scheme.searches else space.forecast(ends.mode[None], self.grid)
+        return Ends(sampled.members, ends.mode, run, central), sampled, {}
 
     def refine(self, posterior: Array, minima: Sequence[Minimum], earlier: Refinement | None) -> Refined:
         """What takes the place of the posterior ensemble (N, n). ``earlier``: where a chain was interrupted."""
