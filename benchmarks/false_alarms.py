@@ -17,13 +17,14 @@ from pathlib import Path
 
 import numpy as np
 from acoustic_twin import NARROW, WIDE, make_twin, prior
+from laser_twin import STD, TIMES, laser_prior
 from records import Record, fill
 
 from en4dvar.assimilate import assimilate
 from en4dvar.ensemble.forecast import forecast
 from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm
+from en4dvar.prior import Prior
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.state import Array
 from en4dvar_bubble import BubbleModel
@@ -54,14 +55,9 @@ def through_the_collapse(accuracy: AccuracyName) -> Callable[[int], InverseProbl
 
 def laser(seed: int) -> InverseProblem:
     """With rebounds, of a neo-Hookean gel."""
-    p = {parameter.name: parameter for parameter in LASER.parameters}
-    terms = (
-        PriorTerm.lognormal(p["G"], 4e3, 0.5),
-        PriorTerm.lognormal(p["mu"], 0.06, 0.5),
-        PriorTerm.normal(p["R_max"], 250e-6, 5e-6),
-        PriorTerm.lognormal(p["R_eq"], 35e-6, 0.2),
-    )
-    return drawn(LASER, Prior(terms), 0.7e-6 + 1.4e-6 * np.arange(30), 1.5e-6, seed)
+    terms = {term.parameter.name: term for term in laser_prior().terms}
+    of = Prior(tuple(terms[name] for name in ("G", "mu", "R_max", "R_eq")))  # the order in which truths are drawn
+    return drawn(LASER, of, TIMES, STD, seed)
 
 
 DESIGNS: dict[str, Callable[[int], InverseProblem]] = {

@@ -18,28 +18,20 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from laser_twin import laser_prior
 from records import Record, fill
 
 from en4dvar.assimilate import assimilate
 from en4dvar.diagnostics import DECISIVE
 from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.varying import PiecewiseModel, RandomWalk
 from en4dvar_bubble.laws import get_law
 from en4dvar_bubble.model import BubbleModel
 
 MODEL = BubbleModel(law=get_law("neo-hookean-kelvin-voigt"), start="laser")
-OF = {p.name: p for p in MODEL.parameters}
-PRIOR = Prior(
-    (
-        PriorTerm.lognormal(OF["G"], 4e3, 0.5),
-        PriorTerm.lognormal(OF["mu"], 0.06, 0.5),
-        PriorTerm.lognormal(OF["R_eq"], 35e-6, 0.2),
-        PriorTerm.normal(OF["R_max"], 250e-6, 5e-6),
-    )
-)
+PRIOR = laser_prior()
 TIMES = np.arange(0.7e-6, 60e-6, 1.4e-6)
 NOISE, STD = 1.5e-6, 0.4  # m; of ln μ, of each change
 KNOTS = np.array([0.5, 1.0, 1.5, 2.0])  # times that of the first collapse

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 from en4dvar.config.context import Context, Made, parse_spread, read_each
 from en4dvar.config.schema import Section
@@ -13,6 +13,8 @@ from en4dvar.hints import shown, suggest
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import StatePerturbation
 from en4dvar.state import Field, Parameter
+
+T = TypeVar("T")
 
 
 class Perturbed(NamedTuple):
@@ -52,20 +54,26 @@ def dynamic_fields(model: ForwardModel) -> dict[str, Field]:
     return {f.name: f for f in model.layout if f.name not in constant}
 
 
-def _perturbed(given: Mapping[str, Any], context: Context) -> tuple[Perturbed, ...]:
-    """In the order of the file."""
+def read_fields(
+    given: Mapping[str, Any], context: Context, instead: str, read: Callable[[Any, Context], T]
+) -> tuple[T, ...]:
+    """What is said of fields of the state, in the order of the file; ``instead`` is what to do for a parameter."""
     fields = dynamic_fields(context.model)
 
     def unknown(name: str) -> str:
         if name in {p.name for p in context.model.parameters}:
-            return f"{name} is a parameter: give it a prior in parameters"
+            return f"{name} is a parameter: {instead}"
         return f"unknown field {shown(name)} of the state{suggest(name, fields)}"
-
-    def read(entry: Any, context: Context) -> Perturbed:
-        return InitialSpread.model_validate(entry, context=context).std
 
     with Faults() as faults:
         return tuple(read_each(given, fields, context, faults, read, unknown).values())
+
+
+def _perturbed(given: Mapping[str, Any], context: Context) -> tuple[Perturbed, ...]:
+    def read(entry: Any, context: Context) -> Perturbed:
+        return InitialSpread.model_validate(entry, context=context).std
+
+    return read_fields(given, context, "give it a prior in parameters", read)
 
 
 PERTURBED = Made(

@@ -9,13 +9,12 @@ from typing import Annotated, Any, Self
 
 from pydantic import model_validator
 
-from en4dvar.config.context import Context, Made, Spread, parse_spread, quantity, read_each, subject_unit, time_unit
-from en4dvar.config.initial_state import dynamic_fields
+from en4dvar.config.context import Context, Made, Spread, parse_spread, quantity, subject_unit, time_unit
+from en4dvar.config.initial_state import read_fields
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel
-from en4dvar.hints import shown, suggest
 from en4dvar.state import Array, Field
 from en4dvar.varying import StateChanges
 
@@ -88,19 +87,10 @@ class ErrorOf:
 
 
 def _model_error(given: Mapping[str, Any], context: Context) -> tuple[ErrorOf, ...]:
-    """In the order of the file."""
-    fields = dynamic_fields(context.model)
-
-    def unknown(name: str) -> str:
-        if name in {p.name for p in context.model.parameters}:
-            return f"{name} is a parameter: write varies behind its prior"
-        return f"unknown field {shown(name)} of the state{suggest(name, fields)}"
-
     def read(entry: Any, context: Context) -> ErrorOf:
         return ErrorOf(context.subject, ModelErrorSection.model_validate(entry, context=context))
 
-    with Faults() as faults:
-        return tuple(read_each(given, fields, context, faults, read, unknown).values())
+    return read_fields(given, context, "write varies behind its prior", read)
 
 
 MODEL_ERROR = Made(
