@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ CLASSES = {
     "bright centre": {"centre": 0.45},
     "drift": {"drift": 0.4},
     "ellipse": {"ellipticity": 0.03},
-    "overflow": {"shape": (64, 128), "bubble": (63.3, 31.6)},
+    "overflow": {"shape": (64, 128)},
     "dirt": {"dirt": 24},
 }
 FRAMES = 12
@@ -52,19 +53,25 @@ def movie_of(frames: list[Frame]) -> Movie:
     return Movie(Path("rendered"), read, len(frames), 1e-6, 1e5)
 
 
-def rendered(kind: str, number: int) -> tuple[Array, Array]:
-    """Errors of the radii of one rendered movie in stated std, and in pixels; NaN where a frame was not read."""
+def film(kind: str, number: int) -> tuple[Array, list[Frame]]:
+    """Radii (FRAMES,) in the middle of the exposures, and the frames of a rendered movie, empty ones first."""
     rng = np.random.default_rng([number, list(CLASSES).index(kind)])
     scene = Scene(**CLASSES[kind])  # type: ignore[arg-type]
     ratio = float(np.exp(rng.uniform(np.log(3), np.log(30))))
-    scene = Scene(**{**scene.__dict__, "noise": scene.contrast * scene.level / ratio})
+    centre = (np.array(scene.shape[::-1]) - 1) / 2 + rng.uniform(-0.5, 0.5, 2)
+    scene = replace(scene, noise=scene.contrast * scene.level / ratio, bubble=tuple(centre))
     low, high = (36, 58) if kind == "overflow" else (8 if kind != "blurred" else 12, 42)
     middle = rng.uniform(low, high, FRAMES)
-    within = np.linspace(-0.5, 0.5, 9)
     speed = rng.uniform(2, 5, FRAMES) if kind == "moving fast" else np.zeros(FRAMES)
-    radii = middle[:, None] + np.minimum(speed, 0.2 * middle)[:, None] * within
-    found = track(movie_of(list(render(radii, scene, rng))))
-    readings = found.readings[scene.before :]
+    radii = middle[:, None] + np.minimum(speed, 0.2 * middle)[:, None] * np.linspace(-0.5, 0.5, 9)
+    return middle, list(render(radii, scene, rng))
+
+
+def rendered(kind: str, number: int) -> tuple[Array, Array]:
+    """Errors of the radii of one rendered movie in stated std, and in pixels; NaN where a frame was not read."""
+    middle, frames = film(kind, number)
+    found = track(movie_of(frames))
+    readings = found.readings[Scene.before :]
     wrong = np.array([r.radius for r in readings]) - middle
     return wrong / np.array([r.errors.std for r in readings]), wrong
 

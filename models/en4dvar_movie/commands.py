@@ -16,8 +16,9 @@ import click
     "--frame-rate", metavar="RATE", help="Frames per time, e.g. '270 kHz'; needed where the file does not tell."
 )
 @click.option(
-    "--exposure", metavar="TIME", help="Exposure of a frame, e.g. '500 ns': the timing error is a tenth of it."
+    "--exposure", metavar="TIME", help="Exposure of a frame or length of a flash, e.g. '500 ns'."
 )
+@click.option("--flashes", metavar="TIMES", help="Flashes of one exposure, as '0 us, 2 us, 4 us': nested circles.")
 @click.option("--raw", metavar="WxHxBITS", help="Shape of the frames of a file without header, e.g. 512x128x8.")
 @click.option(
     "--corrections", type=click.Path(path_type=Path), help="Text file: FRAME out, or FRAME X Y RADIUS (pixels)."
@@ -27,8 +28,9 @@ import click
 @click.option("--force", is_flag=True, help="Replace these files.")
 @click.option("--workers", type=click.IntRange(min=1), help="Threads; the numbers do not depend on it.")
 def track(
-    movie: Path, pixel: str | None, frame_rate: str | None, exposure: str | None, raw: str | None,
-    corrections: Path | None, out: Path | None, page: Path | None, force: bool, workers: int | None,
+    movie: Path, pixel: str | None, frame_rate: str | None, exposure: str | None,
+    flashes: str | None, raw: str | None, corrections: Path | None, out: Path | None, page: Path | None,
+    force: bool, workers: int | None,
 ) -> None:  # fmt: skip
     """Read the bubble's radius and its error from every frame of a movie.
 
@@ -45,6 +47,7 @@ def track(
     from en4dvar.files import write_text
     from en4dvar.units import parse_quantity
     from en4dvar_movie.corrections import read_corrections
+    from en4dvar_movie.flashes import parse_flashes
     from en4dvar_movie.frames import open_movie, with_scale
     from en4dvar_movie.page import page_text
     from en4dvar_movie.table import Scale, to_csv
@@ -59,23 +62,27 @@ def track(
     length, rate = given(pixel, "m", "--pixel"), given(frame_rate, "1/s", "--frame-rate")
     opened = with_scale(open_movie(movie, raw), length, rate)
     shutter = given(exposure, "s", "--exposure")
-    scale = Scale(opened.pixel, opened.rate, float("nan") if shutter is None else shutter)
+    instants = parse_flashes(flashes) if flashes else (0.0,)
+    scale = Scale(opened.pixel, opened.rate, float("nan") if shutter is None else shutter, instants)
     if shutter is not None and shutter * scale.rate > 1.001:
         raise click.UsageError(f"--exposure {exposure} is longer than the {1e6 / scale.rate:g} us between two frames")
+    if instants[-1] - instants[0] >= 1 / scale.rate:
+        raise click.UsageError(f"--flashes {flashes}: more than the {1e6 / scale.rate:g} us between two frames")
     table = out or Path(f"{movie.stem}.csv")
     shown = page or table.with_suffix(".html")
     for target in (table, shown):
         refuse_to_replace(target, force)
     fixed = read_corrections(corrections) if corrections else {}
     with _bar(opened.count) as progress:
-        found = track_movie(opened, workers or available_cores(), fixed, progress)
+        found = track_movie(opened, workers or available_cores(), fixed, progress, instants)
     for note in opened.notes:
         click.echo(f"note: {note}", err=True)
     words = command_line()
     write_text(table, to_csv(found.readings, scale, str(movie), words))
     write_text(shown, page_text(opened, found, scale, words))
     used = [r for r in found.readings if r.used]
-    click.echo(f"{len(used)} of {len(found.readings)} frames read; the others and why: see the page")
+    what = "frames" if len(instants) == 1 else "circles"
+    click.echo(f"{len(used)} of {len(found.readings)} {what} read; the others and why: see the page")
     click.echo(f"readings: {table}\npage: {shown}\nnext: en4dvar init --data {table}")
 
 

@@ -89,7 +89,7 @@ def open_movie(path: str | Path, raw: str | None = None) -> Movie:
     raise DataError(f"{path}: not a movie by its suffix ({kinds}, or a folder of frames); of a raw file say --raw")
 
 
-def _library(name: str) -> ModuleType:
+def library(name: str) -> ModuleType:
     from importlib import import_module
 
     try:
@@ -131,7 +131,7 @@ def _size(shape: tuple[int, ...]) -> str:
 
 
 def _tiff(path: Path) -> Movie:
-    tifffile = _library("tifffile")
+    tifffile = library("tifffile")
     try:
         with tifffile.TiffFile(path) as file:
             pages = len(file.pages)
@@ -174,14 +174,14 @@ def _folder(path: Path) -> Movie:
             if file.suffix.lower() in TIFF:
                 yield from _tiff(file).open()
             else:
-                with _library("PIL.Image").open(file) as image:
+                with library("PIL.Image").open(file) as image:
                     yield np.asarray(image)
 
     return Movie(path, read, len(files))
 
 
 def _video(path: Path) -> Movie:
-    av = _library("av")
+    av = library("av")
 
     def read() -> Iterator[Frame]:
         with av.open(str(path)) as file:

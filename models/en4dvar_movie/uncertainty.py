@@ -66,11 +66,14 @@ def _smoothed(outlines: Sequence[Outline | None]) -> Array:
 def _errors(outline: Outline, ratio: float, optics: Optics) -> Errors:
     sharp = min(outline.width, optics.width)
     radius = outline.circle.R + 0.5 * sharp**2 / outline.circle.R
-    variance = outline.variance * ratio + outline.common + _hidden(outline) + FLOOR**2
+    variance = outline.variance * ratio + outline.common + _hidden(outline) + outline.joined**2 + FLOOR**2
     words = ""
-    if outline.width > COLLAPSE * outline.circle.R:
-        variance += (0.25 * outline.width) ** 2
-        words = "blurred over much of its radius: the bubble moved within the exposure, or is out of focus"
+    moved = np.sqrt(max(outline.width**2 - sharp**2, 0.0))  # blur beyond that of the optics
+    if moved > COLLAPSE * outline.circle.R:
+        variance += (0.25 * moved) ** 2
+        words = "blurred over much of its radius: the bubble moved within the exposure"
+    elif outline.joined:
+        words = "nested circles too close to be told apart: their mean"
     elif outline.seen < 0.9:
         words = f"{outline.seen:.0%} of the outline lies in the frame"
     # the edge's profile has the slope 1/(√(2π) w) at its half level
