@@ -24,6 +24,7 @@ SAMPLES = 24  # frames looked at for what they share
 SMOOTH = 12.0  # pixels: the brightness that contrasts are relative to varies slowly
 LEAST_SPREAD = 0.002  # of the contrast
 NOISY = 0.1  # of a pixel's noise: what a contrast can be uncertain by for the noise
+SHARPEST = 5  # per cent of the frames: those where the bubble moved least within the exposure
 SPECK = 100  # pixels: the largest change that is no bubble
 LEAST_CONTRAST = 0.08  # of the background's brightness
 BRIGHT = 0.25  # of the contrast: how much brighter a flash is
@@ -192,6 +193,6 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
     contrasts = np.array([o.contrast for o in large])
     contrast = float(np.median(contrasts))
     scatter = 1.2533 * float(np.std(contrasts)) / max(len(large) - 1, 1) ** 0.5  # of a median
-    width = float(np.percentile([o.width for o in found], 20))
+    width = float(np.percentile([o.width for o in found], SHARPEST))
     scatter = min(scatter, NOISY * background.noise)  # more is not noise: bubbles differ in how bright their centre is
     return Optics(contrast, width, max(scatter / -contrast, LEAST_SPREAD))

@@ -19,7 +19,7 @@ LOOSE = 0.1  # how much less is known of the level next to an edge that is blurr
 CUTOFF = 5.0  # of Tukey's weights, in robust std
 DARKER = 3.0  # std of the contrast: no bubble is darker than the movie's clearest by more
 REACH = 4.0  # how far from the outline pixels are used, in widths of the edge
-APART = 1.0  # widths of the edge: nested circles that are closer are not told apart
+APART = 1.5  # widths of the edge: nested circles that are closer are not told apart
 X, Y, R, W, LEVEL, CONTRAST, GLARE, RIM = range(SHAPE)
 
 
@@ -40,7 +40,7 @@ def fit_outline(image: Array, start: Circle, optics: Optics, circles: int = 1) -
         ring = _ring(p, gaps)
         if _glare_is_far(p, gaps, ring):
             p[GLARE], p[RIM] = 0.0, RIM_SHARE * _innermost(p, gaps)
-        modes = modes_for(image.shape, p) if turn else 1
+        modes = modes_for(image.shape, p)
         p = np.concatenate([p[:SHAPE], np.zeros(2 * (modes - 1)), gaps])
         known = replace(optics, spread=max(optics.spread, FIRST_SPREAD[turn]))
         fitted = _descend(image, p, modes, ring, noise, known, CLOSE[turn])
@@ -160,48 +160,44 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
     shape = p[SHAPE : SHAPE + 2 * (modes - 1)].reshape(-1, 2).T if modes > 1 else np.zeros((2, 0))
     mode_variance = float(np.diag(inverse)[SHAPE : SHAPE + shape.size].mean()) if modes > 1 else 0.0
     free = len(p) - 2 * _glare_is_far(p, gaps, ring)
-    outlines = []
-    for s, gap in enumerate(np.append(0.0, gaps)):
-        weights = inverse[R] - (inverse[SHAPE + shape.size + s - 1] if s else 0.0)
-        circle = Circle(float(p[X]), float(p[Y]), float(p[R] - gap))
+    outlines: list[Outline] = []
+    for group in _groups(np.append(0.0, gaps), APART * p[W]):
+        # of the radius, or of the mean of radii that cannot be told apart
+        weights = inverse[R] - np.mean([inverse[SHAPE + shape.size + s - 1] if s else 0 * p for s in group], axis=0)
+        inside = np.append(0.0, gaps)[group]
+        circle = Circle(float(p[X]), float(p[Y]), float(p[R] - inside.mean()))
         sectors = int(np.clip(2 * np.pi * circle.R / max(4.0, 2 * p[W]), 8, 256))
         sums, spread, slope, fitted = influence(image, p, modes, ring, CUTOFF * noise, weights, sectors)
         # the step of robust weights is the M-estimator's, its error that of Huber (1981): ψ' in the place of the weights
         variance = spread / max(slope, 0.3) ** 2 * total / max(total - free, 1.0)
         common = noise**2 * weights[CONTRAST] ** 2 * precision[CONTRAST]  # of the contrast that all frames share
-        outlines.append(
-            Outline(
-                circle=circle,
-                width=float(p[W]),
-                contrast=float(p[CONTRAST]),
-                noise=noise,
-                modes=shape,
-                variance=float(variance),
-                ratio=float(np.sum(sums**2) / _left(fitted, weights, A, inverse) / max(spread, 1e-30)),
-                common=float(common),
-                mode_std=float(np.sqrt(max(mode_variance, 0) * squares / total)),
-                seen=share_inside(image.shape, circle),
-            )
+        one = Outline(
+            circle=circle,
+            width=float(p[W]),
+            contrast=float(p[CONTRAST]),
+            noise=noise,
+            modes=shape,
+            variance=float(variance),
+            ratio=float(np.sum(sums**2) / _left(fitted, weights, A, inverse) / max(spread, 1e-30)),
+            common=float(common),
+            mode_std=float(np.sqrt(max(mode_variance, 0) * squares / total)),
+            seen=share_inside(image.shape, circle),
+            # as if evenly spread over the distance from which they are told apart
+            joined=float(np.hypot(APART * p[W] / 12**0.5, np.std(inside))) if len(group) > 1 else 0.0,
         )
-    return _joined(outlines)
+        outlines += [one] * len(group)
+    return outlines
 
 
-def _joined(outlines: list[Outline]) -> list[Outline]:
-    """Nested circles, the largest first; those closer to the next than edges of their blur allow get their mean."""
-    groups: list[list[Outline]] = []
-    for outline in outlines:
-        near = APART * outline.width
-        if groups and groups[-1][-1].circle.R - outline.circle.R < near:
-            groups[-1].append(outline)
+def _groups(gaps: Array, near: float) -> list[list[int]]:
+    """Nested circles by their places, the largest first; those closer than ``near`` to the next are together."""
+    groups = [[0]]
+    for s in range(1, len(gaps)):
+        if gaps[s] - gaps[s - 1] < near:
+            groups[-1].append(s)
         else:
-            groups.append([outline])
-    return [one for group in groups for one in (_at_their_mean(group) if len(group) > 1 else group)]
-
-
-def _at_their_mean(group: list[Outline]) -> list[Outline]:
-    radii = np.array([one.circle.R for one in group])
-    std = float(np.hypot(APART * group[0].width / 12**0.5, np.std(radii)))  # as if evenly spread over the distance
-    return [replace(one, circle=replace(one.circle, R=float(radii.mean())), joined=std) for one in group]
+            groups.append([s])
+    return groups
 
 
 def _left(fitted: Array, weights: Array, A: Array, inverse: Array) -> float:

@@ -26,7 +26,7 @@ TRUNCATE = 5.0  # std of the blur
 class Scene:
     """What is filmed and with what; lengths in pixels. Each field's annotation says what it is."""
 
-    shape: Annotated[tuple[int, int], "height and width of a frame"] = (128, 128)
+    shape: Annotated[tuple[int, int], "WIDTHxHEIGHT of a frame"] = (128, 128)
     level: Annotated[float, "grey level of the background"] = 150.0
     contrast: Annotated[float, "share of the light that the bubble takes"] = 0.5
     blur: Annotated[float, "std of the blur by the optics"] = 1.2
