@@ -58,7 +58,7 @@ def movie_of(frames: list[Frame]) -> Movie:
 
 
 def film(kind: str, number: int) -> tuple[Array, list[Frame]]:
-    """Radii (FRAMES,) in the middle of the exposures, (FRAMES, 3) at three flashes, and the frames, empty ones first."""
+    """Radii (K,) in the middle of the exposures, (K, 3) at three flashes, and the frames, empty ones first."""
     rng = np.random.default_rng([number, list(CLASSES).index(kind)])
     scene = Scene(**CLASSES[kind])  # type: ignore[arg-type]
     ratio = float(np.exp(rng.uniform(np.log(3), np.log(30))))

@@ -67,7 +67,7 @@ def gases(folder: Path) -> None:
 
 
 def movie(folder: Path) -> None:
-    """Radii of a person and of ``track``, the same window, law and errors: differences in posterior std of the person's."""
+    """Radii of a person and of ``track`` under the same window, law and errors: how far apart in posterior std."""
     import scipy.io
 
     found = track(open_movie(SHARED / "PAstiff_xy002.mp4"), 2)
@@ -78,9 +78,7 @@ def movie(folder: Path) -> None:
         write_text(folder / f"{name}.csv", to_csv(readings, scale, "PAstiff_xy002.mp4", name))
     for words, error in (("1 %", {}), ("1 %, discrepancy", MISSED), ("stated, discrepancy", {**MISSED, **OWN})):
         both = {
-            name: estimates(
-                f"{name}, {words}", folder, {"data.path": str(folder / f"{name}.csv"), **COLUMNS, **error}
-            )
+            name: estimates(f"{name}, {words}", folder, {"data.path": str(folder / f"{name}.csv"), **COLUMNS, **error})
             for name in ("hand", "track")
         }
         for key, (mean, std) in both["hand"].items():

@@ -12,10 +12,10 @@ from scipy import ndimage
 
 from en4dvar.errors import DataError
 from en4dvar.state import Array
+from en4dvar_movie.fitting import fit_outline
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.kernels import normalise
 from en4dvar_movie.locate import TILE, locate
-from en4dvar_movie.fitting import fit_outline
 from en4dvar_movie.outline import Circle, Optics
 
 Image = npt.NDArray[Any]  # brightness (H, W), of any precision

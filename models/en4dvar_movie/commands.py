@@ -15,9 +15,7 @@ import click
 @click.option(
     "--frame-rate", metavar="RATE", help="Frames per time, e.g. '270 kHz'; needed where the file does not tell."
 )
-@click.option(
-    "--exposure", metavar="TIME", help="Exposure of a frame or length of a flash, e.g. '500 ns'."
-)
+@click.option("--exposure", metavar="TIME", help="Exposure of a frame or length of a flash, e.g. '500 ns'.")
 @click.option("--flashes", metavar="TIMES", help="Flashes of one exposure, as '0 us, 2 us, 4 us': nested circles.")
 @click.option("--raw", metavar="WxHxBITS", help="Shape of the frames of a file without header, e.g. 512x128x8.")
 @click.option(
@@ -25,12 +23,13 @@ import click
 )
 @click.option("--out", type=click.Path(path_type=Path), help="CSV file to write; default <name of the movie>.csv.")
 @click.option("--page", type=click.Path(path_type=Path), help="HTML page to write; default beside the CSV file.")
+@click.option("--outlined", type=click.Path(path_type=Path), help="Movie to write too, with the outlines drawn.")
 @click.option("--force", is_flag=True, help="Replace these files.")
 @click.option("--workers", type=click.IntRange(min=1), help="Threads; the numbers do not depend on it.")
 def track(
     movie: Path, pixel: str | None, frame_rate: str | None, exposure: str | None,
     flashes: str | None, raw: str | None, corrections: Path | None, out: Path | None, page: Path | None,
-    force: bool, workers: int | None,
+    outlined: Path | None, force: bool, workers: int | None,
 ) -> None:  # fmt: skip
     """Read the bubble's radius and its error from every frame of a movie.
 
@@ -49,9 +48,11 @@ def track(
     from en4dvar_movie.corrections import read_corrections
     from en4dvar_movie.flashes import parse_flashes
     from en4dvar_movie.frames import open_movie, with_scale
+    from en4dvar_movie.outlined import outlined as outlined_frames
     from en4dvar_movie.page import page_text
     from en4dvar_movie.table import Scale, to_csv
     from en4dvar_movie.tracking import track as track_movie
+    from en4dvar_movie.writing import require_suffix, write_movie
 
     def given(text: str | None, unit: str, option: str) -> float | None:
         value = None if text is None else parse_quantity(text, unit)
@@ -70,7 +71,9 @@ def track(
         raise click.UsageError(f"--flashes {flashes}: more than the {1e6 / scale.rate:g} us between two frames")
     table = out or Path(f"{movie.stem}.csv")
     shown = page or table.with_suffix(".html")
-    for target in (table, shown):
+    if outlined:
+        require_suffix(outlined)
+    for target in (table, shown, outlined):
         refuse_to_replace(target, force)
     fixed = read_corrections(corrections) if corrections else {}
     with _bar(opened.count) as progress:
@@ -80,6 +83,9 @@ def track(
     words = command_line()
     write_text(table, to_csv(found.readings, scale, str(movie), words))
     write_text(shown, page_text(opened, found, scale, words))
+    if outlined:
+        pictures = outlined_frames(opened, found)
+        write_movie(outlined, pictures, len({r.found.frame for r in found.readings}), scale.pixel, scale.rate)
     used = [r for r in found.readings if r.used]
     what = "frames" if len(instants) == 1 else "circles"
     click.echo(f"{len(used)} of {len(found.readings)} {what} read; the others and why: see the page")

@@ -18,7 +18,7 @@ from en4dvar.state import Array
 from en4dvar.units import UnitError, parse_quantity
 from en4dvar_movie.flashes import parse_flashes
 from en4dvar_movie.scene import Scene, render
-from en4dvar_movie.writing import write_movie
+from en4dvar_movie.writing import require_suffix, write_movie
 
 if TYPE_CHECKING:
     from en4dvar.config import Config
@@ -56,11 +56,12 @@ def film(config: Config, times: Array | None, out: Path, settings: Mapping[str, 
     steps = np.diff(at)
     if len(at) < 2 or np.ptp(steps) > 1e-6 * steps.mean():
         raise ConfigError("the frames of a movie are evenly spaced: give --times FROM:TO:STEP")
+    require_suffix(out)
     exposed = exposures(at, camera)
     instants, where = np.unique(np.maximum(exposed, at[0]), return_inverse=True)  # before the first the bubble rests
     radii = simulate(config, instants).values[where].reshape(exposed.shape) / camera.pixel
     frames = render(radii, scene, np.random.default_rng(seed))
-    write_movie(out, frames, scene.before + len(at), scene.shape, camera.pixel, 1 / float(steps.mean()), scene.bits)
+    write_movie(out, frames, scene.before + len(at), camera.pixel, 1 / float(steps.mean()))
     return (
         f"movie: {out}, {scene.before + len(at)} frames of {scene.shape[1]} × {scene.shape[0]} pixels of "
         f"{1e6 * camera.pixel:g} um; the first {scene.before} are empty, so that frame {scene.before} is at "

@@ -52,7 +52,7 @@ def fit_outline(image: Array, start: Circle, optics: Optics, circles: int = 1) -
 
 
 def nested_radii(image: Array, start: Circle, optics: Optics, circles: int) -> Array:
-    """First radii (S,), the largest first: where the mean brightness about the centre passes the middle of each step."""
+    """First radii (S,), the largest first: where the mean brightness about the centre passes each step's middle."""
     if circles == 1:
         return np.array([start.R])
     y, x = np.indices(image.shape)
@@ -168,7 +168,7 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
         circle = Circle(float(p[X]), float(p[Y]), float(p[R] - inside.mean()))
         sectors = int(np.clip(2 * np.pi * circle.R / max(4.0, 2 * p[W]), 8, 256))
         sums, spread, slope, fitted = influence(image, p, modes, ring, CUTOFF * noise, weights, sectors)
-        # the step of robust weights is the M-estimator's, its error that of Huber (1981): ψ' in the place of the weights
+        # the step of robust weights is the M-estimator's, its error that of Huber (1981): ψ' instead of the weights
         variance = spread / max(slope, 0.3) ** 2 * total / max(total - free, 1.0)
         common = noise**2 * weights[CONTRAST] ** 2 * precision[CONTRAST]  # of the contrast that all frames share
         one = Outline(

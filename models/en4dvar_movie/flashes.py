@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import permutations
+from itertools import pairwise, permutations
 
 import numpy as np
 
@@ -25,7 +25,7 @@ def parse_flashes(text: str) -> tuple[float, ...]:
     instants = tuple(parse_quantity(part, "s") for part in text.split(","))
     if len(instants) > MOST:
         raise FlashError(f"{len(instants)} flashes in an exposure; at most {MOST} can be told apart")
-    if any(b <= a for a, b in zip(instants, instants[1:], strict=False)):
+    if any(b <= a for a, b in pairwise(instants)):
         raise FlashError(f"flashes {text!r}: give their instants in the order of time")
     return instants
 
@@ -34,8 +34,8 @@ def in_time(radii: Sequence[Array], times: Array, flashes: Sequence[float]) -> l
     """Which circle belongs to each flash (S,), for each of K frames: the order in which the wall's speed changes least.
 
     All flashes are alike in a picture, so only the history tells: of all orders of the circles of each frame, those are
-    chosen whose Σ |change of dR/dt| from reading to reading is least, over all frames at once (dynamic programming over
-    the orders of two frames that follow each other).
+    chosen whose ∫ (d²R/dt²)² dt is least over all frames at once, as of a spline (dynamic programming over the orders
+    of two frames that follow each other).
 
     Parameters
     ----------
@@ -67,6 +67,7 @@ def in_time(radii: Sequence[Array], times: Array, flashes: Sequence[float]) -> l
 
 
 def _bend(radii: Array, instants: Array) -> Array:
-    """Σ |change of speed| along the last axis of radii (…, n) at instants (n,)."""
-    speeds = np.diff(radii, axis=-1) / np.diff(instants)
-    return np.asarray(np.abs(np.diff(speeds, axis=-1)).sum(axis=-1))
+    """Σ (change of speed)² / time along the last axis of radii (…, n) at instants (n,)."""
+    steps = np.diff(instants)
+    speeds = np.diff(radii, axis=-1) / steps
+    return np.asarray((np.diff(speeds, axis=-1) ** 2 / (steps[1:] + steps[:-1])).sum(axis=-1))

@@ -19,7 +19,7 @@ UNKNOWN = 0.05  # of the step between frames, where no exposure is given
 
 @dataclass(frozen=True)
 class Scale:
-    """``pixel`` m, ``rate`` 1/s, ``exposure`` s (NaN where it is not known), ``flashes`` of a frame after its instant, s."""
+    """``pixel`` m, ``rate`` 1/s, ``exposure`` s (NaN where not known), ``flashes`` of a frame after its instant, s."""
 
     pixel: float
     rate: float

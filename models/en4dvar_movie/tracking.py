@@ -11,10 +11,10 @@ import numpy as np
 
 from en4dvar_movie.background import CHANGED, LEAST_CONTRAST, Background, find_background, share_changed
 from en4dvar_movie.corrections import Correction
+from en4dvar_movie.fitting import fit_outline
 from en4dvar_movie.flashes import in_time
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.locate import TILE, locate
-from en4dvar_movie.fitting import fit_outline
 from en4dvar_movie.outline import Circle, Optics, Outline
 from en4dvar_movie.uncertainty import NEIGHBOURS, Errors, errors_of
 
@@ -97,6 +97,8 @@ def find_bubble(
     image, tiles = background.normalised(frame)
     if correction is not None and correction.start is not None:
         place: tuple[Circle, float] | None = (correction.start, -optics.contrast)
+    elif number < background.frames:
+        return [Found(number, None, "no bubble: the frame is one of the background's")]
     else:
         if share_changed(tiles, background.noise) > CHANGED:
             return [Found(number, None, "flash: much of the frame is brighter than the background")]

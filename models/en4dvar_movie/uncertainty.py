@@ -10,7 +10,8 @@ the amplitude of mode 2 (the mean of a degree-2 harmonic over a great circle has
 own a does not stand out of its noise, that of neighbouring frames together may.
 
 Turning: an edge that moves one way during the exposure has its half level where it is in the middle of it. One that
-turns there, as in a collapse, sweeps a range of √12 blurs and is at its end in the middle: √3 blurs from the half level.
+turns there, as in a collapse, sweeps a range of √12 blurs and is at its end in the middle: √3 blurs from the half
+level.
 
 Curvature: blur moves the half level of a disc inwards by w²/2R. It is given back for the blur that the movie's sharp
 frames share; what goes beyond it is the wall's motion during the exposure, which has no such shift.
@@ -100,7 +101,7 @@ def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics:
 
 
 def _hidden(outlines: Sequence[Outline | None]) -> Array:
-    """Variance of the radius for the extent along the line of sight (K,), from the frame's own mode 2 or its neighbours'."""
+    """Variance of the radius for the extent along the line of sight (K,): of the own mode 2, or the neighbours'."""
     where = [k for k, o in enumerate(outlines) if o is not None and o.amplitude(2) >= 0 and o.mode_std > 0]
     known = [o for k in where if (o := outlines[k]) is not None]
     radii = np.array([o.circle.R for o in known])

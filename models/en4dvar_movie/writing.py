@@ -1,8 +1,9 @@
-"""Writing movies frame by frame: TIFF with its scale, or a video without loss."""
+"""Writing movies frame by frame: TIFF with its scale, or a video."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 
 from en4dvar.errors import DataError
@@ -11,46 +12,53 @@ from en4dvar_movie.frames import TIFF, VIDEO, Frame, library
 PLAYED = 30  # frames a second, of a video
 
 
-def write_movie(
-    path: Path, frames: Iterable[Frame], count: int, shape: tuple[int, int], pixel: float, rate: float, bits: int = 8
-) -> None:
-    """``count`` grey frames (H, W); a TIFF says size of a pixel (m) and rate (1/s), as ImageJ writes them.
+def require_suffix(path: Path) -> None:
+    """Raise :class:`DataError` where a movie cannot be written under this name."""
+    if path.suffix.lower() not in (*TIFF, *VIDEO):
+        raise DataError(f"{path}: not a movie by its suffix ({', '.join((*TIFF, *VIDEO))})")
+
+
+def write_movie(path: Path, frames: Iterable[Frame], count: int, pixel: float, rate: float) -> None:
+    """``count`` frames, grey (H, W) or coloured (H, W, 3); a TIFF says size of a pixel (m) and rate (1/s).
+
+    A grey video is without loss; a coloured one is to be looked at.
 
     Raises
     ------
     DataError: the suffix is none of a movie's, a library is missing, or the file cannot be written.
     """
-    suffix = path.suffix.lower()
-    if suffix not in (*TIFF, *VIDEO):
-        raise DataError(f"{path}: not a movie by its suffix ({', '.join((*TIFF, *VIDEO))})")
-    if bits > 8 and suffix in VIDEO:
-        raise DataError(f"{path}: a video holds 8 bits; write {bits} bits as .tif")
+    require_suffix(path)
+    stream = iter(frames)
+    first = next(stream)
     try:
-        if suffix in TIFF:
-            _write_tiff(path, frames, count, shape, pixel, rate, bits)
+        if path.suffix.lower() in TIFF:
+            _write_tiff(path, first, stream, count, pixel, rate)
+        elif first.dtype.itemsize > 1:
+            raise DataError(f"{path}: a video holds 8 bits; write more as .tif")
         else:
-            _write_video(path, frames, shape)
+            _write_video(path, first, stream)
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be written: {error}") from None
 
 
-def _write_tiff(
-    path: Path, frames: Iterable[Frame], count: int, shape: tuple[int, int], pixel: float, rate: float, bits: int
-) -> None:
-    per_um = 1e-6 / pixel
+def _write_tiff(path: Path, first: Frame, others: Iterator[Frame], count: int, pixel: float, rate: float) -> None:
+    colour = first.ndim == 3
     with library("tifffile").TiffWriter(path, imagej=True) as file:
         file.write(
-            iter(frames), shape=(count, *shape), dtype="uint16" if bits > 8 else "uint8", photometric="minisblack",
-            resolution=(per_um, per_um), metadata={"axes": "TYX", "unit": "um", "finterval": 1 / rate},
+            chain([first], others), shape=(count, *first.shape), dtype=first.dtype,
+            photometric="rgb" if colour else "minisblack", resolution=(1e-6 / pixel, 1e-6 / pixel),
+            metadata={"axes": "TYXS" if colour else "TYX", "unit": "um", "finterval": 1 / rate},
         )  # fmt: skip
 
 
-def _write_video(path: Path, frames: Iterable[Frame], shape: tuple[int, int]) -> None:
+def _write_video(path: Path, first: Frame, others: Iterator[Frame]) -> None:
     av = library("av")
+    colour = first.ndim == 3
     with av.open(str(path), "w") as file:
         stream = file.add_stream("libx264", rate=PLAYED)
-        stream.height, stream.width, stream.pix_fmt = *shape, "gray"
-        stream.options = {"qp": "0"}  # without loss
-        for frame in frames:
-            file.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="gray")))
+        stream.height, stream.width = first.shape[:2]
+        stream.pix_fmt = "yuv420p" if colour else "gray"
+        stream.options = {} if colour else {"qp": "0"}
+        for frame in chain([first], others):
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24" if colour else "gray")))
         file.mux(stream.encode())

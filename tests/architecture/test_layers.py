@@ -51,7 +51,7 @@ BUBBLE = (
 # and inside the reader of movies
 MOVIE = (
     "frames", "kernels", "outline", "fitting", "locate", "background", "corrections", "uncertainty", "flashes",
-    "tracking", "table", "page", "outlined", "scene", "writing", "filming", "commands",
+    "tracking", "table", "outlined", "page", "scene", "writing", "filming", "commands",
 )  # fmt: skip
 
 

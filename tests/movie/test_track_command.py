@@ -37,7 +37,7 @@ def test_from_the_movie_to_observations(tmp_path, monkeypatch):
     comment = [line for line in lines if line.startswith("#")]
     assert "pixel: 2.5 um; frame rate: 400000 Hz" in " ".join(comment)
     assert lines[len(comment)] == "frame,t_us,R_um,R_std_um,t_std_us,x_um,y_um,eccentricity,used,reason"
-    assert lines[len(comment) + 1].endswith(",,,,,,,0,no bubble: nothing differs from the background")
+    assert lines[len(comment) + 1].endswith(",,,,,,,0,no bubble: the frame is one of the background's")
     page = (tmp_path / "gel.html").read_text()
     assert page.count("<polygon") == 27
     assert CliRunner().invoke(main, ["init", "--data", "gel.csv", "--start", "laser"]).exit_code == 0
