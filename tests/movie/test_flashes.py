@@ -24,7 +24,7 @@ def path(t):
 
 def tracked(scene=Scene(noise=5.0), seed=1):  # noqa: B008  # a frozen value
     frames = list(render(path(AT), scene, np.random.default_rng(seed)))
-    return track(replace(movie_of(frames), rate=1e6), flashes=FLASHES)
+    return track(replace(movie_of(frames), rate=1.0), flashes=FLASHES)
 
 
 def test_circles_three_pixels_apart_are_read_at_their_flashes():
