@@ -6,10 +6,13 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from en4dvar.cli import main
 from en4dvar.errors import ConfigError
 from en4dvar_movie.filming import Camera, described, exposures, film, parse_settings
 from en4dvar_movie.frames import open_movie
+from en4dvar_movie.outlined import RED
 from en4dvar_movie.scene import Scene, render
 from en4dvar_movie.tracking import track
 
@@ -118,3 +121,33 @@ def test_what_is_no_radius_and_frames_without_a_rate(config, tmp_path):
     with pytest.raises(ConfigError, match="evenly spaced"):
         film(config, np.array([0.0, 1e-6, 3e-6]), tmp_path / "m.tif", {}, 0)
     assert not (tmp_path / "m.tif").exists()
+
+
+LASER = """
+name: laser
+model: {name: bubble, law: neo-hookean-kelvin-voigt, start: laser, gas: polytropic, vapour_pressure: saturated}
+parameters: {G: 8 kPa, mu: 0.1 Pa s, R_eq: 40 um, R_max: 200 um}
+"""
+
+
+@pytest.mark.slow
+def test_the_movie_of_a_laser_bubble_and_back(tmp_path, monkeypatch):
+    """The commands of docs/movies.md, against the table of the same simulation."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "laser.yaml").write_text(LASER)
+    asked = ["--movie-set", "pixel=4 um", "--movie-set", "exposure=500 ns", "--movie-set", "noise=5"]
+    words = ["simulate", "laser.yaml", "--times", "0 us:60 us:2 us", "--seed", "3", "--out", "gel_true.csv"]
+    outcome = CliRunner().invoke(main, [*words, "--movie", "gel.tif", *asked])
+    assert outcome.exit_code == 0, outcome.output
+    outcome = CliRunner().invoke(main, ["track", "gel.tif", "--exposure", "500 ns", "--outlined", "seen.tif"])
+    assert outcome.exit_code == 0, outcome.output
+    assert "31 of 34 frames read" in outcome.output
+    truth = np.genfromtxt("gel_true.csv", delimiter=",", skip_header=4)[:, 1]
+    told = np.genfromtxt("gel.csv", delimiter=",", skip_header=4, usecols=(2, 3))[3:]
+    off = np.abs(told[:, 0] - truth)
+    assert np.median(off) < 0.3
+    assert np.mean(off < 3 * told[:, 1]) > 0.9
+    seen = list(open_movie("seen.tif").open())
+    assert seen[5].shape == (512, 512, 3)
+    assert np.any(np.all(seen[5] == RED, axis=-1))
+    assert not np.any(np.all(seen[0] == RED, axis=-1))
