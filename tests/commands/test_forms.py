@@ -1,4 +1,4 @@
-"""Forms of a simulation that application packages add: options of ``simulate``, nothing imported before they are used."""
+"""Forms of a simulation that application packages add as options of ``simulate``; nothing is imported before."""
 
 import sys
 from importlib.metadata import EntryPoint
