@@ -19,16 +19,23 @@ def image(radii, width, rng, noise=0.05, side=64):
     return (CONTRAST * shade + noise * rng.standard_normal(r.shape)).astype(np.float32)
 
 
+def fits(R, width, count=60):
+    rng = np.random.default_rng(8)
+    start, optics = Circle(31.8, 31.8, R + 0.4), Optics(CONTRAST, width, 0.002)
+    return [fit_outline(image(R, width, rng), start, optics)[0] for _ in range(count)]
+
+
 @pytest.mark.parametrize(("R", "width"), [(14.0, 3.0), (14.0, 1.2), (22.0, 3.0), (40.0, 1.2)])
 def test_sectors_scatter_as_pixels_do_where_noise_is_white(R, width):
     """What the fit takes out of the sums over sectors is given back, for sharp and blurred, whole and cut outlines."""
-    rng = np.random.default_rng(8)
-    optics = Optics(CONTRAST, width, 0.002)
-    start = Circle(31.8, 31.8, R + 0.4)
-    fits = [fit_outline(image(R, width, rng), start, optics)[0] for _ in range(60)]
-    off = np.array([o.circle.R for o in fits]) - R
-    assert np.mean([o.ratio for o in fits]) == pytest.approx(1.0, abs=0.15)
-    stated = np.sqrt(np.mean([o.variance for o in fits]))
+    assert np.mean([o.ratio for o in fits(R, width)]) == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize(("R", "width"), [(14.0, 1.2), (22.0, 3.0), (40.0, 1.2)])
+def test_the_error_is_that_of_repeated_images(R, width):
+    found = fits(R, width)
+    off = np.array([o.circle.R for o in found]) - R
+    stated = np.sqrt(np.mean([o.variance for o in found]))
     assert off.std() / stated == pytest.approx(1.0, abs=0.3)
     assert abs(off.mean()) < 3 * stated / np.sqrt(len(off)) + 0.005
 
@@ -37,10 +44,10 @@ def test_nested_circles_and_their_errors():
     rng = np.random.default_rng(9)
     radii = np.array([25.0, 21.0, 15.0])
     optics = Optics(CONTRAST, 1.2, 0.002)
-    fits = [fit_outline(image(radii, 1.2, rng), Circle(32.3, 31.5, 20.0), optics, 3) for _ in range(30)]
-    off = np.array([[o.circle.R for o in found] for found in fits]) - radii
-    stated = np.sqrt(np.mean([[o.variance for o in found] for found in fits], axis=0))
-    assert np.all(np.abs(off.mean(axis=0)) < 3 * stated / np.sqrt(len(fits)) + 0.005)
+    found = [fit_outline(image(radii, 1.2, rng), Circle(32.3, 31.5, 20.0), optics, 3) for _ in range(30)]
+    off = np.array([[o.circle.R for o in one] for one in found]) - radii
+    stated = np.sqrt(np.mean([[o.variance for o in one] for one in found], axis=0))
+    assert np.all(np.abs(off.mean(axis=0)) < 3 * stated / np.sqrt(len(found)) + 0.005)
     assert np.all((off.std(axis=0) / stated > 0.65) & (off.std(axis=0) / stated < 1.4))
 
 
