@@ -32,6 +32,7 @@ class Camera:
 
     pixel: Annotated[float, "m", "size of a pixel"] = 2e-6
     exposure: Annotated[float, "s", "how long light falls on a frame, or how long a flash is"] = 0.0
+    jitter: Annotated[float, "s", "std of the instants of the frames, each by itself"] = 0.0
     flashes: Annotated[tuple[float, ...], "flashes of a frame after its instant, such as 0 us, 2 us"] = (0.0,)
 
 
@@ -57,10 +58,11 @@ def film(config: Config, times: Array | None, out: Path, settings: Mapping[str, 
     if len(at) < 2 or np.ptp(steps) > 1e-6 * steps.mean():
         raise ConfigError("the frames of a movie are evenly spaced: give --times FROM:TO:STEP")
     require_suffix(out)
-    exposed = exposures(at, camera)
+    rng = np.random.default_rng(seed)
+    exposed = exposures(at + camera.jitter * rng.standard_normal(len(at)), camera)
     instants, where = np.unique(np.maximum(exposed, at[0]), return_inverse=True)  # before the first the bubble rests
     radii = simulate(config, instants).values[where].reshape(exposed.shape) / camera.pixel
-    frames = render(radii, scene, np.random.default_rng(seed))
+    frames = render(radii, scene, rng)
     write_movie(out, frames, scene.before + len(at), camera.pixel, 1 / float(steps.mean()))
     return (
         f"movie: {out}, {scene.before + len(at)} frames of {scene.shape[1]} × {scene.shape[0]} pixels of "
