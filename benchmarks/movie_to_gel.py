@@ -5,7 +5,8 @@
 
 Each experiment goes through files as a user's does: ``film`` writes a TIFF, ``track`` its table, whose columns are the
 errors of the estimate; nothing is told that the movie does not show. Frames of 96 × 96 pixels of 6 µm, an exposure of
-200 ns whose instant is off by a tenth of it, as the table supposes, contrast over noise 5 to 25, a bright centre, uneven light, dirt. Tables as those of calibration.py.
+200 ns whose instant is off by a tenth of it, as the table supposes, contrast over noise 5 to 25, half of the bubbles
+with a bright centre, uneven light, dirt. Tables as those of calibration.py.
 """
 
 from __future__ import annotations
@@ -51,8 +52,8 @@ def scenery(rng: np.random.Generator) -> dict[str, str]:
     ratio = np.exp(rng.uniform(np.log(5), np.log(25)))
     x, y = 47.5 + rng.uniform(-0.5, 0.5, 2)
     return {
-        "pixel": "6 um", "exposure": "200 ns", "jitter": "20 ns", "shape": "96x96", "noise": f"{75 / ratio:.3f}", "dirt": "8",
-        "centre": f"{rng.choice([0.0, 0.4]):g}", "drift": "0.05", "bubble": f"{x:.3f},{y:.3f}",
+        "pixel": "6 um", "exposure": "200 ns", "jitter": "20 ns", "shape": "96x96", "noise": f"{75 / ratio:.3f}",
+        "dirt": "8", "centre": f"{rng.choice([0.0, 0.4]):g}", "drift": "0.05", "bubble": f"{x:.3f},{y:.3f}",
     }  # fmt: skip
 
 
