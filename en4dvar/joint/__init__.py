@@ -6,3 +6,8 @@ in units of the prior, which enters once for what is shared. From the bottom up:
 ``problem`` (who shares what), ``tangent`` (an experiment's runs), ``descent``, ``members`` (the posterior ensemble),
 ``estimate``.
 """
+
+from en4dvar.joint.estimate import JointEstimate, Single, estimate_jointly
+from en4dvar.joint.problem import JointProblem, sharing
+
+__all__ = ["JointEstimate", "JointProblem", "Single", "estimate_jointly", "sharing"]

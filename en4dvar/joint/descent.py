@@ -1,4 +1,4 @@
-"""Gauss–Newton in arrow form: each experiment is linearised in its own few directions, the border is solved for once."""
+"""Gauss–Newton in arrow form: each experiment is linearised in its own few directions, the border is solved once."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from en4dvar.joint.arrow import Arrow
 from en4dvar.joint.problem import JointProblem
-from en4dvar.joint.tangent import Experiment, Local
+from en4dvar.joint.tangent import Experiment, LocalForm
 from en4dvar.state import Array
 
 LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01)  # of a step, tried in turn until J falls
@@ -40,7 +40,7 @@ class Joined:
 
     place: Place
     cost: float
-    locals: tuple[Local, ...]
+    locals: tuple[LocalForm, ...]
     arrow: Arrow
     step: tuple[Array, list[Array]]
     norm: float

@@ -120,7 +120,8 @@ class _Estimate:
         lowest = min(descents, key=lambda one: one.at.cost)
         self.tell(f"J {lowest.at.cost:.4g} after {len(lowest.costs) - 1} iterations, {lowest.stop}")
         members, cautions = self._members(lowest)
-        grids = tuple(np.linspace(*one.observations.times[[0, -1]], GRID_POINTS) for one in joint.experiments)
+        ends = [one.observations.times[[0, -1]] for one in joint.experiments]
+        grids = tuple(np.linspace(first, last, GRID_POINTS) for first, last in ends)
         forecasts = tuple(
             one.run(
                 joint.standard(
@@ -231,9 +232,8 @@ class _Estimate:
         for one, run in zip(self.joint.experiments, forecasts, strict=True):
             alive = int(run.active[:-1].sum())
             if alive < needed * (len(run) - 1):
-                raise TooFewMembersError(
-                    f"{one.observations.name}: {len(run) - 1 - alive} of {len(run) - 1} members of the joint posterior fail"
-                )
+                name, lost, count = one.observations.name, len(run) - 1 - alive, len(run) - 1
+                raise TooFewMembersError(f"{name}: {lost} of {count} members of the joint posterior fail")
 
 
 def _physical(joint: JointProblem, z: Array) -> Array:

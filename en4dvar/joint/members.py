@@ -62,7 +62,7 @@ def sampled(
     border, log_weights = _proposed(at, stream)
     chosen_own: list[Array] = []
     logs: list[Array] = []
-    for e, experiment in enumerate(experiments):
+    for experiment in experiments:
         own, log_ratio = _own(joint, experiment, at, border, arrow, stream)
         log_weights = log_weights + logsumexp(log_ratio, axis=1) - np.log(INNER)
         chosen_own.append(own)

@@ -10,6 +10,7 @@ import numpy as np
 
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.errors import ConfigError
+from en4dvar.hints import suggest
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.state import Array
@@ -35,8 +36,6 @@ class JointProblem:
 
     def __post_init__(self) -> None:
         names = [one.observations.name for one in self.experiments]
-        if len(names) < 2:
-            raise ConfigError("a joint estimate takes at least two data sets")
         if again := sorted({name for name in names if names.count(name) > 1}):
             raise ConfigError(f"data sets of a joint estimate need names of their own: {', '.join(again)} twice")
         for one, groups in zip(self.experiments, self.groups, strict=True):
@@ -102,5 +101,17 @@ class JointProblem:
 
 
 def sharing(experiments: Sequence[InverseProblem], names: Sequence[str]) -> JointProblem:
-    """Experiments that all share the parameters called ``names``. Raises :class:`ConfigError`."""
-    return JointProblem(tuple(experiments), tuple(dict.fromkeys(names, EVERYONE) for _ in experiments))
+    """Experiments of which those that estimate one of the parameters ``names`` have it in common.
+
+    Raises :class:`ConfigError`, also where fewer than two do.
+    """
+    if len(experiments) < 2:
+        raise ConfigError("a joint estimate takes at least two data sets")
+    for name in names:
+        if sum(name in one.prior.names for one in experiments) < 2:
+            known = sorted({name for one in experiments for name in one.prior.names})
+            raise ConfigError(
+                f"{name}: not estimated in two data sets, so that it could be shared{suggest(name, known)}"
+            )
+    groups = tuple({name: EVERYONE for name in names if name in one.prior.names} for one in experiments)
+    return JointProblem(tuple(experiments), groups)

@@ -14,7 +14,7 @@ from en4dvar.state import Array
 
 
 @dataclass(frozen=True)
-class Local:
+class LocalForm:
     """J_o at a point, its gradient (n,) and Gauss–Newton Hessian (n, n) in units of the prior, and the central run."""
 
     cost: float
@@ -41,7 +41,7 @@ class Experiment:
         """J_o (B,) of control vectors (B, n) in units of the prior; +inf where the model fails."""
         return self.problem.observations.cost(self.run(z).predicted)
 
-    def linearise(self, z: Array) -> Local | None:
+    def linearise(self, z: Array) -> LocalForm | None:
         """At z (n,), by n runs beside it; None where it or too many of them fail.
 
         A run that fails is replaced by the one on the other side.
@@ -57,4 +57,4 @@ class Experiment:
         if not (np.isfinite(cost) and np.isfinite(change).all()):
             return None
         d, S = observations.whiten(Linearisation.of_stacked(run.predicted[0], stacked[0], change))
-        return Local(cost, -S.T @ d, S.T @ S, run[:1])
+        return LocalForm(cost, -S.T @ d, S.T @ S, run[:1])

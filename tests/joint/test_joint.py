@@ -82,7 +82,8 @@ def test_the_stacked_kalman_solution():
         np.testing.assert_allclose(members[:-1].mean(axis=0), mean[where], rtol=0, atol=1e-10)
         np.testing.assert_allclose(np.cov(members[:-1].T), covariance[np.ix_(where, where)], rtol=0, atol=1e-10)
     assert found.log_evidence == pytest.approx(evidence, abs=1e-9)
-    assert found.converged and not found.cautions
+    assert found.converged
+    assert not found.cautions
 
 
 def test_members_of_two_experiments_correlate_only_through_what_they_share():
@@ -131,7 +132,8 @@ def test_a_member_of_any_experiment_may_fail():
     problems[2] = replace(problems[2], model=fragile)
     found = estimate.estimate_jointly(_joint(problems), SETTINGS, seed=3)
     alive = [run.active[:-1].sum() for run in found.forecasts]
-    assert alive[2] < 48 and alive[0] == 48
+    assert alive[2] < 48
+    assert alive[0] == 48
     np.testing.assert_allclose(found.shared_mode, _exact(problems)[0][:3], atol=1e-10)
 
 
@@ -184,7 +186,8 @@ def test_the_arrow_is_the_dense_matrix():
     [
         (lambda p: sharing(p[:1], ["a"]), "at least two"),
         (lambda p: sharing(p, []), "at least one"),
-        (lambda p: sharing(p, ["d"]), "set 0: d: shared, but not estimated there"),
+        (lambda p: sharing(p, ["d"]), "d: not estimated in two data sets"),
+        (lambda p: JointProblem(tuple(p), ({"d": ""}, {})), "set 0: d: shared, but not estimated there"),
         (lambda p: sharing([p[0], p[0]], ["a"]), "set 0 twice"),
         (lambda p: sharing([p[0], replace(p[1], prior=_wider(p[1].prior))], ["a"]), "a: its prior must be the same"),
     ],
