@@ -5,8 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from en4dvar_movie.frames import Movie
+    from en4dvar_movie.table import Scale
 
 
 @click.command()
@@ -44,31 +49,15 @@ def track(
     from en4dvar.commands.common import command_line, refuse_to_replace
     from en4dvar.executor import available_cores
     from en4dvar.files import write_text
-    from en4dvar.units import parse_quantity
     from en4dvar_movie.corrections import read_corrections
-    from en4dvar_movie.flashes import parse_flashes
-    from en4dvar_movie.frames import open_movie, with_scale
+    from en4dvar_movie.frames import open_movie
     from en4dvar_movie.outlined import outlined as outlined_frames
     from en4dvar_movie.page import page_text
-    from en4dvar_movie.table import Scale, to_csv
+    from en4dvar_movie.table import to_csv
     from en4dvar_movie.tracking import track as track_movie
     from en4dvar_movie.writing import require_suffix, write_movie
 
-    def given(text: str | None, unit: str, option: str) -> float | None:
-        value = None if text is None else parse_quantity(text, unit)
-        if value is not None and not value > 0:
-            raise click.UsageError(f"{option} must be positive")
-        return value
-
-    length, rate = given(pixel, "m", "--pixel"), given(frame_rate, "1/s", "--frame-rate")
-    opened = with_scale(open_movie(movie, raw), length, rate)
-    shutter = given(exposure, "s", "--exposure")
-    instants = parse_flashes(flashes) if flashes else (0.0,)
-    scale = Scale(opened.pixel, opened.rate, float("nan") if shutter is None else shutter, instants)
-    if shutter is not None and shutter * scale.rate > 1.001:
-        raise click.UsageError(f"--exposure {exposure} is longer than the {1e6 / scale.rate:g} us between two frames")
-    if instants[-1] - instants[0] >= 1 / scale.rate:
-        raise click.UsageError(f"--flashes {flashes}: more than the {1e6 / scale.rate:g} us between two frames")
+    opened, scale = _scaled(open_movie(movie, raw), pixel, frame_rate, exposure, flashes)
     table = out or Path(f"{movie.stem}.csv")
     shown = page or table.with_suffix(".html")
     if outlined:
@@ -77,7 +66,7 @@ def track(
         refuse_to_replace(target, force)
     fixed = read_corrections(corrections) if corrections else {}
     with _bar(opened.count) as progress:
-        found = track_movie(opened, workers or available_cores(), fixed, progress, instants)
+        found = track_movie(opened, workers or available_cores(), fixed, progress, scale.flashes)
     for note in opened.notes:
         click.echo(f"note: {note}", err=True)
     words = command_line()
@@ -87,9 +76,35 @@ def track(
         pictures = outlined_frames(opened, found)
         write_movie(outlined, pictures, len({r.found.frame for r in found.readings}), scale.pixel, scale.rate)
     used = [r for r in found.readings if r.used]
-    what = "frames" if len(instants) == 1 else "circles"
+    what = "frames" if len(scale.flashes) == 1 else "circles"
     click.echo(f"{len(used)} of {len(found.readings)} {what} read; the others and why: see the page")
     click.echo(f"readings: {table}\npage: {shown}\nnext: en4dvar init --data {table}")
+
+
+def _scaled(
+    movie: Movie, pixel: str | None, frame_rate: str | None, exposure: str | None, flashes: str | None
+) -> tuple[Movie, Scale]:
+    """The movie with its scale. Raises :class:`click.UsageError`, :class:`DataError` where the options cannot be."""
+    from en4dvar.units import parse_quantity
+    from en4dvar_movie.flashes import parse_flashes
+    from en4dvar_movie.frames import with_scale
+    from en4dvar_movie.table import Scale
+
+    def given(text: str | None, unit: str, option: str) -> float | None:
+        value = None if text is None else parse_quantity(text, unit)
+        if value is not None and not value > 0:
+            raise click.UsageError(f"{option} must be positive")
+        return value
+
+    movie = with_scale(movie, given(pixel, "m", "--pixel"), given(frame_rate, "1/s", "--frame-rate"))
+    shutter = given(exposure, "s", "--exposure")
+    instants = parse_flashes(flashes) if flashes else (0.0,)
+    between = f"the {1e6 / movie.rate:g} us between two frames"
+    if shutter is not None and shutter * movie.rate > 1.001:
+        raise click.UsageError(f"--exposure {exposure} is longer than {between}")
+    if instants[-1] - instants[0] >= 1 / movie.rate:
+        raise click.UsageError(f"--flashes {flashes}: more than {between}")
+    return movie, Scale(movie.pixel, movie.rate, float("nan") if shutter is None else shutter, instants)
 
 
 @contextmanager
