@@ -30,6 +30,10 @@ LASER = {"name": "bubble", "law": "neo-hookean-kelvin-voigt", "start": "laser"}
 GASES = {
     "polytropic, as stored": STORED,
     "polytropic": {},
+    "polytropic, quadratic law": {
+        "model.law": "quadratic-kelvin-voigt",
+        "parameters.alpha": {"prior": "lognormal", "median": 0.3, "log_std": 1.0},
+    },
     "polytropic, no vapour": {"model.vapour_pressure": "0 Pa"},
     "heat, vapour frozen": {"model": {**LASER, "gas": "heat", "vapour": "frozen"}},
     "heat, vapour transported": {"model": {**LASER, "gas": "heat", "vapour": "transport"}},
