@@ -21,6 +21,7 @@ from en4dvar.prior import LARGEST
 from en4dvar.series import Part, Series
 from en4dvar.state import Array
 
+SEVERAL = ", "  # between the names of several sources
 SAME_TIME = 1e-9  # of the whole duration: times of different series that are this close are the same instant
 
 
@@ -30,8 +31,8 @@ class Observations:
 
     Attributes
     ----------
-    times: (K,) in the model's time unit (seconds for the bubble), from the model's time zero; strictly increasing within
-        a series, of a field not decreasing.
+    times: (K,) in the model's time unit (seconds for the bubble), from the model's time zero; strictly increasing
+        within a series, of a field not decreasing.
     values: (K,) finite, in the observable's unit.
     noise: the observation errors (:func:`en4dvar.noise.noise_of` makes them of std, timing error and correlation).
     weights: (K,) β_k ≥ 0; 1 counts an observation fully (``weights: sum``), 1/K is ``weights: mean``.
@@ -82,9 +83,10 @@ class Observations:
                 raise DataError(f"{name}: a correlation of {a!r} and {b!r}; it is of two of: {', '.join(names)}")
             i, j = names.index(a), names.index(b)
             between[i, j] = between[j, i] = value
-        times = _same_instants([one.times for one in series])
+        times = [one.times for one in series]
+        times = _same_instants(times) if len(times) > 1 else times
         try:
-            noise = joint_noise(times, [one.noise for one in series], between)
+            noise = joint_noise(times, [one.noise for one in series], between) if len(series) > 1 else series[0].noise
         except ValueError as error:
             raise DataError(f"{name}: {error}") from None
         ends = np.cumsum([len(t) for t in times]).tolist()
@@ -98,7 +100,7 @@ class Observations:
             noise=noise,
             weights=np.concatenate([np.asarray(one.weights) for one in series]),
             name=name,
-            source=", ".join(dict.fromkeys(one.source for one in series if one.source)),
+            source=SEVERAL.join(dict.fromkeys(one.source for one in series if one.source)),
             scalars={key: value for one in series for key, value in one.scalars.items()},
             parts=() if len(series) == 1 and series[0].places is None else parts,
         )
@@ -199,16 +201,8 @@ class Observations:
 
 
 def _same_instants(times: Sequence[Array]) -> list[Array]:
-    """The times of each series, those that differ by rounding alone made equal to those of the series before."""
-    every = np.concatenate(times)
-    close = SAME_TIME * float(np.ptp(every)) if len(every) else 0.0
-    known, found = np.empty(0), []
-    for own in times:
-        if len(known):
-            after = np.clip(np.searchsorted(known, own), 1, len(known) - 1) if len(known) > 1 else np.zeros(len(own), int)
-            before = np.maximum(after - 1, 0)
-            nearest = np.where(own - known[before] < known[after] - own, known[before], known[after])
-            own = np.where(np.abs(nearest - own) <= close, nearest, own)
-        known = np.union1d(known, own)
-        found.append(own)
-    return found
+    """The times of each series; those that differ by rounding alone are made equal to the earliest of them."""
+    every = np.unique(np.concatenate(times))
+    begins = np.diff(every, prepend=-np.inf) > SAME_TIME * float(np.ptp(every))
+    earliest = every[begins][np.cumsum(begins) - 1]
+    return [earliest[np.searchsorted(every, own)] for own in times]

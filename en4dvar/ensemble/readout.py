@@ -1,4 +1,4 @@
-"""H of every series of a data set as one function of a path: which instants and places each of its values is read at."""
+"""H of every series of a data set as one function of a path: at which instants and places it is read."""
 
 from __future__ import annotations
 

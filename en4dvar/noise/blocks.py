@@ -1,4 +1,4 @@
-r"""Errors of several series side by side: blocks of readings, each with errors of its own kind, independent of the others.
+r"""Errors of several series side by side: blocks of readings, each with its own kind of errors, and independent.
 
 R is block diagonal once the readings are ordered by block: readings whose errors are correlated, directly or through
 others, are one block of :class:`CorrelatedNoise`, those that share the threshold of a robust cost one of

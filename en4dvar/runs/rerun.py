@@ -18,11 +18,11 @@ from en4dvar.config.document import parse_document
 from en4dvar.config.load import resolve
 from en4dvar.errors import OutputError
 from en4dvar.executor import choose_executor, one_blas_thread
+from en4dvar.observations import SEVERAL
 from en4dvar.report.result import Result, load_result
 from en4dvar.runs.trust import Ask, of_strangers
 from en4dvar.storage.campaign_file import failed_datasets
-from en4dvar.storage.checkpoint import file_digest
-from en4dvar.storage.fingerprint import Identity, identity
+from en4dvar.storage.fingerprint import Identity, digest_of, identity
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.store import result_files
 
@@ -143,9 +143,10 @@ def _by_how_much(a: np.ndarray, b: np.ndarray) -> str:
 
 def _data_file(recorded: Result) -> str:
     """What became of the data file; "" where it is as it was."""
-    source = Path(str(recorded.observed_data.attrs["data_source"]))
-    if not source.is_file():
+    sources = [Path(text) for text in str(recorded.observed_data.attrs["data_source"]).split(SEVERAL)]
+    source = next((path for path in sources if not path.is_file()), None)
+    if source is not None:
         return f"{source} is gone, the recorded observations were used"
-    if file_digest(source) != recorded.attributes["data_sha256"]:
-        return f"{source} has changed since, the recorded observations were used"
+    if digest_of(sources) != recorded.attributes["data_sha256"]:
+        return f"{SEVERAL.join(map(str, sources))} has changed since, the recorded observations were used"
     return ""
