@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from en4dvar.assimilate import assimilate
-from en4dvar.config.build import problem_of
+from en4dvar.config.build import inverse_plan, problem_of
 from en4dvar.config.document import parse_document
 from en4dvar.config.load import resolve
 from en4dvar.errors import OutputError
@@ -96,7 +96,8 @@ def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = Fals
     with one_blas_thread(), choose_executor(config.model, None, workers) as executor:
         for file in files:
             recorded = load_result(file)
-            problem = problem_of(config, recorded.observations())
+            observables = {one.name: one.observable for one in inverse_plan(config).series}
+            problem = problem_of(config, recorded.observations(observables))
             analysis = assimilate(problem, config.assimilation, int(recorded.attributes["seed"]), executor)
             again = Result.from_analysis(analysis, {})
             variables, differ = differences(recorded, again)

@@ -20,7 +20,11 @@ from en4dvar.analysis import Analysis
 from en4dvar.caution import codes
 from en4dvar.diagnostics import active_members, nrmse
 from en4dvar.influence import prior_distance
+from en4dvar.noise import BlockNoise
+from en4dvar.observations import Observations
+from en4dvar.series import Part, Places
 from en4dvar.state import Array, Parameter
+from en4dvar.storage.axes import Axis, axes_of
 from en4dvar.storage.modes import mode_variables
 from en4dvar.storage.netcdf import Group, Variable, netcdf_attributes
 from en4dvar.storage.netcdf import variable as _variable
@@ -58,8 +62,6 @@ def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]
         "assimilation_settings": json.dumps(asdict(a.settings)),
         "warnings": "\n".join(c.line for c in a.cautions),
     }
-    label = f"{a.problem.observable.label}, log-likelihood of each observation"
-    log_likelihood = _variable((*MEMBER, "time"), a.log_likelihood[None], "1", label)
     return {
         "/": Group(attrs=netcdf_attributes({**root, **attributes})),
         "/prior": group({**_parameters(a, a.prior), **pieces(a, a.prior)}),
@@ -69,7 +71,7 @@ def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]
         "/observed_data": group(*_observed(a)),
         "/constant_data": group(_constants(a)),
         "/sample_stats": group(_sample_stats(a), _scalars(a)),
-        "/log_likelihood": group({a.problem.observable.name: log_likelihood}),
+        "/log_likelihood": group(_log_likelihood(a)),
         "/iterations": group(_iterations(a)),
     }
 
@@ -91,13 +93,22 @@ def _coordinates(a: Analysis) -> Variables:
     return {
         "chain": _variable("chain", np.zeros(1, dtype=np.int64), "1", "chain", fill=False),
         "draw": _variable("draw", np.arange(len(a.prior)), "1", "ensemble member", fill=False),
-        "time": _time(a, "time", a.observations.times, "observation time"),
+        **{
+            axis.time: _time(a, axis.time, a.observations.times[part.where], "observation time")
+            for axis, part in _series(a)
+        },
         "path_time": _time(a, "path_time", a.trajectory_times, "time on the clock of the observations"),
         "parameter": _variable("parameter", names, "1", "estimated parameter", fill=False),
         "iteration": _variable("iteration", [r.iteration for r in a.iterations], "1", "iteration", fill=False),
         **response_coordinates(a),
         **piece_coordinates(a),
     }
+
+
+def _series(a: Analysis) -> list[tuple[Axis, Part]]:
+    """Each series with the names that its variables have."""
+    parts = a.problem.parts
+    return list(zip(axes_of([part.name for part in parts]), parts, strict=True))
 
 
 def _time(a: Analysis, dim: str, values: Array, long_name: str) -> Variable:
@@ -111,36 +122,90 @@ def _parameters(a: Analysis, members: Array) -> Variables:
     return {p.name: _variable(MEMBER, members[None, :, i], **about(p)) for i, p in enumerate(a.parameters)}
 
 
-def _observable(a: Analysis, dims: tuple[str, ...], values: Array, what: str) -> Variable:
-    o = a.problem.observable
+def _observable(part: Part, dims: tuple[str, ...], values: Array, what: str) -> Variable:
+    o = part.observable
     return _variable(dims, values, o.unit, f"{o.label}, {what}", display_units=o.display_unit, symbol=o.symbol)
 
 
 def _predictive(a: Analysis, predictions: Array, paths: Array) -> Variables:
-    name = a.problem.observable.name
+    found: Variables = {}
+    width, curves = len(a.trajectory_times), iter(range(len(a.problem.parts)))
+    for axis, part in _series(a):
+        words = "noise-free prediction at the observations"
+        found[part.name] = _observable(part, (*MEMBER, axis.time), predictions[None, :, part.where], words)
+        if part.has_path:
+            first = width * next(curves)
+            along = paths[None, :, first : first + width]
+            words = "noise-free prediction along the path"
+            found[f"{part.name}_path"] = _observable(part, (*MEMBER, "path_time"), along, words)
+    return found
+
+
+def _log_likelihood(a: Analysis) -> Variables:
     return {
-        name: _observable(a, (*MEMBER, "time"), predictions[None], "noise-free prediction at the observations"),
-        f"{name}_path": _observable(a, (*MEMBER, "path_time"), paths[None], "noise-free prediction along the path"),
+        part.name: _variable(
+            (*MEMBER, axis.time),
+            a.log_likelihood[None, :, part.where],
+            "1",
+            f"{part.observable.label}, log-likelihood of each observation",
+        )
+        for axis, part in _series(a)
     }
 
 
 def _observed(a: Analysis) -> tuple[Variables, dict[str, Any]]:
     """Variables and attributes of the data and of what is stated about their errors."""
-    name, obs = a.problem.observable.name, a.observations
+    obs = a.observations
+    variables: Variables = {}
+    for axis, part in _series(a):
+        variables |= _observed_series(a, axis, part)
+    scalars = {f"{SCALAR}{key}": value for key, value in obs.scalars.items()}
+    if not obs.parts:
+        matrices, dims, stated = obs.noise.matrices(), ("time", "time_column"), obs.noise.attributes()
+        names = {key: f"{a.problem.observable.name}_{key}" for key in matrices}
+    else:
+        matrices, dims, stated = obs.noise.matrices(), ("reading", "reading_column"), _thresholds(obs)
+        names = {key: key for key in matrices}
+    for key, (matrix, words) in matrices.items():
+        variables[names[key]] = _variable(dims, matrix, "1", words)
+    return variables, {"name": obs.name, "data_source": obs.source, **scalars, **stated}
+
+
+def _observed_series(a: Analysis, axis: Axis, part: Part) -> Variables:
+    name, obs, own = part.name, a.observations, part.where
+    dims = (axis.time,)
     variables = {
-        name: _observable(a, ("time",), obs.values, "observed"),
-        f"{name}_std": _observable(a, ("time",), a.error_std, "observation-error std, timing error included"),
-        f"{name}_reading_std": _observable(a, ("time",), obs.std, "observation-error std of the reading alone"),
-        "time_std": _time(a, "time", obs.noise.time_std, "std of the observation times"),
-        "weights": _variable("time", obs.weights, "1", "weight of the observation in the cost"),
+        name: _observable(part, dims, obs.values[own], "observed"),
+        f"{name}_std": _observable(part, dims, a.error_std[own], "observation-error std, timing error included"),
+        f"{name}_reading_std": _observable(part, dims, obs.std[own], "observation-error std of the reading alone"),
+        axis.own("time_std"): _time(a, axis.time, obs.noise.time_std[own], "std of the observation times"),
+        axis.own("weights"): _variable(dims, obs.weights[own], "1", "weight of the observation in the cost"),
     }
-    for key, (matrix, words) in obs.noise.matrices().items():
-        variables[f"{name}_{key}"] = _variable(("time", "time_column"), matrix, "1", words)
+    if part.places is not None:
+        variables |= _places(name, axis, part.places)
     if a.down_weights is not None:
         words = "weight of the observation in the robust cost at its minimum"
-        variables[f"{name}_huber_weight"] = _variable("time", a.down_weights, "1", words)
-    scalars = {f"{SCALAR}{key}": value for key, value in obs.scalars.items()}
-    return variables, {"name": obs.name, "data_source": obs.source, **scalars, **obs.noise.attributes()}
+        variables[f"{name}_huber_weight"] = _variable(dims, a.down_weights[own], "1", words)
+    return variables
+
+
+def _places(name: str, axis: Axis, places: Places) -> Variables:
+    """Where on a field the readings were taken, and between which of its components they are interpolated."""
+    corners = (axis.time, f"{name}_corner")
+    index, share = places.indices.astype(float), places.shares
+    return {
+        f"{name}_place": _variable(axis.time, places.positions, places.unit, "where on the field it was read"),
+        f"{name}_place_index": _variable(corners, index, "1", "components of the field that make up the reading"),
+        f"{name}_place_share": _variable(corners, share, "1", "their shares"),
+    }
+
+
+def _thresholds(obs: Observations) -> dict[str, float]:
+    """Beyond how many std the cost of each series is robust, of those where it is."""
+    noise = obs.noise
+    each = noise.thresholds if isinstance(noise, BlockNoise) else np.full(len(obs), noise.counts_within)
+    found = {f"{part.name}_huber_threshold": float(each[part.begin]) for part in obs.parts}
+    return {name: threshold for name, threshold in found.items() if math.isfinite(threshold)}
 
 
 def _constants(a: Analysis) -> Variables:
@@ -157,7 +222,6 @@ def _sample_stats(a: Analysis) -> Variables:
     active, prior_active = active_members(a.posterior_failures), active_members(a.prior_failures)
     reason = "reason of failure, empty where the member is alive"
     centre = "value at the minimum of J, each in the unit of its parameter"
-    name = a.problem.observable.name
     return {
         "active": _variable(MEMBER, active[None], "1", "member survived the posterior forecast"),
         "failure_reason": _variable(MEMBER, _text(a.posterior_failures)[None], "1", reason),
@@ -165,7 +229,12 @@ def _sample_stats(a: Analysis) -> Variables:
         "prior_failure_reason": _variable(MEMBER, _text(a.prior_failures)[None], "1", f"prior: {reason}"),
         "centre": _variable("parameter", a.centre, "1", centre),
         "dfs": _variable("parameter", a.dfs_per_parameter, "1", "degrees of freedom for signal of the parameter"),
-        f"{name}_centre": _observable(a, ("time",), a.centre_predictions, "prediction at the minimum of J"),
+        **{
+            f"{part.name}_centre": _observable(
+                part, (axis.time,), a.centre_predictions[part.where], "prediction at the minimum of J"
+            )
+            for axis, part in _series(a)
+        },
         **_residuals(a),
         **_discrepancy(a),
         **_readings(a),
@@ -180,17 +249,25 @@ def _sample_stats(a: Analysis) -> Variables:
     }
 
 
+def _of_readings(a: Analysis, name: str, values: Array, words: str, above: tuple[str, ...] = ()) -> Variables:
+    """Numbers (…, K) of the readings: a variable ``<series>_<name>`` for each series."""
+    return {
+        f"{part.name}_{name}": _variable((*above, axis.time), values[..., part.where], "1", words)
+        for axis, part in _series(a)
+    }
+
+
 def _residuals(a: Analysis) -> Variables:
     """Whitened residuals and leverages (time), NaN where a reading does not count."""
-    name, found = a.problem.observable.name, a.residuals
+    found = a.residuals
     if found is None:
         return {}
     white, leverage, studentised = np.full((3, len(a.observations)), np.nan)
     white[found.which], leverage[found.which], studentised[found.which] = found.white, found.leverage, found.studentised
     return {
-        f"{name}_whitened_residual": _variable("time", white, "1", "whitened residual at the minimum of J"),
-        f"{name}_studentised": _variable("time", studentised, "1", "whitened residual over its own expected std"),
-        f"{name}_leverage": _variable("time", leverage, "1", "share of the reading in its own prediction"),
+        **_of_readings(a, "whitened_residual", white, "whitened residual at the minimum of J"),
+        **_of_readings(a, "studentised", studentised, "whitened residual over its own expected std"),
+        **_of_readings(a, "leverage", leverage, "share of the reading in its own prediction"),
     }
 
 
@@ -199,18 +276,27 @@ def _readings(a: Analysis) -> Variables:
     living = a.prior_predictions[active_members(a.prior_failures)]
     distance = prior_distance(a.observations.values, living, a.error_std)
     words = "distance of the reading from the prior's prediction, in the std of both"
-    found = {f"{a.problem.observable.name}_prior_distance": _variable("time", distance, "1", words)}
+    found = _of_readings(a, "prior_distance", distance, words)
     if a.influence is None:
         return found
-    of_each = ("parameter", "time")
     what = "change of the posterior mean if the reading is left out"
     how = "0 by importance weights, 1 by linear response, 2: only another fit tells"
-    return found | {
-        "influence_change": _variable(of_each, a.influence.change, "1", f"{what}, each in the unit of its parameter"),
-        "influence_in_std": _variable(of_each, a.influence.in_std, "1", f"{what}, in posterior standard deviations"),
-        "influence_pareto_shape": _variable("time", a.influence.pareto_shape, "1", "Pareto shape of the weights"),
-        "influence_how": _variable("time", a.influence.how.astype(float), "1", how),
-    }
+    i = a.influence
+    in_std = f"{what}, in posterior standard deviations"
+    for axis, part in _series(a):
+        dims, own = ("parameter", axis.time), part.where
+        words = f"{what}, each in the unit of its parameter"
+        found |= {
+            axis.own("influence_change"): _variable(dims, i.change[:, own], "1", words),
+            axis.own("influence_in_std"): _variable(
+                dims, i.in_std[:, own], "1", f"{what}, in posterior standard deviations"
+            ),
+            axis.own("influence_pareto_shape"): _variable(
+                axis.time, i.pareto_shape[own], "1", "Pareto shape of the weights"
+            ),
+            axis.own("influence_how"): _variable(axis.time, i.how[own].astype(float), "1", how),
+        }
+    return found
 
 
 SHARES = ("errors", "discrepancy", "prior")
@@ -218,9 +304,10 @@ SHARES = ("errors", "discrepancy", "prior")
 
 def _discrepancy(a: Analysis) -> Variables:
     """What the model misses (time), and where the variance of each parameter comes from (parameter)."""
-    name, found = a.problem.observable.name, a.discrepancy
+    (part, *_), found = a.problem.parts, a.discrepancy
     if found is None:
         return {}
+    name = part.name
     shares = {
         f"variance_from_{source}": _variable(
             "parameter", found.shares[:, i], "1", f"share of the posterior variance that comes from the {source}"
@@ -228,22 +315,22 @@ def _discrepancy(a: Analysis) -> Variables:
         for i, source in enumerate(SHARES)
     }
     return {
-        f"{name}_discrepancy": _observable(a, ("time",), found.mean, "what the model misses, at the minimum of J"),
-        f"{name}_discrepancy_std": _observable(a, ("time",), found.std, "std of what the model misses"),
+        f"{name}_discrepancy": _observable(part, ("time",), found.mean, "what the model misses, at the minimum of J"),
+        f"{name}_discrepancy_std": _observable(part, ("time",), found.std, "std of what the model misses"),
         **shares,
     }
 
 
 def _scalars(a: Analysis) -> dict[str, Any]:
     """What judges the fit as a whole."""
-    y, active, last = a.observations.values, active_members(a.posterior_failures), a.iterations[-1]
+    active, last = active_members(a.posterior_failures), a.iterations[-1]
     return {
         "n_members": len(active),
         "n_active": int(active.sum()),
-        "n_observations": len(y),
+        "n_observations": len(a.observations),
         "n_weighted": len(a.observations.used),
-        "nrmse": nrmse(y, a.posterior_predictions[active].mean(axis=0)) if active.any() else np.nan,
-        "nrmse_centre": nrmse(y, a.centre_predictions),
+        "nrmse": _nrmse(a, a.posterior_predictions[active].mean(axis=0)) if active.any() else np.nan,
+        "nrmse_centre": _nrmse(a, a.centre_predictions),
         "chi2_per_observation": last.chi2_per_observation,
         "cost": last.cost,
         "dfs": last.dfs,
@@ -263,6 +350,15 @@ def _scalars(a: Analysis) -> dict[str, Any]:
         **a.shape,
         **a.refinement,
     }
+
+
+def _nrmse(a: Analysis, predicted: Array) -> float:
+    """Of several series, in units of their own, from the mean of (1 − NRMSE)² over those that vary."""
+    if not a.observations.parts:
+        return nrmse(a.observations.values, predicted)
+    y = a.observations.values
+    each = [nrmse(y[p.where], predicted[p.where]) for p in a.problem.parts if np.ptp(y[p.where]) > 0]
+    return float(1 - np.sqrt(np.mean((1 - np.array(each)) ** 2))) if each else np.nan
 
 
 def _judged_residuals(a: Analysis) -> dict[str, Any]:
