@@ -22,12 +22,7 @@ def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
     parts = [
         f"{config.name}: {len(first.prior.names)} parameters from {len(problems)} data set(s) with "
         f"{settings.scheme}, {settings.members} members, weights {config.weights}, seed {config.seed}",
-        table(
-            [
-                ("data set", "observations", "window", "maximum", "error std"),
-                *(row for p in problems for row in _data_rows(p)),
-            ]
-        ),
+        table([("data set", "observations", "window", "maximum", "error std"), *rows]),
     ]
     for problem in problems if any(e.needs_data for e in config.parameters) else problems[:1]:
         title = f"estimated ({problem.observations.name})" if len(problems) > 1 else "estimated"

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Discriminator, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, Tag
-from pydantic_core import CoreSchema, core_schema
+from pydantic import ConfigDict, Discriminator, Field, Tag, WithJsonSchema
 
 from en4dvar.config.context import Context, Made
 from en4dvar.config.data import Data
@@ -17,6 +16,7 @@ from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import Observable
 from en4dvar.hints import shown, suggest
 
+EACH = {"type": "object", "minProperties": 1, "additionalProperties": {"x-definition": "series"}}
 Correlation = Annotated[float, Field(gt=-1, lt=1)]
 
 
@@ -68,22 +68,6 @@ class DataPlan:
         return {"series": written, **rest}
 
 
-class _EachSeries:
-    """Annotation of the JSON schema: what a series may say, nothing of it required, for the rest is above it."""
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        inner = handler.generate_schema(SeriesData)
-        return core_schema.dict_schema(
-            core_schema.str_schema(), core_schema.any_schema(), min_length=1, metadata={"each": inner}
-        )
-
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        each: Any = schema.get("metadata", {}).get("each")
-        found = dict(handler.resolve_ref_schema(handler(each)))
-        found.pop("required", None)
-        return {"type": "object", "minProperties": 1, "additionalProperties": found}
-
-
 class DataOfSeries(Section):
     """Several series that are assimilated together, each with its own file, times, units, errors and weights.
 
@@ -93,7 +77,7 @@ class DataOfSeries(Section):
 
     model_config = ConfigDict(extra="allow")
 
-    series: Annotated[dict[str, Any], _EachSeries()]
+    series: Annotated[dict[str, Any], Field(min_length=1), WithJsonSchema(EACH)]
     """Name of the series → what ``data:`` says of a single one; the name is that of its observable, unless it says
     ``observable``."""
     correlation: dict[str, dict[str, Correlation]] | None = None

@@ -75,8 +75,7 @@ class Composite:
         self.problem, self.executor = problem, executor or SerialExecutor()
         self._initial_states = InitialStates(problem)
         self._operators = _operators(problem)
-        self._parts, self._batched = problem.parts, batched(problem)
-        self._curves = sum(part.has_path for part in self._parts)
+        self._batched = batched(problem)
         self._scaled, self._discrepancy = problem.has_noise_scale, problem.discrepancy
 
     def __call__(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
@@ -86,41 +85,52 @@ class Composite:
         same run. A member fails, without disturbing the others, where a parameter leaves its bounds, ``initial_state``
         raises, the model returns a :class:`Failure`, or H gives anything but finite numbers.
         """
-        problem, (instants, rows) = self.problem, self.problem.observations.instants
-        k, (times, at_observations, at_extra) = len(problem.observations), _union(instants, extra_times)
-        rows = rows if isinstance(at_observations, slice) else at_observations[rows]
-        reading = self._reading(len(times), rows, at_extra, limits=len(extra_times) > 0)
+        problem = self.problem
+        times, reading, size, at_observations, at_extra = self._reading(extra_times)
         physical = problem.prior.to_physical(x)
         failures = out_of_bounds(problem.prior, physical)
         alive, states = self._initial_states(physical, failures)
         shift = _of_framework(problem, physical, TIME_SHIFT, 0.0)
         shifted = times + shift[alive, None]
         outcomes = self.executor.trajectories(problem.model, states, shifted) if len(states) else ()
-        observed, limits, reasons = reading.observe(outcomes, k + self._curves * len(extra_times))
+        observed, limits, reasons = reading.observe(outcomes, size)
         if alive is EVERYONE:
             failures = reasons
         else:
             read = observed, limits
-            observed = np.full((len(observed), len(x), observed.shape[2]), np.nan)
+            observed = np.full((len(observed), len(x), size), np.nan)
             limits = np.full((len(x), len(reading.limits), 2), np.nan)
             observed[:, alive], limits[alive] = read
             for i, reason in zip(np.arange(len(x))[alive], reasons, strict=True):
                 failures[i] = reason
         predicted = Predicted(
-            observed[0][:, :k],
-            observed[1][:, :k] if len(observed) > 1 else None,
+            observed[0][:, at_observations],
+            observed[1][:, at_observations] if len(observed) > 1 else None,
             _of_framework(problem, physical, NOISE_SCALE, 1.0) if self._scaled else None,
             np.stack([_of_framework(problem, physical, p, np.nan) for p in self._discrepancy], axis=1)
             if self._discrepancy
             else None,
         )
         extremes, beyond = limits[..., 0], limits[..., 1] - shift[:, None]
-        return Forecast(predicted, observed[0][:, k:], tuple(failures), extremes, beyond)
+        return Forecast(predicted, observed[0][:, at_extra], tuple(failures), extremes, beyond)
 
-    def _reading(self, n_times: int, rows: Indices, along: Indices, limits: bool) -> Reading:
-        """H of every part, its rate where R depends on it, and the model's limits of validity where asked for."""
-        readouts = tuple(Readout(one, self._parts, n_times, rows, along) for one in self._operators)
-        return Reading(readouts, tuple(self.problem.model.validity) if limits else (), self._batched)
+    def _reading(self, extra_times: Array) -> tuple[Array, Reading, int, Indices, Indices]:
+        """The instants; what is read there and how many numbers that are; which of them are observations, and curves.
+
+        A single observable is read at all instants, and picked from them for all members at once.
+        """
+        observations = self.problem.observations
+        limits = tuple(self.problem.model.validity) if len(extra_times) else ()
+        instants, rows = observations.instants
+        times, at_instants, at_extra = _union(instants, extra_times)
+        if not observations.parts:
+            quantities = tuple(of_parts[0] for of_parts in self._operators)
+            return times, Reading(quantities, limits, self._batched), len(times), at_instants, at_extra
+        rows = rows if isinstance(at_instants, slice) else at_instants[rows]
+        readouts = tuple(Readout(one, observations.parts, len(times), rows, at_extra) for one in self._operators)
+        k, curves = len(observations), sum(part.has_path for part in observations.parts)
+        size = k + curves * len(extra_times)
+        return times, Reading(readouts, limits, self._batched), size, slice(0, k), slice(k, size)
 
 
 def forecast(

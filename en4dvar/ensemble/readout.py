@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.ensemble.members import MisshapenError
 from en4dvar.errors import ConfigError
 from en4dvar.forward import RateOperator
 from en4dvar.problem import InverseProblem
@@ -16,13 +17,6 @@ from en4dvar.series import Part
 from en4dvar.state import Array
 
 Indices = npt.NDArray[np.intp] | slice
-
-
-class MisshapenError(ValueError):
-    """An observation operator gave another number of values than there are instants."""
-
-    def __str__(self) -> str:
-        return "misshapen prediction"
 
 
 @dataclass(frozen=True)

@@ -55,9 +55,10 @@ def residuals(result: StoredResult) -> Figure:
     grid = figure.add_gridspec(3 if discrepant else 2, 3)
     top, below = figure.add_subplot(grid[0, :]), grid.nrows - 1
     top.axhline(0, color=LIGHT["muted"], lw=0.6)
-    for series, colour in readings.each_series(result):
+    for axis, (series, colour) in zip(result.axes, readings.each_series(result), strict=True):
         chosen = series[counts[series]]
-        top.plot(time[chosen], white[chosen], "-", color=LIGHT["muted"], lw=0.5)
+        if f"{axis.name}_place" not in result.observed_data:
+            top.plot(time[chosen], white[chosen], "-", color=LIGHT["muted"], lw=0.5)
         top.plot(time[chosen], white[chosen], "o", ms=2.2, color=colour)
     top.set(xlabel=label, ylabel="whitened residual")
     readings.name_series(top, result)

@@ -36,8 +36,9 @@ class SeriesShown:
         observed, name = result.observed_data, axis.name
         data, std = shown(observed[name]), shown(observed[f"{name}_std"])
         x, x_label = shown(observed[axis.time]), with_unit("time", observed[axis.time].attrs["display_units"])
-        if f"{name}_place" in observed and not np.ptp(x) > 0:
-            x = np.asarray(observed[f"{name}_place"].values)
+        places = np.asarray(observed[f"{name}_place"].values) if f"{name}_place" in observed else np.empty(0)
+        if len(np.unique(places)) > len(np.unique(x)):
+            x = places
             x_label = with_unit("place", str(observed[f"{name}_place"].attrs["units"]))
         attrs = observed[name].attrs
         label = str(attrs["long_name"]).removesuffix(", observed")

@@ -155,31 +155,31 @@ def _log_likelihood(a: Analysis) -> Variables:
 
 def _observed(a: Analysis) -> tuple[Variables, dict[str, Any]]:
     """Variables and attributes of the data and of what is stated about their errors."""
-    obs = a.observations
+    stated = a.observations
     variables: Variables = {}
     for axis, part in _series(a):
         variables |= _observed_series(a, axis, part)
-    scalars = {f"{SCALAR}{key}": value for key, value in obs.scalars.items()}
-    if not obs.parts:
-        matrices, dims, stated = obs.noise.matrices(), ("time", "time_column"), obs.noise.attributes()
+    scalars = {f"{SCALAR}{key}": value for key, value in stated.scalars.items()}
+    if not stated.parts:
+        matrices, dims, numbers = stated.noise.matrices(), ("time", "time_column"), stated.noise.attributes()
         names = {key: f"{a.problem.observable.name}_{key}" for key in matrices}
     else:
-        matrices, dims, stated = obs.noise.matrices(), ("reading", "reading_column"), _thresholds(obs)
+        matrices, dims, numbers = stated.noise.matrices(), ("reading", "reading_column"), _thresholds(stated)
         names = {key: key for key in matrices}
     for key, (matrix, words) in matrices.items():
         variables[names[key]] = _variable(dims, matrix, "1", words)
-    return variables, {"name": obs.name, "data_source": obs.source, **scalars, **stated}
+    return variables, {"name": stated.name, "data_source": stated.source, **scalars, **numbers}
 
 
 def _observed_series(a: Analysis, axis: Axis, part: Part) -> Variables:
-    name, obs, own = part.name, a.observations, part.where
+    name, stated, own = part.name, a.observations, part.where
     dims = (axis.time,)
     variables = {
-        name: _observable(part, dims, obs.values[own], "observed"),
+        name: _observable(part, dims, stated.values[own], "observed"),
         f"{name}_std": _observable(part, dims, a.error_std[own], "observation-error std, timing error included"),
-        f"{name}_reading_std": _observable(part, dims, obs.std[own], "observation-error std of the reading alone"),
-        axis.own("time_std"): _time(a, axis.time, obs.noise.time_std[own], "std of the observation times"),
-        axis.own("weights"): _variable(dims, obs.weights[own], "1", "weight of the observation in the cost"),
+        f"{name}_reading_std": _observable(part, dims, stated.std[own], "observation-error std of the reading alone"),
+        axis.own("time_std"): _time(a, axis.time, stated.noise.time_std[own], "std of the observation times"),
+        axis.own("weights"): _variable(dims, stated.weights[own], "1", "weight of the observation in the cost"),
     }
     if part.places is not None:
         variables |= _places(name, axis, part.places)
@@ -200,11 +200,11 @@ def _places(name: str, axis: Axis, places: Places) -> Variables:
     }
 
 
-def _thresholds(obs: Observations) -> dict[str, float]:
+def _thresholds(stated: Observations) -> dict[str, float]:
     """Beyond how many std the cost of each series is robust, of those where it is."""
-    noise = obs.noise
-    each = noise.thresholds if isinstance(noise, BlockNoise) else np.full(len(obs), noise.counts_within)
-    found = {f"{part.name}_huber_threshold": float(each[part.begin]) for part in obs.parts}
+    noise = stated.noise
+    each = noise.thresholds if isinstance(noise, BlockNoise) else np.full(len(stated), noise.counts_within)
+    found = {f"{part.name}_huber_threshold": float(each[part.begin]) for part in stated.parts}
     return {name: threshold for name, threshold in found.items() if math.isfinite(threshold)}
 
 
@@ -288,9 +288,7 @@ def _readings(a: Analysis) -> Variables:
         words = f"{what}, each in the unit of its parameter"
         found |= {
             axis.own("influence_change"): _variable(dims, i.change[:, own], "1", words),
-            axis.own("influence_in_std"): _variable(
-                dims, i.in_std[:, own], "1", f"{what}, in posterior standard deviations"
-            ),
+            axis.own("influence_in_std"): _variable(dims, i.in_std[:, own], "1", in_std),
             axis.own("influence_pareto_shape"): _variable(
                 axis.time, i.pareto_shape[own], "1", "Pareto shape of the weights"
             ),
