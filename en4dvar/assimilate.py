@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar import diagnostics as diag
 from en4dvar.analysis import Analysis, Discrepancy, Mode, Progress, Record
@@ -247,9 +248,20 @@ class _Assimilation:
         if linear is None:
             return None
         at = linear.prediction
-        rates = self.rates(at)
+        speed = np.abs(self.rates(at))
         white, sensitivity = observations.whiten(linear)
-        return Residuals.of(white, sensitivity, len(self.space.members) - 1, np.abs(rates), observations.used)
+        if observations.parts:
+            speed = speed / observations.std
+        precision = len(self.space.members) - 1
+        return Residuals.of(white, sensitivity, precision, speed, observations.used, self.in_a_row())
+
+    def in_a_row(self) -> npt.NDArray[np.intp]:
+        """(K,) a label for each series; for each reading, where it has several places."""
+        labels = np.arange(len(self.problem.observations))
+        for part in self.problem.parts:
+            if part.has_path:
+                labels[part.where] = part.begin
+        return labels
 
     def rates(self, at: Predicted) -> Array:
         """How fast each observable changes at its readings (K,), by differences where the model does not say; zero of

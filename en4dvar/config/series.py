@@ -16,6 +16,7 @@ from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import Observable
 from en4dvar.hints import shown, suggest
 
+RESERVED = ("time", "path_time", "reading", "parameter", "chain", "draw", "correlation", "mode", "active", "dfs")
 EACH = {"type": "object", "minProperties": 1, "additionalProperties": {"x-definition": "series"}}
 Correlation = Annotated[float, Field(gt=-1, lt=1)]
 
@@ -112,7 +113,10 @@ def _plan(section: DataOfSeries, context: Context) -> DataPlan:
                 return ("series", name, *where) if _has(own, where) or not _has(common, where) else where
 
             with faults.at(schema=SeriesData, place=place):
+                _check_name(name)
                 plans[name] = _series(name, _merged(common, own), context)
+                if plans[name].data.error is not None and plans[name].data.error.discrepancy is not None:
+                    raise ConfigError([Fault("a discrepancy is that of a single series", "error.discrepancy")])
         for name, others in (section.correlation or {}).items():
             for other in others:
                 _check_pair(name, other, section, faults)
@@ -129,6 +133,12 @@ def _has(given: Any, where: Place) -> bool:
         and where[0] in given
         and (len(where) == 1 or not isinstance(given[where[0]], dict) or _has(given[where[0]], where[1:]))
     )
+
+
+def _check_name(name: str) -> None:
+    """Variables of the result are called after it. Raises :class:`ConfigError`."""
+    if not name.isidentifier() or name in RESERVED:
+        raise ConfigError(f"{shown(name)} cannot be the name of a series; use letters, digits and _, as in well_3")
 
 
 def _series(name: str, given: dict[str, Any], context: Context) -> SeriesPlan:

@@ -61,6 +61,7 @@ def examine(
         *found,
         *(caution("implausible-data", words) for words in doubts(a.problem, a.prior_predictions)),
         *checks.down_weighted(a),
+        *checks.weighted(a),
         *unfinished(a),
         *checks.rank(prior, control.prior, control.posterior[alive]),
         *collapse(prior, control, alive),
