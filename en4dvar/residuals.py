@@ -92,7 +92,9 @@ class Residuals:
 
     @cached_property
     def lag_one_chance(self) -> float:
-        """Probability of so high an autocorrelation where the model is right."""
+        """Probability of so high an autocorrelation where the model is right; 1 where no reading follows another."""
+        if not self.follows.any():
+            return 1.0
         neighbours = np.diag(self.follows.astype(float), k=1)
         return self._chance(0.5 * (neighbours + neighbours.T))
 
@@ -101,11 +103,15 @@ class Residuals:
         """Runs of one sign, and how many are expected of independent residuals."""
         positive = self.white > 0
         n, above = len(positive), int(positive.sum())
-        return 1 + int(np.sum(positive[1:] != positive[:-1])), 1 + 2 * above * (n - above) / n
+        changes, share = (positive[1:] != positive[:-1]) & self.follows, float(self.follows.mean())
+        return 1 + int(np.sum(changes)), 1 + 2 * above * (n - above) / n * share
 
     @cached_property
     def runs_chance(self) -> float:
-        """Probability of so few runs, by the normal approximation (Wald & Wolfowitz 1940, Ann. Math. Stat. 11, 147)."""
+        """Probability of so few runs, by the normal approximation (Wald & Wolfowitz 1940, Ann. Math. Stat. 11, 147);
+        1 where no reading follows another."""
+        if not self.follows.any():
+            return 1.0
         found, expected = self.runs
         n = len(self.white)
         variance = (expected - 1) * (expected - 2) / (n - 1)

@@ -69,7 +69,7 @@ class Data(Section):
 
     @classmethod
     def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        block = field_of(context.model, context.observed) if context.built and context.observed else None
+        block = field_of(context.units, context.observed) if context.observed else None
         if block is not None and block.size > 1 and "places" not in given:
             faults.add(("places",), f"required: {block.name!r} is a field of {block.size} values; say which were read")
         columns = given.get("columns")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, StrictInt
+from pydantic import BeforeValidator, Discriminator, Field, StrictInt, Tag
 
 from en4dvar.config.context import Context, Made
 from en4dvar.config.schema import Section
@@ -58,7 +59,7 @@ class Placing:
 
 def placing(given: Any, context: Context) -> Placing:
     """Raises :class:`ConfigError`, its path the faulty key."""
-    block = field_of(context.model, context.observable)
+    block = field_of(context.units, context.observable)
     size = block.size if block else None
     if isinstance(given, PlaceColumn):
         if given.unit is None:
@@ -90,4 +91,23 @@ def _coordinates(block: StateBlock | None, key: str) -> StateBlock:
     return block
 
 
-PLACES = Made(placing, StrictInt | str | list[StrictInt | str] | PlaceColumn)
+def _kind(given: Any) -> str:
+    return "a column" if isinstance(given, Mapping | PlaceColumn) else "places"
+
+
+def _known(given: Any) -> Any:
+    entries = given if isinstance(given, list) else [given]
+    column = isinstance(given, Mapping) and "column" in given
+    if not column and not all(isinstance(one, int | str) and not isinstance(one, bool) for one in entries):
+        raise ValueError("write an index, a coordinate such as '3 m', a list of either, or {column: NAME}")
+    return given
+
+
+PLACES = Made(
+    placing,
+    Annotated[
+        Annotated[StrictInt | str | list[StrictInt | str], Tag("places")] | Annotated[PlaceColumn, Tag("a column")],
+        Discriminator(_kind),
+        BeforeValidator(_known),
+    ],
+)

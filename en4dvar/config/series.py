@@ -109,11 +109,14 @@ def _plan(section: DataOfSeries, context: Context) -> DataPlan:
                 faults.add(("series", name), "expected 'key: value' lines")
                 continue
 
+            if fault := _name_fault(name, {**common, **own}, context):
+                faults.add(("series", name), fault, at_key=True)
+                continue
+
             def place(where: Place, name: str = name, own: dict[str, Any] = own) -> Place:
                 return ("series", name, *where) if _has(own, where) or not _has(common, where) else where
 
             with faults.at(schema=SeriesData, place=place):
-                _check_name(name)
                 plans[name] = _series(name, _merged(common, own), context)
                 if plans[name].data.error is not None and plans[name].data.error.discrepancy is not None:
                     raise ConfigError([Fault("a discrepancy is that of a single series", "error.discrepancy")])
@@ -135,20 +138,23 @@ def _has(given: Any, where: Place) -> bool:
     )
 
 
-def _check_name(name: str) -> None:
-    """Variables of the result are called after it. Raises :class:`ConfigError`."""
+def _name_fault(name: str, given: Mapping[str, Any], context: Context) -> str:
+    """What is wrong with the name of a series, after which variables of the result are called; "" where nothing is."""
     if not name.isidentifier() or name in RESERVED:
-        raise ConfigError(f"{shown(name)} cannot be the name of a series; use letters, digits and _, as in well_3")
+        return f"{shown(name)} cannot be the name of a series; use letters, digits and _, as in well_3"
+    known = [observable.name for observable in context.units.observables]
+    if "observable" in given or name in known:
+        return ""
+    return f"unknown observable {shown(name)}{suggest(name, known)}; of another name, it has to say observable: NAME"
 
 
 def _series(name: str, given: dict[str, Any], context: Context) -> SeriesPlan:
     known = {observable.name: observable for observable in context.units.observables}
-    chosen = given.get("observable", name)
-    if not isinstance(chosen, str) or chosen not in known:
-        what = "observable" if "observable" in given else "series"
-        words = f"unknown observable {shown(str(chosen))}{suggest(str(chosen), known)}"
-        hint = "" if what == "observable" else "; of another name, it has to say observable: NAME"
-        raise ConfigError([Fault(f"{words}{hint}", "observable" if what == "observable" else "")])
+    chosen = str(given.get("observable", name))
+    if chosen not in known:
+        raise ConfigError(
+            [Fault(f"unknown observable {shown(str(chosen))}{suggest(str(chosen), known)}", "observable")]
+        )
     context.observed = known[chosen]
     data = SeriesData.model_validate(given, context=context)
     return SeriesPlan(name, known[chosen], data, data.group or name)

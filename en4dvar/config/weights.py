@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from en4dvar import user_file
 from en4dvar.config.context import Context, Made, quantity, time_unit
@@ -125,4 +125,30 @@ def _of_function(name: str, base: Path) -> Weighing:
     return Weighing(of=of, stated={"function": reference})
 
 
-WEIGHTS = Made(weighing, list[Number] | WeightColumn | WeightFunction | AwayFromMinima)
+_KINDS = ("column", "zero_near_minima", "function")
+
+
+def _kind(given: Any) -> str | None:
+    """Which of the ways to state weights it is; None: none of them."""
+    if isinstance(given, Mapping):
+        return next((f"a {key}" for key in _KINDS if key in given), None)
+    return "a list" if isinstance(given, list) else None
+
+
+def _known(given: Any) -> Any:
+    if _kind(given) is None:
+        raise ValueError("write a list, {column: NAME}, {zero_near_minima: 2 us} or {function: ./weights.py:name}")
+    return given
+
+
+WEIGHTS = Made(
+    weighing,
+    Annotated[
+        Annotated[list[Number], Tag("a list")]
+        | Annotated[WeightColumn, Tag("a column")]
+        | Annotated[AwayFromMinima, Tag("a zero_near_minima")]
+        | Annotated[WeightFunction, Tag("a function")],
+        Discriminator(_kind),
+        BeforeValidator(_known),
+    ],
+)

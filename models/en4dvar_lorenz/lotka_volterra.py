@@ -73,8 +73,8 @@ class LotkaVolterra(Autonomous):
     observables = (
         Observable("prey", "1", StateField("prey"), "$u$", positive=True),
         Observable("predator", "1", StateField("predator"), "$v$", positive=True),
-        Observable("ln_prey", "1", Logarithm("prey"), r"$\ln u$", label="logarithm of the prey"),
-        Observable("ln_predator", "1", Logarithm("predator"), r"$\ln v$", label="logarithm of the predators"),
+        Observable("ln_prey", "1", Logarithm("prey"), r"$\ln u$", label="log prey"),
+        Observable("ln_predator", "1", Logarithm("predator"), r"$\ln v$", label="log predators"),
     )
     path_parameters = ("alpha", "beta", "gamma", "delta")
     integrate = staticmethod(integrate)
