@@ -10,7 +10,7 @@ import xarray as xr
 from en4dvar.config.symbols import symbol_fault
 from en4dvar.errors import OutputError
 from en4dvar.storage.axes import Axis, axes_of
-from en4dvar.storage.groups import MEMBER
+from en4dvar.storage.readings import MEMBER
 from en4dvar.units import UnitError, convert
 
 _GROUPS = (

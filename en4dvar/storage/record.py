@@ -14,7 +14,7 @@ from en4dvar.observations import Observations
 from en4dvar.series import Part, Places
 from en4dvar.state import Array
 from en4dvar.storage.axes import Axis
-from en4dvar.storage.groups import SCALAR
+from en4dvar.storage.readings import SCALAR
 
 
 def observations_of(
