@@ -57,6 +57,11 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
     "overstated-error": ("caution", "state the observation error as it is (or estimate sigma); intervals are too wide"),
     "not-informed": ("note", "do not quote it as measured: fix it, or add data that depend on it"),
     "down-weighted": ("note", "look at these observations; they count less than the others"),
+    "one-descent": (
+        "note",
+        "set assimilation.starts: 2 or more, with linearisation: bundle and more members than parameters; or compare "
+        "with another seed",
+    ),
     "start-moved": ("note", "no action is needed where the iterations converged"),
 }
 SPOILS = {"non-gaussian", "at-bound"}  # mean ± std, though they are not serious; what is serious does in any case

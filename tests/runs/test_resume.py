@@ -158,7 +158,7 @@ def foreign(content):
 REASONS = {
     cut_short: "damaged or incomplete",
     altered: "damaged or incomplete",
-    of_an_older_version: "checkpoint format 0; this version reads 2",
+    of_an_older_version: "checkpoint format 0; this version reads 3",
     of_another_run: "belongs to another run",
     foreign: "not a checkpoint of en4dvar",
 }
