@@ -354,6 +354,8 @@ class _Assimilation:
             found = search.settled(found)
             return found, self.gaussian(found.descent)
         ends = self.gaussian(found.descent)
+        if begun.over > 1 and not begun.lower:
+            space.forward_runs = start.forward_runs  # they were counted before the second round
         fit = diag.gaussianity(ends.members, ends.mode, self.costs(ends.members, ends.run))["gaussian_fit"]
         rest = search.rest(found)
         if rest and (len(found.minima) > 1 or not fit >= CLEARED):

@@ -28,12 +28,13 @@ SAME_COST = 0.01  # of J, by which a descent must end lower to be another one
 
 @dataclass(frozen=True)
 class SearchState:
-    """Where a search stands: how many rounds are ``over`` and the forward runs that these took, those ``spent`` on the
-    round under way, its ``comparison``, and from the end of that on where its descents ended (``minima``) and the
-    lowest of them, the ``rival``, before its latest iteration.
+    """Where a search stands: how many rounds are ``over``, whether the last of them ended ``lower`` than those before,
+    the forward runs that they took, and those ``spent`` on the round under way; its ``comparison``, and from the end of
+    that on where its descents ended (``minima``) and the lowest of them, the ``rival``, before its latest iteration.
     """
 
     over: int = 0
+    lower: bool = False
     runs: int = 0
     spent: int = 0
     comparison: StartState | None = None
@@ -82,7 +83,7 @@ class Search:
 
     def challenged(self, found: Found) -> Found:
         """After a descent from the member farthest from the lowest minimum."""
-        return self.round(found, [challenger(self.space, self.run, found.minima[0])])
+        return self.round(found, [challenger(self.space, self.run, found)])
 
     def settled(self, found: Found) -> Found:
         """After ``starts`` members more, and again while one descent alone ended lowest and the budget lasts."""
@@ -102,7 +103,7 @@ class Search:
             return found
         after = self._after(found, members)
         after = replace(after, runs=found.runs + self.space.forward_runs - self.began)
-        self.keep(lambda: (after, SearchState(self.over, after.runs)))
+        self.keep(lambda: (after, SearchState(self.over, after.descent is not found.descent, after.runs)))
         return after
 
     def _after(self, found: Found, members: Sequence[int]) -> Found:
@@ -157,8 +158,12 @@ class Search:
         self.keep(lambda: (found, replace(state(), over=self.over - 1, runs=found.runs, spent=spent)))
 
 
-def challenger(space: WeightSpace, run: Forecast, minimum: Minimum) -> int:
-    """The member farthest from a minimum, in standard deviations of the Gaussian about it, of the half of lower J."""
+def challenger(space: WeightSpace, run: Forecast, found: Found) -> int:
+    """The member farthest from the lowest minimum, in standard deviations of the Gaussian about it, of those in the
+    half of lower J that were not tried.
+    """
     costs = (space.drawn.background_costs + space.observation_cost(run))[:-1]
-    better = np.argsort(costs, kind="stable")[: max(1, int(np.isfinite(costs).sum()) // 2)]
-    return int(max(better, key=lambda i: minimum.distance(space.members[i])))
+    order = np.argsort(costs, kind="stable").tolist()
+    better = order[: max(len(found.tried) + 1, int(np.isfinite(costs).sum()) // 2)]
+    lowest = found.minima[0]
+    return max((i for i in better if i not in found.tried), key=lambda i: lowest.distance(space.members[i]))

@@ -170,7 +170,8 @@ class Rounds(DataWindow):
         self.rounds += 1
         costs = tuple(descent.cost for descent in self.descents)
         self.tell(StartRecord(self.rounds, costs, sum(not descent.ended for descent in self.descents)))
-        if len(going) == 1 and going[0].cost <= min(*costs, self.plausible):
+        others = (self.lowest.cost, *(minimum.cost for minimum in self.known))
+        if len(going) == 1 and going[0].cost <= min(*costs, *others, self.plausible):
             going[0].ended = True  # it can only go lower: the comparison is decided
 
     def _follow(self, descent: Descent, move: Move | None) -> None:

@@ -3,7 +3,7 @@
 It is written by streaming: one data set is in memory at a time. Dimensions follow the files of the data sets, in the
 ArviZ schema, with ``dataset`` in front; ``time`` becomes ``observation`` (padded with NaN to the longest data set) and
 the observation times a variable. Scalars that judge a fit become variables of ``sample_stats``. The paths between the
-observations, the iterations and the modes stay in ``datasets/``.
+observations, the iterations, the descents and the modes stay in ``datasets/``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ GROUPS = (
     "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "constant_data", "sample_stats",
     "log_likelihood",
 )  # fmt: skip
-LEFT_OUT = {"path_time", "iteration", "mode"}
+LEFT_OUT = {"path_time", "iteration", "mode", "descent"}
 RENAMED = {"time": "observation", "time_column": "observation_column"}  # padded to the longest data set
 PARAMETER = "parameter"
 FAILURES = "failed_datasets"  # root attribute: JSON of name → reason

@@ -122,6 +122,7 @@ PROVOKED: dict[str, Callable[[], Analysis]] = {
     "starts-disagree": lambda: run(signless(), members=4),
     "residual-structure": lambda: run(bent()),
     "odd-residuals": lambda: run(spiked()),
+    "one-descent": lambda: run(linear(), starts=1),
     "start-moved": lambda: run(
         make_problem(Fragile(-0.9, names=TWO), (-1.0, 0.5)), start="prior-mean", min_active_fraction=0.2
     ),
