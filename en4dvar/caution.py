@@ -143,6 +143,14 @@ def codes(cautions: Iterable[Caution]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(c.code for c in cautions))
 
 
+def of_several_modes(cautions: Iterable[Caution], parameter: str) -> bool:
+    """Whether members of a parameter are drawn from modes apart: mean ± std describe none, quantiles all of them.
+
+    Where members were drawn from one mode alone the warning is serious, and nothing of them is to be quoted.
+    """
+    return any(c.code == "several-modes" and not c.spoils and parameter in c.parameters for c in cautions)
+
+
 def untrusted(cautions: Iterable[Caution], parameter: str) -> tuple[str, ...]:
     """Codes of the warnings for which no interval of a parameter is to be quoted, the worst first; () where one is.
 

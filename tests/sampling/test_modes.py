@@ -11,6 +11,7 @@ from en4dvar.assimilate import assimilate, log_posterior
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.problem import AssimilationSettings
 from en4dvar.sampling import mcmc
+from en4dvar.summary import summarise
 
 KEYWORDS = mcmc.sample.__kwdefaults__
 
@@ -38,7 +39,11 @@ def test_weights_are_the_masses_of_the_wells(kind, mean):
     assert positive == pytest.approx(expected, abs=0.03)
     assert np.mean(analysis.posterior[:, 0] > 0) == pytest.approx(expected, abs=0.03)
     assert sum(mode.weight for mode in analysis.modes) == pytest.approx(1)
-    assert "several-modes" in {c.code for c in analysis.cautions}
+    (told,) = (c for c in analysis.cautions if c.code == "several-modes")
+    assert told.parameters == ("a",)  # b is the same in both
+    a, b = summarise(analysis)
+    assert (a.modal, b.modal) == (True, False)
+    assert a.q05 < 0 < a.q95
 
 
 @pytest.mark.parametrize("case", CASES[::2])
@@ -72,7 +77,9 @@ def test_of_a_model_that_is_not_cheap_the_other_minimum_is_told():
     slow = assimilate(two_wells(compiled=False, mean=0.0), AssimilationSettings(), 1)
     assert slow.refinement == {}
     assert len(slow.modes) == 2
-    assert "several-modes" in {c.code for c in slow.cautions}
+    (told,) = (c for c in slow.cautions if c.code == "several-modes")
+    assert told.severity == "serious"
+    assert all(row.untrusted == ("several-modes",) for row in summarise(slow))
 
 
 def test_the_evidence_is_that_of_both_wells():
