@@ -26,21 +26,22 @@ from en4dvar.ensemble.forecast import log_posterior
 from en4dvar.prior import own_seed
 from en4dvar.problem import AssimilationSettings, InverseProblem
 
+CHAIN = {"assimilation.refine": "mcmc"}
 ROOT = Path(__file__).resolve().parents[1]
 PARTICLES, WALK = 2000, 60
 TOLERANCE = 0.05
 RIGHT_SCALE = 2.76e-6 / 3.7037e-6  # of PA1_exp2: metres a pixel instead of seconds a frame (shared/data/README.md)
+STIFF, SOFT = ("polyacrylamide_estrada", "PA1_exp2_RofTdata_0.mat"), ("polyacrylamide_soft", "A_E2_002.mat")
+SCALED = {"data.columns.radius.unit": f"{RIGHT_SCALE:.6f}*m", "parameters.R_eq.median": "47 um"}
+WIDE = {"parameters.G.log_std": 1.0, "parameters.mu.log_std": 0.7}
 MEASURED = {
-    "PA1_exp2, as it is": ("polyacrylamide_estrada", "PA1_exp2_RofTdata_0.mat", {}),
-    "PA1_exp2, right scale": (
-        "polyacrylamide_estrada", "PA1_exp2_RofTdata_0.mat",
-        {"data.columns.radius.unit": f"{RIGHT_SCALE:.6f}*m", "parameters.R_eq.median": "47 um"},
-    ),
-    "soft gel A_E2_002": ("polyacrylamide_soft", "A_E2_002.mat", {}),
-    "soft gel, wide priors": (
-        "polyacrylamide_soft", "A_E2_002.mat", {"parameters.G.log_std": 1.0, "parameters.mu.log_std": 0.7},
-    ),
-}  # fmt: skip
+    "PA1_exp2, as it is": (*STIFF, {}),
+    "PA1_exp2, right scale": (*STIFF, SCALED),
+    "PA1_exp2, right scale, `refine: mcmc`": (*STIFF, SCALED | CHAIN),
+    "soft gel A_E2_002": (*SOFT, {}),
+    "soft gel A_E2_002, `refine: mcmc`": (*SOFT, CHAIN),
+    "soft gel, wide priors": (*SOFT, WIDE),
+}
 
 
 def reference(problem: InverseProblem, seed: int) -> Tempered:

@@ -17,7 +17,7 @@ from en4dvar.prior import Prior, member_stream
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.emulated_cost import needed_runs
 from en4dvar.sampling.modes import TOO_FEW, WeightedDraws, nearest, sample_modes
-from en4dvar.sampling.shape import guide
+from en4dvar.sampling.shape import doubtful, guide
 from en4dvar.state import Array
 from en4dvar.units import convert
 
@@ -26,7 +26,6 @@ COUNTS = math.log(1e-3)  # evidence of a minimum relative to that of the lowest,
 MISSED = 0.5  # of J, by which a draw must be lower than all minima to be told
 APART = 2.0  # standard deviations between modes of a parameter from which mean ± std describe none of them
 SEEN = 0.02  # weight of a mode that is told
-SHIFT, SPREAD = 0.25, 0.15  # of the ensemble, by the emulator: half of what is warned of
 
 
 @dataclass(frozen=True)
@@ -100,9 +99,8 @@ def in_doubt(minima: Sequence[Minimum], agree: bool, shape: Mapping[str, float])
     ``agree``: whether descents from different members ended there. ``shape`` is that of
     :func:`~en4dvar.sampling.shape.examine_shape`.
     """
-    off = shape.get("mean_shift", 0.0) > SHIFT or abs(shape.get("spread_ratio", 1.0) - 1) > SPREAD
     unclear = shape.get("emulator_fit", 1.0) < diag.EMULATED_ENOUGH
-    return not agree or len(minima) > 1 or bool(shape.get("non_gaussian")) or off or unclear
+    return not agree or len(minima) > 1 or bool(shape.get("non_gaussian")) or doubtful(shape) or unclear
 
 
 def refined(
