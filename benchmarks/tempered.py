@@ -19,18 +19,18 @@ KEPT = 0.9  # share of the population that stays effective from one β to the ne
 SWEEPS = 6  # at each β
 LEAPS = 0.1  # share of the moves by a whole difference
 JITTER = 1e-3  # of the population's standard deviation
-GROUPS = 8  # of particles, for the error
 
 
 @dataclass(frozen=True)
 class Tempered:
-    """Draws (D, n) of the posterior, the runs they took, and the standard error of the mean, in standard deviations and
-    the largest of all coordinates, from the means of eight groups of particles.
+    """Draws (D, n) of the posterior, and the runs they took.
+
+    Their number says nothing of the masses of modes apart, which are those that survived when β was low: compare
+    populations of different seeds.
     """
 
     draws: Array
     runs: int
-    error: float
 
     @property
     def mean(self) -> Array:
@@ -71,11 +71,7 @@ def tempered(
     for _ in range(walk):
         z, logs = _sweep(of, z, logs, 1.0, random)
         kept.append(z)
-    draws = np.stack(kept)
-    groups = np.array([draws[:, i::GROUPS].mean(axis=(0, 1)) for i in range(GROUPS)])
-    flat = draws.reshape(-1, n)
-    error = float(np.max(groups.std(axis=0, ddof=1) / flat.std(axis=0))) / np.sqrt(GROUPS)
-    return Tempered(mean + std * flat, runs, error)
+    return Tempered(mean + std * np.concatenate(kept), runs)
 
 
 def _next(logs: Array, most: float) -> float:

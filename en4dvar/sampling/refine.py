@@ -14,6 +14,7 @@ from en4dvar.caution import Caution, caution
 from en4dvar.descent.minima import Minimum
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.prior import Prior, member_stream
+from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.emulated_cost import needed_runs
 from en4dvar.sampling.modes import TOO_FEW, WeightedDraws, nearest, sample_modes
@@ -87,9 +88,13 @@ def _apart(minima: Sequence[Minimum]) -> Array:
 
 
 def samples(space: WeightSpace) -> bool:
-    """Whether a doubt is settled by sampling: ``refine: auto`` with a cheap model of few parameters, all constant."""
-    n, problem, settings = len(space.mean), space.problem, space.settings
-    few = needed_runs(n) is not None and space.basis.shape[1] == n and not problem.varying
+    """Whether a doubt is settled by sampling."""
+    return may_sample(space.problem, space.settings) and space.basis.shape[1] == len(space.mean)
+
+
+def may_sample(problem: InverseProblem, settings: AssimilationSettings) -> bool:
+    """Whether there is ``refine: auto`` with a cheap model of few parameters, all constant."""
+    few = needed_runs(len(problem.prior.names)) is not None and not problem.varying
     return settings.refine == "auto" and problem.model.cheap and few and not settings.stochastic_model
 
 

@@ -24,7 +24,6 @@ def test_a_sampled_posterior_is_that_of_the_population(kind):
     """Moments of all modes together, within three standard errors of 1500 effective draws."""
     problem = two_wells(kind, mean=0.3)
     found, other = assimilate(problem, AssimilationSettings(), 1), population(problem)
-    assert other.error < 0.03
     assert np.abs((found.posterior.mean(axis=0) - other.mean) / other.std).max() < 3 / np.sqrt(1500)
     assert found.posterior.std(axis=0, ddof=1) / other.std == pytest.approx([1, 1], abs=0.05)
 
