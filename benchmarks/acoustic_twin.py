@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.ensemble.forecast import forecast
+from worlds import RIGHT, World
+
 from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
@@ -44,8 +45,16 @@ def prior(log_std: dict[str, float] = NARROW, widen: float = 1.0) -> Prior:
     return Prior((*terms, PriorTerm.normal(TIME_SHIFT, 0.0, widen * SHIFT_STD)))
 
 
-def make_twin(seed: int, of: Prior, *, truths: Prior | None = None, std: float = 1.4e-6, time_std: float = 0.0) -> Twin:
-    """Experiment ``seed``: truth from ``truths`` (default: the prior ``of``), readings with errors (m, s).
+def make_twin(
+    seed: int,
+    of: Prior,
+    *,
+    truths: Prior | None = None,
+    std: float = 1.4e-6,
+    time_std: float = 0.0,
+    world: World = RIGHT,
+) -> Twin:
+    """Experiment ``seed``: truth from ``truths`` (default: the prior ``of``), readings of a ``world`` with errors (m, s).
 
     A truth that cannot be integrated, or whose bubble yields fewer than 5 readings, is drawn again.
     """
@@ -55,11 +64,12 @@ def make_twin(seed: int, of: Prior, *, truths: Prior | None = None, std: float =
         truth = truths.mean + truths.std * rng.standard_normal(len(truths.names))
         times = 5.6e-6 + np.cumsum(rng.uniform(1.25e-6, 1.75e-6, 60))
         design = Observations(times, np.ones(60), noise_of(np.full(60, std), np.full(60, time_std)), np.ones(60))
-        run = forecast(InverseProblem(MODEL, MODEL.observables[0], design, of), truth[None])
+        problem = InverseProblem(MODEL, MODEL.observables[0], design, of)
+        run = world.run(problem, truth, seed)
         noise = rng.standard_normal((2, 60))
         if run.failures[0]:
             continue
-        values = run.predictions[0] + std * noise[0]
+        values = world.values(problem, run, noise[0], seed)
         if run.predicted.rates is not None:
             values += time_std * run.predicted.rates[0] * noise[1]
         last = np.flatnonzero(values < STOP * np.maximum.accumulate(values))

@@ -61,7 +61,7 @@ def experiment(seed: int, twin: Twin, settings: AssimilationSettings, chain: boo
         analysis = assimilate(twin.problem, settings, seed)
     except En4dvarError as error:  # counted: no run may fail
         return {"failure": str(error)}
-    x = of.from_physical(analysis.posterior)
+    x = of.from_physical(analysis.posterior)[:, : len(twin.truth)]  # amplitude and length of a discrepancy are last
     record = {
         "truth": twin.truth,
         "mean": x.mean(axis=0),
@@ -69,6 +69,9 @@ def experiment(seed: int, twin: Twin, settings: AssimilationSettings, chain: boo
         "rank": np.sum(x < twin.truth, axis=0),
         "converged": analysis.converged,
         "warned": [c.code for c in analysis.cautions],
+        "graver": [c.code for c in analysis.cautions if c.severity != "note"],
+        "log_evidence": analysis.log_evidence,
+        "runs": analysis.forward_runs,
         **analysis.refinement,
     }
     if chain:

@@ -7,10 +7,12 @@ where both R_eq and μ are too large meet the rebound by its phase and not by it
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from acoustic_twin import Twin
+from worlds import RIGHT, World
 
-from en4dvar.ensemble.forecast import forecast
 from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
@@ -32,17 +34,16 @@ def laser_prior() -> Prior:
     return Prior((*terms, PriorTerm.normal(parameters["R_max"], LARGEST, LARGEST_STD)))
 
 
-def make_laser_twin(seed: int) -> Twin:
-    """Experiment ``seed``. A truth that cannot be integrated is drawn again."""
+def make_laser_twin(seed: int, model: BubbleModel = MODEL, world: World = RIGHT) -> Twin:
+    """Experiment ``seed``, fitted by ``model``. A truth that cannot be integrated is drawn again."""
     of, ones = laser_prior(), np.ones(len(TIMES))
     rng = np.random.default_rng([20211, seed])
     while True:
         truth = of.mean + of.std * rng.standard_normal(len(of.names))
         observed = Observations(TIMES, ones, noise_of(STD * ones, 0 * ones), ones, name=f"laser{seed:04d}")
-        problem = InverseProblem(MODEL, MODEL.observables[0], observed, of)
-        run = forecast(problem, truth[None])
+        problem = InverseProblem(model, model.observables[0], observed, of)
+        run = world.run(problem, truth, seed)
         if not run.failures[0]:
             break
-    values = run.predictions[0] + STD * rng.standard_normal(len(TIMES))
-    observed = Observations(TIMES, values, observed.noise, ones, name=observed.name)
-    return Twin(InverseProblem(MODEL, MODEL.observables[0], observed, of), truth)
+    values = world.values(problem, run, rng.standard_normal(len(TIMES)), seed)
+    return Twin(replace(problem, observations=replace(observed, values=values)), truth)
