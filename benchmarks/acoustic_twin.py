@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-
 from worlds import RIGHT, World
 
 from en4dvar.noise import noise_of
@@ -54,7 +53,7 @@ def make_twin(
     time_std: float = 0.0,
     world: World = RIGHT,
 ) -> Twin:
-    """Experiment ``seed``: truth from ``truths`` (default: the prior ``of``), readings of a ``world`` with errors (m, s).
+    """Experiment ``seed``: truth from ``truths`` (default: the prior ``of``), readings of a ``world``, errors in m, s.
 
     A truth that cannot be integrated, or whose bubble yields fewer than 5 readings, is drawn again.
     """

@@ -34,9 +34,11 @@ def laser_prior() -> Prior:
     return Prior((*terms, PriorTerm.normal(parameters["R_max"], LARGEST, LARGEST_STD)))
 
 
-def make_laser_twin(seed: int, model: BubbleModel = MODEL, world: World = RIGHT) -> Twin:
-    """Experiment ``seed``, fitted by ``model``. A truth that cannot be integrated is drawn again."""
-    of, ones = laser_prior(), np.ones(len(TIMES))
+def make_laser_twin(
+    seed: int, model: BubbleModel = MODEL, world: World = RIGHT, more: tuple[PriorTerm, ...] = ()
+) -> Twin:
+    """Experiment ``seed``, fitted by ``model`` with ``more`` parameters. A truth that cannot be run is drawn again."""
+    of, ones = Prior((*laser_prior().terms, *more)), np.ones(len(TIMES))
     rng = np.random.default_rng([20211, seed])
     while True:
         truth = of.mean + of.std * rng.standard_normal(len(of.names))
