@@ -72,6 +72,7 @@ def experiment(seed: int, twin: Twin, settings: AssimilationSettings, chain: boo
         "graver": [c.code for c in analysis.cautions if c.severity != "note"],
         "log_evidence": analysis.log_evidence,
         "runs": analysis.forward_runs,
+        "what_if": {shift.name: shift.in_std for shift in analysis.what_if if shift.settled},
         **analysis.refinement,
     }
     if chain:
