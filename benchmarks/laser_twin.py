@@ -39,13 +39,17 @@ def make_laser_twin(
 ) -> Twin:
     """Experiment ``seed``, fitted by ``model`` with ``more`` parameters. A truth that cannot be run is drawn again."""
     of, ones = Prior((*laser_prior().terms, *more)), np.ones(len(TIMES))
-    rng = np.random.default_rng([20211, seed])
+    observed = Observations(TIMES, ones, noise_of(STD * ones, 0 * ones), ones, name=f"laser{seed:04d}")
+    return read_once(InverseProblem(model, model.observables[0], observed, of), [20211, seed], world)
+
+
+def read_once(problem: InverseProblem, seed: list[int], world: World = RIGHT) -> Twin:
+    """Readings at the times of a problem, of a truth from its prior."""
+    of, observed, rng = problem.prior, problem.observations, np.random.default_rng(seed)
     while True:
         truth = of.mean + of.std * rng.standard_normal(len(of.names))
-        observed = Observations(TIMES, ones, noise_of(STD * ones, 0 * ones), ones, name=f"laser{seed:04d}")
-        problem = InverseProblem(model, model.observables[0], observed, of)
-        run = world.run(problem, truth, seed)
+        run = world.run(problem, truth, seed[-1])
         if not run.failures[0]:
             break
-    values = world.values(problem, run, rng.standard_normal(len(TIMES)), seed)
+    values = world.values(problem, run, rng.standard_normal(len(observed.times)), seed[-1])
     return Twin(replace(problem, observations=replace(observed, values=values)), truth)

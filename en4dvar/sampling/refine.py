@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -25,6 +26,7 @@ COUNTS = math.log(1e-3)  # evidence of a minimum relative to that of the lowest,
 
 MISSED = 0.5  # of J, by which a draw must be lower than all minima to be told
 SEEN = 0.02  # weight of a mode that is told
+OVERLAP = "no action is needed: mean ± std describe the members"
 SHIFT, SPREAD = 0.25, 0.15  # of the ensemble, by the emulator: half of what is warned of
 
 
@@ -72,9 +74,22 @@ def mode_cautions(
     at = " and ".join(f"{convert(float(c[apart]), p.unit, p.display_unit):.3g}" for c in centres)
     unit = "" if p.display_unit == "1" else f" {p.display_unit}"
     drawn = "members are drawn from all of them" if result else "members describe the first alone"
-    yield caution(
-        "several-modes", f"the posterior has {len(seen)} modes, {p.name} = {at}{unit}, of weights {shares}; {drawn}"
-    )
+    words = f"the posterior has {len(seen)} modes, {p.name} = {at}{unit}, of weights {shares}; {drawn}"
+    told = caution("several-modes", words)
+    if result is None or any(_two_peaks(one, other) for one, other in itertools.combinations(seen, 2)):
+        yield told
+    else:
+        yield replace(told, severity="note", words=f"{words}, and overlap in every parameter", advice=OVERLAP)
+
+
+def _two_peaks(one: Minimum, other: Minimum) -> bool:
+    """Whether the distribution of any one parameter has a peak for each.
+
+    A sum of two Gaussians can have two peaks only where they lie more than two standard deviations apart (Ashman, Bird
+    & Zepf 1994, Astron. J. 108, 2348).
+    """
+    variance = 0.5 * (np.diag(one.covariance) + np.diag(other.covariance))
+    return bool(np.any((one.x - other.x) ** 2 > 4 * variance))
 
 
 def samples(space: WeightSpace) -> bool:
