@@ -89,7 +89,8 @@ def main() -> None:
         records = [record for key, record in found.items() if key.rsplit("/", 1)[0] == design]
         notes = Counter(code for r in records for code in {c for severity, c in r["warnings"] if severity == "note"})
         which = Counter(code for r in records for code in graver(r))
-        warn, falsely = (f"{(n := sum(map(ask, records)))} ({n / max(1, len(records)):.1%})" for ask in (graver, false))
+        asked = (sum(bool(ask(r)) for r in records) for ask in (graver, false))
+        warn, falsely = (f"{count} ({count / max(1, len(records)):.1%})" for count in asked)
         told = (", ".join(f"{code} {count}" for code, count in counts.most_common()) for counts in (which, notes))
         print(f"| {design} | {len(records)} | {warn} | {falsely} | {' | '.join(told)} |")
 
