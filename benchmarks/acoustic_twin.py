@@ -8,10 +8,10 @@ microsecond of the collapse, which no flash resolves and where the radius change
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
-from worlds import RIGHT, World
+from worlds import RIGHT, Twin, World, read_once
 
 from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
@@ -19,6 +19,7 @@ from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.state import TIME_SHIFT, Array
 from en4dvar_bubble import BubbleModel
+from en4dvar_bubble.solver.driver import AccuracyName, preset
 
 MEDIANS = {"G": 500.0, "alpha": 0.03, "mu": 0.1, "R0": 0.5e-6}
 NARROW = {"G": 0.3, "alpha": 0.3, "mu": 0.3, "R0": 0.3}
@@ -29,19 +30,20 @@ FEWEST = 5  # readings; a smaller set is drawn again
 MODEL = BubbleModel()
 
 
-@dataclass(frozen=True)
-class Twin:
-    """An inverse problem and the truth (n,), transformed, that made its data."""
-
-    problem: InverseProblem
-    truth: Array
-
-
 def prior(log_std: dict[str, float] = NARROW, widen: float = 1.0) -> Prior:
     """Lognormal about the paper's initial guesses for 0.3 % agarose, t_s ~ N(0, 0.3 µs); spreads times ``widen``."""
     parameters = {p.name: p for p in MODEL.parameters}
     terms = [PriorTerm.lognormal(parameters[k], m, widen * log_std[k]) for k, m in MEDIANS.items()]
     return Prior((*terms, PriorTerm.normal(TIME_SHIFT, 0.0, widen * SHIFT_STD)))
+
+
+def through_the_collapse(
+    times: Array, log_std: dict[str, float], accuracy: AccuracyName = "standard", std: float = 1.4e-6
+) -> Callable[[int], Twin]:
+    """Readings at fixed ``times`` (K,) s, wherever the collapse is."""
+    model, of, ones = BubbleModel(accuracy=preset(accuracy, "acoustic")), prior(log_std), np.ones(len(times))
+    observed = Observations(times, ones, noise_of(std * ones, 0 * ones), ones, name="through")
+    return lambda seed: read_once(InverseProblem(model, model.observables[0], observed, of), [17, seed])
 
 
 def make_twin(

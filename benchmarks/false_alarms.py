@@ -17,36 +17,27 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from acoustic_twin import NARROW, WIDE, Twin, make_twin, prior
-from laser_twin import make_laser_twin, read_once
+from acoustic_twin import NARROW, WIDE, make_twin, prior, through_the_collapse
+from laser_twin import make_laser_twin
 from records import Record, fill
+from worlds import Twin
 
 from en4dvar.assimilate import assimilate
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.problem import AssimilationSettings
 from en4dvar_bubble import BubbleModel
 from en4dvar_bubble.laws import NeoHookeanKelvinVoigt
-from en4dvar_bubble.solver.driver import AccuracyName, preset
 
 SETTINGS = AssimilationSettings(what_if=False)  # whose warnings are the same
-STD = 1.4e-6  # m, of readings through the collapse
 LASER = BubbleModel(law=NeoHookeanKelvinVoigt(), start="laser")
 
 
-def through_the_collapse(accuracy: AccuracyName) -> Callable[[int], Twin]:
-    """Fifteen readings from the growth to the rebound, wherever the collapse is."""
-    model, of, std = BubbleModel(accuracy=preset(accuracy, "acoustic")), prior(NARROW), np.full(15, STD)
-    observed = Observations(np.linspace(4e-6, 32e-6, 15), std, noise_of(std, 0 * std), np.ones(15), name="good")
-    return lambda seed: read_once(InverseProblem(model, model.observables[0], observed, of), [17, seed])
-
-
+FIFTEEN = np.linspace(4e-6, 32e-6, 15)  # s
 DESIGNS: dict[str, Callable[[int], Twin]] = {
     "acoustic, until 65 % of the maximum": lambda seed: make_twin(seed, prior(NARROW)),
     "the same, wide priors": lambda seed: make_twin(seed, prior(WIDE)),
-    "acoustic, through the collapse": through_the_collapse("standard"),
-    "the same, accuracy: fast": through_the_collapse("fast"),
+    "acoustic, through the collapse": through_the_collapse(FIFTEEN, NARROW),
+    "the same, accuracy: fast": through_the_collapse(FIFTEEN, NARROW, "fast"),
     "laser, with rebounds": lambda seed: make_laser_twin(seed, LASER),
 }
 

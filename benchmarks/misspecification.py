@@ -22,11 +22,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from acoustic_twin import MODEL, WIDE, Twin, make_twin, prior
+from acoustic_twin import MODEL, WIDE, make_twin, prior
 from calibration import CENTRAL, experiment
 from laser_twin import make_laser_twin
 from records import Record, fill
-from worlds import World
+from worlds import Twin, World
 
 from en4dvar.config.context import Context
 from en4dvar.config.data import DiscrepancySection

@@ -17,6 +17,14 @@ FAR_OFF = 8.0  # standard deviations of an outlier
 
 
 @dataclass(frozen=True)
+class Twin:
+    """An inverse problem and the truth (n,), transformed, that made its data."""
+
+    problem: InverseProblem
+    truth: Array
+
+
+@dataclass(frozen=True)
 class World:
     """By default everything is as the fit has it; ``stream`` keeps its random numbers apart from an experiment's.
 
@@ -62,3 +70,15 @@ class World:
 
 
 RIGHT = World()
+
+
+def read_once(problem: InverseProblem, seed: list[int], world: World = RIGHT) -> Twin:
+    """Readings at the times of a problem, of a truth from its prior."""
+    of, observed, rng = problem.prior, problem.observations, np.random.default_rng(seed)
+    while True:
+        truth = of.mean + of.std * rng.standard_normal(len(of.names))
+        run = world.run(problem, truth, seed[-1])
+        if not run.failures[0]:
+            break
+    values = world.values(problem, run, rng.standard_normal(len(observed.times)), seed[-1])
+    return Twin(replace(problem, observations=replace(observed, values=values)), truth)
