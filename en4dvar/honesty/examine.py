@@ -61,6 +61,7 @@ def examine(
         *found,
         *(caution("implausible-data", words) for words in doubts(a.problem, a.prior, a.prior_predictions)),
         *checks.down_weighted(a),
+        *checks.weighted(a),
         *unfinished(a),
         *checks.rank(prior, control.prior, control.posterior[alive]),
         *collapse(prior, control, alive),
@@ -92,7 +93,13 @@ def doubts(problem: InverseProblem, members: Array, predicted: Array) -> Sequenc
     y, alive = problem.observations, np.all(np.isfinite(predicted), axis=1)
     values = {name: np.full(alive.sum(), value) for name, value in problem.fixed.items()}
     values |= dict(zip(problem.prior.names, members[alive].T, strict=True))
-    return problem.model.doubts(problem.observable.name, y.times, y.values, predicted[alive], values)
+    return [
+        words
+        for part in problem.parts
+        for words in problem.model.doubts(
+            part.observable.name, y.times[part.where], y.values[part.where], predicted[alive, part.where], values
+        )
+    ]
 
 
 def _structure(a: Analysis) -> tuple[Caution, ...]:
