@@ -29,7 +29,7 @@ from records import Record, fill
 from worlds import Twin, World
 
 from en4dvar.config.context import Context
-from en4dvar.config.data import DiscrepancySection
+from en4dvar.config.discrepancy import DiscrepancySection
 from en4dvar.noise import noise_of
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem, discrepancy_parameters
