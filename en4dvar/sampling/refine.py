@@ -76,12 +76,12 @@ def mode_cautions(
     unit = "" if p.display_unit == "1" else f" {p.display_unit}"
     drawn = "members are drawn from all of them" if result else "members describe the first alone"
     words = f"the posterior has {len(seen)} modes, {p.name} = {at}{unit}, of weights {shares}; {drawn}"
+    if result and not np.any(distances > APART):
+        told = caution("several-modes", f"{words}, and overlap in every parameter", "note")
+        yield replace(told, advice=OVERLAP)
+        return
     names = tuple(name for j, name in enumerate(prior.names) if distances[j] > APART or j == most)
-    told = caution("several-modes", words, None if result else "serious", names if result else ())
-    if result is not None and distances.max() <= APART:
-        words = f"{words}, and they overlap in every parameter"
-        told = replace(told, severity="note", words=words, advice=OVERLAP, parameters=())
-    yield told
+    yield caution("several-modes", words, None if result else "serious", names if result else ())
 
 
 def _apart(minima: Sequence[Minimum]) -> Array:
