@@ -18,7 +18,7 @@ from en4dvar.descent.start import AGREE, StartState, affordable, challenger, cho
 from en4dvar.descent.variance import shares_of_variance
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
-from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, log_posterior
+from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, log_posterior, plotting_times
 from en4dvar.errors import ConfigError, TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.honesty import ControlEnsembles, examine
@@ -39,7 +39,6 @@ from en4dvar.state import Array
 
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 
-GRID_POINTS = 200  # M, of the plotting grid
 SAME_COST = 0.01  # of J, by which a descent must end lower to be another one
 
 
@@ -142,7 +141,7 @@ class _Assimilation:
                 "discrepancy; use en4dvar"
             )
         self.space = WeightSpace(problem, settings, seed, executor)
-        self.grid = np.linspace(problem.observations.times[0], problem.observations.times[-1], GRID_POINTS)
+        self.grid = plotting_times(problem)
 
     def run(self, resume: LoopState | None) -> Analysis:
         problem, space, noise = self.problem, self.space, self.problem.observations.noise

@@ -16,6 +16,7 @@ from en4dvar.problem import InverseProblem
 from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Array, Parameter
 
 NO_TIMES: Array = np.empty(0)
+GRID_POINTS = 200  # of a plot
 SAME_INSTANT = 1e-9  # of the window: an extra time this close to an observation is read at the observation
 
 
@@ -109,6 +110,15 @@ class Composite:
         )
         extremes, beyond = limits[..., 0], limits[..., 1] - shift[:, None]
         return Forecast(predicted, observed[0][:, at_extra], tuple(failures), extremes, beyond)
+
+
+def plotting_times(problem: InverseProblem) -> Array:
+    """The instants (M,) of prior and posterior paths in a plot, on the clock of the observations.
+
+    Further ones than the observations are asked for only where the model gives them for next to nothing.
+    """
+    times = problem.observations.times
+    return np.linspace(times[0], times[-1], GRID_POINTS) if problem.model.dense else times
 
 
 def forecast(
