@@ -231,10 +231,9 @@ class ForwardModel(ABC):
     def dense(self) -> bool:
         """Whether a path may be asked for between the observations at next to no cost, for smooth curves in plots.
 
-        Otherwise it is asked for at the observations alone. True of models with ``trajectories`` of their own, unless
-        they say otherwise; of those that only ``step`` every instant costs a step.
+        Otherwise it is asked for at the observations alone. True of compiled models unless they say otherwise.
         """
-        return type(self).trajectories is not ForwardModel.trajectories
+        return self.compiled
 
     @property
     def cheap(self) -> bool:

@@ -89,13 +89,13 @@ def read_document(path: Path) -> Document:
     return parse_document(text, str(path))
 
 
-def document_of(given: Mapping[Any, Any], told: str = "") -> Document:
-    """Plain data of Python as if it had been read from a file; ``told`` stands for the file in messages.
+def document_of(given: Mapping[Any, Any]) -> Document:
+    """Plain data of Python as if it had been read from a file.
 
     Numbers of numpy become numbers, arrays, tuples and sets lists, paths text. Raises :class:`ConfigError`: every value
     that a YAML file could not hold.
     """
-    document, faults = Document({}, told), list[Fault]()
+    document, faults = Document({}), list[Fault]()
     data = _plain(given, (), document, faults)
     if faults:
         raise ConfigError(faults)
