@@ -228,6 +228,11 @@ class ForwardModel(ABC):
         return kind.step is not ForwardModel.step or kind.resumed is not ForwardModel.resumed
 
     @property
+    def threaded(self) -> bool:
+        """Whether threads serve it, since ``trajectories`` releases the interpreter lock. True of compiled models."""
+        return self.compiled
+
+    @property
     def dense(self) -> bool:
         """Whether a path may be asked for between the observations at next to no cost, for smooth curves in plots.
 

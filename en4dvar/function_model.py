@@ -9,16 +9,27 @@ import functools
 import hashlib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from types import CodeType
 from typing import Any
 
 import numpy as np
 
-from en4dvar.forward import Failure, ForwardModel, Observable, StateField, Trajectory
+from en4dvar.forward import Failure, ForwardModel, Observable, Trajectory
 from en4dvar.state import Array, Field, Parameter, StateLayout
 from en4dvar.user_code import reason_of
 
 Function = Callable[[dict[str, float], Array], Any]
+
+
+@dataclass(frozen=True)
+class Returned:
+    """H: what the function returned under a name."""
+
+    name: str
+
+    def __call__(self, trajectory: Trajectory) -> Array:
+        return trajectory[self.name]
 
 
 class FunctionModel(ForwardModel):
@@ -43,7 +54,7 @@ class FunctionModel(ForwardModel):
         dense: bool = False,
     ):
         self.function, self.parameters = function, tuple(parameters)
-        self.observables = tuple(Observable(name, unit, StateField(name)) for name, unit in observables.items())
+        self.observables = tuple(Observable(name, unit, Returned(name)) for name, unit in observables.items())
         self.time_unit = self.time_display_unit = time_unit  # type: ignore[misc]
         self._dense = dense
         self.layout = StateLayout((Field("theta", len(self.parameters)),))

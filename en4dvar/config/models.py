@@ -99,7 +99,7 @@ def read_model(
     """
     if not isinstance(raw, dict):
         return None  # told with the other keys of the file
-    name = raw.get("name")
+    name = raw.get("name", "command" if "command" in raw else None)
     if not isinstance(name, str):
         faults.append(document.fault(("model", "name"), "name the model, e.g. name: bubble"))
         return None

@@ -18,7 +18,7 @@ LAYERS = (
     ("state", "hints", "files", "tables", "caution", "compiled", "user_code", "user_file"),
     ("units", "prior", "forward", "noise"),
     ("batch", "observations", "function_model"),
-    ("varying",),
+    ("varying", "programs"),
     ("problem", "diagnostics", "residuals", "influence"),
     ("executor",),
     ("ensemble",),
