@@ -99,7 +99,7 @@ def name_of(function: object) -> str:
     while isinstance(function, functools.partial):
         function = function.func
     kind = function if hasattr(function, "__qualname__") else type(function)
-    return f"{kind.__module__}:{kind.__qualname__}"  # type: ignore[attr-defined]
+    return f"{kind.__module__}:{kind.__qualname__}"
 
 
 def digest_of(function: object) -> str:
@@ -109,10 +109,10 @@ def digest_of(function: object) -> str:
     """
     while isinstance(function, functools.partial):
         function = function.func
-    called = function if hasattr(function, "__code__") else getattr(type(function), "__call__", None)
+    called: Any = function if hasattr(function, "__code__") else vars(type(function)).get("__call__", function)
     code = getattr(called, "__code__", None)
     try:
-        text = inspect.getsource(inspect.unwrap(called or function))  # type: ignore[arg-type]
+        text = inspect.getsource(inspect.unwrap(called))
     except (OSError, TypeError):
         text = repr(_content(code)) if isinstance(code, CodeType) else name_of(function)
     return hashlib.sha256(text.encode()).hexdigest()

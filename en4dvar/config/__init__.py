@@ -14,9 +14,7 @@ from en4dvar.errors import ConfigError, Fault
 __all__ = ["Config", "TwinConfig", "load_any", "load_config", "load_twin", "resolve", "time_grid"]
 
 
-def load_any(
-    source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None
-) -> Config | TwinConfig:
+def load_any(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Config | TwinConfig:
     """A twin experiment where the file has a ``twin:`` section, else what :func:`load_config` gives."""
     document, base = document_from(source)
     document = override(document, overrides or {})

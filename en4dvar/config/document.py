@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -107,7 +107,7 @@ def _plain(value: Any, path: Key, document: Document, faults: list[Fault]) -> An
         return {str(key): _plain(item, (*path, str(key)), document, faults) for key, item in value.items()}
     if isinstance(value, os.PathLike):
         return os.fspath(value)
-    if isinstance(tolist := getattr(value, "tolist", None), Callable):  # numpy's, and what wraps it
+    if callable(tolist := getattr(value, "tolist", None)):  # numpy's, and what wraps it
         value = tolist()
     if isinstance(value, list | tuple | set | frozenset):
         return [_plain(item, (*path, i), document, faults) for i, item in enumerate(value)]

@@ -53,6 +53,12 @@ def _pattern(text: str) -> str:
     return text
 
 
+def _from_one(column: int | str | None) -> int | str | None:
+    if column == "" or (isinstance(column, int) and column < 1):
+        raise ValueError(f"columns are counted from 1, or named; not {column!r}")
+    return column
+
+
 def _inside(name: str) -> str:
     if Path(name).is_absolute() or ".." in Path(name).parts or not name:
         raise ValueError("name a file of the scratch directory, without .. and not from the root")
@@ -103,7 +109,7 @@ class OutputOf(_Section):
     """Unit of the numbers that the program writes."""
     file: Annotated[str, AfterValidator(_inside)] = OUTPUT
     """File in the scratch directory; default the one that {output} names; stdout is what the program prints."""
-    column: Annotated[int, Field(ge=1)] | str | None = None
+    column: Annotated[int | str | None, AfterValidator(_from_one)] = None
     """Column of a table: its header, or its number from 1."""
     key: Annotated[str, Field(min_length=1)] | None = None
     """Path into a JSON file, with dots."""
@@ -111,7 +117,7 @@ class OutputOf(_Section):
     """Regular expression with one group; every match is a value."""
     instructions: File | None = None
     """Instruction file of PEST (.ins); every observation is a value, in order."""
-    time: Annotated[int, Field(ge=1)] | str | None = None
+    time: Annotated[int | str | None, AfterValidator(_from_one)] = None
     """Column or key of the times that the values belong to; without it there is one value for each observation."""
 
     @model_validator(mode="after")
@@ -122,7 +128,9 @@ class OutputOf(_Section):
         if self.time is not None and given[0] not in ("column", "key"):
             raise ValueError(f"time goes with column or key, not with {given[0]}")
         if self.instructions is not None and not pest.is_instructions(self.instructions.read_text(encoding="utf-8")):
-            raise ValueError(f"{self.instructions}: the first line of PEST's instructions is pif and a sign, e.g. pif @")
+            raise ValueError(
+                f"{self.instructions}: the first line of PEST's instructions is pif and a sign, e.g. pif @"
+            )
         return self
 
 
@@ -130,9 +138,11 @@ def _with_unit(given: Any) -> Any:
     return {"unit": given} if isinstance(given, str) else given
 
 
-class Settings(_Section):
+class CommandSettings(_Section):
     """A program as forward model: how it is called, what goes in, what comes out."""
 
+    shell: bool = False
+    """Run the command by /bin/sh instead of splitting it into words."""
     command: Annotated[str, Field(min_length=1)]
     """Program and arguments, split as by a shell but run without one. {input} and {output} are names of files, {NAME} a
     parameter, {here} the folder of this file, {python} this Python. It runs in a scratch directory of its own."""
@@ -153,8 +163,6 @@ class Settings(_Section):
     """Longest that one run may take, e.g. 60 s; past it the program is ended and the member has failed."""
     retries: Annotated[int, Field(ge=0, le=100)] = 0
     """How often a run that failed is tried again; for licences and full disks, not for models that vary."""
-    shell: bool = False
-    """Run the command by /bin/sh instead of splitting it into words."""
     scratch: Path | None = None
     """Folder that holds the scratch directories; default the system's for temporary files."""
 
@@ -226,12 +234,12 @@ def _placed(command: str, base: Path, shell: bool) -> str:
 class CommandModel(FunctionModel):
     """An external program: parameters go into files or arguments, observables come out of files."""
 
-    Settings = Settings
+    Settings = CommandSettings
 
-    def __init__(self, settings: Settings):
+    def __init__(self, settings: CommandSettings):
         words = split(settings.command, settings.shell)
         program = "/bin/sh" if settings.shell else shutil.which(words[0]) or words[0]
-        require_permission(f"model command {settings.command!r}", Path(program))
+        require_permission(f"model command {settings.command!r}", Path(program), anything=True)
         outputs = {
             name: Output(one.file, one.column, one.key, one.pattern, one.instructions, one.time)
             for name, one in settings.outputs.items()
@@ -244,10 +252,12 @@ class CommandModel(FunctionModel):
             Parameter(name, one.unit, bounds=(one.lower, one.upper), label=one.label)
             for name, one in settings.parameters.items()
         ]
-        super().__init__(run, parameters, {name: one.unit for name, one in settings.outputs.items()}, settings.time_unit)
+        super().__init__(
+            run, parameters, {name: one.unit for name, one in settings.outputs.items()}, settings.time_unit
+        )
 
     @classmethod
-    def from_settings(cls, settings: Settings) -> CommandModel:
+    def from_settings(cls, settings: CommandSettings) -> CommandModel:
         """Raises :class:`~en4dvar.user_code.RefusedError` where the program may not be run."""
         return cls(settings)
 

@@ -1,4 +1,4 @@
-"""Numbers out of the files that a program leaves: a column of a table, a key of JSON, a pattern, PEST's instructions."""
+"""Numbers out of the files that a program leaves: a column, a key of JSON, a pattern, PEST's instructions."""
 
 from __future__ import annotations
 
@@ -46,7 +46,9 @@ class Output:
         values = self._values(text)
         if self.time is None:
             if len(values) != len(times):
-                raise ProgramError(f"{self.file}: {len(values)} values for {len(times)} times; name the column of times")
+                raise ProgramError(
+                    f"{self.file}: {len(values)} values for {len(times)} times; name the column of times"
+                )
             return values
         own = _column(text, self.time, self.file) if self.column is not None else _key(text, str(self.time), self.file)
         return _at(times, own, values, self.file)
@@ -72,7 +74,9 @@ def _at(times: Array, own: Array, values: Array, file: str) -> Array:
         raise ProgramError(f"{file}: {len(own)} times for {len(values)} values, or times that do not increase")
     slack = 1e-9 * max(abs(own[0]), abs(own[-1]))
     if times[0] < own[0] - slack or times[-1] > own[-1] + slack:
-        raise ProgramError(f"{file}: times from {own[0]:g} to {own[-1]:g}, but {times[0]:g} to {times[-1]:g} are needed")
+        raise ProgramError(
+            f"{file}: times from {own[0]:g} to {own[-1]:g}, but {times[0]:g} to {times[-1]:g} are needed"
+        )
     return np.asarray(np.interp(times, own, values))
 
 

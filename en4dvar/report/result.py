@@ -53,7 +53,9 @@ class Result(StoredResult):
 
         groups = {path.strip("/"): node.to_dataset() for path, node in self.tree.children.items()}
         known = getattr(arviz, "InferenceData", None)
-        return self.tree if known is None or isinstance(self.tree, known) else known(attrs=dict(self.attributes), **groups)
+        return (
+            self.tree if known is None or isinstance(self.tree, known) else known(attrs=dict(self.attributes), **groups)
+        )
 
     def _repr_html_(self) -> str:
         return cell_html(self)

@@ -17,9 +17,7 @@ from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.inputs.readers import DataFile
 
 
-def validate(
-    source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None
-) -> Config | TwinConfig:
+def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Config | TwinConfig:
     """Load a configuration and read its data files; nothing is computed or written.
 
     Parameters
@@ -52,9 +50,7 @@ def _problem_faults(config: Config) -> Iterator[Fault]:
     yield from _file_faults(config.document, plan, partial(build_one, config))
 
 
-def _data_faults(
-    source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None
-) -> Iterator[Fault]:
+def _data_faults(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None) -> Iterator[Fault]:
     """Faults of the data files, for a configuration that has faults elsewhere than in its data section."""
     try:
         document, base = document_from(source)

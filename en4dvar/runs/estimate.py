@@ -136,15 +136,15 @@ class _Given:
     def _function(self, function: Any) -> FunctionModel:
         unknown = self.units.keys() - self.priors.keys() - self.columns.keys()
         if unknown:
-            raise ConfigError(f"units: {sorted(unknown)[0]!r} is neither a parameter in priors nor a column of the data")
+            raise ConfigError(
+                f"units: {sorted(unknown)[0]!r} is neither a parameter in priors nor a column of the data"
+            )
         names = [name for name in self.priors if name not in (TIME_SHIFT.name, NOISE_SCALE.name)]
         if wrong := [name for name in names if not str(name).isidentifier()]:
             raise ConfigError(f"priors: {wrong[0]!r} is no name of a parameter; write letters, digits and _")
         parameters = [Parameter(name, self.units.get(name, "1")) for name in names]
         observed = self.observed([name for name in self.columns if name != TIME])
-        return FunctionModel(
-            function, parameters, {observed: self.units.get(observed, "1")}, self.units.get(TIME, "1")
-        )
+        return FunctionModel(function, parameters, {observed: self.units.get(observed, "1")}, self.units.get(TIME, "1"))
 
     def observed(self, known: list[str]) -> str:
         """The name of what was observed, of the ``known`` ones. Raises :class:`ConfigError`."""
@@ -236,5 +236,7 @@ def _keep_data(path: Path, text: str, replaces: bool) -> None:
     make_folder(path.parent)
     old = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else text
     if old != text and not (replaces and holds_run(path.parent)):
-        raise OutputError(f"{path}: holds other readings; choose another directory, or give force=True to replace a run")
+        raise OutputError(
+            f"{path}: holds other readings; choose another directory, or give force=True to replace a run"
+        )
     write_text(path, text)

@@ -30,7 +30,12 @@ Varying = RandomWalk | StateChanges
 def can_vary(model: ForwardModel, name: str) -> bool:
     """Whether a parameter can change on the way: the state carries it, and it does not act at the start alone."""
     acts = not model.path_parameters or name in model.path_parameters
-    return model.resumable and acts and name in model.layout.names and model.layout[name].stop - model.layout[name].start == 1
+    return (
+        model.resumable
+        and acts
+        and name in model.layout.names
+        and model.layout[name].stop - model.layout[name].start == 1
+    )
 
 
 class PiecewiseModel(ForwardModel):

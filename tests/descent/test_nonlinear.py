@@ -124,7 +124,8 @@ def test_progress_and_forward_runs_are_reported():
     assert problem.model.runs == counted
     single = assimilate(problem, AssimilationSettings(members=16, starts=1), 1)
     assert single.forward_runs == problem.model.runs - counted
-    # prior and posterior forecast with the centre; two members run again; 2 + 1 runs a record; 4 trials a move, 4 bent ones after a short move
+    # prior and posterior forecast with the centre; two members again;
+    # 2 + 1 runs a record; 4 trials a move, 4 bent ones after a short move
     short = sum(1 for record in single.iterations if 0 < record.step_length < 1)
     moves = sum(1 for record in single.iterations if record.step_length > 0)
     assert single.forward_runs == 2 * 17 + 2 + 3 * len(single.iterations) + 4 * (moves + short)

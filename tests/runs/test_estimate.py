@@ -154,7 +154,10 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "errors": ({"error": np.ones(3)}, "error: y_std has 3 numbers for 12 readings"),
     "no error column": ({"error": {"y_std": {"column": "sd"}}}, "data: no column 'sd'; the columns are: time, y"),
     "prior": ({"priors": {"a": {"prior": "flat"}}}, "priors.a.prior: 'flat' is not one of"),
-    "prior unit": ({"units": {"a": "m"}, "priors": {"a": {**PRIORS["a"], "std": "2 m"}, "b": 1}}, "priors.a.mean: 0 has no unit; write e.g. '0 m'"),
+    "prior unit": (
+        {"units": {"a": "m"}, "priors": {"a": {**PRIORS["a"], "std": "2 m"}, "b": 1}},
+        "priors.a.mean: 0 has no unit; write e.g. '0 m'",
+    ),
     "odd unit": ({"units": {"c": "m"}}, "units: 'c' is neither a parameter in priors nor a column"),
     "name of a prior": ({"priors": {"a b": 1.0}}, "priors: 'a b' is no name of a parameter"),
     "nothing estimated": ({"priors": {"a": 1.0, "b": 2.0}}, "no parameter has a prior; nothing to estimate"),
