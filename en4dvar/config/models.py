@@ -20,6 +20,7 @@ from en4dvar.hints import shown, suggest
 from en4dvar.user_code import RefusedError, file_of, loading, require_permission
 
 GROUP = "en4dvar.models"
+COMMAND = "command"  # the model that a section with this key means where it names none
 HANDED = "python"  # instead of a name: a model that a script handed over, which no file can make again
 OWN = "./my_model.py:MyModel, or package:MyModel"
 
@@ -99,7 +100,7 @@ def read_model(
     """
     if not isinstance(raw, dict):
         return None  # told with the other keys of the file
-    name = raw.get("name", "command" if "command" in raw else None)
+    name = raw.get("name", COMMAND if COMMAND in raw else None)
     if not isinstance(name, str):
         faults.append(document.fault(("model", "name"), "name the model, e.g. name: bubble"))
         return None

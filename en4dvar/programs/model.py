@@ -26,7 +26,7 @@ from en4dvar.files import expanded
 from en4dvar.function_model import FunctionModel
 from en4dvar.hints import no_such_file, suggest
 from en4dvar.programs import pest
-from en4dvar.programs.outputs import Output
+from en4dvar.programs.outputs import ProgramOutput
 from en4dvar.programs.process import OUTPUT, STDOUT, Program, fill, split
 from en4dvar.programs.template import TIMES, check_template, input_name
 from en4dvar.state import Parameter
@@ -76,7 +76,7 @@ def _file(text: Any, info: ValidationInfo) -> Any:
 
 
 Unit = Annotated[str, AfterValidator(_unit)]
-File = Annotated[Path, BeforeValidator(_file)]
+File = Annotated[Path, BeforeValidator(_file, json_schema_input_type=str)]
 
 
 class _Section(BaseModel):
@@ -134,6 +134,13 @@ class OutputOf(_Section):
         return self
 
 
+def _several(given: Any) -> Any:
+    return (given,) if isinstance(given, str | Path) else given
+
+
+Files = Annotated[tuple[File, ...], BeforeValidator(_several, json_schema_input_type=str | tuple[str, ...])]
+
+
 def _with_unit(given: Any) -> Any:
     return {"unit": given} if isinstance(given, str) else given
 
@@ -146,14 +153,17 @@ class CommandSettings(_Section):
     command: Annotated[str, Field(min_length=1)]
     """Program and arguments, split as by a shell but run without one. {input} and {output} are names of files, {NAME} a
     parameter, {here} the folder of this file, {python} this Python. It runs in a scratch directory of its own."""
-    parameters: Annotated[dict[str, Annotated[ParameterOf, BeforeValidator(_with_unit)]], Field(min_length=1)]
+    parameters: Annotated[
+        dict[str, Annotated[ParameterOf, BeforeValidator(_with_unit, json_schema_input_type=str | ParameterOf)]],
+        Field(min_length=1),
+    ]
     """Name → unit, or a section: what is filled in."""
     outputs: Annotated[dict[str, OutputOf], Field(min_length=1)]
     """Observable → where its values are."""
-    templates: tuple[File, ...] = ()
+    templates: Files = ()
     """Input files with {{ NAME }} for a parameter, {{ times }} for the observation times, or of PEST (ptf ~); the first
     one is {input}. Suffixes .j2, .tpl and .template are left out of the name."""
-    files: tuple[File, ...] = ()
+    files: Files = ()
     """Further files that are copied into the scratch directory."""
     time_unit: Unit = "s"
     """Unit of times."""
@@ -165,11 +175,6 @@ class CommandSettings(_Section):
     """How often a run that failed is tried again; for licences and full disks, not for models that vary."""
     scratch: Path | None = None
     """Folder that holds the scratch directories; default the system's for temporary files."""
-
-    @field_validator("templates", "files", mode="before")
-    @classmethod
-    def _several(cls, given: Any) -> Any:
-        return (given,) if isinstance(given, str | Path) else given
 
     @field_validator("scratch", mode="after")
     @classmethod
@@ -241,7 +246,7 @@ class CommandModel(FunctionModel):
         program = "/bin/sh" if settings.shell else shutil.which(words[0]) or words[0]
         require_permission(f"model command {settings.command!r}", Path(program), anything=True)
         outputs = {
-            name: Output(one.file, one.column, one.key, one.pattern, one.instructions, one.time)
+            name: ProgramOutput(one.file, one.column, one.key, one.pattern, one.instructions, one.time)
             for name, one in settings.outputs.items()
         }
         run = Program(

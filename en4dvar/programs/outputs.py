@@ -21,7 +21,7 @@ COMMENT = ("#", "%", "//")
 
 
 @dataclass(frozen=True)
-class Output:
+class ProgramOutput:
     """Where the values of one observable are: in ``file`` of the scratch directory, by one of the four ways.
 
     column: header of a column of text, or its number from 1. key: dotted path into JSON. pattern: regular expression

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from en4dvar.programs.errors import ProgramError
-from en4dvar.programs.outputs import Output
+from en4dvar.programs.outputs import ProgramOutput
 from en4dvar.programs.template import filled, input_name
 from en4dvar.state import Array
 
@@ -34,7 +34,7 @@ class Program:
 
     words: tuple[str, ...]
     templates: tuple[Path, ...]
-    outputs: Mapping[str, Output]
+    outputs: Mapping[str, ProgramOutput]
     files: tuple[Path, ...] = ()
     environment: Mapping[str, str] = field(default_factory=dict)
     time_limit: float | None = None

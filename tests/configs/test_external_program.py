@@ -1,4 +1,4 @@
-"""The shipped configuration with an external program recovers its truth, with the bits of the same function in Python."""
+"""The shipped external program recovers its truth, with the bits of the same function in Python."""
 
 from __future__ import annotations
 
