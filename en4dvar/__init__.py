@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from en4dvar.prior import PriorTerm as PriorTerm
     from en4dvar.problem import AssimilationSettings as AssimilationSettings
     from en4dvar.problem import InverseProblem as InverseProblem
+    from en4dvar.programs.control import from_pest as from_pest
     from en4dvar.report.compare import Comparison as Comparison
     from en4dvar.report.compare import compare_runs as compare_runs
     from en4dvar.report.export import export_table as export_table
@@ -73,6 +74,7 @@ _HOME = {
     "observations": ("Observations",),
     "prior": ("Prior", "PriorTerm"),
     "analysis": ("Analysis",),
+    "programs.control": ("from_pest",),
     "problem": ("AssimilationSettings", "InverseProblem"),
     "runs.estimate": ("estimate",),
     "runs.runner": ("run", "run_campaign", "write_report"),

@@ -117,6 +117,8 @@ class OutputOf(_Section):
     """Regular expression with one group; every match is a value."""
     instructions: File | None = None
     """Instruction file of PEST (.ins); every observation is a value, in order."""
+    observations: tuple[str, ...] | None = None
+    """Which of the instructions' observations, in the order of the readings; default all."""
     time: Annotated[int | str | None, AfterValidator(_from_one)] = None
     """Column or key of the times that the values belong to; without it there is one value for each observation."""
 
@@ -127,6 +129,8 @@ class OutputOf(_Section):
             raise ValueError(f"give one of {', '.join(WAYS)}; given: {', '.join(given) or 'none'}")
         if self.time is not None and given[0] not in ("column", "key"):
             raise ValueError(f"time goes with column or key, not with {given[0]}")
+        if self.observations is not None and self.instructions is None:
+            raise ValueError("observations are those of instructions, and there are none")
         if self.instructions is not None and not pest.is_instructions(self.instructions.read_text(encoding="utf-8")):
             raise ValueError(
                 f"{self.instructions}: the first line of PEST's instructions is pif and a sign, e.g. pif @"
@@ -138,7 +142,19 @@ def _several(given: Any) -> Any:
     return (given,) if isinstance(given, str | Path) else given
 
 
+def _named(given: Any) -> Any:
+    """Input file → template; of templates alone the name of the file follows."""
+    given = _several(given)
+    return {input_name(Path(str(one))): one for one in given} if isinstance(given, list | tuple) else given
+
+
 Files = Annotated[tuple[File, ...], BeforeValidator(_several, json_schema_input_type=str | tuple[str, ...])]
+
+
+Templates = Annotated[
+    dict[Annotated[str, AfterValidator(_inside)], File],
+    BeforeValidator(_named, json_schema_input_type=str | tuple[str, ...] | dict[str, str]),
+]
 
 
 def _with_unit(given: Any) -> Any:
@@ -160,9 +176,9 @@ class CommandSettings(_Section):
     """Name → unit, or a section: what is filled in."""
     outputs: Annotated[dict[str, OutputOf], Field(min_length=1)]
     """Observable → where its values are."""
-    templates: Files = ()
+    templates: Templates = {}
     """Input files with {{ NAME }} for a parameter, {{ times }} for the observation times, or of PEST (ptf ~); the first
-    one is {input}. Suffixes .j2, .tpl and .template are left out of the name."""
+    one is {input}. Suffixes .j2, .tpl and .template are left out of the name; or write NAME: template."""
     files: Files = ()
     """Further files that are copied into the scratch directory."""
     time_unit: Unit = "s"
@@ -208,9 +224,9 @@ class CommandSettings(_Section):
                 raise ValueError(f"command: {{{name}}} is nothing that is filled in{suggest(name, known)}")
         if "{input}" in self.command and not self.templates:
             raise ValueError("command: {input} is the first of templates, and there is none")
-        for template in self.templates:
+        for template in self.templates.values():
             check_template(template, self.parameters)
-        written = [*map(input_name, self.templates), *(file.name for file in self.files), OUTPUT, STDOUT]
+        written = [*self.templates, *(file.name for file in self.files), OUTPUT, STDOUT]
         if double := {name for name in written if written.count(name) > 1}:
             raise ValueError(f"templates and files: two of them become {min(double)!r} in the scratch directory")
         return self
@@ -246,7 +262,9 @@ class CommandModel(FunctionModel):
         program = "/bin/sh" if settings.shell else shutil.which(words[0]) or words[0]
         require_permission(f"model command {settings.command!r}", Path(program), anything=True)
         outputs = {
-            name: ProgramOutput(one.file, one.column, one.key, one.pattern, one.instructions, one.time)
+            name: ProgramOutput(
+                one.file, one.column, one.key, one.pattern, one.instructions, one.time, one.observations
+            )
             for name, one in settings.outputs.items()
         }
         run = Program(

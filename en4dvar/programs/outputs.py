@@ -25,8 +25,9 @@ class ProgramOutput:
     """Where the values of one observable are: in ``file`` of the scratch directory, by one of the four ways.
 
     column: header of a column of text, or its number from 1. key: dotted path into JSON. pattern: regular expression
-    with one group, every match a value. instructions: file of PEST, every observation a value. With ``time``, a column
-    or key of times, values are interpolated linearly at those that are asked for; without it there is one value a time.
+    with one group, every match a value. instructions: file of PEST, each of the ``observations``, by default all, a
+    value. With ``time``, a column or key of times, values are interpolated linearly at those that are asked for;
+    without it there is one value a time.
     """
 
     file: str
@@ -35,6 +36,7 @@ class ProgramOutput:
     pattern: str | None = None
     instructions: Path | None = None
     time: str | int | None = None
+    observations: tuple[str, ...] | None = None
 
     def read(self, folder: Path, times: Array) -> Array:
         """The values at ``times`` (K,). Raises :class:`ProgramError`."""
@@ -61,7 +63,11 @@ class ProgramOutput:
         if self.pattern is not None:
             return _numbers(re.findall(self.pattern, text, re.MULTILINE), self.file)
         assert self.instructions is not None
-        return np.array([*pest.read(_instructions(self.instructions), text, self.file).values()])
+        found = pest.read(_instructions(self.instructions), text, self.file)
+        names = [name.lower() for name in self.observations] if self.observations is not None else list(found)
+        if lacking := [name for name in names if name not in found]:
+            raise ProgramError(f"{self.instructions} reads no {lacking[0]!r}")
+        return np.array([found[name] for name in names])
 
 
 @functools.cache

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from en4dvar.programs.errors import ProgramError
 from en4dvar.programs.outputs import ProgramOutput
-from en4dvar.programs.template import filled, input_name
+from en4dvar.programs.template import filled
 from en4dvar.state import Array
 
 OUTPUT = "output"  # the file that {output} names
@@ -28,12 +28,13 @@ class Program:
     """A command as a function of parameters and times; the same numbers for the same arguments, wherever it runs.
 
     ``words``: program and arguments, in which ``{input}``, ``{output}`` and ``{NAME}`` of a parameter are filled in; a
-    single one with ``shell``, which then runs it. ``files`` are copied into the scratch directory, whose parent is
-    ``scratch``. It runs again ``retries`` times where it fails.
+    single one with ``shell``, which then runs it. ``templates``: input file → template, the first is ``{input}``.
+    ``files`` are copied into the scratch directory, whose parent is ``scratch``. It runs again ``retries`` times where
+    it fails.
     """
 
     words: tuple[str, ...]
-    templates: tuple[Path, ...]
+    templates: Mapping[str, Path]
     outputs: Mapping[str, ProgramOutput]
     files: tuple[Path, ...] = ()
     environment: Mapping[str, str] = field(default_factory=dict)
@@ -57,8 +58,9 @@ class Program:
         try:
             for file in self.files:
                 shutil.copy(file, folder)
-            for template in self.templates:
-                (folder / input_name(template)).write_text(filled(template, parameters, times), encoding="utf-8")
+            for name, template in self.templates.items():
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (folder / name).write_text(filled(template, parameters, times), encoding="utf-8")
             self._run(folder, parameters)
             return {name: output.read(folder, times) for name, output in self.outputs.items()}
         except OSError as error:
@@ -68,7 +70,7 @@ class Program:
 
     def _run(self, folder: Path, parameters: Mapping[str, float]) -> None:
         values = {name: repr(float(value)) for name, value in parameters.items()}
-        values |= {"input": input_name(self.templates[0]) if self.templates else "", "output": OUTPUT}
+        values |= {"input": next(iter(self.templates), ""), "output": OUTPUT}
         words = [fill(word, values) for word in self.words]
         with (folder / STDOUT).open("wb") as printed:
             process = subprocess.Popen(

@@ -185,6 +185,11 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "pattern": ({"outputs": {"y": {"pattern": "("}}}, "model.outputs.y.pattern: is no regular expression"),
     "groups": ({"outputs": {"y": {"pattern": "a"}}}, "model.outputs.y.pattern: has 0 groups; put the number"),
     "time": ({"outputs": {"y": {"pattern": "(a)", "time": 1}}}, "model.outputs.y: time goes with column or key"),
+    "observations": (
+        {"outputs": {"y": {"column": 1, "observations": ["a"]}}},
+        "model.outputs.y: observations are those",
+    ),
+    "name of a file": ({"templates": {"../x": "in.json.j2"}}, "name a file of the scratch directory"),
     "file": ({"outputs": {"y": {"column": 1, "file": "../x"}}}, "model.outputs.y.file: name a file of the scratch"),
     "instructions": (
         {"outputs": {"y": {"instructions": "in.json.j2"}}},
@@ -194,7 +199,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "unknown in template": ({"parameters": {"a": "1"}}, "model: {folder}/in.json.j2: 'b' is no parameter of the model"),
     "files": ({"files": "mesh.dat"}, "mesh.dat: no such file"),
     "two files": (
-        {"files": ["in.json.j2"], "templates": ["in.json.j2", "in.json.tpl"]},
+        {"templates": "in.json.tpl", "files": ["in.json.j2", "in.json"]},
         "two of them become 'in.json'",
     ),
     "time unit": ({"time_unit": "fortnight"}, "model.time_unit: "),
@@ -212,6 +217,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 def test_each_wrong_value_is_one_located_message(fault, folder, monkeypatch):
     monkeypatch.chdir(folder)
     (folder / "in.json.tpl").write_text("{}")
+    (folder / "in.json").write_text("{}")
     changes, words = BAD[fault]
     with pytest.raises(en4dvar.ConfigError) as caught:
         fit(section(**changes))
