@@ -17,7 +17,7 @@ LAYERS = (
     ("errors",),
     ("state", "hints", "files", "tables", "caution", "compiled", "user_code", "user_file"),
     ("units", "prior", "forward", "noise"),
-    ("batch", "observations", "function_model"),
+    ("batch", "series", "observations", "function_model"),
     ("varying", "programs"),
     ("problem", "diagnostics", "residuals", "influence"),
     ("executor",),
