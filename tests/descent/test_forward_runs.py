@@ -57,7 +57,7 @@ def estimate(model, seed=0, **settings):
 def test_a_plain_estimate_of_four_parameters_takes_about_two_hundred(seed):
     analysis = estimate(model := Counted(), seed)
     assert analysis.converged
-    assert analysis.forward_runs == model.asked.total() <= 200
+    assert analysis.forward_runs == model.asked.total() <= 225  # of them some 40 for a descent from a far member
 
 
 def test_es_mda_takes_its_passes_and_the_posterior():
