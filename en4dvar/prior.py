@@ -5,6 +5,7 @@ Each parameter θ has a transform x = f(θ) to an unbounded coordinate in which 
     normal     x = θ
     lognormal  x = ln θ                          θ > 0
     logit      x = ln((θ − a) / (b − θ))         a < θ < b
+    uniform, half-normal, beta                   x = Φ⁻¹(F(θ)), the Gaussian score (:mod:`en4dvar.parameter_map`)
 
 Random numbers are counter-based (Philox; Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"): the key is
 (seed, parameter name), the counter is the member. Growing N leaves the first members' draws as they were, adding a
@@ -22,12 +23,15 @@ from typing import Literal
 
 import numpy as np
 
+from en4dvar import parameter_map
 from en4dvar.errors import ConfigError
+from en4dvar.parameter_map import QUANTILE_MAPS
 from en4dvar.state import Array, Parameter, TransformName
 
 Sampling = Literal["exact", "random"]
 LARGEST = 1e150  # its square is a number still
 LARGEST_LOG = 300.0  # std of a logarithm or logit: one std is 130 powers of ten
+SHAPES = 0.1, 1e6  # smallest and largest α, β of a beta
 RESOLVED = 1e-12  # of the mean: an ensemble that spreads by less has four digits at most
 
 
@@ -35,7 +39,8 @@ RESOLVED = 1e-12  # of the mean: an ensemble that spreads by less has four digit
 class PriorTerm:
     """The prior of one parameter; ``mean`` and ``std`` are those of the transformed coordinate.
 
-    Use the constructors, which take physical values. ``bounds`` (a, b) belong to ``logit`` and are physical.
+    Use the constructors, which take physical values. ``bounds`` (a, b) belong to ``logit`` and to the kinds of
+    :mod:`en4dvar.parameter_map`, and are physical; ``shape`` holds the other numbers of the latter.
 
     Raises
     ------
@@ -47,6 +52,7 @@ class PriorTerm:
     mean: float
     std: float
     bounds: tuple[float, float] = (-math.inf, math.inf)
+    shape: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         self._require(math.isfinite(self.mean), "the mean must be finite")
@@ -113,6 +119,58 @@ class PriorTerm:
             )
         return cls(parameter, "logit", math.log((median - low) / (high - median)), logit_std, (low, high))
 
+    @classmethod
+    def uniform(cls, parameter: Parameter, bounds: tuple[float, float]) -> PriorTerm:
+        """θ equally likely everywhere between finite physical ``bounds``."""
+        return cls._by_quantiles(parameter, "uniform", bounds, ())
+
+    @classmethod
+    def half_normal(cls, parameter: Parameter, std: float, low: float = 0.0) -> PriorTerm:
+        """θ = low + |N(0, std²)|, in the parameter's unit; ``std`` is that of the whole Gaussian."""
+        term = cls._by_quantiles(parameter, "half-normal", (low, math.inf), (std,))
+        around = max(abs(low), 1 / LARGEST)
+        term._require(RESOLVED * around < std < LARGEST, f"a standard deviation of {std:g} beside {low:g}")
+        return term
+
+    @classmethod
+    def beta(cls, parameter: Parameter, bounds: tuple[float, float], alpha: float, beta: float) -> PriorTerm:
+        """(θ − a)/(b − a) ~ Beta(alpha, beta) between finite physical ``bounds`` (a, b)."""
+        for name, value in (("alpha", alpha), ("beta", beta)):
+            if not SHAPES[0] <= value <= SHAPES[1]:
+                raise ConfigError(
+                    f"prior of {parameter.name}: {name} must lie between {SHAPES[0]:g} and {SHAPES[1]:g}, not {value:g}"
+                )
+        return cls._by_quantiles(parameter, "beta", bounds, (alpha, beta))
+
+    @classmethod
+    def _by_quantiles(
+        cls, parameter: Parameter, kind: TransformName, bounds: tuple[float, float], shape: tuple[float, ...]
+    ) -> PriorTerm:
+        (low, high), term = bounds, cls(parameter, kind, 0.0, 1.0, bounds, shape)
+        finite = math.isfinite(low) and (math.isfinite(high) or kind == "half-normal")
+        term._require(finite and low < high, f"{kind} needs finite bounds, low < high, not {bounds}")
+        return term
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Physical limits that θ does not reach, ±inf where there are none."""
+        return (0.0, math.inf) if self.transform == "lognormal" else self.bounds
+
+    @property
+    def has_bound(self) -> bool:
+        """Whether the map, rather than the parameter, sets a limit at which the prior has probability."""
+        return self.transform == "logit" or self.transform in QUANTILE_MAPS
+
+    def slope(self, x: float) -> float:
+        """dθ/dx of the parameter map at a transformed value."""
+        if self.transform in QUANTILE_MAPS:
+            return parameter_map.slope(self.transform, x, self.bounds, self.shape)
+        theta = float(self.to_physical(np.array(x)))
+        if self.transform == "logit":
+            low, high = self.bounds
+            return (theta - low) * (high - theta) / (high - low)
+        return theta if self.transform == "lognormal" else 1.0
+
     def to_physical(self, x: Array) -> Array:
         """θ for transformed values ``x`` of any shape; overflow gives inf, which no model accepts as a value."""
         x = np.asarray(x, dtype=float)
@@ -121,6 +179,8 @@ class PriorTerm:
         if self.transform == "lognormal":
             with np.errstate(over="ignore"):
                 return np.asarray(np.exp(x))
+        if self.transform in QUANTILE_MAPS:
+            return parameter_map.value(self.transform, x, self.bounds, self.shape)
         low, high = self.bounds
         # from the nearer bound, so that values close to it keep their relative precision
         return np.where(x < 0, low + (high - low) * _sigmoid(x), high - (high - low) * _sigmoid(-x))
@@ -135,9 +195,11 @@ class PriorTerm:
         theta = np.asarray(theta, dtype=float)
         if self.transform == "normal":
             return theta
-        low, high = (0.0, math.inf) if self.transform == "lognormal" else self.bounds
+        low, high = self.range
         if not np.all((theta > low) & (theta < high)):
             raise ValueError(f"{self.parameter.name}: values must lie strictly between {low:g} and {high:g}")
+        if self.transform in QUANTILE_MAPS:
+            return parameter_map.score(self.transform, theta, self.bounds, self.shape)
         return np.asarray(np.log(theta) if self.transform == "lognormal" else np.log((theta - low) / (high - theta)))
 
 

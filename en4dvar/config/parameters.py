@@ -34,6 +34,9 @@ _RECIPES = {
     "normal": "mean and std",
     "lognormal": "median and log_std, or mean and std",
     "logit": "lower, upper, median and logit_std",
+    "uniform": "lower and upper",
+    "half-normal": "std, and lower where it does not start at zero",
+    "beta": "lower, upper, alpha and beta",
 }
 
 
@@ -56,14 +59,15 @@ Location = Annotated[
 class PriorSection(Section):
     """A prior by name; locations and spreads carry the parameter's unit, a ``%`` spread is relative to the location."""
 
-    prior: Literal["normal", "lognormal", "logit"]
-    """Shape: normal (mean, std), lognormal (median and log_std, or mean and std), logit (lower, upper, median, …)."""
+    prior: Literal["normal", "lognormal", "logit", "uniform", "half-normal", "beta"]
+    """Shape: normal (mean, std), lognormal (median and log_std, or mean and std), logit (lower, upper, median, …),
+    uniform (lower, upper), half-normal (std, and lower, by default 0), beta (lower, upper, alpha, beta)."""
     mean: Location = None
     """Mean with its unit, or ``maximum``: the largest observation of the window."""
     median: Location = None
     """Median with its unit, or ``maximum``: the largest observation of the window."""
     std: Annotated[Spread | None, Made(lambda text, context: parse_spread(text, subject_unit(context)))] = None
-    """Standard deviation with its unit, or in % of the mean."""
+    """Standard deviation with its unit, or in % of the mean; of a half-normal, that of the whole Gaussian."""
     log_std: Annotated[float, Field(gt=0)] | None = None
     """Standard deviation of the natural logarithm: 0.3 is about 30 %, 0.7 a factor of two."""
     logit_std: Annotated[float, Field(gt=0)] | None = None
@@ -72,6 +76,10 @@ class PriorSection(Section):
     """Lower bound with its unit; never reached."""
     upper: Value = None
     """Upper bound with its unit; never reached."""
+    alpha: Annotated[float, Field(gt=0)] | None = None
+    """First exponent of a beta: probability leans to ``upper`` where it is the larger one."""
+    beta: Annotated[float, Field(gt=0)] | None = None
+    """Second exponent of a beta."""
     varies: VariesSection | None = None
     """The parameter varies in time; the prior is that of its first piece."""
 
@@ -141,9 +149,19 @@ class Uncertain:
         if spec.prior == "lognormal" and given == {"median", "log_std"} and spec.log_std is not None:
             return PriorTerm.lognormal(parameter, median, spec.log_std)
         if spec.prior == "logit" and given == {"lower", "upper", "median", "logit_std"} and spec.logit_std is not None:
-            return PriorTerm.logit(parameter, (spec.lower or 0.0, spec.upper or 0.0), median, spec.logit_std)
+            return PriorTerm.logit(parameter, self._bounds, median, spec.logit_std)
+        if spec.prior == "uniform" and given == {"lower", "upper"}:
+            return PriorTerm.uniform(parameter, self._bounds)
+        if spec.prior == "half-normal" and given - {"lower"} == {"std"}:
+            return PriorTerm.half_normal(parameter, self._std(0.0), spec.lower or 0.0)
+        if spec.prior == "beta" and given == {"lower", "upper", "alpha", "beta"} and spec.alpha and spec.beta:
+            return PriorTerm.beta(parameter, self._bounds, spec.alpha, spec.beta)
         takes, has = _RECIPES[spec.prior], ", ".join(sorted(given)) or "none of these"
         raise ConfigError(f"a {spec.prior} prior takes {takes}; given: {has}")
+
+    @property
+    def _bounds(self) -> tuple[float, float]:
+        return self.spec.lower or 0.0, self.spec.upper or 0.0
 
     def walk(self, model: ForwardModel, term: PriorTerm, times: Array) -> RandomWalk | None:
         """How it varies over a window of observations at ``times`` (K,); None where it does not.
@@ -158,7 +176,7 @@ class Uncertain:
             message = f"relative to the mean, which is zero; give it in {self.parameter.unit}"
             raise ConfigError([Fault(message, "varies.std")])
         try:
-            return RandomWalk.of(model, term, varies.knots(times), varies.std.absolute(centre) / _slope(term, centre))
+            return RandomWalk.of(model, term, varies.knots(times), varies.std.absolute(centre) / term.slope(term.mean))
         except ConfigError as error:
             raise ConfigError(
                 [replace(f, path=f"varies.{f.path}" if f.path else "varies") for f in error.problems]
@@ -180,14 +198,6 @@ class Uncertain:
             message = f"{100 * std.value:g} % is relative to the mean, which is zero; give it in {self.parameter.unit}"
             raise ConfigError([Fault(message, "std")])
         return std.absolute(mean)
-
-
-def _slope(term: PriorTerm, theta: float) -> float:
-    """dθ/dx of the transform."""
-    if term.transform == "logit":
-        low, high = term.bounds
-        return (theta - low) * (high - theta) / (high - low)
-    return theta if term.transform == "lognormal" else 1.0
 
 
 Entry = Fixed | Scalar | Uncertain

@@ -139,7 +139,7 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
     at: zero is infinitely far in ln θ. The prior's own share near the bound is no finding, three times it is.
     """
     for j, (term, parameter) in enumerate(zip(prior.terms, prior.parameters, strict=True)):
-        low, high = term.bounds if term.transform == "logit" else parameter.bounds
+        low, high = term.bounds if term.has_bound else parameter.bounds
         if term.transform == "lognormal":
             low = -math.inf
         if math.isinf(low) and math.isinf(high):

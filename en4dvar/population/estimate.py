@@ -77,7 +77,7 @@ class Population:
 
         Raises
         ------
-        ValueError: a logit prior, which has no closed mean.
+        ValueError: a prior that is neither normal nor lognormal, whose mean has no closed form.
         """
         return self._moments()[0]
 
@@ -95,8 +95,8 @@ class Population:
         mean, std = self.nu.copy(), self.tau.copy()
         for j, name in enumerate(self.names):
             transform = self.prior.terms[self.prior.names.index(name)].transform
-            if transform == "logit":
-                raise ValueError(f"{name}: the population mean of a logit prior has no closed form")
+            if transform not in ("normal", "lognormal"):
+                raise ValueError(f"{name}: the population mean of a {transform} prior has no closed form")
             if transform == "lognormal":
                 mean[:, j] = np.exp(self.nu[:, j] + self.tau[:, j] ** 2 / 2)
                 std[:, j] = mean[:, j] * np.sqrt(np.expm1(self.tau[:, j] ** 2))
