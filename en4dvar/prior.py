@@ -1,4 +1,4 @@
-"""Priors: independent Gaussians in transformed space, physical values outside, never clipped.
+"""Priors: Gaussians in transformed space, physical values outside, never clipped.
 
 Each parameter θ has a transform x = f(θ) to an unbounded coordinate in which its prior is N(mean, std²):
 
@@ -6,6 +6,9 @@ Each parameter θ has a transform x = f(θ) to an unbounded coordinate in which 
     lognormal  x = ln θ                          θ > 0
     logit      x = ln((θ − a) / (b − θ))         a < θ < b
     uniform, half-normal, beta                   x = Φ⁻¹(F(θ)), the Gaussian score (:mod:`en4dvar.parameter_map`)
+
+Parameters are independent but for those of a :class:`~en4dvar.dependence.Block`, which are correlated in transformed
+space.
 
 Random numbers are counter-based (Philox; Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"): the key is
 (seed, parameter name), the counter is the member. Growing N leaves the first members' draws as they were, adding a
@@ -24,6 +27,7 @@ from typing import Literal
 import numpy as np
 
 from en4dvar import parameter_map
+from en4dvar.dependence import Block
 from en4dvar.errors import ConfigError
 from en4dvar.parameter_map import QUANTILE_MAPS
 from en4dvar.state import Array, Parameter, TransformName
@@ -205,15 +209,29 @@ class PriorTerm:
 
 @dataclass(frozen=True)
 class Prior:
-    """Independent prior terms; the control vector holds their parameters in this order."""
+    """Prior terms, independent but for the parameters of ``blocks``; the control vector holds them in this order.
+
+    ``mean`` and ``std`` are those of each coordinate by itself; white coordinates z ~ N(0, I): see :meth:`white`.
+    """
 
     terms: tuple[PriorTerm, ...]
+    blocks: tuple[Block, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.terms:
             raise ConfigError("prior: at least one parameter must be estimated")
         if len(set(self.names)) != len(self.names):
             raise ConfigError(f"prior: a parameter is given twice in {', '.join(self.names)}")
+        correlated = [name for block in self.blocks for name in block.names]
+        if len(set(correlated)) != len(correlated):
+            raise ConfigError("prior: a parameter is in two blocks of correlated ones")
+        if missing := set(correlated) - set(self.names):
+            raise ConfigError(f"prior: {', '.join(sorted(missing))} is correlated, but not estimated")
+
+    def of(self, terms: tuple[PriorTerm, ...]) -> Prior:
+        """Of other ``terms``, with the correlations that this prior has between parameters that are among them."""
+        names = {term.parameter.name for term in terms}
+        return Prior(terms, tuple(kept for block in self.blocks if (kept := block.among(tuple(names)))))
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -273,17 +291,61 @@ class Prior:
         """Control vectors (…, n) of physical values ``theta`` (…, n). Raises ValueError outside a transform's range."""
         return np.stack([term.from_physical(theta[..., j]) for j, term in enumerate(self.terms)], axis=-1)
 
+    @cached_property
+    def _placed(self) -> tuple[tuple[list[int], Block], ...]:
+        """Each block with the columns of its parameters."""
+        columns = {name: j for j, name in enumerate(self.names)}
+        return tuple(([columns[name] for name in block.names], block) for block in self.blocks)
+
+    def white(self, x: Array) -> Array:
+        """White coordinates z (…, n) of control vectors ``x`` (…, n): N(0, I) under the prior."""
+        return self.white_change(x - self.mean)
+
+    def white_change(self, dx: Array) -> Array:
+        """Changes (…, n) of the white coordinates for changes ``dx`` (…, n) of control vectors."""
+        z = np.asarray(dx / self.std)
+        for columns, block in self._placed:
+            z[..., columns] = block.whitened(z[..., columns])
+        return z
+
+    def from_white(self, z: Array) -> Array:
+        """Control vectors (…, n) of white coordinates ``z`` (…, n)."""
+        return np.asarray(self.mean + self.from_white_change(z))
+
+    def from_white_change(self, dz: Array) -> Array:
+        """Changes (…, n) of control vectors for changes ``dz`` (…, n) of the white coordinates."""
+        if not self.blocks:
+            return np.asarray(self.std * dz)
+        y = np.array(dz, dtype=float)
+        for columns, block in self._placed:
+            y[..., columns] = block.coloured(y[..., columns])
+        return np.asarray(self.std * y)
+
+    def white_covariance(self, covariance: Array) -> Array:
+        """A covariance (n, n) of control vectors in white coordinates."""
+        scaled = covariance / np.outer(self.std, self.std)
+        for columns, block in self._placed:
+            scaled[columns] = block.whitened(scaled[columns].T).T
+            scaled[:, columns] = block.whitened(scaled[:, columns])
+        return np.asarray(scaled)
+
+    @cached_property
+    def log_det_root(self) -> float:
+        """½ ln det of the prior covariance in transformed space."""
+        return float(np.sum(np.log(self.std))) + sum(block.log_det_root for block in self.blocks)
+
     def log_density(self, x: Array) -> Array:
         """Normalised log density (…,) in transformed space of control vectors ``x`` (…, n)."""
-        z = (x - self.mean) / self.std
-        constant = np.sum(np.log(self.std)) + 0.5 * len(self.terms) * math.log(2 * math.pi)
+        z = self.white(x)
+        constant = self.log_det_root + 0.5 * len(self.terms) * math.log(2 * math.pi)
         return np.asarray(-0.5 * np.sum(z * z, axis=-1) - constant)
 
     def sample(self, n_members: int, seed: int, method: Sampling = "exact") -> Array:
         """Prior ensemble (N, n) in transformed space.
 
         ``random``: independent draws. ``exact``: the same draws, affinely corrected so that the sample mean and
-        covariance are the prior's (second-order-exact). The correction is a Gram–Schmidt process in the order of the
+        covariance are the prior's (second-order-exact). An ensemble that a block brings along takes the place of the
+        draws of its parameters where it has N members. The correction is a Gram–Schmidt process in the order of the
         parameters: one added at the end leaves the others as they were, but growing N moves every member.
 
         Raises
@@ -295,9 +357,12 @@ class Prior:
         if n_members < needed:
             raise ConfigError(f"sampling {method!r} of {n} parameters needs at least {needed} members, not {n_members}")
         z = np.column_stack([standard_normal(seed, name, n_members) for name in self.names])
+        for columns, block in self._placed:
+            if block.members is not None and len(block.members) == n_members:
+                z[:, columns] = block.whitened(block.members)
         if method == "exact":
             z = _whiten_sample(z)
-        return self.mean + self.std * z
+        return self.from_white(z)
 
 
 def own_seed(seed: int, name: str) -> int:

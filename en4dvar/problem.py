@@ -72,7 +72,9 @@ class InverseProblem:
     def varied(self, varying: Sequence[Varying]) -> InverseProblem:
         """The same with what varies; the changes join the control vector at its end."""
         changes = (change for one in varying for change in one.changes)
-        return replace(self, model=PiecewiseModel(self.model, varying), prior=Prior((*self.prior.terms, *changes)))
+        return replace(
+            self, model=PiecewiseModel(self.model, varying), prior=self.prior.of((*self.prior.terms, *changes))
+        )
 
     @property
     def constant(self) -> InverseProblem:
@@ -81,7 +83,7 @@ class InverseProblem:
             return self
         changes = {change.parameter.name for one in self.varying for change in one.changes}
         terms = tuple(term for term in self.prior.terms if term.parameter.name not in changes)
-        return replace(self, model=self.model.model, prior=Prior(terms))
+        return replace(self, model=self.model.model, prior=self.prior.of(terms))
 
 
 def discrepancy_parameters(model: ForwardModel, observable: Observable) -> tuple[Parameter, Parameter]:

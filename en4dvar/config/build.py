@@ -77,7 +77,8 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
     if asked.sampling == "exact" and asked.members <= count:
         message = f"{asked.members} are too few for {count} parameters; at least {count + 1}"
         raise ConfigError([config.document.fault(("assimilation", "members"), message)])
-    problem = InverseProblem(config.model, config.observable, observations, Prior(terms), fixed, perturbations)
+    prior = Prior(terms, config.dependence)
+    problem = InverseProblem(config.model, config.observable, observations, prior, fixed, perturbations)
     if varying:
         problem = problem.varied(varying)
     check_problem(problem)

@@ -37,6 +37,7 @@ _RECIPES = {
     "uniform": "lower and upper",
     "half-normal": "std, and lower where it does not start at zero",
     "beta": "lower, upper, alpha and beta",
+    "ensemble": "map and unit, both where they are needed, and no number of its own",
 }
 
 
@@ -59,9 +60,10 @@ Location = Annotated[
 class PriorSection(Section):
     """A prior by name; locations and spreads carry the parameter's unit, a ``%`` spread is relative to the location."""
 
-    prior: Literal["normal", "lognormal", "logit", "uniform", "half-normal", "beta"]
+    prior: Literal["normal", "lognormal", "logit", "uniform", "half-normal", "beta", "ensemble"]
     """Shape: normal (mean, std), lognormal (median and log_std, or mean and std), logit (lower, upper, median, …),
-    uniform (lower, upper), half-normal (std, and lower, by default 0), beta (lower, upper, alpha, beta)."""
+    uniform (lower, upper), half-normal (std, and lower, by default 0), beta (lower, upper, alpha, beta), or ensemble:
+    mean, spread and correlations are those of the members in the file of ``prior: {ensemble: FILE}``."""
     mean: Location = None
     """Mean with its unit, or ``maximum``: the largest observation of the window."""
     median: Location = None
@@ -80,6 +82,10 @@ class PriorSection(Section):
     """First exponent of a beta: probability leans to ``upper`` where it is the larger one."""
     beta: Annotated[float, Field(gt=0)] | None = None
     """Second exponent of a beta."""
+    map: Literal["normal", "lognormal", "logit"] | None = None
+    """Of an ensemble: in which coordinate its members are taken as Gaussian; by default the parameter's own."""
+    unit: Annotated[str | None, unit_of(subject_unit)] = None
+    """Of an ensemble: unit of the numbers in the file, where that does not tell it."""
     varies: VariesSection | None = None
     """The parameter varies in time; the prior is that of its first piece."""
 
@@ -122,10 +128,19 @@ class Scalar:
 
 @dataclass(frozen=True)
 class Uncertain:
-    """A parameter with a prior; ``maximum`` as a location is the observed maximum in the window."""
+    """A parameter with a prior; ``maximum`` as a location is the observed maximum in the window.
+
+    ``of_members`` is the prior that an ensemble makes, once its file is read.
+    """
 
     parameter: Parameter
     spec: PriorSection
+    of_members: PriorTerm | None = None
+
+    @property
+    def from_ensemble(self) -> bool:
+        """Whether the prior is that of the members in a file."""
+        return self.spec.prior == "ensemble"
 
     @property
     def needs_data(self) -> bool:
@@ -141,7 +156,9 @@ class Uncertain:
 
     def _term(self, mean: float, median: float) -> PriorTerm:
         spec, parameter = self.spec, self.parameter
-        given = spec.model_fields_set - {"prior", "varies"}
+        given = self._given
+        if self.of_members is not None:
+            return self.of_members
         if spec.prior == "normal" and given == {"mean", "std"}:
             return PriorTerm.normal(parameter, mean, self._std(mean))
         if spec.prior == "lognormal" and given == {"mean", "std"}:
@@ -156,8 +173,25 @@ class Uncertain:
             return PriorTerm.half_normal(parameter, self._std(0.0), spec.lower or 0.0)
         if spec.prior == "beta" and given == {"lower", "upper", "alpha", "beta"} and spec.alpha and spec.beta:
             return PriorTerm.beta(parameter, self._bounds, spec.alpha, spec.beta)
-        takes, has = _RECIPES[spec.prior], ", ".join(sorted(given)) or "none of these"
-        raise ConfigError(f"a {spec.prior} prior takes {takes}; given: {has}")
+        raise self._recipe()
+
+    @property
+    def _given(self) -> set[str]:
+        return self.spec.model_fields_set - {"prior", "varies"}
+
+    def _recipe(self) -> ConfigError:
+        takes, has = _RECIPES[self.spec.prior], ", ".join(sorted(self._given)) or "none of these"
+        return ConfigError(f"{'an' if self.from_ensemble else 'a'} {self.spec.prior} prior takes {takes}; given: {has}")
+
+    def check(self) -> None:
+        """Raise :class:`ConfigError` for what can be told without data and files."""
+        if self.from_ensemble:
+            if not self._given <= {"map", "unit"}:
+                raise self._recipe()
+        elif not self.needs_data:
+            self.term()
+        elif self.spec.prior != "logit":
+            self.term(maximum=1.0)  # the other values do not wait for the data
 
     @property
     def _bounds(self) -> tuple[float, float]:
@@ -214,10 +248,7 @@ def _entry(given: Any, context: Context) -> Entry:
     entry = Uncertain(parameter, PriorSection.model_validate(given, context=context))
     if entry.spec.varies is not None and not can_vary(context.model, parameter.name):
         raise ConfigError([Fault(f"{parameter.name} cannot vary: {_why_not(context.model, parameter)}", "varies")])
-    if not entry.needs_data:
-        entry.term()
-    elif entry.spec.prior != "logit":
-        entry.term(maximum=1.0)  # the other values do not wait for the data
+    entry.check()
     return entry
 
 
@@ -260,6 +291,8 @@ def entries(kind: str = "") -> Made:
             for name, entry in found.items():
                 if kind and entry.needs_data:
                     faults.add((name,), f"{kind} has no data file to take a value from")
+                if kind and isinstance(entry, Uncertain) and entry.from_ensemble:
+                    faults.add((name, "prior"), f"{kind} has no ensemble of its own; give it another prior")
                 if kind and isinstance(entry, Uncertain) and entry.spec.varies is not None:
                     faults.add((name, "varies"), f"{kind} has constant parameters")
             for parameter in model.parameters:

@@ -121,12 +121,13 @@ def forecast(
 def cost(problem: InverseProblem, x: Array, executor: Executor | None = None) -> Array:
     """J (B,) of control vectors ``x`` (B, n), with the prior's own mean and covariance; +inf where the model fails.
 
-    J = ½ Σ_j ((x_j − mean_j)/std_j)² + Σ_k β_k [½ (y_k − m_k)²/s_k² + ln(s_k/std_k)].
+    J = ½ ‖z‖² + Σ_k β_k [½ (y_k − m_k)²/s_k² + ln(s_k/std_k)], z the white coordinates of x: (x_j − mean_j)/std_j
+    where no parameters are correlated.
     """
     run = forecast(problem, x, executor)
     observation = problem.observations.cost(run.predicted)
     with np.errstate(over="ignore"):
-        z = (x - problem.prior.mean) / problem.prior.std
+        z = problem.prior.white(x)
         return np.where(run.active, 0.5 * np.sum(z * z, axis=-1) + observation, np.inf)
 
 

@@ -122,11 +122,13 @@ def estimate_population(
 
     Raises
     ------
-    ValueError: fewer than 3 sets, or too few successful runs about the best fit of one.
+    ValueError: fewer than 3 sets, a correlated prior, or too few successful runs about the best fit of one.
     """
     scales, effort = hyper or HyperPrior(), effort or Effort()
     if len(start) < 3:
         raise ValueError("a population needs at least 3 data sets")
+    if prior.blocks:
+        raise ValueError("a population needs a prior of independent parameters")
     with one_blas_thread():
         return _Estimate(runs, start, prior, names, seed, scales, effort, workers).result()
 

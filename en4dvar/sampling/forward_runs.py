@@ -70,7 +70,7 @@ class ForwardRuns:
         alike: dict[object, list[int]] = {}
         for s, p in enumerate(problems):
             o, k = p.observations, len(p.observations)
-            if p.prior.terms != problems[0].prior.terms:
+            if p.prior != problems[0].prior:
                 raise ConfigError(f"{o.name}: a population needs one prior")
             if not o.noise.plain or p.has_noise_scale:
                 raise ConfigError(f"{o.name}: a population needs independent Gaussian errors of known std")

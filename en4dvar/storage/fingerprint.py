@@ -25,6 +25,7 @@ from en4dvar.storage.provenance import package_versions
 
 PACKAGES = ("en4dvar", "numpy", "scipy", "numba", "llvmlite")
 _NO_NUMBERS = ("execution", "output")
+_PRIOR_FILES = ("prior", "prior_correlation")  # sections that name files
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,8 @@ def identity(resolved: str, model: ForwardModel, data: Mapping[str, DataFile]) -
     software = {"python": f"{sys.version_info.major}.{sys.version_info.minor}", **package_versions(PACKAGES)}
     errors = (content.get("data") or {}).get("error", {})
     sources = {"en4dvar": source_digest("en4dvar"), **_packages_of(model)}
-    sources |= {str(path): file_digest(path) for path in _paths([content["model"], errors])}
+    named = [content["model"], errors, *(content.get(key) for key in _PRIOR_FILES)]
+    sources |= {str(path): file_digest(path) for path in _paths(named)}
     text = yaml.safe_dump(
         {**settings, "software": software, "sources": sources}, sort_keys=False, allow_unicode=True, width=120
     )

@@ -33,6 +33,7 @@ REFERENCES = (
     "layout: ArviZ InferenceData schema"
 )
 MEMBER = ("chain", "draw")
+MOST_WRITTEN = 50  # parameters of a block of correlated ones whose matrix is an attribute
 SCALAR = "scalar_"  # begins the attribute of a number found beside the data
 UNTOLD = "with heavy tails beside a discrepancy no single reading has a density of its own given the others"
 Variables = dict[str, Variable]
@@ -62,7 +63,7 @@ def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]
     log_likelihood = _variable((*MEMBER, "time"), a.log_likelihood[None], "1", label)
     return {
         "/": Group(attrs=netcdf_attributes({**root, **attributes})),
-        "/prior": group({**_parameters(a, a.prior), **pieces(a, a.prior)}),
+        "/prior": group({**_parameters(a, a.prior), **pieces(a, a.prior)}, _correlated(a)),
         "/posterior": group({**_parameters(a, a.posterior), **pieces(a, a.posterior)}),
         "/prior_predictive": group(_predictive(a, a.prior_predictions, a.prior_trajectories)),
         "/posterior_predictive": group(_predictive(a, a.posterior_predictions, a.posterior_trajectories)),
@@ -72,6 +73,15 @@ def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]
         "/log_likelihood": group({a.problem.observable.name: log_likelihood}),
         "/iterations": group(_iterations(a)),
     }
+
+
+def _correlated(a: Analysis) -> dict[str, Any]:
+    """Which parameters are correlated in the prior, in transformed space; of large blocks their names alone."""
+    blocks = [
+        {"names": block.names, "correlation": block.matrix.tolist() if len(block.names) <= MOST_WRITTEN else []}
+        for block in a.problem.prior.blocks
+    ]
+    return {"correlated": json.dumps(blocks)} if blocks else {}
 
 
 def about(p: Parameter) -> dict[str, Any]:

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LAYERS = (
     ("errors",),
     ("state", "hints", "files", "tables", "caution", "compiled", "user_code", "user_file"),
-    ("parameter_map",),
+    ("dependence", "parameter_map"),
     ("units", "prior", "forward", "noise"),
     ("batch", "observations"),
     ("varying",),
