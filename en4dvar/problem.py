@@ -29,14 +29,23 @@ class StatePerturbation:
 
 
 @dataclass(frozen=True)
+class Tie:
+    """A parameter of the model that is ``factor`` times the one named ``to``, which is estimated."""
+
+    parameter: Parameter
+    to: str
+    factor: float = 1.0
+
+
+@dataclass(frozen=True)
 class InverseProblem:
     """Everything that defines a posterior: F, H, y, R, the prior, and the values held fixed.
 
     The control vector holds ``prior.parameters`` in transformed space. A parameter named ``t_s`` shifts the observation
     times: member i is observed at t_k + t_s,i; one named ``sigma`` multiplies the std of every observation error, where
     the model has no parameter of that name. ``discrepancy_amplitude`` and ``discrepancy_length`` are those of the
-    discrepancy that the observations allow for. ``perturbations`` act on the initial state. ``fixed`` are physical SI
-    values of the other parameters.
+    discrepancy that the observations allow for. ``perturbations`` act on the initial state, ``tied`` follow what is
+    estimated. ``fixed`` are physical SI values of the other parameters.
     """
 
     model: ForwardModel
@@ -45,6 +54,7 @@ class InverseProblem:
     prior: Prior
     fixed: Mapping[str, float] = field(default_factory=dict)
     perturbations: tuple[StatePerturbation, ...] = ()
+    tied: tuple[Tie, ...] = ()
 
     @property
     def has_noise_scale(self) -> bool:

@@ -31,6 +31,9 @@ def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
         parts.append(table([(title, "unit", "prior", "median", "5 %", "95 %"), *_prior_rows(problem)]))
         if correlated := _correlation_rows(problem):
             parts.append(table([("correlated in the prior", "correlation"), *correlated]))
+        if problem.tied:
+            rows = [(tie.parameter.name, tie.to, f"{tie.factor:g}") for tie in problem.tied]
+            parts.append(table([("tied", "to", "times"), *rows]))
         if problem.fixed:
             known = {p.parameter.name: p.parameter for p in config.parameters}
             fixed = [(name, *_shown(known[name], value)) for name, value in problem.fixed.items()]

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from en4dvar.config import Config
 from en4dvar.config.context import Spread
 from en4dvar.config.data import Data
-from en4dvar.config.parameters import Fixed, Uncertain
+from en4dvar.config.parameters import Fixed, Tied, Uncertain, inside_bounds
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.files import PathError, expanded, readable
@@ -26,7 +26,7 @@ from en4dvar.inputs.window import select
 from en4dvar.noise import Noise, noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import InverseProblem, discrepancy_parameters
+from en4dvar.problem import InverseProblem, Tie, discrepancy_parameters
 from en4dvar.state import Array
 from en4dvar.units import UnitError, convert
 from en4dvar.varying import Varying
@@ -71,6 +71,10 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
     """The inverse problem of observations, wherever they come from. Raises :class:`ConfigError`."""
     terms, fixed = resolve_parameters(config, observations)
     terms = (*terms, *(perturbed.term for perturbed in config.initial_state), *_discrepancy(config, observations))
+    estimated = {term.parameter.name for term in terms}
+    tied = tuple(
+        Tie(e.parameter, e.to, e.factor) for e in config.parameters if isinstance(e, Tied) and e.to in estimated
+    )
     perturbations = tuple(perturbed.perturbation for perturbed in config.initial_state)
     varying = _varying(config, observations, terms)
     asked, count = config.assimilation, len(terms) + sum(len(one.changes) for one in varying)
@@ -78,7 +82,7 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
         message = f"{asked.members} are too few for {count} parameters; at least {count + 1}"
         raise ConfigError([config.document.fault(("assimilation", "members"), message)])
     prior = Prior(terms, config.dependence)
-    problem = InverseProblem(config.model, config.observable, observations, prior, fixed, perturbations)
+    problem = InverseProblem(config.model, config.observable, observations, prior, fixed, perturbations, tied)
     if varying:
         problem = problem.varied(varying)
     check_problem(problem)
@@ -280,6 +284,7 @@ def resolve_parameters(
     terms: list[PriorTerm] = []
     fixed: dict[str, float] = {}
     faults: list[Fault] = []
+    tied: list[Tied] = []
     for entry in config.parameters:
         path = ("parameters", entry.parameter.name)
         try:
@@ -287,6 +292,8 @@ def resolve_parameters(
                 fixed[entry.parameter.name] = entry.value
             elif isinstance(entry, Uncertain):
                 terms.append(entry.term(_maximum(entry, config, observations)))
+            elif isinstance(entry, Tied):
+                tied.append(entry)
             elif observations is None:
                 raise ConfigError("the value comes from the data file, and there is none; set a value")
             else:
@@ -295,6 +302,13 @@ def resolve_parameters(
             faults += [config.document.fault((*path, f.path) if f.path else path, f.message) for f in error.problems]
         except UnitError as error:
             faults.append(config.document.fault(path, str(error)))
+    for entry in tied:
+        if entry.to in fixed:
+            path = ("parameters", entry.parameter.name)
+            try:
+                fixed[entry.parameter.name] = inside_bounds(fixed[entry.to] * entry.factor, entry.parameter)
+            except ConfigError as error:
+                faults.append(config.document.fault(path, str(error)))
     if faults:
         raise ConfigError(faults)
     return tuple(terms), fixed

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -43,10 +43,15 @@ _RECIPES = {
 
 def _bounded(text: Any, parameter: Parameter) -> float:
     """A value in the parameter's unit. Raises :class:`ConfigError`, :class:`UnitError`."""
+    return inside_bounds(parse_quantity(text, parameter.unit), parameter, brief(str(text), 80))
+
+
+def inside_bounds(value: float, parameter: Parameter, shown: str = "") -> float:
+    """The value, in the parameter's unit. Raises :class:`ConfigError` with it as ``shown``."""
     low, high = parameter.bounds
-    value = parse_quantity(text, parameter.unit)
     if not low <= value <= high:
-        raise ConfigError(f"{brief(str(text), 80)} is outside the bounds [{low:g}, {high:g}] {parameter.unit}")
+        words = shown or f"{value:g} {parameter.unit}"
+        raise ConfigError(f"{words} is outside the bounds [{low:g}, {high:g}] {parameter.unit}")
     return value
 
 
@@ -97,6 +102,43 @@ class FromFile(Section):
     """Name of a scalar in the data file, e.g. Req."""
     unit: Annotated[str, unit_of(subject_unit)]
     """Unit of that scalar in the file."""
+
+
+class TiedSection(Section):
+    """A parameter that has the value of another one, or a multiple of it."""
+
+    tied: Annotated[str, Field(min_length=1)]
+    """Name of the other parameter, which has a prior or a value."""
+    factor: float = 1.0
+    """Multiple of it."""
+
+
+@dataclass(frozen=True)
+class Tied:
+    """A parameter that is ``factor`` times the one named ``to``."""
+
+    needs_data: ClassVar[bool] = False
+    parameter: Parameter
+    to: str
+    factor: float
+
+    def check(self, found: Mapping[str, Entry], own: Sequence[str]) -> None:
+        """Raise :class:`ConfigError` where it cannot follow; ``own`` are the names of the model's parameters."""
+        name, other = self.parameter.name, found.get(self.to)
+        if name not in own:
+            raise ConfigError(f"{name} is no parameter of the model and cannot be tied")
+        if other is None or self.to not in own or self.to == name:
+            names = [one for one in found if one in own and one != name]
+            raise ConfigError(
+                [Fault(f"{self.to!r} is no other parameter of the model{suggest(self.to, names)}", "tied")]
+            )
+        if isinstance(other, Tied):
+            raise ConfigError([Fault(f"{self.to} is tied itself; tie {name} to {other.to}", "tied")])
+        if isinstance(other, Uncertain) and other.spec.varies is not None:
+            raise ConfigError([Fault(f"{self.to} varies in time, and nothing can follow that", "tied")])
+        if other.parameter.unit != self.parameter.unit:
+            units = f"{other.parameter.unit}, {name} in {self.parameter.unit}"
+            raise ConfigError([Fault(f"{self.to} is in {units}", "tied")])
 
 
 @dataclass(frozen=True)
@@ -234,7 +276,7 @@ class Uncertain:
         return std.absolute(mean)
 
 
-Entry = Fixed | Scalar | Uncertain
+Entry = Fixed | Scalar | Uncertain | Tied
 
 
 def _entry(given: Any, context: Context) -> Entry:
@@ -245,6 +287,9 @@ def _entry(given: Any, context: Context) -> Entry:
     if "from_file" in given:
         scalar = FromFile.model_validate(given, context=context)
         return Scalar(parameter, scalar.from_file, scalar.unit)
+    if "tied" in given:
+        tied = TiedSection.model_validate(given, context=context)
+        return Tied(parameter, tied.tied, tied.factor)
     entry = Uncertain(parameter, PriorSection.model_validate(given, context=context))
     if entry.spec.varies is not None and not can_vary(context.model, parameter.name):
         raise ConfigError([Fault(f"{parameter.name} cannot vary: {_why_not(context.model, parameter)}", "varies")])
@@ -291,6 +336,11 @@ def entries(kind: str = "") -> Made:
             for name, entry in found.items():
                 if kind and entry.needs_data:
                     faults.add((name,), f"{kind} has no data file to take a value from")
+                if isinstance(entry, Tied):
+                    with faults.at(name):
+                        entry.check(found, [p.name for p in model.parameters])
+                if kind and isinstance(entry, Tied):
+                    faults.add((name, "tied"), f"{kind} has no tied parameters; give a value or a prior")
                 if kind and isinstance(entry, Uncertain) and entry.from_ensemble:
                     faults.add((name, "prior"), f"{kind} has no ensemble of its own; give it another prior")
                 if kind and isinstance(entry, Uncertain) and entry.spec.varies is not None:

@@ -154,8 +154,11 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
     if unknown := {p.field for p in problem.perturbations} - set(problem.model.layout.names):
         raise ConfigError(f"initial_state: {', '.join(sorted(unknown))}: not a field of the model's state")
     required = {p.name for p in (*discrepancy, *perturbed, *problem.model.parameters)} - {TIME_SHIFT.name}
+    tied = {tie.parameter.name for tie in problem.tied}
     for names, message in (
-        (required - estimated - fixed, "neither fixed nor estimated"),
+        (required - estimated - fixed - tied, "neither fixed nor estimated"),
+        (tied & (estimated | fixed), "tied, and fixed or estimated as well"),
+        ({tie.to for tie in problem.tied} - estimated, "not estimated, but others are tied to it"),
         (estimated & fixed, "both fixed and estimated"),
         ((estimated | fixed) - set(known), "not a parameter of the model"),
     ):

@@ -76,7 +76,7 @@ class ForwardRuns:
                 raise ConfigError(f"{o.name}: a population needs independent Gaussian errors of known std")
             self.times[s] = o.times[-1]
             self.times[s, :k], self.values[s, :k], self.weight[s, :k] = o.times, o.values, o.weights / o.std**2
-            key = id(p.model), id(p.observable), tuple(sorted(p.fixed.items())), p.perturbations
+            key = id(p.model), id(p.observable), tuple(sorted(p.fixed.items())), p.perturbations, p.tied
             alike.setdefault(key, []).append(s)
         self.groups = [(Predictor(problems[sets[0]], executor), sets) for sets in alike.values()]
 

@@ -166,7 +166,7 @@ def sobol_box(centre: Array, half: Array, count: int, seed: int) -> Array:
 def _searched(problem: InverseProblem) -> tuple[object, ...]:
     """What data sets of one design have in common besides the model."""
     terms = [(t.parameter.name, t.transform, t.bounds, t.shape) for t in problem.prior.terms]
-    return terms, problem.fixed, problem.perturbations, problem.observable.name
+    return terms, problem.fixed, problem.perturbations, problem.tied, problem.observable.name
 
 
 def _without_shift(problem: InverseProblem) -> InverseProblem:

@@ -68,7 +68,7 @@ def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]
         "/prior_predictive": group(_predictive(a, a.prior_predictions, a.prior_trajectories)),
         "/posterior_predictive": group(_predictive(a, a.posterior_predictions, a.posterior_trajectories)),
         "/observed_data": group(*_observed(a)),
-        "/constant_data": group(_constants(a)),
+        "/constant_data": group(_constants(a), _tied(a)),
         "/sample_stats": group(_sample_stats(a), _scalars(a)),
         "/log_likelihood": group({a.problem.observable.name: log_likelihood}),
         "/iterations": group(_iterations(a)),
@@ -82,6 +82,12 @@ def _correlated(a: Analysis) -> dict[str, Any]:
         for block in a.problem.prior.blocks
     ]
     return {"correlated": json.dumps(blocks)} if blocks else {}
+
+
+def _tied(a: Analysis) -> dict[str, Any]:
+    """Which parameters follow another one, and by which factor."""
+    tied = {tie.parameter.name: [tie.to, tie.factor] for tie in a.problem.tied}
+    return {"tied": json.dumps(tied)} if tied else {}
 
 
 def about(p: Parameter) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from scipy import stats
 from toys import Vectorised, make_problem
 
 from en4dvar.assimilate import assimilate, log_posterior
+from en4dvar.config.dependence import term_of_members
 from en4dvar.dependence import Block
 from en4dvar.errors import ConfigError
 from en4dvar.population import estimate_population
@@ -147,3 +148,19 @@ def test_blocks_that_do_not_suit_the_prior_are_refused():
         Prior(terms, (Block(("a", "e"), pair),))
     with pytest.raises(ValueError, match="independent parameters"):
         estimate_population(None, np.zeros((3, 5, 4)), Prior(terms, (BLOCK,)), ("a",), 1)
+
+
+@pytest.mark.parametrize("members", [12, 30])
+def test_posterior_with_an_ensemble_as_prior(members):
+    """Its Gaussian, whatever the number of members; with as many as the file has, they are the file's."""
+    problem, found = linear_problem(None), np.random.default_rng(2).standard_normal((12, 4)) @ np.diag([1, 2, 0.5, 1])
+    made = [term_of_members(p, x, None) for p, x in zip(problem.prior.parameters, found.T, strict=True)]
+    y = np.stack([scores for _, scores in made], axis=1)
+    block = Block(NAMES, np.corrcoef(y.T), y)
+    problem = replace(problem, prior=Prior(tuple(term for term, _ in made), (block,)))
+    assert covariance(problem.prior) == pytest.approx(np.cov(found.T), abs=1e-12)
+    analysis = assimilate(problem, AssimilationSettings(members=members), 1)
+    mean, expected, _ = closed_form(problem)
+    assert analysis.posterior.mean(axis=0) == pytest.approx(mean, abs=1e-10)
+    assert np.cov(analysis.posterior.T) == pytest.approx(expected, abs=1e-10)
+    assert np.allclose(analysis.prior[:12], found, atol=1e-10) == (members == 12)
