@@ -361,7 +361,7 @@ class Prior:
             if block.members is not None and len(block.members) == n_members:
                 z[:, columns] = block.whitened(block.members)
         if method == "exact":
-            z = _whiten_sample(z)
+            z = whiten_sample(z)
         return self.from_white(z)
 
 
@@ -394,7 +394,7 @@ def member_stream(seed: int, name: str, member: int = 0) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(key=key, counter=np.array([0, 0, 0, member], dtype=np.uint64)))
 
 
-def _whiten_sample(z: Array) -> Array:
+def whiten_sample(z: Array) -> Array:
     """Members (N, n) with zero mean and unit sample covariance, column j made from columns 0…j."""
     q, r = np.linalg.qr(z - z.mean(axis=0))
     q = q * np.sign(np.diag(r))
