@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar import diagnostics as diag
 from en4dvar.analysis import Analysis, Discrepancy, Mode, Progress, Record
@@ -142,7 +143,7 @@ class _Assimilation:
                 "discrepancy; use en4dvar"
             )
         self.space = WeightSpace(problem, settings, seed, executor)
-        self.grid = np.linspace(problem.observations.times[0], problem.observations.times[-1], GRID_POINTS)
+        self.grid = np.linspace(*problem.observations.span, GRID_POINTS)
 
     def run(self, resume: LoopState | None) -> Analysis:
         problem, space, noise = self.problem, self.space, self.problem.observations.noise
@@ -247,9 +248,31 @@ class _Assimilation:
         if linear is None:
             return None
         at = linear.prediction
-        rates = np.gradient(at.values, observations.times) if at.rates is None else at.rates
+        speed = np.abs(self.rates(at))
         white, sensitivity = observations.whiten(linear)
-        return Residuals.of(white, sensitivity, len(self.space.members) - 1, np.abs(rates), observations.used)
+        if observations.parts:
+            speed = speed / observations.std
+        precision = len(self.space.members) - 1
+        return Residuals.of(white, sensitivity, precision, speed, observations.used, self.in_a_row())
+
+    def in_a_row(self) -> npt.NDArray[np.intp]:
+        """(K,) a label for each series; for each reading, where it has several places."""
+        labels = np.arange(len(self.problem.observations))
+        for part in self.problem.parts:
+            if part.has_path:
+                labels[part.where] = part.begin
+        return labels
+
+    def rates(self, at: Predicted) -> Array:
+        """How fast each observable changes at its readings (K,), by differences where the model does not say; zero of
+        a series with several places, or fewer than two readings."""
+        if at.rates is not None:
+            return at.rates
+        rates = np.zeros_like(at.values)
+        for part in self.problem.parts:
+            if part.has_path and part.end - part.begin > 1:
+                rates[part.where] = np.gradient(at.values[part.where], self.problem.observations.times[part.where])
+        return rates
 
     def influence(self, run: Forecast, members: Array, response: LinearResponse, gaussian: bool) -> Influence | None:
         """Of each reading on the posterior ``members`` (N, n), whose ``run`` it is; None where it cannot be told.

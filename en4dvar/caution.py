@@ -54,6 +54,11 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
         "caution",
         "look at the figure of the residuals and at these readings before quoting the intervals",
     ),
+    "not-bayesian": (
+        "caution",
+        "say in every quotation how readings were weighted; for the Bayesian posterior state the errors as they are "
+        "and leave the weights out (assimilation.weights: sum)",
+    ),
     "overstated-error": ("caution", "state the observation error as it is (or estimate sigma); intervals are too wide"),
     "not-informed": ("note", "do not quote it as measured: fix it, or add data that depend on it"),
     "down-weighted": ("note", "look at these observations; they count less than the others"),

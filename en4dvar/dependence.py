@@ -23,7 +23,7 @@ LEAST_INDEPENDENT = 1e-10  # share of its variance that a parameter must keep, g
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class Dependence:
     """``names`` (m) of parameters with the correlation ``matrix`` (m, m), independent of all others.
 
     ``members`` (N, m): the standardised members of an ensemble whose correlation the matrix is. A prior ensemble of N
@@ -58,7 +58,7 @@ class Block:
             raise ConfigError(f"{words}: the matrix is not positive definite, as a correlation must be")
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Block) and self.names == other.names and np.array_equal(self.matrix, other.matrix)
+        return isinstance(other, Dependence) and self.names == other.names and np.array_equal(self.matrix, other.matrix)
 
     def __hash__(self) -> int:
         return hash(self.names)
@@ -82,7 +82,7 @@ class Block:
         """L z, of (…, m)."""
         return np.asarray(z @ self.root.T)
 
-    def among(self, names: Sequence[str]) -> Block | None:
+    def among(self, names: Sequence[str]) -> Dependence | None:
         """The block of those of its parameters that are in ``names``; None where fewer than two are left."""
         kept = [i for i, name in enumerate(self.names) if name in names]
         if len(kept) == len(self.names):
@@ -90,4 +90,4 @@ class Block:
         if len(kept) < 2:
             return None
         members = None if self.members is None else self.members[:, kept]
-        return Block(tuple(self.names[i] for i in kept), self.matrix[np.ix_(kept, kept)], members)
+        return Dependence(tuple(self.names[i] for i in kept), self.matrix[np.ix_(kept, kept)], members)

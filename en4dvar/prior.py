@@ -7,8 +7,8 @@ Each parameter θ has a transform x = f(θ) to an unbounded coordinate in which 
     logit      x = ln((θ − a) / (b − θ))         a < θ < b
     uniform, half-normal, beta                   x = Φ⁻¹(F(θ)), the Gaussian score (:mod:`en4dvar.parameter_map`)
 
-Parameters are independent but for those of a :class:`~en4dvar.dependence.Block`, which are correlated in transformed
-space.
+Parameters are independent but for those of a :class:`~en4dvar.dependence.Dependence`, which are correlated in
+transformed space.
 
 Random numbers are counter-based (Philox; Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"): the key is
 (seed, parameter name), the counter is the member. Growing N leaves the first members' draws as they were, adding a
@@ -27,7 +27,7 @@ from typing import Literal
 import numpy as np
 
 from en4dvar import parameter_map
-from en4dvar.dependence import Block
+from en4dvar.dependence import Dependence
 from en4dvar.errors import ConfigError
 from en4dvar.parameter_map import QUANTILE_MAPS
 from en4dvar.state import Array, Parameter, TransformName
@@ -215,7 +215,7 @@ class Prior:
     """
 
     terms: tuple[PriorTerm, ...]
-    blocks: tuple[Block, ...] = ()
+    blocks: tuple[Dependence, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.terms:
@@ -292,7 +292,7 @@ class Prior:
         return np.stack([term.from_physical(theta[..., j]) for j, term in enumerate(self.terms)], axis=-1)
 
     @cached_property
-    def _placed(self) -> tuple[tuple[list[int], Block], ...]:
+    def _placed(self) -> tuple[tuple[list[int], Dependence], ...]:
         """Each block with the columns of its parameters."""
         columns = {name: j for j, name in enumerate(self.names)}
         return tuple(([columns[name] for name in block.names], block) for block in self.blocks)

@@ -17,7 +17,7 @@ from en4dvar.config.document import Document
 from en4dvar.config.parameters import Entry, Uncertain
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
-from en4dvar.dependence import Block
+from en4dvar.dependence import Dependence
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.files import expanded
 from en4dvar.hints import suggest
@@ -110,7 +110,7 @@ class PriorFile(Section):
         return {**super().as_written(given), "ensemble": str(self.ensemble)}
 
 
-def joined(found: Sequence[tuple[tuple[str, ...], Array]]) -> tuple[Block, ...]:
+def joined(found: Sequence[tuple[tuple[str, ...], Array]]) -> tuple[Dependence, ...]:
     """Blocks of correlations between some names each; what shares a name is one block, zero where nothing is said.
 
     Raises
@@ -125,13 +125,13 @@ def joined(found: Sequence[tuple[tuple[str, ...], Array]]) -> tuple[Block, ...]:
     return tuple(_one_block([found[k] for k in sorted(group)]) for group in groups)
 
 
-def _one_block(parts: Sequence[tuple[tuple[str, ...], Array]]) -> Block:
+def _one_block(parts: Sequence[tuple[tuple[str, ...], Array]]) -> Dependence:
     if len(parts) == 1:
-        return Block(*parts[0])
+        return Dependence(*parts[0])
     names = tuple(dict.fromkeys(name for each, _ in parts for name in each))
     matrix, said = np.eye(len(names)), np.eye(len(names), dtype=bool)
     for each, part in parts:
-        Block(each, part)  # a fault of it alone is told of it alone
+        Dependence(each, part)  # a fault of it alone is told of it alone
         columns = [names.index(name) for name in each]
         where = np.ix_(columns, columns)
         again = said[where] & ~np.eye(len(columns), dtype=bool)
@@ -139,7 +139,7 @@ def _one_block(parts: Sequence[tuple[tuple[str, ...], Array]]) -> Block:
             i, j = np.argwhere(again)[0]
             raise ConfigError(f"the correlation of {each[i]} and {each[j]} is given twice")
         matrix[where], said[where] = part, True
-    return Block(names, matrix)
+    return Dependence(names, matrix)
 
 
 def resolved(
@@ -149,7 +149,7 @@ def resolved(
     others: Sequence[str],
     apart: Mapping[str, str],
     document: Document,
-) -> tuple[tuple[Entry, ...], tuple[Block, ...]]:
+) -> tuple[tuple[Entry, ...], tuple[Dependence, ...]]:
     """The entries with the priors that an ensemble makes, and what the priors have to do with each other.
 
     Parameters
@@ -162,7 +162,7 @@ def resolved(
     """
     faults: list[Fault] = []
     asking = [e for e in entries if isinstance(e, Uncertain) and e.from_ensemble]
-    found: tuple[Block, ...] = ()
+    found: tuple[Dependence, ...] = ()
     made: dict[str, Entry] = {}
     if asking or ensemble is not None:
         try:
@@ -177,7 +177,7 @@ def resolved(
         try:
             _check_names(one.between, estimated, alone)
             parts.append((one.between, one.of_all(read_square)))
-            Block(*parts[-1])
+            Dependence(*parts[-1])
         except (ConfigError, DataError) as error:
             faults.append(document.fault(place, str(error)))
     if not faults:
@@ -198,7 +198,7 @@ def _check_names(names: Sequence[str], estimated: Sequence[str], apart: Mapping[
 
 def _of_ensemble(
     asking: Sequence[Uncertain], ensemble: PriorFile | None, apart: Mapping[str, str]
-) -> tuple[tuple[Block, ...], dict[str, Entry]]:
+) -> tuple[tuple[Dependence, ...], dict[str, Entry]]:
     """The Gaussian of the members' mean and covariance in transformed space. Raises :class:`ConfigError` with paths."""
     if ensemble is None:
         raise _at(f"parameters.{asking[0].parameter.name}", "no ensemble is given; write 'prior: {ensemble: FILE}'")
@@ -230,7 +230,7 @@ def _of_ensemble(
     matrix = np.atleast_2d(np.corrcoef(y.T))
     np.fill_diagonal(matrix, 1.0)
     try:
-        return (Block(tuple(made), matrix, y),), made
+        return (Dependence(tuple(made), matrix, y),), made
     except ConfigError as error:
         raise _at("prior.ensemble", f"{ensemble.ensemble}: {error}") from None
 

@@ -55,7 +55,7 @@ def preview(problem: InverseProblem, settings: AssimilationSettings, seed: int, 
     that fail are told by ``run.failures``, not raised.
     """
     y = problem.observations
-    grid = np.linspace(y.times[0], y.times[-1], GRID_POINTS)
+    grid = np.linspace(*y.span, GRID_POINTS)
     executor = SerialExecutor()
     with one_blas_thread():
         space = WeightSpace(problem, settings, seed, executor)

@@ -109,6 +109,10 @@ def _followed(tie: Tie, values: Array) -> Array:
     return np.asarray(found)
 
 
+class MisshapenError(ValueError):
+    """An observation operator gave another number of values than there are instants."""
+
+
 def _without(failures: list[str]) -> Indices:
     return np.flatnonzero([not reason for reason in failures]) if any(failures) else EVERYONE
 
@@ -145,6 +149,9 @@ class Reading:
                 continue
             try:
                 one = self._all([outcome])
+            except MisshapenError:
+                reasons[i] = "misshapen prediction"
+                continue
             except BaseException as error:  # H belongs to the user as well
                 reasons[i] = reason_of(error)
                 continue

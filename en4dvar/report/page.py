@@ -168,7 +168,7 @@ def _iterations(result: StoredResult) -> list[tuple[str, ...]]:
 def _settings(result: StoredResult) -> list[tuple[str, str]]:
     """The scheme's settings and how observations are weighted."""
     given = json.loads(str(result.attributes["assimilation_settings"]))
-    weights = result.observed_data["weights"].values
+    weights = result.of_readings("observed_data", "weights", shared=True)
     total = f"{len(weights)} observations, weights sum to {plain_number(float(weights.sum()))}"
     return [*((key.replace("_", " "), str(value)) for key, value in given.items()), ("observations", total)]
 

@@ -18,7 +18,7 @@ LAYERS = (
     ("state", "hints", "files", "tables", "caution", "compiled", "user_code", "user_file"),
     ("dependence", "parameter_map"),
     ("units", "prior", "forward", "noise"),
-    ("batch", "observations"),
+    ("batch", "series", "observations"),
     ("varying",),
     ("problem", "diagnostics", "residuals", "influence"),
     ("executor",),

@@ -126,6 +126,7 @@ PROVOKED: dict[str, Callable[[], Analysis]] = {
         make_problem(Fragile(-0.9, names=TWO), (-1.0, 0.5)), start="prior-mean", min_active_fraction=0.2
     ),
     "down-weighted": lambda: run(outlier()),
+    "not-bayesian": lambda: run(make_problem(Vectorised(TWO), (1.0, 0.5), weights=1 / 9)),
     "not-informed": lambda: run(linear(scale=0.01, std=0.5)),
 }
 

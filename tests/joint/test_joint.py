@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from toys import Decay, Fragile, Linear, Vectorised, make_observations
 
-from en4dvar.dependence import Block
+from en4dvar.dependence import Dependence
 from en4dvar.errors import ConfigError
 from en4dvar.joint import estimate
 from en4dvar.joint.arrow import Arrow
@@ -184,7 +184,7 @@ def test_the_arrow_is_the_dense_matrix():
 
 def correlated(problem):
     """Its first two parameters are."""
-    block = Block(problem.prior.names[:2], np.array([[1.0, 0.5], [0.5, 1.0]]))
+    block = Dependence(problem.prior.names[:2], np.array([[1.0, 0.5], [0.5, 1.0]]))
     return replace(problem, prior=replace(problem.prior, blocks=(block,)))
 
 

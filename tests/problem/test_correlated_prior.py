@@ -10,7 +10,7 @@ from toys import Vectorised, make_problem
 
 from en4dvar.assimilate import assimilate, log_posterior
 from en4dvar.config.dependence import term_of_members
-from en4dvar.dependence import Block
+from en4dvar.dependence import Dependence
 from en4dvar.errors import ConfigError
 from en4dvar.population import estimate_population
 from en4dvar.prior import Prior, PriorTerm
@@ -20,7 +20,7 @@ from en4dvar.state import Parameter
 
 NAMES = ("a", "b", "c", "d")
 MATRIX = np.array([[1.0, 0.7, -0.2], [0.7, 1.0, 0.3], [-0.2, 0.3, 1.0]])
-BLOCK = Block(("d", "a", "c"), MATRIX)  # neither side by side nor in the order of the control vector
+BLOCK = Dependence(("d", "a", "c"), MATRIX)  # neither side by side nor in the order of the control vector
 
 
 def linear_problem(block=BLOCK, scale=(1.0, 0.5, 2.0, 1.5)):
@@ -108,7 +108,7 @@ def test_density_and_white_coordinates():
 def test_the_marginals_stay_and_the_correlation_is_that_of_the_logarithms():
     a, b = Parameter("a", "Pa"), Parameter("b", "1")
     terms = PriorTerm.lognormal(a, 2.0, 0.5), PriorTerm.uniform(b, (0.0, 1.0))
-    prior = Prior(terms, (Block(("a", "b"), np.array([[1.0, 0.8], [0.8, 1.0]])),))
+    prior = Prior(terms, (Dependence(("a", "b"), np.array([[1.0, 0.8], [0.8, 1.0]])),))
     theta = prior.to_physical(prior.sample(4000, 1))
     assert stats.kstest(theta[:, 1], "uniform").pvalue > 0.01
     assert np.corrcoef(np.log(theta[:, 0]), stats.norm.ppf(theta[:, 1]))[0, 1] == pytest.approx(0.8, abs=1e-10)
@@ -136,16 +136,16 @@ def test_a_prior_of_some_of_the_parameters_keeps_their_correlations():
 )
 def test_what_is_no_correlation_is_refused(names, matrix, words):
     with pytest.raises(ConfigError, match=words):
-        Block(names, np.array(matrix, dtype=float))
+        Dependence(names, np.array(matrix, dtype=float))
 
 
 def test_blocks_that_do_not_suit_the_prior_are_refused():
     terms = linear_problem().prior.terms
     pair = np.array([[1.0, 0.5], [0.5, 1.0]])
     with pytest.raises(ConfigError, match="in two blocks"):
-        Prior(terms, (BLOCK, Block(("a", "b"), pair)))
+        Prior(terms, (BLOCK, Dependence(("a", "b"), pair)))
     with pytest.raises(ConfigError, match="e is correlated, but not estimated"):
-        Prior(terms, (Block(("a", "e"), pair),))
+        Prior(terms, (Dependence(("a", "e"), pair),))
     with pytest.raises(ValueError, match="independent parameters"):
         estimate_population(None, np.zeros((3, 5, 4)), Prior(terms, (BLOCK,)), ("a",), 1)
 
@@ -156,7 +156,7 @@ def test_posterior_with_an_ensemble_as_prior(members):
     problem, found = linear_problem(None), np.random.default_rng(2).standard_normal((12, 4)) @ np.diag([1, 2, 0.5, 1])
     made = [term_of_members(p, x, None) for p, x in zip(problem.prior.parameters, found.T, strict=True)]
     y = np.stack([scores for _, scores in made], axis=1)
-    block = Block(NAMES, np.corrcoef(y.T), y)
+    block = Dependence(NAMES, np.corrcoef(y.T), y)
     problem = replace(problem, prior=Prior(tuple(term for term, _ in made), (block,)))
     assert covariance(problem.prior) == pytest.approx(np.cov(found.T), abs=1e-12)
     analysis = assimilate(problem, AssimilationSettings(members=members), 1)
