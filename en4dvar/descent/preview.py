@@ -20,19 +20,21 @@ ENOUGH = 0.3  # seconds of forward runs that the time of one is taken from
 LONGEST = 20.0  # seconds that the forecast of the prior ensemble may take unasked
 ITERATIONS = 5  # of a descent, typically
 SEARCH = 3  # runs of a step control, typically
+CHALLENGER = 0.5  # of a descent, until one from a far member has come to the same minimum
 
 
 @dataclass(frozen=True)
 class Preview:
     """The prior ensemble of one data set before any assimilation.
 
-    ``run`` is its forecast: predictions (N, K) and, along ``grid`` (M,), paths (N, M); of the first members only where
-    all would take long. ``seconds`` is the time of one forward run on one thread, ``runs`` how many an estimate takes,
-    typically.
+    ``run`` is the forecast of its ``members`` (N, n), physical: predictions (N, K) and, along ``grid`` (M,), paths
+    (N, M); of the first ones only where all would take long. ``seconds`` is the time of one forward run on one thread,
+    ``runs`` how many an estimate takes, typically.
     """
 
     problem: InverseProblem
     grid: Array
+    members: Array
     run: Forecast
     seconds: float
     runs: int
@@ -66,7 +68,7 @@ def preview(problem: InverseProblem, settings: AssimilationSettings, seed: int, 
         runs = expected_runs(space)
         if problem.varying:  # its evidence takes a second fit
             runs += expected_runs(WeightSpace(problem.constant, settings, seed, executor))
-    return Preview(problem, grid, run, seconds, runs)
+    return Preview(problem, grid, problem.prior.to_physical(members), run, seconds, runs)
 
 
 def _seconds_per_run(problem: InverseProblem, members: Array, executor: Executor) -> tuple[float, int]:
@@ -86,7 +88,7 @@ def expected_runs(space: WeightSpace) -> int:
 
     A scheme that runs its whole ensemble does so once for each assimilation and once at the end, with the mean. A
     search takes prior and posterior forecast, and for each iteration a tangent (of n runs, or N) and the trials of the
-    step control, ``starts`` descents side by side.
+    step control, ``starts`` descents side by side, and a part of one more from a far member.
     """
     settings, n_members = space.settings, len(space.members)
     scheme = window_scheme(settings)
@@ -95,4 +97,6 @@ def expected_runs(space: WeightSpace) -> int:
     economical = scheme.economical(space.basis)
     tangent = 1 + (space.basis.shape[1] if economical else n_members)
     starts = settings.starts if settings.start == "best-member" and economical else 1
-    return 2 * (n_members + 1) + starts * min(ITERATIONS, settings.max_iterations) * (tangent + SEARCH)
+    challenger = CHALLENGER if settings.starts > 1 and economical else 0.0
+    iterations = (starts + challenger) * min(ITERATIONS, settings.max_iterations)
+    return 2 * (n_members + 1) + round(iterations * (tangent + SEARCH))

@@ -20,7 +20,7 @@ from en4dvar.analysis import Analysis
 from en4dvar.caution import codes
 from en4dvar.diagnostics import active_members, nrmse
 from en4dvar.state import Array, Parameter
-from en4dvar.storage.modes import mode_variables
+from en4dvar.storage.modes import descent_scalars, mode_variables
 from en4dvar.storage.netcdf import Group, netcdf_attributes
 from en4dvar.storage.netcdf import variable as _variable
 from en4dvar.storage.readings import (
@@ -215,7 +215,7 @@ def _scalars(a: Analysis) -> dict[str, Any]:
         "stop_reason": a.stop_reason,
         "forward_runs": a.forward_runs,
         "n_modes": len(a.modes),
-        "n_agreeing": a.modes[0].descents if a.modes else 1,
+        **descent_scalars(a),
         "what_if_runs": sum(shift.runs for shift in a.what_if),
         "ledger_runs": a.ledger.runs if a.ledger else 0,
         "warning_codes": " ".join(codes(a.cautions)),

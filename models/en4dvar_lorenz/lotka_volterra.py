@@ -6,8 +6,7 @@ Sources: Lotka (1925), Elements of Physical Biology; Volterra (1926), Nature 118
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated
 
 import numpy as np
 from numba import njit
@@ -16,6 +15,7 @@ from pydantic import Field as Setting
 
 from en4dvar import Field, Observable, Parameter, StateField, StateLayout
 from en4dvar_lorenz.autonomous import Autonomous
+from en4dvar_lorenz.logarithm import Logarithm
 from en4dvar_lorenz.rk4 import rk4
 
 SOURCE = "Lotka (1925), Volterra (1926)"
@@ -40,17 +40,6 @@ def tendency(x: np.ndarray, dx: np.ndarray) -> None:
 @njit(nogil=True)
 def integrate(start: np.ndarray, times: np.ndarray, longest: float) -> np.ndarray:
     return rk4(tendency, start, times, longest)
-
-
-@dataclass(frozen=True)
-class Logarithm:
-    """H that reads the natural logarithm of a positive field: errors that are a share of it have one std there."""
-
-    name: str
-    batched: ClassVar[bool] = True
-
-    def __call__(self, trajectory: Any) -> np.ndarray:
-        return np.log(trajectory[self.name])
 
 
 def _positive(name: str, label: str, symbol: str) -> Parameter:
