@@ -473,7 +473,7 @@ class _Assimilation:
 
     def costs(self, members: Array, run: Forecast) -> Array:
         """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""
-        z = (members - self.problem.prior.mean) / self.problem.prior.std
+        z = self.problem.prior.white(members)
         return np.where(run.active, 0.5 * np.sum(z**2, axis=1) + self.space.observation_cost(run), np.inf)
 
     def keep(self, state: Callable[[], LoopState]) -> None:

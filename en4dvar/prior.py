@@ -1,10 +1,14 @@
-"""Priors: independent Gaussians in transformed space, physical values outside, never clipped.
+"""Priors: Gaussians in transformed space, physical values outside, never clipped.
 
 Each parameter θ has a transform x = f(θ) to an unbounded coordinate in which its prior is N(mean, std²):
 
     normal     x = θ
     lognormal  x = ln θ                          θ > 0
     logit      x = ln((θ − a) / (b − θ))         a < θ < b
+    uniform, half-normal, beta                   x = Φ⁻¹(F(θ)), the Gaussian score (:mod:`en4dvar.parameter_map`)
+
+Parameters are independent but for those of a :class:`~en4dvar.dependence.Dependence`, which are correlated in
+transformed space.
 
 Random numbers are counter-based (Philox; Salmon et al. 2011, "Parallel random numbers: as easy as 1, 2, 3"): the key is
 (seed, parameter name), the counter is the member. Growing N leaves the first members' draws as they were, adding a
@@ -22,12 +26,16 @@ from typing import Literal
 
 import numpy as np
 
+from en4dvar import parameter_map
+from en4dvar.dependence import Dependence
 from en4dvar.errors import ConfigError
+from en4dvar.parameter_map import QUANTILE_MAPS
 from en4dvar.state import Array, Parameter, TransformName
 
 Sampling = Literal["exact", "random"]
 LARGEST = 1e150  # its square is a number still
 LARGEST_LOG = 300.0  # std of a logarithm or logit: one std is 130 powers of ten
+SHAPES = 0.1, 1e6  # smallest and largest α, β of a beta
 RESOLVED = 1e-12  # of the mean: an ensemble that spreads by less has four digits at most
 
 
@@ -35,7 +43,8 @@ RESOLVED = 1e-12  # of the mean: an ensemble that spreads by less has four digit
 class PriorTerm:
     """The prior of one parameter; ``mean`` and ``std`` are those of the transformed coordinate.
 
-    Use the constructors, which take physical values. ``bounds`` (a, b) belong to ``logit`` and are physical.
+    Use the constructors, which take physical values. ``bounds`` (a, b) belong to ``logit`` and to the kinds of
+    :mod:`en4dvar.parameter_map`, and are physical; ``shape`` holds the other numbers of the latter.
 
     Raises
     ------
@@ -47,6 +56,7 @@ class PriorTerm:
     mean: float
     std: float
     bounds: tuple[float, float] = (-math.inf, math.inf)
+    shape: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         self._require(math.isfinite(self.mean), "the mean must be finite")
@@ -113,6 +123,58 @@ class PriorTerm:
             )
         return cls(parameter, "logit", math.log((median - low) / (high - median)), logit_std, (low, high))
 
+    @classmethod
+    def uniform(cls, parameter: Parameter, bounds: tuple[float, float]) -> PriorTerm:
+        """θ equally likely everywhere between finite physical ``bounds``."""
+        return cls._by_quantiles(parameter, "uniform", bounds, ())
+
+    @classmethod
+    def half_normal(cls, parameter: Parameter, std: float, low: float = 0.0) -> PriorTerm:
+        """θ = low + |N(0, std²)|, in the parameter's unit; ``std`` is that of the whole Gaussian."""
+        term = cls._by_quantiles(parameter, "half-normal", (low, math.inf), (std,))
+        around = max(abs(low), 1 / LARGEST)
+        term._require(RESOLVED * around < std < LARGEST, f"a standard deviation of {std:g} beside {low:g}")
+        return term
+
+    @classmethod
+    def beta(cls, parameter: Parameter, bounds: tuple[float, float], alpha: float, beta: float) -> PriorTerm:
+        """(θ − a)/(b − a) ~ Beta(alpha, beta) between finite physical ``bounds`` (a, b)."""
+        for name, value in (("alpha", alpha), ("beta", beta)):
+            if not SHAPES[0] <= value <= SHAPES[1]:
+                raise ConfigError(
+                    f"prior of {parameter.name}: {name} must lie between {SHAPES[0]:g} and {SHAPES[1]:g}, not {value:g}"
+                )
+        return cls._by_quantiles(parameter, "beta", bounds, (alpha, beta))
+
+    @classmethod
+    def _by_quantiles(
+        cls, parameter: Parameter, kind: TransformName, bounds: tuple[float, float], shape: tuple[float, ...]
+    ) -> PriorTerm:
+        (low, high), term = bounds, cls(parameter, kind, 0.0, 1.0, bounds, shape)
+        finite = math.isfinite(low) and (math.isfinite(high) or kind == "half-normal")
+        term._require(finite and low < high, f"{kind} needs finite bounds, low < high, not {bounds}")
+        return term
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Physical limits that θ does not reach, ±inf where there are none."""
+        return (0.0, math.inf) if self.transform == "lognormal" else self.bounds
+
+    @property
+    def has_bound(self) -> bool:
+        """Whether the map, rather than the parameter, sets a limit at which the prior has probability."""
+        return self.transform == "logit" or self.transform in QUANTILE_MAPS
+
+    def slope(self, x: float) -> float:
+        """dθ/dx of the parameter map at a transformed value."""
+        if self.transform in QUANTILE_MAPS:
+            return parameter_map.slope(self.transform, x, self.bounds, self.shape)
+        theta = float(self.to_physical(np.array(x)))
+        if self.transform == "logit":
+            low, high = self.bounds
+            return (theta - low) * (high - theta) / (high - low)
+        return theta if self.transform == "lognormal" else 1.0
+
     def to_physical(self, x: Array) -> Array:
         """θ for transformed values ``x`` of any shape; overflow gives inf, which no model accepts as a value."""
         x = np.asarray(x, dtype=float)
@@ -121,6 +183,8 @@ class PriorTerm:
         if self.transform == "lognormal":
             with np.errstate(over="ignore"):
                 return np.asarray(np.exp(x))
+        if self.transform in QUANTILE_MAPS:
+            return parameter_map.value(self.transform, x, self.bounds, self.shape)
         low, high = self.bounds
         # from the nearer bound, so that values close to it keep their relative precision
         return np.where(x < 0, low + (high - low) * _sigmoid(x), high - (high - low) * _sigmoid(-x))
@@ -135,23 +199,39 @@ class PriorTerm:
         theta = np.asarray(theta, dtype=float)
         if self.transform == "normal":
             return theta
-        low, high = (0.0, math.inf) if self.transform == "lognormal" else self.bounds
+        low, high = self.range
         if not np.all((theta > low) & (theta < high)):
             raise ValueError(f"{self.parameter.name}: values must lie strictly between {low:g} and {high:g}")
+        if self.transform in QUANTILE_MAPS:
+            return parameter_map.score(self.transform, theta, self.bounds, self.shape)
         return np.asarray(np.log(theta) if self.transform == "lognormal" else np.log((theta - low) / (high - theta)))
 
 
 @dataclass(frozen=True)
 class Prior:
-    """Independent prior terms; the control vector holds their parameters in this order."""
+    """Prior terms, independent but for the parameters of ``blocks``; the control vector holds them in this order.
+
+    ``mean`` and ``std`` are those of each coordinate by itself; white coordinates z ~ N(0, I): see :meth:`white`.
+    """
 
     terms: tuple[PriorTerm, ...]
+    blocks: tuple[Dependence, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.terms:
             raise ConfigError("prior: at least one parameter must be estimated")
         if len(set(self.names)) != len(self.names):
             raise ConfigError(f"prior: a parameter is given twice in {', '.join(self.names)}")
+        correlated = [name for block in self.blocks for name in block.names]
+        if len(set(correlated)) != len(correlated):
+            raise ConfigError("prior: a parameter is in two blocks of correlated ones")
+        if missing := set(correlated) - set(self.names):
+            raise ConfigError(f"prior: {', '.join(sorted(missing))} is correlated, but not estimated")
+
+    def of(self, terms: tuple[PriorTerm, ...]) -> Prior:
+        """Of other ``terms``, with the correlations that this prior has between parameters that are among them."""
+        names = {term.parameter.name for term in terms}
+        return Prior(terms, tuple(kept for block in self.blocks if (kept := block.among(tuple(names)))))
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -211,17 +291,61 @@ class Prior:
         """Control vectors (…, n) of physical values ``theta`` (…, n). Raises ValueError outside a transform's range."""
         return np.stack([term.from_physical(theta[..., j]) for j, term in enumerate(self.terms)], axis=-1)
 
+    @cached_property
+    def _placed(self) -> tuple[tuple[list[int], Dependence], ...]:
+        """Each block with the columns of its parameters."""
+        columns = {name: j for j, name in enumerate(self.names)}
+        return tuple(([columns[name] for name in block.names], block) for block in self.blocks)
+
+    def white(self, x: Array) -> Array:
+        """White coordinates z (…, n) of control vectors ``x`` (…, n): N(0, I) under the prior."""
+        return self.white_change(x - self.mean)
+
+    def white_change(self, dx: Array) -> Array:
+        """Changes (…, n) of the white coordinates for changes ``dx`` (…, n) of control vectors."""
+        z = np.asarray(dx / self.std)
+        for columns, block in self._placed:
+            z[..., columns] = block.whitened(z[..., columns])
+        return z
+
+    def from_white(self, z: Array) -> Array:
+        """Control vectors (…, n) of white coordinates ``z`` (…, n)."""
+        return np.asarray(self.mean + self.from_white_change(z))
+
+    def from_white_change(self, dz: Array) -> Array:
+        """Changes (…, n) of control vectors for changes ``dz`` (…, n) of the white coordinates."""
+        if not self.blocks:
+            return np.asarray(self.std * dz)
+        y = np.array(dz, dtype=float)
+        for columns, block in self._placed:
+            y[..., columns] = block.coloured(y[..., columns])
+        return np.asarray(self.std * y)
+
+    def white_covariance(self, covariance: Array) -> Array:
+        """A covariance (n, n) of control vectors in white coordinates."""
+        scaled = covariance / np.outer(self.std, self.std)
+        for columns, block in self._placed:
+            scaled[columns] = block.whitened(scaled[columns].T).T
+            scaled[:, columns] = block.whitened(scaled[:, columns])
+        return np.asarray(scaled)
+
+    @cached_property
+    def log_det_root(self) -> float:
+        """½ ln det of the prior covariance in transformed space."""
+        return float(np.sum(np.log(self.std))) + sum(block.log_det_root for block in self.blocks)
+
     def log_density(self, x: Array) -> Array:
         """Normalised log density (…,) in transformed space of control vectors ``x`` (…, n)."""
-        z = (x - self.mean) / self.std
-        constant = np.sum(np.log(self.std)) + 0.5 * len(self.terms) * math.log(2 * math.pi)
+        z = self.white(x)
+        constant = self.log_det_root + 0.5 * len(self.terms) * math.log(2 * math.pi)
         return np.asarray(-0.5 * np.sum(z * z, axis=-1) - constant)
 
     def sample(self, n_members: int, seed: int, method: Sampling = "exact") -> Array:
         """Prior ensemble (N, n) in transformed space.
 
         ``random``: independent draws. ``exact``: the same draws, affinely corrected so that the sample mean and
-        covariance are the prior's (second-order-exact). The correction is a Gram–Schmidt process in the order of the
+        covariance are the prior's (second-order-exact). An ensemble that a block brings along takes the place of the
+        draws of its parameters where it has N members. The correction is a Gram–Schmidt process in the order of the
         parameters: one added at the end leaves the others as they were, but growing N moves every member.
 
         Raises
@@ -233,9 +357,12 @@ class Prior:
         if n_members < needed:
             raise ConfigError(f"sampling {method!r} of {n} parameters needs at least {needed} members, not {n_members}")
         z = np.column_stack([standard_normal(seed, name, n_members) for name in self.names])
+        for columns, block in self._placed:
+            if block.members is not None and len(block.members) == n_members:
+                z[:, columns] = block.whitened(block.members)
         if method == "exact":
             z = whiten_sample(z)
-        return self.mean + self.std * z
+        return self.from_white(z)
 
 
 def own_seed(seed: int, name: str) -> int:

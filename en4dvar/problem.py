@@ -30,14 +30,23 @@ class StatePerturbation:
 
 
 @dataclass(frozen=True)
+class Tie:
+    """A parameter of the model that is ``factor`` times the one named ``to``, which is estimated."""
+
+    parameter: Parameter
+    to: str
+    factor: float = 1.0
+
+
+@dataclass(frozen=True)
 class InverseProblem:
     """Everything that defines a posterior: F, H, y, R, the prior, and the values held fixed.
 
     The control vector holds ``prior.parameters`` in transformed space. A parameter named ``t_s`` shifts the observation
     times: member i is observed at t_k + t_s,i; one named ``sigma`` multiplies the std of every observation error, where
     the model has no parameter of that name. ``discrepancy_amplitude`` and ``discrepancy_length`` are those of the
-    discrepancy that the observations allow for. ``perturbations`` act on the initial state. ``fixed`` are physical SI
-    values of the other parameters.
+    discrepancy that the observations allow for. ``perturbations`` act on the initial state, ``tied`` follow what is
+    estimated. ``fixed`` are physical SI values of the other parameters.
 
     Where the observations have parts, these say what was observed, and ``observable`` is that of the first.
     """
@@ -48,6 +57,7 @@ class InverseProblem:
     prior: Prior
     fixed: Mapping[str, float] = field(default_factory=dict)
     perturbations: tuple[StatePerturbation, ...] = ()
+    tied: tuple[Tie, ...] = ()
 
     @property
     def parts(self) -> tuple[Part, ...]:
@@ -81,7 +91,9 @@ class InverseProblem:
     def varied(self, varying: Sequence[Varying]) -> InverseProblem:
         """The same with what varies; the changes join the control vector at its end."""
         changes = (change for one in varying for change in one.changes)
-        return replace(self, model=PiecewiseModel(self.model, varying), prior=Prior((*self.prior.terms, *changes)))
+        return replace(
+            self, model=PiecewiseModel(self.model, varying), prior=self.prior.of((*self.prior.terms, *changes))
+        )
 
     @property
     def constant(self) -> InverseProblem:
@@ -90,7 +102,7 @@ class InverseProblem:
             return self
         changes = {change.parameter.name for one in self.varying for change in one.changes}
         terms = tuple(term for term in self.prior.terms if term.parameter.name not in changes)
-        return replace(self, model=self.model.model, prior=Prior(terms))
+        return replace(self, model=self.model.model, prior=self.prior.of(terms))
 
 
 def discrepancy_parameters(model: ForwardModel, observable: Observable) -> tuple[Parameter, Parameter]:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
-TransformName = Literal["normal", "lognormal", "logit"]
+TransformName = Literal["normal", "lognormal", "logit", "uniform", "half-normal", "beta"]
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +17,7 @@ from en4dvar.tables import table
 from en4dvar.units import convert
 
 SAMPLED = 5000  # forward runs of a posterior that is sampled, typically
+MOST_PAIRS, MOST_NAMED, LEAST_SHOWN = 15, 100, 0.005  # of correlations: rows, parameters of a block, size
 
 
 def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
@@ -30,6 +32,11 @@ def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
     for problem in problems if any(e.needs_data for e in config.parameters) else problems[:1]:
         title = f"estimated ({problem.observations.name})" if len(problems) > 1 else "estimated"
         parts.append(table([(title, "unit", "prior", "median", "5 %", "95 %"), *_prior_rows(problem)]))
+        if correlated := _correlation_rows(problem):
+            parts.append(table([("correlated in the prior", "correlation"), *correlated]))
+        if problem.tied:
+            rows = [(tie.parameter.name, tie.to, f"{tie.factor:g}") for tie in problem.tied]
+            parts.append(table([("tied", "to", "times"), *rows]))
         if problem.fixed:
             known = {p.parameter.name: p.parameter for p in config.parameters}
             fixed = [(name, *_shown(known[name], value)) for name, value in problem.fixed.items()]
@@ -83,6 +90,17 @@ def _prior_rows(problem: InverseProblem) -> list[tuple[str, ...]]:
         shown = [_shown(term.parameter, float(q))[0] for q in quantiles]
         rows.append((term.parameter.name, term.parameter.display_unit, term.transform, *shown))
     return rows
+
+
+def _correlation_rows(problem: InverseProblem) -> list[tuple[str, ...]]:
+    """The pairs that are most correlated."""
+    pairs = [
+        (block.matrix[i, j], f"{block.names[i]}, {block.names[j]}")
+        for block in problem.prior.blocks
+        for i, j in itertools.combinations(range(min(len(block.names), MOST_NAMED)), 2)
+    ]
+    strongest = sorted(pairs, key=lambda pair: -abs(pair[0]))[:MOST_PAIRS]
+    return [(names, f"{value:.2f}") for value, names in strongest if abs(value) >= LEAST_SHOWN]
 
 
 def _shown(parameter: Parameter, value: float) -> tuple[str, str]:

@@ -8,7 +8,7 @@ from functools import partial
 
 from en4dvar.config import Config
 from en4dvar.config.find_files import find_files, with_parts
-from en4dvar.config.parameters import Fixed, Uncertain
+from en4dvar.config.parameters import Fixed, Tied, Uncertain, inside_bounds
 from en4dvar.config.reading import read_observations
 from en4dvar.config.series import DataPlan, SeriesPlan
 from en4dvar.ensemble.forecast import check_problem
@@ -16,7 +16,7 @@ from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.inputs.readers import DataFile
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import InverseProblem, discrepancy_parameters
+from en4dvar.problem import InverseProblem, Tie, discrepancy_parameters
 from en4dvar.units import UnitError, convert
 from en4dvar.varying import Varying
 
@@ -60,13 +60,18 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
     """The inverse problem of observations, wherever they come from. Raises :class:`ConfigError`."""
     terms, fixed = resolve_parameters(config, observations)
     terms = (*terms, *(perturbed.term for perturbed in config.initial_state), *_discrepancy(config, observations))
+    estimated = {term.parameter.name for term in terms}
+    tied = tuple(
+        Tie(e.parameter, e.to, e.factor) for e in config.parameters if isinstance(e, Tied) and e.to in estimated
+    )
     perturbations = tuple(perturbed.perturbation for perturbed in config.initial_state)
     varying = _varying(config, observations, terms)
     asked, count = config.assimilation, len(terms) + sum(len(one.changes) for one in varying)
     if asked.sampling == "exact" and asked.members <= count:
         message = f"{asked.members} are too few for {count} parameters; at least {count + 1}"
         raise ConfigError([config.document.fault(("assimilation", "members"), message)])
-    problem = InverseProblem(config.model, config.observable, observations, Prior(terms), fixed, perturbations)
+    prior = Prior(terms, config.dependence)
+    problem = InverseProblem(config.model, config.observable, observations, prior, fixed, perturbations, tied)
     if varying:
         problem = problem.varied(varying)
     check_problem(problem)
@@ -151,6 +156,7 @@ def resolve_parameters(
     terms: list[PriorTerm] = []
     fixed: dict[str, float] = {}
     faults: list[Fault] = []
+    tied: list[Tied] = []
     for entry in config.parameters:
         path = ("parameters", entry.parameter.name)
         try:
@@ -158,6 +164,8 @@ def resolve_parameters(
                 fixed[entry.parameter.name] = entry.value
             elif isinstance(entry, Uncertain):
                 terms.append(entry.term(_maximum(entry, config, observations)))
+            elif isinstance(entry, Tied):
+                tied.append(entry)
             elif observations is None:
                 raise ConfigError("the value comes from the data file, and there is none; set a value")
             else:
@@ -166,6 +174,13 @@ def resolve_parameters(
             faults += [config.document.fault((*path, f.path) if f.path else path, f.message) for f in error.problems]
         except UnitError as error:
             faults.append(config.document.fault(path, str(error)))
+    for entry in tied:
+        if entry.to in fixed:
+            path = ("parameters", entry.parameter.name)
+            try:
+                fixed[entry.parameter.name] = inside_bounds(fixed[entry.to] * entry.factor, entry.parameter)
+            except ConfigError as error:
+                faults.append(config.document.fault(path, str(error)))
     if faults:
         raise ConfigError(faults)
     return tuple(terms), fixed

@@ -17,7 +17,7 @@ from typing import Any
 from en4dvar.config.context import TEXT
 from en4dvar.config.load import Estimation
 from en4dvar.config.models import COMMAND, GROUP, find_model, settings_of
-from en4dvar.config.parameters import FromFile, PriorSection
+from en4dvar.config.parameters import FromFile, PriorSection, TiedSection
 from en4dvar.config.series import SeriesData
 from en4dvar.config.synthetic import CampaignFile
 from en4dvar.config.twin import TwinFile
@@ -33,7 +33,7 @@ def json_schema() -> Json:
     definitions: Json = {
         "parameter": {
             "description": "A prior (estimated), a quantity (fixed), or a scalar of the data file (fixed).",
-            "anyOf": [dict(TEXT), *(_of(kind.model_json_schema()) for kind in (PriorSection, FromFile))],
+            "anyOf": [dict(TEXT), *(_of(kind.model_json_schema()) for kind in (PriorSection, FromFile, TiedSection))],
         },
     }
     definitions["series"] = _partial(_of(SeriesData.model_json_schema()))  # the rest is said for all series

@@ -13,6 +13,7 @@ from pydantic import Field
 
 from en4dvar.config.context import Context, Made, time_unit
 from en4dvar.config.data import Data
+from en4dvar.config.dependence import PriorCorrelation, PriorFile, resolved
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.initial_state import PERTURBED, Perturbed
 from en4dvar.config.models import read_model
@@ -21,10 +22,11 @@ from en4dvar.config.schema import Assimilation, Execution, File, Output, Quantit
 from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.validate import check
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
+from en4dvar.dependence import Dependence
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.problem import AssimilationSettings
-from en4dvar.state import Array
+from en4dvar.state import NOISE_SCALE, Array
 from en4dvar.units import UnitError, parse_quantity
 
 
@@ -69,6 +71,10 @@ class Estimation(File):
     """Where the observations are, what they mean and how well they are known."""
     parameters: Annotated[tuple[Entry, ...], entries()]
     """For each parameter a prior (estimated), a quantity (fixed), or a scalar of the data file (fixed)."""
+    prior: PriorFile | None = None
+    """A file of members, for the parameters with ``{prior: ensemble}``."""
+    prior_correlation: tuple[PriorCorrelation, ...] | None = None
+    """Which parameters are correlated in the prior, and how."""
     initial_state: Annotated[tuple[Perturbed, ...], PERTURBED] | None = None
     """Fields of the initial state that are uncertain, each with its ``std``."""
     model_error: Annotated[tuple[ErrorOf, ...], MODEL_ERROR] | None = None
@@ -81,6 +87,14 @@ class Estimation(File):
     """Where results go."""
     simulate: Simulate | None = None
     """Settings of ``en4dvar simulate``."""
+
+    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """As given, with absolute paths."""
+        written = super().as_written(given)
+        if self.prior_correlation:
+            each = zip(self.prior_correlation, given["prior_correlation"], strict=True)
+            written["prior_correlation"] = [one.as_written(text) for one, text in each]
+        return written
 
 
 @dataclass(frozen=True)
@@ -103,6 +117,7 @@ class Config:
     resolved: str
     initial_state: tuple[Perturbed, ...] = ()
     model_error: tuple[ErrorOf, ...] = ()
+    dependence: tuple[Dependence, ...] = ()
 
     @property
     def text(self) -> str:
@@ -135,13 +150,17 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
         raise ConfigError([document.fault(("twin",), "a twin experiment: it can be run and validated", at_key=True)])
     read = read_file(Estimation, document, base, model)
     file = read.file
+    own = {p.name for p in read.model.parameters}
+    apart = {} if NOISE_SCALE.name in own else {NOISE_SCALE.name: "it is the scale of the errors"}
+    others = [perturbed.term.parameter.name for perturbed in file.initial_state or ()]
+    parameters, blocks = resolved(file.parameters, file.prior, file.prior_correlation or (), others, apart, document)
     return Config(
         document=document,
         name=file.name,
         seed=file.seed,
         model=read.model,
         observable=_observable(file.data, read),
-        parameters=file.parameters,
+        parameters=parameters,
         data=file.data,
         assimilation=file.assimilation.settings,
         weights=file.assimilation.weights,
@@ -152,6 +171,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
         resolved=read.resolved(file.parameters),
         initial_state=file.initial_state or (),
         model_error=file.model_error or (),
+        dependence=blocks,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -34,15 +34,24 @@ _RECIPES = {
     "normal": "mean and std",
     "lognormal": "median and log_std, or mean and std",
     "logit": "lower, upper, median and logit_std",
+    "uniform": "lower and upper",
+    "half-normal": "std, and lower where it does not start at zero",
+    "beta": "lower, upper, alpha and beta",
+    "ensemble": "map and unit, both where they are needed, and no number of its own",
 }
 
 
 def _bounded(text: Any, parameter: Parameter) -> float:
     """A value in the parameter's unit. Raises :class:`ConfigError`, :class:`UnitError`."""
+    return inside_bounds(parse_quantity(text, parameter.unit), parameter, brief(str(text), 80))
+
+
+def inside_bounds(value: float, parameter: Parameter, shown: str = "") -> float:
+    """The value, in the parameter's unit. Raises :class:`ConfigError` with it as ``shown``."""
     low, high = parameter.bounds
-    value = parse_quantity(text, parameter.unit)
     if not low <= value <= high:
-        raise ConfigError(f"{brief(str(text), 80)} is outside the bounds [{low:g}, {high:g}] {parameter.unit}")
+        words = shown or f"{value:g} {parameter.unit}"
+        raise ConfigError(f"{words} is outside the bounds [{low:g}, {high:g}] {parameter.unit}")
     return value
 
 
@@ -56,14 +65,16 @@ Location = Annotated[
 class PriorSection(Section):
     """A prior by name; locations and spreads carry the parameter's unit, a ``%`` spread is relative to the location."""
 
-    prior: Literal["normal", "lognormal", "logit"]
-    """Shape: normal (mean, std), lognormal (median and log_std, or mean and std), logit (lower, upper, median, …)."""
+    prior: Literal["normal", "lognormal", "logit", "uniform", "half-normal", "beta", "ensemble"]
+    """Shape: normal (mean, std), lognormal (median and log_std, or mean and std), logit (lower, upper, median, …),
+    uniform (lower, upper), half-normal (std, and lower, by default 0), beta (lower, upper, alpha, beta), or ensemble:
+    mean, spread and correlations are those of the members in the file of ``prior: {ensemble: FILE}``."""
     mean: Location = None
     """Mean with its unit, or ``maximum``: the largest observation of the window."""
     median: Location = None
     """Median with its unit, or ``maximum``: the largest observation of the window."""
     std: Annotated[Spread | None, Made(lambda text, context: parse_spread(text, subject_unit(context)))] = None
-    """Standard deviation with its unit, or in % of the mean."""
+    """Standard deviation with its unit, or in % of the mean; of a half-normal, that of the whole Gaussian."""
     log_std: Annotated[float, Field(gt=0)] | None = None
     """Standard deviation of the natural logarithm: 0.3 is about 30 %, 0.7 a factor of two."""
     logit_std: Annotated[float, Field(gt=0)] | None = None
@@ -72,6 +83,14 @@ class PriorSection(Section):
     """Lower bound with its unit; never reached."""
     upper: Value = None
     """Upper bound with its unit; never reached."""
+    alpha: Annotated[float, Field(gt=0)] | None = None
+    """First exponent of a beta: probability leans to ``upper`` where it is the larger one."""
+    beta: Annotated[float, Field(gt=0)] | None = None
+    """Second exponent of a beta."""
+    map: Literal["normal", "lognormal", "logit"] | None = None
+    """Of an ensemble: in which coordinate its members are taken as Gaussian; by default the parameter's own."""
+    unit: Annotated[str | None, unit_of(subject_unit)] = None
+    """Of an ensemble: unit of the numbers in the file, where that does not tell it."""
     varies: VariesSection | None = None
     """The parameter varies in time; the prior is that of its first piece."""
 
@@ -83,6 +102,43 @@ class FromFile(Section):
     """Name of a scalar in the data file, e.g. Req."""
     unit: Annotated[str, unit_of(subject_unit)]
     """Unit of that scalar in the file."""
+
+
+class TiedSection(Section):
+    """A parameter that has the value of another one, or a multiple of it."""
+
+    tied: Annotated[str, Field(min_length=1)]
+    """Name of the other parameter, which has a prior or a value."""
+    factor: float = 1.0
+    """Multiple of it."""
+
+
+@dataclass(frozen=True)
+class Tied:
+    """A parameter that is ``factor`` times the one named ``to``."""
+
+    needs_data: ClassVar[bool] = False
+    parameter: Parameter
+    to: str
+    factor: float
+
+    def check(self, found: Mapping[str, Entry], own: Sequence[str]) -> None:
+        """Raise :class:`ConfigError` where it cannot follow; ``own`` are the names of the model's parameters."""
+        name, other = self.parameter.name, found.get(self.to)
+        if name not in own:
+            raise ConfigError(f"{name} is no parameter of the model and cannot be tied")
+        if other is None or self.to not in own or self.to == name:
+            names = [one for one in found if one in own and one != name]
+            raise ConfigError(
+                [Fault(f"{self.to!r} is no other parameter of the model{suggest(self.to, names)}", "tied")]
+            )
+        if isinstance(other, Tied):
+            raise ConfigError([Fault(f"{self.to} is tied itself; tie {name} to {other.to}", "tied")])
+        if isinstance(other, Uncertain) and other.spec.varies is not None:
+            raise ConfigError([Fault(f"{self.to} varies in time, and nothing can follow that", "tied")])
+        if other.parameter.unit != self.parameter.unit:
+            units = f"{other.parameter.unit}, {name} in {self.parameter.unit}"
+            raise ConfigError([Fault(f"{self.to} is in {units}", "tied")])
 
 
 @dataclass(frozen=True)
@@ -114,10 +170,19 @@ class Scalar:
 
 @dataclass(frozen=True)
 class Uncertain:
-    """A parameter with a prior; ``maximum`` as a location is the observed maximum in the window."""
+    """A parameter with a prior; ``maximum`` as a location is the observed maximum in the window.
+
+    ``of_members`` is the prior that an ensemble makes, once its file is read.
+    """
 
     parameter: Parameter
     spec: PriorSection
+    of_members: PriorTerm | None = None
+
+    @property
+    def from_ensemble(self) -> bool:
+        """Whether the prior is that of the members in a file."""
+        return self.spec.prior == "ensemble"
 
     @property
     def needs_data(self) -> bool:
@@ -133,7 +198,9 @@ class Uncertain:
 
     def _term(self, mean: float, median: float) -> PriorTerm:
         spec, parameter = self.spec, self.parameter
-        given = spec.model_fields_set - {"prior", "varies"}
+        given = self._given
+        if self.of_members is not None:
+            return self.of_members
         if spec.prior == "normal" and given == {"mean", "std"}:
             return PriorTerm.normal(parameter, mean, self._std(mean))
         if spec.prior == "lognormal" and given == {"mean", "std"}:
@@ -141,9 +208,36 @@ class Uncertain:
         if spec.prior == "lognormal" and given == {"median", "log_std"} and spec.log_std is not None:
             return PriorTerm.lognormal(parameter, median, spec.log_std)
         if spec.prior == "logit" and given == {"lower", "upper", "median", "logit_std"} and spec.logit_std is not None:
-            return PriorTerm.logit(parameter, (spec.lower or 0.0, spec.upper or 0.0), median, spec.logit_std)
-        takes, has = _RECIPES[spec.prior], ", ".join(sorted(given)) or "none of these"
-        raise ConfigError(f"a {spec.prior} prior takes {takes}; given: {has}")
+            return PriorTerm.logit(parameter, self._bounds, median, spec.logit_std)
+        if spec.prior == "uniform" and given == {"lower", "upper"}:
+            return PriorTerm.uniform(parameter, self._bounds)
+        if spec.prior == "half-normal" and given - {"lower"} == {"std"}:
+            return PriorTerm.half_normal(parameter, self._std(0.0), spec.lower or 0.0)
+        if spec.prior == "beta" and given == {"lower", "upper", "alpha", "beta"} and spec.alpha and spec.beta:
+            return PriorTerm.beta(parameter, self._bounds, spec.alpha, spec.beta)
+        raise self._recipe()
+
+    @property
+    def _given(self) -> set[str]:
+        return self.spec.model_fields_set - {"prior", "varies"}
+
+    def _recipe(self) -> ConfigError:
+        takes, has = _RECIPES[self.spec.prior], ", ".join(sorted(self._given)) or "none of these"
+        return ConfigError(f"{'an' if self.from_ensemble else 'a'} {self.spec.prior} prior takes {takes}; given: {has}")
+
+    def check(self) -> None:
+        """Raise :class:`ConfigError` for what can be told without data and files."""
+        if self.from_ensemble:
+            if not self._given <= {"map", "unit"}:
+                raise self._recipe()
+        elif not self.needs_data:
+            self.term()
+        elif self.spec.prior != "logit":
+            self.term(maximum=1.0)  # the other values do not wait for the data
+
+    @property
+    def _bounds(self) -> tuple[float, float]:
+        return self.spec.lower or 0.0, self.spec.upper or 0.0
 
     def walk(self, model: ForwardModel, term: PriorTerm, times: Array) -> RandomWalk | None:
         """How it varies over a window of observations at ``times`` (K,); None where it does not.
@@ -158,7 +252,7 @@ class Uncertain:
             message = f"relative to the mean, which is zero; give it in {self.parameter.unit}"
             raise ConfigError([Fault(message, "varies.std")])
         try:
-            return RandomWalk.of(model, term, varies.knots(times), varies.std.absolute(centre) / _slope(term, centre))
+            return RandomWalk.of(model, term, varies.knots(times), varies.std.absolute(centre) / term.slope(term.mean))
         except ConfigError as error:
             raise ConfigError(
                 [replace(f, path=f"varies.{f.path}" if f.path else "varies") for f in error.problems]
@@ -182,15 +276,7 @@ class Uncertain:
         return std.absolute(mean)
 
 
-def _slope(term: PriorTerm, theta: float) -> float:
-    """dθ/dx of the transform."""
-    if term.transform == "logit":
-        low, high = term.bounds
-        return (theta - low) * (high - theta) / (high - low)
-    return theta if term.transform == "lognormal" else 1.0
-
-
-Entry = Fixed | Scalar | Uncertain
+Entry = Fixed | Scalar | Uncertain | Tied
 
 
 def _entry(given: Any, context: Context) -> Entry:
@@ -201,13 +287,13 @@ def _entry(given: Any, context: Context) -> Entry:
     if "from_file" in given:
         scalar = FromFile.model_validate(given, context=context)
         return Scalar(parameter, scalar.from_file, scalar.unit)
+    if "tied" in given:
+        tied = TiedSection.model_validate(given, context=context)
+        return Tied(parameter, tied.tied, tied.factor)
     entry = Uncertain(parameter, PriorSection.model_validate(given, context=context))
     if entry.spec.varies is not None and not can_vary(context.model, parameter.name):
         raise ConfigError([Fault(f"{parameter.name} cannot vary: {_why_not(context.model, parameter)}", "varies")])
-    if not entry.needs_data:
-        entry.term()
-    elif entry.spec.prior != "logit":
-        entry.term(maximum=1.0)  # the other values do not wait for the data
+    entry.check()
     return entry
 
 
@@ -252,6 +338,13 @@ def entries(kind: str = "") -> Made:
             for name, entry in found.items():
                 if kind and entry.needs_data:
                     faults.add((name,), f"{kind} has no data file to take a value from")
+                if isinstance(entry, Tied):
+                    with faults.at(name):
+                        entry.check(found, [p.name for p in model.parameters])
+                if kind and isinstance(entry, Tied):
+                    faults.add((name, "tied"), f"{kind} has no tied parameters; give a value or a prior")
+                if kind and isinstance(entry, Uncertain) and entry.from_ensemble:
+                    faults.add((name, "prior"), f"{kind} has no ensemble of its own; give it another prior")
                 if kind and isinstance(entry, Uncertain) and entry.spec.varies is not None:
                     faults.add((name, "varies"), f"{kind} has constant parameters")
             for parameter in model.parameters:

@@ -202,7 +202,7 @@ def _initial(experiment: TwinExperiment, streams: list[np.random.Generator]) -> 
     model, prior = experiment.model, experiment.prior
     theta = {name: np.full(len(streams), value) for name, value in experiment.fixed.items()}
     if prior is not None:
-        x = prior.mean + prior.std * np.array([stream.standard_normal(len(prior.terms)) for stream in streams])
+        x = prior.from_white(np.array([stream.standard_normal(len(prior.terms)) for stream in streams]))
         theta |= dict(zip(prior.names, prior.to_physical(x).T, strict=True))
     try:
         states = np.array(

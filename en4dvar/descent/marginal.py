@@ -34,9 +34,9 @@ def marginal_members(space: WeightSpace, linear: Linearisation, mode: Array, pos
     of_errors = np.array([name in names for name in prior.names])
     if not np.any([p.name in prior.names for p in problem.discrepancy]):
         return posterior
-    z_mode = (mode - prior.mean) / prior.std
+    z_mode = prior.white(mode)
     stream = member_stream(seed, "discrepancy")
-    covariance = np.atleast_2d(np.cov(posterior.T)) / np.outer(prior.std, prior.std)
+    covariance = prior.white_covariance(np.atleast_2d(np.cov(posterior.T)))
     root = WIDER * np.linalg.cholesky(covariance[np.ix_(of_errors, of_errors)])
     normal = stream.standard_normal((DRAWS, len(root))) / np.sqrt(stream.chisquare(FREEDOM, (DRAWS, 1)) / FREEDOM)
     draws = z_mode[of_errors] + normal @ root.T
@@ -51,7 +51,7 @@ def marginal_members(space: WeightSpace, linear: Linearisation, mode: Array, pos
     members = _drawn(weights, draws, means, covariances, of_errors, len(posterior), stream)
     if space.settings.sampling == "exact":
         members = _with_moments(members, weights, draws, means, covariances, of_errors)
-    return np.asarray(prior.mean + prior.std * members)
+    return prior.from_white(members)
 
 
 def _given(
@@ -63,9 +63,9 @@ def _given(
     assert isinstance(noise, DiscrepancyNoise)
     at, beta = linear.prediction, float(observations.weights[0])
     noise = noise.gaussian_at(observations.values, at)
-    to_control = space.anomalies.T @ space.basis / prior.std[:, None]
+    to_control = np.ascontiguousarray(prior.white_change((space.anomalies.T @ space.basis).T).T)
     slopes = (linear.anomalies.T @ np.linalg.pinv(to_control))[:, ~of_errors]
-    rest = (mode - prior.mean)[~of_errors] / prior.std[~of_errors]
+    rest = prior.white(mode)[~of_errors]
     columns = np.column_stack([observations.values - at.values + slopes @ rest, slopes])
     x = np.tile(mode, (len(draws), 1))
     x[:, of_errors] = prior.mean[of_errors] + prior.std[of_errors] * draws

@@ -48,7 +48,7 @@ class Minimum:
 
     def log_evidence(self, prior: Prior) -> float:
         """Laplace's approximation of ln ∫ exp(−J_o) N(x; prior) dx over this minimum alone."""
-        return float(-self.cost + 0.5 * np.linalg.slogdet(self.covariance)[1] - np.sum(np.log(prior.std)))
+        return float(-self.cost + 0.5 * np.linalg.slogdet(self.covariance)[1] - prior.log_det_root)
 
 
 def merged(minima: Sequence[Minimum]) -> tuple[Minimum, ...]:

@@ -18,9 +18,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from en4dvar.parameter_map import QUANTILE_MAPS
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.state import NOISE_SCALE, Array
+
+STENCIL = 0.02  # width of differences, in prior standard deviations
 
 
 def mean_beyond_mode(problem: InverseProblem, mode: Array, posterior: Array, dfs: float) -> Array:
@@ -52,6 +55,8 @@ def log_derivatives(term: PriorTerm, x: float) -> tuple[float, float, float]:
     """Derivatives g', g'', g''' of u = ln σ in the transformed coordinate at ``x``."""
     if term.transform == "lognormal":
         return 1.0, 0.0, 0.0
+    if term.transform in QUANTILE_MAPS:
+        return _differences(term, x)
     sigma = float(term.to_physical(np.array(x)))
     slopes = 1.0, 0.0, 0.0
     if term.transform == "logit":
@@ -61,3 +66,11 @@ def log_derivatives(term: PriorTerm, x: float) -> tuple[float, float, float]:
         slopes = slope, slope * (1 - 2 * share), slope * (1 - 6 * share + 6 * share**2)
     a, b, c = (slope / sigma for slope in slopes)
     return a, b - a**2, c - 3 * a * b + 2 * a**3
+
+
+def _differences(term: PriorTerm, x: float) -> tuple[float, float, float]:
+    """The same by central differences over seven points."""
+    h, u = STENCIL, np.log(term.to_physical(x + STENCIL * np.arange(-3.0, 4.0)))
+    first = np.dot([-1, 9, -45, 0, 45, -9, 1], u) / (60 * h)
+    second = np.dot([2, -27, 270, -490, 270, -27, 2], u) / (180 * h**2)
+    return float(first), float(second), float(np.dot([1, -8, 13, 0, -13, 8, -1], u) / (8 * h**3))

@@ -1,8 +1,8 @@
 """One data set as a window of the loop: its runs, how far a step goes, records, and when a descent has ended.
 
-A scheme that searches minimises J: steps are judged by J of the central run, and none that raises it is accepted. Any
-other takes its steps as they are; J and its Gauss–Newton step, from a regression over the ensemble, are then there for
-the record only.
+A scheme that searches minimises J: steps are judged by J of the central run, and none that raises it is accepted. A
+regression over the ensemble settles in the end (:mod:`en4dvar.descent.settling`). Any other scheme takes its steps as
+they are; J and its Gauss–Newton step, from a regression over the ensemble, are then there for the record only.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from en4dvar import diagnostics as diag
 from en4dvar.analysis import IterationRecord, Record
+from en4dvar.descent.settling import NEAR, Settling
 from en4dvar.descent.step_control import STEP_CONTROLS, Move, Point, Tangent, run_searches
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnostics import UNSEEN
@@ -57,7 +58,8 @@ class Descent:
     ``worst_loss`` are the reasons of failure in the iteration that lost most members, or empty. ``cost`` is J where it
     was last evaluated. A descent whose ``stop`` is set ends with the next iterate, which is recorded and not left.
     ``members`` are those of the prior ensemble from which descents go on as this one: its own, and of those that met
-    it, at J of up to ``highest``. ``at`` and ``step`` belong to the iteration under way and are not kept.
+    it, at J of up to ``highest``. ``settling`` is there once a regression has come close to its end.
+    ``at`` and ``step`` belong to the iteration under way and are not kept.
     """
 
     weights: Weights
@@ -69,6 +71,7 @@ class Descent:
     ended: bool = False
     members: tuple[int, ...] = ()
     highest: float = -math.inf
+    settling: Settling | None = None
     at: Iterate | None = None
     step: Step | GaussNewtonStep | None = None
 
@@ -191,13 +194,14 @@ class DataWindow:
                 descent.stop, descent.converged = f"step of {step.norm:.2g} posterior standard deviations", True
             elif descent.iteration == settings.max_iterations:
                 descent.stop = f"iteration limit ({settings.max_iterations}) reached"
-            else:
+            elif not self._settles(descent):
                 (move,) = self.search([descent])
                 again = None if move else self._look_again(scheme, descent)
                 if move is None and again is None:
-                    descent.stop = "no decrease possible along the step"
-                    least = max(self.small(at.cost), 0.5 * UNSEEN**2)
-                    descent.converged = step.predicted_decrease <= least
+                    self._no_decrease(descent)
+        if not descent.stop and move is None and again is None:
+            self._settle(descent)
+            return
         self.record(descent, step.hessian.economical_transform, move.step_length if move else 0.0)
         descent.ended = bool(descent.stop)
         if again is not None:
@@ -208,6 +212,26 @@ class DataWindow:
             # one more forecast, to linearise at the end point
             descent.stop, descent.converged = f"relative decrease of J below {settings.cost_tolerance:g}", True
         descent.weights = self._onwards(descent, move.w)
+
+    def _no_decrease(self, descent: Descent) -> None:
+        """The search by J has ended; a regression goes on to settle."""
+        if self.settings.linearisation == "transform":
+            return
+        descent.stop = "no decrease possible along the step"
+        least = max(self.small(descent.iterate.cost), 0.5 * UNSEEN**2)
+        descent.converged = descent.newton.predicted_decrease <= least
+
+    def _settles(self, descent: Descent) -> bool:
+        near = descent.settling is not None or descent.newton.norm <= NEAR
+        return self.settings.linearisation == "transform" and near
+
+    def _settle(self, descent: Descent) -> None:
+        """A share of the step, whatever J of the central run says."""
+        step = descent.newton
+        descent.settling = settling = (descent.settling or Settling()).after(step.norm)
+        self.record(descent, step.hessian.economical_transform, settling.share)
+        w = descent.weights.w + settling.share * step.direction
+        descent.weights = replace(descent.weights, w=w) if settling.held else self._onwards(descent, w)
 
     def _look_again(self, scheme: Scheme, descent: Descent) -> Weights | None:
         """The same centre with members that may show the way down, where J does not fall along the step; else None.

@@ -153,12 +153,13 @@ def forecast(
 def cost(problem: InverseProblem, x: Array, executor: Executor | None = None) -> Array:
     """J (B,) of control vectors ``x`` (B, n), with the prior's own mean and covariance; +inf where the model fails.
 
-    J = ½ Σ_j ((x_j − mean_j)/std_j)² + Σ_k β_k [½ (y_k − m_k)²/s_k² + ln(s_k/std_k)].
+    J = ½ ‖z‖² + Σ_k β_k [½ (y_k − m_k)²/s_k² + ln(s_k/std_k)], z the white coordinates of x: (x_j − mean_j)/std_j
+    where no parameters are correlated.
     """
     run = forecast(problem, x, executor)
     observation = problem.observations.cost(run.predicted)
     with np.errstate(over="ignore"):
-        z = (x - problem.prior.mean) / problem.prior.std
+        z = problem.prior.white(x)
         return np.where(run.active, 0.5 * np.sum(z * z, axis=-1) + observation, np.inf)
 
 
@@ -185,8 +186,11 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
     if unknown := {p.field for p in problem.perturbations} - set(problem.model.layout.names):
         raise ConfigError(f"initial_state: {', '.join(sorted(unknown))}: not a field of the model's state")
     required = {p.name for p in (*discrepancy, *perturbed, *problem.model.parameters)} - {TIME_SHIFT.name}
+    tied = {tie.parameter.name for tie in problem.tied}
     for names, message in (
-        (required - estimated - fixed, "neither fixed nor estimated"),
+        (required - estimated - fixed - tied, "neither fixed nor estimated"),
+        (tied & (estimated | fixed), "tied, and fixed or estimated as well"),
+        ({tie.to for tie in problem.tied} - estimated, "not estimated, but others are tied to it"),
         (estimated & fixed, "both fixed and estimated"),
         ((estimated | fixed) - set(known), "not a parameter of the model"),
     ):

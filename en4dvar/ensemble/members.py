@@ -17,7 +17,7 @@ from en4dvar.batch import Batch
 from en4dvar.executor import Outcome
 from en4dvar.forward import Failure, ValidityLimit
 from en4dvar.prior import Prior
-from en4dvar.problem import InverseProblem
+from en4dvar.problem import InverseProblem, Tie
 from en4dvar.state import Array
 from en4dvar.user_code import own_fault, reason_of
 
@@ -46,6 +46,7 @@ class InitialStates:
         columns = {name: j for j, name in enumerate(problem.prior.names)}
         own = [p.name for p in problem.model.parameters]
         self.estimated = tuple((name, columns[name]) for name in own if name in columns)
+        self.tied = tuple((tie, columns[tie.to]) for tie in problem.tied)
         self.fixed = tuple((name, float(problem.fixed[name])) for name in own if name in problem.fixed)
         self.perturbed = tuple((p, columns.get(p.parameter.name)) for p in problem.perturbations)
 
@@ -74,6 +75,7 @@ class InitialStates:
         """States (B, n_state); ValueError where one is not a state."""
         theta = {name: physical[:, j] for name, j in self.estimated}
         theta |= {name: np.full(len(physical), value) for name, value in self.fixed}
+        theta |= {tie.parameter.name: _followed(tie, physical[:, j]) for tie, j in self.tied}
         states = np.asarray(self.problem.model.initial_states(theta), dtype=float)
         if states.shape != (len(physical), self.size):
             raise ValueError("misshapen initial state")
@@ -97,6 +99,14 @@ class InitialStates:
                 unit = fields[perturbation.field].unit
                 raise ValueError(f"perturbed initial {perturbation.field} outside ({low:g}, {high:g}) {unit}")
         return states
+
+
+def _followed(tie: Tie, values: Array) -> Array:
+    """Values (B,) of a tied parameter; ValueError outside its bounds."""
+    p, (low, high), found = tie.parameter, tie.parameter.bounds, tie.factor * values
+    if not np.all((found >= low) & (found <= high)):
+        raise ValueError(f"{p.name} outside [{low:g}, {high:g}] {p.unit}")
+    return np.asarray(found)
 
 
 class MisshapenError(ValueError):

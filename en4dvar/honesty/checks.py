@@ -107,8 +107,8 @@ def _chance(probability: float) -> str:
 
 def conflict(prior: Prior, centre: Array) -> Findings:
     """A posterior centre (n,) far from the prior: 2 J_b beyond the 99.95 % point of χ²_n."""
-    z = (centre - prior.mean) / prior.std
-    if float(z @ z) <= chi2_interval(len(z))[1]:
+    z, white = (centre - prior.mean) / prior.std, prior.white(centre)
+    if float(white @ white) <= chi2_interval(len(z))[1]:
         return
     worst = np.argsort(-np.abs(z))
     far = [j for j in worst if abs(z[j]) > 2] or worst[:1]
@@ -139,7 +139,7 @@ def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[
     at: zero is infinitely far in ln θ. The prior's own share near the bound is no finding, three times it is.
     """
     for j, (term, parameter) in enumerate(zip(prior.terms, prior.parameters, strict=True)):
-        low, high = term.bounds if term.transform == "logit" else parameter.bounds
+        low, high = term.bounds if term.has_bound else parameter.bounds
         if term.transform == "lognormal":
             low = -math.inf
         if math.isinf(low) and math.isinf(high):

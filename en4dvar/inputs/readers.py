@@ -234,15 +234,7 @@ def _csv_contents(table: Table) -> Contents:
 
 def read_covariance(matrix: Matrix) -> Array:
     """The covariance (K, K) of a CSV file: symmetric, positive variances. Raises :class:`DataError`."""
-    path = matrix.path
-    _require_file(path)
-    with _readable(path):
-        rows = _rows_of_numbers(path)
-    if not rows or len(rows) != len(rows[0]):
-        raise DataError(
-            f"{path}: a covariance is square, but this has {len(rows)} rows of {len(rows[0]) if rows else 0}"
-        )
-    values = np.array(rows)
+    path, values = matrix.path, read_square(matrix.path, "covariance")
     if not np.all(np.isfinite(values)) or not np.all(np.diag(values) > 0):
         raise DataError(f"{path}: the variances must be positive and every covariance finite")
     scale = np.sqrt(np.outer(np.diag(values), np.diag(values)))
@@ -253,6 +245,16 @@ def read_covariance(matrix: Matrix) -> Array:
             f"{path}: not symmetric: {values[i, j]:g} in row {i + 1}, column {j + 1}, {values[j, i]:g} across"
         )
     return np.asarray(convert(0.5 * (values + values.T), matrix.unit, matrix.target))
+
+
+def read_square(path: Path, what: str = "correlation matrix") -> Array:
+    """The numbers (K, K) of a CSV file without header. Raises :class:`DataError`."""
+    _require_file(path)
+    with _readable(path):
+        rows = _rows_of_numbers(path)
+    if not rows or len(rows) != len(rows[0]):
+        raise DataError(f"{path}: a {what} is square, but this has {len(rows)} rows of {len(rows[0]) if rows else 0}")
+    return np.array(rows)
 
 
 def _rows_of_numbers(path: Path) -> list[list[float]]:

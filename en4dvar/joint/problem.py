@@ -28,7 +28,7 @@ class JointProblem:
     Raises
     ------
     ConfigError: fewer than two experiments, two of one name, a shared parameter that an experiment does not estimate,
-        nothing shared, or priors that differ.
+        nothing shared, or priors that differ or are correlated.
     """
 
     experiments: tuple[InverseProblem, ...]
@@ -40,6 +40,8 @@ class JointProblem:
             raise ConfigError(f"data sets of a joint estimate need names of their own: {', '.join(again)} twice")
         for one, groups in zip(self.experiments, self.groups, strict=True):
             check_problem(one)
+            if one.prior.blocks:
+                raise ConfigError(f"{one.observations.name}: a joint estimate needs priors that are not correlated")
             if missing := sorted(set(groups) - set(one.prior.names)):
                 raise ConfigError(f"{one.observations.name}: {', '.join(missing)}: shared, but not estimated there")
         if not self.shared:

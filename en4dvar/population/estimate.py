@@ -77,7 +77,7 @@ class Population:
 
         Raises
         ------
-        ValueError: a logit prior, which has no closed mean.
+        ValueError: a prior that is neither normal nor lognormal, whose mean has no closed form.
         """
         return self._moments()[0]
 
@@ -95,8 +95,8 @@ class Population:
         mean, std = self.nu.copy(), self.tau.copy()
         for j, name in enumerate(self.names):
             transform = self.prior.terms[self.prior.names.index(name)].transform
-            if transform == "logit":
-                raise ValueError(f"{name}: the population mean of a logit prior has no closed form")
+            if transform not in ("normal", "lognormal"):
+                raise ValueError(f"{name}: the population mean of a {transform} prior has no closed form")
             if transform == "lognormal":
                 mean[:, j] = np.exp(self.nu[:, j] + self.tau[:, j] ** 2 / 2)
                 std[:, j] = mean[:, j] * np.sqrt(np.expm1(self.tau[:, j] ** 2))
@@ -122,11 +122,13 @@ def estimate_population(
 
     Raises
     ------
-    ValueError: fewer than 3 sets, or too few successful runs about the best fit of one.
+    ValueError: fewer than 3 sets, a correlated prior, or too few successful runs about the best fit of one.
     """
     scales, effort = hyper or HyperPrior(), effort or Effort()
     if len(start) < 3:
         raise ValueError("a population needs at least 3 data sets")
+    if prior.blocks:
+        raise ValueError("a population needs a prior of independent parameters")
     with one_blas_thread():
         return _Estimate(runs, start, prior, names, seed, scales, effort, workers).result()
 

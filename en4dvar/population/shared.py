@@ -55,8 +55,10 @@ def fit_shared(runs: CampaignRuns, starts: Array, prior: Prior, names: Sequence[
 
     Raises
     ------
-    ValueError: the model cannot be run at any start.
+    ValueError: the model cannot be run at any start, or the prior is correlated.
     """
+    if prior.blocks:
+        raise ValueError("shared parameters need a prior of independent ones")
     where = [prior.names.index(name) for name in names]
     problem = _Shared(runs, prior, where, starts.shape[1])
     best = min((_search(problem, problem.pack(start), most) for start in starts), key=lambda end: end.cost)

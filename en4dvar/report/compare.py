@@ -1,6 +1,7 @@
 """Runs side by side: posteriors of any, and for models of the same data evidence and posterior model probabilities.
 
-Probabilities start from equal ones and follow the Laplace evidence of each run, p(M|y) ∝ p(y|M). Over several data
+Probabilities start from equal ones and follow the evidence of each run, p(M|y) ∝ p(y|M): that of the draws where its
+posterior was sampled, else Laplace's approximation. Over several data
 sets, each with parameters of its own, log-evidences add. A difference below one is called undecidable: "not worth
 more than a bare mention" (Kass & Raftery 1995, J. Am. Stat. Assoc. 90, 773). Evidences of different data (two gels)
 do not compare: there the posteriors are shown, and no probabilities.
@@ -24,8 +25,15 @@ from en4dvar.summary import ParameterSummary, estimate_cells
 from en4dvar.tables import table
 
 MOST_WARNINGS = 12  # on the terminal
+MEANINGLESS = (
+    2.0  # p_WAIC beyond so many times the number of parameters tells of members that do not fit, no complexity
+)
 UNDECIDABLE = 1.0  # difference of log-evidence
 ALL = "all data sets"
+WITHOUT_WAIC = (
+    f"p_WAIC – where it is more than {MEANINGLESS:g} times the number of parameters: members do not fit the readings, "
+    "and it counts nothing"
+)
 
 
 @dataclass(frozen=True)
@@ -33,7 +41,8 @@ class ModelScore:
     """One run on one data set (or, summed, on all): what the table of ``en4dvar compare`` shows.
 
     ``effective_parameters`` is p_WAIC, the sum over the observations of the posterior variance of their
-    log-likelihood (Gelman, Hwang & Vehtari 2014, Stat. Comput. 24, 997); ``dfs`` is its linear counterpart.
+    log-likelihood (Gelman, Hwang & Vehtari 2014, Stat. Comput. 24, 997), or NaN where it says nothing, see
+    :data:`MEANINGLESS`; ``dfs`` is its linear counterpart.
     ``difference`` is the log-evidence minus that of the best model; NaN, as ``probability``, where the runs used
     different data. ``warnings`` are the codes of its warnings, and ``doubted`` those for which neither its intervals
     nor its evidence are to be trusted.
@@ -196,7 +205,8 @@ def comparison_table(comparison: Comparison) -> str:
     verdicts = [f"{name}: {comparison.verdict(name)}" for name in comparison.datasets]
     if comparison.incomparable:
         verdicts = [comparison.verdict("")]
-    return "\n".join([table([header, *rows]), "", *verdicts, *_warned(comparison.cautions)])
+    notes = [WITHOUT_WAIC] if any(np.isnan(s.effective_parameters) for s in comparison.scores) else []
+    return "\n".join([table([header, *rows]), *notes, "", *verdicts, *_warned(comparison.cautions)])
 
 
 def _warned(cautions: Sequence[ComparedCaution]) -> list[str]:
@@ -270,11 +280,17 @@ def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:
         probability=float("nan"),
         chi2_per_observation=float(stats["chi2_per_observation"]),
         dfs=float(stats["dfs"]),
-        effective_parameters=float(np.sum(np.var(likelihood[result.alive], axis=0, ddof=1))),
+        effective_parameters=_effective(likelihood[result.alive], result.sample_stats["dfs"].size),
         nrmse=float(stats["nrmse"]),
         warnings=" ".join(codes(result.cautions)),
         doubted=" ".join(codes(c for c in result.cautions if c.spoils)),
     )
+
+
+def _effective(likelihood: Array, n_parameters: int) -> float:
+    """p_WAIC from log-likelihoods (N', K) of the members."""
+    found = float(np.sum(np.var(likelihood, axis=0, ddof=1)))
+    return found if found <= MEANINGLESS * n_parameters else float("nan")
 
 
 def _total(scores: Sequence[ModelScore]) -> ModelScore:

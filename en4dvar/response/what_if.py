@@ -136,7 +136,7 @@ def _shift(
     if reason:
         return Shift(*about, unknown, unknown, unknown, np.nan, runs, reason)
     prior = problem.prior
-    z = (response.at + moved - step - prior.mean - of_prior) / prior.std
+    z = prior.white_change(response.at + moved - step - prior.mean - of_prior)
     there = 0.5 * float(z @ z) + misfit - decrease
     mode, positive = prior.to_physical(response.at), prior.bounds[0] >= 0
     change = prior.to_physical(response.at + moved) - mode

@@ -11,6 +11,7 @@ from en4dvar.config import Config, time_grid
 from en4dvar.config.build import data_files, resolve_parameters
 from en4dvar.config.data import Data
 from en4dvar.config.error_std import parse_error_std
+from en4dvar.config.parameters import Tied
 from en4dvar.config.reading import read_observations
 from en4dvar.config.series import DataPlan
 from en4dvar.errors import ConfigError, En4dvarError
@@ -61,6 +62,11 @@ def simulate(config: Config, times: Array | None = None) -> Simulation:
         times = observations.times
     terms, fixed = resolve_parameters(config, observations)
     theta = {**fixed, **{t.parameter.name: float(t.to_physical(np.array(t.mean))) for t in terms}}
+    theta |= {
+        e.parameter.name: e.factor * theta[e.to]
+        for e in config.parameters
+        if isinstance(e, Tied) and e.parameter.name not in theta
+    }
     return Simulation(times, _forward(config, theta, times), theta)
 
 

@@ -153,7 +153,7 @@ def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> _Runs:
 
 
 def _prior_cost(prior: Prior, x: Array) -> Array:
-    z = (x - prior.mean) / prior.std
+    z = prior.white(x)
     return np.asarray(0.5 * (z * z).sum(axis=1))
 
 

@@ -54,7 +54,7 @@ def _sample(runs: CampaignRuns, prior: Prior, samplers: Mapping[int, Importance]
         if not len(going):
             break
         z = np.stack([samplers[s].draw() for s in going])  # in units of the prior
-        x = prior.mean + prior.std * z.transpose(1, 0, 2)
+        x = prior.from_white(z.transpose(1, 0, 2))
         logs = log_likelihood(runs, runs.predictions(x, going), going).T
         for s, at, log in zip(going, z, logs, strict=True):
             samplers[s].add(at, log)

@@ -70,7 +70,7 @@ class ForwardRuns:
         alike: dict[object, list[int]] = {}
         for s, p in enumerate(problems):
             o, k = p.observations, len(p.observations)
-            if p.prior.terms != problems[0].prior.terms:
+            if p.prior != problems[0].prior:
                 raise ConfigError(f"{o.name}: a population needs one prior")
             if o.parts:
                 raise ConfigError(f"{o.name}: a population needs one observable, without places")
@@ -78,7 +78,7 @@ class ForwardRuns:
                 raise ConfigError(f"{o.name}: a population needs independent Gaussian errors of known std")
             self.times[s] = o.times[-1]
             self.times[s, :k], self.values[s, :k], self.weight[s, :k] = o.times, o.values, o.weights / o.std**2
-            key = id(p.model), id(p.observable), tuple(sorted(p.fixed.items())), p.perturbations
+            key = id(p.model), id(p.observable), tuple(sorted(p.fixed.items())), p.perturbations, p.tied
             alike.setdefault(key, []).append(s)
         self.groups = [(Predictor(problems[sets[0]], executor), sets) for sets in alike.values()]
 

@@ -85,12 +85,12 @@ def sample_modes(cost: Cost, prior: Prior, minima: Sequence[Minimum], seed: int)
     sampler = Importance(_about(prior, minima), member_stream(seed, "modes"), DRAWS, WIDER)
     for _ in range(MOST_ROUNDS):
         z = sampler.draw()
-        sampler.add(z, 0.5 * np.sum(z**2, axis=1) - cost(prior.mean + prior.std * z))
+        sampler.add(z, 0.5 * np.sum(z**2, axis=1) - cost(prior.from_white(z)))
         if sampler.effective >= ENOUGH:
             break
     if not np.isfinite(sampler.log):
         raise ValueError("no draw about a minimum of J can be run")
-    x = prior.mean + prior.std * sampler.z
+    x = prior.from_white(sampler.z)
     n, proposal = len(prior.names), sampler.next_proposal()
     return WeightedDraws(
         x=x,
@@ -99,7 +99,7 @@ def sample_modes(cost: Cost, prior: Prior, minima: Sequence[Minimum], seed: int)
         log_evidence=sampler.log,
         lowest=float(-sampler.target.max() - 0.5 * n * np.log(2 * np.pi)),
         proposal=StudentMixture(
-            proposal.share, prior.mean + prior.std * proposal.centre, prior.std[:, None] * proposal.root
+            proposal.share, prior.from_white(proposal.centre), _of_columns(prior.from_white_change, proposal.root)
         ),
     )
 
@@ -108,10 +108,14 @@ def _about(prior: Prior, minima: Sequence[Minimum]) -> StudentMixture:
     """Student t about the minima, all alike, and the prior; in the prior's coordinates."""
     n, count = len(prior.names), len(minima)
     share = np.append(np.full(count, (1 - OF_PRIOR) / count), OF_PRIOR)
-    centre = np.vstack([*((m.x - prior.mean) / prior.std for m in minima), np.zeros(n)])
-    scale = np.outer(prior.std, prior.std)
-    root = np.stack([*(np.linalg.cholesky(m.covariance / scale) for m in minima), np.eye(n)])
+    centre = np.vstack([*(prior.white(m.x) for m in minima), np.zeros(n)])
+    root = np.stack([*(np.linalg.cholesky(prior.white_covariance(m.covariance)) for m in minima), np.eye(n)])
     return StudentMixture(share, centre, root)
+
+
+def _of_columns(change: Callable[[Array], Array], roots: Array) -> Array:
+    """What a change of coordinates makes of the columns of matrices (M, n, n)."""
+    return np.ascontiguousarray(change(roots.transpose(0, 2, 1)).transpose(0, 2, 1))
 
 
 def nearest(prior: Prior, minima: Sequence[Minimum], x: Array) -> npt.NDArray[np.intp]:

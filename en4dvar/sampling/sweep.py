@@ -21,7 +21,7 @@ import numpy as np
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.files import atomic_path, inside, open_plain
-from en4dvar.prior import Prior, member_stream
+from en4dvar.prior import member_stream
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.forward_runs import Predictor
 from en4dvar.sampling.nearest import Targets, best_over_shifts, targets
@@ -165,8 +165,8 @@ def sobol_box(centre: Array, half: Array, count: int, seed: int) -> Array:
 
 def _searched(problem: InverseProblem) -> tuple[object, ...]:
     """What data sets of one design have in common besides the model."""
-    terms = [(t.parameter.name, t.transform, t.bounds) for t in problem.prior.terms]
-    return terms, problem.fixed, problem.perturbations, problem.observable.name
+    terms = [(t.parameter.name, t.transform, t.bounds, t.shape) for t in problem.prior.terms]
+    return terms, problem.fixed, problem.perturbations, problem.tied, problem.observable.name
 
 
 def _without_shift(problem: InverseProblem) -> InverseProblem:
@@ -175,7 +175,7 @@ def _without_shift(problem: InverseProblem) -> InverseProblem:
     if not terms:
         raise ConfigError("nothing but the time shift is estimated; a sweep needs a prior on a parameter")
     fixed = {name: value for name, value in problem.fixed.items() if name != TIME_SHIFT.name}
-    return replace(problem, prior=Prior(terms), fixed=fixed)
+    return replace(problem, prior=problem.prior.of(terms), fixed=fixed)
 
 
 @dataclass(frozen=True)

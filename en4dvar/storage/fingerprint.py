@@ -25,6 +25,7 @@ from en4dvar.storage.provenance import package_versions
 
 PACKAGES = ("en4dvar", "numpy", "scipy", "numba", "llvmlite")
 _NO_NUMBERS = ("execution", "output")
+_PRIOR_FILES = ("prior", "prior_correlation")  # sections that name files
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,8 @@ def identity(resolved: str, model: ForwardModel, data: Mapping[str, DataFile]) -
     section = content.get("data") or {}
     stated = [one.get(key) for one in (section, *section.get("series", {}).values()) for key in ("error", "weights")]
     sources = {"en4dvar": source_digest("en4dvar"), **_packages_of(model)}
-    sources |= {str(path): file_digest(path) for path in _paths([content["model"], stated])}
+    named = [content["model"], stated, *(content.get(key) for key in _PRIOR_FILES)]
+    sources |= {str(path): file_digest(path) for path in _paths(named)}
     text = yaml.safe_dump(
         {**settings, "software": software, "sources": sources}, sort_keys=False, allow_unicode=True, width=120
     )

@@ -43,6 +43,7 @@ REFERENCES = (
     "Bocquet & Sakov (2014), doi:10.1002/qj.2236; Sakov, Oliver & Bertino (2012), doi:10.1175/MWR-D-11-00176.1; "
     "layout: ArviZ InferenceData schema"
 )
+MOST_WRITTEN = 50  # parameters of a block of correlated ones whose matrix is an attribute
 UNTOLD = "with heavy tails beside a discrepancy no single reading has a density of its own given the others"
 
 
@@ -68,16 +69,31 @@ def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]
     }
     return {
         "/": Group(attrs=netcdf_attributes({**root, **attributes})),
-        "/prior": group({**_parameters(a, a.prior), **pieces(a, a.prior)}),
+        "/prior": group({**_parameters(a, a.prior), **pieces(a, a.prior)}, _correlated(a)),
         "/posterior": group({**_parameters(a, a.posterior), **pieces(a, a.posterior)}),
         "/prior_predictive": group(predictive(a, a.prior_predictions, a.prior_trajectories)),
         "/posterior_predictive": group(predictive(a, a.posterior_predictions, a.posterior_trajectories)),
         "/observed_data": group(*observed(a)),
-        "/constant_data": group(_constants(a)),
+        "/constant_data": group(_constants(a), _tied(a)),
         "/sample_stats": group(_sample_stats(a), _scalars(a)),
         "/log_likelihood": group(log_likelihood(a)),
         "/iterations": group(_iterations(a)),
     }
+
+
+def _correlated(a: Analysis) -> dict[str, Any]:
+    """Which parameters are correlated in the prior, in transformed space; of large blocks their names alone."""
+    blocks = [
+        {"names": block.names, "correlation": block.matrix.tolist() if len(block.names) <= MOST_WRITTEN else []}
+        for block in a.problem.prior.blocks
+    ]
+    return {"correlated": json.dumps(blocks)} if blocks else {}
+
+
+def _tied(a: Analysis) -> dict[str, Any]:
+    """Which parameters follow another one, and by which factor."""
+    tied = {tie.parameter.name: [tie.to, tie.factor] for tie in a.problem.tied}
+    return {"tied": json.dumps(tied)} if tied else {}
 
 
 def about(p: Parameter) -> dict[str, Any]:

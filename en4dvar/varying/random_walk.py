@@ -9,7 +9,6 @@ are what they are without; the values of the pieces are their sums.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -20,7 +19,7 @@ from en4dvar.prior import PriorTerm
 from en4dvar.state import Array, Field, Parameter
 from en4dvar.units import convert
 
-SCALE = {"normal": "", "lognormal": "ln", "logit": "logit"}  # what a change is one of
+SCALE = {"normal": "", "lognormal": "ln", "logit": "logit"}  # what a change is one of; else of the Gaussian score
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ class RandomWalk:
         NaN where the parameter is outside of the range of its transform.
         """
         term, value = self.first, np.asarray(theta[self.name], dtype=float)
-        low, high = (0.0, math.inf) if term.transform == "lognormal" else term.bounds
+        low, high = term.range
         inside = (value > low) & (value < high)
         centre = term.to_physical(np.array(term.mean))
         first = np.where(inside, term.from_physical(np.where(inside, value, centre)), np.nan)
@@ -97,7 +96,7 @@ def clock(model: ForwardModel, knot: float) -> str:
 
 def _change(model: ForwardModel, first: PriorTerm, k: int, knot: float) -> Parameter:
     """The change at the k-th knot, counted from one."""
-    p, scale = first.parameter, SCALE[first.transform]
+    p, scale = first.parameter, SCALE.get(first.transform, "score")
     unit, shown = (p.unit, p.display_unit) if first.transform == "normal" else ("1", "1")
     if len(p.symbol) > 2 and p.symbol[0] == p.symbol[-1] == "$":
         function = rf"\mathrm{{{scale}}} " if scale else ""

@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LAYERS = (
     ("errors",),
     ("state", "hints", "files", "tables", "caution", "compiled", "user_code", "user_file"),
+    ("dependence", "parameter_map"),
     ("units", "prior", "forward", "noise"),
     ("batch", "series", "observations", "function_model"),
     ("varying", "programs"),

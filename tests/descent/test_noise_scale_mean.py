@@ -20,6 +20,7 @@ TERMS = {
     "lognormal": PriorTerm.lognormal(NOISE_SCALE, 1.0, 0.4),
     "normal": PriorTerm.normal(NOISE_SCALE, 1.0, 0.4),
     "logit": PriorTerm.logit(NOISE_SCALE, (0.2, 4.0), 1.0, 1.0),
+    "beta": PriorTerm.beta(NOISE_SCALE, (0.2, 4.0), 2.0, 5.0),
 }
 
 

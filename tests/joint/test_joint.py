@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from toys import Decay, Fragile, Linear, Vectorised, make_observations
 
+from en4dvar.dependence import Dependence
 from en4dvar.errors import ConfigError
 from en4dvar.joint import estimate
 from en4dvar.joint.arrow import Arrow
@@ -181,11 +182,21 @@ def test_the_arrow_is_the_dense_matrix():
     assert arrow.log_determinant == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-12)
 
 
+def correlated(problem):
+    """Its first two parameters are."""
+    block = Dependence(problem.prior.names[:2], np.array([[1.0, 0.5], [0.5, 1.0]]))
+    return replace(problem, prior=replace(problem.prior, blocks=(block,)))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda p: sharing(p[:1], ["a"]), "at least two"),
         (lambda p: sharing(p, []), "at least one"),
+        (
+            lambda p: sharing([correlated(p[0]), *p[1:]], ["a"]),
+            "set 0: a joint estimate needs priors",
+        ),
         (lambda p: sharing(p, ["d"]), "d: not estimated in two data sets"),
         (lambda p: JointProblem(tuple(p), ({"d": ""}, {})), "set 0: d: shared, but not estimated there"),
         (lambda p: sharing([p[0], p[0]], ["a"]), "set 0 twice"),

@@ -14,7 +14,7 @@ from en4dvar.cli import main
 from en4dvar.errors import OutputError
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.report.compare import ALL, compare_runs, comparison_table, model_probabilities
+from en4dvar.report.compare import ALL, _effective, compare_runs, comparison_table, model_probabilities
 from en4dvar.report.overlay import overlay
 from en4dvar.report.result import Result
 from en4dvar.storage.store import save
@@ -62,6 +62,12 @@ def test_probabilities_follow_the_exact_evidence_of_linear_models(tmp_path):
     assert comparison.of("set1")[1].dfs == pytest.approx(2, abs=0.01)
     # p_WAIC of a well informed linear parameter is near 1
     assert comparison.of("set1")[0].effective_parameters == pytest.approx(1, abs=0.6)
+
+
+def test_members_that_do_not_fit_have_no_effective_number_of_parameters():
+    likelihood = np.random.default_rng(1).normal(size=(48, 54))
+    assert _effective(0.1 * likelihood, 1) == pytest.approx(0.54, abs=0.1)
+    assert np.isnan(_effective(12 * likelihood, 4))  # 7 900 for 54 readings
 
 
 def test_equal_models_are_undecidable_on_the_command_line(tmp_path):

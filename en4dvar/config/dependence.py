@@ -1,0 +1,262 @@
+"""``prior_correlation:``, which parameters are correlated in the prior, and ``prior:``, an ensemble of them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, cast
+
+import numpy as np
+from pydantic import Field
+
+from en4dvar.config.context import Context, Made
+from en4dvar.config.document import Document
+from en4dvar.config.parameters import Entry, Uncertain
+from en4dvar.config.schema import Section
+from en4dvar.config.validate import Faults
+from en4dvar.dependence import Dependence
+from en4dvar.errors import ConfigError, DataError, Fault
+from en4dvar.files import expanded
+from en4dvar.hints import suggest
+from en4dvar.inputs.members import read_members
+from en4dvar.inputs.readers import read_square
+from en4dvar.prior import PriorTerm
+from en4dvar.state import Array, Parameter, TransformName
+
+KINDS = ("correlation", "matrix", "file", "kernel")
+NUGGET = 1e-8  # share of the variance that close neighbours keep to themselves: a smooth kernel is singular to rounding
+KERNELS: Mapping[str, Callable[[Array], Array]] = {  # of distances in correlation lengths
+    "exponential": lambda r: np.exp(-r),
+    "matern-3/2": lambda r: (1 + np.sqrt(3) * r) * np.exp(-np.sqrt(3) * r),
+    "matern-5/2": lambda r: (1 + np.sqrt(5) * r + 5 / 3 * r**2) * np.exp(-np.sqrt(5) * r),
+    "gaussian": lambda r: np.exp(-0.5 * r**2),
+}
+
+
+def _path(text: str, context: Context) -> Path:
+    return context.base.absolute() / expanded(text)
+
+
+Position = float | tuple[float, ...]
+
+
+class PriorCorrelation(Section):
+    """Parameters that are correlated: of two the number, of more a matrix, a file of it, or a function of distance."""
+
+    between: Annotated[tuple[str, ...], Field(min_length=2)]
+    """Names of the parameters, each with a prior of its own."""
+    correlation: Annotated[float, Field(gt=-1, lt=1)] | None = None
+    """Of two parameters: of their values where normal, of their logarithms where lognormal, else of the scores."""
+    matrix: tuple[tuple[float, ...], ...] | None = None
+    """Rows of the correlation matrix, in the order of the names."""
+    file: Annotated[Path | None, Made(_path, Annotated[str, Field(min_length=1)], {"type": "string"})] = None
+    """CSV file of the correlation matrix, without header, relative to the configuration's folder."""
+    kernel: Literal["exponential", "matern-3/2", "matern-5/2", "gaussian"] | None = None
+    """PriorCorrelation as a function of distance, for parameters with places: needs ``at`` and ``length``."""
+    at: tuple[Position, ...] | None = None
+    """Place of each parameter, a number or a list of coordinates."""
+    length: Annotated[float, Field(gt=0)] | None = None
+    """PriorCorrelation length of the kernel, in the unit of the places."""
+
+    @classmethod
+    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        if sum(key in given for key in KINDS) != 1:
+            faults.add((), f"give one of {', '.join(KINDS)}")
+        for key in ("at", "length"):
+            if (key in given) != ("kernel" in given):
+                faults.add((key,) if key in given else (), "at and length belong to a kernel, and a kernel needs both")
+
+    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """As given, with an absolute path."""
+        return {**super().as_written(given), **({"file": str(self.file)} if self.file else {})}
+
+    def of_all(self, read: Callable[[Path], Array]) -> Array:
+        """The matrix (m, m). Raises :class:`ConfigError`, :class:`DataError`."""
+        if self.correlation is not None:
+            if len(self.between) != 2:
+                raise ConfigError(f"one correlation is that of two parameters, not of {len(self.between)}; give matrix")
+            return np.array([[1.0, self.correlation], [self.correlation, 1.0]])
+        if self.file is not None:
+            return read(self.file)
+        if self.kernel is not None:
+            return self._of_distance()
+        rows = self.matrix or ()
+        if len({len(row) for row in rows}) != 1:
+            raise ConfigError("the rows of the matrix have different lengths")
+        return np.array(rows)
+
+    def _of_distance(self) -> Array:
+        places = [np.atleast_1d(np.asarray(place, dtype=float)) for place in self.at or ()]
+        if len(places) != len(self.between) or len({len(place) for place in places}) != 1:
+            raise ConfigError(f"at: give {len(self.between)} places, one a parameter, all with as many coordinates")
+        where = np.stack(places) / (self.length or 1.0)
+        distance = np.sqrt(np.sum((where[:, None] - where) ** 2, axis=-1))
+        found = (1 - NUGGET) * KERNELS[self.kernel or ""](distance)
+        np.fill_diagonal(found, 1.0)
+        return np.asarray(found)
+
+
+class PriorFile(Section):
+    """Priors from an ensemble in a file: of the parameters that say ``{prior: ensemble}``."""
+
+    ensemble: Annotated[Path, Made(_path, Annotated[str, Field(min_length=1)], {"type": "string"})]
+    """posterior.nc of an earlier run, other netCDF with a variable a parameter, or a CSV file with a column each."""
+
+    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """As given, with an absolute path."""
+        return {**super().as_written(given), "ensemble": str(self.ensemble)}
+
+
+def joined(found: Sequence[tuple[tuple[str, ...], Array]]) -> tuple[Dependence, ...]:
+    """Blocks of correlations between some names each; what shares a name is one block, zero where nothing is said.
+
+    Raises
+    ------
+    ConfigError: a pair of which two say something, or no correlation matrix.
+    """
+    groups: list[list[int]] = []
+    for k, (names, _) in enumerate(found):
+        touching = [group for group in groups if any({*names} & {*found[i][0]} for i in group)]
+        merged = [*itertools.chain.from_iterable(touching), k]
+        groups = [*(group for group in groups if group not in touching), merged]
+    return tuple(_one_block([found[k] for k in sorted(group)]) for group in groups)
+
+
+def _one_block(parts: Sequence[tuple[tuple[str, ...], Array]]) -> Dependence:
+    if len(parts) == 1:
+        return Dependence(*parts[0])
+    names = tuple(dict.fromkeys(name for each, _ in parts for name in each))
+    matrix, said = np.eye(len(names)), np.eye(len(names), dtype=bool)
+    for each, part in parts:
+        Dependence(each, part)  # a fault of it alone is told of it alone
+        columns = [names.index(name) for name in each]
+        where = np.ix_(columns, columns)
+        again = said[where] & ~np.eye(len(columns), dtype=bool)
+        if again.any():
+            i, j = np.argwhere(again)[0]
+            raise ConfigError(f"the correlation of {each[i]} and {each[j]} is given twice")
+        matrix[where], said[where] = part, True
+    return Dependence(names, matrix)
+
+
+def resolved(
+    entries: Sequence[Entry],
+    ensemble: PriorFile | None,
+    correlations: Sequence[PriorCorrelation],
+    others: Sequence[str],
+    apart: Mapping[str, str],
+    document: Document,
+) -> tuple[tuple[Entry, ...], tuple[Dependence, ...]]:
+    """The entries with the priors that an ensemble makes, and what the priors have to do with each other.
+
+    Parameters
+    ----------
+    others: names that are estimated besides the entries. apart: why a parameter can be correlated with no other.
+
+    Raises
+    ------
+    ConfigError: every fault, located in the file.
+    """
+    faults: list[Fault] = []
+    asking = [e for e in entries if isinstance(e, Uncertain) and e.from_ensemble]
+    found: tuple[Dependence, ...] = ()
+    made: dict[str, Entry] = {}
+    if asking or ensemble is not None:
+        try:
+            found, made = _of_ensemble(asking, ensemble, apart)
+        except ConfigError as error:
+            faults += [document.fault(tuple(f.path.split(".")), f.message) for f in error.problems]
+    estimated = [e.parameter.name for e in entries if isinstance(e, Uncertain)] + list(others)
+    alone = {**apart, **{e.parameter.name: "its correlations are those of the ensemble" for e in asking}}
+    parts = []
+    for k, one in enumerate(correlations):
+        place = ("prior_correlation", k)
+        try:
+            _check_names(one.between, estimated, alone)
+            parts.append((one.between, one.of_all(read_square)))
+            Dependence(*parts[-1])
+        except (ConfigError, DataError) as error:
+            faults.append(document.fault(place, str(error)))
+    if not faults:
+        try:
+            return tuple(made.get(e.parameter.name, e) for e in entries), (*found, *joined(parts))
+        except ConfigError as error:
+            faults.append(document.fault(("prior_correlation",), str(error)))
+    raise ConfigError(faults)
+
+
+def _check_names(names: Sequence[str], estimated: Sequence[str], apart: Mapping[str, str]) -> None:
+    for name in names:
+        if name in apart:
+            raise ConfigError(f"{name} cannot be correlated: {apart[name]}")
+        if name not in estimated:
+            raise ConfigError(f"{name!r} is no parameter with a prior{suggest(name, estimated)}")
+
+
+def _of_ensemble(
+    asking: Sequence[Uncertain], ensemble: PriorFile | None, apart: Mapping[str, str]
+) -> tuple[tuple[Dependence, ...], dict[str, Entry]]:
+    """The Gaussian of the members' mean and covariance in transformed space. Raises :class:`ConfigError` with paths."""
+    if ensemble is None:
+        raise _at(f"parameters.{asking[0].parameter.name}", "no ensemble is given; write 'prior: {ensemble: FILE}'")
+    if not asking:
+        raise _at("prior", "no parameter takes its prior from it; write e.g. 'G: {prior: ensemble}'")
+    for entry in asking:
+        if reason := apart.get(entry.parameter.name):
+            raise _at(f"parameters.{entry.parameter.name}", f"cannot be part of an ensemble: {reason}")
+    units = {e.parameter.name: (e.parameter.unit, e.spec.unit or "") for e in asking}
+    try:
+        members = read_members(ensemble.ensemble, units)
+    except DataError as error:
+        raise _at("prior.ensemble", str(error)) from None
+    count, n = len(next(iter(members.values()))), len(asking)
+    if count < n + 2:
+        words = f"{count} members are too few for {n} parameters; at least {n + 2}"
+        raise _at("prior.ensemble", f"{ensemble.ensemble}: {words}")
+    made: dict[str, Entry] = {}
+    columns = []
+    for entry in asking:
+        name = entry.parameter.name
+        try:
+            term, scores = term_of_members(entry.parameter, members[name], entry.spec.map)
+        except ConfigError as error:
+            raise _at(f"parameters.{name}", str(error).removeprefix(f"prior of {name}: ")) from None
+        made[name] = replace(entry, of_members=term)
+        columns.append(scores)
+    y = np.stack(columns, axis=1)
+    matrix = np.atleast_2d(np.corrcoef(y.T))
+    np.fill_diagonal(matrix, 1.0)
+    try:
+        return (Dependence(tuple(made), matrix, y),), made
+    except ConfigError as error:
+        raise _at("prior.ensemble", f"{ensemble.ensemble}: {error}") from None
+
+
+def term_of_members(parameter: Parameter, values: Array, kind: str | None) -> tuple[PriorTerm, Array]:
+    """The Gaussian of members (N,) in the coordinate ``kind``, and the members standardised (N,).
+
+    Raises
+    ------
+    ConfigError: members outside of the parameter's bounds or of the range of its map, or all alike.
+    """
+    low, high = parameter.bounds
+    kind = kind or parameter.transform
+    outside = (values < low) | (values > high)
+    if outside.any():
+        where = f"outside of [{low:g}, {high:g}] {parameter.unit}, e.g. {values[outside][0]:g}"
+        raise ConfigError(f"{int(outside.sum())} of {len(values)} members lie {where}")
+    bounds = parameter.bounds if kind == "logit" else (-math.inf, math.inf)
+    shape = PriorTerm(parameter, cast(TransformName, kind), 0.0, 1.0, bounds)
+    try:
+        x = shape.from_physical(values)
+    except ValueError as error:
+        raise ConfigError(f"{error}, as map: {kind} has it") from None
+    term = replace(shape, mean=float(x.mean()), std=float(x.std(ddof=1)))
+    return term, np.asarray((x - term.mean) / term.std)
+
+
+def _at(path: str, message: str) -> ConfigError:
+    return ConfigError([Fault(message, path)])

@@ -1,0 +1,101 @@
+"""Ensembles of parameters from files: a posterior of ours, netCDF of others, CSV. Values are read, and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from en4dvar.errors import DataError
+from en4dvar.hints import listed, no_such_file, suggest
+from en4dvar.inputs.readers import read_contents
+from en4dvar.state import Array
+from en4dvar.units import UnitError, convert
+
+NETCDF = (".nc", ".nc4", ".cdf")
+DRAWS = ("chain", "draw", "member", "sample", "realization", "ensemble")  # dimensions along which members lie
+MOST_MEMBERS = 1_000_000
+
+
+def read_members(path: Path, units: Mapping[str, tuple[str, str]]) -> dict[str, Array]:
+    """Members (N,) of each parameter by name, in its own unit.
+
+    Parameters
+    ----------
+    units: for each name the unit that is wanted and, "" where the file tells it, the one in the file.
+
+    Raises
+    ------
+    DataError: the file cannot be read, lacks a name or a unit, or holds numbers that are not finite.
+    """
+    if not path.is_file():
+        raise DataError(no_such_file(path))
+    found = _of_netcdf(path, units) if path.suffix.lower() in NETCDF else _of_table(path, units)
+    lengths = {name: len(values) for name, (values, _) in found.items()}
+    if len(set(lengths.values())) != 1:
+        raise DataError(f"{path}: unequal numbers of members: {listed([f'{k} {n}' for k, n in lengths.items()])}")
+    members = {}
+    for name, (values, unit) in found.items():
+        if not np.all(np.isfinite(values)):
+            raise DataError(
+                f"{path}: {name} has {int(np.sum(~np.isfinite(values)))} members that are not finite numbers"
+            )
+        members[name] = _converted(path, name, values, unit, units[name])
+    return members
+
+
+def _converted(path: Path, name: str, values: Array, unit: str, units: tuple[str, str]) -> Array:
+    target, stated = units
+    unit = stated or unit
+    if not unit and target != "1":
+        raise DataError(f"{path}: {name} has no unit there; write e.g. '{name}: {{prior: ensemble, unit: {target}}}'")
+    try:
+        return np.asarray(convert(values, unit or "1", target), dtype=float)
+    except UnitError as error:
+        raise DataError(f"{path}: {name}: {error}") from None
+
+
+def _of_table(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, str]]:
+    contents = read_contents(path)
+    for name in names:
+        if name not in contents.columns:
+            raise DataError(contents.others.get(name) or f"{path}: no column {name!r}{suggest(name, contents.columns)}")
+    return {name: (contents.columns[name], "") for name in names}
+
+
+def _of_netcdf(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, str]]:
+    import netCDF4  # a tenth of a second that other files do not need
+
+    try:
+        with netCDF4.Dataset(path) as file:
+            group = file.groups.get("posterior", file)
+            stats = file.groups.get("sample_stats") if group is not file else None
+            alive = None
+            if stats is not None and "active" in stats.variables:
+                alive = _numbers(path, stats.variables["active"]) > 0
+            found = {}
+            for name in names:
+                if name not in group.variables:
+                    raise DataError(f"{path}: no variable {name!r}{suggest(name, group.variables)}")
+                variable = group.variables[name]
+                values = _numbers(path, variable)
+                values = values[alive] if alive is not None and len(alive) == len(values) else values
+                found[name] = values, str(getattr(variable, "units", ""))
+            return found
+    except (OSError, RuntimeError) as error:
+        raise DataError(f"{path}: cannot be read as netCDF: {error}") from None
+
+
+def _numbers(path: Path, variable: Any) -> Array:
+    """All numbers of a variable along its members, NaN where they are missing."""
+    others = [d for d, size in zip(variable.dimensions, variable.shape, strict=True) if d not in DRAWS and size != 1]
+    if others or not variable.ndim:
+        where = f"lies along {', '.join(variable.dimensions) or 'nothing'}"
+        raise DataError(f"{path}: {variable.name} {where}; members must lie along one of {', '.join(DRAWS)}")
+    if variable.size > MOST_MEMBERS:
+        raise DataError(f"{path}: {variable.size} members of {variable.name}; at most {MOST_MEMBERS}")
+    if getattr(variable.dtype, "kind", "O") not in "fiub":
+        raise DataError(f"{path}: {variable.name} holds no numbers")
+    return np.ma.filled(np.ma.asarray(variable[:]).astype(float), np.nan).ravel()

@@ -1,0 +1,141 @@
+"""Uniform, half-normal and beta priors against scipy's distributions and against quadrature."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.integrate import quad
+from toy_config import write_toy
+from toys import OBSERVABLE, Vectorised, make_observations
+
+from en4dvar.assimilate import assimilate, log_posterior
+from en4dvar.config import load_config
+from en4dvar.config.build import build
+from en4dvar.errors import ConfigError
+from en4dvar.honesty.checks import at_bound
+from en4dvar.prior import Prior, PriorTerm
+from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.state import Parameter
+
+A = Parameter("a", "m")
+NAMED = {
+    "uniform": (PriorTerm.uniform(A, (-1.0, 3.0)), stats.uniform(-1, 4)),
+    "half-normal": (PriorTerm.half_normal(A, 2.0, 0.5), stats.halfnorm(0.5, 2.0)),
+    "half-normal from zero": (PriorTerm.half_normal(A, 2.0), stats.halfnorm(0, 2.0)),
+    "beta": (PriorTerm.beta(A, (-1.0, 3.0), 2.0, 5.0), stats.beta(2, 5, -1, 4)),
+    "beta with peaks at its bounds": (PriorTerm.beta(A, (0.0, 1.0), 0.5, 0.5), stats.beta(0.5, 0.5)),
+}
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_the_score_is_that_of_the_distribution(name):
+    term, named = NAMED[name]
+    x = np.linspace(-4, 4, 33)
+    theta = term.to_physical(x)
+    lower = x < 0
+    assert named.cdf(theta[lower]) == pytest.approx(stats.norm.cdf(x[lower]), rel=1e-7)
+    assert named.sf(theta[~lower]) == pytest.approx(stats.norm.sf(x[~lower]), rel=1e-7)
+    assert np.all(np.diff(theta) > 0)
+    assert term.from_physical(theta) == pytest.approx(x, abs=1e-7)
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_the_density_in_the_displayed_quantity(name):
+    """N(x; 0, 1) dx = f(θ) dθ, with the slope that a varying parameter uses."""
+    term, named = NAMED[name]
+    for x in (-2.5, -0.3, 0.0, 1.7):
+        density = math.exp(float(Prior((term,)).log_density(np.array([x])))) / term.slope(x)
+        assert density == pytest.approx(float(named.pdf(float(term.to_physical(np.array(x))))), rel=1e-10)
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_moments_by_quadrature_and_of_draws(name):
+    term, named = NAMED[name]
+    for power in (1, 2):
+        moment = quad(lambda x, p=power: float(term.to_physical(np.array(x))) ** p * stats.norm.pdf(x), -12, 12)[0]
+        assert moment == pytest.approx(named.moment(power), rel=1e-7)
+    drawn = Prior((term,)).to_physical(Prior((term,)).sample(4000, 1))[:, 0]
+    assert drawn.mean() == pytest.approx(named.mean(), abs=4 * named.std() / math.sqrt(4000))
+    assert stats.kstest(drawn, named.cdf).pvalue > 0.01
+
+
+def test_tails_keep_their_distance_to_the_bound():
+    for term in (PriorTerm.uniform(A, (0.0, 2.0)), PriorTerm.half_normal(A, 1.0), PriorTerm.beta(A, (0.0, 2.0), 1, 1)):
+        far = float(term.to_physical(np.array(-20.0)))
+        assert 0 < far < 1e-80
+        assert float(term.from_physical(np.array(far))) == pytest.approx(-20, rel=1e-12)
+    assert float(PriorTerm.half_normal(A, 1.0).to_physical(np.array(30.0))) == pytest.approx(30.02, abs=0.01)
+    with pytest.raises(ValueError, match="strictly between 0 and 2"):
+        PriorTerm.uniform(A, (0.0, 2.0)).from_physical(np.array(2.0))
+
+
+@pytest.mark.parametrize("name", ["uniform", "half-normal", "beta"])
+def test_posterior_and_evidence_of_a_linear_observation(name):
+    """Sampled members, and exp(−J) summed over x, against quadrature over the parameter itself."""
+    term, named = NAMED[name]
+    times, std, y = np.array([0.5, 1.0, 1.5]), 1.1, np.array([0.9, -0.3, 0.2])
+    observations = make_observations(times, y, std)
+    problem = InverseProblem(Vectorised(("a",)), OBSERVABLE, observations, Prior((term,)))
+    low, high = named.support()[0], min(named.support()[1], 20.0)
+
+    def joint(theta):
+        return named.pdf(theta) * np.prod(stats.norm.pdf(y, theta, std))
+
+    evidence, first, second = (quad(lambda t, p=p: t**p * joint(t), low, high, limit=200)[0] for p in range(3))
+    mean = first / evidence
+    found = assimilate(problem, AssimilationSettings(members=400, refine="mcmc"), 1)
+    assert found.refinement["mcmc_converged"]
+    spread = math.sqrt(second / evidence - mean**2)
+    assert found.posterior[:, 0].mean() == pytest.approx(mean, abs=0.06 * spread)
+    assert found.posterior[:, 0].std(ddof=1) == pytest.approx(spread, rel=0.05)
+    x = np.linspace(-8, 8, 4001)
+    log = log_posterior(problem, x[:, None]) - observations.log_normalisation() - 0.5 * math.log(2 * math.pi)
+    assert math.log(np.sum(np.exp(log)) * (x[1] - x[0])) == pytest.approx(math.log(evidence), abs=1e-10)
+
+
+def test_at_the_edge_of_a_uniform_prior():
+    prior = Prior((PriorTerm.uniform(A, (0.0, 2.0)),))
+    members = prior.sample(200, 1)
+    (found,) = at_bound(prior, members, 0.1 * members + 3, [""] * 200)
+    assert "of the posterior members of a pile up at its upper bound (2 m)" in found.line
+    assert not list(at_bound(prior, members, members, [""] * 200))
+
+
+def test_from_yaml_to_the_problem(tmp_path: Path):
+    (problem,) = build(
+        load_config(
+            write_toy(
+                tmp_path,
+                ("A: {prior: normal, mean: maximum, std: 1 %}", "A: {prior: uniform, lower: 90 um, upper: 0.2 mm}"),
+                ("prior: lognormal, median: 3 N/m, log_std: 0.3", "prior: half-normal, std: 3 N/m"),
+                ("c: 0.02 N s/m", "c: {prior: beta, lower: 0 N s/m, upper: 0.1 N s/m, alpha: 2, beta: 5}"),
+            )
+        )
+    )
+    assert [t.transform for t in problem.prior.terms] == ["uniform", "half-normal", "beta"]
+    assert [t.bounds for t in problem.prior.terms] == [pytest.approx((9e-5, 2e-4)), (0.0, math.inf), (0.0, 0.1)]
+    assert [t.shape for t in problem.prior.terms] == [(), (3.0,), (2.0, 5.0)]
+
+
+@pytest.mark.parametrize(
+    ("prior", "fault"),
+    [
+        ("uniform, lower: 1 N/m", "a uniform prior takes lower and upper; given: lower"),
+        ("uniform, lower: 2 N/m, upper: 1 N/m", "uniform needs finite bounds, low < high, not (2.0, 1.0)"),
+        ("uniform, lower: -2 N/m, upper: 1 N/m", "-2 N/m is outside the bounds [0, inf] N/m"),
+        ("half-normal, std: 10 %", "10 % is relative to the mean, which is zero; give it in N/m"),
+        ("half-normal, median: 1 N/m", "a half-normal prior takes std, and lower where it does not start at zero"),
+        ("beta, lower: 0 N/m, upper: 1 N/m, alpha: 2", "a beta prior takes lower, upper, alpha and beta"),
+        ("beta, lower: 0 N/m, upper: 1 N/m, alpha: 2, beta: 0.01", "beta must lie between 0.1 and 1e+06, not 0.01"),
+        ("beta, lower: 0 N/m, upper: 1 N/m, alpha: -2, beta: 1", "should be greater than 0, not -2"),
+    ],
+)
+def test_bad_input_is_told_where_it_stands(tmp_path, prior, fault):
+    with pytest.raises(ConfigError) as error:
+        load_config(write_toy(tmp_path, ("lognormal, median: 3 N/m, log_std: 0.3", prior)))
+    (told,) = error.value.problems
+    assert fault in told.message
+    assert told.line == 14
+    assert told.column > 1
