@@ -268,7 +268,7 @@ _LN2_HIGH = 6.93147180369123816490e-01
 _LN2_LOW = 1.90821492927058770002e-10
 
 
-@nb.njit(inline="always")
+@nb.njit(forceinline=True)
 def exp(x):
     """e^x lane by lane to about 1 ulp, for any |x| (clamped to the range of normal doubles).
 
@@ -294,7 +294,7 @@ def exp(x):
     return _scale_by_power_of_two(q, k)
 
 
-@nb.njit(inline="always")
+@nb.njit(forceinline=True)
 def log(x):
     """Natural logarithm lane by lane of positive normal numbers, to about 1 ulp.
 

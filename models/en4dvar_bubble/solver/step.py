@@ -162,7 +162,7 @@ def _judge(lanes, shear, tolerances, w):
     store(w.norm, 2, mach)
 
 
-@nb.njit(forceinline=True)
+@nb.njit(inline="always")
 def attempt(lanes, eq, tolerances, w):
     """One step of all lanes: see :class:`arrays.Workspace` for what it leaves."""
     algebraic = _algebraic_row(eq)
@@ -171,7 +171,7 @@ def attempt(lanes, eq, tolerances, w):
     _judge(lanes, eq.dims.shear, tolerances, w)
 
 
-@nb.njit(forceinline=True)
+@nb.njit(inline="always")
 def interpolant(w):
     """Rows 3n of the dense-output polynomial (K1, K2, K3) of all lanes, to ``dense``."""
     n = len(w.f)
