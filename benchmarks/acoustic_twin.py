@@ -8,17 +8,18 @@ microsecond of the collapse, which no flash resolves and where the radius change
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
+from worlds import RIGHT, Twin, World, read_once
 
-from en4dvar.ensemble.forecast import forecast
 from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.state import TIME_SHIFT, Array
 from en4dvar_bubble import BubbleModel
+from en4dvar_bubble.solver.driver import AccuracyName, preset
 
 MEDIANS = {"G": 500.0, "alpha": 0.03, "mu": 0.1, "R0": 0.5e-6}
 NARROW = {"G": 0.3, "alpha": 0.3, "mu": 0.3, "R0": 0.3}
@@ -29,14 +30,6 @@ FEWEST = 5  # readings; a smaller set is drawn again
 MODEL = BubbleModel()
 
 
-@dataclass(frozen=True)
-class Twin:
-    """An inverse problem and the truth (n,), transformed, that made its data."""
-
-    problem: InverseProblem
-    truth: Array
-
-
 def prior(log_std: dict[str, float] = NARROW, widen: float = 1.0) -> Prior:
     """Lognormal about the paper's initial guesses for 0.3 % agarose, t_s ~ N(0, 0.3 µs); spreads times ``widen``."""
     parameters = {p.name: p for p in MODEL.parameters}
@@ -44,8 +37,25 @@ def prior(log_std: dict[str, float] = NARROW, widen: float = 1.0) -> Prior:
     return Prior((*terms, PriorTerm.normal(TIME_SHIFT, 0.0, widen * SHIFT_STD)))
 
 
-def make_twin(seed: int, of: Prior, *, truths: Prior | None = None, std: float = 1.4e-6, time_std: float = 0.0) -> Twin:
-    """Experiment ``seed``: truth from ``truths`` (default: the prior ``of``), readings with errors (m, s).
+def through_the_collapse(
+    times: Array, log_std: dict[str, float], accuracy: AccuracyName = "standard", std: float = 1.4e-6
+) -> Callable[[int], Twin]:
+    """Readings at fixed ``times`` (K,) s, wherever the collapse is."""
+    model, of, ones = BubbleModel(accuracy=preset(accuracy, "acoustic")), prior(log_std), np.ones(len(times))
+    observed = Observations(times, ones, noise_of(std * ones, 0 * ones), ones, name="through")
+    return lambda seed: read_once(InverseProblem(model, model.observables[0], observed, of), [17, seed])
+
+
+def make_twin(
+    seed: int,
+    of: Prior,
+    *,
+    truths: Prior | None = None,
+    std: float = 1.4e-6,
+    time_std: float = 0.0,
+    world: World = RIGHT,
+) -> Twin:
+    """Experiment ``seed``: truth from ``truths`` (default: the prior ``of``), readings of a ``world``, errors in m, s.
 
     A truth that cannot be integrated, or whose bubble yields fewer than 5 readings, is drawn again.
     """
@@ -55,11 +65,12 @@ def make_twin(seed: int, of: Prior, *, truths: Prior | None = None, std: float =
         truth = truths.mean + truths.std * rng.standard_normal(len(truths.names))
         times = 5.6e-6 + np.cumsum(rng.uniform(1.25e-6, 1.75e-6, 60))
         design = Observations(times, np.ones(60), noise_of(np.full(60, std), np.full(60, time_std)), np.ones(60))
-        run = forecast(InverseProblem(MODEL, MODEL.observables[0], design, of), truth[None])
+        problem = InverseProblem(MODEL, MODEL.observables[0], design, of)
+        run = world.run(problem, truth, seed)
         noise = rng.standard_normal((2, 60))
         if run.failures[0]:
             continue
-        values = run.predictions[0] + std * noise[0]
+        values = world.values(problem, run, noise[0], seed)
         if run.predicted.rates is not None:
             values += time_std * run.predicted.rates[0] * noise[1]
         last = np.flatnonzero(values < STOP * np.maximum.accumulate(values))

@@ -3,6 +3,8 @@
     python benchmarks/calibration.py a                 30 % priors, En4D-Var alone; 20 of them against a Markov chain
     python benchmarks/calibration.py b                 wide priors, ``refine: mcmc``
     python benchmarks/calibration.py laser             laser-induced bubbles with rebounds, default settings
+    python benchmarks/calibration.py rebound           acoustic, through the rebound, wide priors, default settings
+    python benchmarks/calibration.py stiff             a stiff gel as ``init`` proposes it, default settings
     python benchmarks/calibration.py b --minutes 4     a piece of it: records are kept and the next call goes on
 
 Over ``--n`` experiments: rank histograms of every parameter uniform (chi-squared, p > 0.01), central 50 and 90 %
@@ -17,10 +19,11 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from acoustic_twin import NARROW, WIDE, Twin, make_twin, prior
-from laser_twin import laser_prior, make_laser_twin
+from acoustic_twin import NARROW, WIDE, make_twin, prior, through_the_collapse
+from laser_twin import laser_prior, make_laser_twin, stiff_gel
 from records import Record, fill
 from scipy.stats import binomtest, chisquare
+from worlds import Twin
 
 from en4dvar.assimilate import assimilate
 from en4dvar.descent.weight_space import WeightSpace
@@ -61,7 +64,7 @@ def experiment(seed: int, twin: Twin, settings: AssimilationSettings, chain: boo
         analysis = assimilate(twin.problem, settings, seed)
     except En4dvarError as error:  # counted: no run may fail
         return {"failure": str(error)}
-    x = of.from_physical(analysis.posterior)
+    x = of.from_physical(analysis.posterior)[:, : len(twin.truth)]  # amplitude and length of a discrepancy are last
     record = {
         "truth": twin.truth,
         "mean": x.mean(axis=0),
@@ -69,6 +72,10 @@ def experiment(seed: int, twin: Twin, settings: AssimilationSettings, chain: boo
         "rank": np.sum(x < twin.truth, axis=0),
         "converged": analysis.converged,
         "warned": [c.code for c in analysis.cautions],
+        "graver": [c.code for c in analysis.cautions if c.severity != "note"],
+        "log_evidence": analysis.log_evidence,
+        "runs": analysis.forward_runs,
+        "what_if": {shift.name: shift.in_std for shift in analysis.what_if if shift.settled},
         **analysis.refinement,
     }
     if chain:
@@ -82,7 +89,24 @@ def experiment(seed: int, twin: Twin, settings: AssimilationSettings, chain: boo
     return record
 
 
-CASES = {"a": (narrow, prior(NARROW)), "b": (wide, prior(WIDE)), "laser": (laser, laser_prior())}
+def rebound(key: str) -> Record:
+    """Wide priors, a window through collapse and rebound, as a user would run it."""
+    return experiment(int(key), REBOUND(int(key)), AssimilationSettings(what_if=False))
+
+
+def stiff(key: str) -> Record:
+    """A stiff gel with the priors of ``init``, as a user would run it."""
+    return experiment(int(key), stiff_gel(int(key)), AssimilationSettings(what_if=False))
+
+
+REBOUND = through_the_collapse(np.linspace(4e-6, 60e-6, 30), WIDE)
+CASES = {
+    "a": (narrow, prior(NARROW)),
+    "b": (wide, prior(WIDE)),
+    "laser": (laser, laser_prior()),
+    "rebound": (rebound, prior(WIDE)),
+    "stiff": (stiff, stiff_gel(0).problem.prior),
+}
 
 
 def verdict(passed: bool) -> str:

@@ -7,7 +7,8 @@
 
 A run is off where the mean of a parameter lies more than 0.5 standard deviations of a long Markov chain from the
 chain's, or its standard deviation differs by more than 30 %. The flag (``sample_stats.non_gaussian``) is of the same
-run, without refinement. Chains are kept as records; flags are computed anew.
+run, without refinement. A run that is off is repeated with ``refine: auto``, the default: it is mended where it then is
+off no longer, told where it warns (graver than a note), else silent. Chains are kept as records; flags are made anew.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ import numpy as np
 from acoustic_twin import NARROW, WIDE, make_twin, prior
 from records import Record, fill, load
 
+from en4dvar.analysis import Analysis
 from en4dvar.assimilate import assimilate
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.forecast import log_posterior
 from en4dvar.executor import SerialExecutor
+from en4dvar.noise import noise_of
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.shape import guide
@@ -50,8 +53,9 @@ def thinned(problem: InverseProblem, few: int | None) -> InverseProblem:
     if few is None or few >= len(o.times):
         return problem
     kept = np.linspace(0, len(o.times) - 1, few).astype(int)
-    parts = {name: getattr(o, name)[kept] for name in ("times", "values", "std", "time_std", "weights")}
-    return replace(problem, observations=replace(o, **parts))
+    noise = noise_of(o.noise.std[kept], o.noise.time_std[kept])
+    few_of_them = replace(o, times=o.times[kept], values=o.values[kept], noise=noise, weights=o.weights[kept])
+    return replace(problem, observations=few_of_them)
 
 
 DESIGNS: dict[str, Callable[[int], InverseProblem]] = {
@@ -97,6 +101,22 @@ def judged(key: str, chain: Record, settings: AssimilationSettings = SETTINGS) -
     began = time.process_time()
     analysis = assimilate(problem, settings, seed)
     took = time.process_time() - began
+    record = {
+        **distance(problem, analysis, chain),
+        "seconds": took,
+        "runs": analysis.forward_runs,
+        "missed": analysis.iterations[-1].cost - chain.get("lowest", np.nan),
+        **analysis.shape,
+    }
+    if is_off(record):
+        default = assimilate(problem, replace(settings, refine="auto"), seed)
+        told = any(c.severity != "note" for c in default.cautions)
+        record |= {"mended": not is_off(distance(problem, default, chain)), "told": told}
+    return record
+
+
+def distance(problem: InverseProblem, analysis: Analysis, chain: Record) -> Record:
+    """Of an ensemble from what the chain says: the farthest mean, the farthest ratio of standard deviations."""
     x = problem.prior.from_physical(analysis.posterior)
     mean, std = np.array(chain["mean"]), np.array(chain["std"])
     ratio = x.std(axis=0, ddof=1) / std
@@ -104,26 +124,29 @@ def judged(key: str, chain: Record, settings: AssimilationSettings = SETTINGS) -
         "shift": float(np.max(np.abs(x.mean(axis=0) - mean) / std)),
         "ratio": float(ratio[np.argmax(np.abs(np.log(ratio)))]),
         "off_by": float(np.max(np.abs(ratio - 1))),
-        "seconds": took,
-        "runs": analysis.forward_runs,
-        "missed": analysis.iterations[-1].cost - chain.get("lowest", np.nan),
-        **analysis.shape,
     }
+
+
+def is_off(record: Record) -> bool:
+    return bool(record["shift"] > OFF[0] or record["off_by"] > OFF[1])
 
 
 def table(found: dict[str, Record]) -> None:
     """Print, design by design and for all, how many runs are off and how many of which are flagged."""
-    print("| design | runs | off | flagged of them | false alarms | emulated |\n|---|---|---|---|---|---|")
+    heads = ["design", "runs", "off", "flagged of them", "false alarms", "emulated", "auto: mended", "told", "silent"]
+    print(f"| {' | '.join(heads)} |\n{'|---' * len(heads)}|")
     by_design: dict[str, list[Record]] = {}
     for key, record in found.items():
         by_design.setdefault(key.rsplit("/", 1)[0], []).append(record)
     for design, records in {**by_design, "all": list(found.values())}.items():
-        off = np.array([r["shift"] > OFF[0] or r["off_by"] > OFF[1] for r in records])
+        off = np.array([is_off(r) for r in records])
+        mended = sum(r.get("mended", False) for r in records)
+        told = sum(r.get("told", False) and not r["mended"] for r in records)
         flag = np.array([bool(r["non_gaussian"]) for r in records])
         emulated = sum("emulator_fit" in r for r in records)
         print(
             f"| {design} | {len(off)} | {off.sum()} | {(flag & off).sum()} | {(flag & ~off).sum()} of {(~off).sum()} | "
-            f"{emulated} |"
+            f"{emulated} | {mended} | {told} | {off.sum() - mended - told} |"
         )
     seconds = {e: [r["seconds"] for r in found.values() if ("emulator_fit" in r) == e] for e in (True, False)}
     words = [f"{'with' if e else 'without'} emulator {1e3 * np.median(s):.0f} ms" for e, s in seconds.items() if s]

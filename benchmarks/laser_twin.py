@@ -7,15 +7,19 @@ where both R_eq and μ are too large meet the rebound by its phase and not by it
 
 from __future__ import annotations
 
-import numpy as np
-from acoustic_twin import Twin
+from dataclasses import replace
 
-from en4dvar.ensemble.forecast import forecast
+import numpy as np
+from worlds import RIGHT, Twin, World, read_once
+
 from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
+from en4dvar.state import TIME_SHIFT
 from en4dvar_bubble import BubbleModel, NeoHookeanKelvinVoigt
+from en4dvar_bubble.gas import saturated_vapour_pressure
+from en4dvar_bubble.medium import WATER_25C
 
 MODEL = BubbleModel(law=NeoHookeanKelvinVoigt(), start="laser", gas="polytropic")
 MEDIANS = {"G": 4e3, "mu": 0.06, "R_eq": 35e-6}
@@ -23,26 +27,32 @@ LOG_STD = {"G": 0.5, "mu": 0.5, "R_eq": 0.2}
 LARGEST, LARGEST_STD = 250e-6, 5e-6  # R_max, m
 STD = 1.5e-6
 TIMES = 0.7e-6 + 1.4e-6 * np.arange(30)
+PARAMETERS = {p.name: p for p in MODEL.parameters}
+SATURATED = replace(WATER_25C, p_v=saturated_vapour_pressure(WATER_25C.T_inf))
+PROPOSED = replace(MODEL, medium=SATURATED)
+STIFF = {"G": (8e3, 1.0), "mu": (0.1, 0.7), "R_eq": (48e-6, 0.4)}  # median, log_std
+STIFF_TIMES = 3.7e-6 * np.arange(1, 31)
 
 
 def laser_prior() -> Prior:
     """Lognormal about the medians, R_max ~ N(250 µm, 5 µm)."""
-    parameters = {p.name: p for p in MODEL.parameters}
-    terms = [PriorTerm.lognormal(parameters[k], m, LOG_STD[k]) for k, m in MEDIANS.items()]
-    return Prior((*terms, PriorTerm.normal(parameters["R_max"], LARGEST, LARGEST_STD)))
+    terms = [PriorTerm.lognormal(PARAMETERS[k], m, LOG_STD[k]) for k, m in MEDIANS.items()]
+    return Prior((*terms, PriorTerm.normal(PARAMETERS["R_max"], LARGEST, LARGEST_STD)))
 
 
-def make_laser_twin(seed: int) -> Twin:
-    """Experiment ``seed``. A truth that cannot be integrated is drawn again."""
-    of, ones = laser_prior(), np.ones(len(TIMES))
-    rng = np.random.default_rng([20211, seed])
-    while True:
-        truth = of.mean + of.std * rng.standard_normal(len(of.names))
-        observed = Observations(TIMES, ones, noise_of(STD * ones, 0 * ones), ones, name=f"laser{seed:04d}")
-        problem = InverseProblem(MODEL, MODEL.observables[0], observed, of)
-        run = forecast(problem, truth[None])
-        if not run.failures[0]:
-            break
-    values = run.predictions[0] + STD * rng.standard_normal(len(TIMES))
-    observed = Observations(TIMES, values, observed.noise, ones, name=observed.name)
-    return Twin(InverseProblem(MODEL, MODEL.observables[0], observed, of), truth)
+def make_laser_twin(
+    seed: int, model: BubbleModel = MODEL, world: World = RIGHT, more: tuple[PriorTerm, ...] = ()
+) -> Twin:
+    """Experiment ``seed``, fitted by ``model`` with ``more`` parameters. A truth that cannot be run is drawn again."""
+    of, ones = Prior((*laser_prior().terms, *more)), np.ones(len(TIMES))
+    observed = Observations(TIMES, ones, noise_of(STD * ones, 0 * ones), ones, name=f"laser{seed:04d}")
+    return read_once(InverseProblem(model, model.observables[0], observed, of), [20211, seed], world)
+
+
+def stiff_gel(seed: int) -> Twin:
+    """A stiff polyacrylamide gel as ``en4dvar init`` proposes it: wide priors, errors of 1 %, a camera of 270 kHz."""
+    terms = [PriorTerm.lognormal(PARAMETERS[k], *about) for k, about in STIFF.items()]
+    terms += [PriorTerm.normal(PARAMETERS["R_max"], 400e-6, 4e-6), PriorTerm.normal(TIME_SHIFT, 0.0, 0.5e-6)]
+    ones = np.ones(len(STIFF_TIMES))
+    observed = Observations(STIFF_TIMES, ones, noise_of(4e-6 * ones, 0 * ones), ones, name=f"stiff{seed:04d}")
+    return read_once(InverseProblem(PROPOSED, PROPOSED.observables[0], observed, Prior(tuple(terms))), [20213, seed])

@@ -18,9 +18,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from acoustic_twin import NARROW, WIDE, Twin, make_twin, prior
+from acoustic_twin import NARROW, WIDE, make_twin, prior
 from laser_twin import make_laser_twin
 from records import Record, fill
+from worlds import Twin
 
 from en4dvar.assimilate import assimilate
 from en4dvar.ensemble.forecast import log_posterior

@@ -302,10 +302,13 @@ class ForwardModel(ABC):
         """:meth:`trajectories` of states (N, n_state) as work that threads share, where the model can; else None."""
         return None
 
-    def doubts(self, observable: str, times: Array, values: Array, predicted: Array) -> Sequence[str]:
+    def doubts(
+        self, observable: str, times: Array, values: Array, predicted: Array, members: Mapping[str, Array]
+    ) -> Sequence[str]:
         """Why observations ``values`` (K,) at ``times`` (K,) cannot be what they say, in words; by default nothing.
 
-        ``predicted`` (N, K) is the same of the prior members that could be run. Asked before a run and told with its
+        ``predicted`` (N, K) is the same of the prior members that could be run, ``members`` are their parameters by
+        name, (N,) each, physical and SI. Asked before a run and told with its
         warnings: the place for scales and units that only the model can judge.
         """
         return ()

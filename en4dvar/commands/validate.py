@@ -70,7 +70,7 @@ def _warn(one: Preview) -> None:
     if reasons:
         lost = f"{len(reasons)} of {len(one.run.failures)} prior members cannot be run"
         click.echo(f"warning: {name}: {lost}, e.g.: {reasons[0]}", err=True)
-    for words in doubts(one.problem, one.run.predictions):
+    for words in doubts(one.problem, one.members, one.run.predictions):
         click.echo(f"warning: {name}: {words}", err=True)
     if one.outside > 0.1:
         share = f"{100 * one.outside:.0f} % of the observations lie outside everything the prior expects"

@@ -26,13 +26,14 @@ CHALLENGER = 0.5  # of a descent, until one from a far member has come to the sa
 class Preview:
     """The prior ensemble of one data set before any assimilation.
 
-    ``run`` is its forecast: predictions (N, K) and, along ``grid`` (M,), paths (N, M); of the first members only where
-    all would take long. ``seconds`` is the time of one forward run on one thread, ``runs`` how many an estimate takes,
-    typically.
+    ``run`` is the forecast of its ``members`` (N, n), physical: predictions (N, K) and, along ``grid`` (M,), paths
+    (N, M); of the first ones only where all would take long. ``seconds`` is the time of one forward run on one thread,
+    ``runs`` how many an estimate takes, typically.
     """
 
     problem: InverseProblem
     grid: Array
+    members: Array
     run: Forecast
     seconds: float
     runs: int
@@ -65,7 +66,7 @@ def preview(problem: InverseProblem, settings: AssimilationSettings, seed: int, 
         runs = expected_runs(space)
         if problem.varying:  # its evidence takes a second fit
             runs += expected_runs(WeightSpace(problem.constant, settings, seed, executor))
-    return Preview(problem, grid, run, seconds, runs)
+    return Preview(problem, grid, problem.prior.to_physical(members), run, seconds, runs)
 
 
 def _seconds_per_run(problem: InverseProblem, members: Array, executor: Executor) -> tuple[float, int]:

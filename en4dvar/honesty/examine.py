@@ -59,7 +59,7 @@ def examine(
     members = a.posterior[alive]
     warnings = (
         *found,
-        *(caution("implausible-data", words) for words in doubts(a.problem, a.prior_predictions)),
+        *(caution("implausible-data", words) for words in doubts(a.problem, a.prior, a.prior_predictions)),
         *checks.down_weighted(a),
         *checks.weighted(a),
         *unfinished(a),
@@ -85,14 +85,19 @@ def _changes(a: Analysis) -> set[str]:
     return {change.parameter.name for one in a.problem.varying for change in one.changes}
 
 
-def doubts(problem: InverseProblem, predicted: Array) -> Sequence[str]:
-    """The model's doubts about the observations beside predictions (N, K) of prior members, NaN where one failed."""
+def doubts(problem: InverseProblem, members: Array, predicted: Array) -> Sequence[str]:
+    """The model's doubts about the observations.
+
+    Beside prior ``members`` (N, n), physical, and their predictions (N, K), NaN where one failed.
+    """
     y, alive = problem.observations, np.all(np.isfinite(predicted), axis=1)
+    values = {name: np.full(alive.sum(), value) for name, value in problem.fixed.items()}
+    values |= dict(zip(problem.prior.names, members[alive].T, strict=True))
     return [
         words
         for part in problem.parts
         for words in problem.model.doubts(
-            part.observable.name, y.times[part.where], y.values[part.where], predicted[alive, part.where]
+            part.observable.name, y.times[part.where], y.values[part.where], predicted[alive, part.where], values
         )
     ]
 

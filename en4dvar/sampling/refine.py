@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -27,6 +27,7 @@ COUNTS = math.log(1e-3)  # evidence of a minimum relative to that of the lowest,
 MISSED = 0.5  # of J, by which a draw must be lower than all minima to be told
 APART = 2.0  # standard deviations between modes of a parameter from which mean ± std describe none of them
 SEEN = 0.02  # weight of a mode that is told
+OVERLAP = "no action is needed: mean ± std describe the members"
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,10 @@ def mode_cautions(
     unit = "" if p.display_unit == "1" else f" {p.display_unit}"
     drawn = "members are drawn from all of them" if result else "members describe the first alone"
     words = f"the posterior has {len(seen)} modes, {p.name} = {at}{unit}, of weights {shares}; {drawn}"
+    if result and not np.any(distances > APART):
+        told = caution("several-modes", f"{words}, and overlap in every parameter", "note")
+        yield replace(told, advice=OVERLAP)
+        return
     names = tuple(name for j, name in enumerate(prior.names) if distances[j] > APART or j == most)
     yield caution("several-modes", words, None if result else "serious", names if result else ())
 

@@ -73,9 +73,11 @@ class PiecewiseModel(ForwardModel):
         inner = self.model.initial_states({p.name: theta[p.name] for p in self.model.parameters})
         return np.hstack([inner, *(one.values(theta) for one in self.varying)])
 
-    def doubts(self, observable: str, times: Array, values: Array, predicted: Array) -> Sequence[str]:
+    def doubts(
+        self, observable: str, times: Array, values: Array, predicted: Array, members: Mapping[str, Array]
+    ) -> Sequence[str]:
         """Those of the model."""
-        return self.model.doubts(observable, times, values, predicted)
+        return self.model.doubts(observable, times, values, predicted, members)
 
     def step(self, x: Array, t0: float, t1: float) -> Array:
         """Raises RuntimeError with the model's reason where it fails."""

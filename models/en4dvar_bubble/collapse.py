@@ -19,16 +19,18 @@ From above it is bounded by r < 1.1 + 2.2/(Re − 3), Re = R_max √(ρ p_∞)/�
 runs (20 to 500 µm, R_max/R_eq of 5 to 12, G from 0.1 to 42 kPa; tests/bubble/test_collapse.py holds it to them).
 
 How stiff or thick a gel can be no formula says: :data:`STIFF` and :data:`THICK` are what is taken for granted, well
-above what has been published of gels that bubbles were used on. A prior that expects more is believed.
+above what has been published of gels that bubbles were used on. A prior that expects more is believed; so are prior
+members below both that come as far, for a law that stiffens, or a pulse, does what no neo-Hookean spring can.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import stdtrit
 
 from en4dvar.errors import DataError
@@ -42,6 +44,7 @@ STIFF = 20e3  # Pa; published: 7.7 kPa (Estrada et al. 2018), stiff polyacrylami
 THICK = 0.3  # Pa s; published: 0.19 (Yang et al. 2020)
 SOFT = 1.02  # r of a large bubble in a soft gel, whose gas and viscosity prolong its collapse a little
 APART = 1.05  # noise and physics that the model lacks move r by less than this
+TAILS = 0.5  # of the range of the members' ln r: 48 of a Gaussian reach 2.2 standard deviations, with tails twice that
 SURE = 0.99  # one-sided probability, by the scatter of the samples
 SAME_FACTOR = 1.12  # a factor that is this close to that of a known mistake may be it
 
@@ -112,25 +115,48 @@ def bounds(R_max: float, medium: Medium) -> tuple[float, float]:
     return least, 1.1 + 2.2 / (reynolds - 3) if reynolds > 3 else math.inf
 
 
-def doubt(view: Lobe, medium: Medium, expected: Sequence[float] = ()) -> str:
+@dataclass(frozen=True)
+class Expected:
+    """Ratios (M,) of the prior members, and whether each is a ``common`` gel, no stiffer or thicker than granted."""
+
+    ratios: Array
+    common: npt.NDArray[np.bool_]
+
+    def like(self, ratio: float, short: bool) -> bool:
+        """Whether a common gel comes as far to that side."""
+        r = self.ratios[self.common]
+        return bool(np.any(r <= ratio) if short else np.any(r >= ratio))
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """What the prior can bring about, members and the tails beyond them."""
+        low, high = np.log([self.ratios.min(), self.ratios.max()])
+        more = TAILS * (high - low)
+        return math.exp(low - more), math.exp(high + more)
+
+
+NOTHING = Expected(np.empty(0), np.empty(0, dtype=bool))
+
+
+def doubt(view: Lobe, medium: Medium, expected: Expected = NOTHING) -> str:
     """Why the scales of a history cannot be right, and what would explain it; "" where they can.
 
-    ``expected`` are the ratios of the prior members: a ratio that none of them comes near is doubted, and one outside
-    :func:`bounds`, beyond its margin, unless half of them are there as well.
+    A ratio that lies beyond what the prior members and their tails reach is doubted, and one outside :func:`bounds`,
+    beyond its margin, unless half of the members are there as well, or a common gel comes as far.
     """
     ratio, (least, largest) = view.rayleigh_ratio(medium), bounds(view.R_max, medium)
-    sure = 1 + view.margin
+    sure, ratios = 1 + view.margin, expected.ratios
+    apart = max(APART, sure)
     short, long = ratio * sure < least, ratio > largest * sure
-    like_it = sum(r < least if short else r > largest for r in expected)
-    if (short or long) and 2 * like_it <= len(expected):
+    half = 2 * np.sum(ratios < least if short else ratios > largest) > len(ratios)
+    if (short or long) and not half and not expected.like(ratio * apart if short else ratio / apart, short):
         limit = f"{STIFF / 1e3:g} kPa allows no less than {least:.2f}"
         if long:
             limit = f"{THICK:g} Pa s allows no more than {largest:.2f}"
         return f"{_measured(ratio)}; a gel of {limit}: {_explained(SOFT / ratio)}"
-    apart = max(APART, sure)
-    if len(expected) and not min(expected) / apart <= ratio <= max(expected) * apart:
-        usual = float(np.median(expected))
-        span = f"{min(expected):.2f} to {max(expected):.2f}"
+    if len(ratios) and not expected.range[0] / apart <= ratio <= expected.range[1] * apart:
+        usual = float(np.median(ratios))
+        span = f"{min(ratios):.2f} to {max(ratios):.2f}"
         return f"{_measured(ratio)}; the prior expects {span}: {_explained(usual / ratio)}, or the prior is wrong"
     return ""
 
@@ -149,19 +175,31 @@ def _explained(factor: float) -> str:
     return f"{words}; are the units of both columns right?" if by > 30 else f"{words} (pixel size, frame rate, units)"
 
 
-def doubts(times: Array, radius: Array, predicted: Array, medium: Medium) -> tuple[str, ...]:
-    """:func:`doubt` of a window ``times`` (K,) s, ``radius`` (K,) m; ``predicted`` (N, K) m are the prior members."""
+def doubts(
+    times: Array, radius: Array, predicted: Array, members: Mapping[str, Array], medium: Medium
+) -> tuple[str, ...]:
+    """:func:`doubt` of a window ``times`` (K,) s, ``radius`` (K,) m.
+
+    ``predicted`` (N, K) m are the prior members, ``members`` their parameters by name, (N,) each, SI.
+    """
     if radius[int(np.argmax(radius)) :].min() > TOLD * radius.max():
         return ()
     try:
         view = lobe(times, radius)
     except DataError:
         return ()
-    expected = []
-    for path in predicted:
+    ratios, common = [], []
+    for path, usual in zip(predicted, _common(members, len(predicted)), strict=True):
         try:
-            expected.append(lobe(times, path).rayleigh_ratio(medium))
+            ratios.append(lobe(times, path).rayleigh_ratio(medium))
         except DataError:
             continue
-    found = doubt(view, medium, expected)
+        common.append(usual)
+    found = doubt(view, medium, Expected(np.array(ratios), np.array(common, dtype=bool)))
     return (found,) if found else ()
+
+
+def _common(members: Mapping[str, Array], count: int) -> npt.NDArray[np.bool_]:
+    """Of members, whether neither G nor μ, where the law has one, is beyond what is granted."""
+    limits = (("G", STIFF), ("mu", THICK))
+    return np.all([members[k] <= most for k, most in limits if k in members] or [np.ones(count, dtype=bool)], axis=0)

@@ -96,9 +96,11 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         """See :mod:`en4dvar_bubble.alternatives`."""
         return alternatives(self)
 
-    def doubts(self, observable: str, times: Array, values: Array, predicted: Array) -> Sequence[str]:
+    def doubts(
+        self, observable: str, times: Array, values: Array, predicted: Array, members: Mapping[str, Array]
+    ) -> Sequence[str]:
         """Whether the collapse time can be right, see :mod:`en4dvar_bubble.collapse`."""
-        return doubts(times, values, predicted, self.medium)
+        return doubts(times, values, predicted, members, self.medium)
 
     def initial_state(self, theta: Mapping[str, float]) -> Array:
         return np.asarray(self.initial_states({p.name: np.array([theta[p.name]]) for p in self.parameters})[0])

@@ -51,8 +51,8 @@ BUBBLE = (
 
 # and inside the reader of movies
 MOVIE = (
-    "frames", "kernels", "outline", "locate", "background", "corrections", "uncertainty", "tracking", "table", "page",
-    "scene", "commands",
+    "frames", "kernels", "outline", "fitting", "locate", "background", "corrections", "uncertainty", "flashes",
+    "tracking", "table", "outlined", "page", "scene", "writing", "filming", "commands",
 )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.io import loadmat
 
 from en4dvar_bubble import BubbleModel, collapse
-from en4dvar_bubble.collapse import RAYLEIGH, Lobe, bounds, doubt, doubts, lobe
+from en4dvar_bubble.collapse import RAYLEIGH, Expected, Lobe, bounds, doubt, doubts, lobe
 from en4dvar_bubble.medium import WATER_25C
 from en4dvar_bubble.settings import BubbleSettings
 
@@ -84,12 +84,44 @@ def test_no_forward_run_of_a_gel_is_doubted(radius: float, monkeypatch: pytest.M
             assert low < lobe(times, path["R"]).rayleigh_ratio(model.medium) < high, theta
 
 
+def expected(ratios: list[float], common: bool = False) -> Expected:
+    return Expected(np.array(ratios), np.full(len(ratios), common))
+
+
 def test_a_prior_that_expects_it_is_believed() -> None:
     assert "radii 1.34 times too large, or the time step 1.34 times too short" in doubt(usual(0.76), WATER_25C)
-    assert "1.34 times" in doubt(usual(0.76), WATER_25C, [0.74, 0.9, 0.95])  # wide enough to hold it is not enough
-    assert doubt(usual(0.76), WATER_25C, [0.7, 0.76, 0.95]) == ""
-    assert "the prior expects 0.90 to 0.98" in doubt(usual(1.05), WATER_25C, [0.9, 0.94, 0.98])
-    assert doubt(usual(1.0), WATER_25C, [0.9, 0.94, 0.98]) == ""
+    stiff = expected([0.74, 0.9, 0.95])
+    assert "1.34 times" in doubt(usual(0.76), WATER_25C, stiff)  # stiffer than gels are, and wide enough to hold it
+    assert doubt(usual(0.76), WATER_25C, expected([0.7, 0.76, 0.95])) == ""
+    assert "the prior expects 0.90 to 0.98" in doubt(usual(1.1), WATER_25C, expected([0.9, 0.94, 0.98]))
+    assert doubt(usual(1.0), WATER_25C, expected([0.9, 0.94, 0.98])) == ""
+
+
+def test_a_law_by_which_a_soft_gel_collapses_so_fast_is_believed() -> None:
+    """As the quadratic law does, whose spring no bound of a neo-Hookean one holds for."""
+    assert doubt(usual(0.76), WATER_25C, expected([0.74, 0.9, 0.95], common=True)) == ""
+    assert doubt(usual(0.76), WATER_25C, expected([0.85, 0.9, 0.95], common=True))
+    viscous = 1.05 * bounds(400e-6, WATER_25C)[1]
+    assert doubt(usual(viscous), WATER_25C, expected([1.0, viscous + 0.1, 1.0], common=True)) == ""
+    assert doubt(usual(viscous), WATER_25C, expected([1.0, viscous + 0.1, 1.0]))
+
+
+def test_which_member_is_a_common_gel() -> None:
+    members = {"G": np.array([1e3, 1e5, 1e3]), "mu": np.array([0.1, 0.1, 1.0]), "R_eq": np.full(3, 1e-5)}
+    assert collapse._common(members, 3).tolist() == [True, False, False]
+    assert collapse._common({"R_eq": members["R_eq"]}, 3).all()
+
+
+def test_ratios_of_the_prior_are_seldom_doubted() -> None:
+    """A ratio drawn as the members are lies beyond the range of 48 in one set in 25."""
+    rng = np.random.default_rng(3)
+    doubted = 0
+    for _ in range(400):
+        *members, truth = 1.02 * np.exp(0.04 * rng.standard_normal(49))
+        doubted += doubt(usual(truth), WATER_25C, expected(members)) != ""
+    assert doubted == 0
+    assert doubt(usual(1.02 * 1.34), WATER_25C, expected(members))
+    assert doubt(usual(1.02 / 1.34), WATER_25C, expected(members))
 
 
 def test_the_margin_is_that_of_the_scatter() -> None:
@@ -115,6 +147,6 @@ def test_a_window_that_ends_before_the_collapse_tells_nothing() -> None:
     R = view.R_max * (1 - (t / view.t_c) ** 2) ** 0.4
     predicted = np.stack([R, R])
     medium = replace(WATER_25C, S=0.07)
-    assert doubts(t, R, predicted[:0], medium)
-    assert doubts(t[:20], R[:20], predicted[:0, :20], medium) == ()
-    assert doubts(t, R, predicted, medium) == ()
+    assert doubts(t, R, predicted[:0], {}, medium)
+    assert doubts(t[:20], R[:20], predicted[:0, :20], {}, medium) == ()
+    assert doubts(t, R, predicted, {}, medium) == ()

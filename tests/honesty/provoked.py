@@ -27,8 +27,9 @@ class Violent(Vectorised):
 class Doubtful(Vectorised):
     """Does not believe a reading that no prior member comes near."""
 
-    def doubts(self, observable, times, values, predicted):
+    def doubts(self, observable, times, values, predicted, members):
         assert (len(times), len(times)) == (len(values), predicted.shape[1])
+        assert {name: len(value) for name, value in members.items()} == dict.fromkeys(TWO, len(predicted))
         return [f"no {observable} is like this"] * bool(len(predicted))
 
 

@@ -8,9 +8,13 @@ from same_bits import assert_same_bits
 from wells import UnlikeWells, Wells, two_wells
 
 from en4dvar.assimilate import assimilate, log_posterior
+from en4dvar.descent.minima import Minimum
 from en4dvar.executor import ThreadsExecutor
+from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings
 from en4dvar.sampling import mcmc
+from en4dvar.sampling.refine import Refined, mode_cautions
+from en4dvar.state import Parameter
 from en4dvar.summary import summarise
 
 KEYWORDS = mcmc.sample.__kwdefaults__
@@ -91,3 +95,15 @@ def test_the_evidence_is_that_of_both_wells():
     exact = np.logaddexp.reduce(logs) + np.log(cell) - problem.observations.log_normalisation()
     analysis = assimilate(problem, AssimilationSettings(), 1)
     assert analysis.log_evidence == pytest.approx(exact, abs=0.1)
+
+
+@pytest.mark.parametrize(("apart", "severity"), [(1.5, "note"), (2.5, "caution")])
+def test_modes_that_overlap_are_only_worth_knowing(apart: float, severity: str) -> None:
+    """Two Gaussians of one width make two peaks where they lie more than two standard deviations apart."""
+    prior = Prior(tuple(PriorTerm.normal(Parameter(name, "m"), 0.0, 1.0) for name in "ab"))
+    minima = [Minimum(np.array([x, 0.0]), np.diag([0.01, 0.04]), 3.0, 2) for x in (0.0, 0.1 * apart)]
+    sampled, weights = Refined(np.zeros((8, 2)), {}), np.array([0.6, 0.4])
+    (told,) = mode_cautions(prior, minima, weights, True, sampled)
+    assert (told.code, told.severity) == ("several-modes", severity)
+    (told,) = mode_cautions(prior, minima, weights, True, None)  # members describe one of them alone
+    assert told.severity == "serious"
