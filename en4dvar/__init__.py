@@ -1,8 +1,9 @@
 """En4D-Var: ensemble data assimilation for models that you can run but not differentiate.
 
     import en4dvar
-    result = en4dvar.run("configs/quickstart.yaml")
-    print(result.to_dataframe().describe())
+    result = en4dvar.estimate(model, data, priors, error=0.1)  # a function and arrays
+    result = en4dvar.run("configs/quickstart.yaml")  # or a file
+    print(result)
 
 Names are imported when first used, so that ``import en4dvar`` stays light.
 """
@@ -31,12 +32,14 @@ if TYPE_CHECKING:
     from en4dvar.forward import Observable as Observable
     from en4dvar.forward import StateField as StateField
     from en4dvar.forward import Trajectory as Trajectory
+    from en4dvar.function_model import FunctionModel as FunctionModel
     from en4dvar.noise import noise_of as noise_of
     from en4dvar.observations import Observations as Observations
     from en4dvar.prior import Prior as Prior
     from en4dvar.prior import PriorTerm as PriorTerm
     from en4dvar.problem import AssimilationSettings as AssimilationSettings
     from en4dvar.problem import InverseProblem as InverseProblem
+    from en4dvar.programs.control import from_pest as from_pest
     from en4dvar.report.compare import Comparison as Comparison
     from en4dvar.report.compare import compare_runs as compare_runs
     from en4dvar.report.export import export_table as export_table
@@ -44,6 +47,7 @@ if TYPE_CHECKING:
     from en4dvar.report.result import load_result as load_result
     from en4dvar.runs.campaign import Campaign as Campaign
     from en4dvar.runs.checks import validate as validate
+    from en4dvar.runs.estimate import estimate as estimate
     from en4dvar.runs.runner import run as run
     from en4dvar.runs.runner import run_campaign as run_campaign
     from en4dvar.runs.runner import write_report as write_report
@@ -67,11 +71,14 @@ _HOME = {
     "errors": ("ConfigError", "DataError", "En4dvarError", "OutputError", "TooFewMembersError"),
     "report.export": ("export_table",),
     "forward": ("Failure", "ForwardModel", "Observable", "StateField", "Trajectory"),
+    "function_model": ("FunctionModel",),
     "noise": ("noise_of",),
     "observations": ("Observations",),
     "prior": ("Prior", "PriorTerm"),
     "analysis": ("Analysis",),
+    "programs.control": ("from_pest",),
     "problem": ("AssimilationSettings", "InverseProblem"),
+    "runs.estimate": ("estimate",),
     "runs.runner": ("run", "run_campaign", "write_report"),
     "series": ("Places", "Series"),
     "runs.simulation": ("Simulation", "simulate"),
@@ -81,6 +88,7 @@ _HOME = {
     "units": ("Quantity",),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
+__all__ = sorted(_MODULE)
 
 
 def __getattr__(name: str) -> Any:
@@ -96,4 +104,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*_MODULE, "__version__"])
+    return [*__all__, "__version__"]

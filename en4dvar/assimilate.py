@@ -20,7 +20,7 @@ from en4dvar.descent.start import StartState, choose_start
 from en4dvar.descent.variance import shares_of_variance
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
-from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, log_posterior
+from en4dvar.ensemble.forecast import Forecast, check_problem, cost, forecast, log_posterior, plotting_times
 from en4dvar.errors import ConfigError, TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.honesty import ControlEnsembles, examine
@@ -40,8 +40,6 @@ from en4dvar.schemes.en4dvar import En4DVar
 from en4dvar.state import Array
 
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
-
-GRID_POINTS = 200  # M, of the plotting grid
 
 
 @dataclass(frozen=True)
@@ -145,7 +143,7 @@ class _Assimilation:
                 "discrepancy; use en4dvar"
             )
         self.space = WeightSpace(problem, settings, seed, executor)
-        self.grid = np.linspace(*problem.observations.span, GRID_POINTS)
+        self.grid = plotting_times(problem)
 
     def run(self, resume: LoopState | None) -> Analysis:
         problem, space, noise = self.problem, self.space, self.problem.observations.noise

@@ -31,7 +31,15 @@ def kernel(function: F) -> F:
     ------
     OutputError: nowhere can compiled code be kept.
     """
-    compile_: Callable[[F], Any] = numba.njit(cache=True, nogil=True)
+    return _compiled(function, numba.njit(cache=True, nogil=True))
+
+
+def summing_kernel(function: F) -> F:
+    """A :func:`kernel` whose sums may be added in another order, side by side; the order is the same in every run."""
+    return _compiled(function, numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"}))
+
+
+def _compiled(function: F, compile_: Callable[[F], Any]) -> F:
     try:
         compiled: F = compile_(function)
     except RuntimeError:  # numba found no folder

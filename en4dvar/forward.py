@@ -1,7 +1,8 @@
 """What a forward model is: a state-vector operator F, seen through an observation operator H.
 
 A model author writes ``layout``, ``parameters``, ``initial_state`` and ``step``; everything else has a default.
-A model that can integrate many members at once overrides ``trajectories``, the fast path.
+A model that can integrate many members at once overrides ``trajectories``, the fast path, and may then do without
+``step``.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 
@@ -225,6 +226,30 @@ class ForwardModel(ABC):
         """
         return self
 
+    def __new__(cls, *arguments: object, **named: object) -> Self:
+        if cls.step is ForwardModel.step and cls.trajectories is ForwardModel.trajectories:
+            raise TypeError(f"{cls.__name__} has neither step nor trajectories; write one of them")
+        return super().__new__(cls)
+
+    @property
+    def resumable(self) -> bool:
+        """Whether a member can go on from its state at any instant."""
+        kind = type(self)
+        return kind.step is not ForwardModel.step or kind.resumed is not ForwardModel.resumed
+
+    @property
+    def threaded(self) -> bool:
+        """Whether threads serve it, since ``trajectories`` releases the interpreter lock. True of compiled models."""
+        return self.compiled
+
+    @property
+    def dense(self) -> bool:
+        """Whether a path may be asked for between the observations at next to no cost, for smooth curves in plots.
+
+        Otherwise it is asked for at the observations alone. True of compiled models unless they say otherwise.
+        """
+        return self.compiled
+
     @property
     def cheap(self) -> bool:
         """Whether ten thousand runs take seconds, so that a doubt about a posterior is settled by sampling it.
@@ -242,9 +267,13 @@ class ForwardModel(ABC):
         n_members = len(next(iter(theta.values())))
         return np.stack([self.initial_state({k: float(v[i]) for k, v in theta.items()}) for i in range(n_members)])
 
-    @abstractmethod
     def step(self, x: Array, t0: float, t1: float) -> Array:
-        """F_{t1←t0}: advance one state (n_state,). May raise; the caller turns it into a :class:`Failure`."""
+        """F_{t1←t0}: advance one state (n_state,). May raise; the caller turns it into a :class:`Failure`.
+
+        A model that overrides :meth:`trajectories` needs no step, but what resumes a state at any instant does: schemes
+        of a series and parameters that vary in time.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no step: it cannot be resumed from a state on its way")
 
     def trajectories(self, x: Array, times: Array) -> Sequence[Trajectory | Failure]:
         """Integrate a batch of members from time zero.

@@ -24,7 +24,7 @@ import numpy as np
 
 from en4dvar.errors import ConfigError, En4dvarError
 
-Permission = Callable[[str, Path | None], None]
+Permission = Callable[[str, Path | None, bool], None]
 _permission: ContextVar[Permission | None] = ContextVar("permission", default=None)
 _in_worker = False
 _NOT_THE_USERS = (str(Path(__file__).parent), sysconfig.get_path("stdlib"))
@@ -142,18 +142,20 @@ def file_of(module: str) -> Path | None:
     return Path(folders[0]) if folders else Path(spec.origin) if spec.has_location and spec.origin else None
 
 
-def require_permission(what: str, file: Path | None) -> None:
+def require_permission(what: str, file: Path | None, anything: bool = False) -> None:
     """Called before code that a configuration names is loaded; ``file``: its path as it is named, None: not known.
+
+    ``anything``: what it does depends on more than the file, as with an interpreter and its arguments.
 
     Raises :class:`RefusedError` within :func:`permission`, where that refuses.
     """
     if (ask := _permission.get()) is not None:
-        ask(what, file)
+        ask(what, file, anything)
 
 
 @contextmanager
 def permission(ask: Permission) -> Iterator[None]:
-    """Within, ``ask(what, file)`` is called before code that a configuration names is loaded, and may raise."""
+    """Within, ``ask(what, file, anything)`` is called before code that a configuration names runs, and may raise."""
     before = _permission.set(ask)
     try:
         yield

@@ -23,7 +23,7 @@ class PluginCommand(click.Command):
     """Stands for a command until it is invoked."""
 
     def __init__(self, entry: EntryPoint):
-        super().__init__(entry.name, short_help=_first_sentence(entry) or f"From {entry.module.partition('.')[0]}.")
+        super().__init__(entry.name, short_help=first_sentence(entry) or f"From {entry.module.partition('.')[0]}.")
         self.entry = entry
 
     def make_context(
@@ -44,7 +44,7 @@ def plugin_commands() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 
-def _first_sentence(entry: EntryPoint) -> str:
+def first_sentence(entry: EntryPoint) -> str:
     """First sentence of the command's docstring, read without importing; "" where it cannot be found."""
     top, *rest = entry.module.split(".")
     spec = find_spec(top)

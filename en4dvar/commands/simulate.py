@@ -5,19 +5,21 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 
 from en4dvar.commands.common import Source, command_line, config_options, deliver, refuse_to_replace
+from en4dvar.commands.forms import WithForms, asked, write_form
 
 
-@click.command()
+@click.command(cls=WithForms)
 @config_options
 @click.option("--out", type=click.Path(path_type=Path), help="CSV file to write; default standard output.")
 @click.option("--times", metavar="FROM:TO:STEP", help="Instants, e.g. '0 us:60 us:1 us'.")
 @click.option("--noise", metavar="STD", help="Add Gaussian noise, e.g. '1.4 um' or '1 % of maximum'.")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the noise; default the configuration's.")
-@click.option("--force", is_flag=True, help="Replace the file given by --out.")
+@click.option("--force", is_flag=True, help="Replace the files.")
 def simulate(
     source: Source,
     out: Path | None,
@@ -25,6 +27,7 @@ def simulate(
     noise: str | None,
     seed: int | None,
     force: bool,
+    **forms: Any,
 ) -> None:
     """Run the model once and write the observable as CSV: at fixed values and prior medians.
 
@@ -39,17 +42,27 @@ def simulate(
     from en4dvar.config.document import read_document
     from en4dvar.runs.simulation import noise_level, parse_times, simulate, to_csv
 
+    others = asked(forms)
+    if others and noise and out is None:
+        raise click.UsageError("--noise is that of the table: give its file with --out")
     if "campaign" in read_document(source.path).data:
-        if source.data or times or noise:
-            raise click.UsageError("--data, --times and --noise do not apply to a configuration with a 'campaign:'")
+        if source.data or times or noise or others:
+            words = ", ".join(["--data", "--times", *(f"--{name}" for name in others)])
+            raise click.UsageError(f"{words} and --noise do not apply to a configuration with a 'campaign:'")
         _simulate_campaign(source, out, seed, force)
         return
     config = source.load()
-    refuse_to_replace(out, force)
-    simulation = simulate(config, parse_times(times, config.model.time_unit) if times else None)
+    for path in (out, *(path for path, _ in others.values())):
+        refuse_to_replace(path, force)
+    instants = parse_times(times, config.model.time_unit) if times else None
+    seed = config.seed if seed is None else seed
+    for name, (path, settings) in others.items():
+        click.echo(write_form(name, config, instants, path, settings, seed))
+    if others and out is None:  # the table was not asked for
+        return
+    simulation = simulate(config, instants)
     if noise:
-        level = noise_level(noise, config, simulation)
-        simulation = simulation.with_noise(level, config.seed if seed is None else seed)
+        simulation = simulation.with_noise(noise_level(noise, config, simulation), seed)
     deliver(to_csv(simulation, config, command_line()), out, "")
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from en4dvar.config.document import override, read_document
+from en4dvar.config.document import document_from, override
 from en4dvar.config.load import Config, load_config, resolve, time_grid
 from en4dvar.config.twin import TwinConfig, resolve_twin
 from en4dvar.errors import ConfigError, Fault
@@ -14,17 +14,16 @@ from en4dvar.errors import ConfigError, Fault
 __all__ = ["Config", "TwinConfig", "load_any", "load_config", "load_twin", "resolve", "time_grid"]
 
 
-def load_any(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config | TwinConfig:
+def load_any(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Config | TwinConfig:
     """A twin experiment where the file has a ``twin:`` section, else what :func:`load_config` gives."""
-    path = Path(path)
-    document = override(read_document(path), overrides or {})
-    base = path.resolve().parent
+    document, base = document_from(source)
+    document = override(document, overrides or {})
     return resolve_twin(document, base) if "twin" in document.data else resolve(document, base)
 
 
-def load_twin(path: str | Path, overrides: Mapping[str, Any] | None = None) -> TwinConfig:
+def load_twin(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> TwinConfig:
     """As :func:`load_config`, for a twin experiment. Raises :class:`ConfigError`."""
-    config = load_any(path, overrides)
+    config = load_any(source, overrides)
     if not isinstance(config, TwinConfig):
-        raise ConfigError([Fault("not a twin experiment: it has no twin: section", file=str(path))])
+        raise ConfigError([Fault("not a twin experiment: it has no twin: section", file=config.document.file)])
     return config

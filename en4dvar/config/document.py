@@ -7,6 +7,7 @@ number, dates are text. Duplicate keys, aliases and tags are refused: a configur
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -88,6 +89,34 @@ def read_document(path: Path) -> Document:
     return parse_document(text, str(path))
 
 
+def document_of(given: Mapping[Any, Any]) -> Document:
+    """Plain data of Python as if it had been read from a file.
+
+    Numbers of numpy become numbers, arrays, tuples and sets lists, paths text. Raises :class:`ConfigError`: every value
+    that a YAML file could not hold.
+    """
+    document, faults = Document({}), list[Fault]()
+    data = _plain(given, (), document, faults)
+    if faults:
+        raise ConfigError(faults)
+    return replace(document, data=data, text=yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=120))
+
+
+def _plain(value: Any, path: Key, document: Document, faults: list[Fault]) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item, (*path, str(key)), document, faults) for key, item in value.items()}
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if callable(tolist := getattr(value, "tolist", None)):  # numpy's, and what wraps it
+        value = tolist()
+    if isinstance(value, list | tuple | set | frozenset):
+        return [_plain(item, (*path, i), document, faults) for i, item in enumerate(value)]
+    if value is None or type(value) in (bool, int, float, str):
+        return value
+    faults.append(Fault(f"{shown(value)} is neither number, text, list nor dict", _dotted(path), document.file))
+    return None
+
+
 def parse_document(text: str, file: str = "") -> Document:
     """Parse YAML text whose top level is a mapping. Raises :class:`ConfigError`."""
     tree = _Tree(file)
@@ -98,6 +127,17 @@ def parse_document(text: str, file: str = "") -> Document:
     if tree.faults:
         raise ConfigError(tree.faults)
     return Document(data, file, text, tree.keys, tree.values)
+
+
+def document_from(source: str | Path | Mapping[str, Any]) -> tuple[Document, Path]:
+    """A YAML file, or a dict of the same, and the folder where its relative paths start: the file's, or this one.
+
+    Raises :class:`ConfigError`.
+    """
+    if isinstance(source, Mapping):
+        return document_of(source), Path.cwd()
+    path = Path(source)
+    return read_document(path), path.resolve().parent
 
 
 def override(document: Document, overrides: Mapping[str, Any]) -> Document:

@@ -16,7 +16,7 @@ from typing import Any
 
 from en4dvar.config.context import TEXT
 from en4dvar.config.load import Estimation
-from en4dvar.config.models import GROUP, find_model, settings_of
+from en4dvar.config.models import COMMAND, GROUP, find_model, settings_of
 from en4dvar.config.parameters import FromFile, PriorSection, TiedSection
 from en4dvar.config.series import SeriesData
 from en4dvar.config.synthetic import CampaignFile
@@ -155,16 +155,20 @@ def _parameters(known: tuple[Parameter, ...]) -> Json:
 
 
 def _model_section(models: list[str]) -> Json:
+    unnamed = {"required": [COMMAND], "not": {"required": ["name"]}}
     return {
         "type": "object",
-        "required": ["name"],
+        "anyOf": [{"required": ["name"]}, {"required": [COMMAND]}],
         "properties": {
             "name": {
                 "description": "Name of the model (see 'en4dvar models'), ./my_model.py:MyModel, or package:MyModel.",
                 "anyOf": [{"enum": sorted(models)}, {"type": "string", "pattern": ":"}],
             }
         },
-        "allOf": [_if(_names(name), {"$ref": f"#/$defs/model_{name}"}) for name in models],
+        "allOf": [
+            *(_if(_names(name), {"$ref": f"#/$defs/model_{name}"}) for name in models),
+            *[_if(unnamed, {"$ref": f"#/$defs/model_{COMMAND}"})] * (COMMAND in models),
+        ],
     }
 
 

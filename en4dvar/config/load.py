@@ -14,7 +14,7 @@ from pydantic import Field
 from en4dvar.config.context import Context, Made, time_unit
 from en4dvar.config.data import Data
 from en4dvar.config.dependence import PriorCorrelation, PriorFile, resolved
-from en4dvar.config.document import Document, override, read_document
+from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.initial_state import PERTURBED, Perturbed
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, entries
@@ -125,27 +125,30 @@ class Config:
         return self.document.text
 
 
-def load_config(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
+def load_config(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Config:
     """Read and validate a configuration.
 
     Parameters
     ----------
-    path: the YAML file; paths inside it are relative to its folder.
+    source: the YAML file, paths inside it relative to its folder; or a dict of the same, relative to this folder.
     overrides: values for dotted keys such as ``"assimilation.members"``; text is read as YAML.
 
     Raises
     ------
     ConfigError: carries every fault found, with file, line and column.
     """
-    path = Path(path)
-    return resolve(override(read_document(path), overrides or {}), path.resolve().parent)
+    document, base = document_from(source)
+    return resolve(override(document, overrides or {}), base)
 
 
-def resolve(document: Document, base: Path) -> Config:
-    """Validate a document whose relative paths start at ``base``. Raises :class:`ConfigError`."""
+def resolve(document: Document, base: Path, model: ForwardModel | None = None) -> Config:
+    """Validate a document whose relative paths start at ``base``. Raises :class:`ConfigError`.
+
+    ``model``: one that is there already; the ``model:`` section then only records what it is.
+    """
     if "twin" in document.data:
         raise ConfigError([document.fault(("twin",), "a twin experiment: it can be run and validated", at_key=True)])
-    read = read_file(Estimation, document, base)
+    read = read_file(Estimation, document, base, model)
     file = read.file
     own = {p.name for p in read.model.parameters}
     apart = {} if NOISE_SCALE.name in own else {NOISE_SCALE.name: "it is the scale of the errors"}
@@ -203,10 +206,14 @@ class Read(Generic[S]):
         return yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
 
 
-def read_file(kind: type[S], document: Document, base: Path) -> Read[S]:
-    """Validate a document of one kind. Raises :class:`ConfigError`: every fault, in the order of the file."""
+def read_file(kind: type[S], document: Document, base: Path, model: ForwardModel | None = None) -> Read[S]:
+    """Validate a document of one kind, for a ``model`` that is there already or else is read from it.
+
+    Raises :class:`ConfigError`: every fault, in the order of the file.
+    """
     faults: list[Fault] = []
-    found = read_model(document.data.get("model"), base, document, faults)
+    section = document.data.get("model")
+    found = (model, dict(section or {})) if model else read_model(section, base, document, faults)
     model = found[0].with_parameters(_named(document)) if found else None
     context = context_of(document, base, model)
     file = check(kind, document.data, (), document, faults, context)

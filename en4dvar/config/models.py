@@ -20,6 +20,8 @@ from en4dvar.hints import shown, suggest
 from en4dvar.user_code import RefusedError, file_of, loading, require_permission
 
 GROUP = "en4dvar.models"
+COMMAND = "command"  # the model that a section with this key means where it names none
+HANDED = "python"  # instead of a name: a model that a script handed over, which no file can make again
 OWN = "./my_model.py:MyModel, or package:MyModel"
 
 
@@ -98,9 +100,13 @@ def read_model(
     """
     if not isinstance(raw, dict):
         return None  # told with the other keys of the file
-    name = raw.get("name")
+    name = raw.get("name", COMMAND if COMMAND in raw else None)
     if not isinstance(name, str):
         faults.append(document.fault(("model", "name"), "name the model, e.g. name: bubble"))
+        return None
+    if name == HANDED:
+        words = f"{shown(raw.get('object'))} was handed over by a Python script; run that script again"
+        faults.append(document.fault(("model", "name"), words))
         return None
     try:
         if user_file.is_file_reference(name):

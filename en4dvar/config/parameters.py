@@ -300,6 +300,8 @@ def _entry(given: Any, context: Context) -> Entry:
 def _why_not(model: ForwardModel, parameter: Parameter) -> str:
     if parameter not in model.parameters:
         return "it is no parameter of the model"
+    if not model.resumable:
+        return "the model has no step, so that it cannot go on from its state at a knot"
     if parameter.name not in model.layout.names:
         return f"the state of the model has no field {parameter.name!r} that could be changed on the way"
     acting = ", ".join(model.path_parameters)

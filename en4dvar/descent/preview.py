@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.descent.weight_space import WeightSpace
-from en4dvar.ensemble.forecast import Forecast, forecast
+from en4dvar.ensemble.forecast import Forecast, forecast, plotting_times
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.schemes import window_scheme
 from en4dvar.schemes.en4dvar import En4DVar
 from en4dvar.state import Array
 
-GRID_POINTS = 200  # of the prior predictive
 ENOUGH = 0.3  # seconds of forward runs that the time of one is taken from
 LONGEST = 20.0  # seconds that the forecast of the prior ensemble may take unasked
 ITERATIONS = 5  # of a descent, typically
@@ -56,8 +55,7 @@ def preview(problem: InverseProblem, settings: AssimilationSettings, seed: int, 
     The first run is not counted: it may compile the model. ``whole``: every member, however long it takes. Members
     that fail are told by ``run.failures``, not raised.
     """
-    y = problem.observations
-    grid = np.linspace(*y.span, GRID_POINTS)
+    grid = plotting_times(problem)
     executor = SerialExecutor()
     with one_blas_thread():
         space = WeightSpace(problem, settings, seed, executor)

@@ -107,13 +107,13 @@ class WeightSpace:
         return self.composite(x, extra_times)
 
     def check_repeats(self, prior_run: Forecast, extra_times: Array) -> None:
-        """Run two members of the prior forecast again, at the same instants; ``forward_runs`` does not count them.
+        """Run two members of the prior forecast again, at the same instants.
 
         Raises :class:`ConfigError`: they give other predictions.
         """
 
         def again(members: list[int]) -> tuple[Array, tuple[str, ...]]:
-            run = self.composite(self.members[members], extra_times)
+            run = self.forecast(self.members[members], extra_times)
             return run.predictions, run.failures
 
         alive = prior_run[: len(self.members)]

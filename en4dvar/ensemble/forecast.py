@@ -18,6 +18,7 @@ from en4dvar.problem import InverseProblem
 from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Array, Parameter
 
 NO_TIMES: Array = np.empty(0)
+GRID_POINTS = 200  # of a plot
 SAME_INSTANT = 1e-9  # of the window: an extra time this close to an observation is read at the observation
 
 
@@ -131,6 +132,15 @@ class Composite:
         k, curves = len(observations), sum(part.has_path for part in observations.parts)
         size = k + curves * len(extra_times)
         return times, Reading(readouts, limits, self._batched), size, slice(0, k), slice(k, size)
+
+
+def plotting_times(problem: InverseProblem) -> Array:
+    """The instants (M,) of prior and posterior paths in a plot, on the clock of the observations.
+
+    Further ones than the observations are asked for only where the model gives them for next to nothing.
+    """
+    observations = problem.observations
+    return np.linspace(*observations.span, GRID_POINTS) if problem.model.dense else observations.instants[0]
 
 
 def forecast(

@@ -39,7 +39,7 @@ def make_executor(model: ForwardModel, workers: int = 1) -> Executor:
     """The executor of this machine that serves ``model`` with ``workers`` workers."""
     if workers == 1:
         return SerialExecutor()
-    return ThreadsExecutor(workers) if model.compiled else ProcessesExecutor(workers)
+    return ThreadsExecutor(workers) if model.threaded else ProcessesExecutor(workers)
 
 
 def choose_executor(
@@ -49,7 +49,7 @@ def choose_executor(
     address: str | None = None,
     limits: Limits = NO_LIMITS,
 ) -> Executor:
-    """As asked for; by default threads on every core for compiled models, else this process alone.
+    """As asked for; by default threads on every core for compiled models and programs, else this process alone.
 
     With ``limits`` the default are processes, the only workers of this machine that can be held to them.
 
@@ -62,7 +62,7 @@ def choose_executor(
     if kind == "serial":
         return SerialExecutor()
     if workers is None and address is None:
-        workers = available_cores() if kind or model.compiled else 1
+        workers = available_cores() if kind or model.threaded else 1
     if kind == "dask" or address is not None:
         from en4dvar.executor.dask import DaskExecutor
 

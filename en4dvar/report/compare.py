@@ -130,8 +130,10 @@ class Comparison:
         )
 
 
-def compare_runs(runs: Sequence[str | Path]) -> Comparison:
-    """Compare run directories: laws on the same data, or gels.
+def compare_runs(runs: Sequence[str | Path] | Mapping[str, str | Path | StoredResult]) -> Comparison:
+    """Compare runs: laws on the same data, or gels.
+
+    ``runs``: run directories or result files (``.nc``); or name → one of these, or a result at hand.
 
     Raises
     ------
@@ -139,8 +141,10 @@ def compare_runs(runs: Sequence[str | Path]) -> Comparison:
     """
     if len(runs) < 2:
         raise OutputError("compare needs at least two run directories")
-    paths = [Path(run) for run in runs]
-    results = {name: _results(path) for name, path in zip(_labels(paths), paths, strict=True)}
+    if not isinstance(runs, Mapping):
+        paths = [Path(run) for run in runs]
+        runs = dict(zip(_labels(paths), paths, strict=True))
+    results = {name: _results(run) for name, run in runs.items()}
     datasets = list(dict.fromkeys(dataset for held in results.values() for dataset in held))
     pairs = [(name, d, held[d]) for d in datasets for name, held in results.items() if d in held]
     estimates = tuple(
@@ -237,9 +241,12 @@ def _labels(runs: Sequence[Path]) -> list[str]:
     return labels
 
 
-def _results(run: Path) -> dict[str, StoredResult]:
-    """Data set → result of a run directory."""
-    return {result.name: result for result in map(load_stored, result_files(run))}
+def _results(run: str | Path | StoredResult) -> dict[str, StoredResult]:
+    """Data set → result of a run."""
+    if isinstance(run, StoredResult):
+        return {run.name: run}
+    files = [Path(run)] if Path(run).suffix == ".nc" else result_files(Path(run))
+    return {result.name: result for result in map(load_stored, files)}
 
 
 def _same_data(a: StoredResult, b: StoredResult) -> bool:

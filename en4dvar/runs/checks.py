@@ -9,7 +9,7 @@ from typing import Any
 
 from en4dvar.config import Config, TwinConfig, load_any
 from en4dvar.config.build import build_one, data_files, inverse_plan
-from en4dvar.config.document import Document, override, read_document
+from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.load import context_of, in_order
 from en4dvar.config.reading import read_observations
 from en4dvar.config.schema import Section
@@ -19,12 +19,12 @@ from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.inputs.readers import DataFile
 
 
-def validate(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config | TwinConfig:
+def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Config | TwinConfig:
     """Load a configuration and read its data files; nothing is computed or written.
 
     Parameters
     ----------
-    path: the YAML file; paths inside it are relative to its folder.
+    source: the YAML file, paths inside it relative to its folder; or a dict of the same, relative to this folder.
     overrides: values for dotted keys such as ``"assimilation.members"``; text is read as YAML.
 
     Raises
@@ -32,9 +32,9 @@ def validate(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Co
     ConfigError: every fault of the file *and* of the data files it names, each with file, line and column.
     """
     try:
-        config = load_any(path, overrides)
+        config = load_any(source, overrides)
     except ConfigError as error:
-        raise ConfigError(in_order([*error.problems, *_data_faults(Path(path), overrides)])) from None
+        raise ConfigError(in_order([*error.problems, *_data_faults(source, overrides)])) from None
     if isinstance(config, Config):
         faults = list(_problem_faults(config))
         if faults:
@@ -52,13 +52,14 @@ def _problem_faults(config: Config) -> Iterator[Fault]:
     yield from _file_faults(config.document, plan, partial(build_one, config))
 
 
-def _data_faults(path: Path, overrides: Mapping[str, Any] | None) -> Iterator[Fault]:
+def _data_faults(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None) -> Iterator[Fault]:
     """Faults of the data files, for a configuration that has faults elsewhere than in its data section."""
     try:
-        document = override(read_document(path), overrides or {})
+        document, base = document_from(source)
+        document = override(document, overrides or {})
     except ConfigError:
         return
-    context = context_of(document, path.resolve().parent, None)
+    context = context_of(document, base, None)
     observed = context.observed
     found = check(_DataSection, {"data": document.data.get("data")}, (), document, [], context)
     if found is None or context.default is None:

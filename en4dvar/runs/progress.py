@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
+from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -145,13 +146,17 @@ def time_left(gone: float, done: int, total: int, iterations: Sequence[int], len
 
 @contextmanager
 def terminal_progress(n_datasets: int) -> Iterator[LiveProgress | None]:
-    """A live line on the terminal (standard error), or None where there is no terminal. NO_COLOR is respected."""
+    """A live line on the terminal (standard error) or in a notebook, or None where there is neither.
+
+    NO_COLOR is respected. In a notebook rich needs ipywidgets; without it there is no line.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
-    console = Console(stderr=True)
-    if not console.is_terminal:
+    notebook = Console()
+    console = notebook if notebook.is_jupyter and find_spec("ipywidgets") else Console(stderr=True)
+    if console is not notebook and (notebook.is_jupyter or not console.is_terminal):
         yield None
         return
     wide = [BarColumn(20)] if console.width >= WIDE else []

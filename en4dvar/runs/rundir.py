@@ -34,6 +34,7 @@ FIXED = (
     "config.yaml", "config.resolved.yaml", "posterior.nc", "twin.nc", "run.log", "report.html", "summary.csv",
     "what_if.csv", "ledger.csv", "varying.csv",
 )  # fmt: skip
+GIVEN = "data.csv"  # readings that a script handed over, written before its run begins
 Mode = Literal["new", "force", "resume", "report"]
 
 
@@ -163,7 +164,7 @@ def _prepare(path: Path, mode: Mode) -> Path:
     """The folder of a new run, to write to. Raises :class:`OutputError`."""
     finish_replacement(path)
     listed = listed_files(path)
-    others = {p.name for p in path.iterdir() if not PARTIAL.fullmatch(p.name)} - {LOCK}
+    others = {p.name for p in path.iterdir() if not PARTIAL.fullmatch(p.name)} - {LOCK, GIVEN}
     if mode == "resume" and others:
         raise OutputError(f"{path}: holds no run")
     if mode == "new" and (listed or others - {LISTING}):  # an empty list is of a run that was killed before it began

@@ -26,7 +26,7 @@ from en4dvar.summary import summary_csv
 
 
 def run(
-    config: Config | str | Path,
+    config: Config | str | Path | Mapping[str, Any],
     *,
     overrides: Mapping[str, Any] | None = None,
     force: bool = False,
@@ -38,8 +38,8 @@ def run(
 
     Parameters
     ----------
-    config: a loaded configuration, or the path of a YAML file.
-    overrides: of dotted keys, when ``config`` is a path; e.g. ``{"data.path": "/data/gel.csv"}``.
+    config: a loaded configuration, the path of a YAML file, or a dict of what would be in it.
+    overrides: of dotted keys, where ``config`` is not loaded yet; e.g. ``{"data.path": "/data/gel.csv"}``.
     force: replace the files of an earlier run in the same directory, once this run is complete.
     resume: continue an interrupted run in the same directory, to the same bits; where none has begun, begin.
     progress: called with the data set's name and the record of each iteration as it ends, in the calling thread; its
@@ -60,7 +60,7 @@ def run(
 
 
 def run_campaign(
-    config: Config | str | Path,
+    config: Config | str | Path | Mapping[str, Any],
     *,
     overrides: Mapping[str, Any] | None = None,
     force: bool = False,
@@ -177,9 +177,9 @@ def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int 
         return write_pages(directory.work, datasets, workers)
 
 
-def _loaded(config: Config | str | Path, overrides: Mapping[str, Any] | None) -> Config:
+def _loaded(config: Config | str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None) -> Config:
     if not isinstance(config, Config):
         return load_config(config, overrides)
     if overrides:
-        raise ConfigError("overrides apply to a file; give them to load_config instead")
+        raise ConfigError("overrides apply to a file or dict; give them to load_config instead")
     return config

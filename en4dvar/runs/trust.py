@@ -21,21 +21,23 @@ Ask = Callable[[str], bool]  # question → whether the user says yes
 def of_strangers(source: Path, ask: Ask | None, trust: bool) -> Iterator[None]:
     """Within, code that the result files of ``source`` name is loaded where the user may be supposed to know it.
 
-    That is code below the working directory and in installed packages. Anything else, and whatever is named by a
-    relative path (a run records absolute ones), is loaded with ``trust`` or where ``ask`` says yes.
+    That is code below the working directory and in installed packages. Anything else, any command, and whatever is
+    named by a relative path (a run records absolute ones), is loaded with ``trust`` or where ``ask`` says yes.
 
     Raises :class:`RefusedError` inside.
     """
-    answers: dict[Path, bool] = {}
+    answers: dict[str, bool] = {}
 
-    def require(what: str, file: Path | None) -> None:
-        if file is None or trust or _known(file):
+    def require(what: str, file: Path | None, anything: bool) -> None:
+        if file is None or trust or (_known(file) and not anything):
             return
         where = (source.absolute() / file.expanduser()).resolve()
         told = f"{source}: its {what} is code outside of this project, {where}"
-        if where not in answers:
-            answers[where] = ask is not None and ask(f"{told}; run it?")
-        if not answers[where]:
+        if anything:
+            told = f"{source}: its {what} runs a program, {where}"
+        if told not in answers:
+            answers[told] = ask is not None and ask(f"{told}; run it?")
+        if not answers[told]:
             raise RefusedError(f"{told}; read it, then give --trust to run it")
 
     with permission(require):

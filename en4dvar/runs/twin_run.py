@@ -23,7 +23,7 @@ STATE = f"{FOLDER}/twin.cycle"
 
 
 def run_twin(
-    config: TwinConfig | str | Path,
+    config: TwinConfig | str | Path | Mapping[str, Any],
     *,
     overrides: Mapping[str, Any] | None = None,
     force: bool = False,

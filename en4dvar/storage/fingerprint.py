@@ -104,3 +104,5 @@ def _paths(value: Any) -> Iterator[Path]:
         for text in (value, value.rpartition(":")[0]):  # also file:object
             if os.path.isfile(text):
                 yield Path(text)
+        if " " in value:  # a command
+            yield from (Path(word) for word in value.split() if os.path.isabs(word) and os.path.isfile(word))

@@ -151,12 +151,16 @@ class StoredResult:
         """Posterior members as rows (index ``draw``), parameters as columns, SI; NaN where a member failed."""
         return self.posterior.isel(chain=0, drop=True).to_dataframe()
 
-    def __str__(self) -> str:
-        """The summary as a table (display units), how the fit ended, and the warnings."""
+    @property
+    def ended(self) -> str:
+        """How the fit ended, in words."""
         s = self.sample_stats.attrs
         ended = f"{'converged' if s['converged'] else 'not converged'}: {s['stop_reason']}"
-        fit = f"chi2/K {s['chi2_per_observation']:.3g}, NRMSE {s['nrmse']:.3g}, DFS {s['dfs']:.3g}"
-        parts = [results_table({self.name: self.summary()}), f"{ended}; {fit}"]
+        return f"{ended}; chi2/K {s['chi2_per_observation']:.3g}, NRMSE {s['nrmse']:.3g}, DFS {s['dfs']:.3g}"
+
+    def __str__(self) -> str:
+        """The summary as a table (display units), how the fit ended, and the warnings."""
+        parts = [results_table({self.name: self.summary()}), self.ended]
         return "\n".join([*parts, *(f"{caution.kind}: {caution.words}" for caution in self.cautions)])
 
 

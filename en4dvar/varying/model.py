@@ -30,7 +30,12 @@ Varying = RandomWalk | StateChanges
 def can_vary(model: ForwardModel, name: str) -> bool:
     """Whether a parameter can change on the way: the state carries it, and it does not act at the start alone."""
     acts = not model.path_parameters or name in model.path_parameters
-    return acts and name in model.layout.names and model.layout[name].stop - model.layout[name].start == 1
+    return (
+        model.resumable
+        and acts
+        and name in model.layout.names
+        and model.layout[name].stop - model.layout[name].start == 1
+    )
 
 
 class PiecewiseModel(ForwardModel):
@@ -46,6 +51,11 @@ class PiecewiseModel(ForwardModel):
         self.path_parameters = tuple(name for name in model.path_parameters if name not in varied)
         for name in ATTRIBUTES:
             setattr(self, name, getattr(model, name))
+
+    @property
+    def dense(self) -> bool:
+        """As the model."""
+        return self.model.dense
 
     @property
     def alternatives(self) -> tuple[Alternative, ...]:  # type: ignore[override]

@@ -12,10 +12,11 @@ from scipy import ndimage
 
 from en4dvar.errors import DataError
 from en4dvar.state import Array
+from en4dvar_movie.fitting import fit_outline
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.kernels import normalise
 from en4dvar_movie.locate import TILE, locate
-from en4dvar_movie.outline import Circle, Optics, fit_outline
+from en4dvar_movie.outline import Circle, Optics
 
 Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 LEADING = 40  # frames looked at for the background
@@ -23,9 +24,11 @@ SAMPLES = 24  # frames looked at for what they share
 SMOOTH = 12.0  # pixels: the brightness that contrasts are relative to varies slowly
 LEAST_SPREAD = 0.002  # of the contrast
 NOISY = 0.1  # of a pixel's noise: what a contrast can be uncertain by for the noise
+SHARPEST = 5  # per cent of the frames: those where the bubble moved least within the exposure
 SPECK = 100  # pixels: the largest change that is no bubble
 LEAST_CONTRAST = 0.08  # of the background's brightness
 BRIGHT = 0.25  # of the contrast: how much brighter a flash is
+STEADY = 10_000  # tiles that say how bright a frame is
 CHANGED = 0.3  # share of tiles that a flash changes
 
 
@@ -49,15 +52,15 @@ class Background:
 
     def steadied(self, image: Array, tiles: Array, bubble: Circle) -> Array:
         """The image at the background's own brightness: what the light does far from the bubble is taken out."""
-        y, x = TILE * np.indices(tiles.shape)
-        outside = tiles[np.hypot(x - bubble.x, y - bubble.y) > 1.4 * bubble.R + 8]
+        down, across = (TILE * np.arange(side) - at for side, at in zip(tiles.shape, (bubble.y, bubble.x), strict=True))
+        outside = tiles[np.add.outer(down**2, across**2) > (1.4 * bubble.R + 8) ** 2]
         if len(outside) < 0.05 * tiles.size:
             return image
-        change = np.float32(np.median(outside))
+        change = np.float32(np.median(outside[:: -(-len(outside) // STEADY)]))
         return (image - change) / (1 + change if self.relative else np.float32(1))
 
 
-def find_background(movie: Movie) -> tuple[Background, Optics]:
+def find_background(movie: Movie, circles: int = 1) -> tuple[Background, Optics]:
     """Background and optics of a movie, from its first frames and some along it. Raises :class:`DataError`."""
     leading, samples = _look(movie)
     first = leading[0].astype(np.float32)
@@ -72,7 +75,7 @@ def find_background(movie: Movie) -> tuple[Background, Optics]:
     background = _with_sign(level, samples, noise, empty)
     if empty:
         background = _refined(background, samples)
-    return background, _optics(background, samples, movie)
+    return background, _optics(background, samples, movie, circles)
 
 
 def _look(movie: Movie) -> tuple[list[Frame], list[Frame]]:
@@ -172,7 +175,7 @@ def share_changed(tiles: Array, noise: float) -> float:
     return float(np.mean(tiles > max(4 * noise, BRIGHT)))
 
 
-def _optics(background: Background, samples: Sequence[Frame], movie: Movie) -> Optics:
+def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circles: int) -> Optics:
     """Contrast and sharpness that the sampled frames share. Raises :class:`DataError` where none shows a bubble."""
     found = []
     for frame in samples:
@@ -180,15 +183,16 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie) -> O
         place = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
         if place is None or share_changed(tiles, background.noise) > CHANGED:
             continue
-        outline = fit_outline(background.steadied(image, tiles, place[0]), place[0], Optics(-place[1]))
-        if outline is not None and outline.seen > 0.15 and outline.contrast < 0:
-            found.append(outline)
+        steady = background.steadied(image, tiles, place[0])
+        outlines = fit_outline(steady, place[0], Optics(-place[1]), circles)
+        if outlines is not None and outlines[0].seen > 0.15 and outlines[0].contrast < 0:
+            found.append(outlines[0])
     if not found:
         raise DataError(f"{movie.path}: no frame shows a bubble that differs from the background")
     large = sorted(found, key=lambda o: o.circle.R / o.width)[3 * len(found) // 4 :]  # they show the full contrast
     contrasts = np.array([o.contrast for o in large])
     contrast = float(np.median(contrasts))
     scatter = 1.2533 * float(np.std(contrasts)) / max(len(large) - 1, 1) ** 0.5  # of a median
-    width = float(np.percentile([o.width for o in found], 20))
+    width = float(np.percentile([o.width for o in found], SHARPEST))
     scatter = min(scatter, NOISY * background.noise)  # more is not noise: bubbles differ in how bright their centre is
     return Optics(contrast, width, max(scatter / -contrast, LEAST_SPREAD))

@@ -5,8 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+if TYPE_CHECKING:
+    from en4dvar_movie.frames import Movie
+    from en4dvar_movie.table import Scale
 
 
 @click.command()
@@ -15,20 +20,21 @@ import click
 @click.option(
     "--frame-rate", metavar="RATE", help="Frames per time, e.g. '270 kHz'; needed where the file does not tell."
 )
-@click.option(
-    "--exposure", metavar="TIME", help="Exposure of a frame, e.g. '500 ns': the timing error is a tenth of it."
-)
+@click.option("--exposure", metavar="TIME", help="Exposure of a frame or length of a flash, e.g. '500 ns'.")
+@click.option("--flashes", metavar="TIMES", help="Flashes of one exposure, as '0 us, 2 us, 4 us': nested circles.")
 @click.option("--raw", metavar="WxHxBITS", help="Shape of the frames of a file without header, e.g. 512x128x8.")
 @click.option(
     "--corrections", type=click.Path(path_type=Path), help="Text file: FRAME out, or FRAME X Y RADIUS (pixels)."
 )
 @click.option("--out", type=click.Path(path_type=Path), help="CSV file to write; default <name of the movie>.csv.")
 @click.option("--page", type=click.Path(path_type=Path), help="HTML page to write; default beside the CSV file.")
+@click.option("--outlined", type=click.Path(path_type=Path), help="Movie to write too, with the outlines drawn.")
 @click.option("--force", is_flag=True, help="Replace these files.")
 @click.option("--workers", type=click.IntRange(min=1), help="Threads; the numbers do not depend on it.")
 def track(
-    movie: Path, pixel: str | None, frame_rate: str | None, exposure: str | None, raw: str | None,
-    corrections: Path | None, out: Path | None, page: Path | None, force: bool, workers: int | None,
+    movie: Path, pixel: str | None, frame_rate: str | None, exposure: str | None,
+    flashes: str | None, raw: str | None, corrections: Path | None, out: Path | None, page: Path | None,
+    outlined: Path | None, force: bool, workers: int | None,
 ) -> None:  # fmt: skip
     """Read the bubble's radius and its error from every frame of a movie.
 
@@ -43,12 +49,46 @@ def track(
     from en4dvar.commands.common import command_line, refuse_to_replace
     from en4dvar.executor import available_cores
     from en4dvar.files import write_text
-    from en4dvar.units import parse_quantity
     from en4dvar_movie.corrections import read_corrections
-    from en4dvar_movie.frames import open_movie, with_scale
+    from en4dvar_movie.frames import open_movie
+    from en4dvar_movie.outlined import outlined as outlined_frames
     from en4dvar_movie.page import page_text
-    from en4dvar_movie.table import Scale, to_csv
+    from en4dvar_movie.table import to_csv
     from en4dvar_movie.tracking import track as track_movie
+    from en4dvar_movie.writing import require_suffix, write_movie
+
+    opened, scale = _scaled(open_movie(movie, raw), pixel, frame_rate, exposure, flashes)
+    table = out or Path(f"{movie.stem}.csv")
+    shown = page or table.with_suffix(".html")
+    if outlined:
+        require_suffix(outlined)
+    for target in (table, shown, outlined):
+        refuse_to_replace(target, force)
+    fixed = read_corrections(corrections) if corrections else {}
+    with _bar(opened.count) as progress:
+        found = track_movie(opened, workers or available_cores(), fixed, progress, scale.flashes)
+    for note in opened.notes:
+        click.echo(f"note: {note}", err=True)
+    words = command_line()
+    write_text(table, to_csv(found.readings, scale, str(movie), words))
+    write_text(shown, page_text(opened, found, scale, words))
+    if outlined:
+        pictures = outlined_frames(opened, found)
+        write_movie(outlined, pictures, len({r.found.frame for r in found.readings}), scale.pixel, scale.rate)
+    used = [r for r in found.readings if r.used]
+    what = "frames" if len(scale.flashes) == 1 else "circles"
+    click.echo(f"{len(used)} of {len(found.readings)} {what} read; the others and why: see the page")
+    click.echo(f"readings: {table}\npage: {shown}\nnext: en4dvar init --data {table}")
+
+
+def _scaled(
+    movie: Movie, pixel: str | None, frame_rate: str | None, exposure: str | None, flashes: str | None
+) -> tuple[Movie, Scale]:
+    """The movie with its scale. Raises :class:`click.UsageError`, :class:`DataError` where the options cannot be."""
+    from en4dvar.units import parse_quantity
+    from en4dvar_movie.flashes import parse_flashes
+    from en4dvar_movie.frames import with_scale
+    from en4dvar_movie.table import Scale
 
     def given(text: str | None, unit: str, option: str) -> float | None:
         value = None if text is None else parse_quantity(text, unit)
@@ -56,27 +96,15 @@ def track(
             raise click.UsageError(f"{option} must be positive")
         return value
 
-    length, rate = given(pixel, "m", "--pixel"), given(frame_rate, "1/s", "--frame-rate")
-    opened = with_scale(open_movie(movie, raw), length, rate)
+    movie = with_scale(movie, given(pixel, "m", "--pixel"), given(frame_rate, "1/s", "--frame-rate"))
     shutter = given(exposure, "s", "--exposure")
-    scale = Scale(opened.pixel, opened.rate, float("nan") if shutter is None else shutter)
-    if shutter is not None and shutter * scale.rate > 1.001:
-        raise click.UsageError(f"--exposure {exposure} is longer than the {1e6 / scale.rate:g} us between two frames")
-    table = out or Path(f"{movie.stem}.csv")
-    shown = page or table.with_suffix(".html")
-    for target in (table, shown):
-        refuse_to_replace(target, force)
-    fixed = read_corrections(corrections) if corrections else {}
-    with _bar(opened.count) as progress:
-        found = track_movie(opened, workers or available_cores(), fixed, progress)
-    for note in opened.notes:
-        click.echo(f"note: {note}", err=True)
-    words = command_line()
-    write_text(table, to_csv(found.readings, scale, str(movie), words))
-    write_text(shown, page_text(opened, found, scale, words))
-    used = [r for r in found.readings if r.used]
-    click.echo(f"{len(used)} of {len(found.readings)} frames read; the others and why: see the page")
-    click.echo(f"readings: {table}\npage: {shown}\nnext: en4dvar init --data {table}")
+    instants = parse_flashes(flashes) if flashes else (0.0,)
+    between = f"the {1e6 / movie.rate:g} us between two frames"
+    if shutter is not None and shutter * movie.rate > 1.001:
+        raise click.UsageError(f"--exposure {exposure} is longer than {between}")
+    if instants[-1] - instants[0] >= 1 / movie.rate:
+        raise click.UsageError(f"--flashes {flashes}: more than {between}")
+    return movie, Scale(movie.pixel, movie.rate, float("nan") if shutter is None else shutter, instants)
 
 
 @contextmanager

@@ -5,8 +5,10 @@ Frames are (H, W) arrays of brightness, 8 or 16 bit. Nothing is held: a movie is
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
@@ -89,7 +91,7 @@ def open_movie(path: str | Path, raw: str | None = None) -> Movie:
     raise DataError(f"{path}: not a movie by its suffix ({kinds}, or a folder of frames); of a raw file say --raw")
 
 
-def _library(name: str) -> ModuleType:
+def library(name: str) -> ModuleType:
     from importlib import import_module
 
     try:
@@ -130,17 +132,41 @@ def _size(shape: tuple[int, ...]) -> str:
     return " × ".join(map(str, shape[1::-1] + shape[2:]))
 
 
-def _tiff(path: Path) -> Movie:
-    tifffile = _library("tifffile")
+@contextmanager
+def overheard(name: str) -> Iterator[list[str]]:
+    """Within, what a library logs is kept as a list instead of shown."""
+    faults: list[str] = []
+    logger = logging.getLogger(name)
+    keep = logging.Handler()
+    keep.emit = lambda record: faults.append(record.getMessage())  # type: ignore[method-assign]
+    before = logger.propagate
+    logger.addHandler(keep)
+    logger.propagate = False
     try:
-        with tifffile.TiffFile(path) as file:
+        yield faults
+    finally:
+        logger.removeHandler(keep)
+        logger.propagate = before
+
+
+def _tiff(path: Path) -> Movie:
+    tifffile = library("tifffile")
+    try:
+        with overheard("tifffile") as faults, tifffile.TiffFile(path) as file:
             pages = len(file.pages)
             about = dict(file.imagej_metadata or {})
-            tags = file.pages[0].tags
-            pixel = _tiff_pixel(about, tags.get("XResolution"))
+            first = file.pages[0]
+            pixel = _tiff_pixel(about, first.tags.get("XResolution"))
+            start, frame, plain = first.dataoffsets[0], first.nbytes, first.compression == 1
+            kind, shape = np.dtype(first.dtype).newbyteorder(file.byteorder), first.shape
     except (OSError, ValueError, IndexError, KeyError, tifffile.TiffFileError) as error:
         raise DataError(f"{path}: cannot be read as TIFF: {error}") from None
-    step = about.get("finterval")
+    count = int(about.get("images", pages))
+    rate = 1 / float(about["finterval"]) if about.get("finterval") else float("nan")
+    if pages == 1 < count and plain and path.stat().st_size >= start + count * frame:  # ImageJ's way beyond 4 GB
+        return Movie(path, lambda: _blocks(path, start, count, kind, shape), count, pixel, rate)
+    if pages < count or any("invalid page offset" in fault for fault in faults):
+        raise DataError(f"{path}: the file is damaged or cut off: of {count} frames not all are there")
 
     def read() -> Iterator[Frame]:
         with tifffile.TiffFile(path) as file:
@@ -150,7 +176,7 @@ def _tiff(path: Path) -> Movie:
                 except tifffile.TiffFileError as error:
                     raise ValueError(error) from None
 
-    return Movie(path, read, pages, pixel, 1 / float(step) if step else float("nan"))
+    return Movie(path, read, pages, pixel, rate)
 
 
 def _tiff_pixel(about: dict[str, Any], resolution: Any) -> float:
@@ -174,14 +200,14 @@ def _folder(path: Path) -> Movie:
             if file.suffix.lower() in TIFF:
                 yield from _tiff(file).open()
             else:
-                with _library("PIL.Image").open(file) as image:
+                with library("PIL.Image").open(file) as image:
                     yield np.asarray(image)
 
     return Movie(path, read, len(files))
 
 
 def _video(path: Path) -> Movie:
-    av = _library("av")
+    av = library("av")
 
     def read() -> Iterator[Frame]:
         with av.open(str(path)) as file:
@@ -213,12 +239,17 @@ def _raw(path: Path, raw: str) -> Movie:
     if not frame or not size or size % frame:
         raise DataError(f"{path}: {size} bytes are no whole number of frames of {raw} ({frame} bytes each)")
 
-    def read() -> Iterator[Frame]:
-        with path.open("rb") as file:
-            for _ in range(size // frame):
-                yield np.frombuffer(file.read(frame), kind).reshape(height, width)
+    count = size // frame
+    return Movie(path, lambda: _blocks(path, 0, count, kind, (height, width)), count)
 
-    return Movie(path, read, size // frame)
+
+def _blocks(path: Path, start: int, count: int, kind: np.dtype[Any], shape: tuple[int, ...]) -> Iterator[Frame]:
+    """Frames that follow each other in a file, without anything between them."""
+    with path.open("rb") as file:
+        file.seek(start)
+        for _ in range(count):
+            frame = np.frombuffer(file.read(int(np.prod(shape)) * kind.itemsize), kind).reshape(shape)
+            yield frame.astype(kind.newbyteorder("="), copy=False)
 
 
 def with_scale(movie: Movie, pixel: float | None, rate: float | None) -> Movie:

@@ -2,10 +2,12 @@
 
 The image near the outline is modelled as
 
-    m(r, θ) = b + c Φ((ρ(θ) − r)/w) + g Φ((ρ_g − r)/w),      ρ(θ) = R + Σ_{n≥2} A_n cos nθ + B_n sin nθ,
+    m(r, θ) = b + c/S Σ_s Φ((ρ(θ) − d_s − r)/w) + g Φ((ρ_g − r)/w),      ρ(θ) = R + Σ_{n≥2} A_n cos nθ + B_n sin nθ,
 
 in polar coordinates about the centre (x, y): an edge of width w (std of the blur), contrast c, and the bright centre of
-a bubble that acts as a lens, g and ρ_g. The order of the parameters is that of :data:`NAMES`, then A_2, B_2, A_3, …
+a bubble that acts as a lens, g and ρ_g. Where S flashes light one exposure, S nested circles share the contrast; the
+outermost has the radius R, the others lie d_s inside it. The order of the parameters is that of :data:`NAMES`, then
+A_2, B_2, A_3, … and d_2, d_3, …
 """
 
 from __future__ import annotations
@@ -14,16 +16,20 @@ import math
 
 import numpy as np
 
-from en4dvar.compiled import kernel
+from en4dvar.compiled import kernel, summing_kernel
 
 NAMES = ("x", "y", "R", "w", "b", "c", "g", "rho_g")
 SHAPE = len(NAMES)  # the first mode's place
+FAR = 7.0  # widths from an edge where nothing of it is left in double precision but 1e-12
+BLOCK = 64  # pixels
 _ROOT_HALF = math.sqrt(0.5)
 _DENSITY = 1 / math.sqrt(2 * math.pi)
 
 
 @kernel
 def _normal(z):  # Φ and its derivative
+    if z < -FAR or z > FAR:
+        return (1.0 if z > 0 else 0.0), 0.0
     return 0.5 * math.erfc(-z * _ROOT_HALF), _DENSITY * math.exp(-0.5 * z * z)
 
 
@@ -42,21 +48,31 @@ def _row(j, i, p, modes, row):
         rho += p[k] * cn + p[k + 1] * sn
         slope += n * (p[k + 1] * cn - p[k] * sn)  # dρ/dθ
     w = p[3]
-    z, zg = (rho - r) / w, (p[7] - r) / w
-    F, f = _normal(z)
+    gaps = 8 + 2 * (modes - 1)  # the place of d_2
+    circles = 1 + len(p) - gaps
+    F, edge, wider = 0.0, 0.0, 0.0
+    for s in range(circles):
+        z = (rho - (p[gaps + s - 1] if s else 0.0) - r) / w
+        part, f = _normal(z)
+        f *= p[5] / circles / w
+        F += part / circles
+        edge += f
+        wider += f * z
+        if s:
+            row[gaps + s - 1] = -f
+    zg = (p[7] - r) / w
     G, g = _normal(zg)
-    edge = p[5] * f / w
     glare = p[6] * g / w
     # r falls by cos as x grows, θ grows by sin/r: both move the edge
     row[0] = edge * (cos + slope * sin / r) + glare * cos
     row[1] = edge * (sin - slope * cos / r) + glare * sin
     row[2] = edge
-    row[3] = -edge * z - glare * zg
+    row[3] = -wider - glare * zg
     row[4] = 1.0
     row[5] = F
     row[6] = G
     row[7] = glare
-    for k in range(8, 8 + 2 * (modes - 1)):
+    for k in range(8, gaps):
         row[k] *= edge
     return p[4] + p[5] * F + p[6] * G
 
@@ -80,7 +96,7 @@ def _bounds(shape, x, y, reach):
 @kernel
 def residuals(image, p, modes, ring):
     """Residuals (n,) of the pixels whose distance from ``ring[:2]`` lies between ``ring[2]`` and ``ring[3]``."""
-    row = np.zeros(8 + 2 * (modes - 1))
+    row = np.zeros(len(p))
     top, bottom, left, right = _bounds(image.shape, ring[0], ring[1], ring[3])
     found = np.empty(max(0, bottom - top) * max(0, right - left))
     n = 0
@@ -93,11 +109,28 @@ def residuals(image, p, modes, ring):
     return found[:n]
 
 
+@summing_kernel
+def _add(A, rows, weights):
+    """A += Σ_k weights_k rows_k rows_kᵀ of rows (P, BLOCK), below the diagonal."""
+    scaled = np.empty(BLOCK)
+    for a in range(len(A)):
+        for k in range(BLOCK):
+            scaled[k] = rows[a, k] * weights[k]
+        for b in range(a + 1):
+            total = 0.0
+            for k in range(BLOCK):
+                total += scaled[k] * rows[b, k]
+            A[a, b] += total
+
+
 @kernel
 def normal_equations(image, p, modes, ring, cutoff):
     """JᵀWJ (P, P), JᵀWr (P,), Σ w r², Σ w and the robust cost, W of Tukey's bisquare with ``cutoff``."""
-    size = 8 + 2 * (modes - 1)
+    size = len(p)
     row = np.zeros(size)
+    rows = np.zeros((size, BLOCK))  # of pixels whose products are added together, which is quicker
+    weights = np.zeros(BLOCK)
+    n = 0
     A = np.zeros((size, size))
     g = np.zeros(size)
     squares = total = cost = 0.0
@@ -116,10 +149,15 @@ def normal_equations(image, p, modes, ring, cutoff):
             squares += w * r * r
             total += w
             for a in range(size):
-                s = w * row[a]
-                g[a] += s * r
-                for b in range(a + 1):
-                    A[a, b] += s * row[b]
+                rows[a, n] = row[a]
+                g[a] += w * row[a] * r
+            weights[n] = w
+            n += 1
+            if n == BLOCK:
+                _add(A, rows, weights)
+                n = 0
+    weights[n:] = 0.0
+    _add(A, rows, weights)
     for a in range(size):
         for b in range(a):
             A[b, a] = A[a, b]
@@ -128,9 +166,13 @@ def normal_equations(image, p, modes, ring, cutoff):
 
 @kernel
 def influence(image, p, modes, ring, cutoff, weights, sectors):
-    """What moves the radius: Σ of u_i = (weights·J_i) ψ_i by sector (S,), Σ u_i² over pixels, and Σ ψ'_i / Σ w_i."""
-    row = np.zeros(8 + 2 * (modes - 1))
+    """What moves the radius, u_i = (weights·J_i) ψ_i of each pixel, in its sums.
+
+    Σ u_i by sector (K,), Σ u_i² over pixels, Σ ψ'_i / Σ w_i, and by sector JᵀWJ·weights (K, P): what a fit takes out.
+    """
+    row = np.zeros(len(p))
     sums = np.zeros(sectors)
+    fitted = np.zeros((sectors, len(p)))
     squares = slopes = total = 0.0
     top, bottom, left, right = _bounds(image.shape, ring[0], ring[1], ring[3])
     for j in range(top, bottom):
@@ -145,11 +187,14 @@ def influence(image, p, modes, ring, cutoff, weights, sectors):
             v = min(1.0, (r / cutoff) ** 2)
             slopes += (1 - v) * (1 - 5 * v)
             total += (1 - v) ** 2
-            u *= r * (1 - v) ** 2
             turn = math.atan2(j - p[1], i - p[0]) / (2 * math.pi) + 0.5
-            sums[min(sectors - 1, int(turn * sectors))] += u
+            k = min(sectors - 1, int(turn * sectors))
+            for a in range(len(row)):
+                fitted[k, a] += (1 - v) ** 2 * row[a] * u
+            u *= r * (1 - v) ** 2
+            sums[k] += u
             squares += u * u
-    return sums, squares, slopes / total
+    return sums, squares, slopes / total, fitted
 
 
 @kernel

@@ -60,13 +60,17 @@ def circle_through(points: Array) -> Circle | None:
     for _ in range(6):
         if len(kept) < 6:
             return found
-        x, y = kept.T
-        matrix = np.stack([x, y, np.ones(len(x))], axis=1)
-        (a, b, c), *_ = np.linalg.lstsq(matrix, x * x + y * y, rcond=None)
+        middle = kept.mean(axis=0)  # about which the sums of squares lose no digits
+        x, y = (kept - middle).T
+        matrix = np.stack([x, y, np.ones(len(x))])
+        try:
+            a, b, c = np.linalg.solve(matrix @ matrix.T, matrix @ (x * x + y * y))
+        except np.linalg.LinAlgError:  # all on one line
+            return found
         square = c + (a * a + b * b) / 4
         if square <= 0:
             return found
-        found = Circle(a / 2, b / 2, float(np.sqrt(square)))
+        found = Circle(float(a / 2 + middle[0]), float(b / 2 + middle[1]), float(np.sqrt(square)))
         off = np.abs(np.hypot(points[:, 0] - found.x, points[:, 1] - found.y) - found.R)
         kept = points[off <= max(2.5 * float(np.median(off)), 0.75)]
     return found

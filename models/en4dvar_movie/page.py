@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -13,6 +14,7 @@ from matplotlib.figure import Figure
 from en4dvar.report.style import DARK, LIGHT, css_variables, inline_svg, styled
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.outline import MODES
+from en4dvar_movie.outlined import brightest, by_frame, grey
 from en4dvar_movie.table import Scale
 from en4dvar_movie.tracking import Reading, Track
 
@@ -35,6 +37,7 @@ def page_text(movie: Movie, found: Track, scale: Scale, command: str) -> str:
         command=command,
         count=len(found.readings),
         used=len(used),
+        what="frames" if len(found.flashes) == 1 else "circles",
         scale=f"{1e6 * scale.pixel:.6g} µm a pixel, {scale.rate:.6g} frames a second",
         background=found.background.frames,
         common=f"{float(np.median([r.errors.common for r in used])) * 1e6 * scale.pixel:.2g}" if used else "",
@@ -51,7 +54,7 @@ def _radius(used: list[Reading], scale: Scale) -> Figure:
     ax = figure.subplots()
     um = 1e6 * scale.pixel
     ax.errorbar(
-        [1e6 * r.found.frame / scale.rate for r in used], [um * r.radius for r in used],
+        [1e6 * scale.time(r.found) for r in used], [um * r.radius for r in used],
         yerr=[1.645 * um * r.errors.std for r in used],
         fmt="o", ms=2.5, color=LIGHT["ink"], ecolor=LIGHT["centre"], elinewidth=1, capsize=1.5,
     )  # fmt: skip
@@ -63,7 +66,7 @@ def _radius(used: list[Reading], scale: Scale) -> Figure:
 def _shape(used: list[Reading], scale: Scale) -> Figure:
     figure = Figure(figsize=(6.8, 2.4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    times = [1e6 * r.found.frame / scale.rate for r in used]
+    times = [1e6 * scale.time(r.found) for r in used]
     outlines = [r.found.outline for r in used]
     left.plot(times, [o.eccentricity if o else np.nan for o in outlines], ".", ms=3, color=LIGHT["ink"])
     left.set(xlabel="time (µs)", ylabel="eccentricity")
@@ -83,29 +86,29 @@ def _shape(used: list[Reading], scale: Scale) -> Figure:
     return figure
 
 
-def _strip(movie: Movie, found: Track) -> list[dict[str, str]]:
+def _strip(movie: Movie, found: Track) -> list[dict[str, Any]]:
     """Evenly chosen frames as pictures, each with its outline as a path over it."""
-    every = -(-len(found.readings) // SHOWN)
-    pictures = []
-    for reading, frame in zip(found.readings, movie.frames(), strict=False):
-        if reading.found.frame % every == 0:
-            pictures.append(_picture(frame, reading, found))
-    return pictures
+    circles = by_frame(found.readings)
+    every = -(-len(circles) // SHOWN)
+    full = brightest(found)
+    return [
+        _picture(number, frame, circles[number], full)
+        for number, frame in enumerate(movie.frames())
+        if number % every == 0 and number in circles
+    ]
 
 
-def _picture(frame: Frame, reading: Reading, found: Track) -> dict[str, str]:
+def _picture(number: int, frame: Frame, readings: list[Reading], full: float) -> dict[str, Any]:
     step = -(-max(frame.shape) // SIDE)
-    full = 1.3 * float(np.percentile(found.background.level, 95))
-    small = np.clip(255.0 * frame[::step, ::step] / max(full, 1.0), 0, 255).astype(np.uint8)
-    outline = reading.found.outline
-    points = outline.points(TURN) / step if outline is not None and reading.used else np.empty((0, 2))
+    small = grey(frame[::step, ::step], full)
+    outlines = [r.found.outline.points(TURN) / step for r in readings if r.found.outline is not None and r.used]
     return {
-        "frame": str(reading.found.frame),
+        "frame": str(number),
         "png": png(small),
         "width": str(small.shape[1]),
         "height": str(small.shape[0]),
-        "points": " ".join(f"{x + 0.5:.2f},{y + 0.5:.2f}" for x, y in points),
-        "words": reading.reason,
+        "outlines": [" ".join(f"{x + 0.5:.2f},{y + 0.5:.2f}" for x, y in points) for points in outlines],
+        "words": "; ".join(dict.fromkeys(r.reason for r in readings if r.reason)),
     }
 
 

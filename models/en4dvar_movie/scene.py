@@ -1,56 +1,59 @@
-"""Movies of a bubble whose radius is known: what ``track`` is measured against.
+"""Movies of a bubble whose radius is known: what ``track`` is measured against, and ``en4dvar simulate --movie``.
 
 A frame is light on a sensor: an uneven background, darkened inside the bubble except in its bright centre, averaged
-over the exposure and over a pixel, blurred by the optics, with dirt, shot noise and read noise, in whole grey levels.
+over the exposure (or over flashes) and over a pixel, blurred by the optics, with dirt, shot noise and read noise, in
+whole grey levels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from scipy import ndimage
 
 from en4dvar.state import Array
+from en4dvar_movie.frames import Frame
 
 FINE = 3  # sub-pixels to a side
+GLARE = 0.7  # how much of a bubble's shade its bright centre lacks
+TRUNCATE = 5.0  # std of the blur
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Lengths in pixels, brightness in grey levels of 8 bit.
+    """What is filmed and with what; lengths in pixels. Each field's annotation says what it is."""
 
-    ``blur`` is the std of the optics, ``contrast`` the share of light that a bubble takes, ``uneven`` that by which the
-    background varies; ``noise`` the std of the camera at the background's brightness, half of its variance shot noise;
-    ``centre`` the bright centre's share of the radius (0: none); ``drift`` the way of the centre in a frame;
-    ``ellipticity`` the std of a random surface of degree 2 over the radius; ``dirt`` the number of specks, a quarter
-    of them moving with the frame; ``bubble`` where the centre is (x, y); ``before`` frames are without a bubble.
-    """
-
-    shape: tuple[int, int] = (128, 128)
-    level: float = 150.0
-    contrast: float = 0.5
-    blur: float = 1.2
-    noise: float = 3.0
-    uneven: float = 0.1
-    centre: float = 0.0
-    drift: float = 0.0
-    ellipticity: float = 0.0
-    dirt: int = 0
-    bubble: tuple[float, float] = (63.3, 64.2)
-    before: int = 3
+    shape: Annotated[tuple[int, int], "WIDTHxHEIGHT of a frame"] = (128, 128)
+    level: Annotated[float, "grey level of the background"] = 150.0
+    contrast: Annotated[float, "share of the light that the bubble takes"] = 0.5
+    blur: Annotated[float, "std of the blur by the optics"] = 1.2
+    noise: Annotated[float, "std of the noise where the background is, in grey levels"] = 3.0
+    shot: Annotated[float, "share of the noise's variance that is shot noise, growing with the light"] = 0.5
+    uneven: Annotated[float, "share by which the background's light varies over a frame"] = 0.1
+    centre: Annotated[float, "radius of the bright centre over that of the bubble; 0: none"] = 0.0
+    drift: Annotated[float, "way of the bubble's centre from frame to frame"] = 0.0
+    ellipticity: Annotated[float, "std of a random ellipsoid's surface over its radius"] = 0.0
+    dirt: Annotated[int, "number of specks, a quarter of which moves from frame to frame"] = 0
+    bubble: Annotated[tuple[float, float] | None, "x and y of the bubble's centre; default the frame's middle"] = None
+    before: Annotated[int, "empty frames before the bubble"] = 3
+    bits: Annotated[int, "of a grey level: 8 or 16"] = 8
 
 
-def render(radii: Array, scene: Scene, rng: np.random.Generator) -> Iterator[Array]:
-    """Frames (H, W), 8 bit, of radii (K, S) in pixels at S instants within each exposure."""
+def render(radii: Array, scene: Scene, rng: np.random.Generator) -> Iterator[Frame]:
+    """Frames (H, W) of radii (K, S) in pixels at S instants within each exposure, of equal light."""
     light = _background(scene, rng)
     surface = _surface(scene, rng)
     heading = rng.uniform(0, 2 * np.pi)
+    seed = int(rng.integers(2**31))  # of what moves
     for k in range(-scene.before, len(radii)):
-        frame = light if k < 0 else light * (1 - scene.contrast * _shade(radii[k], k, surface, heading, scene))
+        frame = light.copy()
+        if k >= 0:
+            _darken(frame, radii[k], k * scene.drift * np.array([np.cos(heading), np.sin(heading)]), surface, scene)
         if scene.dirt:
-            frame = frame * _specks(scene, np.random.default_rng([k + scene.before, scene.dirt]), scene.dirt // 4)
+            frame *= _specks(scene, np.random.default_rng([seed, k + scene.before]), scene.dirt // 4)
         yield _exposed(frame, scene, rng)
 
 
@@ -79,26 +82,42 @@ def _surface(scene: Scene, rng: np.random.Generator) -> Array:
     return np.asarray(M - np.eye(3) * np.trace(M) / 3)
 
 
-def _shade(radii: Array, k: int, M: Array, heading: float, scene: Scene) -> Array:
-    """How much of a pixel (H, W) the bubble covers, blurred."""
+def _darken(frame: Array, radii: Array, moved: Array, M: Array, scene: Scene) -> None:
+    """Take the bubble's shade from a frame (H, W).
+
+    Only the box about the bubble is computed. It goes beyond the frame where that cuts the bubble, for light from
+    there is blurred into the frame.
+    """
     height, width = scene.shape
-    y, x = np.indices((height * FINE, width * FINE))
-    at = (FINE - 1) / 2
-    dx = (x - at) / FINE - scene.bubble[0] - k * scene.drift * np.cos(heading)
-    dy = (y - at) / FINE - scene.bubble[1] - k * scene.drift * np.sin(heading)
+    x0, y0 = (scene.bubble or ((width - 1) / 2, (height - 1) / 2)) + moved
+    margin = int(np.ceil(TRUNCATE * scene.blur)) + 2
+    reach = float(radii.max()) * (1 + float(np.abs(M).sum())) + margin
+    left, right = max(-margin, int(x0 - reach)), min(width + margin, int(x0 + reach) + 2)
+    top, bottom = max(-margin, int(y0 - reach)), min(height + margin, int(y0 + reach) + 2)
+    if right <= left or bottom <= top:
+        return
+    at = (np.arange(max(right - left, bottom - top) * FINE) - (FINE - 1) / 2) / FINE
+    dx, dy = at[: (right - left) * FINE] + left - x0, (at[: (bottom - top) * FINE] + top - y0)[:, None]
     r = np.hypot(dx, dy) + 1e-9
     cos, sin = dx / r, dy / r
     form = 1 + M[0, 0] * cos**2 + M[1, 1] * sin**2 + 2 * M[0, 1] * cos * sin
-    covered = np.zeros(r.shape)
-    for radius in radii:
-        covered += np.clip((radius * form - r) * FINE + 0.5, 0, 1)
-        if scene.centre:
-            covered -= 0.7 * np.clip((scene.centre * radius - r) * FINE + 0.5, 0, 1)
-    smooth = ndimage.gaussian_filter(covered / len(radii), scene.blur * FINE, mode="nearest", truncate=5)
-    return np.asarray(smooth.reshape(height, FINE, width, FINE).mean(axis=(1, 3)))
+    shade = _cover(r / form, radii) - (GLARE * _cover(r / form, scene.centre * radii) if scene.centre else 0.0)
+    smooth = ndimage.gaussian_filter(shade, scene.blur * FINE, mode="nearest", truncate=TRUNCATE)
+    whole = smooth.reshape(bottom - top, FINE, right - left, FINE).mean(axis=(1, 3))
+    inside = np.s_[max(top, 0) : min(bottom, height), max(left, 0) : min(right, width)]
+    rows, columns = frame[inside].shape
+    first = max(-top, 0), max(-left, 0)
+    frame[inside] *= 1 - scene.contrast * whole[first[0] : first[0] + rows, first[1] : first[1] + columns]
 
 
-def _exposed(light: Array, scene: Scene, rng: np.random.Generator) -> Array:
-    shot = 0.5 * scene.noise**2 * np.clip(light / scene.level, 0, None)
-    noisy = light + rng.normal(size=light.shape) * np.sqrt(shot + 0.5 * scene.noise**2)
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+def _cover(r: Array, radii: Array) -> Array:
+    """Mean over radii (S,) of how much of a sub-pixel at r the disc covers: linear between its edges."""
+    edges = np.sort(np.concatenate([radii - 0.5 / FINE, radii + 0.5 / FINE]))
+    values = np.clip((radii[:, None] - edges) * FINE + 0.5, 0, 1).mean(axis=0)
+    return np.interp(r, edges, values)
+
+
+def _exposed(light: Array, scene: Scene, rng: np.random.Generator) -> Frame:
+    shot = scene.shot * scene.noise**2 * np.clip(light / scene.level, 0, None)
+    noisy = light + rng.normal(size=light.shape) * np.sqrt(shot + (1 - scene.shot) * scene.noise**2)
+    return np.clip(np.rint(noisy), 0, 2**scene.bits - 1).astype(np.uint16 if scene.bits > 8 else np.uint8)

@@ -10,7 +10,7 @@ from importlib.metadata import version
 
 import numpy as np
 
-from en4dvar_movie.tracking import Reading
+from en4dvar_movie.tracking import Found, Reading
 
 COLUMNS = ("frame", "t_us", "R_um", "R_std_um", "t_std_us", "x_um", "y_um", "eccentricity", "used", "reason")
 STEADY = 0.1  # of the exposure: where its light may be centred
@@ -19,11 +19,16 @@ UNKNOWN = 0.05  # of the step between frames, where no exposure is given
 
 @dataclass(frozen=True)
 class Scale:
-    """``pixel`` m, ``rate`` 1/s, ``exposure`` s (NaN where it is not known)."""
+    """``pixel`` m, ``rate`` 1/s, ``exposure`` s (NaN where not known), ``flashes`` of a frame after its instant, s."""
 
     pixel: float
     rate: float
     exposure: float = float("nan")
+    flashes: tuple[float, ...] = (0.0,)
+
+    def time(self, found: Found) -> float:
+        """When a circle was seen, s."""
+        return found.frame / self.rate + self.flashes[found.flash]
 
     @property
     def time_std(self) -> float:
@@ -37,7 +42,8 @@ def to_csv(readings: Sequence[Reading], scale: Scale, movie: str, command: str) 
     exposure = f"{1e6 * scale.exposure:g} us" if scale.exposure > 0 else "not given"
     head = [
         f"en4dvar track, version {version('en4dvar')}: {command}",
-        f"movie: {movie}; pixel: {1e6 * scale.pixel:.9g} um; frame rate: {scale.rate:.9g} Hz; exposure: {exposure}",
+        f"movie: {movie}; pixel: {1e6 * scale.pixel:.9g} um; frame rate: {scale.rate:.9g} Hz; exposure: {exposure}"
+        + (f"; flashes: {', '.join(f'{1e6 * t:g} us' for t in scale.flashes)}" if len(scale.flashes) > 1 else ""),
         f"R_std_um is independent from frame to frame; the level of the edge moves all radii together, by "
         f"{1e6 * scale.pixel * float(np.median(common)) if common else 0:.2g} um; the pixel's size scales them",
     ]
@@ -51,7 +57,7 @@ def to_csv(readings: Sequence[Reading], scale: Scale, movie: str, command: str) 
 
 def _row(reading: Reading, scale: Scale) -> Iterable[str]:
     um = 1e6 * scale.pixel
-    first = [str(reading.found.frame), f"{1e6 * reading.found.frame / scale.rate:.9g}"]
+    first = [str(reading.found.frame), f"{1e6 * scale.time(reading.found):.9g}"]
     outline = reading.found.outline
     last = [str(int(reading.used)), reading.reason]
     if not reading.used or outline is None:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from en4dvar_movie.background import CHANGED, LEAST_CONTRAST, Background, find_background, share_changed
 from en4dvar_movie.corrections import Correction
+from en4dvar_movie.fitting import fit_outline
+from en4dvar_movie.flashes import in_time
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.locate import TILE, locate
-from en4dvar_movie.outline import Circle, Optics, Outline, fit_outline
-from en4dvar_movie.uncertainty import Errors, errors_of
+from en4dvar_movie.outline import Circle, Optics, Outline
+from en4dvar_movie.uncertainty import NEIGHBOURS, Errors, errors_of
 
 LEAST_SEEN = 0.12  # share of the outline inside the frame
 LEAST_RADIUS = 2.5  # pixels
@@ -22,11 +26,12 @@ MOST_BLUR = 0.12  # of the radius, of an outline that the frame cuts
 
 @dataclass(frozen=True)
 class Found:
-    """What a frame shows: its outline, or the ``reason`` why there is none."""
+    """What a frame shows at one of its flashes: its outline, or the ``reason`` why there is none."""
 
     frame: int
     outline: Outline | None
     reason: str
+    flash: int = 0
 
 
 @dataclass(frozen=True)
@@ -42,11 +47,12 @@ class Reading:
 
 @dataclass(frozen=True)
 class Track:
-    """The readings of a movie and what its frames share."""
+    """The readings of a movie, in the order of time, and what its frames share; ``flashes`` (S,) of a frame, s."""
 
     readings: tuple[Reading, ...]
     background: Background
     optics: Optics
+    flashes: tuple[float, ...] = (0.0,)
 
 
 def track(
@@ -54,48 +60,70 @@ def track(
     workers: int = 1,
     corrections: Mapping[int, Correction] | None = None,
     progress: Callable[[int], None] = lambda done: None,
+    flashes: tuple[float, ...] = (0.0,),
 ) -> Track:
-    """Readings of every frame; the same numbers for any number of workers.
+    """Readings of every frame, or of every flash of each; the same numbers for any number of workers.
 
     Raises
     ------
     DataError: the movie cannot be read or shows no bubble.
     """
-    background, optics = find_background(movie)
+    background, optics = find_background(movie, len(flashes))
     fixed = corrections or {}
 
-    def look(numbered: tuple[int, Frame]) -> Found:
+    def look(numbered: tuple[int, Frame]) -> list[Found]:
         number, frame = numbered
-        return find_bubble(number, frame, background, optics, fixed.get(number))
+        return find_bubble(number, frame, background, optics, fixed.get(number), len(flashes))
 
     found = []
     for one in in_order(look, enumerate(movie.frames()), workers):
         found.append(one)
         progress(len(found))
-    return Track(tuple(readings_of(found, optics, fixed)), background, optics)
+    if len(flashes) > 1:
+        found = ordered(found, movie.rate, flashes)
+    flat = [circle for one in found for circle in one]
+    return Track(tuple(readings_of(flat, optics, fixed)), background, optics, flashes)
 
 
 def find_bubble(
-    number: int, frame: Frame, background: Background, optics: Optics, correction: Correction | None = None
-) -> Found:
-    """The bubble's outline in one frame."""
+    number: int,
+    frame: Frame,
+    background: Background,
+    optics: Optics,
+    correction: Correction | None = None,
+    circles: int = 1,
+) -> list[Found]:
+    """The bubble's outline in one frame, or its nested ones, the largest first; one entry where there is none."""
     image, tiles = background.normalised(frame)
     if correction is not None and correction.start is not None:
         place: tuple[Circle, float] | None = (correction.start, -optics.contrast)
+    elif number < background.frames:
+        return [Found(number, None, "no bubble: the frame is one of the background's")]
     else:
         if share_changed(tiles, background.noise) > CHANGED:
-            return Found(number, None, "flash: much of the frame is brighter than the background")
+            return [Found(number, None, "flash: much of the frame is brighter than the background")]
         place = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
     if place is None:
-        return Found(number, None, "no bubble: nothing differs from the background")
-    outline = fit_outline(background.steadied(image, tiles, place[0]), place[0], optics)
-    return Found(number, outline, _fault(outline, optics, background.noise))
+        return [Found(number, None, "no bubble: nothing differs from the background")]
+    outlines = fit_outline(background.steadied(image, tiles, place[0]), place[0], optics, circles)
+    if outlines is None:
+        return [Found(number, None, "no circle fits the outline")]
+    return [Found(number, o, _fault(o, optics, background.noise)) for o in outlines]
 
 
-def _fault(outline: Outline | None, optics: Optics, noise: float) -> str:
+def ordered(found: list[list[Found]], rate: float, flashes: Sequence[float]) -> list[list[Found]]:
+    """The nested circles of each frame in the order of the flashes; frames without all of them keep theirs."""
+    whole = [k for k, one in enumerate(found) if len(one) == len(flashes) and not any(c.reason for c in one)]
+    radii = [np.array([c.outline.circle.R for c in found[k] if c.outline is not None]) for k in whole]
+    at = np.array([found[k][0].frame / rate for k in whole])
+    result = list(found)
+    for k, order in zip(whole, in_time(radii, at, flashes), strict=True):
+        result[k] = [replace(found[k][circle], flash=flash) for flash, circle in enumerate(order)]
+    return result
+
+
+def _fault(outline: Outline, optics: Optics, noise: float) -> str:
     """Why an outline is none; "" where it is one."""
-    if outline is None:
-        return "no circle fits the outline"
     if outline.circle.R < LEAST_RADIUS:
         return f"too small: the radius is below {LEAST_RADIUS:g} pixels"
     if outline.seen < LEAST_SEEN:
@@ -110,13 +138,13 @@ def _fault(outline: Outline | None, optics: Optics, noise: float) -> str:
 
 
 def in_order(
-    look: Callable[[tuple[int, Frame]], Found], frames: Iterable[tuple[int, Frame]], workers: int
-) -> Iterator[Found]:
+    look: Callable[[tuple[int, Frame]], list[Found]], frames: Iterable[tuple[int, Frame]], workers: int
+) -> Iterator[list[Found]]:
     """``look`` at each frame in threads; a few frames are held at a time."""
     if workers == 1:
         yield from map(look, frames)
         return
-    waiting: deque[Future[Found]] = deque()
+    waiting: deque[Future[list[Found]]] = deque()
     with ThreadPoolExecutor(workers) as pool:
         for numbered in frames:
             waiting.append(pool.submit(look, numbered))
@@ -126,8 +154,22 @@ def in_order(
             yield waiting.popleft().result()
 
 
+def elsewhere(found: Sequence[Found]) -> list[Found]:
+    """The same, with a reason for outlines that lie outside the bubble of the frames about them: specks of dirt."""
+    good = [k for k, one in enumerate(found) if one.outline is not None and not one.reason]
+    circles = np.array([(c.x, c.y, c.R) for k in good if (o := found[k].outline) is not None for c in [o.circle]])
+    result = list(found)
+    for n, k in enumerate(good):
+        near = circles[max(0, n - NEIGHBOURS) : n + NEIGHBOURS + 1]
+        x, y = np.median(near[:, :2], axis=0)
+        if np.hypot(circles[n, 0] - x, circles[n, 1] - y) > max(near[:, 2].max(), 2 * circles[n, 2]):
+            result[k] = replace(found[k], reason="elsewhere: the outline lies outside the bubble of other frames")
+    return result
+
+
 def readings_of(found: list[Found], optics: Optics, corrections: Mapping[int, Correction]) -> Iterator[Reading]:
     """Radii with their errors, and what is left out by hand or for the neighbours' sake."""
+    found = elsewhere(found)
     good = [one.outline if not one.reason else None for one in found]
     errors = errors_of(good, optics)
     for one, outline, error in zip(found, good, errors, strict=True):

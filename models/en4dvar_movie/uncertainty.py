@@ -6,7 +6,12 @@ than pixels do (compression, jagged outlines), averaged over neighbouring frames
 Shape: a bubble's extent along the line of sight is not seen. Were its outline an isotropic random surface of degree 2,
 the mean radius over the sphere would differ from that over the outline by a normal error of variance a²/6, where a is
 the amplitude of mode 2 (the mean of a degree-2 harmonic over a great circle has variance σ²/4, mode 2 itself the rest,
-3σ²/4 = a²/2). Two numbers tell a², so that 90 % intervals take Student's t with 2 degrees of freedom.
+3σ²/4 = a²/2). Two numbers tell a², so that 90 % intervals take Student's t with 2 degrees of freedom. Where a frame's
+own a does not stand out of its noise, that of neighbouring frames together may.
+
+Turning: an edge that moves one way during the exposure has its half level where it is in the middle of it. One that
+turns there, as in a collapse, sweeps a range of √12 blurs and is at its end in the middle: √3 blurs from the half
+level.
 
 Curvature: blur moves the half level of a disc inwards by w²/2R. It is given back for the blur that the movie's sharp
 frames share; what goes beyond it is the wall's motion during the exposure, which has no such shift.
@@ -26,7 +31,8 @@ NEIGHBOURS = 10  # frames to each side
 STUDENT = 2.92 / 1.645  # 95 % quantiles of t with 2 degrees of freedom and of the normal distribution
 FLOOR = 0.005  # pixels: what sampling by whole pixels leaves uncertain in the best of images
 SIGNIFICANT = 3.0  # std of a mode's amplitude from which it is one
-COLLAPSE = 0.2  # of the radius: blur from which the bubble has collapsed within the exposure
+COLLAPSE = 0.15  # of the radius: blur by motion from which the bubble may have turned within the exposure
+ONE_WAY, TURNED = 0.25, 3**0.5 / 2  # of that blur: std of the radius
 THRESHOLD = 0.05  # of the contrast: what the level of the edge can be off by in all frames alike
 
 
@@ -45,8 +51,22 @@ NOTHING = Errors(float("nan"), float("nan"), float("nan"))
 
 def errors_of(outlines: Sequence[Outline | None], optics: Optics) -> list[Errors]:
     """Errors of each frame; of those without an outline :data:`NOTHING`."""
-    ratios = _smoothed(outlines)
-    return [_errors(o, ratio, optics) if o is not None else NOTHING for o, ratio in zip(outlines, ratios, strict=True)]
+    hidden = _hidden(outlines)
+    turns = _turns(outlines)
+    return [
+        _errors(o, ratio, variance, turned, optics) if o is not None else NOTHING
+        for o, ratio, variance, turned in zip(outlines, _smoothed(outlines), hidden, turns, strict=True)
+    ]
+
+
+def _turns(outlines: Sequence[Outline | None]) -> list[bool]:
+    """Whether the radius of a frame lies below, or above, those of both neighbours."""
+    where = [k for k, o in enumerate(outlines) if o is not None]
+    radii = np.array([o.circle.R for o in outlines if o is not None])
+    found = [False] * len(outlines)
+    for n in range(1, len(where) - 1):
+        found[where[n]] = bool((radii[n] - radii[n - 1]) * (radii[n + 1] - radii[n]) <= 0)
+    return found
 
 
 def _smoothed(outlines: Sequence[Outline | None]) -> Array:
@@ -63,23 +83,38 @@ def _smoothed(outlines: Sequence[Outline | None]) -> Array:
     return found
 
 
-def _errors(outline: Outline, ratio: float, optics: Optics) -> Errors:
+def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics: Optics) -> Errors:
     sharp = min(outline.width, optics.width)
     radius = outline.circle.R + 0.5 * sharp**2 / outline.circle.R
-    variance = outline.variance * ratio + outline.common + _hidden(outline) + FLOOR**2
+    variance = outline.variance * ratio + outline.common + hidden + outline.joined**2 + FLOOR**2
     words = ""
-    if outline.width > COLLAPSE * outline.circle.R:
-        variance += (0.25 * outline.width) ** 2
-        words = "blurred over much of its radius: the bubble moved within the exposure, or is out of focus"
+    moved = float(np.sqrt(max(outline.width**2 - sharp**2, 0.0)))  # blur beyond that of the optics
+    if moved > COLLAPSE * outline.circle.R:
+        variance += ((TURNED if turned else ONE_WAY) * moved) ** 2
+        words = f"the bubble {'turned' if turned else 'moved over much of its radius'} within the exposure"
+    elif outline.joined:
+        words = "nested circles too close to be told apart: their mean"
     elif outline.seen < 0.9:
         words = f"{outline.seen:.0%} of the outline lies in the frame"
     # the edge's profile has the slope 1/(√(2π) w) at its half level
     return Errors(radius, float(np.sqrt(variance)), float(THRESHOLD * np.sqrt(2 * np.pi) * outline.width), words)
 
 
-def _hidden(outline: Outline) -> float:
-    """Variance of the radius for the extent along the line of sight."""
-    amplitude = outline.amplitude(2)
-    if not amplitude > SIGNIFICANT * outline.mode_std:
-        return 0.0
-    return STUDENT**2 * (amplitude**2 - 2 * outline.mode_std**2) / 6
+def _hidden(outlines: Sequence[Outline | None]) -> Array:
+    """Variance of the radius for the extent along the line of sight (K,): of the own mode 2, or the neighbours'."""
+    where = [k for k, o in enumerate(outlines) if o is not None and o.amplitude(2) >= 0 and o.mode_std > 0]
+    known = [o for k in where if (o := outlines[k]) is not None]
+    radii = np.array([o.circle.R for o in known])
+    noise = np.array([2 * o.mode_std**2 for o in known]) / radii**2  # mean and std of (a/R)² where there is no mode 2
+    excess = np.array([o.amplitude(2) ** 2 for o in known]) / radii**2 - noise
+    found = np.zeros(len(outlines))
+    for n, k in enumerate(where):
+        near = slice(max(0, n - NEIGHBOURS), n + NEIGHBOURS + 1)
+        weights = 1 / noise[near] ** 2
+        together = float(np.average(excess[near], weights=weights))
+        if excess[n] > (SIGNIFICANT**2 / 2 - 1) * noise[n]:
+            found[k] = excess[n]
+        elif together > SIGNIFICANT / np.sqrt(weights.sum()):
+            found[k] = together
+        found[k] *= STUDENT**2 * radii[n] ** 2 / 6
+    return found

@@ -18,8 +18,8 @@ LAYERS = (
     ("state", "hints", "files", "tables", "caution", "compiled", "user_code", "user_file"),
     ("dependence", "parameter_map"),
     ("units", "prior", "forward", "noise"),
-    ("batch", "series", "observations"),
-    ("varying",),
+    ("batch", "series", "observations", "function_model"),
+    ("varying", "programs"),
     ("problem", "diagnostics", "residuals", "influence"),
     ("executor",),
     ("ensemble",),
@@ -52,8 +52,8 @@ BUBBLE = (
 
 # and inside the reader of movies
 MOVIE = (
-    "frames", "kernels", "outline", "locate", "background", "corrections", "uncertainty", "tracking", "table", "page",
-    "scene", "commands",
+    "frames", "kernels", "outline", "fitting", "locate", "background", "corrections", "uncertainty", "flashes",
+    "tracking", "table", "outlined", "page", "scene", "writing", "filming", "commands",
 )  # fmt: skip
 
 

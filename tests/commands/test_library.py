@@ -37,6 +37,11 @@ def test_the_session_runs_and_recovers_its_truth(session: tuple[dict[str, Any], 
     for name, value in truth.items():
         assert abs(members[name].mean() - value) < 3 * members[name].std(), name
     assert names["ahead"].outside == 0
+    coffee = names["coffee"].to_dataframe()
+    assert (abs(coffee.mean() - [92.0, 0.05]) < 3 * coffee.std()).all()
+    assert "exponential is preferred" in printed
+    assert (folder / "coffee.html").is_file()
+    assert "posterior" in names["inference_data"].groups()
     assert (folder / "posterior.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "runs" / "gel" / "report.html").is_file()
     assert "data.error.radius_std | 1.4 has no unit" in printed

@@ -124,3 +124,10 @@ def test_log(tmp_path: Path, analysis: Analysis) -> None:
     assert lines[1].endswith("failed: ValueError: broken")
     with pytest.raises(OutputError, match="cannot be written"):
         RunLog(tmp_path / "no" / "run.log")
+
+
+def test_a_notebook_without_widgets_has_no_line_and_no_warning(monkeypatch):
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    monkeypatch.setattr("en4dvar.runs.progress.find_spec", lambda name: None)
+    with terminal_progress(1) as progress:
+        assert progress is None

@@ -42,9 +42,9 @@ def test_a_chaotic_series_is_followed(scheme):
 
 
 def test_es_mda_runs_each_ensemble_once():
-    """Four assimilations of 100 members: five ensembles, each with its mean."""
+    """Four assimilations of 100 members: five ensembles, each with its mean, and two members again."""
     plain = {"assimilation.emulator": "off", "assimilation.what_if": False}
     changes = {"assimilation.scheme": "es-mda", "assimilation.members": 100, **plain}
     config = load_config(CONFIGS / "quickstart.yaml", changes)
     (problem,) = build(config)
-    assert assimilate(problem, config.assimilation, config.seed).forward_runs == 5 * 101
+    assert assimilate(problem, config.assimilation, config.seed).forward_runs == 5 * 101 + 2

@@ -72,6 +72,9 @@ def damaged(folder, kind):
     path = folder / {"folder": "empty", "video": "m.mp4", "kind": "m.pdf"}.get(kind, "m.tif")
     if kind == "folder":
         path.mkdir()
+    elif kind == "half":
+        tifffile.imwrite(path, FRAMES, imagej=True)
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     elif kind == "shapes":
         with tifffile.TiffWriter(path) as file:
             for k in range(3):
@@ -86,6 +89,7 @@ def damaged(folder, kind):
     [
         ("empty", "the file is empty"),
         ("cut", "cannot be read"),
+        ("half", "damaged or cut off: of 4 frames not all are there"),
         ("video", "cannot be read as a movie"),
         ("kind", "not a movie by its suffix"),
         ("folder", "holds no frame"),
@@ -98,6 +102,35 @@ def test_what_cannot_be_read_is_told_in_one_message(tmp_path, kind, words):
         read(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_stack_of_one_page_that_announces_many(tmp_path):
+    """ImageJ's way beyond 4 GB, here with the high byte first."""
+    deep = (FRAMES.astype(np.uint16) * 16).astype(">u2")
+    words = "ImageJ=1.53\nimages=4\nframes=4\nunit=um\nfinterval=1e-6\n"
+    tifffile.imwrite(
+        tmp_path / "m.tif", deep[0], photometric="minisblack", description=words, metadata=None, byteorder=">"
+    )
+    with tifffile.TiffFile(tmp_path / "m.tif") as file:
+        start = file.pages[0].dataoffsets[0]
+    (tmp_path / "m.tif").write_bytes((tmp_path / "m.tif").read_bytes()[:start] + deep.tobytes())
+    found = read(tmp_path / "m.tif")
+    assert np.array_equal(found, deep)
+    assert found.dtype.isnative
+
+
+def test_an_interlaced_movie(tmp_path):
+    import av
+
+    with av.open(str(tmp_path / "m.mp4"), "w") as file:
+        stream = file.add_stream("libx264", rate=25)
+        stream.height, stream.width, stream.pix_fmt = 32, 48, "yuv420p"
+        stream.options = {"flags": "+ildct+ilme", "x264-params": "interlaced=1:tff=1"}
+        for frame in FRAMES:
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="gray")))
+        file.mux(stream.encode())
+    with pytest.raises(DataError, match="interlaced; save whole frames"):
+        read(tmp_path / "m.mp4")
 
 
 def test_raw_of_another_length(tmp_path):

@@ -37,7 +37,7 @@ def test_from_the_movie_to_observations(tmp_path, monkeypatch):
     comment = [line for line in lines if line.startswith("#")]
     assert "pixel: 2.5 um; frame rate: 400000 Hz" in " ".join(comment)
     assert lines[len(comment)] == "frame,t_us,R_um,R_std_um,t_std_us,x_um,y_um,eccentricity,used,reason"
-    assert lines[len(comment) + 1].endswith(",,,,,,,0,no bubble: nothing differs from the background")
+    assert lines[len(comment) + 1].endswith(",,,,,,,0,no bubble: the frame is one of the background's")
     page = (tmp_path / "gel.html").read_text()
     assert page.count("<polygon") == 27
     assert CliRunner().invoke(main, ["init", "--data", "gel.csv", "--start", "laser"]).exit_code == 0
@@ -77,3 +77,22 @@ def test_nothing_is_replaced_and_the_scale_is_asked_for(tmp_path, monkeypatch):
     mute = CliRunner().invoke(main, ["track", "gel.tif", "--out", "b.csv"])
     assert mute.exit_code == 2
     assert "never guessed" in mute.output
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--exposure", "3 us"], "longer than the 2.5 us between two frames"),
+        (["--flashes", "0 us, 2.6 us"], "more than the 2.5 us between two frames"),
+        (["--flashes", "1 us, 0 us"], "in the order of time"),
+        (["--pixel", "-1 um"], "--pixel must be positive"),
+        (["--outlined", "seen.gif"], "seen.gif: not a movie by its suffix"),
+    ],
+)
+def test_options_that_cannot_be(tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    tifffile.imwrite("m.tif", np.zeros((3, 32, 32), np.uint8), photometric="minisblack")
+    scale = ["--pixel", "1 um", "--frame-rate", "400 kHz"]
+    outcome = CliRunner().invoke(main, ["track", "m.tif", *scale, *words])
+    assert outcome.exit_code == 2
+    assert message in outcome.output

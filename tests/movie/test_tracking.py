@@ -67,6 +67,39 @@ def test_a_flash_is_named_and_left_out():
     assert sum(r.used for r in found.readings) == 5
 
 
+def test_a_bubble_that_turns_within_the_exposure_has_an_error_to_match():
+    """The largest disc of the exposure casts some shade, the smallest is where the bubble is at its middle."""
+    still = np.array([34.0, 27.0, 21.0, 0.0, 21.0, 27.0, 34.0])
+    radii = np.repeat(still[:, None], 41, axis=1)
+    radii[3] = 6 + 14 * np.abs(np.linspace(-1, 1, 41))
+    found = track(movie_of(list(render(radii, Scene(), np.random.default_rng(4)))))
+    reading = found.readings[6]
+    assert "turned within the exposure" in reading.reason
+    assert abs(reading.radius - 6) < 2.5 * reading.errors.std
+    assert reading.errors.std < 8
+    assert all(r.errors.std < 0.1 for r in found.readings[3:] if r is not reading)
+
+
+def test_no_bubble_is_darker_than_the_clearest():
+    """A collapse within the exposure about a bright centre, which a darker bubble of a wider edge would fit as well."""
+    radii = np.repeat(np.array([40.0, 35.0, 30.0, 0.0, 30.0, 35.0, 40.0])[:, None], 41, axis=1)
+    radii[3] = 4 + 20 * np.abs(np.linspace(-1, 1, 41))
+    found = track(movie_of(list(render(radii, Scene(centre=0.5), np.random.default_rng(4)))))
+    darkest = min(r.found.outline.contrast for r in found.readings if r.found.outline is not None)
+    assert darkest > 1.02 * found.optics.contrast
+
+
+def test_dirt_is_no_bubble():
+    """Neither in a frame of the background, at the bubble's place, nor later elsewhere."""
+    shown = frames()
+    shown[1] = frames(Scene(bubble=(62.0, 60.0)), np.array([3.5]))[3]
+    shown.append(frames(Scene(bubble=(20.0, 100.0)), np.array([5.0]))[3])
+    found = track(movie_of(shown))
+    assert [r.found.frame for r in found.readings if r.used] == [3, 4, 5, 6, 7, 8]
+    assert "background" in found.readings[1].reason
+    assert "elsewhere" in found.readings[9].reason
+
+
 def test_corrections_by_hand():
     movie = movie_of(frames())
     found = track(movie, corrections={5: Correction(True, None, "two bubbles")})

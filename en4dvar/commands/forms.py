@@ -1,0 +1,77 @@
+"""Forms of a simulation that application packages add: entry points of group ``en4dvar.simulate``, name → function.
+
+``movie`` makes ``en4dvar simulate --movie FILE --movie-set KEY=VALUE …`` of ``movie(config, times, out, settings,
+seed)``, which writes FILE and returns what is said of it. Nothing is imported before such an option is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from en4dvar.commands.plugin_commands import first_sentence
+from en4dvar.errors import En4dvarError
+
+if TYPE_CHECKING:
+    from en4dvar.config import Config
+    from en4dvar.state import Array
+
+GROUP = "en4dvar.simulate"
+
+
+class WithForms(click.Command):
+    """A command with two options for each form: its file, and its settings."""
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        own = super().get_params(ctx)
+        given = {option for parameter in own for option in parameter.opts}
+        added = [o for entry in forms().values() for o in _options(entry) if not given.intersection(o.opts)]
+        return [*own[:-1], *added, own[-1]]  # --help stays the last
+
+
+def forms() -> dict[str, EntryPoint]:
+    """Entry points by name; nothing is imported."""
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def _options(entry: EntryPoint) -> list[click.Option]:
+    name, about = entry.name, first_sentence(entry) or f"From {entry.module.partition('.')[0]}."
+    return [
+        click.Option([f"--{name}"], metavar="FILE", type=click.Path(path_type=Path), help=about),
+        click.Option([f"--{name}-set"], metavar="KEY=VALUE", multiple=True, help=f"Set a value of the {name}."),
+    ]
+
+
+def asked(options: Mapping[str, Any]) -> dict[str, tuple[Path, dict[str, str]]]:
+    """Form → file and settings. Raises :class:`click.UsageError`: settings without a file, or not KEY=VALUE."""
+    found = {}
+    for name in forms():
+        out, texts = options.get(name), options.get(f"{name}_set", ())
+        if texts and out is None:
+            raise click.UsageError(f"--{name}-set needs --{name} FILE")
+        if out is not None:
+            found[name] = out, dict(_setting(name, text) for text in texts)
+    return found
+
+
+def _setting(name: str, text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise click.BadParameter(f"{text!r} is not KEY=VALUE", param_hint=f"--{name}-set")
+    return key.strip(), value.strip()
+
+
+def write_form(
+    name: str, config: Config, times: Array | None, out: Path, settings: Mapping[str, str], seed: int
+) -> str:
+    """What is said of the file written. Raises :class:`En4dvarError`: the form cannot be loaded, or refuses."""
+    entry = forms()[name]
+    try:
+        function = entry.load()
+    except (ImportError, AttributeError) as error:
+        raise En4dvarError(f"--{name} ({entry.value}) cannot be loaded: {error}") from error
+    return str(function(config, times, out, settings, seed))

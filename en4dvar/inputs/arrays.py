@@ -1,0 +1,99 @@
+"""Readings that a script holds in memory: arrays, a pandas or an xarray object, as columns with names.
+
+pandas and xarray objects are known by what they can do, so that neither need be installed.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from en4dvar.errors import DataError
+from en4dvar.hints import listed, shown, suggest
+from en4dvar.state import Array
+
+TIME = "time"
+VALUE = "y"
+FORMS = "(times, values), a dict of columns, a pandas Series or DataFrame, or an xarray DataArray or Dataset"
+
+
+def columns_of(data: Any, time: str = TIME, value: str = VALUE) -> dict[str, Array]:
+    """Columns by name, that of the times first and called :data:`TIME`, all of one length; NaN is a missing reading.
+
+    Parameters
+    ----------
+    data: one of :data:`FORMS`. time: name of the column, coordinate or index of times. value: what a series without a
+        name is called.
+
+    Raises
+    ------
+    DataError: it is none of these, has no times, or columns differ in length or are no numbers.
+    """
+    columns = _columns(data, time, value)
+    times = columns.pop(time, None)
+    if times is None:
+        raise DataError(f"no column {time!r} of times{suggest(time, columns)}; say which it is: time='...'")
+    found = {name: _numbers(name, column) for name, column in {TIME: times, **columns}.items()}
+    for name, column in found.items():
+        if column.shape != found[TIME].shape:
+            raise DataError(f"{name!r} has shape {column.shape}, but there are {len(found[TIME])} times")
+    return found
+
+
+def _columns(data: Any, time: str, value: str) -> dict[str, Any]:
+    if isinstance(data, Mapping) and not hasattr(data, "data_vars"):
+        return {str(name): column for name, column in data.items()}
+    if hasattr(data, "data_vars"):  # xarray.Dataset
+        return {**_coordinate(data, time), **{str(name): data[name].values for name in data.data_vars}}
+    if hasattr(data, "dims") and hasattr(data, "coords"):  # xarray.DataArray
+        return {**_coordinate(data, time), str(data.name or value): data.values}
+    if hasattr(data, "columns") and hasattr(data, "index"):  # pandas.DataFrame
+        columns = {str(name): data[name] for name in data.columns}
+        return columns if time in columns else {time: data.index, **columns}
+    if hasattr(data, "index") and hasattr(data, "to_numpy"):  # pandas.Series
+        return {time: data.index, str(data.name or value): data}
+    if isinstance(data, Sequence) and not isinstance(data, str) and len(data) == 2:
+        return {time: data[0], value: data[1]}
+    raise DataError(f"{type(data).__name__} is none of: {FORMS}")
+
+
+def _coordinate(data: Any, time: str) -> dict[str, Any]:
+    """The times of an xarray object: the coordinate of that name, else the one of its only dimension."""
+    names = [time, *map(str, data.dims)] if len(data.dims) == 1 else [time]
+    return next(({time: data.coords[name].values} for name in names if name in data.coords), {})
+
+
+def _numbers(name: str, column: Any) -> Array:
+    values = np.asarray(column)
+    if values.dtype.kind in "Mm":
+        raise DataError(
+            f"{name!r} holds dates; give elapsed time as numbers, e.g. (t - t[0]) / np.timedelta64(1, 's') for seconds"
+        )
+    try:
+        numbers = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        first = shown(values.ravel().tolist()[0]) if values.size else "nothing"
+        raise DataError(f"{name!r} holds no numbers but {first}") from None
+    if numbers.ndim != 1:
+        raise DataError(f"{name!r} has shape {numbers.shape}; give one number a time, shape (K,)")
+    return numbers
+
+
+def csv_of(columns: Mapping[str, Array]) -> str:
+    """The columns as a CSV file that reads back to the bit."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([repr(float(x)) for x in row] for row in zip(*columns.values(), strict=True))
+    return text.getvalue()
+
+
+def require_columns(columns: Mapping[str, Array], names: Sequence[str]) -> None:
+    """Raise :class:`DataError` for one that is not there."""
+    for name in names:
+        if name not in columns:
+            raise DataError(f"no column {name!r}; the columns are: {listed(columns)}")

@@ -1,0 +1,211 @@
+"""Fitting the outline: a blurred edge, or several nested ones, to every pixel near it, robustly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from en4dvar.state import Array
+from en4dvar_movie.kernels import SHAPE, influence, normal_equations, residuals
+from en4dvar_movie.outline import MODES, Circle, Optics, Outline, share_inside
+
+ROUNDS = 30
+CLOSE = (1e-2, 1e-2, 1e-4)  # pixels: the step at which each turn ends
+RIM_SHARE = 0.45  # of the radius: where the bright centre ends, before it is fitted
+LEVEL_SPREAD = 0.001  # of the background next to the bubble, in contrasts: halos are not the level of the background
+FIRST_SPREAD = (0.03, 0.0, 0.0)  # of the contrast in the first turns
+LOOSE = 0.1  # how much less is known of the level next to an edge that is blurred
+CUTOFF = 5.0  # of Tukey's weights, in robust std
+DARKER = 3.0  # std of the contrast: no bubble is darker than the movie's clearest by more
+REACH = 4.0  # how far from the outline pixels are used, in widths of the edge
+APART = 1.5  # widths of the edge: nested circles that are closer are not told apart
+X, Y, R, W, LEVEL, CONTRAST, GLARE, RIM = range(SHAPE)
+
+
+def fit_outline(image: Array, start: Circle, optics: Optics, circles: int = 1) -> list[Outline] | None:
+    """The outline near ``start`` in an image (H, W) whose background is zero; None where nothing fits.
+
+    With several ``circles``, nested about one centre, one of each, the largest first.
+    """
+    radii = nested_radii(image, start, optics, circles)
+    p = np.zeros(SHAPE + circles - 1)
+    p[[X, Y, R, W, CONTRAST]] = start.x, start.y, radii[0], optics.width, optics.contrast
+    p[SHAPE:] = radii[0] - radii[1:]
+    p[RIM] = RIM_SHARE * radii[-1]
+    noise = abs(optics.contrast)
+    modes = 1
+    for turn in range(3):  # the ring of pixels follows the circle; the cutoff follows the noise
+        gaps = p[len(p) - circles + 1 :]
+        ring = _ring(p, gaps)
+        if _glare_is_far(p, gaps, ring):
+            p[GLARE], p[RIM] = 0.0, RIM_SHARE * _innermost(p, gaps)
+        modes = modes_for(image.shape, p)
+        p = np.concatenate([p[:SHAPE], np.zeros(2 * (modes - 1)), gaps])
+        known = replace(optics, spread=max(optics.spread, FIRST_SPREAD[turn]))
+        fitted = _descend(image, p, modes, ring, noise, known, CLOSE[turn])
+        if fitted is None:
+            return None
+        p = _sorted(fitted, circles)
+        noise = max(1.4826 * float(np.median(np.abs(residuals(image, p, modes, ring)))), 1e-6)
+    return _outlines(image, p, modes, noise, optics)
+
+
+def nested_radii(image: Array, start: Circle, optics: Optics, circles: int) -> Array:
+    """First radii (S,), the largest first: where the mean brightness about the centre passes each step's middle."""
+    if circles == 1:
+        return np.array([start.R])
+    y, x = np.indices(image.shape)
+    r = np.hypot(x - start.x, y - start.y).astype(int).ravel()
+    profile = np.bincount(r, image.ravel()) / np.maximum(np.bincount(r), 1) / optics.contrast
+    dark = np.maximum.accumulate(profile[: int(2 * start.R) + 20][::-1])  # from outside
+    at = [len(dark) - 1 - int(np.argmax(dark > (s + 0.5) / circles)) for s in range(circles)]
+    radii = np.array([a if dark[-1] > (s + 0.5) / circles else np.nan for s, a in enumerate(at)]) + 0.5
+    radii[np.isnan(radii)] = np.nanmin(np.append(radii, start.R)) - 2.0
+    return np.maximum(radii - 1e-3 * np.arange(circles), 1.0)
+
+
+def modes_for(shape: tuple[int, ...], p: Array) -> int:
+    """The highest mode that a circle of this size shows: none where the frame cuts it."""
+    if share_inside(shape, Circle(*p[:3])) < 0.9:
+        return 1
+    return int(np.clip(p[R] / 4.0, 2, MODES))
+
+
+def _innermost(p: Array, gaps: Array) -> float:
+    return float(p[R] - max(gaps, default=0.0))
+
+
+def _sorted(p: Array, circles: int) -> Array:
+    """The largest radius as R, the others inside it by growing distances."""
+    if circles == 1:
+        return p
+    radii = np.sort(p[R] - np.append(0.0, p[1 - circles :]))[::-1]
+    return np.concatenate([p[:R], radii[:1], p[W : 1 - circles], radii[0] - radii[1:]])
+
+
+def _ring(p: Array, gaps: Array) -> Array:
+    reach = max(REACH * p[W], 6.0)
+    return np.array([p[X], p[Y], max(0.0, _innermost(p, gaps) - reach), p[R] + reach])
+
+
+def _glare_is_far(p: Array, gaps: Array, ring: Array) -> bool:
+    return bool(ring[2] > 0.75 * _innermost(p, gaps))
+
+
+def _known(p: Array, gaps: Array, ring: Array, noise: float, optics: Optics) -> tuple[Array, Array]:
+    """Of what is known before: contrast; the bright centre, which may be missing. Centre (P,) and precision (P,)."""
+    centre, precision = np.zeros(len(p)), np.zeros(len(p))
+    inner = _innermost(p, gaps)
+    centre[RIM], centre[CONTRAST] = RIM_SHARE * inner, optics.contrast
+    tight = 1e12 if _glare_is_far(p, gaps, ring) else 1.0
+    precision[RIM] = noise**2 * tight / (0.1 * inner) ** 2
+    precision[GLARE] = noise**2 * tight / optics.contrast**2
+    loose = max(0.0, p[W] / p[R] - 0.1)  # a bubble that collapses within the exposure is fainter, its halo blurred
+    precision[LEVEL] = noise**2 / (max(LEVEL_SPREAD, optics.spread / 3, LOOSE * loose) * optics.contrast) ** 2
+    precision[CONTRAST] = noise**2 / ((optics.spread + loose) * optics.contrast) ** 2
+    precision[len(p) - len(gaps) :] = noise**2 / p[R] ** 2  # of circles that cannot be told apart
+    return centre, precision
+
+
+def _descend(
+    image: Array, p: Array, modes: int, ring: Array, noise: float, optics: Optics, close: float
+) -> Array | None:
+    """Levenberg–Marquardt; None where it leaves what an outline can be."""
+    damping, cutoff = 1e-3, CUTOFF * noise
+    centre, precision = _known(p, p[SHAPE + 2 * (modes - 1) :], ring, noise, optics)
+    bright = 0.0, -optics.contrast  # what the centre can be between
+    darkest = (1 + DARKER * optics.spread) * optics.contrast
+    A, g, _, total, cost = normal_equations(image, p, modes, ring, cutoff)
+    if total < 3 * len(p):
+        return None
+    cost += 0.5 * float(precision @ (p - centre) ** 2)
+    for _ in range(ROUNDS):
+        H = A + np.diag(precision)
+        try:
+            step = np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-12), g - precision * (p - centre))
+        except np.linalg.LinAlgError:
+            return None
+        trial = p + step
+        trial[W] = np.clip(trial[W], 0.3, max(2 * p[W], 1.0))
+        trial[GLARE] = np.clip(trial[GLARE], min(bright), max(bright))
+        trial[CONTRAST] = max(trial[CONTRAST], darkest)
+        inner = _innermost(trial, trial[SHAPE + 2 * (modes - 1) :])
+        trial[RIM] = np.clip(trial[RIM], 0.1 * inner, 0.75 * inner)
+        if not np.all(np.isfinite(trial)) or inner < 1 or trial[R] > 3 * max(image.shape):
+            return None
+        found = normal_equations(image, trial, modes, ring, cutoff)
+        better = found[4] + 0.5 * float(precision @ (trial - centre) ** 2)
+        if better <= cost and found[3] > 0:
+            done = np.max(np.abs(step[:W])) < close and cost - better <= max(close**2, 1e-7) * cost
+            p, (A, g), cost, damping = trial, found[:2], better, max(damping / 10, 1e-7)
+            if done:
+                break
+        else:
+            damping *= 10
+            if damping > 1e6:
+                break
+    return p
+
+
+def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) -> list[Outline] | None:
+    gaps = p[SHAPE + 2 * (modes - 1) :]
+    ring = _ring(p, gaps)
+    A, _, squares, total, _ = normal_equations(image, p, modes, ring, CUTOFF * noise)
+    _, precision = _known(p, gaps, ring, noise, optics)
+    try:
+        inverse = np.linalg.inv(A + np.diag(precision))
+    except np.linalg.LinAlgError:
+        return None
+    shape = p[SHAPE : SHAPE + 2 * (modes - 1)].reshape(-1, 2).T if modes > 1 else np.zeros((2, 0))
+    mode_variance = float(np.diag(inverse)[SHAPE : SHAPE + shape.size].mean()) if modes > 1 else 0.0
+    free = len(p) - 2 * _glare_is_far(p, gaps, ring)
+    outlines: list[Outline] = []
+    for group in _groups(np.append(0.0, gaps), APART * p[W]):
+        # of the radius, or of the mean of radii that cannot be told apart
+        weights = inverse[R] - np.mean([inverse[SHAPE + shape.size + s - 1] if s else 0 * p for s in group], axis=0)
+        inside = np.append(0.0, gaps)[group]
+        circle = Circle(float(p[X]), float(p[Y]), float(p[R] - inside.mean()))
+        sectors = int(np.clip(2 * np.pi * circle.R / max(4.0, 2 * p[W]), 8, 256))
+        sums, spread, slope, fitted = influence(image, p, modes, ring, CUTOFF * noise, weights, sectors)
+        # the step of robust weights is the M-estimator's, its error that of Huber (1981): ψ' instead of the weights
+        variance = spread / max(slope, 0.3) ** 2 * total / max(total - free, 1.0)
+        common = noise**2 * weights[CONTRAST] ** 2 * precision[CONTRAST]  # of the contrast that all frames share
+        one = Outline(
+            circle=circle,
+            width=float(p[W]),
+            contrast=float(p[CONTRAST]),
+            noise=noise,
+            modes=shape,
+            variance=float(variance),
+            ratio=float(np.sum(sums**2) / _left(fitted, weights, A, inverse) / max(spread, 1e-30)),
+            common=float(common),
+            mode_std=float(np.sqrt(max(mode_variance, 0) * squares / total)),
+            seen=share_inside(image.shape, circle),
+            # as if evenly spread over the distance from which they are told apart
+            joined=float(np.hypot(APART * p[W] / 12**0.5, np.std(inside))) if len(group) > 1 else 0.0,
+        )
+        outlines += [one] * len(group)
+    return outlines
+
+
+def _groups(gaps: Array, near: float) -> list[list[int]]:
+    """Nested circles by their places, the largest first; those closer than ``near`` to the next are together."""
+    groups = [[0]]
+    for s in range(1, len(gaps)):
+        if gaps[s] - gaps[s - 1] < near:
+            groups[-1].append(s)
+        else:
+            groups.append([s])
+    return groups
+
+
+def _left(fitted: Array, weights: Array, A: Array, inverse: Array) -> float:
+    """What a fit leaves of the scatter of sums over sectors, as a share of that of the sums themselves.
+
+    Residuals are (I − H) times the errors, H = J A⁻¹ Jᵀ; a sum over a sector is mᵀ(I − H)ε, of variance
+    mᵀm − 2 gᵀA⁻¹g + gᵀA⁻¹(JᵀJ)A⁻¹g with g = Jᵀm: ``fitted`` (K, P) holds g of each sector, Σ mᵀm is g·weights.
+    """
+    back = fitted @ inverse
+    lost = 2 * np.sum(back * fitted) - np.sum((back @ A) * back)
+    return float(max(1 - lost / max(np.sum(fitted @ weights), 1e-30), 0.2))

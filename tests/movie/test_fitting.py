@@ -1,0 +1,57 @@
+"""The fit of an outline to images whose noise is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from en4dvar_movie.fitting import fit_outline
+from en4dvar_movie.outline import Circle, Optics
+
+CONTRAST = -0.5
+
+
+def image(radii, width, rng, noise=0.05, side=64):
+    y, x = np.indices((side, side)) - (side - 1) / 2 - 0.3
+    r = np.hypot(x, y)
+    shade = np.mean([ndtr((R - r) / width) for R in np.atleast_1d(radii)], axis=0)
+    return (CONTRAST * shade + noise * rng.standard_normal(r.shape)).astype(np.float32)
+
+
+def fits(R, width, count=60):
+    rng = np.random.default_rng(8)
+    start, optics = Circle(31.8, 31.8, R + 0.4), Optics(CONTRAST, width, 0.002)
+    return [fit_outline(image(R, width, rng), start, optics)[0] for _ in range(count)]
+
+
+@pytest.mark.parametrize(("R", "width"), [(14.0, 3.0), (14.0, 1.2), (22.0, 3.0), (40.0, 1.2)])
+def test_sectors_scatter_as_pixels_do_where_noise_is_white(R, width):
+    """What the fit takes out of the sums over sectors is given back, for sharp and blurred, whole and cut outlines."""
+    assert np.mean([o.ratio for o in fits(R, width)]) == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize(("R", "width"), [(14.0, 1.2), (22.0, 3.0), (40.0, 1.2)])
+def test_the_error_is_that_of_repeated_images(R, width):
+    found = fits(R, width)
+    off = np.array([o.circle.R for o in found]) - R
+    stated = np.sqrt(np.mean([o.variance for o in found]))
+    assert off.std() / stated == pytest.approx(1.0, abs=0.3)
+    assert abs(off.mean()) < 3 * stated / np.sqrt(len(off)) + 0.005
+
+
+def test_nested_circles_and_their_errors():
+    rng = np.random.default_rng(9)
+    radii = np.array([25.0, 21.0, 15.0])
+    optics = Optics(CONTRAST, 1.2, 0.002)
+    found = [fit_outline(image(radii, 1.2, rng), Circle(32.3, 31.5, 20.0), optics, 3) for _ in range(30)]
+    off = np.array([[o.circle.R for o in one] for one in found]) - radii
+    stated = np.sqrt(np.mean([[o.variance for o in one] for one in found], axis=0))
+    assert np.all(np.abs(off.mean(axis=0)) < 3 * stated / np.sqrt(len(found)) + 0.005)
+    assert np.all((off.std(axis=0) / stated > 0.65) & (off.std(axis=0) / stated < 1.4))
+
+
+def test_nothing_fits_an_image_of_noise():
+    noise = image(1e-9, 1.0, np.random.default_rng(1))
+    found = fit_outline(noise, Circle(30, 30, 12), Optics(CONTRAST, 1.2, 0.002))
+    assert found is None or abs(found[0].contrast) < 0.2 or found[0].circle.R < 3

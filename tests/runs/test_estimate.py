@@ -1,0 +1,242 @@
+"""``en4dvar.estimate``: a function, arrays and priors; the result is the one that a file and the command line give."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from toys import Linear
+
+import en4dvar
+from en4dvar.runs.rerun import rerun
+
+TIMES = np.linspace(0.0, 3.0, 12)
+NOISE = 0.1
+SHAPE = np.cos(TIMES + 1 / 3)
+VALUES = 1.0 + 0.5 * SHAPE + NOISE * np.random.default_rng(4).standard_normal(12)
+PRIORS = {"a": {"prior": "normal", "mean": 0, "std": 2}, "b": {"prior": "normal", "mean": 0, "std": 1}}
+
+
+def line(parameters: dict[str, float], times: Any) -> Any:
+    """As toys.Linear: linear in its parameters."""
+    return parameters["a"] + parameters["b"] * np.cos(times + 1 / 3)
+
+
+def growth(parameters: dict[str, float], times: Any) -> Any:
+    return {"y": parameters["a"] * np.exp(parameters["b"] * times)}
+
+
+def fit(model: Any = line, data: Any = (TIMES, VALUES), priors: Any = PRIORS, **more: Any) -> en4dvar.Result:
+    return en4dvar.estimate(model, data, priors, **{"error": NOISE, "progress": False, **more})
+
+
+@pytest.fixture(scope="module")
+def result() -> en4dvar.Result:
+    return fit()
+
+
+def test_a_linear_function_has_the_posterior_of_the_closed_form(result):
+    design = np.stack([np.ones_like(TIMES), SHAPE], axis=1)
+    precision = design.T @ design / NOISE**2 + np.diag([1 / 4, 1.0])
+    mean = np.linalg.solve(precision, design.T @ VALUES / NOISE**2)
+    members = result.to_dataframe()[["a", "b"]].to_numpy()
+    np.testing.assert_allclose(members.mean(axis=0), mean, rtol=1e-8)
+    np.testing.assert_allclose(np.cov(members.T), np.linalg.inv(precision), rtol=1e-6)
+
+
+FORMS: dict[str, Any] = {
+    "dict": {"time": TIMES.tolist(), "y": VALUES},
+    "series": pd.Series(VALUES, index=TIMES),
+    "frame with an index": pd.DataFrame({"y": VALUES}, index=TIMES),
+    "frame with a column": pd.DataFrame({"y": VALUES, "time": TIMES}),
+    "DataArray": xr.DataArray(VALUES, dims="t", coords={"t": TIMES}),
+    "Dataset": xr.Dataset({"y": ("time", VALUES)}, coords={"time": TIMES}),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_of_readings_gives_the_same_bits(form, result):
+    assert fit(data=FORMS[form]).posterior.identical(result.posterior)
+
+
+def test_errors_of_each_reading_columns_and_missing_readings(result):
+    assert fit(error=np.full(12, NOISE)).posterior.identical(result.posterior)
+    frame = pd.DataFrame({"t": [*TIMES, 3.5], "seen": [*VALUES, np.nan], "sd": NOISE})
+    named = fit(data=frame, time="t", error={"seen_std": {"column": "sd"}})
+    assert named.observable == "seen"
+    np.testing.assert_array_equal(named.posterior["a"], result.posterior["a"])
+
+
+IN_METRES = {
+    "a": {"prior": "normal", "mean": "0 m", "std": "2 m"},
+    "b": {"prior": "normal", "mean": "0 m", "std": "1 m"},
+}
+
+
+def test_a_function_may_return_names_and_a_model_is_as_good(result):
+    by_name = fit(lambda p, t: {"y": line(p, t), "other": t})
+    assert by_name.posterior.identical(result.posterior)
+    for model in (Linear, Linear(), {"name": "toys:Linear"}, "toys:Linear"):
+        found = fit(model, priors=IN_METRES, error="0.1 m")
+        np.testing.assert_allclose(found.posterior["b"], result.posterior["b"], rtol=1e-7)
+
+
+def test_units_are_kept_and_numbers_fix_parameters():
+    priors = {"a": "100 cm", "b": {"prior": "normal", "mean": "0 m/s", "std": "1 m/s"}}
+    units = {"a": "m", "b": "m/s", "y": "m", "time": "s"}
+    found = fit(priors=priors, units=units)
+    assert list(found.posterior) == ["b"]
+    assert found.posterior["b"].attrs["units"] == "m/s"
+    assert found.observed_data["time"].attrs["units"] == "s"
+
+
+def test_a_run_directory_is_that_of_the_command_line(tmp_path, result):
+    run = tmp_path / "run"
+    kept = fit(directory=run)
+    assert kept.posterior.identical(result.posterior)
+    assert (run / "report.html").is_file()
+    assert en4dvar.load_result(run / "posterior.nc").posterior.identical(result.posterior)
+    again = fit(directory=run, resume=True, report=False)
+    assert again.posterior.identical(result.posterior)
+    with pytest.raises(en4dvar.OutputError, match=r"data\.csv: holds other readings"):
+        fit(data=(TIMES, VALUES + 1), directory=run)
+    with pytest.raises(en4dvar.OutputError, match="cannot be resumed to the same result"):
+        fit(growth, directory=run, resume=True)
+    with pytest.raises(en4dvar.ConfigError, match="was handed over by a Python script; run that script again"):
+        rerun(run)
+
+
+def test_readings_of_somebody_else_are_not_replaced(tmp_path):
+    (tmp_path / "data.csv").write_text("mine")
+    with pytest.raises(en4dvar.OutputError, match="holds other readings"):
+        fit(directory=tmp_path, force=True)
+    assert (tmp_path / "data.csv").read_text() == "mine"
+
+
+def test_a_result_is_saved_shown_and_compared(tmp_path, result):
+    assert en4dvar.load_result(result.save(tmp_path / "line.nc")).posterior.identical(result.posterior)
+    assert "<svg" in result.report(tmp_path / "line.html").read_text(encoding="utf-8")
+    shown = result._repr_html_()
+    assert f"{float(result.posterior['a'].mean()):.4g}" in shown
+    compared = en4dvar.compare_runs({"line": result, "exponential": fit(growth), "file": tmp_path / "line.nc"})
+    assert compared.verdict("data").startswith("undecidable: line and file differ by")
+    for path in (tmp_path / "line", tmp_path / "line.html"):
+        with pytest.raises(en4dvar.OutputError, match=r"ends in \.nc"):
+            result.save(path)
+
+
+def test_a_notebook_shows_names_escaped():
+    found = fit(name="a", priors={"a": PRIORS["a"], "b": PRIORS["b"]})
+    found.tree.attrs["dataset"] = "<script>"
+    assert "<script>" not in found._repr_html_()
+    assert "&lt;script&gt;" in found._repr_html_()
+
+
+FAULTS: dict[str, tuple[dict[str, Any], str]] = {
+    "no model": ({"model": 3}, "model: int is neither a function nor a model"),
+    "unknown model": ({"model": "bubbel"}, "unknown model 'bubbel'; did you mean 'bubble'"),
+    "no data": ({"data": 3.0}, "data: float is none of: (times, values), a dict"),
+    "no times": ({"data": {"t": TIMES, "y": VALUES}}, "data: no column 'time' of times; known: t, y; say which"),
+    "lengths": ({"data": (TIMES, VALUES[:-1])}, "data: 'y' has shape (11,), but there are 12 times"),
+    "dates": ({"data": (TIMES.astype("M8[s]"), VALUES)}, "data: 'time' holds dates; give elapsed time"),
+    "words": ({"data": (TIMES, ["a"] * 12)}, "data: 'y' holds no numbers but 'a'"),
+    "tables": ({"data": (TIMES, VALUES[:, None])}, "data: 'y' has shape (12, 1); give one number a time"),
+    "two columns": ({"data": {"time": TIMES, "u": VALUES, "v": VALUES}}, "observable: name the column of readings"),
+    "no such column": ({"observable": "z", "data": {"time": TIMES, "y": VALUES}}, "data: no column 'z'; the columns"),
+    "no std": ({"error": 0.0}, "error.y_std: must be positive, not 0.0"),
+    "odd error": ({"error": {"y_std": 0.1, "y_sd": 1.0}}, "error.y_sd: unknown key 'y_sd'; did you mean 'y_std'?"),
+    "errors": ({"error": np.ones(3)}, "error: y_std has 3 numbers for 12 readings"),
+    "no error column": ({"error": {"y_std": {"column": "sd"}}}, "data: no column 'sd'; the columns are: time, y"),
+    "prior": ({"priors": {"a": {"prior": "flat"}}}, "priors.a.prior: 'flat' is not one of"),
+    "prior unit": (
+        {"units": {"a": "m"}, "priors": {"a": {**PRIORS["a"], "std": "2 m"}, "b": 1}},
+        "priors.a.mean: 0 has no unit; write e.g. '0 m'",
+    ),
+    "odd unit": ({"units": {"c": "m"}}, "units: 'c' is neither a parameter in priors nor a column"),
+    "name of a prior": ({"priors": {"a b": 1.0}}, "priors: 'a b' is no name of a parameter"),
+    "nothing estimated": ({"priors": {"a": 1.0, "b": 2.0}}, "no parameter has a prior; nothing to estimate"),
+    "an object": ({"priors": {"a": {"prior": object}}}, "priors.a.prior: <class 'object'> is neither number, text"),
+    "odd section": ({"asimilation": {}}, "asimilation: unknown key 'asimilation'; did you mean 'assimilation'?"),
+    "setting": ({"assimilation": {"member": 3}}, "assimilation.member: unknown key 'member'; did you mean 'members'?"),
+    "window": ({"window": {"form": 1}}, "window.form: unknown key 'form'; did you mean 'from'?"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_each_fault_is_one_message_with_its_argument(fault):
+    arguments, words = FAULTS[fault]
+    with pytest.raises((en4dvar.ConfigError, en4dvar.DataError)) as caught:
+        fit(**arguments)
+    assert words in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("function", "reason"),
+    [
+        (lambda p, t: p["c"] + t, "KeyError: 'c'"),
+        (lambda p, t: t[1:], "the function returned shape (11,) for y, expected (12,), one a time"),
+        (lambda p, t: {"z": t}, "the function returned z, but no 'y'"),
+        (lambda p, t: None, "the function returned shape () for y"),
+        (lambda p, t: t * np.nan, "non-finite prediction"),
+    ],
+)
+def test_what_is_wrong_with_a_function_is_told(function, reason):
+    with pytest.raises(en4dvar.TooFewMembersError) as caught:
+        fit(function)
+    assert reason in str(caught.value)
+
+
+def test_a_function_cannot_vary_in_time():
+    varying = {**PRIORS, "b": {**PRIORS["b"], "varies": {"every": 1, "std": 0.1}}}
+    with pytest.raises(en4dvar.ConfigError, match=r"priors\.b\.varies: b cannot vary: the model has no step"):
+        fit(priors=varying)
+
+
+class Neither(en4dvar.ForwardModel):
+    parameters, observables = (), ()
+
+    def initial_state(self, theta: Any) -> Any:
+        return np.zeros(1)
+
+
+def test_a_model_has_a_step_or_trajectories():
+    with pytest.raises(TypeError, match="Neither has neither step nor trajectories; write one of them"):
+        Neither()
+
+
+def test_a_dict_is_run_as_the_file_of_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pd.DataFrame({"t": TIMES, "v": VALUES}).to_csv("line.csv", index=False)
+    content = {
+        "name": "line",
+        "model": {"name": "toys:Linear"},
+        "data": {
+            "path": Path("line.csv"),
+            "columns": {"time": {"name": "t", "unit": "s"}, "y": {"name": "v", "unit": "m"}},
+            "error": {"y_std": "0.1 m"},
+        },
+        "parameters": IN_METRES,
+        "seed": np.int64(3),
+        "output": {"report": False},
+    }
+    found = en4dvar.run(content)
+    written = Path("runs/line/config.yaml")
+    written.rename("line.yaml")
+    assert en4dvar.run("line.yaml", force=True).posterior.identical(found.posterior)
+    assert en4dvar.validate(content).name == "line"
+    with pytest.raises(en4dvar.ConfigError, match=r"data\.error\.y_std: must be positive"):
+        en4dvar.run({**content, "data": {**content["data"], "error": {"y_std": "0 m"}}})
+
+
+def test_a_star_gives_the_public_names():
+    code = "from en4dvar import *; print(estimate.__name__, run.__name__, Prior.__name__)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["estimate", "run", "Prior"]
+    assert set(en4dvar.__all__) <= set(dir(en4dvar))
