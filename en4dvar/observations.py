@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.caution import Caution
 from en4dvar.errors import DataError
 from en4dvar.noise import Linearisation, Noise, Predicted
 from en4dvar.prior import LARGEST
@@ -32,6 +33,7 @@ class Observations:
     weights: (K,) β_k ≥ 0; 1 counts an observation fully (``weights: sum``), 1/K is ``weights: mean``.
     name: of the data set. source: where it was read from (for the record).
     scalars: further numbers found beside the series (e.g. an equilibrium radius), as read, no units applied.
+    doubts: what makes the times of the file implausible.
 
     Raises
     ------
@@ -45,6 +47,7 @@ class Observations:
     name: str = "data"
     source: str = ""
     scalars: Mapping[str, float] = field(default_factory=dict)
+    doubts: tuple[Caution, ...] = ()
 
     def __post_init__(self) -> None:
         where, k = self.source or self.name, len(self.times)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.caution import Caution
 from en4dvar.config import Config
 from en4dvar.config.context import Spread
 from en4dvar.config.data import Data
@@ -20,8 +21,18 @@ from en4dvar.config.parameters import Fixed, Uncertain
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.files import PathError, expanded, readable
-from en4dvar.inputs.readers import SUFFIXES, Column, DataFile, Format, parts_of, read_covariance, read_series
-from en4dvar.inputs.text_table import Decimal
+from en4dvar.inputs.readers import (
+    ANY,
+    SUFFIXES,
+    Column,
+    DataFile,
+    Layout,
+    Readings,
+    parts_of,
+    read_covariance,
+    read_series,
+)
+from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.window import select
 from en4dvar.noise import Noise, noise_of
 from en4dvar.observations import Observations
@@ -122,23 +133,26 @@ def data_files(plan: Data) -> dict[str, DataFile]:
     ------
     DataError: no file matches a pattern, or a file is named twice.
     """
+    time = plan.columns.time
     return with_parts(
-        find_files(plan.path.base, plan.path.texts), plan.columns.observable, plan.format, plan.decimal, plan.by
+        find_files(plan.path.base, plan.path.texts),
+        plan.columns.observable,
+        plan.layout,
+        time.name if isinstance(time, Column) else None,
     )
 
 
 def with_parts(
     files: Mapping[str, Path],
     value: Column,
-    format: Format | None = None,
-    decimal: Decimal = ".",
-    by: str | None = None,
+    layout: Layout = ANY,
+    time: str | None = None,
 ) -> dict[str, DataFile]:
     """Every data set that the files hold, see :func:`~en4dvar.inputs.readers.parts_of`."""
     found: dict[str, DataFile] = {}
     for name, path in files.items():
         try:
-            parts = parts_of(path, value, format, decimal, by)
+            parts = parts_of(path, value, layout, time)
         except DataError:  # told with its reason where it is read
             parts = ()
         for part in parts or ("",):
@@ -196,7 +210,7 @@ def read_observations(plan: Data, file: DataFile, name: str, weights: str = "sum
     stds = plan.error.column("std", columns.observable.unit)
     timing = plan.error.column("time_std", clock.unit if clock else "")
     errors = [column for column in (stds, timing) if column]
-    series = read_series(path, columns.time, columns.observable, plan.format, plan.decimal, errors, file.part, plan.by)
+    series = read_series(path, columns.time, columns.observable, plan.layout, errors, file.part)
     try:
         window = select(series.times, series.values, asked.start, asked.end, asked.prominence)
     except DataError as error:
@@ -222,7 +236,16 @@ def read_observations(plan: Data, file: DataFile, name: str, weights: str = "sum
         name=name,
         source=readable(path),
         scalars=series.scalars,
+        doubts=_doubts(plan, series),
     )
+
+
+def _doubts(plan: Data, series: Readings) -> tuple[Caution, ...]:
+    """What makes the times of a series implausible, where the file states them."""
+    column = plan.columns.time
+    if not isinstance(column, Column):
+        return ()
+    return step_doubts(series.times, column.target, column.unit, series.scalars, column.rate)
 
 
 def _span(times: Array, plan: Data) -> str:

@@ -29,7 +29,7 @@ from en4dvar.config.validate import Faults
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.files import expanded
 from en4dvar.hints import shown, suggest
-from en4dvar.inputs.readers import Column, Format, Matrix, TimeStep
+from en4dvar.inputs.readers import Column, Disorder, Format, Layout, Matrix, Repeated, TimeStep
 from en4dvar.inputs.text_table import Decimal
 from en4dvar.inputs.window import Instant, parse_instant
 from en4dvar.noise import SMOOTHNESS, Kernel
@@ -90,6 +90,8 @@ class TimeColumn(Section):
     """Constant time step: a quantity such as 0.63 us, or the name of a scalar in the file (then with ``unit``)."""
     unit: Annotated[str | None, unit_of(time_unit)] = None
     """Unit of the times in the file, e.g. us; required with ``name``, never guessed."""
+    rate: QuantityText | None = None
+    """Frame rate of the camera, e.g. 270 kHz; the column of times is compared with it."""
 
     @model_validator(mode="after")
     def _one_of(self) -> Self:
@@ -97,18 +99,30 @@ class TimeColumn(Section):
             raise ValueError("give either 'name' (a column of times) or 'step' (a constant time step)")
         if self.name is not None and "unit" not in self.model_fields_set:
             raise ValueError(f"the unit of column {self.name!r} is missing; write unit: us")
+        if self.rate is not None and self.name is None:
+            raise ValueError("'rate' is compared with a column of times; a step needs none")
         return self
 
 
 def _times(given: TimeColumn, context: Context) -> Column | TimeStep:
     unit = time_unit(context)
+    rate = None if given.rate is None else _rate(given.rate, unit)
     if given.unit is not None:
-        named = Column(str(given.name or given.step), given.unit, unit)
+        named = Column(str(given.name or given.step), given.unit, unit, rate=rate)
         return named if given.name else TimeStep(named)
     try:
         return TimeStep(value=parse_quantity(given.step or 0, unit))
     except UnitError as error:
         raise ConfigError([Fault(str(error), "step")]) from None
+
+
+def _rate(text: Any, unit: str) -> float:
+    try:
+        value = parse_quantity(text, f"1/({unit})")
+        require_sign(value, "positive", text)
+    except ValueError as error:
+        raise ConfigError([Fault(str(error), "rate")]) from None
+    return value
 
 
 def _values(given: ValueColumn, context: Context) -> Column:
@@ -372,7 +386,13 @@ class Data(Section):
     decimal: Decimal = "."
     """Decimal sign of the numbers in a CSV file."""
     by: Annotated[str | None, Field(min_length=1)] = None
-    """Column of a CSV file that says which data set a row belongs to: each is estimated by itself."""
+    """Column of a table that says which data set a row belongs to: each is estimated by itself."""
+    sheet: str = ""
+    """Sheet of an Excel workbook, a range of it, or both: ``Film 3``, ``A3:D40``, ``Film 3!A3:D40``."""
+    unsorted: Disorder = "refuse"
+    """Rows whose times do not increase: refuse the file, or sort them."""
+    repeated: Repeated = "refuse"
+    """Several readings of one time: refuse the file, or average them."""
     columns: Annotated[Columns, OfObservable("column role")]
     """Which columns hold the time and the observable, each with its unit: ``time: {name: t, unit: us}``."""
     window: WindowSection = Field({}, validate_default=True)
@@ -382,6 +402,11 @@ class Data(Section):
     error: Annotated[Error, OfObservable()]
     """Observation errors: ``<observable>_std``, ``time_std``, ``correlation_time``, ``covariance``, ``robust``,
     ``discrepancy``."""
+
+    @property
+    def layout(self) -> Layout:
+        """How the files are laid out."""
+        return Layout(self.format, self.decimal, self.by, self.sheet, self.unsorted, self.repeated)
 
     @classmethod
     def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
