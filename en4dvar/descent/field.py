@@ -9,9 +9,9 @@ iterate x_l (a bundle), L_l = ρ_xy ∘ X0ᵀY_l/(N−1) and H_l B H_kᵀ = ρ_y
 
     x* = x̄0 + L_l λ,   (H_l B H_lᵀ + R) λ = y − H(x_l) + H_l(x_l − x̄0),
 
-the Gauss–Newton step; every iterate is x̄0 + Σ_k L_k λ_k, from which J_b and H_l(x_l − x̄0) follow without B. Steps are
-halved until J falls. Members of the posterior are x + X0_i + L (H B Hᵀ + R)⁻¹ (R^{1/2} z_i − Y_i), z_i ~ N(0, I) and
-centred.
+the Gauss–Newton step; every iterate is x̄0 + Σ_k L_k λ_k, from which J_b and H_l(x_l − x̄0) follow without B. Where J
+does not fall, B of the step is made smaller (Levenberg–Marquardt in the metric B⁻¹). Members of the posterior are
+x + X0_i + L (H B Hᵀ + R)⁻¹ (R^{1/2} z_i − Y_i), z_i ~ N(0, I) and centred.
 
 Sources: Courtier (1997), Q. J. R. Meteorol. Soc. 123, 2449 (dual form); Emerick & Reynolds (2013), Computers &
 Geosciences 55, 3 (ES-MDA).
@@ -31,7 +31,7 @@ from en4dvar.schemes.local_gain import ByDistance, Gain, parts
 from en4dvar.state import Array
 
 Forward = Callable[[Array], Array]  # members (M, n) → predictions (M, K)
-HALVINGS = 8
+TRIALS, SHORTER = 8, 0.3  # steps that are tried, each so much shorter than the one before
 
 
 @dataclass(frozen=True)
@@ -107,14 +107,38 @@ def field_en4dvar(
     epsilon: float = 1e-3,
     max_iterations: int = 20,
     tolerance: float = 1e-3,
+    cost_tolerance: float = 1e-3,
     seed: int = 0,
 ) -> FieldDescent:
     """Prior members (N, n) → posterior members, in place, by En4D-Var with localised covariances.
 
     It has converged where the next step is shorter than ``tolerance`` prior standard deviations of the predictions that
-    it moves most. Raises :class:`En4dvarError`: predictions that are not finite.
+    it moves most, or J falls by less than ``cost_tolerance`` of it: where H is not local, the tapered tangent is not
+    quite the gradient of J, and further steps creep. Raises :class:`En4dvarError`: predictions that are not finite.
     """
-    return _Descent(ensemble, data, gain, epsilon).run(max_iterations, tolerance, seed)
+    return _Descent(ensemble, data, gain, epsilon).run(max_iterations, tolerance, cost_tolerance, seed)
+
+
+@dataclass(frozen=True)
+class _Local:
+    """About an iterate: Y (N, K), H B Hᵀ (K, K), H (x − x̄0) (K,), innovation y − H(x) (K,), error variance (K,)."""
+
+    tangent: Array
+    covariance: Array
+    moved: Array
+    innovation: Array
+    variance: Array
+
+    def dual(self, a: float = 1.0) -> Array:
+        """λ (K,) of the step x̄0 + (1 − a)(x − x̄0) + a L λ, which minimises J plus (1/a − 1)/2 δxᵀB⁻¹δx, linearised."""
+        system = a * self.covariance + np.diag(self.variance)
+        return np.asarray(np.linalg.solve(system, self.innovation + a * self.moved), dtype=np.float64)
+
+    @property
+    def length(self) -> float:
+        """Of the full step: the largest change of a prediction, in its prior standard deviations."""
+        spread = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        return float(np.max(np.abs(self.covariance @ self.dual() - self.moved) / spread))
 
 
 class _Descent:
@@ -127,18 +151,18 @@ class _Descent:
         self.duals: list[Array] = []  # λ_k (K,)
         self.at = FieldDescent(self.mean.copy())
 
-    def run(self, max_iterations: int, tolerance: float, seed: int) -> FieldDescent:
+    def run(self, max_iterations: int, tolerance: float, cost_tolerance: float, seed: int) -> FieldDescent:
         at = self.at
         try:
             prediction = self.predict_one(at.centre)
             at.costs.append(self.cost(prediction, self.tangents, self.duals))
-            for _ in range(max_iterations + 1):
+            while True:
                 tangent = self.tangent(prediction)
-                dual, length = self.newton(prediction, tangent)
-                if length <= tolerance:
-                    at.converged = True
-                    break
-                moved = self.move(tangent, dual) if len(at.costs) <= max_iterations else None
+                here = self.local(prediction, tangent)
+                at.converged = here.length <= tolerance or self._creeps(cost_tolerance)
+                moved = None
+                if not at.converged and len(at.costs) <= max_iterations:
+                    moved = self.move(here)
                 if moved is None:
                     break
                 prediction = moved
@@ -147,6 +171,11 @@ class _Descent:
             self.anomalies += self.mean  # the prior, as it was
             raise
         return at
+
+    def _creeps(self, cost_tolerance: float) -> bool:
+        """Whether the last move lowered J by too little to go on."""
+        costs = self.at.costs
+        return len(costs) > 1 and costs[-2] - costs[-1] < cost_tolerance * costs[-1]
 
     def predict_one(self, x: Array) -> Array:
         self.at.forward_runs += 1
@@ -160,14 +189,11 @@ class _Descent:
         tangent = (runs - prediction) / epsilon
         return np.asarray(tangent - tangent.mean(axis=0))
 
-    def newton(self, prediction: Array, tangent: Array) -> tuple[Array, float]:
-        """λ (K,) of the full step, and its length."""
+    def local(self, prediction: Array, tangent: Array) -> _Local:
+        """What the centre, its prediction and the tangent there say."""
         covariance = self.gain.between(tangent, tangent)
         moved = sum((self.gain.between(tangent, Y) @ dual for Y, dual in self._so_far), np.zeros(len(prediction)))
-        system = covariance + np.diag(self.data.std**2)
-        dual = np.asarray(np.linalg.solve(system, self.data.values - prediction + moved), dtype=np.float64)
-        spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        return dual, float(np.max(np.abs(covariance @ dual - moved) / spread))
+        return _Local(tangent, covariance, moved, self.data.values - prediction, self.data.std**2)
 
     @property
     def _so_far(self) -> list[tuple[Array, Array]]:
@@ -180,22 +206,22 @@ class _Descent:
         misfit = (self.data.values - prediction) / self.data.std
         return 0.5 * background + 0.5 * float(misfit @ misfit)
 
-    def move(self, tangent: Array, dual: Array) -> Array | None:
-        """Go along the step as far as J falls; the prediction there, None where it does not fall."""
-        goal = self.mean.copy()
-        for part in parts(len(goal), self.data.width(len(self.anomalies))):
-            goal[part] += self.gain.along(part, self.anomalies[:, part], tangent, dual[None])[0]
-        for k in range(HALVINGS):
-            a = 0.5**k
-            x = (1 - a) * self.at.centre + a * goal
+    def move(self, here: _Local) -> Array | None:
+        """Take the longest step that lowers J; the prediction there, None where none does."""
+        for k in range(TRIALS):
+            a = SHORTER**k
+            dual = a * here.dual(a)
+            x = self.mean + (1 - a) * (self.at.centre - self.mean)
+            for part in parts(len(x), self.data.width(len(self.anomalies))):
+                x[part] += self.gain.along(part, self.anomalies[:, part], here.tangent, dual[None])[0]
             try:
                 prediction = self.predict_one(x)
             except En4dvarError:  # the model does not run there: nearer
                 continue
-            duals = [*((1 - a) * old for old in self.duals), a * dual]
-            cost = self.cost(prediction, [*self.tangents, tangent], duals)
+            tangents, duals = [*self.tangents, here.tangent], [*((1 - a) * old for old in self.duals), dual]
+            cost = self.cost(prediction, tangents, duals)
             if cost < self.at.costs[-1]:
-                self.at.centre, self.tangents, self.duals = x, [*self.tangents, tangent], duals
+                self.at.centre, self.tangents, self.duals = x, tangents, duals
                 self.at.costs.append(cost)
                 return prediction
         return None

@@ -82,7 +82,9 @@ def test_en4dvar_of_a_nonlinear_field_minimises_the_cost():
         return 0.5 * v @ v + 0.5 * np.sum(((data.values - data.forward((mean + root @ v)[None])[0]) / data.std) ** 2)
 
     best = minimize(cost, np.zeros(30), method="BFGS", options={"gtol": 1e-8, "maxiter": 500})
-    end = field_en4dvar(ensemble, data, line(30, read, 4.0), epsilon=1e-5, tolerance=1e-6, max_iterations=60)
+    end = field_en4dvar(
+        ensemble, data, line(30, read, 4.0), epsilon=1e-5, tolerance=1e-6, cost_tolerance=0, max_iterations=60
+    )
     assert end.converged
     assert end.costs == sorted(end.costs, reverse=True)
     assert end.costs[-1] == pytest.approx(best.fun, rel=1e-6)
