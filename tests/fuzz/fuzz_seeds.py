@@ -17,8 +17,10 @@ name: toy
 seed: 3
 data:
   path: toy.csv
+  unsorted: sort
+  repeated: average
   columns:
-    time: {name: t_us, unit: us}
+    time: {name: t_us, unit: us, rate: 2 MHz}
     position: {name: R_um, unit: um}
   window: {from: 0 us, to: 140 us, prominence: 10 %}
   time_zero: 0 us

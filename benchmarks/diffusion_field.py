@@ -1,4 +1,4 @@
-"""``python -m en4dvar_diffusion``: conductivity of 10 000 cells from 200 heads at three instants.
+"""Conductivity of 10 000 cells from 200 heads at three instants: ``python benchmarks/diffusion_field.py``.
 
 Localised En4D-Var and ES-MDA, and ES-MDA without localisation, against the truth that made the readings.
 """
