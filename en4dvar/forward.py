@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -196,6 +196,8 @@ class ForwardModel(ABC):
     run. ``alternatives`` are assumptions that could
     be otherwise, for :mod:`en4dvar.response.what_if`; ``path_quantities`` and ``path_parameters``, names
     of fields of the state that act along the path and not only at its start, are for :mod:`en4dvar.response.ledger`.
+    ``optional_parameters`` are numbers that are known unless ``parameters:`` names them: :meth:`with_parameters` is the
+    model in which they are parameters too.
 
     A model that has settings in YAML also has ``Settings`` (a pydantic model of its ``model:`` section) and
     ``from_settings``; without them the class is called without arguments. In a sequence, parameters that the state
@@ -214,6 +216,14 @@ class ForwardModel(ABC):
     alternatives: tuple[Alternative, ...] = ()
     path_quantities: tuple[PathQuantity, ...] = ()
     path_parameters: tuple[str, ...] = ()
+    optional_parameters: tuple[Parameter, ...] = ()
+
+    def with_parameters(self, names: Collection[str]) -> ForwardModel:
+        """This model with those of its ``optional_parameters`` that are in ``names`` among its ``parameters``.
+
+        Models that have such parameters override it.
+        """
+        return self
 
     @property
     def cheap(self) -> bool:

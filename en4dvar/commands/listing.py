@@ -7,6 +7,7 @@ from typing import Any
 
 from en4dvar.config.models import GROUP, build_model, find_model, settings_of
 from en4dvar.errors import En4dvarError
+from en4dvar.state import Parameter
 from en4dvar.tables import table
 
 
@@ -33,5 +34,11 @@ def _description(name: str) -> str:
     rows = [("  observable", "unit", "", "")]
     rows += [(f"  {o.name}", o.display_unit, "", o.label) for o in model.observables]
     rows += [("  parameter", "unit", "bounds", "")]
-    rows += [(f"  {p.name}", p.display_unit, f"{p.bounds[0]:g} … {p.bounds[1]:g}", p.label) for p in model.parameters]
+    rows += map(_row, model.parameters)
+    if model.optional_parameters:
+        rows += [("  may be named as parameters too", "", "", ""), *map(_row, model.optional_parameters)]
     return f"{name}: {title}\n{table(rows)}\n  settings: {options}"
+
+
+def _row(p: Parameter) -> tuple[str, str, str, str]:
+    return f"  {p.name}", p.display_unit, f"{p.bounds[0]:g} … {p.bounds[1]:g}", p.label

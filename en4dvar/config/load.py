@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
@@ -179,11 +179,18 @@ def read_file(kind: type[S], document: Document, base: Path) -> Read[S]:
     """Validate a document of one kind. Raises :class:`ConfigError`: every fault, in the order of the file."""
     faults: list[Fault] = []
     found = read_model(document.data.get("model"), base, document, faults)
-    context = context_of(document, base, found[0] if found else None)
+    model = found[0].with_parameters(_named(document)) if found else None
+    context = context_of(document, base, model)
     file = check(kind, document.data, (), document, faults, context)
-    if file is None or found is None:
+    if file is None or found is None or model is None:
         raise ConfigError(in_order(faults))
-    return Read(file, found[0], document, context, found[1])
+    return Read(file, model, document, context, found[1])
+
+
+def _named(document: Document) -> Collection[str]:
+    """Names in the ``parameters:`` section."""
+    given = document.data.get("parameters")
+    return given.keys() if isinstance(given, dict) else ()
 
 
 def context_of(document: Document, base: Path, model: ForwardModel | None) -> Context:

@@ -30,18 +30,22 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
         return Alternative(name, words, replace(model, **options))  # type: ignore[arg-type]
 
     medium, driving, rest = model.medium, model.driving, model.stress_free_radius
-    if not driving.silent:
+    if not driving.silent and "p_A" not in model.named:  # what is a parameter has its own uncertainty
         stronger = replace(driving, amplitude=PULSE * driving.amplitude)
         yield changed("pulse_amplitude", "the pulse were 5 % stronger", driving=stronger)
-    pressure = replace(medium, p_inf=AMBIENT * medium.p_inf)
-    yield changed("ambient_pressure", "the ambient pressure were 2 % higher", medium=pressure)
-    tension = replace(medium, S=SURFACE * medium.S)
-    yield changed("surface_tension", "the surface tension were 20 % lower", medium=tension)
+    if "p_inf" not in model.named:
+        pressure = replace(medium, p_inf=AMBIENT * medium.p_inf)
+        yield changed("ambient_pressure", "the ambient pressure were 2 % higher", medium=pressure)
+    if "surface_tension" not in model.named:
+        tension = replace(medium, S=SURFACE * medium.S)
+        yield changed("surface_tension", "the surface tension were 20 % lower", medium=tension)
     if model.gas != "heat":
         yield changed("gas_model", "the gas conducted heat to the wall (gas: heat)", gas="heat")
     elif model.vapour != "transport" and model.medium_heat == "cold":
         yield changed("gas_model", "the gas were polytropic (gas: polytropic)", gas="polytropic")
-    if medium.p_v:
+    if "p_v" in model.named:
+        pass
+    elif medium.p_v:
         yield changed("vapour", "there were no vapour in the bubble", medium=replace(medium, p_v=0.0))
     elif model.vapour == "none":
         saturated = replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))

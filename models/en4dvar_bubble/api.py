@@ -56,7 +56,8 @@ def simulate(
     ----------
     law: name of a constitutive law (``en4dvar laws``), or an instance.
     parameters: SI values, name → number or (member,): the law's (``G``, ``alpha``, ``mu``, …), with ``R0`` for the
-        acoustic start, ``R_max`` and ``R_eq`` (or ``R0``, the same there) for the laser start.
+        acoustic start, ``R_max`` and ``R_eq`` (or ``R0``, the same there) for the laser start; where wanted, any of
+        :mod:`en4dvar_bubble.numbers` (``p_A``, ``surface_tension``, ``c``, …) in place of the model's.
     times: output times (time,) in s, increasing; time zero is the start of the simulation (laser: the instant of
         R_max).
     start, gas, driving, driving_read, medium, radial, vapour, medium_heat, accuracy: the model, see
@@ -94,6 +95,7 @@ def simulate(
         )
     except ValueError as error:
         raise ConfigError(str(error)) from error
+    model = model.with_parameters(dict(parameters or {}))
     theta = _members(model, dict(parameters or {}))
     t = np.asarray([] if times is None else times, dtype=float)
     if t.ndim != 1 or len(t) == 0 or not np.all(np.isfinite(t)) or np.any(np.diff(t) <= 0):
@@ -162,7 +164,7 @@ def _dataset(model: BubbleModel, theta: Mapping[str, Array], t: Array, out: _Out
     data["steps"] = (member, record[:, STEPS].astype(int), {"long_name": "accepted time steps"})
     data["max_wall_mach"] = (member, record[:, MAX_MACH], {"units": "1", "long_name": "largest wall Mach number"})
     if model.system.gas:
-        hottest = medium.T_inf * from_kirchhoff(record[:, MAX_THETA], medium)
+        hottest = medium.T_inf * from_kirchhoff(record[:, MAX_THETA], model.medium_of(theta))
         data["max_temperature"] = (member, hottest, {"units": "K", "long_name": "highest temperature near the centre"})
     coordinates: dict[str, Any] = {"time": ("time", t, {"units": "s", "long_name": "time"})}
     for p in model.parameters:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from en4dvar_bubble.gas import CRITICAL_TEMPERATURE, kirchhoff, mass_fraction, s
 from en4dvar_bubble.laws import ConstitutiveLaw, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.parameters import MANCIA, positive
 from en4dvar_bubble.medium import WATER_25C, Medium
+from en4dvar_bubble.numbers import ALL, GAS_CONTENT, OF_MEDIUM, P_A, R_START, RDOT_START
 from en4dvar_bubble.solver.driver import Accuracy, Radial, Solver, System, preset
 
 FIRST_ORDER = "an expansion to first order in the Mach number: Prosperetti & Lezzi (1986), J. Fluid Mech. 168, 457"
@@ -72,6 +73,8 @@ class Dynamics:
     radial: Radial = "keller-miksis"
     vapour: Vapour = "none"
     medium_heat: Heat = "cold"
+    named: tuple[str, ...] = ()
+    """Those of the :attr:`optional_parameters` that are parameters."""
 
     def __post_init__(self) -> None:
         if self.driving is None:
@@ -111,10 +114,9 @@ class Dynamics:
         valid, _ = MACH_LIMITS[self.radial]
         return Solver(self.system, self.driving, self.reading, self.accuracy, hottest, valid)
 
-    @property
-    def exponent(self) -> float:
-        """Polytropic exponent (used without the energy equation)."""
-        return 1.0 if self.gas == "isothermal" else self.medium.kappa
+    def exponent(self, medium: Medium) -> float | Array:
+        """Polytropic exponent in a medium of :meth:`medium_of` (used without the energy equation)."""
+        return 1.0 if self.gas == "isothermal" else medium.kappa
 
     @property
     def stress_free_radius(self) -> str:
@@ -123,8 +125,34 @@ class Dynamics:
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Those of the law, then R0, or R_eq and R_max for the laser start."""
-        return (*self.law.parameters, *((R0,) if self.start == "acoustic" else (R_EQ, R_MAX)))
+        """Those of the law, then R0, or R_eq and R_max for the laser start, then the optional ones that are named."""
+        radii = (R0,) if self.start == "acoustic" else (R_EQ, R_MAX)
+        return (*self.law.parameters, *radii, *(p for p in ALL if p.name in self.named))
+
+    @property
+    def optional_parameters(self) -> tuple[Parameter, ...]:
+        """The :mod:`numbers` that the equations contain; a law's own parameter of such a name goes before."""
+        heat, transport = self.gas == "heat", self.vapour == "transport"
+        acts = dict.fromkeys((p.name for p in ALL), True)
+        acts |= dict.fromkeys(("A", "B"), heat) | dict.fromkeys(("K_m", "c_m"), bool(self.system.wall))
+        acts |= dict.fromkeys(("tait_B", "tait_n"), self.radial in ("keller-miksis-enthalpy", "gilmore"))
+        acts |= {"D_v": transport, "L_v": transport and bool(self.system.wall), "p_v": self.vapour == "none"}
+        acts |= {"c": self.radial != "rayleigh-plesset", "kappa": self.gas != "isothermal"}
+        acts |= {P_A.name: not self.driving.silent}
+        acts |= dict.fromkeys((R_START.name, RDOT_START.name), self.start == "acoustic")
+        own = {p.name for p in self.law.parameters}
+        return tuple(p for p in ALL if acts[p.name] and p.name not in own)
+
+    def medium_of(self, values: Mapping[str, Array], axes: int = 0) -> Medium:
+        """The medium of members with parameters name → (N,): constants that are parameters are (N, 1, …), with as
+        many further ``axes`` as what they meet has.
+        """
+        own: dict[str, Any] = {
+            constant: values[p.name].reshape(-1, *[1] * axes)
+            for constant, p in OF_MEDIUM.items()
+            if p.name in self.named
+        }
+        return replace(self.medium, **own) if own else self.medium
 
     @cached_property
     def layout(self) -> StateLayout:
@@ -136,7 +164,7 @@ class Dynamics:
         state = [
             Field("R", unit="m", bounds=positive),
             Field("Rdot", unit="m/s"),
-            Field("p_b", unit="Pa", bounds=(self.medium.p_v, np.inf)),
+            Field("p_b", unit="Pa", bounds=(0.0 if "p_v" in self.named else self.medium.p_v, np.inf)),
             Field("S", unit="Pa"),
         ]
         blocks = (
@@ -159,23 +187,24 @@ class Dynamics:
             value = np.asarray(theta[p.name], dtype=float)
             if not np.all((value >= p.bounds[0]) & (value <= p.bounds[1]) & np.isfinite(value)):
                 raise ValueError(f"{p.name} must lie in {p.bounds} {p.unit}")
-        rest = np.asarray(theta[self.stress_free_radius], dtype=float)
-        R = rest if self.start == "acoustic" else np.asarray(theta["R_max"], dtype=float)
+        values = {p.name: np.asarray(theta[p.name], dtype=float) for p in self.parameters}
+        rest = values[self.stress_free_radius]
+        R = values.get(R_START.name, rest) if self.start == "acoustic" else values["R_max"]
         if np.any(rest <= 0) or np.any(R <= 0):
             raise ValueError("radii must be positive")
-        medium, layout, system = self.medium, self.layout, self.system
+        medium, layout, system = self.medium_of(values), self.layout, self.system
         p_v = medium.p_v if self.vapour == "none" else saturated_vapour_pressure(medium.T_inf)
-        gas = (medium.p_inf + 2 * medium.S / rest - p_v) * (rest / R) ** 3
+        gas = (medium.p_inf + 2 * medium.S / rest - p_v) * (rest / R) ** 3 * values.get(GAS_CONTENT.name, 1.0)
         if np.any(gas <= 0):
             raise ValueError("the vapour pressure exceeds the equilibrium pressure: no gas would be in the bubble")
         x = np.empty((len(rest), layout.size))
-        values = {p.name: np.asarray(theta[p.name], dtype=float) for p in self.parameters}
-        fields = {"R": R, "Rdot": 0.0, "p_b": gas + p_v, "T": medium.T_inf, "T_m": medium.T_inf, **values}
+        Rdot = values.get(RDOT_START.name, 0.0)
+        fields = {"R": R, "Rdot": Rdot, "p_b": gas + p_v, "T": medium.T_inf, "T_m": medium.T_inf, **values}
         law_values = {p.name: values[p.name] for p in self.law.parameters}
         relaxed = self.law.relaxed(R / rest, law_values)
         fields["Z"] = relaxed
         fields["S"] = relaxed.sum(axis=1)
-        if self.start == "laser":  # at rest there is no elastic stress
+        if R is not rest:  # there is no elastic stress at the stress-free radius
             fields["S"] = fields["S"] + self.law.elastic_stress((R / rest)[:, None], law_values)[:, 0]
         if system.vapour:
             fields["C"] = mass_fraction(p_v / (gas + p_v), medium)[:, None]
@@ -183,6 +212,10 @@ class Dynamics:
             value = np.asarray(fields[name])
             x[:, where] = value[:, None] if value.ndim == 1 else value
         return x
+
+    def parameter_values(self, x: Array) -> dict[str, Array]:
+        """All parameters, name → (N,), of states (N, n_state)."""
+        return {p.name: x[:, self.layout[p.name].start] for p in self.parameters}
 
     def law_values(self, x: Array) -> dict[str, Array]:
         """The law's parameters, name → (N,), of states (N, n_state)."""

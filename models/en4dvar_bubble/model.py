@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from threading import Lock
 from typing import ClassVar
 
@@ -70,6 +70,10 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
             vapour=settings.vapour,
             medium_heat=settings.medium_heat,
         )
+
+    def with_parameters(self, names: Collection[str]) -> BubbleModel:
+        """See :mod:`en4dvar_bubble.numbers`."""
+        return replace(self, named=tuple(p.name for p in self.optional_parameters if p.name in names))
 
     @property
     def cheap(self) -> bool:

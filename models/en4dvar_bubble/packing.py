@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar.state import Array
 from en4dvar_bubble.dynamics import Dynamics
@@ -18,6 +19,8 @@ from en4dvar_bubble.gas import (
     saturated_vapour_pressure,
 )
 from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
+from en4dvar_bubble.medium import Medium
+from en4dvar_bubble.numbers import P_A
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.arrays import Members
 from en4dvar_bubble.solver.collocation import ball
@@ -42,14 +45,16 @@ class Packed(NamedTuple):
 
 def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packed:
     """States (N, n_state) at ``start`` (µs, one or (N,)), to be integrated to ``times`` (N, K) in µs."""
-    law, rho, system, values = model.law, model.medium.rho, model.system, model.law_values(x)
-    initial, par = _states(model, x)
+    law, system, values = model.law, model.system, model.law_values(x)
+    own = model.parameter_values(x)
+    rho = model.medium_of(own).rho
+    initial, par = _states(model, x, own)
     n_members = len(x)
     memory = viscous = _NO_TABLE
     if system.memory:
-        memory = _memory(model, values, initial, par, x)
+        memory = _memory(model, values, initial, par, x, model.medium_of(own, 1).rho)
     if system.shear:
-        viscous = law.viscous_table(values) / rho * 1e6
+        viscous = law.viscous_table(values) / model.medium_of(own, 2).rho * 1e6
         par[:, rows.VISCOUS_TABLE] = np.arange(n_members, dtype=float) * (VISCOUS_GRID.cells * 8)
     elif "mu" in values:
         par[:, rows.VISCOSITY] = values["mu"] / rho * 1e6
@@ -59,9 +64,16 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packe
     first, others = order[:WIDTH], order[WIDTH:]
     available = np.full(1, n_members, dtype=np.int64)
     samples, elastic = _NO_SAMPLES, _NO_TABLE
-    some = law.samples({name: value[first] for name, value in values.items()})
+    own_density = np.ndim(rho) > 0
+
+    def sampled(which: npt.NDArray[np.intp]) -> Array | None:
+        """Of some members; the kernel divides by one density, those of their own are divided by here."""
+        found = law.samples({name: value[which] for name, value in values.items()})
+        return found * (1 / rho[which])[:, None] if found is not None and own_density else found  # type: ignore[index]
+
+    some = sampled(first)
     if some is None:
-        elastic = law.table(values) / rho
+        elastic = law.table(values) / model.medium_of(own, 2).rho
     else:
         samples = np.empty((n_members, some.shape[1]))
         samples[first] = some
@@ -70,7 +82,7 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packe
     def complete() -> None:
         try:
             if available[0] < n_members:
-                rest = law.samples({name: value[others] for name, value in values.items()})
+                rest = sampled(others)
                 samples[others] = np.nan if rest is None else rest
         finally:  # threads may be waiting
             available[0] = n_members
@@ -84,26 +96,28 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packe
         start=np.full(n_members, start, dtype=float),
         times=np.ascontiguousarray(times),
         samples=samples,
-        factor=1 / rho,
+        factor=1.0 if own_density else 1 / rho,
         tables=elastic,
     )
     return Packed(members, memory, viscous, complete)
 
 
-def _states(model: Dynamics, x: Array) -> tuple[Array, Array]:
-    """Initial values (N, n) and parameters (N, rows) of states (N, n_state); what the law adds to both is missing."""
-    medium, layout, system = model.medium, model.layout, model.system
+def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array, Array]:
+    """Initial values (N, n) and parameters (N, rows) of states (N, n_state) with parameters ``own``; what the law adds
+    to both is missing.
+    """
+    medium, layout, system = model.medium_of(own), model.layout, model.system
     column = {name: x[:, s.start] for name, s in layout.slices.items()}
     log_R = np.log(column["R"] * 1e6)
     initial = np.zeros((len(x), system.size))
     initial[:, -2] = column["Rdot"] / column["R"] * 1e-6
     initial[:, -1] = log_R
-    par = np.tile(_constants(model), (len(x), 1))
+    par = _constants(model, medium, own, len(x))
     gas = (column["p_b"] - medium.p_v) / medium.rho
     if system.gas:
         m = system.gas
         theta = x[:, layout["T"]] / medium.T_inf
-        initial[:, :m] = kirchhoff(theta[:, :m], medium)
+        initial[:, :m] = kirchhoff(theta[:, :m], model.medium_of(own, 1))
         wall = theta[:, m] if system.wall else np.ones(len(x))
         share = ball(m).weights[:m] / theta[:, :m]
         at_wall = ball(m).weights[m] / wall
@@ -118,14 +132,18 @@ def _states(model: Dynamics, x: Array) -> tuple[Array, Array]:
             initial[:, system.first_medium : system.wall_row] = x[:, layout["T_m"]] / medium.T_inf - 1
             initial[:, system.wall_row] = kirchhoff(wall, medium)
     else:
-        par[:, rows.LOG_GAS] = np.log(gas) + 3 * model.exponent * log_R
+        par[:, rows.LOG_GAS] = np.log(gas) + 3 * model.exponent(medium) * log_R
     par[:, rows.LOG_R0] = np.log(column[model.stress_free_radius] * 1e6)
     return initial, par
 
 
-def _memory(model: Dynamics, values: Mapping[str, Array], initial: Array, par: Array, x: Array) -> Array:
-    """Tables of stiffness and equilibrium of the memory variables; writes their initial values and parameters."""
-    system, rho = model.system, model.medium.rho
+def _memory(
+    model: Dynamics, values: Mapping[str, Array], initial: Array, par: Array, x: Array, rho: float | Array
+) -> Array:
+    """Tables of stiffness and equilibrium of the memory variables; writes their initial values and parameters. ``rho``
+    is one density, or (N, 1).
+    """
+    system = model.system
     initial[:, system.first_memory : -2] = x[:, model.layout["Z"]] / rho
     memory = model.law.memory_tables(values)
     member = np.arange(len(x), dtype=float)
@@ -133,21 +151,22 @@ def _memory(model: Dynamics, values: Mapping[str, Array], initial: Array, par: A
         at = rows.MEMORY + rows.PER_MEMORY * j
         par[:, at], par[:, at + 1] = memory.relaxation_time[:, j] * 1e6, memory.convection[j]
         par[:, at + 2] = (member * system.memory + j) * (2 * GRID.cells * 8)
-    return (np.stack([memory.stiffness, memory.equilibrium], axis=2) / rho).reshape(-1, 1, 8)
+    tables = np.stack([memory.stiffness, memory.equilibrium], axis=2)
+    return (tables / np.reshape(rho, (-1, 1, 1, 1, 1))).reshape(-1, 1, 8)
 
 
-def _constants(model: Dynamics) -> Array:
-    """The parameter rows of the solver that are the same for every member, (rows,); zeros elsewhere."""
-    medium, system = model.medium, model.system
-    row = np.zeros(rows.PARAMETERS + rows.PER_MEMORY * system.memory)
+def _constants(model: Dynamics, medium: Medium, own: Mapping[str, Array], n_members: int) -> Array:
+    """The parameters (N, rows) of the solver that come from the medium and the driving; zeros elsewhere."""
+    system = model.system
+    row: dict[int, float | Array] = {}
     row[rows.VAPOUR] = medium.p_v / medium.rho
     row[rows.AMBIENT] = medium.p_inf / medium.rho
     row[rows.SURFACE] = 2 * medium.S / medium.rho * 1e6
     row[rows.INVERSE_C] = 0.0 if system.radial == "rayleigh-plesset" else 1 / medium.c
     row[rows.CONDUCTION] = medium.K_inf * medium.T_inf / medium.rho * 1e6
-    row[rows.KAPPA] = medium.kappa if system.gas else model.exponent
+    row[rows.KAPPA] = medium.kappa if system.gas else model.exponent(medium)
     row[rows.SLOPE] = medium.conduction_slope
-    row[rows.AMPLITUDE] = model.driving.amplitude / medium.rho
+    row[rows.AMPLITUDE] = own.get(P_A.name, model.driving.amplitude) / medium.rho
     row[rows.TAIT_B] = medium.tait_B / medium.rho
     row[rows.TAIT_N] = medium.tait_n
     row[rows.DIFFUSION] = medium.D_v * 1e6
@@ -160,4 +179,7 @@ def _constants(model: Dynamics) -> Array:
     row[rows.MEDIUM_K] = medium.K_m / medium.K_inf
     row[rows.MEDIUM_D] = medium.K_m / (medium.rho * medium.c_m) * 1e6
     row[rows.HEATING] = 12 / (medium.c_m * medium.T_inf)
-    return row
+    par = np.zeros((n_members, rows.PARAMETERS + rows.PER_MEMORY * system.memory))
+    for at, value in row.items():
+        par[:, at] = value
+    return par

@@ -13,6 +13,7 @@ from en4dvar.state import Array, StateLayout
 from en4dvar_bubble.dynamics import Dynamics
 from en4dvar_bubble.gas import from_kirchhoff, mass_fraction, saturated_vapour_pressure
 from en4dvar_bubble.laws.tabulate import GRID
+from en4dvar_bubble.medium import Medium
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.collocation import ball
 from en4dvar_bubble.solver.driver import Solution
@@ -63,13 +64,13 @@ class Paths(Batch):
         if name != "wall_mach":
             return np.abs(self[name]).max(axis=1)
         if self.model.radial == "rayleigh-plesset":  # its equations know no speed of sound
-            return np.asarray(np.abs(self["Rdot"]).max(axis=1) / self.model.medium.c)
+            return np.asarray(np.abs(self["Rdot"] / self.medium(1).c).max(axis=1))
         return self.solution.record[:, MAX_MACH]
 
     def beyond(self, limit: ValidityLimit) -> Array:
         """(N,) since when (s) the wall is faster than the radial equation bears, +inf: never; see :meth:`largest`."""
         if self.model.radial == "rayleigh-plesset":
-            over = np.abs(self["Rdot"]) / self.model.medium.c > limit.value
+            over = np.abs(self["Rdot"]) / self.medium(1).c > limit.value
             first = np.take_along_axis(self.times, np.argmax(over, axis=1)[:, None], axis=1)[:, 0]
             return np.where(over.any(axis=1), first, np.inf)
         return np.asarray(self.solution.record[:, BEYOND] * 1e-6)
@@ -85,6 +86,10 @@ class Paths(Batch):
         """States (N, n_state) at the last instant."""
         solution = replace(self.solution, states=self.solution.states[:, -1:])
         return replace(self, times=self.times[:, -1:], solution=solution, _fields={}).states[:, 0]
+
+    def medium(self, axes: int) -> Medium:
+        """See :meth:`Dynamics.medium_of`."""
+        return self.model.medium_of(self.model.parameter_values(self.initial), axes)
 
     def _constant(self, name: str) -> Array:
         return np.broadcast_to(self.initial[:, self.model.layout[name].start, None], self.times.shape)
@@ -102,7 +107,7 @@ class Paths(Batch):
         return np.exp(self.solution.states[:, :, -1] - self.par[:, None, rows.LOG_R0])
 
     def _T(self) -> Array:
-        system, medium = self.model.system, self.model.medium
+        system, medium = self.model.system, self.medium(2)
         tau = self.solution.states[:, :, : system.gas]
         if system.wall:
             tau = np.concatenate([tau, self.solution.states[:, :, system.wall_row, None]], axis=2)
@@ -120,14 +125,14 @@ class Paths(Batch):
         return (1 + self.solution.states[:, :, system.first_medium : system.wall_row]) * self.model.medium.T_inf
 
     def _Z(self) -> Array:
-        return self.solution.states[:, :, self.model.system.first_memory : -2] * self.model.medium.rho
+        return self.solution.states[:, :, self.model.system.first_memory : -2] * self.medium(2).rho
 
     def _p_b(self) -> Array:
-        medium, system = self.model.medium, self.model.system
+        medium, system = self.medium(1), self.model.system
         log_R = self.solution.states[:, :, -1]
         gas = self.par[:, None, rows.LOG_GAS]
         if not system.gas:
-            return np.asarray(np.exp(gas - 3 * self.model.exponent * log_R) * medium.rho + medium.p_v)
+            return np.asarray(np.exp(gas - 3 * self.model.exponent(medium) * log_R) * medium.rho + medium.p_v)
         m, weights = system.gas, ball(system.gas).weights
         T = self["T"]
         share = weights[:m] * medium.T_inf / T[:, :, :m]
@@ -140,11 +145,11 @@ class Paths(Batch):
         return np.asarray(content / (share.sum(axis=2) + at_wall) + medium.p_v)
 
     def _S(self) -> Array:
-        system, rho = self.model.system, self.model.medium.rho
+        system, rho = self.model.system, self.medium(1).rho
         V = self.solution.states[:, :, -2]
         log_stretch = self.solution.states[:, :, -1] - self.par[:, None, rows.LOG_R0]
         values = self.model.law_values(self.initial)
-        stress = evaluate(self.model.law.table(values) / rho, GRID.span, log_stretch)
+        stress = evaluate(self.model.law.table(values) / self.medium(2).rho, GRID.span, log_stretch)
         if system.memory:
             stress = stress + self.solution.states[:, :, system.first_memory : -2].sum(axis=2)
         if system.shear:

@@ -27,6 +27,7 @@ from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, get_law
 from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.medium import CONSTANT_SETS, CONSTANTS, UNITS, WATER_25C, Medium
+from en4dvar_bubble.numbers import ALL
 from en4dvar_bubble.solver.driver import Accuracy, AccuracyName, Radial, preset
 
 SetName = Literal["water-25C", "imr-v1", "imr-v2"]
@@ -171,7 +172,7 @@ class BubbleSettings(Section):
     def possible_parameters(cls) -> tuple[Parameter, ...]:
         """The parameters of every built-in law and start, for editors; a configuration has those of its own."""
         of_laws = [p for law in REGISTRY.values() for p in law.parameters]
-        return tuple({p.name: p for p in (*of_laws, R0, R_EQ, R_MAX)}.values())
+        return tuple({p.name: p for p in (*of_laws, R0, R_EQ, R_MAX, *ALL)}.values())
 
     @property
     def constitutive_law(self) -> ConstitutiveLaw:

@@ -1,0 +1,56 @@
+"""Numbers of a bubble that are known unless told otherwise; ``parameters:`` may name them, to fix or to estimate them.
+
+Constants of the medium and the gas, the amplitude of the driving, and the state at time zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import Field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from en4dvar.state import Parameter
+from en4dvar_bubble.medium import CONSTANTS
+
+# Not estimated: the temperature, from which saturation and the start follow, molar masses and exponents of diffusion.
+_KNOWN = ("T_inf", "M_g", "M_v", "D_p", "D_T", "A_v", "B_v")
+_NAMES = {"S": "surface_tension"}  # the state has a field S, the stress integral
+_SYMBOLS = {"rho": r"\rho", "p_inf": r"p_\infty", "surface_tension": "S", "kappa": r"\kappa"}
+_SYMBOLS |= {"tait_B": r"B_\mathrm{Tait}", "tait_n": r"n_\mathrm{Tait}"}
+
+
+def _of(constant: Field[Any]) -> Parameter:
+    about, name = constant.metadata, _NAMES.get(constant.name, constant.name)
+    words = about["description"].partition(" (")[0].rstrip(".")
+    label = words if words.startswith("Tait") else words[0].lower() + words[1:]
+    least = about["bounds"].get("gt", about["bounds"].get("ge", 0.0))
+    shown = "kPa" if about["unit"] == "Pa" else ""
+    symbol = f"${_SYMBOLS.get(name, name)}$"
+    return Parameter(name, about["unit"], "lognormal", (least, np.inf), label, symbol, shown, about["source"])
+
+
+def _of_medium() -> Iterator[tuple[str, Parameter]]:
+    for constant in CONSTANTS:
+        if constant.name not in _KNOWN:
+            yield constant.name, _of(constant)
+    label = "constant vapour pressure in the bubble"
+    yield "p_v", Parameter("p_v", "Pa", "lognormal", (0.0, np.inf), label, "$p_v$", "kPa")
+
+
+OF_MEDIUM: Mapping[str, Parameter] = MappingProxyType(dict(_of_medium()))
+"""Constant of the medium → the parameter that sets it."""
+P_A = Parameter("p_A", "Pa", "normal", label="amplitude of the driving", symbol="$p_A$", display_unit="MPa")
+GAS_CONTENT = Parameter(
+    "gas_content",
+    "1",
+    "lognormal",
+    (0.0, np.inf),
+    "amount of gas over that in equilibrium at the stress-free radius",
+    r"$n_g/n_\mathrm{eq}$",
+)
+R_START = Parameter("R_start", "m", "lognormal", (0.0, np.inf), "radius at time zero", "$R(0)$", "um")
+RDOT_START = Parameter("Rdot_start", "m/s", "normal", label="velocity of the wall at time zero", symbol=r"$\dot{R}(0)$")
+ALL = (*OF_MEDIUM.values(), P_A, GAS_CONTENT, R_START, RDOT_START)
