@@ -42,11 +42,14 @@ def in_order(
 def _disorder(before: int, after: int, first: int, written: Written) -> str:
     times, lines = written.times, written.lines
     where = f"{written.path}:{lines[after]}" if lines else f"{written.path}: sample {after + 1}"
-    hint = "; or should the rows be sorted (data.unsorted: sort)?"
+    sort = "sort the rows (data.unsorted: sort)"
+    hint = f"; correct it, or {sort}"
     if times[after] == times[before]:
         hint = "; keep one of the two readings, or their mean (data.repeated: average)"
     elif times[after] <= times[first]:
-        hint = "; if another bubble begins here, give it a file of its own, or say which row is whose (data.by)"
+        hint = (
+            f"; if another bubble begins here, give it a file of its own or say whose each row is (data.by); or {sort}"
+        )
     unit = written.unit
     return f"{where}: times must increase, but {times[after]:g} {unit} follows {times[before]:g} {unit}{hint}"
 

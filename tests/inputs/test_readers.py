@@ -62,7 +62,10 @@ def test_csv_dialects(tmp_path: Path, text: str) -> None:
         ("t,R\n", "no data"),
         ("", "the file holds no data"),
         ("# only this\n", "the file holds no data"),
-        ("t,R\n0,1\n# x\n2,2\n1,3\n", "a.csv:5: times must increase, but 1 us follows 2 us; or should the rows"),
+        (
+            "t,R\n0,1\n# x\n2,2\n1,3\n",
+            "a.csv:5: times must increase, but 1 us follows 2 us; correct it, or sort the rows",
+        ),
         ("t,R\n0,1\n0,2\n1,3\n", "a.csv:3: times must increase, but 0 us follows 0 us; keep one of the two"),
         ("t,R\n1,1\n2,2\n3,3\n1,1\n", "a.csv:5: times must increase, but 1 us follows 3 us; if another bubble begins"),
         ("Camera,X\n\nt,S\n0,1\n", "no column 'R'; the columns are: t, S\n"),
