@@ -115,7 +115,10 @@ def field_en4dvar(
     It has converged where the next step is shorter than ``tolerance`` prior standard deviations of the predictions that
     it moves most, or J falls by less than ``cost_tolerance`` of it: where H is not local, the tapered tangent is not
     quite the gradient of J, and further steps creep. Raises :class:`En4dvarError`: predictions that are not finite.
+    ValueError: another gain, for which there is no J.
     """
+    if not isinstance(gain, ByDistance):
+        raise ValueError("En4D-Var is localised by distance; without places use field_esmda(…, ByCorrelation())")
     return _Descent(ensemble, data, gain, epsilon).run(max_iterations, tolerance, cost_tolerance, seed)
 
 

@@ -170,5 +170,7 @@ def test_what_cannot_be_run_leaves_the_prior(tmp_path):
         with pytest.raises(En4dvarError, match=r"\d+ of \d+ members have predictions that are not finite"):
             run(ensemble, broken, line(30, read, 4.0))
         assert np.allclose(ensemble, before, rtol=0, atol=1e-12)
+    with pytest.raises(ValueError, match=r"without places use field_esmda"):
+        field_en4dvar(ensemble, data, ByCorrelation())
     with pytest.raises(ValueError, match=r"places \(30,\) and observed \(5, 1\) must be"):
         ByDistance(np.arange(30.0), np.zeros((5, 1)), 1.0)
