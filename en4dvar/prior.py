@@ -234,7 +234,7 @@ class Prior:
             raise ConfigError(f"sampling {method!r} of {n} parameters needs at least {needed} members, not {n_members}")
         z = np.column_stack([standard_normal(seed, name, n_members) for name in self.names])
         if method == "exact":
-            z = _whiten_sample(z)
+            z = whiten_sample(z)
         return self.mean + self.std * z
 
 
@@ -267,7 +267,7 @@ def member_stream(seed: int, name: str, member: int = 0) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(key=key, counter=np.array([0, 0, 0, member], dtype=np.uint64)))
 
 
-def _whiten_sample(z: Array) -> Array:
+def whiten_sample(z: Array) -> Array:
     """Members (N, n) with zero mean and unit sample covariance, column j made from columns 0…j."""
     q, r = np.linalg.qr(z - z.mean(axis=0))
     q = q * np.sign(np.diag(r))

@@ -30,6 +30,7 @@ LAYERS = (
     ("cycling",),
     ("sampling",),
     ("assimilate",),
+    ("joint",),
     ("population",),
     ("inputs",),
     ("config",),

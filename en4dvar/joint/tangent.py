@@ -1,0 +1,60 @@
+"""One experiment of a joint problem: J_o of control vectors, and its linearisation by runs close to one of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
+from en4dvar.executor import Executor
+from en4dvar.joint.problem import JointProblem
+from en4dvar.noise import Linearisation
+from en4dvar.state import Array
+
+
+@dataclass(frozen=True)
+class LocalForm:
+    """J_o at a point, its gradient (n,) and Gauss–Newton Hessian (n, n) in units of the prior, and the central run."""
+
+    cost: float
+    gradient: Array
+    hessian: Array
+    central: Forecast
+
+
+class Experiment:
+    """The runs of experiment ``e``."""
+
+    def __init__(self, joint: JointProblem, e: int, epsilon: float, executor: Executor):
+        self.joint, self.e, self.epsilon = joint, e, epsilon
+        self.problem = joint.experiments[e]
+        self.composite = Composite(self.problem, executor)
+        self.forward_runs = 0
+
+    def run(self, z: Array, grid: Array = NO_TIMES) -> Forecast:
+        """Control vectors (B, n) in units of the prior."""
+        self.forward_runs += len(z)
+        return self.composite(self.joint.control(self.e, z), grid)
+
+    def costs(self, z: Array) -> Array:
+        """J_o (B,) of control vectors (B, n) in units of the prior; +inf where the model fails."""
+        return self.problem.observations.cost(self.run(z).predicted)
+
+    def linearise(self, z: Array) -> LocalForm | None:
+        """At z (n,), by n runs beside it; None where it or too many of them fail.
+
+        A run that fails is replaced by the one on the other side.
+        """
+        observations, step = self.problem.observations, self.epsilon * np.eye(len(z))
+        run = self.run(np.vstack([z, z + step]))
+        stacked = run.predicted.stacked
+        change = (stacked[1:] - stacked[0]) / self.epsilon
+        if failed := np.flatnonzero(~np.isfinite(change).all(axis=1)).tolist():
+            behind = self.run(z - step[failed]).predicted.stacked
+            change[failed] = (stacked[0] - behind) / self.epsilon
+        cost = float(observations.cost(run.predicted)[0])
+        if not (np.isfinite(cost) and np.isfinite(change).all()):
+            return None
+        d, S = observations.whiten(Linearisation.of_stacked(run.predicted[0], stacked[0], change))
+        return LocalForm(cost, -S.T @ d, S.T @ S, run[:1])

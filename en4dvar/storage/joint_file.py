@@ -1,0 +1,196 @@
+"""A joint estimate ⇄ ``joint.nc``: members of what is shared and of each data set's own, the fits, and what each data
+set said alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from en4dvar.caution import Caution, worst_first
+from en4dvar.errors import OutputError
+from en4dvar.files import write_bytes
+from en4dvar.joint.estimate import JointEstimate
+from en4dvar.state import Array, Parameter
+from en4dvar.storage.netcdf import Group, Groups, Variable, to_bytes, variable
+from en4dvar.storage.seal import check_seal
+from en4dvar.units import convert
+
+FILE = "joint.nc"
+QUANTILES = (0.05, 0.5, 0.95)
+_DRAWS = ("chain", "draw")
+
+
+@dataclass(frozen=True)
+class Alone:
+    """What one data set said by itself: physical members (N, n) of its parameters ``names``."""
+
+    names: tuple[str, ...]
+    members: Array
+
+
+def save_joint(path: Path, found: JointEstimate, alone: Sequence[Alone], attributes: Mapping[str, Any]) -> Path:
+    """Write the file; it appears complete or not at all. Raises :class:`OutputError`."""
+    return write_bytes(path, to_bytes(joint_groups(found, alone, attributes)))
+
+
+def joint_groups(found: JointEstimate, alone: Sequence[Alone], attributes: Mapping[str, Any]) -> Groups:
+    """All of the file."""
+    names = [one.observations.name for one in found.joint.experiments]
+    datasets = {"dataset": variable("dataset", np.array(names, dtype=object), "", "data set")}
+    root = {
+        **attributes,
+        "converged": int(found.converged),
+        "stop_reason": found.stop_reason,
+        "log_evidence": found.log_evidence,
+        "forward_runs": found.forward_runs,
+        "effective_draws": found.members.effective,
+        "warnings": "\n".join(c.line for c in worst_first(found.cautions)),
+    }
+    return {
+        "/": Group(attrs=root),
+        "/posterior": Group(_shared(found) | _own(found, names), datasets),
+        "/prior": Group(_prior(found)),
+        "/alone": Group(_alone(found, alone), datasets),
+        "/fit": Group(_fit(found), datasets),
+    }
+
+
+def shared_name(key: tuple[str, str]) -> str:
+    """Variable of a shared quantity: its name, and its group where that is not everyone."""
+    name, group = key
+    plain = "".join(c if c.isalnum() else "_" for c in group)
+    return f"{name}_{plain}" if plain else name
+
+
+def _about(p: Parameter) -> dict[str, Any]:
+    return {"symbol": p.symbol, "display_units": p.display_unit}
+
+
+def _shared(found: JointEstimate) -> dict[str, Variable]:
+    variables = {}
+    for j, ((_, group), term) in enumerate(zip(found.joint.shared, found.joint.terms, strict=True)):
+        p = term.parameter
+        label = f"{p.label}, {group}" if group else p.label
+        mode = float(found.shared_mode[j])
+        name = shared_name(found.joint.shared[j])
+        variables[name] = variable(_DRAWS, found.shared[None, :, j], p.unit, label, mode=mode, **_about(p))
+    return variables
+
+
+def _own(found: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
+    """(chain, draw, dataset) of the parameters that data sets have of their own, NaN where one has it not."""
+    count = len(found.members.border)
+    values: dict[str, Array] = {}
+    parameters: dict[str, Parameter] = {}
+    for e, one in enumerate(found.joint.experiments):
+        members = found.control(e)[:-1]
+        for j in found.joint.columns(e)[1]:
+            p = one.prior.parameters[j]
+            values.setdefault(p.name, np.full((1, count, len(names)), np.nan))[0, :, e] = members[:, j]
+            parameters[p.name] = p
+    taken = {shared_name(key) for key in found.joint.shared}
+    return {
+        f"{name}_own" if name in taken else name: variable(
+            (*_DRAWS, "dataset"), array, parameters[name].unit, parameters[name].label, **_about(parameters[name])
+        )
+        for name, array in values.items()
+    }
+
+
+def _prior(found: JointEstimate) -> dict[str, Variable]:
+    """Quantiles (quantile,) of the priors of what is shared."""
+    z = np.array([-1.6448536, 0.0, 1.6448536])
+    return {
+        shared_name(key): variable("quantile", term.to_physical(term.mean + term.std * z), term.parameter.unit, "prior")
+        for key, term in zip(found.joint.shared, found.joint.terms, strict=True)
+    }
+
+
+def _alone(found: JointEstimate, alone: Sequence[Alone]) -> dict[str, Variable]:
+    """Quantiles (dataset, quantile) of each shared parameter as each data set has it by itself."""
+    result = {}
+    for j, key in enumerate(found.joint.shared):
+        rows = np.full((len(alone), len(QUANTILES)), np.nan)
+        for e, one in enumerate(alone):
+            if found.joint.groups[e].get(key[0]) == key[1]:
+                values = one.members[:, one.names.index(key[0])]
+                rows[e] = np.quantile(values[np.isfinite(values)], QUANTILES)
+        unit = found.joint.terms[j].parameter.unit
+        result[shared_name(key)] = variable(("dataset", "quantile"), rows, unit, "5, 50 and 95 % of a data set alone")
+    return result
+
+
+def _fit(found: JointEstimate) -> dict[str, Variable]:
+    """Observations and predictive bands of each data set, padded with NaN, in display units."""
+    experiments = found.joint.experiments
+    most = max(len(one.observations) for one in experiments)
+    times, values = np.full((2, len(experiments), most), np.nan)
+    bands = np.full((len(experiments), len(found.grids[0]), 4), np.nan)
+    for e, (one, run, grid) in enumerate(zip(experiments, found.forecasts, found.grids, strict=True)):
+        to_time = (one.model.time_unit, one.model.time_display_unit)
+        to_value = (one.observable.unit, one.observable.display_unit)
+        k = len(one.observations)
+        times[e, :k] = convert(one.observations.times, *to_time)
+        values[e, :k] = convert(one.observations.values, *to_value)
+        bands[e, :, 0] = convert(grid, *to_time)
+        alive = run.path[:-1][run.active[:-1]]
+        bands[e, :, 1:] = convert(np.quantile(alive, QUANTILES, axis=0).T, *to_value)
+    labels = np.array([one.observable.label for one in experiments], dtype=object)
+    units = np.array([one.observable.display_unit for one in experiments], dtype=object)
+    time_units = np.array([one.model.time_display_unit for one in experiments], dtype=object)
+    alive_counts = np.array([int(run.active[:-1].sum()) for run in found.forecasts])
+    return {
+        "chi2_per_observation": variable("dataset", found.chi2, "1", "misfit per observation at the mode"),
+        "alive": variable("dataset", alive_counts, "1", "members alive"),
+        "observable": variable("dataset", labels, "", "what was observed"),
+        "unit": variable("dataset", units, "", "unit of values and bands"),
+        "time_unit": variable("dataset", time_units, "", "unit of times"),
+        "time": variable(("dataset", "observation"), times, "1", "times of the observations"),
+        "value": variable(("dataset", "observation"), values, "1", "observations"),
+        "band": variable(("dataset", "point", "what"), bands, "1", "time; 5, 50 and 95 % of the members there"),
+    }
+
+
+@dataclass(frozen=True)
+class StoredJoint:
+    """A file of :func:`save_joint`: a thin view of ``tree``."""
+
+    tree: xr.DataTree
+
+    @property
+    def cautions(self) -> tuple[Caution, ...]:
+        """Warnings of the joint estimate, the worst first."""
+        return worst_first(map(Caution.parse, str(self.tree.attrs["warnings"]).splitlines()))
+
+    def group(self, name: str) -> xr.Dataset:
+        """``posterior``, ``prior``, ``alone`` or ``fit``."""
+        return self.tree.children[name].to_dataset()
+
+    @property
+    def datasets(self) -> tuple[str, ...]:
+        """Names of the data sets."""
+        return tuple(map(str, self.group("fit")["dataset"].values))
+
+    @property
+    def shared(self) -> tuple[str, ...]:
+        """Names of the variables of what is shared."""
+        return tuple(str(name) for name in self.group("prior").data_vars)
+
+
+def load_joint(path: Path) -> StoredJoint:
+    """Read the file into memory. Raises :class:`OutputError`: it is none, cut short or altered."""
+    check_seal(path)
+    try:
+        with xr.open_datatree(path, engine="netcdf4", decode_timedelta=False) as tree:
+            nodes = {node.path: node.to_dataset(inherit=False).load() for node in tree.subtree}
+    except OSError as error:
+        raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
+    if {"/posterior", "/prior", "/alone", "/fit"} - set(nodes):
+        raise OutputError(f"{path}: not a joint estimate")
+    return StoredJoint(xr.DataTree.from_dict(nodes))
