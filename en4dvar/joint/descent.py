@@ -7,12 +7,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from en4dvar.descent.window import FAKED
 from en4dvar.joint.arrow import Arrow
 from en4dvar.joint.problem import JointProblem
 from en4dvar.joint.tangent import Experiment, LocalForm
 from en4dvar.state import Array
 
 LENGTHS = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01)  # of a step, tried in turn until J falls
+WIDER = (5.0, 25.0)  # factors of the bundle where J does not fall along the step
 SUFFICIENT = 1e-4  # share of the decrease that the gradient promises (Armijo)
 
 
@@ -56,11 +58,13 @@ class JointDescent:
     converged: bool = False
 
 
-def linearise(joint: JointProblem, experiments: Sequence[Experiment], place: Place) -> Joined | None:
+def linearise(
+    joint: JointProblem, experiments: Sequence[Experiment], place: Place, wider: float = 1.0
+) -> Joined | None:
     """The arrow system of J at a place; None where an experiment cannot be run there."""
     found = []
     for e, experiment in enumerate(experiments):
-        local = experiment.linearise(joint.standard(e, place.border, place.own[e]))
+        local = experiment.linearise(joint.standard(e, place.border, place.own[e]), wider)
         if local is None:
             return None
         found.append(local)
@@ -110,9 +114,15 @@ def descend(
             found.converged, found.stop = True, f"the next step is {at.norm:.1g} posterior standard deviations long"
             return found
         moved = _search(joint, experiments, at)
+        for wider in WIDER:
+            # a step of the model's own error: a wider bundle feels its jumps less
+            if moved is None and (again := linearise(joint, experiments, at.place, wider)):
+                at = found.at = again
+                moved = _search(joint, experiments, at)
         ahead = linearise(joint, experiments, moved) if moved else None
         if ahead is None:
-            found.stop = "J does not fall along the step"
+            found.converged = at.norm < FAKED
+            found.stop = f"J does not fall along the step, of {at.norm:.1g} posterior standard deviations"
             return found
         at = found.at = ahead
         found.costs.append(at.cost)

@@ -135,8 +135,8 @@ class _Estimate:
         self._require(forecasts)
         if not lowest.converged:
             cautions.append(caution("not-converged", f"the joint estimate has not converged: {lowest.stop}"))
-        if any(one.at.cost - lowest.at.cost > TOLD and one.converged for one in descents):
-            words = "descents of the joint estimate ended in different minima; the lowest was taken"
+        if _agreeing(descents) < 2:
+            words = f"none of {len(descents) - 1} further descents of the joint estimate ended in its lowest minimum"
             cautions.append(caution("starts-disagree", words))
         normalisation = sum(one.observations.log_normalisation() for one in joint.experiments)
         return JointEstimate(
@@ -203,19 +203,20 @@ class _Estimate:
         return starts
 
     def _descents(self, starts: Sequence[Place]) -> list[JointDescent]:
-        """From the starts of lowest J, as many as ``starts`` of the settings."""
+        """From one start after the other, that of lowest J first, until two have ended in the lowest minimum."""
         costs = np.array([cost(self.joint, self.experiments, start) for start in starts])
-        best = [
-            starts[i] for i in np.argsort(costs, kind="stable")[: max(2, self.settings.starts)] if costs[i] < np.inf
-        ]
-        s = self.settings
-        found = [
-            descend(self.joint, self.experiments, start, s.max_iterations, s.step_tolerance, s.cost_tolerance)
-            for start in best
-        ]
-        if not any(found):
+        s, found = self.settings, list[JointDescent]()
+        for i in np.argsort(costs, kind="stable"):
+            if np.isfinite(costs[i]):
+                one = descend(
+                    self.joint, self.experiments, starts[i], s.max_iterations, s.step_tolerance, s.cost_tolerance
+                )
+                found += [one] if one else []
+            if _agreeing(found) >= 2:
+                break
+        if not found:
             raise TooFewMembersError("the joint estimate: some experiment cannot be run wherever it starts")
-        return [one for one in found if one is not None]
+        return found
 
     def _members(self, lowest: JointDescent) -> tuple[JointMembers, list[Caution]]:
         laplace = gaussian(lowest.at, self.seed, self.settings.members)
@@ -234,6 +235,12 @@ class _Estimate:
             if alive < needed * (len(run) - 1):
                 name, lost, count = one.observations.name, len(run) - 1 - alive, len(run) - 1
                 raise TooFewMembersError(f"{name}: {lost} of {count} members of the joint posterior fail")
+
+
+def _agreeing(descents: Sequence[JointDescent]) -> int:
+    """How many descents ended in the lowest minimum."""
+    lowest = min((one.at.cost for one in descents), default=np.inf)
+    return sum(one.at.cost - lowest < TOLD for one in descents)
 
 
 def _physical(joint: JointProblem, z: Array) -> Array:

@@ -41,18 +41,22 @@ class Experiment:
         """J_o (B,) of control vectors (B, n) in units of the prior; +inf where the model fails."""
         return self.problem.observations.cost(self.run(z).predicted)
 
-    def linearise(self, z: Array) -> LocalForm | None:
+    def linearise(self, z: Array, wider: float = 1.0) -> LocalForm | None:
         """At z (n,), by n runs beside it; None where it or too many of them fail.
 
-        A run that fails is replaced by the one on the other side.
+        A run that fails is replaced by the one on the other side. A bundle that is ``wider`` has runs on both sides.
         """
-        observations, step = self.problem.observations, self.epsilon * np.eye(len(z))
+        size = self.epsilon * wider
+        observations, step = self.problem.observations, size * np.eye(len(z))
         run = self.run(np.vstack([z, z + step]))
         stacked = run.predicted.stacked
-        change = (stacked[1:] - stacked[0]) / self.epsilon
-        if failed := np.flatnonzero(~np.isfinite(change).all(axis=1)).tolist():
-            behind = self.run(z - step[failed]).predicted.stacked
-            change[failed] = (stacked[0] - behind) / self.epsilon
+        change = (stacked[1:] - stacked[0]) / size
+        again = ~np.isfinite(change).all(axis=1) | (wider > 1)
+        if again.any():
+            behind = (stacked[0] - self.run(z - step[again]).predicted.stacked) / size
+            ahead = change[again]
+            both = 0.5 * (ahead + behind)
+            change[again] = np.where(np.isfinite(both), both, np.where(np.isfinite(ahead), ahead, behind))
         cost = float(observations.cost(run.predicted)[0])
         if not (np.isfinite(cost) and np.isfinite(change).all()):
             return None
