@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.cycling.sequential import SequentialSettings, Series, run_sequential
+from en4dvar.cycling.sequential import CycleSeries, SequentialSettings, run_sequential
 from en4dvar.prior import member_stream
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
@@ -93,7 +93,7 @@ def ours(
     ensemble = np.tile(mean, (members, 1))
     ensemble[:, :n] += system.initial_std * member_stream(seed, "members").standard_normal((members, n))
     times = system.step * system.every * np.arange(1, len(y) + 1)
-    series = Series(times, y, np.full(n, system.error_std))
+    series = CycleSeries(times, y, np.full(n, system.error_std))
     scheme = IEnKS(lag, tolerance=system.tolerance) if lag else ETKF()
     settings = SequentialSettings(scheme, Inflation(inflation), rotation=True)
     began = time.process_time()

@@ -50,6 +50,8 @@ if TYPE_CHECKING:
     from en4dvar.runs.simulation import Simulation as Simulation
     from en4dvar.runs.simulation import simulate as simulate
     from en4dvar.runs.twin_run import run_twin as run_twin
+    from en4dvar.series import Places as Places
+    from en4dvar.series import Series as Series
     from en4dvar.state import Field as Field
     from en4dvar.state import Parameter as Parameter
     from en4dvar.state import StateLayout as StateLayout
@@ -71,6 +73,7 @@ _HOME = {
     "analysis": ("Analysis",),
     "problem": ("AssimilationSettings", "InverseProblem"),
     "runs.runner": ("run", "run_campaign", "write_report"),
+    "series": ("Places", "Series"),
     "runs.simulation": ("Simulation", "simulate"),
     "state": ("Field", "Parameter", "StateLayout"),
     "report.result": ("Result", "load_result"),

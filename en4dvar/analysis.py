@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -57,15 +57,57 @@ class ChainRecord:
 @dataclass(frozen=True)
 class StartRecord:
     """Where the descents stand that decide where the iterations start: rounds of moves, J of each descent, and how
-    many are under way. The moves of the lowest become the first iterations.
+    many are under way. The moves of the lowest become the first iterations. ``further``: the number of the round of
+    descents after these, that look for another minimum, from 1.
     """
 
     rounds: int
     costs: tuple[float, ...]
     active: int
+    further: int = 0
 
 
-Record = IterationRecord | StartRecord | ChainRecord
+@dataclass(frozen=True)
+class Descents:
+    """Where all descents of one data set ended.
+
+    ``members`` (D,) of the prior ensemble from which they started, -1 for its mean; ``minimum`` (D,) the number of the
+    minimum of J in which each ended, 0 is the lowest and -1 none, since the model failed; ``costs`` of the minima;
+    ``spread``, by how much J of those in the lowest differs; forward ``runs`` of the search after the first descents.
+    """
+
+    members: tuple[int, ...]
+    minimum: tuple[int, ...]
+    costs: tuple[float, ...]
+    spread: float
+    runs: int
+
+    @property
+    def agreeing(self) -> int:
+        """How many ended in the lowest minimum."""
+        return sum(number == 0 for number in self.minimum)
+
+    @property
+    def words(self) -> str:
+        """In one sentence."""
+        of = {n: [i for i, m in zip(self.members, self.minimum, strict=True) if m == n] for n in set(self.minimum)}
+        parts = [f"J {self.costs[0]:.6g} by {_members(of.get(0, []))}"]
+        if len(of.get(0, [])) > 1:
+            parts[0] += f" (within {self.spread:.2g})"
+        parts += [f"{self.costs[n]:.6g} by {_members(of[n])}" for n in sorted(of) if n > 0]
+        if -1 in of:
+            parts.append(f"no minimum by {_members(of[-1])}")
+        return f"{len(self.members)} descent{'s' * (len(self.members) > 1)} ended at {', '.join(parts)}"
+
+
+def _members(numbers: Sequence[int]) -> str:
+    """Where descents started."""
+    known = [str(i) for i in numbers if i >= 0]
+    names = [f"member{'s' * (len(known) > 1)} {' '.join(known)}"] if known else []
+    return " and ".join([*names, *(["the prior mean"] if -1 in numbers else [])])
+
+
+Record = IterationRecord | StartRecord | Descents | ChainRecord
 Progress = Callable[[str, Record], None]  # what hears of them, with the name of the data set
 
 
@@ -137,6 +179,7 @@ class Analysis:
     what_if: tuple[Shift, ...] = ()  # under the model's alternatives; the largest first
     influence: Influence | None = None  # of each reading; None where it cannot be told
     modes: tuple[Mode, ...] = ()  # minima of J that count, the lowest first; () of a scheme that does not search
+    descents: Descents | None = None  # where all of them ended; None of a scheme that does not search
     ledger: Ledger | None = None  # what the path went through where it informed the parameters
 
     @property

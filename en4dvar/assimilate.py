@@ -6,15 +6,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from en4dvar import diagnostics as diag
-from en4dvar.analysis import Analysis, Discrepancy, Mode, Progress, Record
-from en4dvar.caution import Caution
+from en4dvar.analysis import Analysis, Descents, Discrepancy, Mode, Progress, Record
+from en4dvar.caution import Caution, caution
 from en4dvar.descent.loop import iterate
 from en4dvar.descent.marginal import marginal_members
 from en4dvar.descent.minima import Minimum, merged
 from en4dvar.descent.noise_scale import mean_beyond_mode
-from en4dvar.descent.start import AGREE, StartState, affordable, challenger, choose_start, search_on
+from en4dvar.descent.search import Found, Search, SearchState
+from en4dvar.descent.start import StartState, choose_start
 from en4dvar.descent.variance import shares_of_variance
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
@@ -40,7 +42,6 @@ from en4dvar.state import Array
 __all__ = ["assimilate", "cost", "forecast", "log_posterior"]
 
 GRID_POINTS = 200  # M, of the plotting grid
-SAME_COST = 0.01  # of J, by which a descent must end lower to be another one
 
 
 @dataclass(frozen=True)
@@ -66,15 +67,17 @@ class LoopState:
     """All that the rest of an assimilation depends on, besides the problem, the settings and the seed.
 
     ``comparison`` is there until the start is chosen; ``descent``, the other ``minima`` that descents ended in and from
-    how many members (``compared``) from then on, ``refinement`` once the Markov chain is under way.
+    which members these started (``tried``) from then on; ``search`` while further descents look for another minimum,
+    ``refinement`` once the Markov chain is under way.
     """
 
     forward_runs: int
     comparison: StartState | None = None
     descent: Descent | None = None
     minima: tuple[Minimum, ...] = ()
-    compared: int = 1
+    tried: tuple[int, ...] = ()
     warnings: tuple[Caution, ...] = ()
+    search: SearchState | None = None
     refinement: Refinement | None = None
 
     @property
@@ -142,15 +145,16 @@ class _Assimilation:
                 "discrepancy; use en4dvar"
             )
         self.space = WeightSpace(problem, settings, seed, executor)
-        self.grid = np.linspace(problem.observations.times[0], problem.observations.times[-1], GRID_POINTS)
+        self.grid = np.linspace(*problem.observations.span, GRID_POINTS)
 
     def run(self, resume: LoopState | None) -> Analysis:
         problem, space, noise = self.problem, self.space, self.problem.observations.noise
         prior_run, start, descent = self.descend(resume)
 
-        descent, minima, gaussian = self.searched(start, descent, prior_run)
-        counting = that_count(minima, problem.prior)
-        agree = start.compared < 2 or minima[0].descents >= AGREE
+        found, gaussian = self.searched(start, descent, prior_run)
+        descent, counting = found.descent, that_count(found.minima, problem.prior)
+        agree = len(found.tried) < 2 or found.agreed
+        descents = self.descents(found)
         ends, sampled, shape = self.sampled(gaussian, counting, agree, start.refinement)
         posterior, mode, after, last = ends.members, ends.mode, ends.run, ends.central
         space.require_members(after.failures, "posterior forecast")
@@ -196,15 +200,18 @@ class _Assimilation:
             residuals=self.residuals(descent),
             discrepancy=self.discrepancy(descent, last.predicted[0]),
             influence=self.influence(after, posterior, response, gaussian=sampled is None),
+            descents=descents,
             what_if=shifts,
             ledger=path,
         )
         control = ControlEnsembles(space.members, posterior, mode, costs, centre_cost)
-        found = (*start.warnings, *(sampled.warnings if sampled else ()))
+        cautions = (*start.warnings, *(sampled.warnings if sampled else ()))
+        if len(found.tried) == 1:
+            cautions = (*cautions, caution("one-descent", "one descent only: another minimum is not excluded"))
         if counting:
             weights = np.array([mode.weight for mode in analysis.modes])
-            found = (*found, *mode_cautions(prior, counting, weights, agree, sampled))
-        return replace(analysis, cautions=examine(analysis, control, descent.worst_loss, found))
+            cautions = (*cautions, *mode_cautions(prior, counting, weights, agree, sampled))
+        return replace(analysis, cautions=examine(analysis, control, descent.worst_loss, cautions))
 
     def descend(self, resume: LoopState | None = None) -> tuple[Forecast, LoopState, Descent]:
         """The prior forecast, where the iterations started, and their end."""
@@ -247,9 +254,31 @@ class _Assimilation:
         if linear is None:
             return None
         at = linear.prediction
-        rates = np.gradient(at.values, observations.times) if at.rates is None else at.rates
+        speed = np.abs(self.rates(at))
         white, sensitivity = observations.whiten(linear)
-        return Residuals.of(white, sensitivity, len(self.space.members) - 1, np.abs(rates), observations.used)
+        if observations.parts:
+            speed = speed / observations.std
+        precision = len(self.space.members) - 1
+        return Residuals.of(white, sensitivity, precision, speed, observations.used, self.in_a_row())
+
+    def in_a_row(self) -> npt.NDArray[np.intp]:
+        """(K,) a label for each series; for each reading, where it has several places."""
+        labels = np.arange(len(self.problem.observations))
+        for part in self.problem.parts:
+            if part.has_path:
+                labels[part.where] = part.begin
+        return labels
+
+    def rates(self, at: Predicted) -> Array:
+        """How fast each observable changes at its readings (K,), by differences where the model does not say; zero of
+        a series with several places, or fewer than two readings."""
+        if at.rates is not None:
+            return at.rates
+        rates = np.zeros_like(at.values)
+        for part in self.problem.parts:
+            if part.has_path and part.end - part.begin > 1:
+                rates[part.where] = np.gradient(at.values[part.where], self.problem.observations.times[part.where])
+        return rates
 
     def influence(self, run: Forecast, members: Array, response: LinearResponse, gaussian: bool) -> Influence | None:
         """Of each reading on the posterior ``members`` (N, n), whose ``run`` it is; None where it cannot be told.
@@ -291,7 +320,7 @@ class _Assimilation:
         begun = choose_start(space, self.scheme, prior_run, self.seed, before, keep, self.tell)
         for record in begun.descent.records:
             self.tell(record)
-        return LoopState(space.forward_runs, None, begun.descent, begun.minima, begun.compared, begun.warnings)
+        return LoopState(space.forward_runs, None, begun.descent, begun.minima, begun.tried, begun.warnings)
 
     def iterate(self, state: LoopState, prior_run: Forecast) -> Descent:
         """The end of the iterations."""
@@ -323,52 +352,71 @@ class _Assimilation:
         final = space.forecast(np.vstack([members, mode]), self.grid)
         return Ends(members, mode, final[:-1], final[-1:])
 
-    def minima(self, start: LoopState, end: Descent) -> tuple[Minimum, ...]:
-        """Those that descents ended in, the lowest first; none of a scheme that does not search."""
-        return merged([self.minimum(end), *start.minima]) if self.scheme.searches else ()
+    def searched(self, start: LoopState, descent: Descent, prior_run: Forecast) -> tuple[Found, Ends]:
+        """All minima, the lowest descent, and the ensemble about it.
 
-    def minimum(self, end: Descent) -> Minimum:
-        """Where a descent has converged."""
-        return Minimum.at(self.space, end.weights.w, end.newton.hessian, end.cost, end.joined)
-
-    def searched(
-        self, start: LoopState, descent: Descent, prior_run: Forecast
-    ) -> tuple[Descent, tuple[Minimum, ...], Ends]:
-        """The lowest descent, all minima, and the ensemble about the lowest.
-
-        Of a cheap model, or for a chain, a descent from a member far from the minimum looks for another; where there is
-        one, or where J of the posterior members is not that of a Gaussian, further members are tried.
+        After the first descents one from a member far from the minimum looks for another. Of a cheap model, or for a
+        chain, many are tried where there is one or where J of the posterior members is not that of a Gaussian; else
+        some, where the lowest minimum is that of one descent alone.
         """
-        space, minima, scheme = self.space, self.minima(start, descent), self.scheme
-        further = self.settings.refine == "mcmc" or samples(space)
-        if not isinstance(scheme, En4DVar) or start.compared < 2 or not further:
-            return descent, minima, self.gaussian(descent)
-        far = challenger(space, prior_run, minima[0])
-        lowest, minima = self.search_on(scheme, descent, minima, [far])
-        found = self.gaussian(lowest)
-        fit = diag.gaussianity(found.members, found.mode, self.costs(found.members, found.run))["gaussian_fit"]
-        rest = [i for i in affordable(space, scheme, prior_run)[start.compared :] if i != far]
-        if rest and (len(minima) > 1 or not fit >= CLEARED):
-            lower, minima = self.search_on(scheme, lowest, minima, rest)
-            found = found if lower is lowest else self.gaussian(lower)
-            lowest = lower
-        return lowest, minima, found
+        space, scheme, before = self.space, self.scheme, self.latest.descent
+        assert before is not None
+        if not isinstance(scheme, En4DVar):
+            return Found(descent, before, (), ()), self.gaussian(descent)
+        begun, minima = start.search or SearchState(), start.minima
+        if start.search is None:
+            minima = merged([Minimum.of(space, descent), *minima])
+        found = Found(descent, before, minima, start.tried, begun.runs)
+        if self.settings.starts < 2 or not scheme.economical(space.basis):
+            return found, self.gaussian(descent)
+        if start.search is not None:
+            space.forward_runs = start.forward_runs
+        search = Search(space, scheme, prior_run, self.seed, begun, self.keep_search, self.tell)
+        found = search.challenged(found)
+        if not (self.settings.refine == "mcmc" or samples(space)):
+            found = search.settled(found)
+            return found, self.gaussian(found.descent)
+        ends = self.gaussian(found.descent)
+        if begun.over > 1 and not begun.lower:
+            space.forward_runs = start.forward_runs  # they were counted before the second round
+        fit = diag.gaussianity(ends.members, ends.mode, self.costs(ends.members, ends.run))["gaussian_fit"]
+        rest = search.rest(found)
+        if rest and (len(found.minima) > 1 or not fit >= CLEARED):
+            earlier, found = found, search.round(found, rest)
+            ends = ends if found.descent is earlier.descent else self.gaussian(found.descent)
+        return found, ends
 
-    def search_on(
-        self, scheme: En4DVar, descent: Descent, minima: tuple[Minimum, ...], members: Sequence[int]
-    ) -> tuple[Descent, tuple[Minimum, ...]]:
-        """The lowest descent, converged, and all minima, with descents from further members."""
-        other, found = search_on(self.space, scheme, members, self.seed, minima, self.tell)
-        minima = merged([*minima, *found])
-        if descent.cost <= other.cost:
-            return descent, minima
-        try:
-            iterate(DataWindow(self.space, self.seed, lambda: None, self.tell), scheme, [other])
-        except TooFewMembersError:  # the model does not run about it
-            return descent, minima
-        if other.cost > descent.cost - SAME_COST:
-            return descent, minima
-        return other, merged([self.minimum(other), *minima])
+    def keep_search(self, state: Callable[[], tuple[Found, SearchState]]) -> None:
+        runs = self.space.forward_runs
+
+        def kept() -> LoopState:
+            found, search = state()
+            return replace(
+                self.latest,
+                forward_runs=runs,
+                descent=found.before,
+                minima=found.minima,
+                tried=found.tried,
+                search=search,
+            )
+
+        self.latest = kept()
+        self.keep(lambda: self.latest)
+
+    def descents(self, found: Found) -> Descents | None:
+        """Where they ended, which is told."""
+        if not found.minima:
+            return None
+        ended = {member: number for number, minimum in enumerate(found.minima) for member in minimum.members}
+        descents = Descents(
+            members=tuple(i if i < len(self.space.members) else -1 for i in found.tried),
+            minimum=tuple(ended.get(i, -1) for i in found.tried),
+            costs=tuple(minimum.cost for minimum in found.minima),
+            spread=found.minima[0].spread,
+            runs=found.runs,
+        )
+        self.tell(descents)
+        return descents
 
     def modes(self, minima: Sequence[Minimum], sampled: Refined | None) -> tuple[Mode, ...]:
         """The minima that count, with their weights; by Laplace where the posterior was not sampled."""

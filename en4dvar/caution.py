@@ -54,9 +54,19 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
         "caution",
         "look at the figure of the residuals and at these readings before quoting the intervals",
     ),
+    "not-bayesian": (
+        "caution",
+        "say in every quotation how readings were weighted; for the Bayesian posterior state the errors as they are "
+        "and leave the weights out (assimilation.weights: sum)",
+    ),
     "overstated-error": ("caution", "state the observation error as it is (or estimate sigma); intervals are too wide"),
     "not-informed": ("note", "do not quote it as measured: fix it, or add data that depend on it"),
     "down-weighted": ("note", "look at these observations; they count less than the others"),
+    "one-descent": (
+        "note",
+        "set assimilation.starts: 2 or more, with linearisation: bundle and more members than parameters; or compare "
+        "with another seed",
+    ),
     "start-moved": ("note", "no action is needed where the iterations converged"),
 }
 SPOILS = {"non-gaussian", "at-bound"}  # mean ± std, though they are not serious; what is serious does in any case
@@ -136,6 +146,14 @@ def gravity(cautions: Sequence[Caution]) -> float:
 def codes(cautions: Iterable[Caution]) -> tuple[str, ...]:
     """The codes, each once."""
     return tuple(dict.fromkeys(c.code for c in cautions))
+
+
+def of_several_modes(cautions: Iterable[Caution], parameter: str) -> bool:
+    """Whether members of a parameter are drawn from modes apart: mean ± std describe none, quantiles all of them.
+
+    Where members were drawn from one mode alone the warning is serious, and nothing of them is to be quoted.
+    """
+    return any(c.code == "several-modes" and not c.spoils and parameter in c.parameters for c in cautions)
 
 
 def untrusted(cautions: Iterable[Caution], parameter: str) -> tuple[str, ...]:

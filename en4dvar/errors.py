@@ -39,9 +39,16 @@ class ConfigError(En4dvarError):
 
 
 class DataError(En4dvarError):
-    """A data file cannot be used."""
+    """A data file cannot be used; ``series`` is the name of the one it holds, where the data are several."""
 
     exit_code = 2
+
+    def __init__(self, message: str, series: str = ""):
+        self.series = series
+        super().__init__(message)
+
+    def __reduce__(self) -> tuple[type[DataError], tuple[str, str]]:
+        return type(self), (str(self), self.series)
 
 
 class OutputError(En4dvarError):

@@ -1,4 +1,4 @@
-"""Observations (y, t, R) of one data set.
+"""Observations (y, t, R) of one data set: of one observable in time, or of several series, one after the other.
 
 The error of observation k is ``s_k² = std_k² + (ẏ_k · time_std_k)²``: a measured value and, where given, the instant
 it was measured at. With ``time_std`` the variance depends on the state through the rate ẏ, so the normalisation
@@ -7,18 +7,23 @@ it was measured at. With ``time_std`` the variance depends on the state through 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
 from en4dvar.caution import Caution
 from en4dvar.errors import DataError
-from en4dvar.noise import Linearisation, Noise, Predicted
+from en4dvar.noise import Linearisation, Noise, Predicted, joint_noise
 from en4dvar.prior import LARGEST
+from en4dvar.series import Part, Series
 from en4dvar.state import Array
+
+SEVERAL = ", "  # between the names of several sources
+SAME_TIME = 1e-9  # of the whole duration: times of different series that are this close are the same instant
 
 
 @dataclass(frozen=True)
@@ -27,13 +32,16 @@ class Observations:
 
     Attributes
     ----------
-    times: (K,) strictly increasing, in the model's time unit (seconds for the bubble), from the model's time zero.
+    times: (K,) in the model's time unit (seconds for the bubble), from the model's time zero; strictly increasing
+        within a series, of a field not decreasing.
     values: (K,) finite, in the observable's unit.
     noise: the observation errors (:func:`en4dvar.noise.noise_of` makes them of std, timing error and correlation).
     weights: (K,) β_k ≥ 0; 1 counts an observation fully (``weights: sum``), 1/K is ``weights: mean``.
     name: of the data set. source: where it was read from (for the record).
     scalars: further numbers found beside the series (e.g. an equilibrium radius), as read, no units applied.
     doubts: what makes the times of the file implausible.
+    parts: which readings belong to which series, see :meth:`of_series`; () where all are of one observable, which has
+        one value at a time.
 
     Raises
     ------
@@ -48,6 +56,58 @@ class Observations:
     source: str = ""
     scalars: Mapping[str, float] = field(default_factory=dict)
     doubts: tuple[Caution, ...] = ()
+    parts: tuple[Part, ...] = ()
+
+    @classmethod
+    def of_series(
+        cls,
+        series: Sequence[Series],
+        correlation: Mapping[tuple[str, str], float] | None = None,
+        name: str = "data",
+    ) -> Self:
+        """Several series as one data set, their readings one series after the other.
+
+        Parameters
+        ----------
+        correlation: of the errors of two series at equal times, by their names, in either order; see
+            :func:`en4dvar.noise.joint_noise`.
+
+        Raises
+        ------
+        DataError: names that are not unique, or that ``correlation`` mentions and no series has; errors that cannot be
+            joined; what is wrong with the observations.
+        """
+        names = [one.name for one in series]
+        if len(set(names)) < len(names):
+            raise DataError(f"{name}: two series have the same name; the names are {', '.join(names)}")
+        between = np.eye(len(series))
+        for (a, b), value in (correlation or {}).items():
+            if a == b or not {a, b} <= set(names):
+                raise DataError(f"{name}: a correlation of {a!r} and {b!r}; it is of two of: {', '.join(names)}")
+            i, j = names.index(a), names.index(b)
+            between[i, j] = between[j, i] = value
+        times = [one.times for one in series]
+        times = _same_instants(times) if len(times) > 1 else times
+        try:
+            noise = joint_noise(times, [one.noise for one in series], between) if len(series) > 1 else series[0].noise
+        except ValueError as error:
+            raise DataError(f"{name}: {error}") from None
+        ends = np.cumsum([len(t) for t in times]).tolist()
+        parts = tuple(
+            Part(one.name, one.observable, end - len(one.times), end, one.places, one.group)
+            for one, end in zip(series, ends, strict=True)
+        )
+        return cls(
+            times=np.concatenate(times),
+            values=np.concatenate([one.values for one in series]),
+            noise=noise,
+            weights=np.concatenate([np.asarray(one.weights) for one in series]),
+            name=name,
+            source=SEVERAL.join(dict.fromkeys(one.source for one in series if one.source)),
+            scalars={key: value for one in series for key, value in one.scalars.items()},
+            doubts=tuple(doubt for one in series for doubt in one.doubts),
+            parts=() if len(series) == 1 and series[0].places is None else parts,
+        )
 
     def __post_init__(self) -> None:
         where, k = self.source or self.name, len(self.times)
@@ -61,9 +121,7 @@ class Observations:
         largest = float(np.max(np.abs([self.times, self.values])))
         if not largest < LARGEST:
             raise DataError(f"{where}: {largest:g} among the observations; is the unit right? (less than {LARGEST:g})")
-        if not np.all(np.diff(self.times) > 0):
-            at = int(np.flatnonzero(np.diff(self.times) <= 0)[0])
-            raise DataError(f"{where}: times must increase; {self.times[at]:g} is followed by {self.times[at + 1]:g}")
+        self._check_order(where)
         if not np.all(self.weights >= 0):
             raise DataError(f"{where}: weights must not be negative")
         try:
@@ -76,6 +134,29 @@ class Observations:
                 f"{where}: an error std of {smallest if std < LARGEST else std:g} beside observations up to "
                 f"{largest:g}: their ratio is too large; is the unit right?"
             )
+
+    def _check_order(self, where: str) -> None:
+        """Raise :class:`DataError` where the times of a series do not increase."""
+        for begin, end, field_ in [(p.begin, p.end, p.places) for p in self.parts] or [(0, len(self), None)]:
+            step = np.diff(self.times[begin:end])
+            wrong = np.flatnonzero(step <= 0 if field_ is None else step < 0)
+            if len(wrong):
+                a, b = self.times[begin:end][wrong[0] : wrong[0] + 2]
+                raise DataError(f"{where}: times must increase; {a:g} is followed by {b:g}")
+
+    @cached_property
+    def instants(self) -> tuple[Array, npt.NDArray[np.intp] | slice]:
+        """The times (T,), each once and increasing, and where among them each reading (K,) was taken."""
+        if not self.parts:
+            return self.times, slice(None)
+        times, rows = np.unique(self.times, return_inverse=True)
+        return times, rows
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last time."""
+        times, _ = self.instants
+        return float(times[0]), float(times[-1])
 
     @property
     def std(self) -> Array:
@@ -121,3 +202,11 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.times)
+
+
+def _same_instants(times: Sequence[Array]) -> list[Array]:
+    """The times of each series; those that differ by rounding alone are made equal to the earliest of them."""
+    every = np.unique(np.concatenate(times))
+    begins = np.diff(every, prepend=-np.inf) > SAME_TIME * float(np.ptp(every))
+    earliest = every[begins][np.cumsum(begins) - 1]
+    return [earliest[np.searchsorted(every, own)] for own in times]

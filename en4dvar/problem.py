@@ -11,6 +11,7 @@ from annotated_types import Ge, Gt, Le, MinLen
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior
+from en4dvar.series import Part
 from en4dvar.state import DISCREPANCY, NOISE_SCALE, Parameter
 from en4dvar.varying import PiecewiseModel, RandomWalk, Varying
 
@@ -37,6 +38,8 @@ class InverseProblem:
     the model has no parameter of that name. ``discrepancy_amplitude`` and ``discrepancy_length`` are those of the
     discrepancy that the observations allow for. ``perturbations`` act on the initial state. ``fixed`` are physical SI
     values of the other parameters.
+
+    Where the observations have parts, these say what was observed, and ``observable`` is that of the first.
     """
 
     model: ForwardModel
@@ -45,6 +48,12 @@ class InverseProblem:
     prior: Prior
     fixed: Mapping[str, float] = field(default_factory=dict)
     perturbations: tuple[StatePerturbation, ...] = ()
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The series of the data set, one at least."""
+        whole = Part(self.observable.name, self.observable, 0, len(self.observations))
+        return self.observations.parts or (whole,)
 
     @property
     def has_noise_scale(self) -> bool:

@@ -29,18 +29,26 @@ FREQUENCIES = np.expm1(np.linspace(np.log1p(1e-4), np.log1p(400.0), 700))
 @dataclass(frozen=True)
 class Residuals:
     """Of the K readings that count: whitened residuals ``white`` e (K,), what the fit ``absorbed`` of their noise,
-    L (K, r) with I − Q = L Lᵀ, and the ``speed`` |ṁ| (K,) of the observable there. ``which`` (K,) are their places in
-    the data.
+    L (K, r) with I − Q = L Lᵀ, and the ``speed`` |ṁ| (K,) of the observable there, of several series in units of their
+    errors. ``which`` (K,) are their places in the data; ``series`` (K,) labels those among which neighbours follow each
+    other in time.
     """
 
     white: Array
     absorbed: Array
     speed: Array
     which: npt.NDArray[np.intp]
+    series: npt.NDArray[np.intp]
 
     @classmethod
     def of(
-        cls, white: Array, sensitivity: Array, prior_precision: float, speed: Array, which: npt.NDArray[np.intp]
+        cls,
+        white: Array,
+        sensitivity: Array,
+        prior_precision: float,
+        speed: Array,
+        which: npt.NDArray[np.intp],
+        series: npt.NDArray[np.intp] | None = None,
     ) -> Residuals:
         """From whitened sensitivities S (K, r), all rows of which take part in A, and N − 1.
 
@@ -49,7 +57,8 @@ class Residuals:
         k = len(speed)
         hessian = prior_precision * np.eye(sensitivity.shape[1]) + sensitivity.T @ sensitivity
         absorbed = np.linalg.solve(np.linalg.cholesky(hessian), sensitivity[:k].T).T
-        return cls(white[:k][which], absorbed[which], speed[which], which)
+        labels = np.zeros(k, dtype=np.intp) if series is None else series
+        return cls(white[:k][which], absorbed[which], speed[which], which, labels[which])
 
     @cached_property
     def leverage(self) -> Array:
@@ -72,26 +81,37 @@ class Residuals:
         return FEWEST <= len(self.white) <= MOST and bool(np.all(np.isfinite(self.white)) and np.any(self.white))
 
     @cached_property
+    def follows(self) -> npt.NDArray[np.bool_]:
+        """(K − 1,) whether a reading follows the one before it in the same series."""
+        return np.asarray(self.series[1:] == self.series[:-1])
+
+    @cached_property
     def lag_one(self) -> float:
         """Autocorrelation of neighbours, Σ e_k e_{k+1}/Σ e²."""
-        return float(self.white[1:] @ self.white[:-1] / (self.white @ self.white))
+        return float((self.white[1:] * self.follows) @ self.white[:-1] / (self.white @ self.white))
 
     @cached_property
     def lag_one_chance(self) -> float:
-        """Probability of so high an autocorrelation where the model is right."""
-        k = len(self.white)
-        return self._chance(0.5 * (np.eye(k, k=1) + np.eye(k, k=-1)))
+        """Probability of so high an autocorrelation where the model is right; 1 where no reading follows another."""
+        if not self.follows.any():
+            return 1.0
+        neighbours = np.diag(self.follows.astype(float), k=1)
+        return self._chance(0.5 * (neighbours + neighbours.T))
 
     @cached_property
     def runs(self) -> tuple[int, float]:
         """Runs of one sign, and how many are expected of independent residuals."""
         positive = self.white > 0
         n, above = len(positive), int(positive.sum())
-        return 1 + int(np.sum(positive[1:] != positive[:-1])), 1 + 2 * above * (n - above) / n
+        changes, share = (positive[1:] != positive[:-1]) & self.follows, float(self.follows.mean())
+        return 1 + int(np.sum(changes)), 1 + 2 * above * (n - above) / n * share
 
     @cached_property
     def runs_chance(self) -> float:
-        """Probability of so few runs, by the normal approximation (Wald & Wolfowitz 1940, Ann. Math. Stat. 11, 147)."""
+        """Probability of so few runs, by the normal approximation (Wald & Wolfowitz 1940, Ann. Math. Stat. 11, 147);
+        1 where no reading follows another."""
+        if not self.follows.any():
+            return 1.0
         found, expected = self.runs
         n = len(self.white)
         variance = (expected - 1) * (expected - 2) / (n - 1)

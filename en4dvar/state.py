@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
@@ -93,12 +93,17 @@ DISCREPANCY = (
 
 @dataclass(frozen=True)
 class Field:
-    """A named block of a state vector; a perturbed initial state must lie strictly inside its ``bounds``."""
+    """A named block of a state vector; a perturbed initial state must lie strictly inside its ``bounds``.
+
+    ``coordinates`` (size,) in ``coordinate_unit`` say where its components are, so that data may say it as well.
+    """
 
     name: str
     size: int = 1
     unit: str = "1"
     bounds: tuple[float, float] = (-np.inf, np.inf)
+    coordinates: Array | None = field(default=None, compare=False)
+    coordinate_unit: str = "1"
 
 
 @dataclass(frozen=True)

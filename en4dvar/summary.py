@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.analysis import Analysis
-from en4dvar.caution import Caution, codes, untrusted
+from en4dvar.caution import Caution, codes, of_several_modes, untrusted
 from en4dvar.diagnostics import HARDLY_INFORMED, active_members, change_words
 from en4dvar.response.what_if import Shift
 from en4dvar.state import Array, Parameter
@@ -20,6 +20,7 @@ from en4dvar.units import convert
 MOST_REMARKS = 3
 INTERVAL = ("std", "q05", "q50", "q95", "dfs")  # what is not printed where it is not to be trusted
 LITTLE = "data say little"
+MODAL = "of several modes: quantiles, no mean ± std"
 DFS_WORDS = (
     (HARDLY_INFORMED, "not narrowed by the data"),
     (0.5, "weakly informed"),
@@ -33,7 +34,8 @@ class ParameterSummary:
     """One row of the summary table; all values in ``unit``, the display unit.
 
     ``informed`` says what the data told of it; ``untrusted`` are the codes of the warnings for which its interval is
-    not to be quoted (:func:`en4dvar.caution.untrusted`), worst first.
+    not to be quoted (:func:`en4dvar.caution.untrusted`), worst first. ``modal``: the members come from several modes,
+    so that the quantiles are quoted and mean and std are not.
     """
 
     name: str
@@ -51,6 +53,12 @@ class ParameterSummary:
     dfs: float
     informed: str = ""
     untrusted: tuple[str, ...] = ()
+    modal: bool = False
+
+    @property
+    def middle(self) -> float:
+        """The mean; of several modes the median."""
+        return self.q50 if self.modal else self.mean
 
     @classmethod
     def of(
@@ -62,8 +70,9 @@ class ParameterSummary:
         q05, q50, q95 = map(float, np.quantile(posterior, (0.05, 0.5, 0.95)) if posterior.size else (np.nan,) * 3)
         centre = convert(centre, p.unit, p.display_unit)
         words, doubted = informed_words(p.name, dfs, cautions), untrusted(cautions, p.name)
+        modal = not doubted and of_several_modes(cautions, p.name)
         numbers = (prior_mean, prior_std, mean, std, q05, q50, q95, centre, dfs)
-        return cls(p.name, p.label, p.symbol, p.display_unit, *numbers, words, doubted)
+        return cls(p.name, p.label, p.symbol, p.display_unit, *numbers, MODAL if modal else words, doubted, modal)
 
 
 def informed_words(name: str, dfs: float, cautions: Sequence[Caution]) -> str:
@@ -142,9 +151,13 @@ def results_table(summaries: Mapping[str, Iterable[ParameterSummary]]) -> str:
 
 
 def estimate_cells(row: ParameterSummary) -> tuple[str, ...]:
-    """Mean, std, 5, 50 and 95 % for a terminal; a mean of three digits alone where no interval is to be trusted."""
+    """Mean, std, 5, 50 and 95 % for a terminal; a mean of three digits alone where no interval is to be trusted, and
+    the quantiles alone of several modes.
+    """
     if row.untrusted:
         return (f"{row.mean:.3g}", "-", "-", "-", "-")
+    if row.modal:
+        return ("-", "-", *(f"{v:.4g}" for v in (row.q05, row.q50, row.q95)))
     return tuple(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q50, row.q95))
 
 
@@ -155,7 +168,8 @@ def summary_csv(
 
     ``summaries``: (name of the data set, its rows, its warnings: column ``warnings`` holds their codes);
     ``failures``: name of the data set → reason, column ``failure``. An interval that is not to be trusted is left out,
-    and column ``untrusted`` says for which warnings.
+    and column ``untrusted`` says for which warnings; so are mean and standard deviation of several modes, which
+    ``informed`` says.
     """
     lines: list[list[object]] = [["dataset", *CSV_COLUMNS, "failure", "warnings"]]
     for name, summary, cautions in summaries:
@@ -165,12 +179,12 @@ def summary_csv(
     return csv_text(lines)
 
 
-CSV_COLUMNS = tuple(f.name for f in fields(ParameterSummary) if f.name not in ("label", "symbol"))
+CSV_COLUMNS = tuple(f.name for f in fields(ParameterSummary) if f.name not in ("label", "symbol", "modal"))
 
 
 def csv_cells(row: ParameterSummary) -> list[object]:
     """The row in the order of :data:`CSV_COLUMNS`."""
-    hidden = INTERVAL if row.untrusted else ()
+    hidden = INTERVAL if row.untrusted else ("mean", "std") if row.modal else ()
     cells = {name: "" if name in hidden else getattr(row, name) for name in CSV_COLUMNS}
     return list((cells | {"untrusted": " ".join(row.untrusted)}).values())
 

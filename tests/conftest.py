@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from en4dvar import report
-from en4dvar.analysis import Analysis, IterationRecord, Mode
+from en4dvar.analysis import Analysis, Descents, IterationRecord, Mode
 from en4dvar.caution import caution
 from en4dvar.forward import ForwardModel, Observable, StateField
 from en4dvar.noise import noise_of
@@ -119,6 +119,7 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
         stop_reason="step norm below 1e-3",
         forward_runs=6 * n_members,
         modes=(Mode(truth, 23.0, 3, 0.02, 0.8), Mode(MEAN, 25.1, 2, 0.0, 0.2)),
+        descents=Descents((4, 17, 9, -1, 30), (0, 0, 0, 1, 1), (23.0, 25.1), 0.02, 20),
         cautions=(caution("members-lost", "1 of 24 members failed in the posterior forecast: collapse too violent"),),
     )
     return replace(analysis, **changes)

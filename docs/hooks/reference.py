@@ -116,8 +116,8 @@ def _takes(node: Json, definitions: Json) -> str:
         return ", ".join(f"`{_text(value)}`" for value in node["enum"])
     if "x-unit" in node:
         return f"quantity, {node['x-unit']}" if node["x-unit"] != "1" else "number"
-    if "anyOf" in node:
-        kinds = [_takes(option, definitions) for option in node["anyOf"] if option.get("type") != "null"]
+    if either := node.get("anyOf") or node.get("oneOf"):
+        kinds = [_takes(option, definitions) for option in either if option.get("type") != "null"]
         kinds = list(dict.fromkeys(kind for kind in kinds if kind))
         return "quantity" if set(kinds) == {"text", "integer", "number"} else " or ".join(kinds)
     if "allOf" in node:

@@ -9,19 +9,23 @@ import numpy as np
 from en4dvar.config import Config
 from en4dvar.descent.preview import Preview
 from en4dvar.problem import InverseProblem
+from en4dvar.sampling.refine import may_sample
+from en4dvar.series import Part
 from en4dvar.state import Parameter
 from en4dvar.tables import table
 from en4dvar.units import convert
+
+SAMPLED = 5000  # forward runs of a posterior that is sampled, typically
 
 
 def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
     """What ``validate`` prints: data sets, priors (centre and 5–95 %), fixed values, scheme."""
     first = problems[0]
-    settings = config.assimilation
+    settings, rows = config.assimilation, [row for problem in problems for row in _data_rows(problem)]
     parts = [
         f"{config.name}: {len(first.prior.names)} parameters from {len(problems)} data set(s) with "
         f"{settings.scheme}, {settings.members} members, weights {config.weights}, seed {config.seed}",
-        table([("data set", "observations", "window", "maximum", "error std"), *(_data_row(p) for p in problems)]),
+        table([("data set", "observations", "window", "maximum", "error std"), *rows]),
     ]
     for problem in problems if any(e.needs_data for e in config.parameters) else problems[:1]:
         title = f"estimated ({problem.observations.name})" if len(problems) > 1 else "estimated"
@@ -38,9 +42,11 @@ def cost_summary(config: Config, one: Preview, count: int) -> str:
     """What an estimate costs: forward runs of a data set and of all ``count``, and the time on one thread."""
     total = one.runs * count
     runs = f"about {one.runs} forward runs" + (f" a data set, {total} in all" if count > 1 else "")
-    chain = "; the Markov chain comes on top" if config.assimilation.refine == "mcmc" else ""
+    more = "; the Markov chain comes on top" if config.assimilation.refine == "mcmc" else ""
+    if may_sample(one.problem, config.assimilation):
+        more = f"; a posterior that leaves a doubt is sampled by some {SAMPLED} more, {_seconds(SAMPLED * one.seconds)}"
     took = f"{_seconds(one.seconds)} each: {_seconds(total * one.seconds)} on one thread"
-    return f"cost: {runs}, {took}, plus some seconds for files and report{chain}"
+    return f"cost: {runs}, {took}, plus some seconds for files and report{more}"
 
 
 def _seconds(value: float) -> str:
@@ -51,16 +57,23 @@ def _seconds(value: float) -> str:
     return f"{value / 3600:.2g} h"
 
 
-def _data_row(problem: InverseProblem) -> tuple[str, ...]:
-    y, model, observable = problem.observations, problem.model, problem.observable
-    start, end = (convert(float(t), model.time_unit, model.time_display_unit) for t in y.times[[0, -1]])
-    top, std = (convert(float(v), observable.unit, observable.display_unit) for v in (y.values.max(), np.median(y.std)))
-    timing = convert(float(np.median(y.noise.time_std)), model.time_unit, model.time_display_unit)
+def _data_rows(problem: InverseProblem) -> list[tuple[str, ...]]:
+    """One a series."""
+    name, parts = problem.observations.name, problem.parts
+    return [_series_row(problem, part, name if len(parts) == 1 else f"{name}: {part.name}") for part in parts]
+
+
+def _series_row(problem: InverseProblem, part: Part, name: str) -> tuple[str, ...]:
+    y, own, model, observable = problem.observations, part.where, problem.model, part.observable
+    start, end = (convert(float(t), model.time_unit, model.time_display_unit) for t in y.times[own][[0, -1]])
+    stated = y.values[own].max(), np.median(y.std[own])
+    top, std = (convert(float(v), observable.unit, observable.display_unit) for v in stated)
+    timing = convert(float(np.median(y.noise.time_std[own])), model.time_unit, model.time_display_unit)
     also = f", {timing:.3g} {model.time_display_unit} in time" if timing else ""
     also += y.noise.words
     unit = observable.display_unit
     window = f"{start:.4g} to {end:.4g} {model.time_display_unit}"
-    return y.name, str(len(y)), window, f"{top:.4g} {unit}", f"{std:.3g} {unit}{also}"
+    return name, str(part.end - part.begin), window, f"{top:.4g} {unit}", f"{std:.3g} {unit}{also}"
 
 
 def _prior_rows(problem: InverseProblem) -> list[tuple[str, ...]]:

@@ -18,6 +18,7 @@ from en4dvar.config.context import TEXT
 from en4dvar.config.load import Estimation
 from en4dvar.config.models import GROUP, find_model, settings_of
 from en4dvar.config.parameters import FromFile, PriorSection
+from en4dvar.config.series import SeriesData
 from en4dvar.config.synthetic import CampaignFile
 from en4dvar.config.twin import TwinFile
 from en4dvar.errors import En4dvarError
@@ -35,6 +36,7 @@ def json_schema() -> Json:
             "anyOf": [dict(TEXT), *(_of(kind.model_json_schema()) for kind in (PriorSection, FromFile))],
         },
     }
+    definitions["series"] = _partial(_of(SeriesData.model_json_schema()))  # the rest is said for all series
     models = list(_models(definitions))
     definitions["model"] = _model_section(models)
     for name, kind in (("estimation", Estimation), ("twin", TwinFile), ("campaign", CampaignFile)):
@@ -83,6 +85,15 @@ def _resolve(node: Any, inner: Json) -> Any:
         target = _resolve(inner[node["$ref"].rpartition("/")[2]], inner)
         return {**target, **{k: _resolve(v, inner) for k, v in node.items() if k != "$ref"}}
     return {k: _resolve(v, inner) for k, v in node.items() if k != "discriminator"}
+
+
+def _partial(node: Any) -> Any:
+    """The same with nothing required, at any depth."""
+    if isinstance(node, list):
+        return [_partial(item) for item in node]
+    if not isinstance(node, dict):
+        return node
+    return {k: _partial(v) for k, v in node.items() if k != "required" or not isinstance(v, list)}
 
 
 def _tidy(node: Any) -> Any:

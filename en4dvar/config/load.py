@@ -18,6 +18,7 @@ from en4dvar.config.initial_state import PERTURBED, Perturbed
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, entries
 from en4dvar.config.schema import Assimilation, Execution, File, Output, QuantityText, Section
+from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.validate import check
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
 from en4dvar.errors import ConfigError, Fault
@@ -64,7 +65,7 @@ class Simulate(Section):
 class Estimation(File):
     """What is estimated from which observations, and how."""
 
-    data: Data | None = None
+    data: DATA | None = None
     """Where the observations are, what they mean and how well they are known."""
     parameters: Annotated[tuple[Entry, ...], entries()]
     """For each parameter a prior (estimated), a quantity (fixed), or a scalar of the data file (fixed)."""
@@ -92,9 +93,9 @@ class Config:
     model: ForwardModel
     observable: Observable
     parameters: tuple[Entry, ...]
-    data: Data | None
+    data: Data | DataPlan | None
     assimilation: AssimilationSettings
-    weights: Literal["sum", "mean"]
+    weights: Literal["sum", "mean", "balanced"]
     execution: Execution
     report: bool
     directory: Path
@@ -136,7 +137,7 @@ def resolve(document: Document, base: Path) -> Config:
         name=file.name,
         seed=file.seed,
         model=read.model,
-        observable=read.context.observed or read.model.observables[0],
+        observable=_observable(file.data, read),
         parameters=file.parameters,
         data=file.data,
         assimilation=file.assimilation.settings,
@@ -149,6 +150,13 @@ def resolve(document: Document, base: Path) -> Config:
         initial_state=file.initial_state or (),
         model_error=file.model_error or (),
     )
+
+
+def _observable(data: Data | DataPlan | None, read: Read[Any]) -> Observable:
+    """What the data hold; of several series that of the first."""
+    if isinstance(data, DataPlan):
+        return data.series[0].observable
+    return read.context.observed or read.model.observables[0]
 
 
 S = TypeVar("S", bound=Section)

@@ -68,7 +68,7 @@ class Section(BaseModel):
         for key, (name, field) in keys.items():
             value = getattr(self, name)
             text = given[key] if key in given else field.get_default(call_default_factory=True)
-            if isinstance(value, Section):
+            if isinstance(value, Section) or hasattr(value, "as_written"):
                 written[key] = value.as_written(text if isinstance(text, dict) else {})
             elif text is not None:
                 written[key] = _plain(text)
@@ -166,8 +166,9 @@ class Assimilation(_Settings):
     scheme: OnAWindow = AssimilationSettings.scheme
     """en4dvar (iterative ensemble smoother), es-mda (multiple data assimilation), or the one analysis of a filter:
     etkf, denkf (deterministic), enkf-n (finite size)."""
-    weights: Literal["sum", "mean"] = "sum"
-    """sum: every observation counts (the Bayesian posterior); mean: β = 1/K, as in the published code."""
+    weights: Literal["sum", "mean", "balanced"] = "sum"
+    """sum: every observation counts (the Bayesian posterior); mean: β = 1/K, as in the published code; balanced: every
+    series, or group of series, counts as if it had as many readings as the others. The latter two are not Bayesian."""
 
     @property
     def settings(self) -> AssimilationSettings:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Self, TypeVar, get_args
@@ -81,20 +81,22 @@ class Faults:
         self._lines.append({"type": PydanticCustomError("fault", "{message}", context), "loc": where, "input": None})
 
     @contextmanager
-    def at(self, *place: str | int, schema: type[BaseModel] = BaseModel) -> Iterator[None]:
-        """Collects what is raised inside as faults below ``place``; ``schema`` is what was validated."""
+    def at(
+        self, *above: str | int, schema: type[BaseModel] = BaseModel, place: Callable[[Place], Place] | None = None
+    ) -> Iterator[None]:
+        """Collects what is raised inside as faults below ``above``, or at the ``place`` that is made of their own;
+        ``schema`` is what was validated."""
+        put = place or (lambda where: (*above, *where))
         try:
             yield
         except ValidationError as error:
             for finding in _tell(error, schema):
-                self._add(replace(finding, place=(*place, *finding.place)))
+                self._add(replace(finding, place=put(finding.place)))
         except ConfigError as error:
             for fault in error.problems:
-                self._add(
-                    _Finding((*place, fault.path) if fault.path else place, fault.message, absent=bool(fault.path))
-                )
+                self._add(_Finding(put((fault.path,) if fault.path else ()), fault.message, absent=bool(fault.path)))
         except ValueError as error:
-            self._add(_Finding(place, str(error)))
+            self._add(_Finding(put(()), str(error)))
 
     def __enter__(self) -> Self:
         return self

@@ -18,7 +18,7 @@ import numpy as np
 from en4dvar.batch import Batch
 from en4dvar.cycling.moments import Moments, MomentsRecorder
 from en4dvar.cycling.rotation import Rotations, rotate
-from en4dvar.cycling.series import Series
+from en4dvar.cycling.series import CycleSeries
 from en4dvar.descent.loop import iterate
 from en4dvar.ensemble.linalg import centre
 from en4dvar.ensemble.repeat import check_repeats
@@ -91,7 +91,7 @@ def run_sequential(
     model: ForwardModel,
     observables: Sequence[Observable],
     members: Array,
-    series: Series,
+    series: CycleSeries,
     settings: SequentialSettings,
     seed: int = 0,
     executor: Executor | None = None,
@@ -176,7 +176,7 @@ class _Run:
         model: ForwardModel,
         observables: tuple[Observable, ...],
         members: Array,
-        series: Series,
+        series: CycleSeries,
         settings: SequentialSettings,
         seed: int,
         executor: Executor,

@@ -11,7 +11,7 @@ from en4dvar.state import Array
 
 
 @dataclass(frozen=True)
-class Series:
+class CycleSeries:
     """Observations ``values`` (K, p) at increasing ``times`` (K,) > 0 with errors R_k = D_k C D_k, D_k = diag(std_k).
 
     ``std`` is (p,) or (K, p). ``correlation`` C (p, p), full or block diagonal, is that of the errors of one instant;

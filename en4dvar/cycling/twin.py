@@ -24,7 +24,7 @@ from en4dvar.cycling.sequential import (
     predictions,
     run_sequential,
 )
-from en4dvar.cycling.series import Series
+from en4dvar.cycling.series import CycleSeries
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import Executor, SerialExecutor, run_chunk
 from en4dvar.forward import Failure, ForwardModel, Observable
@@ -91,7 +91,7 @@ class TwinResult:
     experiment: TwinExperiment
     seed: int
     truth: Array
-    series: Series
+    series: CycleSeries
     run: SequentialResult
 
     @property
@@ -135,7 +135,7 @@ class TwinResult:
         return Score(rmse, spread, *means)
 
 
-def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, Series]:
+def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, CycleSeries]:
     """The truth (K, n_state) and its observations.
 
     Raises
@@ -157,7 +157,7 @@ def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, Series]
         except ValueError as error:
             raise ConfigError(f"twin.error_correlation: {error}") from None
         noise = experiment.error_correlation.correlated(noise)
-    return outcome.states, Series(times, exact + std * noise, std, experiment.error_correlation)
+    return outcome.states, CycleSeries(times, exact + std * noise, std, experiment.error_correlation)
 
 
 def initial_ensemble(experiment: TwinExperiment, seed: int) -> Array:

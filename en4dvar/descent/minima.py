@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar.descent.weight_space import WeightSpace
-from en4dvar.ensemble.linalg import Hessian
+from en4dvar.descent.window import Descent
 from en4dvar.prior import Prior
 from en4dvar.state import Array
 
@@ -19,21 +19,27 @@ SLOPE = 4.0  # as many, within which one that ended early on the slope of a mini
 
 @dataclass(frozen=True)
 class Minimum:
-    """A minimum ``x`` (n,) of J, transformed, the covariance (n, n) of the Gaussian about it, J there, how many
-    descents from different members ended in it, and by how much J of these differs.
+    """A minimum ``x`` (n,) of J, transformed, the covariance (n, n) of the Gaussian about it, J there, the prior
+    ``members`` from which descents ended in it (N: the prior mean), and by how much J of these differs.
     """
 
     x: Array
     covariance: Array
     cost: float
-    descents: int = 1
+    members: tuple[int, ...] = ()
     spread: float = 0.0
 
     @classmethod
-    def at(cls, space: WeightSpace, w: Array, hessian: Hessian, cost: float, descents: int = 1) -> Minimum:
-        """At weights w (N,), whose Hessian of J is known there or close by."""
-        covariance = space.anomalies.T @ hessian.solve(space.anomalies.T).T
-        return cls(space.control(w), np.asarray(covariance), cost, descents)
+    def of(cls, space: WeightSpace, end: Descent) -> Minimum:
+        """Where a descent has ended; the Hessian of J is known there or close by."""
+        covariance = space.anomalies.T @ end.newton.hessian.solve(space.anomalies.T).T
+        spread = max(0.0, end.highest - end.cost)
+        return cls(space.control(end.weights.w), np.asarray(covariance), end.cost, end.members, spread)
+
+    @property
+    def descents(self) -> int:
+        """How many, from different members, ended in it."""
+        return len(self.members)
 
     def distance(self, x: Array) -> float:
         """Of a control vector (n,), in posterior standard deviations."""
@@ -57,7 +63,8 @@ def merged(minima: Sequence[Minimum]) -> tuple[Minimum, ...]:
             on_slope = distance < SLOPE and one.cost - lower.cost > 0.25 * distance**2
             if distance < REACHED or on_slope:
                 spread = max(lower.spread, one.cost + one.spread - lower.cost)
-                found[place] = replace(lower, descents=lower.descents + one.descents, spread=spread)
+                members = tuple(sorted({*lower.members, *one.members}))
+                found[place] = replace(lower, members=members, spread=spread)
                 break
         else:
             found.append(one)

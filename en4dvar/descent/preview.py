@@ -20,6 +20,7 @@ ENOUGH = 0.3  # seconds of forward runs that the time of one is taken from
 LONGEST = 20.0  # seconds that the forecast of the prior ensemble may take unasked
 ITERATIONS = 5  # of a descent, typically
 SEARCH = 3  # runs of a step control, typically
+CHALLENGER = 0.5  # of a descent, until one from a far member has come to the same minimum
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def preview(problem: InverseProblem, settings: AssimilationSettings, seed: int, 
     that fail are told by ``run.failures``, not raised.
     """
     y = problem.observations
-    grid = np.linspace(y.times[0], y.times[-1], GRID_POINTS)
+    grid = np.linspace(*y.span, GRID_POINTS)
     executor = SerialExecutor()
     with one_blas_thread():
         space = WeightSpace(problem, settings, seed, executor)
@@ -86,7 +87,7 @@ def expected_runs(space: WeightSpace) -> int:
 
     A scheme that runs its whole ensemble does so once for each assimilation and once at the end, with the mean. A
     search takes prior and posterior forecast, and for each iteration a tangent (of n runs, or N) and the trials of the
-    step control, ``starts`` descents side by side.
+    step control, ``starts`` descents side by side, and a part of one more from a far member.
     """
     settings, n_members = space.settings, len(space.members)
     scheme = window_scheme(settings)
@@ -95,4 +96,6 @@ def expected_runs(space: WeightSpace) -> int:
     economical = scheme.economical(space.basis)
     tangent = 1 + (space.basis.shape[1] if economical else n_members)
     starts = settings.starts if settings.start == "best-member" and economical else 1
-    return 2 * (n_members + 1) + starts * min(ITERATIONS, settings.max_iterations) * (tangent + SEARCH)
+    challenger = CHALLENGER if settings.starts > 1 and economical else 0.0
+    iterations = (starts + challenger) * min(ITERATIONS, settings.max_iterations)
+    return 2 * (n_members + 1) + round(iterations * (tangent + SEARCH))

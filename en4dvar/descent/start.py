@@ -22,7 +22,7 @@ from en4dvar.descent.step_control import Move
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.ensemble.forecast import Forecast
-from en4dvar.schemes.base import GaussNewtonStep, Scheme
+from en4dvar.schemes.base import Scheme
 from en4dvar.schemes.en4dvar import En4DVar
 
 ROUGH = 1e-2  # relative decrease of J at which a descent stops that only has to tell basins apart
@@ -45,11 +45,11 @@ class StartState:
 
 @dataclass(frozen=True)
 class Start:
-    """The descent to go on with, the other minima that descents ended in, from how many members, and warnings."""
+    """The descent to go on with, the other minima that descents ended in, the members that were tried, and warnings."""
 
     descent: Descent
     minima: tuple[Minimum, ...] = ()
-    compared: int = 1
+    tried: tuple[int, ...] = ()
     warnings: tuple[Caution, ...] = ()
 
 
@@ -70,54 +70,31 @@ def choose_start(
     warnings: tuple[Caution, ...] = ()
     if space.settings.start == "prior-mean":
         if np.isfinite(space.observation_cost(run)[-1]):
-            return Start(_descent_from(space, len(space.members)))
+            mean = len(space.members)
+            return Start(descent_from(space, mean), tried=(mean,))
         words = f"the prior mean cannot be run ({run.failures[-1]}); started from the best prior member"
         warnings = (caution("start-moved", words),)
     starts = affordable(space, scheme, run)
     together = min(space.settings.starts, len(starts))
-    first = _descent_from(space, starts[0])
+    first = descent_from(space, starts[0])
     if together < 2:
-        return Start(first, warnings=warnings)
+        return Start(first, tried=(starts[0],), warnings=warnings)
     window = Rounds(space, seed, resume or StartState(lowest=first), keep, tell)
     while window.rank < len(starts):
         if not window.descents:
-            window.begin_round([_descent_from(space, i) for i in starts[window.rank : window.rank + together]])
+            window.begin_round([descent_from(space, i) for i in starts[window.rank : window.rank + together]])
         iterate(window, scheme, window.descents)
         window.rank += together
         if window.end_round():
             break
         window.descents = []
     window.lowest.ended = False  # it goes on, as the first iterations of the assimilation
-    return Start(window.lowest, window.others(), min(window.rank, len(starts)), warnings)
+    return Start(window.lowest, window.others(), tuple(starts[: window.rank]), warnings)
 
 
-def search_on(
-    space: WeightSpace, scheme: En4DVar, members: Sequence[int], seed: int, known: tuple[Minimum, ...],
-    tell: Callable[[Record], None],
-) -> tuple[Descent, tuple[Minimum, ...]]:  # fmt: skip
-    """The lowest of the descents from further members, and where they ended: at the latest where they reach a known
-    minimum. Nothing is kept of it.
-    """
-    window = Rounds(space, seed, StartState(), lambda state: None, tell, known)
-    window.begin_round([_descent_from(space, i) for i in members])
-    iterate(window, scheme, window.descents)
-    window.end_round()
-    lowest = window.lowest
-    if lowest.joined and isinstance(lowest.step, GaussNewtonStep):
-        window.end_here(lowest)
-    lowest.ended = False
-    return lowest, tuple(window.minima)
-
-
-def challenger(space: WeightSpace, run: Forecast, minimum: Minimum) -> int:
-    """The member farthest from a minimum, in standard deviations of the Gaussian about it, of the half of lower J."""
-    costs = (space.drawn.background_costs + space.observation_cost(run))[:-1]
-    better = np.argsort(costs, kind="stable")[: max(1, int(np.isfinite(costs).sum()) // 2)]
-    return int(max(better, key=lambda i: minimum.distance(space.members[i])))
-
-
-def _descent_from(space: WeightSpace, member: int) -> Descent:
-    return Descent(space.start(space.drawn.at_member(member)))
+def descent_from(space: WeightSpace, member: int) -> Descent:
+    """One that starts from a member of the prior ensemble, or, of number N, from the mean."""
+    return Descent(space.start(space.drawn.at_member(member)), members=(member,))
 
 
 def affordable(space: WeightSpace, scheme: En4DVar, run: Forecast) -> list[int]:
@@ -159,7 +136,7 @@ class Rounds(DataWindow):
 
     def begin_round(self, descents: list[Descent]) -> None:
         """Beside the lowest so far, where that has not ended in a minimum."""
-        unfinished = [self.lowest] if self.lowest.joined and np.isfinite(self.lowest.cost) else []
+        unfinished = [self.lowest] if self.lowest.members and np.isfinite(self.lowest.cost) else []
         for descent in unfinished:
             descent.ended = False
         self.descents = [*unfinished, *descents]
@@ -167,15 +144,15 @@ class Rounds(DataWindow):
     def end_round(self) -> bool:
         """Whether the comparison is over: enough descents agree on the lowest J, which noise and prior explain."""
         self.lowest = min(*self.descents, self.lowest, key=lambda descent: descent.cost)
-        agreeing = self.lowest.joined or max((m.descents for m in merged(self.minima)[:1]), default=0)
+        agreeing = len(self.lowest.members) or max((m.descents for m in merged(self.minima)[:1]), default=0)
         return agreeing >= AGREE and self.lowest.cost <= self.plausible
 
     def others(self) -> tuple[Minimum, ...]:
-        """The minima but that of the lowest, which takes its count along."""
+        """The minima but that of the lowest, which takes the members along."""
         minima = merged(self.minima)
-        if self.lowest.joined or not minima:
+        if self.lowest.members or not minima:
             return minima
-        self.lowest.joined = minima[0].descents
+        self.lowest.members, self.lowest.highest = minima[0].members, minima[0].cost + minima[0].spread
         return minima[1:]
 
     def move(self, scheme: Scheme, going: Sequence[Descent]) -> None:
@@ -193,7 +170,8 @@ class Rounds(DataWindow):
         self.rounds += 1
         costs = tuple(descent.cost for descent in self.descents)
         self.tell(StartRecord(self.rounds, costs, sum(not descent.ended for descent in self.descents)))
-        if len(going) == 1 and going[0].cost <= min(*costs, self.plausible):
+        others = (self.lowest.cost, *(minimum.cost for minimum in self.known))
+        if len(going) == 1 and going[0].cost <= min(*costs, *others, self.plausible):
             going[0].ended = True  # it can only go lower: the comparison is decided
 
     def _follow(self, descent: Descent, move: Move | None) -> None:
@@ -209,10 +187,9 @@ class Rounds(DataWindow):
             self.end_here(descent)
 
     def end_here(self, descent: Descent) -> None:
-        """A minimum, which takes over the count."""
-        w, hessian = descent.weights.w, descent.newton.hessian
-        self.minima.append(Minimum.at(self.space, w, hessian, descent.cost, descent.joined))
-        descent.joined = 0
+        """A minimum, which takes over the members."""
+        self.minima.append(Minimum.of(self.space, descent))
+        descent.members = ()
 
 
 def _end_those_that_met(descents: Sequence[Descent]) -> None:
@@ -223,4 +200,5 @@ def _end_those_that_met(descents: Sequence[Descent]) -> None:
             continue
         for higher in order[position + 1 :]:
             if not higher.ended and lower.newton.hessian.norm(higher.weights.w - lower.weights.w) < SAME:
-                lower.joined, higher.joined, higher.ended = lower.joined + higher.joined, 0, True
+                lower.members, higher.members, higher.ended = (*lower.members, *higher.members), (), True
+                lower.highest = max(lower.highest, higher.highest, higher.cost)

@@ -56,8 +56,8 @@ class Descent:
 
     ``worst_loss`` are the reasons of failure in the iteration that lost most members, or empty. ``cost`` is J where it
     was last evaluated. A descent whose ``stop`` is set ends with the next iterate, which is recorded and not left.
-    ``joined`` counts the descents that go on as this one: itself and those that met it. ``at`` and ``step``
-    belong to the iteration under way and are not kept.
+    ``members`` are those of the prior ensemble from which descents go on as this one: its own, and of those that met
+    it, at J of up to ``highest``. ``at`` and ``step`` belong to the iteration under way and are not kept.
     """
 
     weights: Weights
@@ -67,7 +67,8 @@ class Descent:
     stop: str = ""
     converged: bool = False
     ended: bool = False
-    joined: int = 1
+    members: tuple[int, ...] = ()
+    highest: float = -math.inf
     at: Iterate | None = None
     step: Step | GaussNewtonStep | None = None
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from en4dvar.ensemble.members import EVERYONE, Indices, InitialStates, Reading, out_of_bounds
+from en4dvar.ensemble.readout import Readout, batched, operators_of
 from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor
-from en4dvar.forward import RateOperator
 from en4dvar.noise import Predicted
 from en4dvar.problem import InverseProblem
 from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Array, Parameter
@@ -24,7 +26,8 @@ class Forecast:
     """Predictions of B members; NaN rows where a member failed.
 
     ``predicted`` (B, …) at the observations: predictions (B, K), their rates where R depends on them, the noise scale
-    and the discrepancy where there is one; ``path`` (B, M) at the extra times, ``failures`` (B,) reasons, "" for
+    and the discrepancy where there is one; ``path`` (B, P M) at the extra times, one after the other for the P parts of
+    the observations that have one value at a time (P = 1 of a single observable), ``failures`` (B,) reasons, "" for
     members alive, ``extremes`` (B, V) what the members reached of the model's V limits of validity, ``beyond`` (B, V)
     since when they exceed these, on the clock of the observations (both empty without extra times).
     """
@@ -71,7 +74,8 @@ class Composite:
     def __init__(self, problem: InverseProblem, executor: Executor | None = None):
         self.problem, self.executor = problem, executor or SerialExecutor()
         self._initial_states = InitialStates(problem)
-        self._reading = {limits: _reading(problem, limits) for limits in (False, True)}
+        self._operators = _operators(problem)
+        self._batched = batched(problem)
         self._scaled, self._discrepancy = problem.has_noise_scale, problem.discrepancy
 
     def __call__(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
@@ -81,20 +85,20 @@ class Composite:
         same run. A member fails, without disturbing the others, where a parameter leaves its bounds, ``initial_state``
         raises, the model returns a :class:`Failure`, or H gives anything but finite numbers.
         """
-        problem, reading = self.problem, self._reading[len(extra_times) > 0]
-        times, at_observations, at_extra = _union(problem.observations.times, extra_times)
+        problem = self.problem
+        times, reading, size, at_observations, at_extra = self._reading(extra_times)
         physical = problem.prior.to_physical(x)
         failures = out_of_bounds(problem.prior, physical)
         alive, states = self._initial_states(physical, failures)
         shift = _of_framework(problem, physical, TIME_SHIFT, 0.0)
         shifted = times + shift[alive, None]
         outcomes = self.executor.trajectories(problem.model, states, shifted) if len(states) else ()
-        observed, limits, reasons = reading.observe(outcomes, len(times))
+        observed, limits, reasons = reading.observe(outcomes, size)
         if alive is EVERYONE:
             failures = reasons
         else:
             read = observed, limits
-            observed = np.full((len(observed), len(x), len(times)), np.nan)
+            observed = np.full((len(observed), len(x), size), np.nan)
             limits = np.full((len(x), len(reading.limits), 2), np.nan)
             observed[:, alive], limits[alive] = read
             for i, reason in zip(np.arange(len(x))[alive], reasons, strict=True):
@@ -109,6 +113,24 @@ class Composite:
         )
         extremes, beyond = limits[..., 0], limits[..., 1] - shift[:, None]
         return Forecast(predicted, observed[0][:, at_extra], tuple(failures), extremes, beyond)
+
+    def _reading(self, extra_times: Array) -> tuple[Array, Reading, int, Indices, Indices]:
+        """The instants; what is read there and how many numbers that are; which of them are observations, and curves.
+
+        A single observable is read at all instants, and picked from them for all members at once.
+        """
+        observations = self.problem.observations
+        limits = tuple(self.problem.model.validity) if len(extra_times) else ()
+        instants, rows = observations.instants
+        times, at_instants, at_extra = _union(instants, extra_times)
+        if not observations.parts:
+            quantities = tuple(of_parts[0] for of_parts in self._operators)
+            return times, Reading(quantities, limits, self._batched), len(times), at_instants, at_extra
+        rows = rows if isinstance(at_instants, slice) else at_instants[rows]
+        readouts = tuple(Readout(one, observations.parts, len(times), rows, at_extra) for one in self._operators)
+        k, curves = len(observations), sum(part.has_path for part in observations.parts)
+        size = k + curves * len(extra_times)
+        return times, Reading(readouts, limits, self._batched), size, slice(0, k), slice(k, size)
 
 
 def forecast(
@@ -160,21 +182,15 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
     ):
         if names:
             raise ConfigError(f"{', '.join(sorted(names))}: {message}")
-    _reading(problem, limits=False)
+    _operators(problem)
     return tuple(known[name] for name in problem.fixed)
 
 
-def _reading(problem: InverseProblem, limits: bool) -> Reading:
-    """H; its rate where R depends on it; the model's limits of validity where asked for."""
-    operator = problem.observable.operator
-    validity = tuple(problem.model.validity) if limits else ()
-    batched = getattr(operator, "batched", False)
-    if not problem.observations.noise.needs_rates:
-        return Reading((operator,), validity, batched)
-    if not isinstance(operator, RateOperator):
-        what = "a timing error" if problem.observations.noise.timed else "a discrepancy that grows with the rate"
-        raise ConfigError(f"{what} needs the rate of {problem.observable.name}, which the model does not provide")
-    return Reading((operator, operator.rate), validity, batched)
+def _operators(problem: InverseProblem) -> list[tuple[Callable[[Any], Array], ...]]:
+    """H of every part, and its rate where R depends on it. Raises :class:`ConfigError` where there is no rate."""
+    parts, noise = problem.parts, problem.observations.noise
+    what = "a timing error" if noise.timed else "a discrepancy that grows with the rate"
+    return [operators_of(parts), *([operators_of(parts, True, what)] if noise.needs_rates else [])]
 
 
 def _of_framework(problem: InverseProblem, physical: Array, parameter: Parameter, default: float) -> Array:
@@ -184,7 +200,7 @@ def _of_framework(problem: InverseProblem, physical: Array, parameter: Parameter
     return np.full(len(physical), problem.fixed.get(parameter.name, default))
 
 
-def _union(times: Array, extra: Array) -> tuple[Array, Indices | slice, Indices | slice]:
+def _union(times: Array, extra: Array) -> tuple[Array, Indices, Indices]:
     """Increasing union of the times and where the observations and the extra times stand in it."""
     if not len(extra):
         return times, slice(None), slice(0, 0)

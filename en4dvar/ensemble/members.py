@@ -99,6 +99,10 @@ class InitialStates:
         return states
 
 
+class MisshapenError(ValueError):
+    """An observation operator gave another number of values than there are instants."""
+
+
 def _without(failures: list[str]) -> Indices:
     return np.flatnonzero([not reason for reason in failures]) if any(failures) else EVERYONE
 
@@ -135,6 +139,9 @@ class Reading:
                 continue
             try:
                 one = self._all([outcome])
+            except MisshapenError:
+                reasons[i] = "misshapen prediction"
+                continue
             except BaseException as error:  # H belongs to the user as well
                 reasons[i] = reason_of(error)
                 continue

@@ -246,6 +246,17 @@ def down_weighted(analysis: Analysis, most: int = 6) -> Findings:
     yield caution("down-weighted", words)
 
 
+def weighted(analysis: Analysis) -> Findings:
+    """Weights other than 0, which leaves a reading out, and 1, which counts it once."""
+    weights = analysis.problem.observations.weights
+    odd = weights[(weights != 0) & (weights != 1)]
+    if len(odd):
+        low, high = float(odd.min()), float(odd.max())
+        span = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+        words = f"{len(odd)} of {len(weights)} observations count with weights of {span}"
+        yield caution("not-bayesian", f"{words}: the intervals are not those of the Bayesian posterior")
+
+
 def _rank(anomalies: Array) -> int:
     values = np.linalg.svd(anomalies, compute_uv=False)
     return int(np.sum(values > SAME_DIRECTION * values[0])) if values.size and values[0] > 0 else 0

@@ -62,6 +62,7 @@ def examine(
         *a.problem.observations.doubts,
         *(caution("implausible-data", words) for words in doubts(a.problem, a.prior_predictions)),
         *checks.down_weighted(a),
+        *checks.weighted(a),
         *unfinished(a),
         *checks.rank(prior, control.prior, control.posterior[alive]),
         *collapse(prior, control, alive),
@@ -88,7 +89,13 @@ def _changes(a: Analysis) -> set[str]:
 def doubts(problem: InverseProblem, predicted: Array) -> Sequence[str]:
     """The model's doubts about the observations beside predictions (N, K) of prior members, NaN where one failed."""
     y, alive = problem.observations, np.all(np.isfinite(predicted), axis=1)
-    return problem.model.doubts(problem.observable.name, y.times, y.values, predicted[alive])
+    return [
+        words
+        for part in problem.parts
+        for words in problem.model.doubts(
+            part.observable.name, y.times[part.where], y.values[part.where], predicted[alive, part.where]
+        )
+    ]
 
 
 def _structure(a: Analysis) -> tuple[Caution, ...]:

@@ -49,13 +49,15 @@ SHEETS = (".xls", ".xlsb", ".ods")
 class Column:
     """A column or field ``name`` written in ``unit``, wanted in ``target``.
 
-    ``positive``: zeros before its first reading are none. ``rate``: of times, that of the frames per ``target``.
+    ``positive``: zeros before its first reading are none. ``kind``: what its numbers must be, beside the readings.
+    ``rate``: of times, that of the frames per ``target``.
     """
 
     name: str
     unit: str
     target: str
     positive: bool = False
+    kind: Literal["std", "weight", "place"] = "std"
     rate: float | None = None
 
 
@@ -69,10 +71,19 @@ class TimeStep:
 
 @dataclass(frozen=True)
 class DataFile:
-    """Where one data set is: a file, or of a file that holds several the ``part``, as :func:`parts_of` names it."""
+    """Where one data set is: a file, or of a file that holds several the ``part``, as :func:`parts_of` names it.
+
+    ``others``: where its further series are.
+    """
 
     path: Path
     part: str = ""
+    others: tuple[DataFile, ...] = ()
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """The files of all its series, each once."""
+        return tuple(dict.fromkeys((self.path, *(path for other in self.others for path in other.paths))))
 
 
 @dataclass(frozen=True)
@@ -122,10 +133,14 @@ def read_series(
     layout: Layout = ANY,
     errors: Sequence[Column] = (),
     part: str = "",
+    repeats: bool = False,
+    fewest: int = 3,
 ) -> Readings:
     """Read one data set.
 
-    ``errors`` are columns of standard deviations, each as long as that of the values. ``part``: see :func:`parts_of`.
+    ``errors`` are columns of standard deviations (or weights, or places), each as long as that of the values.
+    ``part``: see :func:`parts_of`. ``repeats``: there may be several readings at a time, in any order of times.
+    ``fewest`` usable readings are needed.
 
     Raises
     ------
@@ -146,16 +161,19 @@ def read_series(
         raise DataError(f"{path}: {len(times)} times but {len(values)} values of {value.name!r}")
     first = 0 if lines and not value.positive else int(np.argmax(np.nan_to_num(values) != 0))
     kept = np.arange(first, len(values))[~(np.isnan(times) | np.isnan(values))[first:]]
-    _check(times[kept], values[kept], value.name, path)
+    _check(times[kept], values[kept], value.name, path, fewest)
+    if repeats:
+        kept = kept[np.argsort(times[kept], kind="stable")]
     stated = {column.name: _stds(columns[column.name], column, kept, len(values), path) for column in errors}
-    if isinstance(time, Column):
+    if isinstance(time, Column) and not repeats:
         written = Written(columns[time.name], time.unit, lines, path)
         order = in_order(times[kept], layout.unsorted == "sort", layout.repeated == "average", kept, written)
         kept, stated = kept[order], {name: stds[order] for name, stds in stated.items()}
+    if repeats:
+        return Readings(times[kept], values[kept], str(path), scalars, stated)
     means = Means(times[kept])
-    return Readings(
-        means.times, means.of(values[kept]), str(path), scalars, {name: means.std(s) for name, s in stated.items()}
-    )
+    stated = {c.name: (means.std if c.kind == "std" else means.of)(stated[c.name]) for c in errors}
+    return Readings(means.times, means.of(values[kept]), str(path), scalars, stated)
 
 
 def _columns(
@@ -177,15 +195,20 @@ def _columns(
 
 
 def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int, path: Path) -> Array:
-    """The standard deviations of the kept readings. Raises :class:`DataError` where one is missing or not positive."""
+    """What belongs to the kept readings: standard deviations, weights or places.
+
+    Raises :class:`DataError` where one is missing, or of the wrong sign.
+    """
     if len(written) != count:
         raise DataError(f"{path}: {len(written)} values of {column.name!r} but {count} readings")
     stds = np.asarray(convert(written[kept], column.unit, column.target))
-    wrong = np.flatnonzero(~(np.isfinite(stds) & (stds > 0)))
+    fits = {"std": stds > 0, "weight": stds >= 0, "place": np.isfinite(stds)}[column.kind]
+    wrong = np.flatnonzero(~(np.isfinite(stds) & fits))
     if len(wrong):
-        said = written[kept[wrong[0]]]
-        what = "is blank" if np.isnan(said) else f"is {said:g}, not positive"
-        raise DataError(f"{path}: the error of reading {kept[wrong[0]] + 1} in column {column.name!r} {what}")
+        said, sign = written[kept[wrong[0]]], {"std": "not positive", "weight": "negative", "place": "not finite"}
+        what = "is blank" if np.isnan(said) else f"is {said:g}, {sign[column.kind]}"
+        noun = {"std": "error"}.get(column.kind, column.kind)
+        raise DataError(f"{path}: the {noun} of reading {kept[wrong[0]] + 1} in column {column.name!r} {what}")
     return stds
 
 
@@ -343,13 +366,13 @@ def _require_file(path: Path) -> None:
         raise DataError(f"{path}: is a directory" if os.path.isdir(path) else no_such_file(path))
 
 
-def _check(times: Array, values: Array, name: str, path: Path) -> None:
+def _check(times: Array, values: Array, name: str, path: Path, fewest: int) -> None:
     if not len(values) or not np.any(values):
         raise DataError(f"{path}: {name!r} holds no usable value (all NaN, blank or zero)")
     if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values))):
         raise DataError(f"{path}: infinite values")
-    if len(values) < 3:
-        raise DataError(f"{path}: {len(values)} usable observations; at least 3 are needed")
+    if len(values) < fewest:
+        raise DataError(f"{path}: {len(values)} usable observations; at least {fewest} are needed")
 
 
 def _step(step: TimeStep, scalars: Mapping[str, float], path: Path) -> float:

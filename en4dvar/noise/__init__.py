@@ -18,13 +18,16 @@ whose tails are exponential. Its rows of d and S take the weights min(1, c/|v|) 
 the gradient is exact, SᵀS bounds the Hessian of the part of m from above.
 
 A kind of errors is one class of this folder: :class:`Noise` is Gaussian and independent, the others say what differs.
+Several series are blocks (:mod:`en4dvar.noise.blocks`), joined where they are correlated (:mod:`en4dvar.noise.joint`).
 A discrepancy of the model (:mod:`en4dvar.noise.discrepancy`) adds a Gaussian process to any of them.
 """
 
+from en4dvar.noise.blocks import BlockNoise
 from en4dvar.noise.correlated import CorrelatedNoise, Correlation
 from en4dvar.noise.discrepancy import DiscrepancyNoise
 from en4dvar.noise.gaussian import Noise, ScaleSkewness
 from en4dvar.noise.huber import HuberNoise
+from en4dvar.noise.joint import joint_noise, noise_of_readings
 from en4dvar.noise.kernel import SMOOTHNESS, Kernel
 from en4dvar.noise.make import noise_of, noise_of_record
 from en4dvar.noise.predicted import Linearisation, Predicted
@@ -32,6 +35,7 @@ from en4dvar.noise.robust_discrepancy import RobustDiscrepancyNoise
 
 __all__ = [
     "SMOOTHNESS",
+    "BlockNoise",
     "CorrelatedNoise",
     "Correlation",
     "DiscrepancyNoise",
@@ -42,6 +46,8 @@ __all__ = [
     "Predicted",
     "RobustDiscrepancyNoise",
     "ScaleSkewness",
+    "joint_noise",
     "noise_of",
+    "noise_of_readings",
     "noise_of_record",
 ]

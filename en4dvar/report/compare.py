@@ -234,7 +234,7 @@ def _results(run: Path) -> dict[str, StoredResult]:
 
 def _same_data(a: StoredResult, b: StoredResult) -> bool:
     ours, theirs = _stated(a.observations()), _stated(b.observations())
-    return (a.observable, ours.keys()) == (b.observable, theirs.keys()) and all(
+    return (a.axes, ours.keys()) == (b.axes, theirs.keys()) and all(
         ours[key].shape == theirs[key].shape and np.allclose(ours[key], theirs[key], rtol=1e-12, atol=0) for key in ours
     )
 
@@ -254,7 +254,7 @@ def _stated(o: Observations) -> dict[str, Array]:
 
 def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:
     stats = result.sample_stats.attrs
-    likelihood = result.dataset("log_likelihood")[result.observable].values[0]
+    likelihood = result.of_readings("log_likelihood", "")[0]
     return ModelScore(
         run,
         dataset,

@@ -19,7 +19,7 @@ from en4dvar.config.symbols import GREEK
 from en4dvar.errors import OutputError
 from en4dvar.report.text import number_like, plain_number, untrusted_words
 from en4dvar.storage.store import StoredResult, load_stored, require_settled, result_files
-from en4dvar.summary import LITTLE, ParameterSummary, summary_csv
+from en4dvar.summary import LITTLE, MODAL, ParameterSummary, summary_csv
 from en4dvar.tables import csv_text
 
 _COMMANDS = (
@@ -85,6 +85,7 @@ def _members_csv(results: Iterable[StoredResult]) -> str:
 
 Found = tuple[str, tuple[ParameterSummary, ...], tuple[Caution, ...]]
 LITTLE_NOTE = "the data say little about it: its posterior is close to its prior"
+MODAL_NOTE = "5 to 95 % of a posterior of several modes, by their weights"
 
 
 def _latex(found: Sequence[Found]) -> str:
@@ -103,7 +104,7 @@ class Notes:
 
     def mark(self, row: ParameterSummary) -> str:
         """What follows a number: the letter of its footnote, or nothing."""
-        words = LITTLE_NOTE if row.informed == LITTLE else ""
+        words = {LITTLE: LITTLE_NOTE, MODAL: MODAL_NOTE}.get(row.informed, "")
         if row.untrusted:
             words = f"not to be trusted: {untrusted_words(row)}"
         if not words:
@@ -160,8 +161,10 @@ def _tabular(columns: str, head: str, lines: list[str], notes: Notes) -> list[st
 
 
 def _estimate(row: ParameterSummary, notes: Notes) -> str:
-    """Mean ± std, or the mean alone, with the mark of its footnote."""
+    """Mean ± std, or the mean alone, or the interval of several modes, with the mark of its footnote."""
     value = f"${_tex(plain_number(row.mean, 3))}$" if row.untrusted else _plus_minus(row.mean, row.std)
+    if row.modal:
+        value = _interval(row)
     return f"{value}{notes.mark(row)}"
 
 

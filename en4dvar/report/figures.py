@@ -10,13 +10,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from en4dvar.report import readings, varying
+from en4dvar.report.history import MANY, history
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, Captioned, panels, scaled_histogram, styled
 from en4dvar.report.text import estimate, pretty_unit, shown, with_unit
 from en4dvar.state import Array
 from en4dvar.storage.store import StoredResult
 
 MAX_PAIRS = 6
-MANY = 5000  # marks: beyond, they are drawn as pixels, for a vector each would make a page of many megabytes
 
 
 @styled
@@ -42,71 +42,34 @@ def histograms(result: StoredResult) -> Figure:
 
 
 @styled
-def history(result: StoredResult) -> Figure:
-    """Data ± std, prior and posterior predictive bands (50 and 90 %), the centre; below, residuals over their std."""
-    name = result.observable
-    observed = result.observed_data
-    time, data, std = (shown(observed[key]) for key in ("time", name, f"{name}_std"))
-    centre = shown(result.sample_stats[f"{name}_centre"])
-    figure = Figure(figsize=(COLUMN, 9.5 / 2.54), layout="constrained")
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
-    _band(top, result, "prior_predictive", (0.05, 0.95), "prior", 0.28, "prior 90 %")
-    _band(top, result, "posterior_predictive", (0.05, 0.95), "posterior", 0.3, "posterior 90 %")
-    _band(top, result, "posterior_predictive", (0.25, 0.75), "posterior", 0.6, "posterior 50 %")
-    size, many = 2.2 if len(time) <= 150 else 1.2, len(time) > MANY
-    if many:  # one path instead of a bar for each, and pixels below the centre
-        band = top.fill_between(time, data - std, data + std, color=LIGHT["ink"], alpha=0.3, lw=0, label="data ± std")
-        band.set_rasterized(True)
-        top.plot(time, data, ",", alpha=0.3, color=LIGHT["ink"], zorder=1.5, rasterized=True)
-    else:
-        top.errorbar(time, data, std, fmt="o", ms=size, lw=0.6, color=LIGHT["ink"], label="data ± std", zorder=4)
-    top.plot(time, centre, lw=0.9, color=LIGHT["centre"], label="centre", zorder=3, rasterized=many)
-    attrs = observed[name].attrs
-    label = str(attrs["long_name"]).removesuffix(", observed")
-    label = label if label == attrs["symbol"] else f"{label} {attrs['symbol']}"
-    top.set_ylabel(with_unit(label, attrs["display_units"]))
-    top.set_ylim(_data_range(data, std))
-    top.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, columnspacing=1.2, handlelength=1.4)
-    residual = (data - centre) / std
-    for limit, alpha in ((2, 0.12), (1, 0.16)):
-        bottom.axhspan(-limit, limit, color=LIGHT["posterior"], alpha=alpha, lw=0)
-    bottom.axhline(0, color=LIGHT["muted"], lw=0.6)
-    bottom.plot(time, residual, "," if many else "o", ms=size, color=LIGHT["ink"], rasterized=many)
-    reach = 1.15 * max(3.0, float(np.max(np.abs(residual))))
-    span = time[-1] - time[0]
-    bottom.set(ylim=(-reach, reach), ylabel="residual / std", xlim=(time[0] - 0.03 * span, time[-1] + 0.03 * span))
-    if reach < 8:
-        bottom.set_yticks([-2, 0, 2])
-    else:
-        bottom.yaxis.set_major_locator(MaxNLocator(4))
-    bottom.set_xlabel(with_unit("time", observed["time"].attrs["display_units"]))
-    return figure
-
-
-@styled
 def residuals(result: StoredResult) -> Figure:
     """Whitened residuals in time, their autocorrelation, normal quantiles, leverages; the discrepancy if any."""
     name, stats = result.observable, result.sample_stats
-    time = shown(result.observed_data["time"])
+    time, label = readings.times(result), readings.time_label(result)
     white, studentised, leverage = (
-        np.asarray(stats[f"{name}_{key}"].values) for key in ("whitened_residual", "studentised", "leverage")
+        result.of_readings("sample_stats", key) for key in ("whitened_residual", "studentised", "leverage")
     )
     counts = np.isfinite(white)
-    label = with_unit("time", result.observed_data["time"].attrs["display_units"])
     discrepant = f"{name}_discrepancy" in stats
     figure = Figure(figsize=(COLUMN, (13.0 if discrepant else 10.0) / 2.54), layout="constrained")
     grid = figure.add_gridspec(3 if discrepant else 2, 3)
     top, below = figure.add_subplot(grid[0, :]), grid.nrows - 1
     top.axhline(0, color=LIGHT["muted"], lw=0.6)
-    top.plot(time[counts], white[counts], "-", color=LIGHT["muted"], lw=0.5)
-    top.plot(time[counts], white[counts], "o", ms=2.2, color=LIGHT["ink"])
+    for axis, (series, colour) in zip(result.axes, readings.each_series(result), strict=True):
+        chosen = series[counts[series]]
+        if f"{axis.name}_place" not in result.observed_data:
+            top.plot(time[chosen], white[chosen], "-", color=LIGHT["muted"], lw=0.5)
+        top.plot(time[chosen], white[chosen], "o", ms=2.2, color=colour)
     top.set(xlabel=label, ylabel="whitened residual")
+    readings.name_series(top, result)
     if discrepant:
         _discrepancy(figure.add_subplot(grid[1, :]), result, time, label)
     _autocorrelation(figure.add_subplot(grid[below, 0]), white[counts])
     _quantiles(figure.add_subplot(grid[below, 1]), studentised[counts])
     ax = figure.add_subplot(grid[below, 2])
-    ax.vlines(time[counts], 0, leverage[counts], color=LIGHT["posterior"], lw=0.9)
+    for series, colour in readings.each_series(result, "posterior"):
+        chosen = series[counts[series]]
+        ax.vlines(time[chosen], 0, leverage[chosen], color=colour, lw=0.9)
     ax.set(xlabel=label, ylabel="leverage", ylim=(0, None))
     return figure
 
@@ -187,7 +150,8 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
         "history",
         "Data with their standard deviation, noise-free predictions of the prior and posterior ensembles (bands hold "
         "50 and 90 % of the members) and of the centre (line through its values at the observation times). Below: "
-        "residual of the centre over its standard deviation.",
+        "residual of the centre over its standard deviation."
+        + (" Each series has its own panels." if len(result.axes) > 1 else ""),
         history(result),
     )
     if varying.stored_walks(result):
@@ -250,24 +214,6 @@ def _reach(prior: Array, posterior: Array) -> tuple[float | None, float | None]:
     low, high = (min(ends), max(ends)) if ends else (0.0, 0.0)
     margin = 0.05 * (high - low)
     return (low - margin, high + margin) if margin > 0 else (None, None)
-
-
-def _band(
-    ax: Axes, result: StoredResult, group: str, levels: tuple[float, float], colour: str, alpha: float, label: str
-) -> None:
-    values = shown(result.dataset(group)[f"{result.observable}_path"][0])
-    seen = np.isfinite(values).any(axis=0)
-    if not seen.any():
-        return
-    low, high = np.nanquantile(values[:, seen], levels, axis=0)
-    time = shown(result.dataset(group)["path_time"])[seen]
-    ax.fill_between(time, low, high, color=LIGHT[colour], alpha=alpha, lw=0, label=label)
-
-
-def _data_range(data: Array, std: Array) -> tuple[float, float]:
-    """Limits of the data with room around: a wide prior must not shrink them to a line."""
-    low, high = float((data - std).min()), float((data + std).max())
-    return low - 0.12 * (high - low), high + 0.25 * (high - low)
 
 
 def _pair(ax: Axes, i: int, j: int, x: Array, y: Array) -> None:

@@ -96,7 +96,7 @@ def estimates(sets: Sequence[SetSummary]) -> Figure:
     for ax, name in zip(panels, names, strict=True):
         x = np.array([i for i, one in enumerate(sets) if name in one.rows])
         rows = [sets[i].rows[name] for i in x]
-        mean, low, high = (np.array([getattr(row, key) for row in rows]) for key in ("mean", "q05", "q95"))
+        mean, low, high = (np.array([getattr(row, key) for row in rows]) for key in ("middle", "q05", "q95"))
         trusted = np.array([not row.untrusted for row in rows], dtype=bool)
         low, high = (np.where(trusted, bound, np.nan) for bound in (low, high))
         prior = rows[0].prior_mean + np.array([-1.0, 1.0]) * rows[0].prior_std

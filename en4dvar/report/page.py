@@ -90,7 +90,17 @@ def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
         ("Information, DFS", *information, False),
         ("Members alive", f"{alive} of {members}", "of the posterior ensemble", alive < members),
         ("Iterations", str(s["n_iterations"]), f"{ended}: {s['stop_reason']}", not s["converged"]),
+        *_descents(s),
     ]
+
+
+def _descents(stats: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
+    """A tile; none of a scheme that does not search, and of results of before."""
+    if "n_descents" not in stats:
+        return []
+    total, agreeing = int(stats["n_descents"]), int(stats["n_agreeing"])
+    words = f"to the lowest minimum: {stats['descents']}; {stats['search_runs']} forward runs to look for another one"
+    return [("Descents", f"{agreeing} of {total}", words, agreeing < 2)]
 
 
 def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = False) -> tuple[str, bool]:
@@ -168,7 +178,7 @@ def _iterations(result: StoredResult) -> list[tuple[str, ...]]:
 def _settings(result: StoredResult) -> list[tuple[str, str]]:
     """The scheme's settings and how observations are weighted."""
     given = json.loads(str(result.attributes["assimilation_settings"]))
-    weights = result.observed_data["weights"].values
+    weights = result.of_readings("observed_data", "weights", shared=True)
     total = f"{len(weights)} observations, weights sum to {plain_number(float(weights.sum()))}"
     return [*((key.replace("_", " "), str(value)) for key, value in given.items()), ("observations", total)]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -22,38 +23,69 @@ CAPTION = (
 FAR = 3.0  # std between a reading and the prior that are told
 
 
+COLOURS = ("ink", "posterior", "centre", "background", "muted")  # of several series, in their order
+
+
 def has_influence(result: StoredResult) -> bool:
     """Whether the file says what leaving out a reading would change."""
-    return "influence_in_std" in result.sample_stats
+    return result.axes[0].own("influence_in_std") in result.sample_stats
+
+
+def times(result: StoredResult) -> Array:
+    """(K,) of all readings, in the display unit."""
+    return np.concatenate([shown(result.observed_data[axis.time]) for axis in result.axes])
+
+
+def time_label(result: StoredResult) -> str:
+    """Of an axis of :func:`times`."""
+    return with_unit("time", result.observed_data[result.axes[0].time].attrs["display_units"])
+
+
+def each_series(result: StoredResult, alone: str = "ink") -> list[tuple[npt.NDArray[np.intp], str]]:
+    """Places among all readings of each series, and its colour; ``alone``: that of a single one."""
+    sizes = [len(result.observed_data[axis.name]) for axis in result.axes]
+    parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+    names = [alone] if len(parts) == 1 else [COLOURS[i % len(COLOURS)] for i in range(len(parts))]
+    return [(part, LIGHT[name]) for part, name in zip(parts, names, strict=True)]
+
+
+def name_series(ax: Axes, result: StoredResult) -> None:
+    """A legend with the colours of several series; nothing for a single one."""
+    if len(result.axes) > 1:
+        for axis, (_, colour) in zip(result.axes, each_series(result), strict=True):
+            ax.plot([], [], "o", ms=3, color=colour, label=axis.name)
+        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(result.axes), handletextpad=0.2)
 
 
 @styled
 def influence(result: StoredResult) -> Figure:
     """Change of each parameter without each reading, and the distance of the readings from the prior, over time."""
-    stats, rows = result.sample_stats, result.summary() if has_influence(result) else ()
-    time = shown(result.observed_data["time"])
+    rows = result.summary() if has_influence(result) else ()
+    time = times(result)
+    in_std = result.of_readings("sample_stats", "influence_in_std", shared=True) if rows else np.empty(0)
     figure = Figure(figsize=(COLUMN, (3.6 + 1.7 * len(rows)) / 2.54), layout="constrained")
     axes = figure.subplots(len(rows) + 1, 1, sharex=True, squeeze=False).ravel()
-    for ax, row in zip(axes, rows, strict=False):
-        change = np.asarray(stats["influence_in_std"].sel(parameter=row.name).values)
-        _stems(ax, time, change, "posterior")
+    for ax, row, change in zip(axes, rows, in_std, strict=False):
+        _stems(ax, time, change, each_series(result, "posterior"))
         ax.set_ylabel(row.symbol)
         reach = 1.15 * max(0.1, float(np.nanmax(np.abs(change), initial=0.0)))
         ax.set_ylim(-reach, reach)
-    distance = np.asarray(stats[f"{result.observable}_prior_distance"].values)
+    distance = result.of_readings("sample_stats", "prior_distance")
     last = axes[-1]
     last.axhspan(-FAR, FAR, color=LIGHT["prior"], alpha=0.16, lw=0)
-    _stems(last, time, distance, "ink")
-    last.set(xlabel=with_unit("time", result.observed_data["time"].attrs["display_units"]), ylabel="prior distance")
+    _stems(last, time, distance, each_series(result))
+    last.set(xlabel=time_label(result), ylabel="prior distance")
+    name_series(axes[0], result)
     return figure
 
 
-def _stems(ax: Axes, time: Array, values: Array, colour: str) -> None:
+def _stems(ax: Axes, time: Array, values: Array, series: list[tuple[npt.NDArray[np.intp], str]]) -> None:
     many = len(time) > 500
     ax.axhline(0, color=LIGHT["muted"], lw=0.6)
-    if not many:
-        ax.vlines(time, 0, values, color=LIGHT[colour], lw=0.8)
-    ax.plot(time, values, "o", ms=1.2 if many else 2.6, color=LIGHT[colour], rasterized=many)
+    for own, colour in series:
+        if not many:
+            ax.vlines(time[own], 0, values[own], color=colour, lw=0.8)
+        ax.plot(time[own], values[own], "o", ms=1.2 if many else 2.6, color=colour, rasterized=many)
 
 
 def reading_words(result: StoredResult) -> list[Markup]:
@@ -63,7 +95,9 @@ def reading_words(result: StoredResult) -> list[Markup]:
 
 
 def _most_moving(result: StoredResult) -> Markup:
-    in_std, change = (np.asarray(result.sample_stats[f"influence_{key}"].values) for key in ("in_std", "change"))
+    in_std, change, how = (
+        result.of_readings("sample_stats", f"influence_{key}", shared=True) for key in ("in_std", "change", "how")
+    )
     if not np.isfinite(in_std).any():
         return Markup("What leaving out a reading would change only another fit tells: each of them decides too much.")
     j, k = np.unravel_index(int(np.nanargmax(np.abs(in_std))), in_std.shape)
@@ -75,12 +109,12 @@ def _most_moving(result: StoredResult) -> Markup:
     ).format(
         _time(result, int(k)), symbol_html(row.symbol), signed(size), pretty_unit(row.unit), fixed(abs(in_std[j, k]), 1)
     )
-    blank = int(np.sum(np.asarray(result.sample_stats["influence_how"].values) == UNKNOWN))
+    blank = int(np.sum(how == UNKNOWN))
     return words + (f" For {blank} of {in_std.shape[1]} readings only another fit tells." if blank else "")
 
 
 def _farthest(result: StoredResult) -> Markup:
-    distance = np.asarray(result.sample_stats[f"{result.observable}_prior_distance"].values)
+    distance = result.of_readings("sample_stats", "prior_distance")
     if not np.isfinite(distance).any():
         return Markup("")
     k, beyond = int(np.nanargmax(np.abs(distance))), int(np.sum(np.abs(distance) > FAR))
@@ -96,5 +130,14 @@ def _why_not(result: StoredResult) -> Markup:
 
 
 def _time(result: StoredResult, k: int) -> str:
-    time = result.observed_data["time"]
-    return f"{plain_number(float(shown(time)[k]))} {pretty_unit(time.attrs['display_units'])}".strip()
+    """When a reading was taken, of several series of which, of a field where."""
+    for axis in result.axes:
+        time = result.observed_data[axis.time]
+        if k < len(time):
+            break
+        k -= len(time)
+    words = f"{plain_number(float(shown(time)[k]))} {pretty_unit(time.attrs['display_units'])}".strip()
+    if f"{axis.name}_place" in result.observed_data:
+        place = result.observed_data[f"{axis.name}_place"]
+        words += f", place {plain_number(float(place[k]))} {pretty_unit(str(place.attrs['units']))}".rstrip()
+    return words if axis.alone else f"{words} ({axis.name})"

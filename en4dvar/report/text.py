@@ -88,7 +88,9 @@ def plus_minus(mean: float, std: float) -> str:
 
 
 def estimate(row: ParameterSummary, mark: str = ", not to be trusted") -> str:
-    """Mean and spread; a mean of three digits, marked, where they are not to be trusted."""
+    """Mean and spread; a mean of three digits, marked, where they are not to be trusted; of several modes 5 to 95 %."""
+    if row.modal:
+        return f"{number_like(row.q05, row.std)} to {number_like(row.q95, row.std)}"
     return f"{plain_number(row.mean, 3)}{mark}" if row.untrusted else plus_minus(row.mean, row.std)
 
 

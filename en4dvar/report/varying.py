@@ -62,7 +62,7 @@ def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
     about, time = variable.attrs, variable[name + PIECE]
     shown, clock = about["display_units"], time.attrs["display_units"]
     begins = np.asarray(time.values, dtype=float)
-    last = float(result.observed_data["time"].values[-1])
+    last = max(float(result.observed_data[axis.time].values[-1]) for axis in result.axes)
     edges = np.append(begins, max(last, begins[-1] + 0.02 * (begins[-1] - begins[0])))
 
     def quantiles(group: str) -> Array:

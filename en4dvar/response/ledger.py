@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.ensemble.members import EVERYONE, InitialStates, Reading
+from en4dvar.ensemble.readout import Readout, batched, operators_of
 from en4dvar.executor.chunks import without_warnings
 from en4dvar.forward import Failure, PathQuantity, Trajectory
 from en4dvar.noise import Linearisation
@@ -93,9 +94,11 @@ def _ledger(problem: InverseProblem, response: LinearResponse, std: Array, names
     physical = prior.to_physical(response.at)
     reasons = [""]
     alive, start = InitialStates(problem)(physical[None], reasons)
-    shift = physical[prior.names.index(TIME_SHIFT.name)] if TIME_SHIFT.name in prior.names else None
-    times = problem.observations.times + (problem.fixed.get(TIME_SHIFT.name, 0.0) if shift is None else shift)
-    path = None if alive is not EVERYONE else _path(problem, start, float(times[-1]))
+    shift = problem.fixed.get(TIME_SHIFT.name, 0.0)
+    if TIME_SHIFT.name in prior.names:
+        shift = float(physical[prior.names.index(TIME_SHIFT.name)])
+    times = problem.observations.times + shift
+    path = None if alive is not EVERYONE else _path(problem, start, float(times.max()))
     if path is None:
         return None
     edges, states, values = path
@@ -104,7 +107,7 @@ def _ledger(problem: InverseProblem, response: LinearResponse, std: Array, names
     changes = [
         (model.layout[name].start, prior.to_physical(x)[j]) for name, j, x in zip(names, columns, moved, strict=True)
     ]
-    local = _localised(problem, states[:-1], edges[:-1], times, changes) / (CHANGE * std[columns])[:, None, None]
+    local = _localised(problem, states[:-1], edges[:-1], shift, changes) / (CHANGE * std[columns])[:, None, None]
     kernel = np.stack(
         [gain @ _whitened(response, one) for gain, one in zip(response.gain[columns], local, strict=True)]
     )
@@ -140,11 +143,11 @@ def _edges(times: Array, values: Array) -> Array:
 
 
 def _localised(
-    problem: InverseProblem, states: Array, start: Array, times: Array, changes: list[tuple[int, float]]
+    problem: InverseProblem, states: Array, start: Array, shift: float, changes: list[tuple[int, float]]
 ) -> Array:
     """What each change (column of the state, value) within each cell does to predictions, (P, M, K).
 
-    ``states`` (M, n_state) of the path at ``start`` (M,) of each cell; ``times`` (K,) of the readings.
+    ``states`` (M, n_state) of the path at ``start`` (M,) of each cell; readings are ``shift`` later than they say.
     """
     n_cells, variants = len(states), [states]
     for column, value in changes:
@@ -153,9 +156,10 @@ def _localised(
         variants.append(changed)
     x = np.concatenate(variants)
     begin = np.tile(start, len(variants))
-    outcomes = problem.model.resumed(x, begin, np.broadcast_to(times, (len(x), len(times))))
-    operator = problem.observable.operator
-    read = Reading((operator,), (), getattr(operator, "batched", False)).observe(outcomes, len(times))[0][0]
+    times, (instants, rows) = problem.observations.times + shift, problem.observations.instants
+    outcomes = problem.model.resumed(x, begin, np.broadcast_to(instants + shift, (len(x), len(instants))))
+    readout = Readout(operators_of(problem.parts), problem.parts, len(instants), rows, slice(0, 0))
+    read = Reading((readout,), (), batched(problem)).observe(outcomes, len(times))[0][0]
     runs = read.reshape(len(variants), n_cells, len(times))
     later = np.where(times > start[:, None], runs[1:] - runs[0], 0.0)  # changed from the start of each cell on
     later[:, 0] = runs[1:, 0] - runs[0, 0]  # readings before time zero, where the model has any

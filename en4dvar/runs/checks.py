@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from en4dvar.config import Config, TwinConfig, load_any
-from en4dvar.config.build import build_one, data_files, inverse_plan, read_observations
-from en4dvar.config.data import Data
+from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.config.document import Document, override, read_document
 from en4dvar.config.load import context_of, in_order
+from en4dvar.config.reading import read_observations
+from en4dvar.config.schema import Section
+from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.inputs.readers import DataFile
@@ -57,18 +59,26 @@ def _data_faults(path: Path, overrides: Mapping[str, Any] | None) -> Iterator[Fa
     except ConfigError:
         return
     context = context_of(document, path.resolve().parent, None)
-    section = document.data.get("data")
-    plan = check(Data, section, ("data",), document, [], context)
-    if plan is not None and context.default is not None:
-        yield from _file_faults(document, plan, lambda name, file: read_observations(plan, file, name))
+    observed = context.observed
+    found = check(_DataSection, {"data": document.data.get("data")}, (), document, [], context)
+    if found is None or context.default is None:
+        return
+    plan = DataPlan.of(found.data, observed or context.default.observables[0])
+    yield from _file_faults(document, plan, lambda name, file: read_observations(plan, file, name))
 
 
-def _file_faults(document: Document, plan: Data, read: Callable[[str, DataFile], object]) -> Iterator[Fault]:
+class _DataSection(Section):
+    """The section of the data alone."""
+
+    data: DATA
+
+
+def _file_faults(document: Document, plan: DataPlan, read: Callable[[str, DataFile], object]) -> Iterator[Fault]:
     """What keeps data files from being read; a file's fault is told at the place that names the file."""
     try:
         files = data_files(plan)
     except DataError as error:
-        yield document.fault(("data", "path"), str(error))
+        yield document.fault(_place_of(error, document), str(error))
         return
     for name, file in files.items():
         try:
@@ -76,4 +86,12 @@ def _file_faults(document: Document, plan: Data, read: Callable[[str, DataFile],
         except ConfigError as error:
             yield from error.problems
         except DataError as error:
-            yield document.fault(("data", "path"), str(error))
+            yield document.fault(_place_of(error, document), str(error))
+
+
+def _place_of(error: DataError, document: Document) -> tuple[str, ...]:
+    """Where the file is named, of one series or of all."""
+    own = ("data", "series", error.series)
+    if not document.has(own):
+        return ("data", "path") if document.has(("data", "path")) else ("data",)
+    return next((path for path in ((*own, "path"), ("data", "path")) if document.has(path)), own)

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from en4dvar.analysis import ChainRecord, Record, StartRecord
+from en4dvar.analysis import ChainRecord, Descents, IterationRecord, Record, StartRecord
 from en4dvar.errors import OutputError
 from en4dvar.files import own_file
 from en4dvar.runs.interrupt import Interrupted
@@ -26,9 +26,11 @@ def describe(name: str, record: Record) -> str:
     """An iteration in one line: J and its terms, step, fit, information, members alive; or where start or chain are."""
     if isinstance(record, StartRecord):
         return (
-            f"{name}: start, round {record.rounds:2d}  lowest J {min(record.costs):.6g}  "
+            f"{name}: {_stage(record)}, round {record.rounds:2d}  lowest J {min(record.costs):.6g}  "
             f"of {len(record.costs)} descents  under way {record.active}"
         )
+    if isinstance(record, Descents):
+        return f"{name}: {record.words}"
     if isinstance(record, ChainRecord):
         return (
             f"{name}: chain, {record.steps:4d} steps  R-hat {record.r_hat:.3f}  "
@@ -39,6 +41,10 @@ def describe(name: str, record: Record) -> str:
         f"{record.observation:.6g}  |dw| {record.step_norm:.2e}  step {record.step_length:.3g}  "
         f"chi2/K {record.chi2_per_observation:.3g}  DFS {record.dfs:.2f}  active {record.active}"
     )
+
+
+def _stage(record: StartRecord) -> str:
+    return "search for another minimum" if record.further else "start"
 
 
 class RunLog:
@@ -94,7 +100,7 @@ class LiveProgress:
         self._lengths: list[int] = []  # iterations of the data sets that have ended
 
     def __call__(self, name: str, record: Record) -> None:
-        if not isinstance(record, ChainRecord):
+        if isinstance(record, StartRecord | IterationRecord):
             self._open[name] = record.rounds if isinstance(record, StartRecord) else record.iteration
         self._show(_short(name, record))
 
@@ -190,7 +196,12 @@ def cycle_progress(cycles: int) -> Iterator[Callable[[int], None] | None]:
 def _short(name: str, record: Record) -> str:
     known = name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
     if isinstance(record, StartRecord):
-        return f"{known} start, round {record.rounds} of {len(record.costs)} descents: lowest J {min(record.costs):.4g}"
+        return (
+            f"{known} {_stage(record)}, round {record.rounds} of {len(record.costs)} descents: "
+            f"lowest J {min(record.costs):.4g}"
+        )
+    if isinstance(record, Descents):
+        return f"{known} {record.words}"
     if isinstance(record, ChainRecord):
         return (
             f"{known} chain of {record.steps} steps: R-hat {record.r_hat:.3f}, {record.effective:.0f} independent draws"

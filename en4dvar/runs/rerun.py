@@ -13,16 +13,16 @@ import numpy as np
 import xarray as xr
 
 from en4dvar.assimilate import assimilate
-from en4dvar.config.build import problem_of
+from en4dvar.config.build import inverse_plan, problem_of
 from en4dvar.config.document import parse_document
 from en4dvar.config.load import resolve
 from en4dvar.errors import OutputError
 from en4dvar.executor import choose_executor, one_blas_thread
+from en4dvar.observations import SEVERAL
 from en4dvar.report.result import Result, load_result
 from en4dvar.runs.trust import Ask, of_strangers
 from en4dvar.storage.campaign_file import failed_datasets
-from en4dvar.storage.checkpoint import file_digest
-from en4dvar.storage.fingerprint import Identity, identity
+from en4dvar.storage.fingerprint import Identity, digest_of, identity
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.store import result_files
 
@@ -96,7 +96,8 @@ def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = Fals
     with one_blas_thread(), choose_executor(config.model, None, workers) as executor:
         for file in files:
             recorded = load_result(file)
-            problem = problem_of(config, recorded.observations())
+            observables = {one.name: one.observable for one in inverse_plan(config).series}
+            problem = problem_of(config, recorded.observations(observables))
             analysis = assimilate(problem, config.assimilation, int(recorded.attributes["seed"]), executor)
             again = Result.from_analysis(analysis, {})
             variables, differ = differences(recorded, again)
@@ -143,9 +144,10 @@ def _by_how_much(a: np.ndarray, b: np.ndarray) -> str:
 
 def _data_file(recorded: Result) -> str:
     """What became of the data file; "" where it is as it was."""
-    source = Path(str(recorded.observed_data.attrs["data_source"]))
-    if not source.is_file():
+    sources = [Path(text) for text in str(recorded.observed_data.attrs["data_source"]).split(SEVERAL)]
+    source = next((path for path in sources if not path.is_file()), None)
+    if source is not None:
         return f"{source} is gone, the recorded observations were used"
-    if file_digest(source) != recorded.attributes["data_sha256"]:
-        return f"{source} has changed since, the recorded observations were used"
+    if digest_of(sources) != recorded.attributes["data_sha256"]:
+        return f"{SEVERAL.join(map(str, sources))} has changed since, the recorded observations were used"
     return ""

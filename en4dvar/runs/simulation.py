@@ -8,8 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar.config import Config, time_grid
-from en4dvar.config.build import data_files, read_observations, resolve_parameters
-from en4dvar.config.data import parse_error_std
+from en4dvar.config.build import data_files, resolve_parameters
+from en4dvar.config.data import Data
+from en4dvar.config.error_std import parse_error_std
+from en4dvar.config.reading import read_observations
+from en4dvar.config.series import DataPlan
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import run_chunk
 from en4dvar.forward import Failure
@@ -44,11 +47,14 @@ def simulate(config: Config, times: Array | None = None) -> Simulation:
     ------
     ConfigError, DataError: no times, or a value that only the data know. En4dvarError: the model fails.
     """
+    if isinstance(config.data, DataPlan):
+        raise ConfigError("a simulation is of one observable; the data of this file are several series")
     times = config.simulate_times if times is None else times
     observations = None
     if config.data is not None and (times is None or any(entry.needs_data for entry in config.parameters)):
-        name, file = next(iter(data_files(config.data).items()))
-        observations = read_observations(config.data, file, name)
+        plan = DataPlan.of(config.data, config.observable)
+        name, file = next(iter(data_files(plan).items()))
+        observations = read_observations(plan, file, name)
     if times is None:
         if observations is None:
             raise ConfigError("no instants to simulate: give simulate.times in the file, or --times FROM:TO:STEP")
@@ -98,7 +104,7 @@ def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:
     model, observable, data = config.model, config.observable, config.data
     time = Column(f"t_{model.time_display_unit}", model.time_display_unit, model.time_unit)
     value = Column(f"{observable.name}_{observable.display_unit}", observable.display_unit, observable.unit)
-    if data is not None:
+    if isinstance(data, Data):
         time = data.columns.time if isinstance(data.columns.time, Column) else time
         value = data.columns.observable
     units = {entry.parameter.name: entry.parameter.unit for entry in config.parameters}

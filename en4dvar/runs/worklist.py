@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from en4dvar.analysis import ChainRecord, Progress, Record, StartRecord
+from en4dvar.analysis import IterationRecord, Progress, Record, StartRecord
 from en4dvar.assimilate import LoopState
 from en4dvar.config import Config
 from en4dvar.config.build import build_one
@@ -163,9 +163,14 @@ class Worklist:
             self._record(name, record)
 
     def _record(self, name: str, record: Record) -> None:
-        if not isinstance(record, ChainRecord):
-            place = (0, record.rounds) if isinstance(record, StartRecord) else (1, record.iteration)
-            if place <= self._reached.get(name, (0, 0)):
+        if isinstance(record, StartRecord | IterationRecord):
+            reached = self._reached.get(name, (0, 0))
+            place = (
+                (2 * record.further, record.rounds)
+                if isinstance(record, StartRecord)
+                else (reached[0] | 1, record.iteration)
+            )
+            if place <= reached:
                 self.run.log.write(f"{name}: its worker was lost; another one repeats it")
             self._reached[name] = place
         self.run.log.write(describe(name, record))

@@ -72,6 +72,8 @@ class ForwardRuns:
             o, k = p.observations, len(p.observations)
             if p.prior.terms != problems[0].prior.terms:
                 raise ConfigError(f"{o.name}: a population needs one prior")
+            if o.parts:
+                raise ConfigError(f"{o.name}: a population needs one observable, without places")
             if not o.noise.plain or p.has_noise_scale:
                 raise ConfigError(f"{o.name}: a population needs independent Gaussian errors of known std")
             self.times[s] = o.times[-1]

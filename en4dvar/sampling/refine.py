@@ -14,18 +14,19 @@ from en4dvar.caution import Caution, caution
 from en4dvar.descent.minima import Minimum
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.prior import Prior, member_stream
+from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.emulated_cost import needed_runs
 from en4dvar.sampling.modes import TOO_FEW, WeightedDraws, nearest, sample_modes
-from en4dvar.sampling.shape import guide
+from en4dvar.sampling.shape import doubtful, guide
 from en4dvar.state import Array
 from en4dvar.units import convert
 
 COUNTS = math.log(1e-3)  # evidence of a minimum relative to that of the lowest, by Laplace, from which it may matter
 
 MISSED = 0.5  # of J, by which a draw must be lower than all minima to be told
+APART = 2.0  # standard deviations between modes of a parameter from which mean ± std describe none of them
 SEEN = 0.02  # weight of a mode that is told
-SHIFT, SPREAD = 0.25, 0.15  # of the ensemble, by the emulator: half of what is warned of
 
 
 @dataclass(frozen=True)
@@ -65,22 +66,35 @@ def mode_cautions(
     seen = [m for m, weight in zip(minima, weights, strict=True) if weight >= SEEN]
     if len(seen) < 2:
         return
+    distances = _apart(seen)
     centres = [prior.to_physical(m.x) for m in seen]
     shares = " and ".join(f"{weight:.2f}" for weight in weights if weight >= SEEN)
-    apart = np.argmax(np.abs((seen[1].x - seen[0].x) / prior.std))
-    p = prior.parameters[apart]
-    at = " and ".join(f"{convert(float(c[apart]), p.unit, p.display_unit):.3g}" for c in centres)
+    most = int(np.argmax(distances))
+    p = prior.parameters[most]
+    at = " and ".join(f"{convert(float(c[most]), p.unit, p.display_unit):.3g}" for c in centres)
     unit = "" if p.display_unit == "1" else f" {p.display_unit}"
     drawn = "members are drawn from all of them" if result else "members describe the first alone"
-    yield caution(
-        "several-modes", f"the posterior has {len(seen)} modes, {p.name} = {at}{unit}, of weights {shares}; {drawn}"
-    )
+    words = f"the posterior has {len(seen)} modes, {p.name} = {at}{unit}, of weights {shares}; {drawn}"
+    names = tuple(name for j, name in enumerate(prior.names) if distances[j] > APART or j == most)
+    yield caution("several-modes", words, None if result else "serious", names if result else ())
+
+
+def _apart(minima: Sequence[Minimum]) -> Array:
+    """(n,) the largest distance of two minima in each parameter, in the larger standard deviation of both."""
+    at = np.array([m.x for m in minima])
+    std = np.sqrt(np.array([np.diag(m.covariance) for m in minima]))
+    between = np.abs(at[:, None] - at) / np.maximum(std[:, None], std)
+    return np.asarray(between.max(axis=(0, 1)))
 
 
 def samples(space: WeightSpace) -> bool:
-    """Whether a doubt is settled by sampling: ``refine: auto`` with a cheap model of few parameters, all constant."""
-    n, problem, settings = len(space.mean), space.problem, space.settings
-    few = needed_runs(n) is not None and space.basis.shape[1] == n and not problem.varying
+    """Whether a doubt is settled by sampling."""
+    return may_sample(space.problem, space.settings) and space.basis.shape[1] == len(space.mean)
+
+
+def may_sample(problem: InverseProblem, settings: AssimilationSettings) -> bool:
+    """Whether there is ``refine: auto`` with a cheap model of few parameters, all constant."""
+    few = needed_runs(len(problem.prior.names)) is not None and not problem.varying
     return settings.refine == "auto" and problem.model.cheap and few and not settings.stochastic_model
 
 
@@ -90,9 +104,8 @@ def in_doubt(minima: Sequence[Minimum], agree: bool, shape: Mapping[str, float])
     ``agree``: whether descents from different members ended there. ``shape`` is that of
     :func:`~en4dvar.sampling.shape.examine_shape`.
     """
-    off = shape.get("mean_shift", 0.0) > SHIFT or abs(shape.get("spread_ratio", 1.0) - 1) > SPREAD
     unclear = shape.get("emulator_fit", 1.0) < diag.EMULATED_ENOUGH
-    return not agree or len(minima) > 1 or bool(shape.get("non_gaussian")) or off or unclear
+    return not agree or len(minima) > 1 or bool(shape.get("non_gaussian")) or doubtful(shape) or unclear
 
 
 def refined(

@@ -8,6 +8,8 @@ within about a tenth, and what they differ from the ensemble's is what a Markov 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from en4dvar import diagnostics as diag
@@ -17,6 +19,7 @@ from en4dvar.sampling.emulated_cost import EmulatedCost, emulate
 from en4dvar.state import Array
 
 CHAIN_FITS = 4  # of an emulator that has to guide a chain into the tails; two tell mean and spread
+SHIFT, SPREAD = 0.25, 0.15  # of the ensemble, by the emulator, that leave a doubt: half of what is warned of
 CLEARED = 0.85  # effective share of the members above which no run was found that was off (docs: calibration)
 
 
@@ -33,16 +36,28 @@ def examine_shape(space: WeightSpace, ensemble: Array, mode: Array, costs: Array
     if shape["gaussian_fit"] < CLEARED:
         emulator = guide(space, ensemble, seed, fits=2)
         if emulator is not None:
-            draws = emulator.draws
-            std = draws.std(axis=0)
-            ratio = ensemble.std(axis=0, ddof=1) / std
-            shape |= {
-                "mean_shift": float(np.max(np.abs(ensemble.mean(axis=0) - draws.mean(axis=0)) / std)),
-                "spread_ratio": float(ratio[np.argmax(np.abs(np.log(ratio)))]),
-                "emulator_fit": emulator.share,
-                **_displayed(space.problem.prior, draws),
-            }
+            found = _off(emulator, ensemble)
+            if doubtful(found):  # by walkers that have not settled, as often as not
+                emulator = emulator.settled(member_stream(seed, "emulator, settled"))
+                found = _off(emulator, ensemble)
+            shape |= {**found, "emulator_fit": emulator.share, **_displayed(space.problem.prior, emulator.draws)}
     return {**shape, "non_gaussian": diag.is_non_gaussian(shape)}
+
+
+def doubtful(shape: Mapping[str, float]) -> bool:
+    """Whether mean or spread of the ensemble are off, by the emulator, by half of what is warned of."""
+    return shape.get("mean_shift", 0.0) > SHIFT or abs(shape.get("spread_ratio", 1.0) - 1) > SPREAD
+
+
+def _off(emulator: EmulatedCost, ensemble: Array) -> dict[str, float]:
+    """How far an ensemble (N, n) is from the emulator's draws."""
+    draws = emulator.draws
+    std = draws.std(axis=0)
+    ratio = ensemble.std(axis=0, ddof=1) / std
+    return {
+        "mean_shift": float(np.max(np.abs(ensemble.mean(axis=0) - draws.mean(axis=0)) / std)),
+        "spread_ratio": float(ratio[np.argmax(np.abs(np.log(ratio)))]),
+    }
 
 
 def _displayed(prior: Prior, draws: Array) -> dict[str, float]:

@@ -3,13 +3,13 @@
 It is written by streaming: one data set is in memory at a time. Dimensions follow the files of the data sets, in the
 ArviZ schema, with ``dataset`` in front; ``time`` becomes ``observation`` (padded with NaN to the longest data set) and
 the observation times a variable. Scalars that judge a fit become variables of ``sample_stats``. The paths between the
-observations, the iterations and the modes stay in ``datasets/``.
+observations, the iterations, the descents and the modes stay in ``datasets/``.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ GROUPS = (
     "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "constant_data", "sample_stats",
     "log_likelihood",
 )  # fmt: skip
-LEFT_OUT = {"path_time", "iteration", "mode"}
+LEFT_OUT = {"path_time", "iteration", "mode", "descent"}
 RENAMED = {"time": "observation", "time_column": "observation_column"}  # padded to the longest data set
 PARAMETER = "parameter"
 FAILURES = "failed_datasets"  # root attribute: JSON of name → reason
@@ -59,7 +59,7 @@ def _write(path: Path, sources: Mapping[str, Path], n_observations: int, attribu
         target.setncatts(attributes)
         with netCDF4.Dataset(max(sources.values(), key=_parameters)) as widest:
             widest.set_auto_maskandscale(False)
-            _define(target, widest, len(sources), n_observations)
+            _define(target, widest, _scalars(sources.values()), len(sources), n_observations)
         for i, (name, file) in enumerate(sources.items()):
             with netCDF4.Dataset(file) as source:
                 source.set_auto_maskandscale(False)
@@ -74,6 +74,18 @@ def _parameters(file: Path) -> int:
         return len(source["sample_stats"].dimensions[PARAMETER])
 
 
+def _scalars(files: Iterable[Path]) -> dict[str, dict[str, Any]]:
+    """Group → name → type of every scalar that any data set has: one that was sampled has more than its neighbour."""
+    found: dict[str, dict[str, Any]] = {group: {} for group in GROUPS}
+    for file in files:
+        with netCDF4.Dataset(file) as source:
+            for group, kinds in found.items():
+                for key in source[group].ncattrs():
+                    text = isinstance(source[group].getncattr(key), str)
+                    kinds.setdefault(key, str if text else np.dtype(float))
+    return found
+
+
 def failed_datasets(path: Path) -> dict[str, str]:
     """Name of the data set without a posterior → reason, from a campaign's file; empty where there is no such file."""
     if not path.is_file():
@@ -86,8 +98,16 @@ def failed_datasets(path: Path) -> dict[str, str]:
         raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
 
 
-def _define(target: netCDF4.Dataset, widest: netCDF4.Dataset, n_datasets: int, n_observations: int) -> None:
-    """Groups, dimensions, variables and coordinates, as in the file of the (first) data set with most parameters."""
+def _define(
+    target: netCDF4.Dataset,
+    widest: netCDF4.Dataset,
+    scalars: Mapping[str, Mapping[str, Any]],
+    n_datasets: int,
+    n_observations: int,
+) -> None:
+    """Groups, dimensions, variables and coordinates, as in the file of the (first) data set with most parameters, and
+    the ``scalars`` of all.
+    """
     for name in GROUPS:
         source, group = widest[name], target.createGroup(name)
         group.createDimension("dataset", n_datasets)
@@ -103,9 +123,8 @@ def _define(target: netCDF4.Dataset, widest: netCDF4.Dataset, n_datasets: int, n
             made = _create(group, variable.name, variable.dtype, ("dataset", *dims) if own else dims, attributes, own)
             if not own:
                 made[...] = variable[...]
-        for key in source.ncattrs():
+        for key, kind in scalars[name].items():
             variable_name = f"{key}_total" if key in group.variables else key  # a parameter's share keeps its name
-            kind = str if isinstance(source.getncattr(key), str) else np.dtype(float)
             about = {"units": "1", "long_name": key.replace("_", " "), "attribute": key}
             _create(group, variable_name, kind, ("dataset",), about, padded=True)
 

@@ -25,7 +25,7 @@ from en4dvar.storage.codec import decode, encode
 
 D = TypeVar("D")
 FORMAT = "en4dvar-checkpoint"
-VERSION = "2"
+VERSION = "3"
 FOLDER = "checkpoints"
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import xarray as xr
 
 from en4dvar.config.symbols import symbol_fault
 from en4dvar.errors import OutputError
-from en4dvar.storage.groups import MEMBER
+from en4dvar.storage.axes import Axis, axes_of
+from en4dvar.storage.readings import MEMBER
 from en4dvar.units import UnitError, convert
 
 _GROUPS = (
@@ -24,12 +25,13 @@ _ATTRIBUTES = {
         "n_iterations", "converged", "stop_reason", "forward_runs",
     ),
 }  # fmt: skip
-# Variables that are read, * for each parameter and % for the observable.
+# Variables that are read, * for each parameter and % for each series; @ begins one that a single series has under the
+# name behind it, several under their own.
 _VARIABLES = {
     "/prior": "*",
-    "/prior_predictive": "%_path path_time",
-    "/posterior_predictive": "%_path path_time",
-    "/observed_data": "% %_std %_reading_std time_std weights time",
+    "/prior_predictive": "%",
+    "/posterior_predictive": "%",
+    "/observed_data": "% %_std %_reading_std @time_std @weights @time",
     "/sample_stats": "active failure_reason centre dfs %_centre parameter",
     "/iterations": "J J_background J_observation step_norm step_length chi2_per_observation dfs spread active *"
     " *_centre",
@@ -56,15 +58,16 @@ def _faults(nodes: Mapping[str, xr.Dataset]) -> Iterator[str]:
         if missing := [name for name in attributes if name not in nodes[group].attrs]:
             yield f"{group} has no attribute {', '.join(missing)}"
     parameters = map(str, of_members(nodes["/posterior"]).data_vars)
-    observables = list(nodes["/log_likelihood"].data_vars)
-    if len(observables) != 1:
+    axes = axes_of(list(map(str, nodes["/log_likelihood"].data_vars)))
+    if not axes:
         yield "/log_likelihood has no variable"
-    named = {"*": list(parameters), "%": [str(observables[0])]}
+    named = {"*": list(parameters), "%": [axis.name for axis in axes], "@": [axis.own("") for axis in axes]}
     for group, names in {**_VARIABLES, "/posterior": "*", "/constant_data": ""}.items():
         held, group_needs = nodes[group].variables, list(_expanded(names, named))
         if missing := [name for name in group_needs if name not in held]:
             yield f"{group} has no variable {', '.join(missing)}"
-        yield from _label_faults(group, nodes[group], named["%"][0])
+        yield from _curve_faults(group, nodes[group], axes, nodes["/observed_data"])
+        yield from _label_faults(group, nodes[group], axes)
 
 
 def _expanded(names: str, named: Mapping[str, list[str]]) -> Iterator[str]:
@@ -72,16 +75,29 @@ def _expanded(names: str, named: Mapping[str, list[str]]) -> Iterator[str]:
         yield from (name.replace(name[0], one, 1) for one in named.get(name[0], [name[0]]))
 
 
-def _label_faults(group: str, dataset: xr.Dataset, observable: str) -> Iterator[str]:
+def _curve_faults(group: str, dataset: xr.Dataset, axes: Sequence[Axis], observed: xr.Dataset) -> Iterator[str]:
+    """Curves along the path, which a series has but for one of a field."""
+    if not group.endswith("_predictive"):
+        return
+    for axis in axes:
+        if f"{axis.name}_path" not in dataset and f"{axis.name}_place" not in observed:
+            yield f"{group} has no variable {axis.name}_path"
+        elif f"{axis.name}_path" in dataset and "path_time" not in dataset.variables:
+            yield f"{group} has no variable path_time"
+
+
+def _label_faults(group: str, dataset: xr.Dataset, axes: Sequence[Axis]) -> Iterator[str]:
     """What keeps variables with a display unit or a symbol from being shown."""
+    times, names = [axis.time for axis in axes], [axis.name for axis in axes]
+    displayed = ("path_time", *times, *(name + end for name in names for end in _SHOWN))
     for name, variable in dataset.variables.items():
         about = variable.attrs
         wanted = ["units"]
         if group in _NAMED and name not in ("chain", "draw"):
             wanted += ["long_name", "symbol", *["display_units"] * (group != "/constant_data")]
-        elif name in ("time", "path_time", *(observable + end for end in _SHOWN)) or "symbol" in about:
+        elif name in displayed or "symbol" in about:
             wanted += ["display_units"]
-        if group == "/observed_data" and name == observable:
+        if group == "/observed_data" and name in names:
             wanted += ["long_name", "symbol"]
         if missing := [key for key in wanted if key not in about]:
             yield f"{group}/{name} has no attribute {', '.join(missing)}"

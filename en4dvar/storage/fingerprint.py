@@ -11,7 +11,7 @@ import functools
 import inspect
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,13 +58,20 @@ def identity(resolved: str, model: ForwardModel, data: Mapping[str, DataFile]) -
     content = yaml.safe_load(resolved)
     settings = {key: value for key, value in content.items() if key not in _NO_NUMBERS}
     software = {"python": f"{sys.version_info.major}.{sys.version_info.minor}", **package_versions(PACKAGES)}
-    errors = (content.get("data") or {}).get("error", {})
+    section = content.get("data") or {}
+    stated = [one.get(key) for one in (section, *section.get("series", {}).values()) for key in ("error", "weights")]
     sources = {"en4dvar": source_digest("en4dvar"), **_packages_of(model)}
-    sources |= {str(path): file_digest(path) for path in _paths([content["model"], errors])}
+    sources |= {str(path): file_digest(path) for path in _paths([content["model"], stated])}
     text = yaml.safe_dump(
         {**settings, "software": software, "sources": sources}, sort_keys=False, allow_unicode=True, width=120
     )
-    return Identity(text, tuple((name, file_digest(file.path)) for name, file in data.items()))
+    return Identity(text, tuple((name, digest_of(file.paths)) for name, file in data.items()))
+
+
+def digest_of(paths: Sequence[Path]) -> str:
+    """SHA-256 of a file, of several that of their digests."""
+    digests = list(map(file_digest, paths))
+    return digests[0] if len(digests) == 1 else digest("\n".join(digests).encode())
 
 
 @functools.cache  # the code that runs is that of the first import

@@ -19,11 +19,22 @@ import numpy.typing as npt
 from en4dvar.analysis import Analysis
 from en4dvar.caution import codes
 from en4dvar.diagnostics import active_members, nrmse
-from en4dvar.influence import prior_distance
 from en4dvar.state import Array, Parameter
-from en4dvar.storage.modes import mode_variables
-from en4dvar.storage.netcdf import Group, Variable, netcdf_attributes
+from en4dvar.storage.modes import descent_scalars, mode_variables
+from en4dvar.storage.netcdf import Group, netcdf_attributes
 from en4dvar.storage.netcdf import variable as _variable
+from en4dvar.storage.readings import (
+    MEMBER,
+    Variables,
+    log_likelihood,
+    observable_variable,
+    observed,
+    predictive,
+    readings,
+    residuals,
+    series_of,
+    time_variable,
+)
 from en4dvar.storage.responses import response_coordinates, response_variables
 from en4dvar.storage.varying import change_scalars, piece_coordinates, pieces
 
@@ -32,10 +43,7 @@ REFERENCES = (
     "Bocquet & Sakov (2014), doi:10.1002/qj.2236; Sakov, Oliver & Bertino (2012), doi:10.1175/MWR-D-11-00176.1; "
     "layout: ArviZ InferenceData schema"
 )
-MEMBER = ("chain", "draw")
-SCALAR = "scalar_"  # begins the attribute of a number found beside the data
 UNTOLD = "with heavy tails beside a discrepancy no single reading has a density of its own given the others"
-Variables = dict[str, Variable]
 
 
 def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]:
@@ -58,18 +66,16 @@ def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]
         "assimilation_settings": json.dumps(asdict(a.settings)),
         "warnings": "\n".join(c.line for c in a.cautions),
     }
-    label = f"{a.problem.observable.label}, log-likelihood of each observation"
-    log_likelihood = _variable((*MEMBER, "time"), a.log_likelihood[None], "1", label)
     return {
         "/": Group(attrs=netcdf_attributes({**root, **attributes})),
         "/prior": group({**_parameters(a, a.prior), **pieces(a, a.prior)}),
         "/posterior": group({**_parameters(a, a.posterior), **pieces(a, a.posterior)}),
-        "/prior_predictive": group(_predictive(a, a.prior_predictions, a.prior_trajectories)),
-        "/posterior_predictive": group(_predictive(a, a.posterior_predictions, a.posterior_trajectories)),
-        "/observed_data": group(*_observed(a)),
+        "/prior_predictive": group(predictive(a, a.prior_predictions, a.prior_trajectories)),
+        "/posterior_predictive": group(predictive(a, a.posterior_predictions, a.posterior_trajectories)),
+        "/observed_data": group(*observed(a)),
         "/constant_data": group(_constants(a)),
         "/sample_stats": group(_sample_stats(a), _scalars(a)),
-        "/log_likelihood": group({a.problem.observable.name: log_likelihood}),
+        "/log_likelihood": group(log_likelihood(a)),
         "/iterations": group(_iterations(a)),
     }
 
@@ -91,8 +97,11 @@ def _coordinates(a: Analysis) -> Variables:
     return {
         "chain": _variable("chain", np.zeros(1, dtype=np.int64), "1", "chain", fill=False),
         "draw": _variable("draw", np.arange(len(a.prior)), "1", "ensemble member", fill=False),
-        "time": _time(a, "time", a.observations.times, "observation time"),
-        "path_time": _time(a, "path_time", a.trajectory_times, "time on the clock of the observations"),
+        **{
+            axis.time: time_variable(a, axis.time, a.observations.times[part.where], "observation time")
+            for axis, part in series_of(a)
+        },
+        "path_time": time_variable(a, "path_time", a.trajectory_times, "time on the clock of the observations"),
         "parameter": _variable("parameter", names, "1", "estimated parameter", fill=False),
         "iteration": _variable("iteration", [r.iteration for r in a.iterations], "1", "iteration", fill=False),
         **response_coordinates(a),
@@ -100,47 +109,9 @@ def _coordinates(a: Analysis) -> Variables:
     }
 
 
-def _time(a: Analysis, dim: str, values: Array, long_name: str) -> Variable:
-    model = a.problem.model
-    shown = model.time_display_unit
-    return _variable(dim, values, model.time_unit, long_name, fill=False, display_units=shown, axis="T")
-
-
 def _parameters(a: Analysis, members: Array) -> Variables:
     """(N, n) physical values → one variable (chain, draw) a parameter."""
     return {p.name: _variable(MEMBER, members[None, :, i], **about(p)) for i, p in enumerate(a.parameters)}
-
-
-def _observable(a: Analysis, dims: tuple[str, ...], values: Array, what: str) -> Variable:
-    o = a.problem.observable
-    return _variable(dims, values, o.unit, f"{o.label}, {what}", display_units=o.display_unit, symbol=o.symbol)
-
-
-def _predictive(a: Analysis, predictions: Array, paths: Array) -> Variables:
-    name = a.problem.observable.name
-    return {
-        name: _observable(a, (*MEMBER, "time"), predictions[None], "noise-free prediction at the observations"),
-        f"{name}_path": _observable(a, (*MEMBER, "path_time"), paths[None], "noise-free prediction along the path"),
-    }
-
-
-def _observed(a: Analysis) -> tuple[Variables, dict[str, Any]]:
-    """Variables and attributes of the data and of what is stated about their errors."""
-    name, obs = a.problem.observable.name, a.observations
-    variables = {
-        name: _observable(a, ("time",), obs.values, "observed"),
-        f"{name}_std": _observable(a, ("time",), a.error_std, "observation-error std, timing error included"),
-        f"{name}_reading_std": _observable(a, ("time",), obs.std, "observation-error std of the reading alone"),
-        "time_std": _time(a, "time", obs.noise.time_std, "std of the observation times"),
-        "weights": _variable("time", obs.weights, "1", "weight of the observation in the cost"),
-    }
-    for key, (matrix, words) in obs.noise.matrices().items():
-        variables[f"{name}_{key}"] = _variable(("time", "time_column"), matrix, "1", words)
-    if a.down_weights is not None:
-        words = "weight of the observation in the robust cost at its minimum"
-        variables[f"{name}_huber_weight"] = _variable("time", a.down_weights, "1", words)
-    scalars = {f"{SCALAR}{key}": value for key, value in obs.scalars.items()}
-    return variables, {"name": obs.name, "data_source": obs.source, **scalars, **obs.noise.attributes()}
 
 
 def _constants(a: Analysis) -> Variables:
@@ -157,7 +128,6 @@ def _sample_stats(a: Analysis) -> Variables:
     active, prior_active = active_members(a.posterior_failures), active_members(a.prior_failures)
     reason = "reason of failure, empty where the member is alive"
     centre = "value at the minimum of J, each in the unit of its parameter"
-    name = a.problem.observable.name
     return {
         "active": _variable(MEMBER, active[None], "1", "member survived the posterior forecast"),
         "failure_reason": _variable(MEMBER, _text(a.posterior_failures)[None], "1", reason),
@@ -165,10 +135,15 @@ def _sample_stats(a: Analysis) -> Variables:
         "prior_failure_reason": _variable(MEMBER, _text(a.prior_failures)[None], "1", f"prior: {reason}"),
         "centre": _variable("parameter", a.centre, "1", centre),
         "dfs": _variable("parameter", a.dfs_per_parameter, "1", "degrees of freedom for signal of the parameter"),
-        f"{name}_centre": _observable(a, ("time",), a.centre_predictions, "prediction at the minimum of J"),
-        **_residuals(a),
+        **{
+            f"{part.name}_centre": observable_variable(
+                part, (axis.time,), a.centre_predictions[part.where], "prediction at the minimum of J"
+            )
+            for axis, part in series_of(a)
+        },
+        **residuals(a),
         **_discrepancy(a),
-        **_readings(a),
+        **readings(a),
         **{
             f"{v.name}_reached": _variable(
                 MEMBER, a.extremes[None, :, i], v.unit, v.label, limit=v.value, source=v.source
@@ -180,47 +155,15 @@ def _sample_stats(a: Analysis) -> Variables:
     }
 
 
-def _residuals(a: Analysis) -> Variables:
-    """Whitened residuals and leverages (time), NaN where a reading does not count."""
-    name, found = a.problem.observable.name, a.residuals
-    if found is None:
-        return {}
-    white, leverage, studentised = np.full((3, len(a.observations)), np.nan)
-    white[found.which], leverage[found.which], studentised[found.which] = found.white, found.leverage, found.studentised
-    return {
-        f"{name}_whitened_residual": _variable("time", white, "1", "whitened residual at the minimum of J"),
-        f"{name}_studentised": _variable("time", studentised, "1", "whitened residual over its own expected std"),
-        f"{name}_leverage": _variable("time", leverage, "1", "share of the reading in its own prediction"),
-    }
-
-
-def _readings(a: Analysis) -> Variables:
-    """What each reading does to the posterior (parameter, time), and how far it lies from the prior (time)."""
-    living = a.prior_predictions[active_members(a.prior_failures)]
-    distance = prior_distance(a.observations.values, living, a.error_std)
-    words = "distance of the reading from the prior's prediction, in the std of both"
-    found = {f"{a.problem.observable.name}_prior_distance": _variable("time", distance, "1", words)}
-    if a.influence is None:
-        return found
-    of_each = ("parameter", "time")
-    what = "change of the posterior mean if the reading is left out"
-    how = "0 by importance weights, 1 by linear response, 2: only another fit tells"
-    return found | {
-        "influence_change": _variable(of_each, a.influence.change, "1", f"{what}, each in the unit of its parameter"),
-        "influence_in_std": _variable(of_each, a.influence.in_std, "1", f"{what}, in posterior standard deviations"),
-        "influence_pareto_shape": _variable("time", a.influence.pareto_shape, "1", "Pareto shape of the weights"),
-        "influence_how": _variable("time", a.influence.how.astype(float), "1", how),
-    }
-
-
 SHARES = ("errors", "discrepancy", "prior")
 
 
 def _discrepancy(a: Analysis) -> Variables:
     """What the model misses (time), and where the variance of each parameter comes from (parameter)."""
-    name, found = a.problem.observable.name, a.discrepancy
+    (part, *_), found = a.problem.parts, a.discrepancy
     if found is None:
         return {}
+    name = part.name
     shares = {
         f"variance_from_{source}": _variable(
             "parameter", found.shares[:, i], "1", f"share of the posterior variance that comes from the {source}"
@@ -228,22 +171,24 @@ def _discrepancy(a: Analysis) -> Variables:
         for i, source in enumerate(SHARES)
     }
     return {
-        f"{name}_discrepancy": _observable(a, ("time",), found.mean, "what the model misses, at the minimum of J"),
-        f"{name}_discrepancy_std": _observable(a, ("time",), found.std, "std of what the model misses"),
+        f"{name}_discrepancy": observable_variable(
+            part, ("time",), found.mean, "what the model misses, at the minimum of J"
+        ),
+        f"{name}_discrepancy_std": observable_variable(part, ("time",), found.std, "std of what the model misses"),
         **shares,
     }
 
 
 def _scalars(a: Analysis) -> dict[str, Any]:
     """What judges the fit as a whole."""
-    y, active, last = a.observations.values, active_members(a.posterior_failures), a.iterations[-1]
+    active, last = active_members(a.posterior_failures), a.iterations[-1]
     return {
         "n_members": len(active),
         "n_active": int(active.sum()),
-        "n_observations": len(y),
+        "n_observations": len(a.observations),
         "n_weighted": len(a.observations.used),
-        "nrmse": nrmse(y, a.posterior_predictions[active].mean(axis=0)) if active.any() else np.nan,
-        "nrmse_centre": nrmse(y, a.centre_predictions),
+        "nrmse": _nrmse(a, a.posterior_predictions[active].mean(axis=0)) if active.any() else np.nan,
+        "nrmse_centre": _nrmse(a, a.centre_predictions),
         "chi2_per_observation": last.chi2_per_observation,
         "cost": last.cost,
         "dfs": last.dfs,
@@ -254,7 +199,7 @@ def _scalars(a: Analysis) -> dict[str, Any]:
         "stop_reason": a.stop_reason,
         "forward_runs": a.forward_runs,
         "n_modes": len(a.modes),
-        "n_agreeing": a.modes[0].descents if a.modes else 1,
+        **descent_scalars(a),
         "what_if_runs": sum(shift.runs for shift in a.what_if),
         "ledger_runs": a.ledger.runs if a.ledger else 0,
         "warning_codes": " ".join(codes(a.cautions)),
@@ -263,6 +208,15 @@ def _scalars(a: Analysis) -> dict[str, Any]:
         **a.shape,
         **a.refinement,
     }
+
+
+def _nrmse(a: Analysis, predicted: Array) -> float:
+    """Of several series, in units of their own, from the mean of (1 − NRMSE)² over those that vary."""
+    if not a.observations.parts:
+        return nrmse(a.observations.values, predicted)
+    y = a.observations.values
+    each = [nrmse(y[p.where], predicted[p.where]) for p in a.problem.parts if np.ptp(y[p.where]) > 0]
+    return float(1 - np.sqrt(np.mean((1 - np.array(each)) ** 2))) if each else np.nan
 
 
 def _judged_residuals(a: Analysis) -> dict[str, Any]:

@@ -14,12 +14,14 @@ import xarray as xr
 from en4dvar.analysis import Analysis
 from en4dvar.caution import Caution, worst_first
 from en4dvar.errors import OutputError
-from en4dvar.noise import noise_of_record
+from en4dvar.forward import Observable
 from en4dvar.observations import Observations
 from en4dvar.state import Array, Parameter
+from en4dvar.storage.axes import Axis, axes_of
 from en4dvar.storage.complete import check_complete, of_members
-from en4dvar.storage.groups import SCALAR, build_groups
+from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import netcdf_file, tree_of
+from en4dvar.storage.record import observations_of
 from en4dvar.storage.seal import check_seal
 from en4dvar.summary import ParameterSummary, living, results_table
 
@@ -81,8 +83,20 @@ class StoredResult:
 
     @property
     def observable(self) -> str:
-        """Name of the observed quantity."""
-        return str(next(iter(self.dataset("log_likelihood").data_vars)))
+        """Name of the observed quantity; of several series that of the first."""
+        return self.axes[0].name
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """The series of the data set, and how their variables are called."""
+        return axes_of([str(name) for name in self.dataset("log_likelihood").data_vars])
+
+    def of_readings(self, group: str, name: str, shared: bool = False) -> Array:
+        """(…, K) of all readings, one series after the other: the variables ``<series>_<name>``, or of a single series
+        ``name`` where that is ``shared``, as ``weights`` are."""
+        data = self.dataset(group)
+        names = [axis.own(name) if shared else f"{axis.name}_{name}" if name else axis.name for axis in self.axes]
+        return np.concatenate([np.asarray(data[one].values) for one in names], axis=-1)
 
     @property
     def cautions(self) -> tuple[Caution, ...]:
@@ -98,20 +112,12 @@ class StoredResult:
         """A group of the file, e.g. ``"prior_predictive"``."""
         return self.tree.children[group].to_dataset()
 
-    def observations(self) -> Observations:
-        """The observations (y, t, R) that the result was estimated from, to the bit."""
-        data, name = self.observed_data, self.observable
-        attributes = {str(key): value for key, value in data.attrs.items()}
-        own = {str(key).removeprefix(f"{name}_"): value.values for key, value in data.data_vars.items()}
-        return Observations(
-            times=data["time"].values,
-            values=data[name].values,
-            noise=noise_of_record(data["time"].values, own["reading_std"], own["time_std"], own, attributes),
-            weights=data["weights"].values,
-            name=self.name,
-            source=str(attributes["data_source"]),
-            scalars={k.removeprefix(SCALAR): float(v) for k, v in attributes.items() if k.startswith(SCALAR)},
-        )
+    def observations(self, observables: Mapping[str, Observable] | None = None) -> Observations:
+        """The observations (y, t, R) that the result was estimated from, to the bit.
+
+        ``observables``: what the series hold, by their names; the file does not know how a model predicts them.
+        """
+        return observations_of(self.observed_data, self.axes, self.name, observables or {})
 
     def members(self, group: str, name: str) -> Array:
         """(N',) finite values of a parameter in ``group`` (prior or posterior), display unit, members in order."""

@@ -160,7 +160,7 @@ def _columns_of(data: str, asked: _Asked, layout: Layout) -> dict[str, Any]:
 
     Raises one :class:`ConfigError` that names every option to add.
     """
-    from en4dvar.config.build import find_files
+    from en4dvar.config.find_files import find_files
     from en4dvar.errors import ConfigError
     from en4dvar.units import convert
     from en4dvar_bubble.starter.page import TRACKED, TRACKED_COLUMNS

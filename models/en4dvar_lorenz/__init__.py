@@ -1,7 +1,8 @@
-"""The test-beds of data assimilation: Lorenz-63, Lorenz-96 and a linear model, for twin experiments."""
+"""The test-beds of data assimilation: Lorenz-63, Lorenz-96, a linear model, and Lotka–Volterra for series of data."""
 
 from en4dvar_lorenz.linear import Linear
 from en4dvar_lorenz.lorenz63 import Lorenz63
 from en4dvar_lorenz.lorenz96 import Lorenz96
+from en4dvar_lorenz.lotka_volterra import LotkaVolterra
 
-__all__ = ["Linear", "Lorenz63", "Lorenz96"]
+__all__ = ["Linear", "Lorenz63", "Lorenz96", "LotkaVolterra"]

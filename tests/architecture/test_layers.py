@@ -17,7 +17,7 @@ LAYERS = (
     ("errors",),
     ("state", "hints", "files", "tables", "caution", "compiled", "user_code", "user_file"),
     ("units", "prior", "forward", "noise"),
-    ("batch", "observations"),
+    ("batch", "series", "observations"),
     ("varying",),
     ("problem", "diagnostics", "residuals", "influence"),
     ("executor",),

@@ -45,6 +45,20 @@ def test_quickstart_recovers_the_synthetic_gel(tmp_path):
         assert (tmp_path / file).stat().st_size > 0
 
 
+@pytest.mark.slow
+def test_predator_and_prey_observed_together(tmp_path):
+    """Within half of a standard deviation of Carpenter's posterior of the same data, and of spreads like his."""
+    result = run("predator_prey", tmp_path, **{"output.report": False})
+    assert [axis.name for axis in result.axes] == ["ln_prey", "ln_predator"]
+    assert not any(c.spoils for c in result.cautions)
+    his = {"alpha": (0.55, 0.06), "beta": (0.028, 0.004), "gamma": (0.80, 0.09), "delta": (0.024, 0.004),
+           "prey_0": (33.9, 2.9), "predator_0": (5.9, 0.5)}  # fmt: skip
+    for name, (value, spread) in his.items():
+        mean, std = mean_and_std(result, name)
+        assert abs(mean - value) < 0.5 * spread, name
+        assert 0.7 < std / spread < 1.4, name
+
+
 def test_laser_with_a_viscosity_that_is_halved(tmp_path):
     result = run("laser_varying", tmp_path, **{"output.report": False})
     assert result.sample_stats.attrs["n_active"] == 48

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from en4dvar.cycling.sequential import SequentialSettings, Series, run_sequential
+from en4dvar.cycling.sequential import CycleSeries, SequentialSettings, run_sequential
 from en4dvar.ensemble.linalg import centre
 from en4dvar.executor import SerialExecutor, ThreadsExecutor
 from en4dvar.forward import Observable
@@ -31,7 +31,7 @@ def linear_twin(n_members, seed=0):
     rng = np.random.default_rng(seed)
     members = np.hstack([rng.standard_normal((n_members, 8)), np.full((n_members, 1), 0.1)])
     values = rng.standard_normal((CYCLES, 3))
-    series = Series(DT * np.arange(1, CYCLES + 1), values, np.full(3, STD))
+    series = CycleSeries(DT * np.arange(1, CYCLES + 1), values, np.full(3, STD))
     return model, (Observable("seen", "1", three_of_eight),), members, series
 
 
@@ -108,7 +108,7 @@ def chaotic_twin(n_members=12, cycles=6, seed=1):
     truth = model.trajectories(start[None], times)[0].states[:, :20]
     members = np.tile(start, (n_members, 1))
     members[:, :20] += rng.standard_normal((n_members, 20))
-    return model, members, Series(times, truth + rng.standard_normal(truth.shape), np.ones(20))
+    return model, members, CycleSeries(times, truth + rng.standard_normal(truth.shape), np.ones(20))
 
 
 def test_ienks_without_lag_and_iterations_is_the_etkf():
@@ -164,7 +164,7 @@ def test_observations_of_the_same_state_can_be_reordered_and_rescaled():
     model, members, series = chaotic_twin()
     order = np.random.default_rng(4).permutation(20)
     factor = 10.0 ** np.random.default_rng(5).integers(-6, 6, 20)
-    shuffled = Series(series.times, (series.values * factor)[:, order], factor[order] * series.std)
+    shuffled = CycleSeries(series.times, (series.values * factor)[:, order], factor[order] * series.std)
     observed = (Observable("mixed", "1", lambda trajectory: (trajectory["x"] * factor)[:, order]),)
     plain = run_sequential(model, model.observables, members, series, SequentialSettings(IEnKS(1)))
     mixed = run_sequential(model, observed, members, shuffled, SequentialSettings(IEnKS(1)))
@@ -208,7 +208,7 @@ FULL = np.array([[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]])
 def test_correlated_errors_are_those_of_the_kalman_filter(scheme, correlation):
     model, observed, members, series = linear_twin(12)
     each = STD * np.array([1.0, 0.5, 2.0])
-    series = Series(series.times, series.values, each, Correlation(correlation))
+    series = CycleSeries(series.times, series.values, each, Correlation(correlation))
     result = run_sequential(model, observed, members, series, SequentialSettings(scheme))
     mean, cov = members[:, :8].mean(axis=0), np.cov(members[:, :8].T)
     m, h, r = flow(model, DT), np.eye(8)[SEEN], np.outer(each, each) * correlation
@@ -222,10 +222,10 @@ def test_correlated_errors_are_those_of_the_kalman_filter(scheme, correlation):
         model,
         observed,
         members,
-        Series(series.times, series.values, each, Correlation(np.eye(3))),
+        CycleSeries(series.times, series.values, each, Correlation(np.eye(3))),
         SequentialSettings(scheme),
     )
     plain = run_sequential(
-        model, observed, members, Series(series.times, series.values, each), SequentialSettings(scheme)
+        model, observed, members, CycleSeries(series.times, series.values, each), SequentialSettings(scheme)
     )
     close(independent.members, plain.members)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from en4dvar.cycling.sequential import SequentialSettings, Series, run_sequential
+from en4dvar.cycling.sequential import CycleSeries, SequentialSettings, run_sequential
 from en4dvar.errors import TooFewMembersError
 from en4dvar.forward import Failure, ForwardModel, Observable, StateField
 from en4dvar.noise import Correlation
@@ -43,7 +43,7 @@ class Breaking(Forced):
 
 def series(cycles=4, std=0.5):
     values = np.random.default_rng(0).standard_normal((cycles, 2))
-    return Series(np.arange(1.0, cycles + 1), values, np.full(2, std))
+    return CycleSeries(np.arange(1.0, cycles + 1), values, np.full(2, std))
 
 
 def members(n=10):
@@ -136,7 +136,7 @@ def test_progress_is_told_each_cycle():
 )
 def test_bad_series(times, values, std, message):
     with pytest.raises(ValueError, match=message):
-        Series(times, values, std)
+        CycleSeries(times, values, std)
 
 
 @pytest.mark.parametrize(
@@ -150,25 +150,25 @@ def test_bad_series(times, values, std, message):
 )
 def test_bad_correlation(correlation, message):
     with pytest.raises(ValueError, match=message):
-        Series(np.array([1.0]), np.zeros((1, 2)), np.ones(2), Correlation(correlation))
+        CycleSeries(np.array([1.0]), np.zeros((1, 2)), np.ones(2), Correlation(correlation))
 
 
 def test_localisation_needs_independent_errors():
     local = Localisation([np.arange(2)], np.ones((1, 2)))
-    y = Series(np.array([1.0]), np.zeros((1, 2)), np.ones(2), Correlation(np.eye(2)))
+    y = CycleSeries(np.array([1.0]), np.zeros((1, 2)), np.ones(2), Correlation(np.eye(2)))
     with pytest.raises(ValueError, match="independent errors"):
         run_sequential(Forced(), Forced.observables, members(), y, SequentialSettings(ETKF(), localisation=local))
 
 
 def test_errors_may_differ_by_time():
     model, plain = Forced(), series()
-    each = Series(plain.times, plain.values, np.tile(plain.std, (4, 1)))
+    each = CycleSeries(plain.times, plain.values, np.tile(plain.std, (4, 1)))
     a, b = (run_sequential(model, model.observables, members(), y, SequentialSettings(IEnKS(1))) for y in (plain, each))
     assert np.array_equal(a.members, b.members)
     blind = each.std.copy()
     blind[1:] = 1e12
     once = run_sequential(
-        model, model.observables, members(), Series(plain.times, plain.values, blind), SequentialSettings(ETKF())
+        model, model.observables, members(), CycleSeries(plain.times, plain.values, blind), SequentialSettings(ETKF())
     )
     assert once.analysis.std[-1] == pytest.approx(once.analysis.std[0], rel=1e-9)
     assert np.all(b.analysis.std[-1] < 0.9 * once.analysis.std[-1])

@@ -16,7 +16,7 @@ from twin_models import Ring
 from en4dvar.config import load_twin
 from en4dvar.cycling.moments import Moments
 from en4dvar.cycling.sequential import SequentialSettings, SequentialState, run_sequential
-from en4dvar.cycling.series import Series
+from en4dvar.cycling.series import CycleSeries
 from en4dvar.errors import OutputError
 from en4dvar.forward import Failure
 from en4dvar.runs.interrupt import Interrupted
@@ -66,7 +66,7 @@ def assert_same(a, b):
 def test_resumed_from_any_cycle(scheme, model):
     rng = np.random.default_rng(0)
     members = model.initial_state({}) + 0.8 * rng.standard_normal((14, 12))
-    series = Series(0.5 * np.arange(1, 12), rng.standard_normal((11, 6)), np.full(6, 0.7))
+    series = CycleSeries(0.5 * np.arange(1, 12), rng.standard_normal((11, 6)), np.full(6, 0.7))
     settings = SequentialSettings(scheme, Inflation(1.02, rtps=0.3), rotation=True, min_active_fraction=0.1)
 
     def run(resume=None):

@@ -115,8 +115,11 @@ def test_progress_and_forward_runs_are_reported():
     seen = []
     analysis = assimilate(problem, AssimilationSettings(members=16), 1, progress=lambda *args: seen.append(args))
     rounds = [record for _, record in seen if isinstance(record, StartRecord)]
-    assert [name for name, _ in seen] == ["toy"] * (len(rounds) + len(analysis.iterations))
-    assert [record for _, record in seen[len(rounds) :]] == list(analysis.iterations)
+    first = [record for record in rounds if not record.further]
+    assert [name for name, _ in seen] == ["toy"] * (len(rounds) + len(analysis.iterations) + 1)
+    assert [r for _, r in seen[len(first) : len(first) + len(analysis.iterations)]] == list(analysis.iterations)
+    assert seen[-1][1] == analysis.descents
+    rounds = first
     assert [record.rounds for record in rounds] == list(range(1, len(rounds) + 1))
     assert all(len(record.costs) == 2 and record.active <= 2 for record in rounds)
     assert np.isclose(min(rounds[-1].costs), [record.cost for record in analysis.iterations], rtol=1e-12).any()

@@ -73,7 +73,7 @@ ROWS = tuple(
          "{file}: damaged or incomplete (its checksum does not match); {data set} is estimated from the start", "0",
          "everything else"),
         ("checkpoint-older", "a checkpoint of another version",
-         "{file}: checkpoint format 0; this version reads 2; {data set} is estimated from the start", "0",
+         "{file}: checkpoint format 0; this version reads 3; {data set} is estimated from the start", "0",
          "everything else"),
         ("result-damaged", "a result file is altered",
          "{file}: damaged or altered since it was written (its checksum does not match)", "2",

@@ -238,7 +238,7 @@ def test_a_damaged_result_is_named_and_not_read(quiet, tmp_path, damage, name):
         pytest.param(flip, "checkpoint-damaged", marks=pytest.mark.fault("checkpoint-damaged")),
         pytest.param(cut, "checkpoint-damaged", marks=pytest.mark.fault("checkpoint-damaged")),
         pytest.param(
-            lambda content, _: content.replace(b"checkpoint 2 ", b"checkpoint 0 "),
+            lambda content, _: content.replace(b"checkpoint 3 ", b"checkpoint 0 "),
             "checkpoint-older",
             marks=pytest.mark.fault("checkpoint-older"),
         ),

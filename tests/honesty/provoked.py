@@ -119,13 +119,15 @@ PROVOKED: dict[str, Callable[[], Analysis]] = {
     "at-bound": lambda: run(bounded(1.6, lambda a: PriorTerm.logit(a, (0.0, 1.0), 0.5, 1.5), (0.0, 1.0))),
     "non-gaussian": lambda: run(make_problem(Product(TWO), (1.0, 1.0), std=0.1)),
     "several-modes": lambda: run(signless(), members=16),
-    "starts-disagree": lambda: run(signless(), members=4),
+    "starts-disagree": lambda: run(make_problem(Wave(), [1.5, 3.0], scale=2.5), members=4),
     "residual-structure": lambda: run(bent()),
     "odd-residuals": lambda: run(spiked()),
+    "one-descent": lambda: run(linear(), starts=1),
     "start-moved": lambda: run(
         make_problem(Fragile(-0.9, names=TWO), (-1.0, 0.5)), start="prior-mean", min_active_fraction=0.2
     ),
     "down-weighted": lambda: run(outlier()),
+    "not-bayesian": lambda: run(make_problem(Vectorised(TWO), (1.0, 0.5), weights=1 / 9)),
     "not-informed": lambda: run(linear(scale=0.01, std=0.5)),
 }
 

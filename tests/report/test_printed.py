@@ -23,10 +23,10 @@ from en4dvar.report.export import export_table
 from en4dvar.report.overlay import write_comparison
 from en4dvar.report.readings import influence, reading_words
 from en4dvar.report.result import Result
-from en4dvar.report.text import plus_minus
+from en4dvar.report.text import number_like, plus_minus
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
 from en4dvar.storage.provenance import provenance
-from en4dvar.storage.store import save
+from en4dvar.storage.store import load_stored, save
 from en4dvar.summary import INTERVAL, results_table
 
 AT_BOUND = caution("at-bound", "half of the members of G pile up", parameters=("G",))
@@ -49,6 +49,30 @@ def bounded(tmp_path, analysis):
 def text_of(html):
     html = re.sub(r"<svg.*?</svg>|<style.*?</style>", "", html, flags=re.S)
     return " ".join(unescape(re.sub(r"<[^>]+>", " ", html)).split())
+
+
+def test_of_several_modes_quantiles_are_printed_everywhere(tmp_path, one_figure, analysis):
+    """And mean ± std nowhere; what is not apart keeps them."""
+    words = "the posterior has 2 modes, G = 2 and 8 kPa, of weights 0.60 and 0.40; members are drawn from all of them"
+    run = written(tmp_path / "modes", analysis, caution("several-modes", words, parameters=("G",)))
+    alive = np.delete(analysis.posterior, 3, axis=0)
+    low, high = np.quantile(alive[:, 0], (0.05, 0.95)) / 1e3
+    mean, std = alive[:, 0].mean() / 1e3, alive[:, 0].std(ddof=1) / 1e3
+    page = text_of(write_pages(run).read_text(encoding="utf-8"))
+    assert f"G = {number_like(low, std)} to {number_like(high, std)} kPa – of several modes" in page
+    assert plus_minus(mean, std) not in page
+    other = plus_minus(alive[:, 1].mean(), alive[:, 1].std(ddof=1))
+    assert f"{other} Pa·s" in page
+    latex = export_table(run, "latex")
+    assert f"${number_like(low, std)}$ to ${number_like(high, std)}$\\textsuperscript{{a}}" in latex
+    assert "5 to 95 \\% of a posterior of several modes" in latex
+    assert f"{number_like(mean, std)} \\pm" not in latex
+    (row,) = (row for row in csv.DictReader(export_table(run).splitlines()) if row["name"] == "G")
+    assert (row["mean"], row["std"]) == ("", "")
+    assert float(row["q05"]) == pytest.approx(low)
+    assert "several modes" in row["informed"]
+    table = results_table({"set": [r for r in load_stored(run / "posterior.nc").summary() if r.name == "G"]})
+    assert table.splitlines()[-1].split()[3:5] == ["-", "-"]
 
 
 def test_page_prints_a_value_without_interval(bounded, one_figure, analysis):

@@ -81,6 +81,14 @@ def test_one_file_for_all(campaign):
         assert {len(r.observed_data["time"]) for r in single.values()} == {25, 31}
 
 
+def test_the_log_says_where_descents_ended(campaign):
+    """And takes no search for a worker that was lost and repeats itself."""
+    log = (campaign.directory / "run.log").read_text(encoding="utf-8")
+    assert log.count("descents ended at J") == len(list(campaign))
+    assert "search for another minimum, round  1" in log
+    assert "worker was lost" not in log
+
+
 def test_correlated_errors_are_kept_beside_one_another(tmp_path):
     path = make_campaign(tmp_path, 2)
     (tmp_path / "data" / "set1.csv").write_text(csv_text(25))

@@ -5,7 +5,7 @@ import re
 import pytest
 from run_files import assert_same_results, configuration, make_campaign
 
-from en4dvar.analysis import StartRecord
+from en4dvar.analysis import Descents, StartRecord
 from en4dvar.executor import choose_executor
 from en4dvar.runs.runner import run_campaign
 
@@ -22,8 +22,12 @@ class Listener:
     def __call__(self, name, record):
         lines = log(self.out)
         if isinstance(record, StartRecord):
-            assert f"{name}: start, round {record.rounds:2d}  lowest J " in lines[-1]
+            stage = "search for another minimum" if record.further else "start"
+            assert f"{name}: {stage}, round {record.rounds:2d}  lowest J " in lines[-1]
             self.flag.with_suffix(".start").touch()
+            return
+        if isinstance(record, Descents):
+            assert f"{name}: {record.words}" in lines[-1]
             return
         if not self.heard:
             assert any(f"{name}: iteration {record.iteration:2d}  J " in line for line in lines)

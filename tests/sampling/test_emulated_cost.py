@@ -9,13 +9,15 @@ from same_bits import assert_same_bits
 from toys import Decay, Fragile, Linear, Toy, make_problem
 
 from en4dvar.assimilate import assimilate, log_posterior
+from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.diagnostics import effective_share, is_non_gaussian, shape_warnings
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.executor import ThreadsExecutor
+from en4dvar.executor import SerialExecutor, ThreadsExecutor
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import AssimilationSettings
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.emulated_cost import emulate, needed_runs
+from en4dvar.sampling.shape import guide
 from en4dvar.sampling.walkers import advance
 from en4dvar.state import NOISE_SCALE
 
@@ -196,3 +198,51 @@ def test_effective_share():
     one_in_a_tail = np.zeros(100)
     one_in_a_tail[7] = 50.0
     assert effective_share(one_in_a_tail) == 1  # it does not decide
+
+
+class Valley(Toy):
+    """b follows a² within a narrow valley: quadratic, so that the emulator is exact."""
+
+    def curve(self, theta, t):
+        a, b = theta
+        return float(0.3 * a if t < 1.0 else 5 * (b - a * a))
+
+    def rate(self, theta, t):
+        return 0.0
+
+
+def valley():
+    model = Valley()
+    prior = tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters)
+    return make_problem(model, [0.5, 0.25], std=0.2, k=8, prior=prior)
+
+
+def moments_of_the_valley(problem):
+    axis = np.linspace(-3, 3, 601)
+    grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    a, b = grid.T
+    y, early = problem.observations.values, problem.observations.times < 1
+    residuals = [*(v - 0.3 * a for v in y[early]), *(v - 5 * (b - a * a) for v in y[~early])]
+    cost = 0.5 * (a * a + b * b) + 0.5 * sum(r * r for r in residuals) / 0.2**2
+    weights = np.exp(cost.min() - cost)
+    weights /= weights.sum()
+    mean = weights @ grid
+    return mean, np.sqrt(weights @ (grid - mean) ** 2)
+
+
+def test_a_doubt_is_told_by_walkers_that_have_settled():
+    """A hundred moves from a Gaussian into a bent valley are too few: spreads were a fifth too small."""
+    problem = valley()
+    settings = AssimilationSettings(members=24, emulator="on", refine="none", starts=1)
+    analysis = assimilate(problem, settings, 1)
+    space = WeightSpace(problem, settings, 1, SerialExecutor())
+    mean, std = moments_of_the_valley(problem)
+    hasty = guide(space, analysis.posterior, 1, fits=2)
+    off = np.abs(np.log(hasty.draws.std(axis=0) / std)).max()
+    assert off > 0.2
+    # what is told is of those that walked on
+    told = np.array([analysis.shape[f"emulated_std_{name}"] for name in "ab"])
+    assert np.abs(np.log(told / std)).max() < 0.6 * off
+    settled = hasty.settled(np.random.default_rng(1))
+    assert np.abs(np.log(settled.draws.std(axis=0) / std)).max() < 0.6 * off
+    assert np.abs((settled.draws.mean(axis=0) - mean) / std).max() < 0.1

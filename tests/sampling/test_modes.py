@@ -5,49 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from same_bits import assert_same_bits
-from toys import Toy, make_problem
+from wells import UnlikeWells, Wells, two_wells
 
 from en4dvar.assimilate import assimilate, log_posterior
 from en4dvar.executor import ThreadsExecutor
-from en4dvar.forward import Trajectory
-from en4dvar.prior import PriorTerm
 from en4dvar.problem import AssimilationSettings
 from en4dvar.sampling import mcmc
+from en4dvar.summary import summarise
 
 KEYWORDS = mcmc.sample.__kwdefaults__
-
-
-class Wells(Toy):
-    """y = f(a) + b t with f(a) = a² (two wells alike) or, for a > 0, (3 a)² (one of them three times as narrow)."""
-
-    narrow = False
-
-    def curve(self, theta, t):
-        a, b = theta
-        return np.where(self.narrow & (a > 0), 3 * a, a) ** 2 + b * t
-
-    def rate(self, theta, t):
-        return theta[1]
-
-    def trajectories(self, x, times):
-        own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
-        theta = np.broadcast_to(x[:, None, 2:], (*own.shape, 2))
-        parts = self.curve(theta.transpose(2, 0, 1), own), theta[..., 1]
-        return [
-            Trajectory(t, s, self.layout)
-            for t, s in zip(own, np.concatenate([np.stack(parts, axis=-1), theta], axis=-1), strict=True)
-        ]
-
-
-class UnlikeWells(Wells):
-    narrow = True
-
-
-def two_wells(kind=Wells, compiled=True, mean=0.3, seed=1):
-    model = kind(compiled=compiled)
-    a, b = model.parameters
-    terms = (PriorTerm.normal(a, mean, 1.0), PriorTerm.normal(b, 0.0, 0.5))
-    return make_problem(model, [-1.0, 0.3], std=0.2, prior=terms, seed=seed)
 
 
 def mass_of_positive(problem):
@@ -73,7 +39,11 @@ def test_weights_are_the_masses_of_the_wells(kind, mean):
     assert positive == pytest.approx(expected, abs=0.03)
     assert np.mean(analysis.posterior[:, 0] > 0) == pytest.approx(expected, abs=0.03)
     assert sum(mode.weight for mode in analysis.modes) == pytest.approx(1)
-    assert "several-modes" in {c.code for c in analysis.cautions}
+    (told,) = (c for c in analysis.cautions if c.code == "several-modes")
+    assert told.parameters == ("a",)  # b is the same in both
+    a, b = summarise(analysis)
+    assert (a.modal, b.modal) == (True, False)
+    assert a.q05 < 0 < a.q95
 
 
 @pytest.mark.parametrize("case", CASES[::2])
@@ -107,7 +77,9 @@ def test_of_a_model_that_is_not_cheap_the_other_minimum_is_told():
     slow = assimilate(two_wells(compiled=False, mean=0.0), AssimilationSettings(), 1)
     assert slow.refinement == {}
     assert len(slow.modes) == 2
-    assert "several-modes" in {c.code for c in slow.cautions}
+    (told,) = (c for c in slow.cautions if c.code == "several-modes")
+    assert told.severity == "serious"
+    assert all(row.untrusted == ("several-modes",) for row in summarise(slow))
 
 
 def test_the_evidence_is_that_of_both_wells():

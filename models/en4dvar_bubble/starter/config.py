@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from en4dvar.config import resolve
-from en4dvar.config.build import build_one, find_files, with_parts
+from en4dvar.config.build import build_one
 from en4dvar.config.document import parse_document
+from en4dvar.config.find_files import find_files, with_parts
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.files import expanded
 from en4dvar.inputs.readers import ANY, Column, DataFile, Layout, Readings, TimeStep, read_series

@@ -1,0 +1,135 @@
+"""Is a posterior that the product calls sampled the posterior?
+
+Against a tempered population that shares none of its samplers: laser-induced bubbles with rebounds where J has two
+minima that count (``laser:SEED``), the same refined by a Markov chain (``mcmc:SEED``), and the measured bubbles in
+polyacrylamide where their files are there. For each parameter, transformed: how far the mean is from the population's
+in its standard deviations, and the ratio of standard deviations; the largest are shown.
+
+    python benchmarks/against_tempered.py [--find 60] [--data FOLDER] [--minutes 5]
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from laser_twin import make_laser_twin
+from records import Record, fill
+from tempered import Tempered, tempered
+
+from en4dvar.analysis import Analysis
+from en4dvar.assimilate import assimilate
+from en4dvar.config.build import build
+from en4dvar.config.load import load_config
+from en4dvar.ensemble.forecast import log_posterior
+from en4dvar.prior import own_seed
+from en4dvar.problem import AssimilationSettings, InverseProblem
+
+CHAIN = {"assimilation.refine": "mcmc"}
+ROOT = Path(__file__).resolve().parents[1]
+PARTICLES, WALK = 3000, 40
+TOLERANCE = 0.05
+RIGHT_SCALE = 2.76e-6 / 3.7037e-6  # of PA1_exp2: metres a pixel instead of seconds a frame (shared/data/README.md)
+STIFF, SOFT = ("polyacrylamide_estrada", "PA1_exp2_RofTdata_0.mat"), ("polyacrylamide_soft", "A_E2_002.mat")
+SCALED = {"data.columns.radius.unit": f"{RIGHT_SCALE:.6f}*m", "parameters.R_eq.median": "47 um"}
+WIDE = {"parameters.G.log_std": 1.0, "parameters.mu.log_std": 0.7}
+MEASURED = {
+    "PA1_exp2, as it is": (*STIFF, {}),
+    "PA1_exp2, right scale": (*STIFF, SCALED),
+    "PA1_exp2, right scale, `refine: mcmc`": (*STIFF, SCALED | CHAIN),
+    "soft gel A_E2_002": (*SOFT, {}),
+    "soft gel A_E2_002, `refine: mcmc`": (*SOFT, CHAIN),
+    "soft gel, wide priors": (*SOFT, WIDE),
+}
+
+
+def reference(problem: InverseProblem, seed: int) -> tuple[Tempered, float]:
+    """Two populations together, and by how much the mean of one differs from that of both, in standard deviations."""
+    prior = problem.prior
+
+    def log_likelihood(x: np.ndarray) -> np.ndarray:
+        return log_posterior(problem, x) + 0.5 * np.sum(((x - prior.mean) / prior.std) ** 2, axis=1)
+
+    a, b = (tempered(log_likelihood, prior.mean, prior.std, s, PARTICLES, WALK) for s in (seed, seed + 10_000))
+    both = Tempered(np.concatenate([a.draws, b.draws]), a.runs + b.runs)
+    return both, float(np.max(np.abs(a.mean - both.mean) / both.std))
+
+
+def compared(problem: InverseProblem, settings: AssimilationSettings, seed: int) -> Record:
+    """What the product and the population say (n,)."""
+    analysis = assimilate(problem, settings, seed)
+    x, (population, error) = problem.prior.from_physical(analysis.posterior), reference(problem, seed)
+    return {
+        "shift": (x.mean(axis=0) - population.mean) / population.std,
+        "ratio": x.std(axis=0, ddof=1) / population.std,
+        "error": error,
+        "runs": [analysis.forward_runs, population.runs],
+        "modes": [float(mode.weight) for mode in analysis.modes],
+        "how": how(analysis),
+        "warned": [c.code for c in analysis.cautions if c.severity != "note"],
+    }
+
+
+def how(analysis: Analysis) -> str:
+    """Where the members come from."""
+    if "importance_draws" in analysis.refinement:
+        return "importance"
+    return "chain" if analysis.refinement else "Gaussian"
+
+
+def run(key: str, data: Path) -> Record:
+    kind, _, number = key.partition(":")
+    if kind in ("laser", "mcmc"):
+        settings = AssimilationSettings(what_if=False, refine="mcmc" if kind == "mcmc" else "auto")
+        return compared(make_laser_twin(int(number)).problem, settings, int(number))
+    name, file, changes = MEASURED[key]
+    config = load_config(ROOT / "configs" / f"{name}.yaml", {"data.path": str(data / file), **changes})
+    (problem,) = build(config)
+    return compared(problem, config.assimilation, own_seed(config.seed, problem.observations.name))
+
+
+def with_two_modes(path: Path, count: int, minutes: float) -> list[int]:
+    """Those of the first laser twins where two minima count, by descents alone."""
+    settings = AssimilationSettings(what_if=False, refine="none", emulator="off")
+
+    def modes(key: str) -> Record:
+        return {"modes": len(assimilate(make_laser_twin(int(key)).problem, settings, int(key)).modes)}
+
+    found = fill(path, [str(i) for i in range(count)], modes, minutes)
+    return [int(key) for key, record in found.items() if record["modes"] > 1]
+
+
+def table(records: dict[str, Record]) -> None:
+    print("| set | by | modes | mean off by | std ratio | populations differ by | runs (populations) | warns |")
+    print("|---|---|---|---|---|---|---|---|")
+    for key, r in records.items():
+        shift = float(np.max(np.abs(r["shift"])))
+        ratio = float(np.exp(np.max(np.abs(np.log(r["ratio"])))))
+        modes = ", ".join(f"{w:.2f}" for w in r["modes"])
+        runs = "{} ({})".format(*r["runs"])
+        codes = ", ".join(r["warned"])
+        print(f"| {key} | {r['how']} | {modes} | {shift:.3f} | {ratio:.3f} | {r['error']:.3f} | {runs} | {codes} |")
+    within = sum(
+        max(np.abs(r["shift"])) < TOLERANCE and max(np.abs(np.log(r["ratio"]))) < TOLERANCE for r in records.values()
+    )
+    print(f"\nwithin {TOLERANCE} in mean and spread: {within} of {len(records)}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--find", type=int, default=60, help="laser twins among which those with two modes are found")
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="the measured bubbles")
+    parser.add_argument("--minutes", type=float, default=1e9)
+    parser.add_argument("--records", type=Path, default=Path("runs/against_tempered"))
+    given = parser.parse_args()
+    seeds = with_two_modes(given.records / "modes.jsonl", given.find, given.minutes)
+    measured = [key for key, (_, file, _) in MEASURED.items() if (given.data / file).is_file()]
+    for key in MEASURED.keys() - measured:
+        print(f"skipped, no file: {key}")
+    keys = [*measured, *(f"laser:{i}" for i in seeds), *(f"mcmc:{i}" for i in seeds[:2])]
+    table(fill(given.records / "sets.jsonl", keys, lambda key: run(key, given.data), given.minutes))
+
+
+if __name__ == "__main__":
+    main()

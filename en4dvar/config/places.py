@@ -1,0 +1,113 @@
+"""``data.places``: where on a field the readings were taken, by index or by coordinate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BeforeValidator, Discriminator, Field, StrictInt, Tag
+
+from en4dvar.config.context import Context, Made
+from en4dvar.config.schema import Section
+from en4dvar.errors import ConfigError, DataError, Fault
+from en4dvar.forward import ForwardModel, Observable, StateField
+from en4dvar.inputs.readers import Column
+from en4dvar.series import Places
+from en4dvar.state import Array
+from en4dvar.state import Field as StateBlock
+from en4dvar.units import UnitError, convert, parse_quantity
+
+
+class PlaceColumn(Section):
+    """A column of places, one a reading."""
+
+    column: Annotated[str, Field(min_length=1)]
+    """Header of the column (CSV) or name of the field (.mat)."""
+    unit: str | None = None
+    """Unit of the coordinates in it; without a unit they are indices, counted from 0."""
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Places as they are stated: a ``column``, or ``positions`` (one for all readings, or one each).
+
+    ``of``: the field with coordinates that they are on; None: they are indices of its components.
+    """
+
+    column: Column | None = None
+    positions: Array | None = None
+    of: StateBlock | None = None
+    size: int | None = None
+
+    def places(self, count: int, read: Array | None) -> Places:
+        """Of ``count`` observations; ``read`` (count,) is what the column holds. Raises :class:`DataError`."""
+        stated = read if self.positions is None else self.positions
+        assert stated is not None
+        if len(stated) not in (1, count):
+            raise DataError(f"{len(stated)} places for {count} observations of the window")
+        positions = np.broadcast_to(stated, (count,))
+        if self.of is not None and self.of.coordinates is not None:
+            return Places.at_coordinates(positions, self.of.coordinates, self.of.coordinate_unit)
+        wrong = positions[(positions != np.round(positions)) | (positions < 0) | (positions >= (self.size or np.inf))]
+        if len(wrong):
+            last = f" to {self.size - 1}" if self.size else ""
+            raise DataError(f"{wrong[0]:g} is not the index of a component of the field; they go from 0{last}")
+        return Places.at_indices(positions.astype(int))
+
+
+def placing(given: Any, context: Context) -> Placing:
+    """Raises :class:`ConfigError`, its path the faulty key."""
+    block = field_of(context.units, context.observable)
+    size = block.size if block else None
+    if isinstance(given, PlaceColumn):
+        if given.unit is None:
+            return Placing(Column(given.column, "1", "1", kind="place"), size=size)
+        target = _coordinates(block, "unit")
+        try:
+            convert(1.0, given.unit, target.coordinate_unit)
+        except UnitError as error:
+            raise ConfigError([Fault(str(error), "unit")]) from None
+        return Placing(Column(given.column, given.unit, target.coordinate_unit, kind="place"), of=target)
+    entries = given if isinstance(given, list) else [given]
+    if all(isinstance(entry, int) for entry in entries):
+        return Placing(positions=np.array(entries, dtype=float), size=size)
+    target = _coordinates(block, "")
+    return Placing(positions=np.array([parse_quantity(e, target.coordinate_unit) for e in entries]), of=target)
+
+
+def field_of(model: ForwardModel, observable: Observable) -> StateBlock | None:
+    """The field of the state that an observable reads, where it reads one as it is."""
+    if not isinstance(observable.operator, StateField):
+        return None
+    return next((block for block in model.layout if block.name == observable.operator.name), None)
+
+
+def _coordinates(block: StateBlock | None, key: str) -> StateBlock:
+    if block is None or block.coordinates is None:
+        message = "the model gives no coordinates for what is observed; write indices, counted from 0, without a unit"
+        raise ConfigError([Fault(message, key)])
+    return block
+
+
+def _kind(given: Any) -> str:
+    return "a column" if isinstance(given, Mapping | PlaceColumn) else "places"
+
+
+def _known(given: Any) -> Any:
+    entries = given if isinstance(given, list) else [given]
+    column = isinstance(given, Mapping) and "column" in given
+    if not column and not all(isinstance(one, int | str) and not isinstance(one, bool) for one in entries):
+        raise ValueError("write an index, a coordinate such as '3 m', a list of either, or {column: NAME}")
+    return given
+
+
+PLACES = Made(
+    placing,
+    Annotated[
+        Annotated[StrictInt | str | list[StrictInt | str], Tag("places")] | Annotated[PlaceColumn, Tag("a column")],
+        Discriminator(_kind),
+        BeforeValidator(_known),
+    ],
+)

@@ -1,0 +1,182 @@
+"""The ``data:`` section of several series, and what both kinds of it come to: a plan of the series of a data set."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Discriminator, Field, Tag, WithJsonSchema
+
+from en4dvar.config.context import Context, Made
+from en4dvar.config.data import Data
+from en4dvar.config.schema import Section
+from en4dvar.config.validate import Faults, Place
+from en4dvar.errors import ConfigError, Fault
+from en4dvar.forward import Observable
+from en4dvar.hints import shown, suggest
+
+RESERVED = ("time", "path_time", "reading", "parameter", "chain", "draw", "correlation", "mode", "active", "dfs")
+EACH = {"type": "object", "minProperties": 1, "additionalProperties": {"x-definition": "series"}}
+Correlation = Annotated[float, Field(gt=-1, lt=1)]
+
+
+class SeriesData(Data):
+    """One series: where its readings are, and what they are of."""
+
+    observable: str | None = None
+    """Name of what was read; default: the name of the series."""
+    group: Annotated[str | None, Field(min_length=1)] = None
+    """Series of one group are balanced as one (``assimilation.weights: balanced``); default: each by itself."""
+
+
+@dataclass(frozen=True)
+class SeriesPlan:
+    """How one series is read."""
+
+    name: str
+    observable: Observable
+    data: Data
+    group: str = ""
+
+
+@dataclass(frozen=True)
+class DataPlan:
+    """How a data set is read: its series, and the correlation of the errors of two of them at equal times."""
+
+    series: tuple[SeriesPlan, ...]
+    correlation: Mapping[tuple[str, str], float]
+
+    @classmethod
+    def of(cls, data: Data | DataPlan, observable: Observable) -> DataPlan:
+        """Of either kind of section; ``observable`` is that of a single series."""
+        if isinstance(data, DataPlan):
+            return data
+        return cls((SeriesPlan(observable.name, observable, data),), {})
+
+    @property
+    def alone(self) -> bool:
+        """Whether there is one series."""
+        return len(self.series) == 1
+
+    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """As given, each series complete, with absolute paths."""
+        common, written = _common(given), dict[str, Any]()
+        for one in self.series:
+            section = one.data.as_written(_merged(common, given["series"][one.name]))
+            written[one.name] = {key: value for key, value in section.items() if value is not None}
+        rest = {"correlation": given["correlation"]} if given.get("correlation") else {}
+        return {"series": written, **rest}
+
+
+class DataOfSeries(Section):
+    """Several series that are assimilated together, each with its own file, times, units, errors and weights.
+
+    Every other key of ``data:`` holds for all series that do not say otherwise, for instance the path of a file that
+    has a column of each.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    series: Annotated[dict[str, Any], Field(min_length=1), WithJsonSchema(EACH)]
+    """Name of the series → what ``data:`` says of a single one; the name is that of its observable, unless it says
+    ``observable``."""
+    correlation: dict[str, dict[str, Correlation]] | None = None
+    """Correlation of the errors of two series at equal times: ``prey: {predator: 0.5}``."""
+
+
+def _common(given: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in given.items() if key not in ("series", "correlation")}
+
+
+def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """What a series says, and below it what holds for all; sections are merged key by key."""
+    return {
+        **common,
+        **{
+            key: {**common[key], **value} if isinstance(value, dict) and isinstance(common.get(key), dict) else value
+            for key, value in own.items()
+        },
+    }
+
+
+def _plan(section: DataOfSeries, context: Context) -> DataPlan:
+    given = {"series": section.series, **(section.model_extra or {})}
+    common, plans = _common(given), dict[str, SeriesPlan]()
+    with Faults() as faults:
+        for name, own in section.series.items():
+            if not isinstance(own, dict):
+                faults.add(("series", name), "expected 'key: value' lines")
+                continue
+
+            if fault := _name_fault(name, {**common, **own}, context):
+                faults.add(("series", name), fault, at_key=True)
+                continue
+
+            def place(where: Place, name: str = name, own: dict[str, Any] = own) -> Place:
+                return ("series", name, *where) if _has(own, where) or not _has(common, where) else where
+
+            with faults.at(schema=SeriesData, place=place):
+                plans[name] = _series(name, _merged(common, own), context)
+                if plans[name].data.error is not None and plans[name].data.error.discrepancy is not None:
+                    raise ConfigError([Fault("a discrepancy is that of a single series", "error.discrepancy")])
+        for name, others in (section.correlation or {}).items():
+            for other in others:
+                _check_pair(name, other, section, faults)
+    context.observed = None
+    pairs = {(a, b): value for a, others in (section.correlation or {}).items() for b, value in others.items()}
+    return DataPlan(tuple(plans.values()), pairs)
+
+
+def _has(given: Any, where: Place) -> bool:
+    """Whether the section says something at a place, or above it."""
+    return (
+        bool(where)
+        and isinstance(given, dict)
+        and where[0] in given
+        and (len(where) == 1 or not isinstance(given[where[0]], dict) or _has(given[where[0]], where[1:]))
+    )
+
+
+def _name_fault(name: str, given: Mapping[str, Any], context: Context) -> str:
+    """What is wrong with the name of a series, after which variables of the result are called; "" where nothing is."""
+    if not name.isidentifier() or name in RESERVED:
+        return f"{shown(name)} cannot be the name of a series; use letters, digits and _, as in well_3"
+    known = [observable.name for observable in context.units.observables]
+    if "observable" in given or name in known:
+        return ""
+    return f"unknown observable {shown(name)}{suggest(name, known)}; of another name, it has to say observable: NAME"
+
+
+def _series(name: str, given: dict[str, Any], context: Context) -> SeriesPlan:
+    known = {observable.name: observable for observable in context.units.observables}
+    chosen = str(given.get("observable", name))
+    if chosen not in known:
+        raise ConfigError(
+            [Fault(f"unknown observable {shown(str(chosen))}{suggest(str(chosen), known)}", "observable")]
+        )
+    context.observed = known[chosen]
+    data = SeriesData.model_validate(given, context=context)
+    return SeriesPlan(name, known[chosen], data, data.group or name)
+
+
+def _check_pair(name: str, other: str, section: DataOfSeries, faults: Faults) -> None:
+    if name not in section.series:
+        faults.add(("correlation", name), f"no series {shown(name)}{suggest(name, section.series)}", at_key=True)
+    elif other not in section.series or other == name:
+        others = [one for one in section.series if one != name]
+        message = f"no other series {shown(other)}{suggest(other, others)}"
+        faults.add(("correlation", name, other), message, at_key=True)
+    elif name in ((section.correlation or {}).get(other) or {}) and name > other:
+        faults.add(("correlation", name, other), f"given as {other}: {{{name}: …}} as well", at_key=True)
+
+
+def _kind(given: Any) -> str:
+    several = (isinstance(given, dict) and "series" in given) or isinstance(given, DataPlan)
+    return "of several series" if several else "of one series"
+
+
+DATA = Annotated[
+    Annotated[Data, Tag("of one series")] | Annotated[DataPlan, Made(_plan, DataOfSeries), Tag("of several series")],
+    Discriminator(_kind),
+]

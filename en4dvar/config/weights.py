@@ -1,0 +1,154 @@
+"""``data.weights``: how much each observation counts, β."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BeforeValidator, Discriminator, Field, Tag
+
+from en4dvar import user_file
+from en4dvar.config.context import Context, Made, quantity, time_unit
+from en4dvar.config.schema import Section
+from en4dvar.errors import ConfigError, DataError, Fault
+from en4dvar.files import PathError
+from en4dvar.hints import shown
+from en4dvar.inputs.readers import Column
+from en4dvar.inputs.window import minima
+from en4dvar.state import Array
+from en4dvar.user_code import loading, reason_of, require_permission
+
+Number = Annotated[float, Field(ge=0)]
+
+
+class WeightColumn(Section):
+    """A column of weights, one a reading."""
+
+    column: Annotated[str, Field(min_length=1)]
+    """Header of the column (CSV) or name of the field (.mat); the numbers have no unit."""
+
+
+class WeightFunction(Section):
+    """A function in a file of your own."""
+
+    function: str
+    """``./weights.py:name``; it gets times and values (K,) in the model's units, and gives weights (K,)."""
+
+
+class AwayFromMinima(Section):
+    """Zero near the minima of the observations, 1 elsewhere."""
+
+    zero_near_minima: Annotated[float, quantity(time_unit, "positive")]
+    """Readings that lie no farther than this from a local minimum do not count, e.g. 2 us."""
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """Weights as they are stated: a ``column`` of the file, or what gives them from times and values (K,).
+
+    ``stated`` is what the resolved file says of a user's function, its absolute path; None: what the file says.
+    """
+
+    column: Column | None = None
+    of: Callable[[Array, Array, float], Array] | None = None
+    stated: Any = None
+
+    def weights(self, times: Array, values: Array, prominence: float, read: Array | None) -> Array:
+        """β (K,) of the observations of a window; ``read`` (K,) are those of the column.
+
+        Raises :class:`DataError` where they are not as many as the observations, negative or not finite.
+        """
+        found = read if read is not None else np.ones(len(times))
+        if self.of is not None:
+            found = np.asarray(self.of(times, values, prominence))
+        if found.shape != times.shape or found.dtype.kind not in "fiub":
+            raise DataError(f"{_count(found)} for {len(times)} observations of the window")
+        found = found.astype(float)
+        if not (np.all(np.isfinite(found)) and np.all(found >= 0)):
+            worst = found[~(np.isfinite(found) & (found >= 0))][0]
+            raise DataError(f"a weight is {worst:g}; weights must be finite and not negative")
+        if not np.any(found > 0):
+            raise DataError("all weights are zero; no observation counts")
+        return found
+
+
+def _count(found: np.ndarray[Any, Any]) -> str:
+    return f"{len(found)} weights" if found.ndim == 1 and found.dtype.kind in "fiub" else f"weights {found.shape}"
+
+
+def weighing(given: Any, context: Context) -> Weighing:
+    """Raises :class:`ConfigError` where a function is not to be had."""
+    if isinstance(given, list):
+        numbers = np.array(given, dtype=float)
+        return Weighing(of=lambda times, values, prominence: numbers)
+    if isinstance(given, WeightColumn):
+        return Weighing(column=Column(given.column, "1", "1", kind="weight"))
+    if isinstance(given, AwayFromMinima):
+        reach = given.zero_near_minima
+        return Weighing(of=lambda times, values, prominence: away_from_minima(times, values, reach, prominence))
+    return _of_function(given.function, context.base)
+
+
+def away_from_minima(times: Array, values: Array, reach: float, prominence: float) -> Array:
+    """1, but 0 for readings within ``reach`` of a local minimum of ``values`` (K,) at ``times`` (K,).
+
+    >>> away_from_minima(np.arange(5.0), np.array([2.0, 1.0, 0.0, 1.0, 2.0]), 1.0, 0.1)
+    array([1., 0., 0., 0., 1.])
+    """
+    at = times[minima(values, prominence).astype(int)]
+    near = np.abs(times[:, None] - at) <= reach * (1 + 1e-9)
+    return np.where(near.any(axis=1), 0.0, 1.0)
+
+
+def _of_function(name: str, base: Path) -> Weighing:
+    if not user_file.is_file_reference(name):
+        raise ConfigError([Fault(f"{shown(name)} names no function of a file; write ./weights.py:name", "function")])
+    try:
+        reference = user_file.absolute(name, base)
+        with loading(f"{shown(name)} cannot be loaded"):
+            require_permission(f"function {shown(name)}", Path(reference.rpartition(":")[0]))
+            function = user_file.load(reference)
+    except (ConfigError, PathError, ValueError) as error:
+        raise ConfigError([Fault(str(error), "function")]) from None
+    if not callable(function):
+        raise ConfigError([Fault(f"{shown(name)} is no function", "function")])
+
+    def of(times: Array, values: Array, prominence: float) -> Array:
+        try:
+            return np.asarray(function(times.copy(), values.copy()))
+        except BaseException as error:
+            raise DataError(f"{name}: {reason_of(error)}") from None
+
+    return Weighing(of=of, stated={"function": reference})
+
+
+_KINDS = ("column", "zero_near_minima", "function")
+
+
+def _kind(given: Any) -> str | None:
+    """Which of the ways to state weights it is; None: none of them."""
+    if isinstance(given, Mapping):
+        return next((f"a {key}" for key in _KINDS if key in given), None)
+    return "a list" if isinstance(given, list) else None
+
+
+def _known(given: Any) -> Any:
+    if _kind(given) is None:
+        raise ValueError("write a list, {column: NAME}, {zero_near_minima: 2 us} or {function: ./weights.py:name}")
+    return given
+
+
+WEIGHTS = Made(
+    weighing,
+    Annotated[
+        Annotated[list[Number], Tag("a list")]
+        | Annotated[WeightColumn, Tag("a column")]
+        | Annotated[AwayFromMinima, Tag("a zero_near_minima")]
+        | Annotated[WeightFunction, Tag("a function")],
+        Discriminator(_kind),
+        BeforeValidator(_known),
+    ],
+)

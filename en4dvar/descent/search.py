@@ -1,0 +1,169 @@
+"""Whether there is another minimum than the one that the first descents ended in.
+
+Members of low J may all lie in the basin of a wrong minimum. A challenger starts from the member farthest from the
+minimum, chosen by the forecast of the prior ensemble that is there anyway; where it ends elsewhere, others follow. All
+rounds are kept as they go, so that an interrupted run repeats no descent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from en4dvar.analysis import Record, StartRecord
+from en4dvar.descent.loop import iterate
+from en4dvar.descent.minima import Minimum, merged
+from en4dvar.descent.start import AGREE, Rounds, StartState, affordable, descent_from
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.descent.window import DataWindow, Descent
+from en4dvar.ensemble.forecast import Forecast
+from en4dvar.errors import TooFewMembersError
+from en4dvar.schemes.base import GaussNewtonStep
+from en4dvar.schemes.en4dvar import En4DVar
+
+SAME_COST = 0.01  # of J, by which a descent must end lower to be another one
+
+
+@dataclass(frozen=True)
+class SearchState:
+    """Where a search stands: how many rounds are ``over``, whether the last of them ended ``lower`` than those before,
+    the forward runs that they took, and those ``spent`` on the round under way; its ``comparison``, and from the end of
+    that on where its descents ended (``minima``) and the lowest of them, the ``rival``, before its latest iteration.
+    """
+
+    over: int = 0
+    lower: bool = False
+    runs: int = 0
+    spent: int = 0
+    comparison: StartState | None = None
+    minima: tuple[Minimum, ...] = ()
+    rival: Descent | None = None
+
+
+@dataclass(frozen=True)
+class Found:
+    """The lowest ``descent``, converged, the same as it was ``before`` its last iteration, all minima, the lowest
+    first, the members that were ``tried``, from which descents started (N: the prior mean), and the forward ``runs``
+    of the rounds of a search.
+    """
+
+    descent: Descent
+    before: Descent
+    minima: tuple[Minimum, ...]
+    tried: tuple[int, ...]
+    runs: int = 0
+
+    @property
+    def agreed(self) -> bool:
+        """Whether descents from different members ended in the lowest minimum."""
+        return self.minima[0].descents >= AGREE
+
+
+Keep = Callable[[Callable[[], tuple[Found, SearchState]]], None]
+
+
+class Search:
+    """Descents from further members of the prior ensemble, whose forecast is ``run``, round after round.
+
+    ``keep`` is called before each move with a function that gives what it takes to go on from there: what was found
+    before the round, and ``begun``. ``forward_runs``: those up to there. ``tell``: see
+    :func:`~en4dvar.descent.start.choose_start`.
+    """
+
+    def __init__(
+        self, space: WeightSpace, scheme: En4DVar, run: Forecast, seed: int, begun: SearchState, keep: Keep,
+        tell: Callable[[Record], None],
+    ):  # fmt: skip
+        self.space, self.scheme, self.run, self.seed = space, scheme, run, seed
+        self.begun, self.keep, self.forward_runs = begun, keep, space.forward_runs
+        self.over, self.began = 0, 0
+        self.tell = lambda r: tell(replace(r, further=self.over) if isinstance(r, StartRecord) else r)
+
+    def challenged(self, found: Found) -> Found:
+        """After a descent from the member farthest from the lowest minimum."""
+        return self.round(found, [challenger(self.space, self.run, found)])
+
+    def settled(self, found: Found) -> Found:
+        """After ``starts`` members more, and again while one descent alone ended lowest and the budget lasts."""
+        together = self.space.settings.starts
+        while not found.agreed and (rest := self.rest(found)):
+            found = self.round(found, rest[:together])
+        return found
+
+    def rest(self, found: Found) -> list[int]:
+        """The members for which a descent can be afforded and that were not tried."""
+        return [i for i in affordable(self.space, self.scheme, self.run) if i not in found.tried]
+
+    def round(self, found: Found, members: Sequence[int]) -> Found:
+        """After descents from these members side by side; nothing is run again of a round that is over."""
+        self.over += 1
+        if self.begun.over >= self.over:
+            return found
+        after = self._after(found, members)
+        after = replace(after, runs=found.runs + self.space.forward_runs - self.began)
+        self.keep(lambda: (after, SearchState(self.over, after.descent is not found.descent, after.runs)))
+        return after
+
+    def _after(self, found: Found, members: Sequence[int]) -> Found:
+        begun = self.begun if self.begun.over == self.over - 1 else SearchState()
+        if begun.comparison or begun.rival:
+            self.space.forward_runs = self.forward_runs
+        self.began = self.space.forward_runs - begun.spent
+        if begun.rival is None:
+            rival, minima = self._compared(found, members, begun.comparison)
+        else:
+            rival, minima = begun.rival.kept, begun.minima
+        after = replace(found, minima=merged([*found.minima, *minima]), tried=(*found.tried, *members))
+        if begun.rival is None and found.descent.cost <= rival.cost:
+            return after
+        before = rival.kept
+
+        def keep() -> None:
+            nonlocal before
+            before = rival.kept
+            self._keep(found, lambda: SearchState(minima=minima, rival=before))
+
+        try:
+            iterate(DataWindow(self.space, self.seed, keep, self.tell), self.scheme, [rival])
+        except TooFewMembersError:  # the model does not run about it
+            return after
+        if rival.cost > found.descent.cost - SAME_COST:
+            return after
+        lowest = Minimum.of(self.space, rival)
+        return replace(after, descent=rival, before=before, minima=merged([lowest, *after.minima]))
+
+    def _compared(
+        self, found: Found, members: Sequence[int], comparison: StartState | None
+    ) -> tuple[Descent, tuple[Minimum, ...]]:
+        """The lowest of the descents, and where they ended: at the latest where they reach a known minimum."""
+
+        def keep(state: Callable[[], StartState]) -> None:
+            self._keep(found, lambda: SearchState(comparison=state()))
+
+        window = Rounds(self.space, self.seed, comparison or StartState(), keep, self.tell, found.minima)
+        if comparison is None:
+            window.begin_round([descent_from(self.space, i) for i in members])
+        iterate(window, self.scheme, window.descents)
+        window.end_round()
+        lowest = window.lowest
+        if lowest.members and isinstance(lowest.step, GaussNewtonStep):
+            window.end_here(lowest)
+        lowest.ended = False
+        return lowest, tuple(window.minima)
+
+    def _keep(self, found: Found, state: Callable[[], SearchState]) -> None:
+        spent = self.space.forward_runs - self.began
+        self.keep(lambda: (found, replace(state(), over=self.over - 1, runs=found.runs, spent=spent)))
+
+
+def challenger(space: WeightSpace, run: Forecast, found: Found) -> int:
+    """The member farthest from the lowest minimum, in standard deviations of the Gaussian about it, of those in the
+    half of lower J that were not tried.
+    """
+    costs = (space.drawn.background_costs + space.observation_cost(run))[:-1]
+    order = np.argsort(costs, kind="stable").tolist()
+    better = order[: max(len(found.tried) + 1, int(np.isfinite(costs).sum()) // 2)]
+    lowest = found.minima[0]
+    return max((i for i in better if i not in found.tried), key=lambda i: lowest.distance(space.members[i]))

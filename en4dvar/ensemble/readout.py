@@ -1,0 +1,73 @@
+"""H of every series of a data set as one function of a path: at which instants and places it is read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.ensemble.members import MisshapenError
+from en4dvar.errors import ConfigError
+from en4dvar.forward import RateOperator
+from en4dvar.problem import InverseProblem
+from en4dvar.series import Part
+from en4dvar.state import Array
+
+Indices = npt.NDArray[np.intp] | slice
+
+
+@dataclass(frozen=True)
+class Readout:
+    """(…, K + P M) of a path at T instants: the K readings of all parts, then the curves of the P parts that have one.
+
+    ``operators`` are those of the ``parts``, or their rates; ``rows`` (K,) says at which instant each reading was
+    taken, ``along`` (M,) those that a curve is read at.
+    """
+
+    operators: tuple[Callable[[Any], Array], ...]
+    parts: tuple[Part, ...]
+    n_times: int
+    rows: Indices
+    along: Indices
+
+    def __call__(self, path: Any) -> Array:
+        found = []
+        curves = []
+        for operator, part in zip(self.operators, self.parts, strict=True):
+            values = np.asarray(operator(path))
+            self._check(values, part)
+            rows = self.rows if isinstance(self.rows, slice) else self.rows[part.where]
+            if part.places is None:
+                found.append(values[..., rows])
+            else:
+                found.append(part.places.read(values[..., rows, :]))
+            if part.has_path:
+                at = values[..., self.along] if part.places is None else values[..., self.along, :]
+                curves.append(part.read_along(at))
+        return np.concatenate([*found, *curves], axis=-1)
+
+    def _check(self, values: Array, part: Part) -> None:
+        of_field = part.places is not None
+        if values.ndim < 1 + of_field or values.shape[-1 - of_field] != self.n_times:
+            raise MisshapenError
+
+
+def operators_of(parts: Sequence[Part], rates: bool = False, why: str = "") -> tuple[Callable[[Any], Array], ...]:
+    """The operators of the parts, or their ``rates``, which are needed for ``why``.
+
+    Raises :class:`ConfigError` where the model does not provide a rate.
+    """
+    if not rates:
+        return tuple(part.observable.operator for part in parts)
+    for part in parts:
+        if not isinstance(part.observable.operator, RateOperator):
+            raise ConfigError(f"{why} needs the rate of {part.observable.name}, which the model does not provide")
+    return tuple(part.observable.operator.rate for part in parts if isinstance(part.observable.operator, RateOperator))
+
+
+def batched(problem: InverseProblem) -> bool:
+    """Whether all operators take a :class:`~en4dvar.batch.Batch`."""
+    return all(getattr(part.observable.operator, "batched", False) for part in problem.parts)

@@ -1,0 +1,178 @@
+r"""Errors of several series side by side: blocks of readings, each with its own kind of errors, and independent.
+
+R is block diagonal once the readings are ordered by block: readings whose errors are correlated, directly or through
+others, are one block of :class:`CorrelatedNoise`, those that share the threshold of a robust cost one of
+:class:`HuberNoise`, the rest one of :class:`Noise`. So cost, score and information are sums over blocks, and what each
+reading contributes stands at its place.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.noise.correlated import CorrelatedNoise, Correlation
+from en4dvar.noise.gaussian import Noise, ScaleSkewness
+from en4dvar.noise.huber import HuberNoise
+from en4dvar.noise.predicted import Linearisation, Predicted
+from en4dvar.state import Array
+
+Indices = npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Block:
+    """The readings ``where`` (K',) and their errors."""
+
+    where: Indices
+    noise: Noise
+
+
+@dataclass(frozen=True)
+class BlockNoise(Noise):
+    """``correlation`` of all K readings, None where no two are correlated; ``thresholds`` (K,) of the robust cost, inf
+    where the errors are Gaussian.
+    """
+
+    correlation: Correlation | None
+    thresholds: Array
+
+    def check(self, weights: Array) -> None:
+        super().check(weights)
+        if self.correlation is not None:
+            self.correlation.check_size(len(weights))
+        if self.thresholds.shape != weights.shape:
+            raise ValueError(f"thresholds of the robust cost have shape {self.thresholds.shape}, not {weights.shape}")
+        for block in self.blocks:
+            block.noise.check(weights[block.where])
+            if block.noise.matrices() and np.isfinite(self.thresholds[block.where]).any():
+                raise ValueError("a robust cost needs independent observation errors")
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """In the order of their first readings."""
+        return tuple(sorted(self._blocks(), key=lambda block: int(block.where[0])))
+
+    def _blocks(self) -> Iterator[Block]:
+        alone = np.ones(len(self.std), dtype=bool)
+        for where in self._correlated():
+            alone[where] = False
+            matrix = Correlation(self._matrix[np.ix_(where, where)])
+            yield Block(where, CorrelatedNoise(self.std[where], self.time_std[where], matrix))
+        for threshold in np.unique(self.thresholds[alone]):
+            where = np.flatnonzero(alone & (self.thresholds == threshold))
+            errors = self.std[where], self.time_std[where]
+            yield Block(where, HuberNoise(*errors, float(threshold)) if math.isfinite(threshold) else Noise(*errors))
+
+    @property
+    def _matrix(self) -> Array:
+        return np.eye(len(self.std)) if self.correlation is None else self.correlation.matrix
+
+    def _correlated(self) -> Iterator[Indices]:
+        """Sets of readings that are correlated with each other and with no other."""
+        if self.correlation is None:
+            return
+        from scipy.sparse.csgraph import connected_components
+
+        count, label = connected_components(self.correlation.matrix != 0, directed=False)
+        sizes = np.bincount(label, minlength=count)
+        for one in np.flatnonzero(sizes > 1):
+            yield np.flatnonzero(label == one)
+
+    @property
+    def words(self) -> str:  # type: ignore[override]
+        return "".join(dict.fromkeys(block.noise.words for block in self.blocks))
+
+    @property
+    def independent(self) -> bool:  # type: ignore[override]
+        return self.correlation is None
+
+    @property
+    def counts_within(self) -> float:
+        return float(self.thresholds.min())
+
+    def frozen(self, predicted: Predicted) -> Noise:
+        return replace(self, std=self.error_std(predicted), time_std=np.zeros_like(self.std))
+
+    def whitened_residual(self, values: Array, predicted: Predicted) -> Array:
+        return self._each(predicted, lambda n, y, p: n.whitened_residual(y, p), values)
+
+    def influence(self, residual: Array) -> Array:
+        return np.asarray(self.thresholds / np.maximum(np.abs(residual), self.thresholds), dtype=float)
+
+    def down_weights(self, values: Array, predicted: Predicted) -> Array | None:
+        if not math.isfinite(self.counts_within):
+            return None
+        return self._each(predicted, lambda n, y, p: n.influence(n.whitened_residual(y, p)), values)
+
+    def squares(self, values: Array, predicted: Predicted) -> Array:
+        return self._each(predicted, lambda n, y, p: n.squares(y, p), values)
+
+    def cost(self, values: Array, weights: Array, predicted: Predicted) -> Array:
+        costs = [b.noise.cost(values[b.where], weights[b.where], part(predicted, b.where)) for b in self.blocks]
+        return np.asarray(np.sum(costs, axis=0))
+
+    def log_likelihood(self, values: Array, predicted: Predicted) -> Array:
+        return self._each(predicted, lambda n, y, p: n.log_likelihood(y, p), values)
+
+    def log_conditional(self, values: Array, predicted: Predicted) -> Array:
+        return self._each(predicted, lambda n, y, p: np.asarray(n.log_conditional(y, p)), values)
+
+    def log_normalisation(self, weights: Array) -> float:
+        return sum(block.noise.log_normalisation(weights[block.where]) for block in self.blocks)
+
+    def whiten(self, values: Array, weights: Array, at: Linearisation) -> tuple[Array, Array]:
+        found = [b.noise.whiten(values[b.where], weights[b.where], tangent(at, b.where)) for b in self.blocks]
+        rows = len(found[0][0]) // len(self.blocks[0].where)  # of each reading: its own, and that of ln s
+        d, sensitivity = np.empty((rows, len(values))), np.empty((rows, len(values), len(at.anomalies)))
+        for block, (own, slopes) in zip(self.blocks, found, strict=True):
+            d[:, block.where] = own.reshape(rows, -1)
+            sensitivity[:, block.where] = slopes.reshape(rows, len(block.where), -1)
+        return d.ravel(), sensitivity.reshape(rows * len(values), -1)
+
+    def precision_times(self, values: Array, weights: Array, at: Predicted, vectors: Array) -> Array:
+        product = np.empty_like(vectors)
+        for b in self.blocks:
+            product[..., b.where] = b.noise.precision_times(
+                values[b.where], weights[b.where], part(at, b.where), vectors[..., b.where]
+            )
+        return product
+
+    def scale_skewness(self) -> ScaleSkewness:
+        """The mean over the readings: they inform the one scale together."""
+        share = [len(block.where) / len(self.std) for block in self.blocks]
+        each = [block.noise.scale_skewness() for block in self.blocks]
+        return ScaleSkewness(
+            sum(w * one.of_predictions for w, one in zip(share, each, strict=True)),
+            sum(w * one.of_scale for w, one in zip(share, each, strict=True)),
+            sum(w * one.information for w, one in zip(share, each, strict=True)),
+        )
+
+    def matrices(self) -> dict[str, tuple[Array, str]]:
+        if self.correlation is None:
+            return {}
+        return {"correlation": (self.correlation.matrix, "correlation of the observation errors")}
+
+    def _each(self, predicted: Predicted, of: Callable[[Noise, Array, Predicted], Array], values: Array) -> Array:
+        """(…, K) of what each block gives of its readings (…, K')."""
+        found = np.empty(np.broadcast_shapes(predicted.values.shape, values.shape))
+        for block in self.blocks:
+            found[..., block.where] = of(block.noise, values[block.where], part(predicted, block.where))
+        return found
+
+
+def part(predicted: Predicted, where: Indices) -> Predicted:
+    """Of some of the readings."""
+    rates = None if predicted.rates is None else predicted.rates[..., where]
+    return replace(predicted, values=predicted.values[..., where], rates=rates)
+
+
+def tangent(at: Linearisation, where: Indices) -> Linearisation:
+    """Of some of the readings."""
+    rates = None if at.rate_anomalies is None else at.rate_anomalies[:, where]
+    return replace(at, prediction=part(at.prediction, where), anomalies=at.anomalies[:, where], rate_anomalies=rates)

@@ -1,0 +1,79 @@
+"""The observations of a result file, as they went into the estimate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import xarray as xr
+
+from en4dvar.forward import Observable, Trajectory
+from en4dvar.noise import noise_of_readings, noise_of_record
+from en4dvar.observations import Observations
+from en4dvar.series import Part, Places
+from en4dvar.state import Array
+from en4dvar.storage.axes import Axis
+from en4dvar.storage.readings import SCALAR
+
+
+def observations_of(
+    data: xr.Dataset, axes: Sequence[Axis], name: str, observables: Mapping[str, Observable]
+) -> Observations:
+    """From the group ``observed_data``; see :meth:`en4dvar.storage.store.StoredResult.observations`."""
+    attributes = {str(key): value for key, value in data.attrs.items()}
+
+    def each(suffix: str) -> Array:
+        return np.concatenate([data[f"{axis.name}{suffix}"].values for axis in axes])
+
+    def own(what: str) -> Array:
+        return np.concatenate([data[axis.own(what)].values for axis in axes])
+
+    times, parts = own("time"), _parts(data, axes, observables)
+    if parts:
+        matrix = data["correlation"].values if "correlation" in data else None
+        within = [float(attributes.get(f"{p.name}_huber_threshold", math.inf)) for p in parts]
+        thresholds = np.repeat(within, [p.end - p.begin for p in parts])
+        noise = noise_of_readings(each("_reading_std"), own("time_std"), matrix, thresholds)
+    else:
+        held = {str(key).removeprefix(f"{axes[0].name}_"): value.values for key, value in data.data_vars.items()}
+        noise = noise_of_record(times, each("_reading_std"), own("time_std"), held, attributes)
+    return Observations(
+        times=times,
+        values=each(""),
+        noise=noise,
+        weights=own("weights"),
+        name=name,
+        source=str(attributes["data_source"]),
+        scalars={k.removeprefix(SCALAR): float(v) for k, v in attributes.items() if k.startswith(SCALAR)},
+        parts=parts,
+    )
+
+
+def _parts(data: xr.Dataset, axes: Sequence[Axis], observables: Mapping[str, Observable]) -> tuple[Part, ...]:
+    """The series; () of a single one without places."""
+    ends = np.cumsum([len(data[axis.name]) for axis in axes]).tolist()
+    found = [
+        Part(axis.name, observables.get(axis.name) or _unread(data, axis), begin, end, _places(data, axis))
+        for axis, begin, end in zip(axes, [0, *ends], ends, strict=False)
+    ]
+    return () if len(found) == 1 and found[0].places is None else tuple(found)
+
+
+def _places(data: xr.Dataset, axis: Axis) -> Places | None:
+    name = f"{axis.name}_place"
+    if name not in data:
+        return None
+    indices, shares = data[f"{name}_index"].values.astype(np.intp), data[f"{name}_share"].values
+    return Places(indices, shares, data[name].values, str(data[name].attrs["units"]))
+
+
+def _unread(data: xr.Dataset, axis: Axis) -> Observable:
+    """What a file knows of an observable; only a model knows how it is predicted."""
+
+    def refuse(trajectory: Trajectory) -> Array:
+        raise NotImplementedError(f"{axis.name} is that of a file; give the model's observable")
+
+    about = data[axis.name].attrs
+    label = str(about["long_name"]).removesuffix(", observed")
+    return Observable(axis.name, about["units"], refuse, about["symbol"], about["display_units"], label)

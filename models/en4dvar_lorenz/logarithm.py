@@ -1,0 +1,19 @@
+"""An observation operator for what is positive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Logarithm:
+    """H that reads the natural logarithm of a positive field: errors that are a share of it have one std there."""
+
+    name: str
+    batched: ClassVar[bool] = True
+
+    def __call__(self, trajectory: Any) -> np.ndarray:
+        return np.log(trajectory[self.name])

@@ -1,0 +1,104 @@
+"""Descents from far members look for another minimum, of every model, and an interrupted search repeats nothing."""
+
+import numpy as np
+import pytest
+from same_bits import assert_same_bits
+from toys import Decay, Wave, make_problem
+from wells import UnlikeWells, Wells, two_wells
+
+from en4dvar.analysis import Descents, StartRecord
+from en4dvar.assimilate import LoopState, assimilate
+from en4dvar.problem import AssimilationSettings
+from en4dvar.storage.codec import decode, encode
+
+
+@pytest.mark.parametrize("settings", [{}, {"refine": "none"}, {"start": "prior-mean"}])
+@pytest.mark.parametrize("kind", [Wells, UnlikeWells])
+def test_no_well_is_lost_of_a_model_that_is_not_cheap(kind, settings):
+    for seed in range(8):
+        problem = two_wells(kind, compiled=settings.get("refine") == "none", seed=seed)
+        analysis = assimilate(problem, AssimilationSettings(**settings), seed)
+        told = analysis.descents
+        assert len(told.costs) == 2, seed
+        assert told.costs[1] - told.costs[0] < 1.1  # both minima, not where a descent was on its way there
+        assert len(analysis.modes) == 2
+        assert "several-modes" in {c.code for c in analysis.cautions}
+        assert told.agreeing >= 2
+        assert len(set(told.members)) == len(told.members)
+        assert 0 < told.runs < 100
+
+
+def test_what_the_search_costs_is_what_was_run():
+    class Counting(Decay):
+        runs = 0
+
+        def trajectories(self, x, times):
+            self.runs += len(x)
+            return super().trajectories(x, times)
+
+    heard, model = [], Counting()
+    problem = make_problem(model, [1.5, 1.2])
+    analysis = assimilate(
+        problem, AssimilationSettings(members=16), 1, progress=lambda _, r: heard.append((r, model.runs))
+    )
+    assert heard[-1][0] == analysis.descents
+    (before,) = (runs for r, runs in heard if r is analysis.iterations[-1])
+    after = max(runs for r, runs in heard if isinstance(r, StartRecord) and r.further)
+    assert analysis.descents.runs == after - before > 0
+    alone = assimilate(make_problem(Counting(), [1.5, 1.2]), AssimilationSettings(members=16, starts=1), 1)
+    assert alone.descents.runs == 0
+
+
+@pytest.mark.parametrize("settings", [{"starts": 1}, {"linearisation": "transform"}, {"members": 3}])
+def test_one_descent_alone_is_told(settings):
+    analysis = assimilate(make_problem(Decay(), [1.5, 1.2]), AssimilationSettings(**settings), 1)
+    assert len(analysis.descents.members) == 1
+    assert "one-descent" in {c.code for c in analysis.cautions}
+    assert "one-descent" not in {
+        c.code for c in assimilate(make_problem(Decay(), [1.5, 1.2]), AssimilationSettings(), 1).cautions
+    }
+
+
+def test_descents_go_on_until_two_agree():
+    """Of many minima the lowest found is that of one descent alone: others follow until a second one ends there."""
+    rounds = []
+    for seed in range(6):
+        analysis = assimilate(make_problem(Wave(), [1.5, 3.0], scale=2.5, seed=seed), AssimilationSettings(), seed)
+        agree = analysis.descents.agreeing >= 2
+        assert agree or "starts-disagree" in {c.code for c in analysis.cautions}
+        assert agree or len(analysis.descents.members) > 8  # all that the budget allows
+        rounds.append(len(analysis.descents.members))
+    assert min(rounds) == 3
+    assert max(rounds) > 4
+
+
+def interrupted(problem, settings, seed, resume=None):
+    states = []
+    analysis = assimilate(problem, settings, seed, resume=resume, keep=lambda state: states.append(state()))
+    return analysis, [decode(encode(state), LoopState) for state in states]
+
+
+def test_a_search_goes_on_from_any_state_to_the_same_bits():
+    settings, seen = AssimilationSettings(start="prior-mean"), set()
+    for seed in (3, 7):
+        problem = two_wells(UnlikeWells, compiled=seed == 7, mean=-0.3, seed=seed)
+        whole, states = interrupted(problem, settings, seed)
+        for i, state in enumerate(states):
+            if state.search is None:
+                continue
+            begun = state.search
+            seen.add((begun.over > 0, begun.comparison is not None, begun.rival is not None))
+            again, rest = interrupted(problem, settings, seed, state)
+            assert_same_bits(again, whole)
+            assert all(r.search and r.search.over >= begun.over for r in rest)
+            assert len(rest) <= len(states) - i + 1
+    assert seen == {(False, True, False), (False, False, True), (True, True, False), (True, False, False)}
+
+
+def test_where_descents_ended_in_words():
+    told = Descents((4, 17, -1, 9), (0, 0, 1, -1), (5.25, 9.5), 0.125, 20)
+    assert told.words == (
+        "4 descents ended at J 5.25 by members 4 17 (within 0.12), 9.5 by the prior mean, no minimum by member 9"
+    )
+    assert told.agreeing == 2
+    assert np.isclose(told.spread, 0.125)

@@ -1,0 +1,40 @@
+"""Two wells: a posterior of two modes."""
+
+import numpy as np
+from toys import Toy, make_problem
+
+from en4dvar.forward import Trajectory
+from en4dvar.prior import PriorTerm
+
+
+class Wells(Toy):
+    """y = f(a) + b t with f(a) = a² (two wells alike) or, for a > 0, (3 a)² (one of them three times as narrow)."""
+
+    narrow = False
+
+    def curve(self, theta, t):
+        a, b = theta
+        return np.where(self.narrow & (a > 0), 3 * a, a) ** 2 + b * t
+
+    def rate(self, theta, t):
+        return theta[1]
+
+    def trajectories(self, x, times):
+        own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+        theta = np.broadcast_to(x[:, None, 2:], (*own.shape, 2))
+        parts = self.curve(theta.transpose(2, 0, 1), own), theta[..., 1]
+        return [
+            Trajectory(t, s, self.layout)
+            for t, s in zip(own, np.concatenate([np.stack(parts, axis=-1), theta], axis=-1), strict=True)
+        ]
+
+
+class UnlikeWells(Wells):
+    narrow = True
+
+
+def two_wells(kind=Wells, compiled=True, mean=0.3, seed=1):
+    model = kind(compiled=compiled)
+    a, b = model.parameters
+    terms = (PriorTerm.normal(a, mean, 1.0), PriorTerm.normal(b, 0.0, 0.5))
+    return make_problem(model, [-1.0, 0.3], std=0.2, prior=terms, seed=seed)
