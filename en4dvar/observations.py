@@ -15,6 +15,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.caution import Caution
 from en4dvar.errors import DataError
 from en4dvar.noise import Linearisation, Noise, Predicted, joint_noise
 from en4dvar.prior import LARGEST
@@ -38,6 +39,7 @@ class Observations:
     weights: (K,) β_k ≥ 0; 1 counts an observation fully (``weights: sum``), 1/K is ``weights: mean``.
     name: of the data set. source: where it was read from (for the record).
     scalars: further numbers found beside the series (e.g. an equilibrium radius), as read, no units applied.
+    doubts: what makes the times of the file implausible.
     parts: which readings belong to which series, see :meth:`of_series`; () where all are of one observable, which has
         one value at a time.
 
@@ -53,6 +55,7 @@ class Observations:
     name: str = "data"
     source: str = ""
     scalars: Mapping[str, float] = field(default_factory=dict)
+    doubts: tuple[Caution, ...] = ()
     parts: tuple[Part, ...] = ()
 
     @classmethod
@@ -102,6 +105,7 @@ class Observations:
             name=name,
             source=SEVERAL.join(dict.fromkeys(one.source for one in series if one.source)),
             scalars={key: value for one in series for key, value in one.scalars.items()},
+            doubts=tuple(doubt for one in series for doubt in one.doubts),
             parts=() if len(series) == 1 and series[0].places is None else parts,
         )
 

@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.caution import Caution
 from en4dvar.errors import DataError
 from en4dvar.forward import Observable
 from en4dvar.noise import Noise
@@ -78,7 +79,7 @@ class Series:
     weights: (K,) β ≥ 0; None: 1.
     name: of the series; default: the observable's. group: what it is balanced as (:func:`balanced`); default: its name.
     places: where on a field the readings were taken; None of an observable with one value at a time.
-    source, scalars: as of :class:`~en4dvar.observations.Observations`.
+    source, scalars, doubts: as of :class:`~en4dvar.observations.Observations`.
     """
 
     observable: Observable
@@ -91,6 +92,7 @@ class Series:
     places: Places | None = None
     source: str = ""
     scalars: Mapping[str, float] = field(default_factory=dict)
+    doubts: tuple[Caution, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or self.observable.name)

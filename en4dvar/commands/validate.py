@@ -70,6 +70,8 @@ def _warn(one: Preview) -> None:
     if reasons:
         lost = f"{len(reasons)} of {len(one.run.failures)} prior members cannot be run"
         click.echo(f"warning: {name}: {lost}, e.g.: {reasons[0]}", err=True)
+    for one_doubt in one.problem.observations.doubts:
+        click.echo(f"warning: {name}: {one_doubt.words}", err=True)
     for words in doubts(one.problem, one.members, one.run.predictions):
         click.echo(f"warning: {name}: {words}", err=True)
     if one.outside > 0.1:

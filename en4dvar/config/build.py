@@ -13,7 +13,7 @@ from en4dvar.config.reading import read_observations
 from en4dvar.config.series import DataPlan, SeriesPlan
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.errors import ConfigError, DataError, Fault
-from en4dvar.inputs.readers import DataFile
+from en4dvar.inputs.readers import Column, DataFile
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem, Tie, discrepancy_parameters
@@ -141,7 +141,8 @@ def _files_of(one: SeriesPlan) -> dict[str, DataFile]:
         files = find_files(data.path.base, data.path.texts)
     except DataError as error:
         raise DataError(str(error), one.name) from None
-    return with_parts(files, data.columns.observable, data.format, data.decimal, data.by)
+    time = data.columns.time
+    return with_parts(files, data.columns.observable, data.layout, time.name if isinstance(time, Column) else None)
 
 
 def resolve_parameters(

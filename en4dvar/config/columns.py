@@ -7,7 +7,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
-from en4dvar.config.context import PLACEHOLDER, Context, Made, observable_unit, time_unit, unit_of
+from en4dvar.config.context import PLACEHOLDER, Context, Made, observable_unit, require_sign, time_unit, unit_of
 from en4dvar.config.schema import QuantityText, Section
 from en4dvar.config.validate import Faults
 from en4dvar.errors import ConfigError, Fault
@@ -55,6 +55,8 @@ class TimeColumn(Section):
     """Constant time step: a quantity such as 0.63 us, or the name of a scalar in the file (then with ``unit``)."""
     unit: Annotated[str | None, unit_of(time_unit)] = None
     """Unit of the times in the file, e.g. us; required with ``name``, never guessed."""
+    rate: QuantityText | None = None
+    """Frame rate of the camera, e.g. 270 kHz; the column of times is compared with it."""
 
     @model_validator(mode="after")
     def _one_of(self) -> Self:
@@ -62,18 +64,30 @@ class TimeColumn(Section):
             raise ValueError("give either 'name' (a column of times) or 'step' (a constant time step)")
         if self.name is not None and "unit" not in self.model_fields_set:
             raise ValueError(f"the unit of column {self.name!r} is missing; write unit: us")
+        if self.rate is not None and self.name is None:
+            raise ValueError("'rate' is compared with a column of times; a step needs none")
         return self
 
 
 def _times(given: TimeColumn, context: Context) -> Column | TimeStep:
     unit = time_unit(context)
+    rate = None if given.rate is None else _rate(given.rate, unit)
     if given.unit is not None:
-        named = Column(str(given.name or given.step), given.unit, unit)
+        named = Column(str(given.name or given.step), given.unit, unit, rate=rate)
         return named if given.name else TimeStep(named)
     try:
         return TimeStep(value=parse_quantity(given.step or 0, unit))
     except UnitError as error:
         raise ConfigError([Fault(str(error), "step")]) from None
+
+
+def _rate(text: Any, unit: str) -> float:
+    try:
+        value = parse_quantity(text, f"1/({unit})")
+        require_sign(value, "positive", text)
+    except ValueError as error:
+        raise ConfigError([Fault(str(error), "rate")]) from None
+    return value
 
 
 def _values(given: ValueColumn, context: Context) -> Column:

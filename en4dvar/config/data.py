@@ -18,7 +18,7 @@ from en4dvar.config.validate import Faults
 from en4dvar.config.weights import WEIGHTS, Weighing
 from en4dvar.config.window import WindowSection, read_time_zero
 from en4dvar.hints import shown, suggest
-from en4dvar.inputs.readers import Format
+from en4dvar.inputs.readers import Disorder, Format, Layout, Repeated
 from en4dvar.inputs.text_table import Decimal
 
 
@@ -50,7 +50,13 @@ class Data(Section):
     decimal: Decimal = "."
     """Decimal sign of the numbers in a CSV file."""
     by: Annotated[str | None, Field(min_length=1)] = None
-    """Column of a CSV file that says which data set a row belongs to: each is estimated by itself."""
+    """Column of a table that says which data set a row belongs to: each is estimated by itself."""
+    sheet: str = ""
+    """Sheet of an Excel workbook, a range of it, or both: ``Film 3``, ``A3:D40``, ``Film 3!A3:D40``."""
+    unsorted: Disorder = "refuse"
+    """Rows whose times do not increase: refuse the file, or sort them."""
+    repeated: Repeated = "refuse"
+    """Several readings of one time, without ``places``: refuse the file, or average them."""
     columns: Annotated[Columns, OfObservable("column role")]
     """Which columns hold the time and the observable, each with its unit: ``time: {name: t, unit: us}``."""
     window: WindowSection = Field({}, validate_default=True)
@@ -67,8 +73,15 @@ class Data(Section):
     """Observation errors: ``<observable>_std``, ``time_std``, ``correlation_time``, ``covariance``, ``robust``,
     ``discrepancy``."""
 
+    @property
+    def layout(self) -> Layout:
+        """How the files are laid out."""
+        return Layout(self.format, self.decimal, self.by, self.sheet, self.unsorted, self.repeated)
+
     @classmethod
     def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        if given.get("repeated") == "average" and "places" in given:
+            faults.add(("repeated",), "not together with places, of which each has a reading of its own", at_key=True)
         block = field_of(context.units, context.observed) if context.observed else None
         if block is not None and block.size > 1 and "places" not in given:
             faults.add(("places",), f"required: {block.name!r} is a field of {block.size} values; say which were read")

@@ -11,22 +11,20 @@ from pathlib import Path
 
 from en4dvar.errors import DataError
 from en4dvar.files import PathError, expanded, readable
-from en4dvar.inputs.readers import SUFFIXES, Column, DataFile, Format, parts_of
-from en4dvar.inputs.text_table import Decimal
+from en4dvar.inputs.readers import ANY, SUFFIXES, Column, DataFile, Layout, parts_of
 
 
 def with_parts(
     files: Mapping[str, Path],
     value: Column,
-    format: Format | None = None,
-    decimal: Decimal = ".",
-    by: str | None = None,
+    layout: Layout = ANY,
+    time: str | None = None,
 ) -> dict[str, DataFile]:
     """Every data set that the files hold, see :func:`~en4dvar.inputs.readers.parts_of`."""
     found: dict[str, DataFile] = {}
     for name, path in files.items():
         try:
-            parts = parts_of(path, value, format, decimal, by)
+            parts = parts_of(path, value, layout, time)
         except DataError:  # told with its reason where it is read
             parts = ()
         for part in parts or ("",):

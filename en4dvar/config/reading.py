@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.caution import Caution
 from en4dvar.config.context import Spread
 from en4dvar.config.data import Data
 from en4dvar.config.series import DataPlan, SeriesPlan
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.files import readable
 from en4dvar.inputs.readers import Column, DataFile, Readings, read_covariance, read_series
+from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.window import select
 from en4dvar.noise import Noise, noise_of
 from en4dvar.observations import Observations
@@ -74,10 +76,19 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int = 3) -> Series:
             places=places.places(len(times), beside(places.column)) if places else None,
             source=readable(path),
             scalars=read.scalars,
+            doubts=_doubts(data, read),
         )
     except (ValueError, DataError) as error:
         words = str(error)
         raise DataError(words if words.startswith(str(path)) else f"{readable(path)}: {words}") from None
+
+
+def _doubts(data: Data, read: Readings) -> tuple[Caution, ...]:
+    """What makes the times of a series implausible, where the file states them."""
+    column, times = data.columns.time, np.unique(read.times)
+    if not isinstance(column, Column) or len(times) < 3:
+        return ()
+    return step_doubts(times, column.target, column.unit, read.scalars, column.rate)
 
 
 def _errors(data: Data) -> dict[str, Column]:
@@ -99,11 +110,9 @@ def _readings(data: Data, file: DataFile, fewest: int) -> Readings:
         file.path,
         data.columns.time,
         data.columns.observable,
-        data.format,
-        data.decimal,
+        data.layout,
         further,
         file.part,
-        data.by,
         repeats=data.places is not None,
         fewest=fewest,
     )

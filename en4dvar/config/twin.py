@@ -27,7 +27,6 @@ from en4dvar.inputs.readers import Matrix, read_covariance
 from en4dvar.noise import Correlation
 from en4dvar.prior import Prior
 from en4dvar.schemes import ON_A_SERIES
-from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import Localisation
 
@@ -117,7 +116,6 @@ class Local(Section):
 _KINDS = ON_A_SERIES
 _KEYS = {name: {field.name for field in fields(kind)} for name, kind in _KINDS.items()}
 _FOREIGN = {name: set().union(*_KEYS.values()) - keys for name, keys in _KEYS.items()}  # keys of other schemes
-_FILTERS = [name for name, kind in _KINDS.items() if issubclass(kind, ETKF)]
 if TYPE_CHECKING:
     OnASeries = str
 else:
@@ -144,7 +142,7 @@ class Sequential(_Iterations):
     rotation: bool = False
     """Rotate the ensemble at random after each analysis, mean and covariance kept."""
     localisation: Local | None = None
-    """Gaspari–Cohn taper over the indices of the observed field (filters only)."""
+    """Gaspari–Cohn taper over the indices of the observed field."""
     stochastic_model: bool = False
     """true: accept a model that gives other numbers when a member is run again; by default that is an error."""
 
@@ -154,8 +152,6 @@ class Sequential(_Iterations):
         if others:
             takers = [name for name, keys in _KEYS.items() if keys >= others]
             raise ValueError(f"{', '.join(sorted(others))}: only with scheme {' or '.join(takers)}")
-        if self.localisation and self.scheme not in _FILTERS:
-            raise ValueError(f"localisation: only with scheme {', '.join(_FILTERS)}")
         return self
 
     def built(self, localisation: Localisation | None) -> SequentialSettings:

@@ -29,7 +29,7 @@ from en4dvar.prior import member_stream
 from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.inflation import Inflation
-from en4dvar.schemes.localisation import Localisation
+from en4dvar.schemes.localisation import LocalDescent, Localisation
 from en4dvar.state import Array
 
 NO_INFLATION = Inflation()
@@ -37,7 +37,7 @@ NO_INFLATION = Inflation()
 
 @dataclass(frozen=True)
 class SequentialSettings:
-    """How the loop treats the ensemble of ``scheme``; ``localisation`` only with a filter (lag 0).
+    """How the loop treats the ensemble of ``scheme``.
 
     ``rotation``: every analysis is turned by a random mean-preserving rotation (:mod:`en4dvar.cycling.rotation`).
     ``stochastic_model``: a model that gives other numbers when a member is run again is accepted.
@@ -49,10 +49,6 @@ class SequentialSettings:
     localisation: Localisation | None = None
     min_active_fraction: float = 0.5
     stochastic_model: bool = False
-
-    def __post_init__(self) -> None:
-        if self.localisation is not None and not isinstance(self.scheme, ETKF):
-            raise ValueError("localisation needs a filter that does not iterate (etkf)")
 
 
 @dataclass(frozen=True)
@@ -327,6 +323,9 @@ class _CycleWindow:
         self.of, self.k = run, k
         self.mean, self.anomalies = centre(run.ensemble)
         self.localised: Array | None = None
+        local = run.settings.localisation
+        self.local = LocalDescent(local, run.ensemble) if local and not isinstance(run.scheme, ETKF) else None
+        self.runs: Runs | None = None
 
     def begin(self, going: Sequence[_Cycle]) -> None:
         pass  # a cycle is short: what is kept is the ensemble between two
@@ -337,6 +336,8 @@ class _CycleWindow:
         if descent.iteration == 0:  # here w = 0 and the members are those of the window, or close to their mean
             width = float(rows[0, 0])
             members = self.of.ensemble if width == 1 else self.mean + width * self.anomalies
+        elif self.local:
+            members = self.local.members(scheme.members)
         else:
             members = self.mean + rows @ self.anomalies
         (states,) = self.of.forecast(members, [self.k + 1])
@@ -345,11 +346,12 @@ class _CycleWindow:
         predicted = self.of.predict(states, self.k + 1)
         if not np.isfinite(predicted).all():
             raise MembersLost(["" if row.all() else "non-finite prediction" for row in np.isfinite(predicted)])
-        return [Runs(predicted)]
+        self.runs = Runs(predicted)
+        return [self.runs]
 
     def whiten(self, scheme: Scheme, descent: _Cycle, reference: Array, anomalies: Array) -> Evaluation:
         evaluation = Evaluation(*self.of.series.whiten(self.k, reference, anomalies))
-        if self.of.settings.localisation is not None:
+        if self.of.settings.localisation is not None and self.local is None:
             self.localised = self.of.settings.localisation.analysis(scheme, self.of.ensemble, evaluation, self.draw)
         return evaluation
 
@@ -360,7 +362,21 @@ class _CycleWindow:
     def move(self, scheme: Scheme, going: Sequence[_Cycle]) -> None:
         (descent,) = going
         assert descent.step is not None
-        descent.weights = descent.step.weights
+        if self.local is None:
+            descent.weights = descent.step.weights
+        else:
+            descent.step = Step(descent.weights, self._local_step(scheme, self.local, descent.iteration))
         descent.ended = scheme.done(descent.iteration, descent.step)
+        if self.local and descent.ended:
+            self.localised = self.local.members(lambda weights: weights.rows)
         descent.iteration += 1
         self.of.iterations[self.k] = descent.iteration
+
+    def _local_step(self, scheme: Scheme, local: LocalDescent, iteration: int) -> float:
+        """The blocks' own steps from the same runs, of which the largest tells when a cycle ends."""
+        assert self.runs is not None
+
+        def whiten(reference: Array, anomalies: Array) -> Evaluation:
+            return Evaluation(*self.of.series.whiten(self.k, reference, anomalies))
+
+        return local.advance(scheme, self.runs, whiten, iteration, self.draw)

@@ -59,6 +59,7 @@ def examine(
     members = a.posterior[alive]
     warnings = (
         *found,
+        *a.problem.observations.doubts,
         *(caution("implausible-data", words) for words in doubts(a.problem, a.prior, a.prior_predictions)),
         *checks.down_weighted(a),
         *checks.weighted(a),

@@ -1,4 +1,4 @@
-"""Vectors and scalars of MATLAB v5 files, also inside structs and cell arrays, read here rather than by a library.
+"""Numbers of MATLAB files. Those of version 5, also inside structs and cell arrays, are read here, not by a library.
 
 One flipped bit in a file takes the process down inside scipy's compiled reader, which trusts sizes it finds in the
 file. To check all that it trusts is to read the file, so this does: every size is compared with the bytes that are
@@ -10,23 +10,20 @@ MathWorks, *MAT-File Format* (R2019b), chapter 1.
 from __future__ import annotations
 
 import math
-import re
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
 from en4dvar.errors import DataError
+from en4dvar.inputs.hdf_matfile import hdf_variables
+from en4dvar.inputs.variables import MOST, MOST_IN_MATRICES, Variables, array_words, gathered
 from en4dvar.state import Array
 
-T = TypeVar("T")
-_INDEX = re.compile(r"\((\d+)\)|\{(\d+)\}")
 HEADER = 128  # bytes
-MOST = 1 << 25  # numbers in all vectors of a file: 256 MiB, whatever a small compressed file may unpack to
 MATRIX, COMPRESSED = 14, 15  # kinds of elements
 HEAD = 4096  # bytes of a compressed variable that tell what it is
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -45,7 +42,7 @@ class _Damaged(Exception):
 
 @dataclass(frozen=True)
 class _Variable:
-    """A vector's ``values`` (K,), or in ``words`` what else it is."""
+    """A vector's ``values`` (K,) or a matrix's (n, m), or in ``words`` what else it is."""
 
     name: str
     values: Array | None = None
@@ -53,51 +50,26 @@ class _Variable:
     holds: bool = False  # a struct or a cell array
 
 
-def mat_vectors(path: Path) -> tuple[dict[str, Array], dict[str, float], dict[str, str]]:
-    """Real vectors (K,) of a ``.mat`` file, its finite scalars, and in words what else it holds.
-
-    Raises :class:`DataError`.
-    """
+def mat_variables(path: Path) -> Variables:
+    """What a ``.mat`` file holds. Raises :class:`DataError`."""
     raw = path.read_bytes()
     if not raw.startswith((b"MATLAB 5.0", b"MATLAB 7.3")):
         raise DataError(f"{path}: not a MATLAB v5 file (no such header); save it in MATLAB with save(..., '-v7')")
     order = {b"IM": "<", b"MI": ">"}.get(raw[126:HEADER], "")
     if raw.startswith(b"MATLAB 7.3") or (order and struct.unpack_from(f"{order}H", raw, 124)[0] == 0x0200):
-        raise DataError(f"{path}: a MATLAB v7.3 (HDF5) file; save it again in MATLAB with save(..., '-v7')")
+        return hdf_variables(path)
     try:
         if not order:
             raise _Damaged("its header does not say in which order bytes are")
         found = _variables(memoryview(raw), order)
     except _Damaged as error:
         raise DataError(f"{path}: not a MATLAB v5 file ({error})") from None
-    vectors = {v.name: v.values for v in found if v.values is not None}
-    scalars = {k: float(v[0]) for k, v in vectors.items() if v.size == 1 and np.isfinite(v[0])}
-    return vectors, scalars, {v.name: v.words for v in found if v.values is None}
-
-
-def indexed(name: str) -> tuple[str, str]:
-    """``expts(2).R`` as ``expts.R`` and ``2``, ``C{3}`` as ``C`` and ``3``; by the first index, "" without one."""
-    found = _INDEX.search(name)
-    return (name[: found.start()] + name[found.end() :], found[1] or found[2]) if found else (name, "")
-
-
-def element(found: Mapping[str, T], part: str) -> dict[str, T]:
-    """What is not inside an array, and of arrays the element ``part`` under names without the index."""
-    inside = {name: value for whole, value in found.items() for name, i in (indexed(whole),) if i and i == part}
-    return {**found, **inside}
-
-
-def first_elements(found: Mapping[str, T]) -> dict[str, T]:
-    """Each array by its first element, under names without the index."""
-    kept: dict[str, T] = {}
-    for whole, value in found.items():
-        kept.setdefault(indexed(whole)[0], value)
-    return kept
+    return gathered((v.name, v.words if v.values is None else v.values) for v in found)
 
 
 def _variables(raw: memoryview, order: str) -> list[_Variable]:
     """Named variables of a file; of two with one name the last. Raises :class:`_Damaged`."""
-    elements, found, numbers = _Elements(raw[HEADER:], order), {}, 0
+    elements, found, numbers, in_matrices = _Elements(raw[HEADER:], order), {}, 0, 0
     while elements.left >= 8:
         kind, content = elements.long()
         if kind == 0:
@@ -109,6 +81,10 @@ def _variables(raw: memoryview, order: str) -> list[_Variable]:
         else:
             raise _Damaged(f"an element of kind {kind} where a variable should be")
         for variable in variables:
+            if variable.values is not None and variable.values.ndim == 2:
+                in_matrices += variable.values.size
+                if in_matrices > MOST_IN_MATRICES:
+                    variable = _Variable(variable.name, words=array_words(variable.values.shape))
             numbers += 0 if variable.values is None else variable.values.size
             if numbers > MOST:
                 raise _Damaged(f"more than {MOST} numbers in vectors")
@@ -169,9 +145,12 @@ def _variable(content: memoryview, order: str, data: bool = True, within: str = 
     if kind in CLASSES or flag & COMPLEX:
         return [_Variable(name, words=CLASSES.get(kind, "complex"))]
     count = math.prod(shape)
-    if count != max(shape):
-        return [_Variable(name, words=f"an array of {' x '.join(map(str, shape))}")]
-    return [_Variable(name, _numbers(elements, order, name, count) if data else None)]
+    if count != max(shape) and (len(shape) > 2 or count > MOST_IN_MATRICES):
+        return [_Variable(name, words=array_words(shape))]
+    if not data:
+        return [_Variable(name)]
+    values = _numbers(elements, order, name, count)
+    return [_Variable(name, values if count == max(shape) else values.reshape(shape, order="F"))]
 
 
 def _name(raw: memoryview) -> str:

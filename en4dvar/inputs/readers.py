@@ -1,4 +1,4 @@
-"""Series from data files: CSV with a header, and the ``.mat`` layouts of cavitation rheometry.
+"""Series from data files: tables of text or of a workbook, and the ``.mat`` layouts of cavitation rheometry.
 
 Rows that hold NaN or a blank are dropped; every remaining number must be finite and the times must increase. Fields of
 ``.mat`` files may be rows or columns; their leading zeros and NaN (frames before nucleation) are dropped and their
@@ -8,7 +8,6 @@ scalars collected. Leading zeros of a column that cannot be zero are dropped fro
 from __future__ import annotations
 
 import csv
-import fnmatch
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -21,14 +20,29 @@ import numpy.typing as npt
 
 from en4dvar.errors import DataError
 from en4dvar.hints import listed, no_such_file, suggest
-from en4dvar.inputs.matfile import element, first_elements, indexed, mat_vectors
-from en4dvar.inputs.text_table import Decimal, Table, cells_of, check_width, delimiter_of, number_in, numbered_lines
+from en4dvar.inputs.matfile import mat_variables
+from en4dvar.inputs.order import Means, Written, in_order
+from en4dvar.inputs.sheets import sheet_lines
+from en4dvar.inputs.text_table import (
+    Decimal,
+    Table,
+    cells_of,
+    check_width,
+    delimiter_of,
+    matches,
+    number_in,
+    numbered_lines,
+)
+from en4dvar.inputs.variables import Variables, indexed
 from en4dvar.state import Array
 from en4dvar.units import convert
 
-Format = Literal["csv", "mat"]
-SUFFIXES: Mapping[str, Format] = {".csv": "csv", ".txt": "csv", ".dat": "csv", ".tsv": "csv", ".mat": "mat"}
-SHEETS = (".xlsx", ".xls", ".xlsm", ".ods")
+Format = Literal["csv", "mat", "xlsx"]
+Disorder = Literal["refuse", "sort"]
+Repeated = Literal["refuse", "average"]
+_TEXT: Mapping[str, Format] = {".csv": "csv", ".txt": "csv", ".dat": "csv", ".tsv": "csv"}
+SUFFIXES: Mapping[str, Format] = {**_TEXT, ".mat": "mat", ".xlsx": "xlsx", ".xlsm": "xlsx"}
+SHEETS = (".xls", ".xlsb", ".ods")
 
 
 @dataclass(frozen=True)
@@ -36,6 +50,7 @@ class Column:
     """A column or field ``name`` written in ``unit``, wanted in ``target``.
 
     ``positive``: zeros before its first reading are none. ``kind``: what its numbers must be, beside the readings.
+    ``rate``: of times, that of the frames per ``target``.
     """
 
     name: str
@@ -43,6 +58,7 @@ class Column:
     target: str
     positive: bool = False
     kind: Literal["std", "weight", "place"] = "std"
+    rate: float | None = None
 
 
 @dataclass(frozen=True)
@@ -80,6 +96,23 @@ class Matrix:
 
 
 @dataclass(frozen=True)
+class Layout:
+    """How a file is laid out: its ``format`` (by default that of the suffix), the ``decimal`` sign of its text, the
+    column that says ``by`` which data set a row belongs to, the ``sheet`` of a workbook with or without a range; what
+    is done with times that do not increase."""
+
+    format: Format | None = None
+    decimal: Decimal = "."
+    by: str | None = None
+    sheet: str = ""
+    unsorted: Disorder = "refuse"
+    repeated: Repeated = "refuse"
+
+
+ANY = Layout()
+
+
+@dataclass(frozen=True)
 class Readings:
     """One observable in time, in the model's units, times increasing; ``scalars`` as the file has them.
 
@@ -97,35 +130,26 @@ def read_series(
     path: Path,
     time: Column | TimeStep,
     value: Column,
-    format: Format | None = None,
-    decimal: Decimal = ".",
+    layout: Layout = ANY,
     errors: Sequence[Column] = (),
     part: str = "",
-    by: str | None = None,
     repeats: bool = False,
     fewest: int = 3,
 ) -> Readings:
-    """Read one data set. ``format`` defaults to the one of the suffix; ``decimal`` is the decimal sign of a CSV file.
+    """Read one data set.
 
     ``errors`` are columns of standard deviations (or weights, or places), each as long as that of the values.
-    ``part``, ``by``: see :func:`parts_of`. ``repeats``: there may be several readings at a time, in any order of times.
+    ``part``: see :func:`parts_of`. ``repeats``: there may be several readings at a time, in any order of times.
     ``fewest`` usable readings are needed.
 
     Raises
     ------
     DataError: the file cannot be used.
     """
-    if part and by is None and "*" in value.name:
+    if part and layout.by is None and "*" in value.name:
         value = replace(value, name=part)
     wanted = [c.name for c in (value, time, *errors) if isinstance(c, Column)]
-    with _opened(path, format) as kind:
-        table = Table(path, decimal) if kind == "csv" else None
-        if by is not None and part not in _groups(table, by, path):
-            raise DataError(f"{path}: no row belongs to {part!r} by column {by!r}")
-        if table and by is not None:
-            at = table.position(by)
-            table.rows = [(line, row) for line, row in table.rows if _cell(row, at) == part]
-        columns, scalars = (_of_table(table, wanted), {}) if table else _of_mat(path, wanted, part)
+    columns, scalars, lines = _columns(path, layout, wanted, part)
     values = convert(columns[value.name], value.unit, value.target)
     if isinstance(time, Column):
         times = convert(columns[time.name], time.unit, time.target)
@@ -135,17 +159,39 @@ def read_series(
         raise DataError(f"{path}: {value.name!r} is empty")
     if len(times) != len(values):
         raise DataError(f"{path}: {len(times)} times but {len(values)} values of {value.name!r}")
-    first = 0 if table and not value.positive else int(np.argmax(np.nan_to_num(values) != 0))
+    first = 0 if lines and not value.positive else int(np.argmax(np.nan_to_num(values) != 0))
     kept = np.arange(first, len(values))[~(np.isnan(times) | np.isnan(values))[first:]]
     _check(times[kept], values[kept], value.name, path, fewest)
     if repeats:
         kept = kept[np.argsort(times[kept], kind="stable")]
-    wrong = np.flatnonzero(np.diff(times[kept]) <= 0)
-    if len(wrong) and not repeats and isinstance(time, Column):
-        lines = [line for line, _ in table.rows] if table else []
-        _tell_disorder(columns[time.name], kept, int(wrong[0]), time.unit, lines, path)
     stated = {column.name: _stds(columns[column.name], column, kept, len(values), path) for column in errors}
-    return Readings(times[kept], values[kept], str(path), scalars, stated)
+    if isinstance(time, Column) and not repeats:
+        written = Written(columns[time.name], time.unit, lines, path)
+        order = in_order(times[kept], layout.unsorted == "sort", layout.repeated == "average", kept, written)
+        kept, stated = kept[order], {name: stds[order] for name, stds in stated.items()}
+    if repeats:
+        return Readings(times[kept], values[kept], str(path), scalars, stated)
+    means = Means(times[kept])
+    stated = {c.name: (means.std if c.kind == "std" else means.of)(stated[c.name]) for c in errors}
+    return Readings(means.times, means.of(values[kept]), str(path), scalars, stated)
+
+
+def _columns(
+    path: Path, layout: Layout, wanted: Sequence[str], part: str
+) -> tuple[dict[str, Array], Mapping[str, float], list[int]]:
+    """The columns wanted of a part, the file's scalars, and the numbers of the lines, none where it has no lines."""
+    with _opened(path, layout) as kind:
+        if kind != "mat":
+            table = _table(path, kind, layout, [*wanted, *([layout.by] if layout.by is not None else [])])
+            if layout.by is not None:
+                if part not in _groups(table, layout.by):
+                    raise DataError(f"{path}: no row belongs to {part!r} by column {layout.by!r}")
+                at = table.position(layout.by)
+                table.rows = [(line, row) for line, row in table.rows if _cell(row, at) == part]
+            return _of_table(table, wanted), {}, [line for line, _ in table.rows]
+        _refuse_by(path, layout)
+        found = mat_variables(path).of(part)
+        return {name: _of_mat(found, name, path) for name in wanted}, found.scalars, []
 
 
 def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int, path: Path) -> Array:
@@ -166,25 +212,40 @@ def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int
     return stds
 
 
-def parts_of(
-    path: Path, value: Column, format: Format | None = None, decimal: Decimal = ".", by: str | None = None
-) -> tuple[str, ...]:
+def parts_of(path: Path, value: Column, layout: Layout = ANY, time: str | None = None) -> tuple[str, ...]:
     """The parts of a file that each hold a data set; () where the file is one data set.
 
-    They are the columns that a name with ``*`` stands for; the elements of a struct array or a cell array, as ``1``,
-    ``2``, …, for the column ``expts.R`` of what MATLAB calls ``expts(1).R``, ``expts(2).R``, …; or what the column
-    ``by`` of a CSV file says. Raises :class:`DataError`.
+    They are the columns that a name with ``*`` stands for, but not that of the ``time``; the elements of a struct array
+    or a cell array, as ``1``, ``2``, …, for the column ``expts.R`` of what MATLAB calls ``expts(1).R``,
+    ``expts(2).R``, …; or what the column ``by`` of a table says. Raises :class:`DataError`.
     """
-    with _opened(path, format) as kind:
-        table = Table(path, decimal) if kind == "csv" else None
-        names = table.names if table else [*mat_vectors(path)[0]]
-    if by is not None:
-        return _groups(table, by, path)
-    if "*" in value.name and value.name not in names:
-        return tuple(name for name in names if fnmatch.fnmatchcase(name, value.name))
-    if table or value.name in names:
+    several = "*" in value.name
+    with _opened(path, layout) as kind:
+        if kind != "mat":
+            table = _table(path, kind, layout, [value.name, *(one for one in (time, layout.by) if one is not None)])
+            if layout.by is not None:
+                return _groups(table, layout.by)
+            if not several or value.name in table.names:
+                return ()
+            return tuple(name for name in table.names if matches(name, value.name) and name != time)
+        _refuse_by(path, layout)
+        found = mat_variables(path)
+    if several:
+        return tuple(name for name in found.matching(value.name) if name != time)
+    if found.vector(value.name) is not None:
         return ()
-    return tuple(i for name, i in map(indexed, names) if i and name == value.name)
+    return tuple(i for name, i in map(indexed, found.vectors) if i and name == value.name)
+
+
+def _table(path: Path, kind: Format, layout: Layout, wanted: Sequence[str] = ()) -> Table:
+    if kind == "csv":
+        return Table(path, layout.decimal, wanted)
+    return Table(path, layout.decimal, wanted, sheet_lines(path, layout.sheet))
+
+
+def _refuse_by(path: Path, layout: Layout) -> None:
+    if layout.by is not None:
+        raise DataError(f"{path}: data.by is for tables; elements of a struct array are data sets without it")
 
 
 @dataclass(frozen=True)
@@ -200,23 +261,27 @@ class Contents:
     others: Mapping[str, str] = field(default_factory=dict)
 
 
-def read_contents(path: Path, format: Format | None = None, decimal: Decimal = ".") -> Contents:
+def read_contents(path: Path, layout: Layout = ANY) -> Contents:
     """Every column that holds numbers. Raises :class:`DataError`."""
-    with _opened(path, format) as kind:
-        return _mat_contents(path) if kind == "mat" else _csv_contents(Table(path, decimal))
+    with _opened(path, layout) as kind:
+        return _mat_contents(path) if kind == "mat" else _table_contents(_table(path, kind, layout))
 
 
 def _mat_contents(path: Path) -> Contents:
-    vectors, scalars, others = mat_vectors(path)
-    vectors, scalars, others = first_elements(vectors), first_elements(scalars), first_elements(others)
-    columns = {k: np.asarray(v, dtype=float).ravel() for k, v in vectors.items() if v.size > 1}
-    words = {name: f"{path}: {name} is {kind}; save what is in it as vectors" for name, kind in others.items()}
+    found = mat_variables(path).of_first()
+    columns = found.columns()
+    words = {name: f"{path}: {name} is {kind}; save what is in it as vectors" for name, kind in found.others.items()}
+    words |= {
+        name: f"{path}: {name} is {found.others[name]}; its columns are {name}(:,1), {name}(:,2), …, its rows "
+        f"{name}(1,:), …"
+        for name in found.matrices
+    }
     for name in columns:  # a struct of which something can be read is no fault
         words.pop(name.partition(".")[0], None)
-    return Contents(columns, scalars, words)
+    return Contents(columns, found.scalars, words)
 
 
-def _csv_contents(table: Table) -> Contents:
+def _table_contents(table: Table) -> Contents:
     columns: dict[str, Array] = {}
     others: dict[str, str] = {}
     for i, name in enumerate(table.names):
@@ -274,10 +339,10 @@ def _rows_of_numbers(path: Path) -> list[list[float]]:
 
 
 @contextmanager
-def _opened(path: Path, format: Format | None) -> Iterator[Format]:
+def _opened(path: Path, layout: Layout) -> Iterator[Format]:
     """The format of a file that is there. Raises :class:`DataError`, also where reading inside fails."""
     _require_file(path)
-    kind = format or SUFFIXES.get(path.suffix.lower())
+    kind = layout.format or SUFFIXES.get(path.suffix.lower())
     if kind is None:
         hint = (
             "save the sheet as CSV"
@@ -312,20 +377,6 @@ def _check(times: Array, values: Array, name: str, path: Path, fewest: int) -> N
         raise DataError(f"{path}: {len(values)} usable observations; at least {fewest} are needed")
 
 
-def _tell_disorder(
-    times: Array, kept: npt.NDArray[np.intp], wrong: int, unit: str, lines: Sequence[int], path: Path
-) -> None:
-    """Times as written; rows in use; the place among these that a time not later follows; numbers of the lines."""
-    before, after = kept[wrong], kept[wrong + 1]
-    where = f"{path}:{lines[after]}" if lines else f"{path}: sample {after + 1}"
-    hint = ""
-    if times[after] == times[before]:
-        hint = "; keep one of the two readings"
-    elif times[after] <= times[kept[0]]:
-        hint = "; if another bubble begins here, give it a file of its own"
-    raise DataError(f"{where}: times must increase, but {times[after]:g} {unit} follows {times[before]:g} {unit}{hint}")
-
-
 def _step(step: TimeStep, scalars: Mapping[str, float], path: Path) -> float:
     if step.column is None:
         value = step.value
@@ -338,13 +389,12 @@ def _step(step: TimeStep, scalars: Mapping[str, float], path: Path) -> float:
     return value
 
 
-def _groups(table: Table | None, by: str, path: Path) -> tuple[str, ...]:
+def _groups(table: Table, by: str) -> tuple[str, ...]:
     """What the column ``by`` says, in the order of the rows. Raises :class:`DataError`."""
-    if table is None:
-        raise DataError(f"{path}: data.by is for text files; elements of a struct array are data sets without it")
     cells = [_cell(row, table.position(by)) for _, row in table.rows]
     if "" in cells:
-        raise DataError(f"{path}:{table.rows[cells.index('')][0]}: column {by!r} does not say which data set this is")
+        line = table.rows[cells.index("")][0]
+        raise DataError(f"{table.path}:{line}: column {by!r} does not say which data set this is")
     return tuple(dict.fromkeys(cells))
 
 
@@ -363,14 +413,15 @@ def _of_table(table: Table, wanted: Sequence[str]) -> dict[str, Array]:
     return columns
 
 
-def _of_mat(path: Path, wanted: Sequence[str], part: str = "") -> tuple[dict[str, Array], dict[str, float]]:
-    vectors, scalars, others = mat_vectors(path)
-    vectors, scalars, others = element(vectors, part), element(scalars, part), element(others, part)
-    for name in wanted:
-        if name not in vectors:
-            kind = others.get(name)
-            fault = f"is {kind}, not a row or column of real numbers" if kind else "is not in the file"
-            rest = [f"{k} ({what})" for k, what in others.items() if k != name]
-            there = f"{listed(sorted(vectors)) or 'none'}{'; no vectors: ' * bool(rest)}{listed(rest)}"
-            raise DataError(f"{path}: field {name!r} {fault}; the vectors are: {there}")
-    return {name: np.asarray(vectors[name], dtype=float).ravel() for name in wanted}, scalars
+def _of_mat(found: Variables, name: str, path: Path) -> Array:
+    """A vector by its name. Raises :class:`DataError`."""
+    vector = found.vector(name)
+    if vector is not None:
+        return np.asarray(vector, dtype=float)
+    kind = found.others.get(name)
+    fault = f"is {kind}, not a row or column of real numbers" if kind else "is not in the file"
+    rest = [f"{k} ({what})" for k, what in found.others.items() if k != name]
+    there = f"{listed(sorted(found.vectors)) or 'none'}{'; no vectors: ' * bool(rest)}{listed(rest)}"
+    matrix = name if name in found.matrices else next(iter(found.matrices), None)
+    hint = f"; columns of a matrix are {matrix}(:,1), {matrix}(:,2), …" if matrix else ""
+    raise DataError(f"{path}: field {name!r} {fault}; the vectors are: {there}{hint}")

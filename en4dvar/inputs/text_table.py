@@ -7,7 +7,10 @@ decomposed umlauts) are the same.
 from __future__ import annotations
 
 import csv
+import fnmatch
+import re
 import unicodedata
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -16,11 +19,15 @@ import numpy as np
 from en4dvar.errors import DataError
 from en4dvar.hints import listed, short
 from en4dvar.state import Array
+from en4dvar.units import UnitError, parse_unit
 
+Lines = Sequence[tuple[int, str | Sequence[str]]]
 Decimal = Literal[".", ","]
 COMMENT = ("#", "%", "//")
 WIDEST = 10_000  # columns
 BLANK = ("", "nan", "na", "n/a", "-")
+PREAMBLE = 200  # lines among which the names of the columns are looked for
+_NAMELESS = re.compile(r"c[1-9]\d*")
 
 
 def numbered_lines(path: Path) -> list[tuple[int, str]]:
@@ -64,45 +71,107 @@ def cells_of(line: str, delimiter: str) -> list[str]:
 
 
 class Table:
-    """A CSV file: ``names`` of the columns, and ``rows`` of cells with the numbers of their lines."""
+    """Columns of a text file or a sheet: their ``names``, and ``rows`` of cells with the numbers of their lines.
 
-    def __init__(self, path: Path, decimal: Decimal):
-        self.path, self.decimal, lines = path, decimal, numbered_lines(path)
+    ``lines`` are numbered lines, of a sheet the cells of each. The names stand in the first line that has all of
+    ``wanted`` (names, or patterns with ``*``), else in the one above the numbers; where none does, the columns are
+    ``c1``, ``c2``, …. Lines of words directly below the names, such as units, are no rows.
+    """
+
+    def __init__(self, path: Path, decimal: Decimal, wanted: Sequence[str] = (), lines: Lines | None = None):
+        self.path, self.decimal = path, decimal
+        lines = numbered_lines(path) if lines is None else lines
         if not lines:
             raise DataError(f"{path}: the file holds no data")
-        (_, header), *self.lines = lines
-        delimiter = delimiter_of(header)
-        check_width(header, delimiter, path)
-        self.names = cells_of(header, delimiter)
-        if all(_is_number(name.replace(",", ".")) for name in self.names):
-            proposed = ("t_us", "R_um", *(f"c{i}" for i in range(3, len(self.names) + 1)))[: len(self.names)]
-            raise DataError(
-                f"{path}: the first line must name the columns, but it holds numbers; put a line such as "
-                f"{(delimiter or ' ').join(proposed)!r} above it"
-            )
-        self.rows = [(number, cells_of(line, delimiter)) for number, line in self.lines]
+        head = [_split(line, path) for _, line in lines[:PREAMBLE]]
+        top, first = _names_and_numbers(head, wanted)
+        self.nameless = top is None
+        delimiter = _delimiter(lines[first if top is None else top][1], self.nameless)
+        self.rows = [(n, cells_of(x, delimiter) if isinstance(x, str) else list(x)) for n, x in lines[first:]]
+        if any(_holds_number(cells) for _, cells in self.rows):
+            while _words(self.rows[0][1]):
+                del self.rows[0]
+        self.names = [f"c{i + 1}" for i in range(len(self.rows[0][1]))] if top is None else head[top]
 
     def position(self, name: str) -> int:
         """Which column has this name. Raises :class:`DataError`."""
         alike = [i for i, other in enumerate(self.names) if _same(other, name)]
         if len(alike) == 1:
             return alike[0]
+        if self.nameless:
+            proposed = ("t_us", "R_um", *self.names[2:])[: len(self.names)]
+            raise DataError(
+                f"{self.path}: no line above the numbers names the columns: put one such as {','.join(proposed)!r} "
+                f"there, or call them {listed(self.names, 4)}"
+            )
         fault = "more than one column" if alike else "no column"
-        below = [n for n, line in self.lines if any(_same(cell, name) for cell in cells_of(line, delimiter_of(line)))]
-        hint = f"; line {below[0]} names it: put # before the lines above" if below and not alike else ""
-        raise DataError(f"{self.path}: {fault} {name!r}; the columns are: {listed(self.names)}{hint}")
+        raise DataError(f"{self.path}: {fault} {name!r}; the columns are: {listed(self.names)}")
 
     def numbers(self, i: int, name: str) -> Array:
-        """A column as numbers. Raises :class:`DataError`, which tells what to do about a second header."""
-        found: list[float] = []
-        for row, (line, cells) in enumerate(self.rows):
-            try:
-                found.append(number_in(cells[i] if i < len(cells) else "", name, self.path, line, self.decimal))
-            except DataError as error:
-                words = row == 0 and not any(_is_number(cell.replace(",", ".")) for cell in cells)
-                hint = "; if this is no reading, put # before the line" if words else ""
-                raise DataError(f"{error}{hint}") from None
-        return np.array(found, dtype=float)
+        """A column as numbers. Raises :class:`DataError`."""
+        cells = ((line, row[i] if i < len(row) else "") for line, row in self.rows)
+        return np.array([number_in(cell, name, self.path, line, self.decimal) for line, cell in cells], dtype=float)
+
+
+def _split(line: str | Sequence[str], path: Path) -> list[str]:
+    """The cells of a line by its own delimiter."""
+    if not isinstance(line, str):
+        return list(line)
+    delimiter = delimiter_of(line)
+    check_width(line, delimiter, path)
+    return cells_of(line, delimiter)
+
+
+def _has_all(cells: Sequence[str], wanted: Sequence[str]) -> bool:
+    return all(any(_same(cell, name) or matches(cell, name) for cell in cells) for name in wanted)
+
+
+def matches(name: str, pattern: str) -> bool:
+    """Whether a pattern with ``*`` stands for a name."""
+    return "*" in pattern and fnmatch.fnmatchcase(name, pattern)
+
+
+def _names_and_numbers(head: Sequence[Sequence[str]], wanted: Sequence[str]) -> tuple[int | None, int]:
+    """The line that names the columns, None where none does, and the first below it.
+
+    It is the one above the last block of lines with numbers, unless it holds units, which stand below the names.
+    """
+    named = next((i for i, cells in enumerate(head) if wanted and _has_all(cells, wanted)), None)
+    if named is not None:
+        return named, named + 1
+    end = next((i for i in reversed(range(len(head))) if _holds_number(head[i])), 0)
+    first = next((i + 1 for i in reversed(range(end)) if _words(head[i])), 0)
+    if _holds_number(head[first]) and (first == 0 or (wanted and all(map(_NAMELESS.fullmatch, wanted)))):
+        return None, first
+    top = max(first - 1, 0)
+    if top and _words(head[top - 1]) and len(head[top - 1]) == len(head[top]) and all(map(_is_unit, head[top])):
+        top -= 1
+    if len(head[top]) == 1 < len(head[first]):
+        return None, first
+    return top, top + 1
+
+
+def _delimiter(line: str | Sequence[str], numbers: bool) -> str:
+    """What separates the cells of a line, whose ``numbers`` may have decimal commas."""
+    if not isinstance(line, str):
+        return ""
+    return next((sign for sign in (";", "\t") if numbers and sign in line), delimiter_of(line))
+
+
+def _is_unit(cell: str) -> bool:
+    try:
+        parse_unit(cell.strip("[]()"))
+    except UnitError:
+        return False
+    return True
+
+
+def _holds_number(cells: Sequence[str]) -> bool:
+    return any(cell.lower() not in BLANK and _is_number(cell.replace(",", ".")) for cell in cells)
+
+
+def _words(cells: Sequence[str]) -> bool:
+    return not _holds_number(cells) and any(cell.lower() not in BLANK for cell in cells)
 
 
 def _same(a: str, b: str) -> bool:

@@ -7,14 +7,14 @@ beyond the support. Sources: Hunt, Kostelich & Szunyogh (2007), Physica D 230, 1
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from en4dvar.ensemble.linalg import apply_weights
-from en4dvar.schemes.base import Draw, Evaluation, Scheme, Weights
+from en4dvar.schemes.base import Draw, Evaluation, Runs, Scheme, Weights
 from en4dvar.state import Array
 
 
@@ -77,14 +77,50 @@ class Localisation:
         analysed = ensemble.copy()
         prior = Weights.prior(len(ensemble))
         for block, taper in zip(self.blocks, self.taper, strict=True):
-            near = taper > 0
-            if not near.any():
+            if not (taper > 0).any():
                 continue
-            root = np.sqrt(taper[near])
-            local = Evaluation(root * evaluation.d[near], root[:, None] * evaluation.S[near])
-            step = scheme.advance(prior, local, 0, _of_some(draw, near))
+            step = scheme.advance(prior, _tapered(evaluation, taper), 0, _of_some(draw, taper > 0))
             analysed[:, block] = apply_weights(ensemble[:, block], step.weights.rows)
         return analysed
+
+
+class LocalDescent:
+    """The blocks of a window's ensemble (N, n), each with weights of its own, through the iterations of a smoother.
+
+    The taper is that of the observations' places, also where these are later than the ensemble: what moves far within a
+    window asks for a larger radius. Source: Bocquet (2016), Q. J. R. Meteorol. Soc. 142, 1075, § 3.
+    """
+
+    def __init__(self, localisation: Localisation, ensemble: Array):
+        self.ensemble = ensemble
+        self.near = [(block, taper) for block, taper in zip(localisation.blocks, localisation.taper, strict=True)
+                     if (taper > 0).any()]  # fmt: skip
+        self.weights = [Weights.prior(len(ensemble)) for _ in self.near]
+
+    def members(self, rows: Callable[[Weights], Array]) -> Array:
+        """Members (N, n): ``rows`` (N, N) of each block's weights, and what is in no block as it was."""
+        found = self.ensemble.copy()
+        for (block, _), weights in zip(self.near, self.weights, strict=True):
+            found[:, block] = apply_weights(self.ensemble[:, block], rows(weights))
+        return found
+
+    def advance(
+        self, scheme: Scheme, runs: Runs, whiten: Callable[[Array, Array], Evaluation], iteration: int, draw: Draw
+    ) -> float:
+        """A step of every block; the largest, in posterior standard deviations of its block."""
+        largest = 0.0
+        for i, (_, taper) in enumerate(self.near):
+            evaluation = whiten(*scheme.linearise(self.weights[i], runs))
+            step = scheme.advance(self.weights[i], _tapered(evaluation, taper), iteration, _of_some(draw, taper > 0))
+            self.weights[i], largest = step.weights, max(largest, step.norm)
+        return largest
+
+
+def _tapered(evaluation: Evaluation, taper: Array) -> Evaluation:
+    """The observations that the ``taper`` (K',) leaves."""
+    near = taper > 0
+    root = np.sqrt(taper[near])
+    return Evaluation(root * evaluation.d[near], root[:, None] * evaluation.S[near])
 
 
 def _of_some(draw: Draw, near: npt.NDArray[np.bool_]) -> Draw:

@@ -6,27 +6,27 @@ import re
 import shlex
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 if TYPE_CHECKING:
-    from en4dvar.inputs.readers import Contents
-    from en4dvar.inputs.text_table import Decimal
+    from en4dvar.inputs.readers import Contents, Layout
     from en4dvar_bubble.starter.proposal import Proposal
 
 _TIME = re.compile(r"(?i)t|time|t[ _(\[].*|time[ _(\[].*")
 _STEP = re.compile(r"(?i)delta_?t|dt|t_?step|time_?step")
+_PIXEL = re.compile(r"(?i)delta_?x|dx|pixel_?size|(um|m)_?per_?(px|pixel)|px_?2_?(um|m)")
 _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 
 
 @click.command()
-@click.option("--data", metavar="PATH", help="CSV or .mat file, a folder or a pattern; without it, an empty starter.")
+@click.option("--data", metavar="PATH", help="CSV, Excel, .mat file, folder or pattern; without it, an empty starter.")
 @click.option("--movie", type=click.Path(path_type=Path), help="Movie, read first as by 'en4dvar track'.")
 @click.option("--pixel", metavar="LENGTH", help="Size of a pixel of the movie, e.g. '2.76 um'.")
-@click.option("--frame-rate", metavar="RATE", help="Frame rate of the movie, e.g. '270 kHz'.")
+@click.option("--frame-rate", metavar="RATE", help="Frame rate of the movie, or of the data's, e.g. '270 kHz'.")
 @click.option("--exposure", metavar="TIME", help="Exposure of a frame of the movie, e.g. '500 ns'.")
 @click.option("--example", type=click.Choice(["quickstart"]), help="An example and its synthetic data instead.")
 @click.option("--time-unit", metavar="UNIT", help="Unit of the times in the file, e.g. us.")
@@ -34,6 +34,10 @@ _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 @click.option("--time-column", metavar="NAME", help="Column of times, where its name does not tell.")
 @click.option("--radius-column", metavar="NAME", help="Column of radii, where its name does not tell.")
 @click.option("--time-step", metavar="TIME", help="Constant time step instead of a column, e.g. '3.7 us'.")
+@click.option("--by", metavar="NAME", help="Column that says which bubble a row belongs to.")
+@click.option("--sheet", metavar="SHEET", help="Sheet of a workbook or a range of it, e.g. 'Film 3!A3:D40'.")
+@click.option("--unsorted", type=click.Choice(["refuse", "sort"]), help="Rows whose times do not increase.")
+@click.option("--repeated", type=click.Choice(["refuse", "average"]), help="Several readings of one time.")
 @click.option("--start", type=click.Choice(["acoustic", "laser"]), help="Start of the bubble; default: what it shows.")
 @click.option("--law", metavar="LAW", help="Constitutive law, see 'en4dvar laws'.")
 @click.option("--out", type=click.Path(path_type=Path), help="YAML file to write; default <name of the data>.yaml.")
@@ -50,6 +54,10 @@ def init(
     time_column: str | None,
     radius_column: str | None,
     time_step: str | None,
+    by: str | None,
+    sheet: str | None,
+    unsorted: str | None,
+    repeated: str | None,
     start: Literal["acoustic", "laser"] | None,
     law: str | None,
     out: Path | None,
@@ -66,8 +74,8 @@ def init(
     """
     if movie is not None and (data is not None or example is not None):
         raise click.UsageError("--movie makes the data; not together with --data or --example")
-    if movie is None and (pixel or frame_rate or exposure):
-        raise click.UsageError("--pixel, --frame-rate and --exposure are of a --movie")
+    if movie is None and (pixel or exposure):
+        raise click.UsageError("--pixel and --exposure are of a --movie")
     if example is not None:
         if data is not None or out is not None:
             raise click.UsageError("--example comes with its own data and file names")
@@ -76,6 +84,7 @@ def init(
     from en4dvar.config.json_schema import schema_text
     from en4dvar.errors import OutputError
     from en4dvar.files import write_text
+    from en4dvar.inputs.readers import Layout
     from en4dvar_bubble.starter.config import propose_config, run_name
     from en4dvar_bubble.starter.page import SCHEMA_FILE, Source, yaml_text
     from en4dvar_bubble.starter.proposal import starter
@@ -94,7 +103,12 @@ def init(
         proposal = starter(start or "acoustic", law)
         text = yaml_text(name, Source("bubble.csv", ("t_us", "us"), None, ("R_um", "um")), proposal, words)
     else:
-        columns = _columns_of(data, _Asked(time_unit, radius_unit, time_column, radius_column, time_step))
+        given = {"by": by, "sheet": sheet, "unsorted": unsorted, "repeated": repeated}
+        layout = Layout(**{name: it for name, it in given.items() if it is not None})  # type: ignore[arg-type]
+        asked = _Asked(
+            time_unit, radius_unit, time_column, radius_column, time_step, frame_rate if movie is None else None
+        )
+        columns = _columns_of(data, asked, layout)
         proposed = propose_config(data, **columns, start=start, law=law, folder=target.parent, name=name, command=words)
         text, proposal = proposed.text, proposed.proposal
     write_text(target, text)
@@ -138,9 +152,10 @@ class _Asked:
     time_column: str | None
     radius_column: str | None
     time_step: str | None
+    rate: str | None
 
 
-def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
+def _columns_of(data: str, asked: _Asked, layout: Layout) -> dict[str, Any]:
     """Columns and units for ``propose_config``: by option, by a telling name, or asked for.
 
     Raises one :class:`ConfigError` that names every option to add.
@@ -149,16 +164,17 @@ def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
     from en4dvar.errors import ConfigError
     from en4dvar.units import convert
     from en4dvar_bubble.starter.page import TRACKED, TRACKED_COLUMNS
+    from en4dvar_bubble.starter.summaries import summary_rows
 
-    first, contents, decimal = _first_with_columns(list(find_files(Path.cwd(), [data]).values()))
+    first, contents, layout = _first_with_columns(list(find_files(Path.cwd(), [data]).values()), layout)
     shown = {name: f"{len(v)} values, {_range(v)}" for name, v in contents.columns.items()}
-    commas = ", decimal commas" if decimal == "," else ""
+    commas = ", decimal commas" if layout.decimal == "," else ""
     click.echo(f"{first}{commas}: {'; '.join(f'{name} ({words})' for name, words in shown.items())}", err=True)
     if contents.scalars:
         told = ", ".join(f"{name} {value:g}" for name, value in contents.scalars.items())
         click.echo(f"others in the file: {told}", err=True)
-    if {*TRACKED_COLUMNS} <= shown.keys() and asked == _Asked(*[None] * 5):
-        return {"radius": TRACKED.radius, "time": TRACKED.time, "decimal": decimal, "errors": TRACKED.errors}
+    if {*TRACKED_COLUMNS} <= shown.keys() and asked == _Asked(*[None] * 6):
+        return {"radius": TRACKED.radius, "time": TRACKED.time, "layout": layout, "errors": TRACKED.errors}
     time, radius, missing = _columns(asked, shown)
     time_unit, radius_unit = asked.time_unit, asked.radius_unit
     step = None if time or asked.time_step else _only(_STEP, contents.scalars)
@@ -175,39 +191,46 @@ def _columns_of(data: str, asked: _Asked) -> dict[str, Any]:
         radius_unit = radius_unit or _ask_unit(radius, shown, "m", "um, mm or m")
     needed = [*missing]
     needed += ["--time-unit UNIT (e.g. us)"] * (time_unit is None and asked.time_step is None)
-    needed += ["--radius-unit UNIT (e.g. um)"] * (radius_unit is None)
+    needed += [f"--radius-unit UNIT (e.g. um{_pixel(contents.scalars)})"] * (radius_unit is None)
+    if missing and (rows := summary_rows(contents.columns)):
+        raise ConfigError(f"{first}: {rows}")
     if needed:
         message = f"{first}: columns with numbers: {', '.join(shown) or 'none'}; units are never guessed: add "
         raise ConfigError("\n".join([*(contents.others.values() if missing else ()), message + ", ".join(needed)]))
     convert(1.0, str(radius_unit), "m")
     if asked.time_step is not None:
-        return {"radius": (radius, radius_unit), "time_step": asked.time_step, "decimal": decimal}
+        return {"radius": (radius, radius_unit), "time_step": asked.time_step, "layout": layout}
     convert(1.0, str(time_unit), "s")
     if step is not None:
-        return {"radius": (radius, radius_unit), "time_step": step, "step_unit": time_unit, "decimal": decimal}
-    return {"radius": (radius, radius_unit), "time": (time, time_unit), "decimal": decimal}
+        return {"radius": (radius, radius_unit), "time_step": step, "step_unit": time_unit, "layout": layout}
+    return {"radius": (radius, radius_unit), "time": (time, time_unit), "rate": asked.rate, "layout": layout}
 
 
-def _first_with_columns(files: Sequence[Path]) -> tuple[Path, Contents, Decimal]:
-    """The first file that holds columns of numbers, and its decimal sign. Raises :class:`DataError`: there is none."""
+def _pixel(scalars: Mapping[str, float]) -> str:
+    """What the unit of radii in pixels may be, by a scalar of the file whose name says so."""
+    name = _only(_PIXEL, scalars)
+    return "" if name is None else f"; where radii are pixels and {name} is the size of one in m, '{scalars[name]:g}*m'"
+
+
+def _first_with_columns(files: Sequence[Path], layout: Layout) -> tuple[Path, Contents, Layout]:
+    """The first file that holds columns of numbers, and with its decimal sign. Raises :class:`DataError`: none does."""
     from en4dvar.errors import DataError
-    from en4dvar.inputs.readers import SUFFIXES, read_contents
+    from en4dvar.inputs.readers import read_contents
+
+    points, commas = (replace(layout, decimal=sign) for sign in (".", ","))
 
     faults: list[str] = []
     for file in files:
         try:
-            contents, with_commas = (read_contents(file, decimal=sign) for sign in (".", ","))
+            contents, with_commas = (read_contents(file, one) for one in (points, commas))
         except DataError as error:
             faults.append(str(error))
             continue
         if len(with_commas.columns) > len(contents.columns):
-            return file, with_commas, ","
+            return file, with_commas, commas
         if contents.columns:
-            return file, contents, "."
-        reason = next(iter(contents.others.values()), f"{file}: no column holds numbers")
-        text = SUFFIXES[file.suffix.lower()] == "csv"
-        header = "; the first line that is no comment (#) must name the columns" if text else ""
-        faults.append(reason + header * ("put #" not in reason))
+            return file, contents, points
+        faults.append(next(iter(contents.others.values()), f"{file}: no column holds numbers"))
     raise DataError("\n".join(faults))
 
 

@@ -319,19 +319,15 @@ def test_vectors_that_a_mat_file_hides_are_told(tmp_path: Path) -> None:
     assert (done.exit_code, done.stderr) == (2, f"{tmp_path}/b.mat: film is a struct; save what is in it as vectors\n")
     savemat("b.mat", {"t": np.arange(9.0), "R": np.ones((3, 9))})
     done = call("init", "--data", "b.mat", *UNITS)
-    assert "b.mat: R is an array of 3 x 9; save what is in it as vectors\n" in done.stderr
-    assert "columns with numbers: t; units are never guessed: add --radius-column NAME" in done.stderr
+    assert "b.mat: R is an array of 3 x 9; its columns are R(:,1), R(:,2), …, its rows R(1,:), …\n" in done.stderr
+    assert "R(:,9); units are never guessed: add --radius-column NAME" in done.stderr
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("t,R\nus,um\n0,1\n", "b.csv:2: 'us' in column 't' is not a number; if this is no reading, put # before"),
+        ("t,R\nus,um\n", "b.csv:2: 'us' in column 't' is not a number"),
         ("t,R\n", "b.csv: no line follows the header"),
-        (
-            "Camera,X\nrate,2e6\n\nt,R\n0,1\n",
-            "b.csv:2: 'rate' in column 'Camera' is not a number; the first line that is no comment (#) must name",
-        ),
     ],
 )
 def test_without_a_column_of_numbers_the_reason_is_told(tmp_path: Path, text: str, message: str) -> None:
@@ -448,3 +444,51 @@ def test_measured_films(file: str, unit: str, G: float, rest: float) -> None:
         if name in problem.fixed:
             continue
         assert abs(np.log(value) - terms[name].mean) < 2 * terms[name].std, name
+
+
+def test_one_table_of_many_bubbles(tmp_path: Path) -> None:
+    text = write(tmp_path / "b.csv").read_text().splitlines()[1:]
+    rows = [f"{name},{line}" for name in ("one", "two") for line in (text if name == "one" else text[::-1])]
+    Path("b.csv").write_text("\n".join(["gel,t_us,R_um", *rows, rows[-1], ""]))
+    done = call("init", "--data", "b.csv", *UNITS, "--by", "gel")
+    assert "times must increase" in done.stderr  # of the second, which is named among the warnings
+    done = call(
+        "init", "--data", "b.csv", *UNITS, "--by", "gel", "--unsorted", "sort", "--repeated", "average", "--force"
+    )
+    assert done.exit_code == 0, done.output
+    problems = build(proposed(Path("b.yaml")))
+    assert [p.observations.name for p in problems] == ["b_one", "b_two"]
+    assert np.array_equal(problems[0].observations.values, problems[1].observations.values)
+
+
+def test_a_rate_that_the_times_contradict_is_told(tmp_path: Path) -> None:
+    write(tmp_path / "b.csv")
+    done = call("init", "--data", "b.csv", *UNITS, "--frame-rate", "270 kHz")
+    told = "the times are 0.7 us apart, which is no whole number of frames: at the rate given one takes 3.704 us"
+    assert told in done.stderr
+    assert f"# MIND: {told}" in Path("b.yaml").read_text()
+    assert f"warning: b: {told}" in call("validate", "b.yaml").stderr
+    (problem,) = build(load_config("b.yaml"))
+    assert [c.code for c in problem.observations.doubts] == ["implausible-data"]
+    assert call("init", "--data", "b.csv", *UNITS, "--frame-rate", f"{1 / 0.7} MHz", "--force").exit_code == 0
+    assert build(load_config("b.yaml"))[0].observations.doubts == ()
+    Path("b.yaml").write_text(Path("b.yaml").read_text().replace("MHz", "parsec"))
+    assert "b.yaml:" in call("validate", "b.yaml").stderr
+    assert "data.columns.time.rate: " in call("validate", "b.yaml").stderr
+
+
+def test_rows_of_summaries_are_explained(tmp_path: Path) -> None:
+    radius = np.array([365e-6, 399e-6, 298e-6])
+    rows = np.column_stack([radius, [6.1, 5.9, 6.3], 0.9 * RAYLEIGH * radius / 10])
+    savemat("b.mat", {"pIMR_array": rows})
+    done = call("init", "--data", "b.mat")
+    assert done.exit_code == 2
+    assert "pIMR_array(:,3) are 3 rows of R_max, R_max/R_eq and collapse time in SI units" in done.stderr
+    savemat("b.mat", {"a": rows * [1e6, 1, 1]})  # in micrometres, which nobody said
+    assert "--radius-column NAME" in call("init", "--data", "b.mat").stderr
+
+
+def test_a_pixel_that_the_file_holds_is_told(tmp_path: Path) -> None:
+    savemat("b.mat", {"R": np.arange(9.0), "deltat": 3.7e-6, "deltax": 2.76e-6})
+    done = call("init", "--data", "b.mat", "--time-unit", "s")
+    assert "deltax is the size of one in m, '2.76e-06*m')" in done.stderr

@@ -147,7 +147,6 @@ def test_validate(tmp_path):
         ("burn_in: 10", "burn_in: 30", r"twin: burn_in \(30\) leaves none of 30 cycles"),
         ("scheme: ienks", "scheme: etkf", r"assimilation: lag: only with scheme ienks"),
         ("scheme: ienks", "scheme: best", r"twin\.yaml:11:\d+: assimilation\.scheme: 'best' is not one of etkf, denkf"),
-        ("lag: 2", "localisation: {radius: 3}", r"localisation: only with scheme etkf"),
         ("model: {name: lorenz96, size: 12}", "model: {name: lorenz69}", r"unknown model 'lorenz69'; did you mean"),
         (
             "burn_in: 10",

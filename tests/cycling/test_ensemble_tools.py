@@ -9,12 +9,10 @@ import pytest
 
 from en4dvar.cycling.moments import BLOCK, MomentsRecorder
 from en4dvar.cycling.rotation import Rotations, reflections, rotate
-from en4dvar.cycling.sequential import SequentialSettings
 from en4dvar.ensemble.linalg import GRAM_LIMIT, Hessian, apply_weights, centre
 from en4dvar.ensemble.near_prior import NearPrior
 from en4dvar.schemes.base import Evaluation, gauss_newton
 from en4dvar.schemes.etkf import ETKF
-from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation, relaxation
 from en4dvar.schemes.localisation import Localisation, distances, gaspari_cohn
 
@@ -255,8 +253,3 @@ def test_localisation_on_a_grid(periodic):
     row, index = Localisation.on_grid(np.arange(6), (6,), 1.5, periodic), np.arange(6.0)
     line = Localisation.on_line(index, index, 1.5, 6.0 if periodic else None)
     assert np.array_equal(row.taper, line.taper)
-
-
-def test_localisation_needs_a_filter():
-    with pytest.raises(ValueError, match="filter"):
-        SequentialSettings(IEnKS(1), localisation=Localisation([np.arange(2)], np.ones((1, 2))))

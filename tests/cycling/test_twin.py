@@ -19,6 +19,7 @@ from en4dvar.prior import Prior, PriorTerm
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation
+from en4dvar.schemes.localisation import Localisation
 from en4dvar.state import Field, Parameter, StateLayout
 from en4dvar_lorenz import Lorenz63, Lorenz96
 from en4dvar_lorenz.lorenz63 import Lorenz63Settings
@@ -247,6 +248,24 @@ def test_few_members_need_localisation():
     local = load_twin(CONFIGS / "lorenz96_letkf.yaml", {"twin.cycles": 150, "twin.burn_in": 50}).experiment
     everywhere = replace(local, sequential=replace(local.sequential, localisation=None))
     assert rmse(local) < 0.5 < 2.0 < rmse(everywhere)
+
+
+@pytest.mark.parametrize("linearisation", ["transform", "bundle"])
+def test_a_taper_of_ones_is_no_localisation(linearisation):
+    """Blocks that see every observation in full have the weights of the whole, in every iteration."""
+    experiment = lorenz96(IEnKS(2, linearisation, tolerance=1e-6), 12, burn_in=2, members=25)
+    size = experiment.model.layout.size
+    everywhere = Localisation([np.arange(0, 15), np.arange(15, size)], np.ones((2, 40)))
+    local = replace(experiment, sequential=replace(experiment.sequential, localisation=everywhere))
+    assert rmse(local, 3) == pytest.approx(rmse(experiment, 3), rel=1e-6)
+
+
+def test_a_smoother_of_few_members_needs_localisation():
+    """Ten members of Lorenz-96 and the IEnKS, lag 1: the whole diverges, the local one is as good as the local ETKF."""
+    etkf = load_twin(CONFIGS / "lorenz96_letkf.yaml", {"twin.cycles": 150, "twin.burn_in": 50}).experiment
+    smoother = replace(etkf, sequential=replace(etkf.sequential, scheme=IEnKS(1)))
+    everywhere = replace(smoother, sequential=replace(smoother.sequential, localisation=None))
+    assert rmse(smoother) < 1.05 * rmse(etkf) < 0.5 < 2.0 < rmse(everywhere)
 
 
 PUBLISHED = [  # DAPPER 1.7.1, its suggested settings: analysis RMSE in long runs

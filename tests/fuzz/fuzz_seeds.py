@@ -17,8 +17,10 @@ name: toy
 seed: 3
 data:
   path: toy.csv
+  unsorted: sort
+  repeated: average
   columns:
-    time: {name: t_us, unit: us}
+    time: {name: t_us, unit: us, rate: 2 MHz}
     position: {name: R_um, unit: um}
   window: {from: 0 us, to: 140 us, prominence: 10 %}
   time_zero: 0 us
@@ -57,6 +59,22 @@ def of(target: str) -> Iterator[bytes]:
                 file = io.BytesIO()
                 savemat(file, {"R": 1e-4 * np.linspace(1, 0.3, 9), "dt": 1e-6}, do_compression=compressed)
                 yield file.getvalue()
+        case "mat 7.3":
+            import h5py
+
+            file = io.BytesIO()
+            with h5py.File(file, "w", userblock_size=512) as hdf:
+                hdf["R"], hdf["dt"] = 1e-4 * np.linspace(1, 0.3, 9)[None], [[1e-6]]
+            yield b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + file.getvalue()[128:]
+        case "workbook":
+            from openpyxl import Workbook
+
+            book, file = Workbook(), io.BytesIO()
+            for line in SERIES.decode().split():
+                cells = line.split(",")
+                book.active.append(cells if "_" in line else [float(cell) for cell in cells])
+            book.save(file)
+            yield file.getvalue()
         case "quantity":
             yield from (b"1.5 Pa s", b"-2e3 mPa*s", b"3 kg/m/s", b"4 (N/m^2) s")
         case _:

@@ -72,6 +72,18 @@ def mat_series(content: bytes, folder: Path) -> bool:
     )
 
 
+def workbook(content: bytes, folder: Path) -> bool:
+    path = folder / "case.xlsx"
+    path.write_bytes(content)
+    _accepted(lambda: read_contents(path), DataError, path)
+    return _accepted(lambda: read_series(path, TIME, RADIUS), DataError, path)
+
+
+def hdf_series(content: bytes, folder: Path) -> bool:
+    """A MATLAB v7.3 file."""
+    return mat_series(content, folder)
+
+
 def quantity(content: bytes, folder: Path) -> bool:
     text = content.decode("utf-8", "replace")
     try:
@@ -95,6 +107,8 @@ TARGETS: Mapping[str, Callable[[bytes, Path], bool]] = {
     "csv": csv_series,
     "covariance": csv_covariance,
     "mat": mat_series,
+    "mat 7.3": hdf_series,
+    "workbook": workbook,
     "quantity": quantity,
     "result": result_file,
 }

@@ -79,7 +79,7 @@ def test_any_bytes(folder, target, content):
 
 @given(st.data())
 @settings(FEW, max_examples=150)
-@pytest.mark.parametrize("target", ["csv", "covariance", "mat", "quantity"])
+@pytest.mark.parametrize("target", ["csv", "covariance", "mat", "mat 7.3", "workbook", "quantity"])
 def test_data_files_with_a_part_replaced(folder, target, data):
     content = data.draw(st.sampled_from(list(seeds.of(target))))
     first, last = sorted(data.draw(st.tuples(*[st.integers(0, len(content))] * 2)))

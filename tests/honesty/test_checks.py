@@ -11,7 +11,7 @@ from honesty.provoked import TWO, bounded, linear, run
 from toys import Fragile, make_problem
 
 from en4dvar.analysis import Analysis
-from en4dvar.caution import CATALOGUE, Caution
+from en4dvar.caution import CATALOGUE, Caution, caution
 from en4dvar.forward import ValidityLimit
 from en4dvar.honesty import ControlEnsembles, examine
 from en4dvar.honesty.checks import at_bound, rank, validity
@@ -45,6 +45,14 @@ def collapsed(shrunk: float = 1.0, alive: int = 48) -> list[Caution]:
 
 def test_a_gaussian_end_is_silent():
     assert examine(*gaussian()) == ()
+
+
+def test_what_the_file_makes_doubtful_is_a_warning():
+    analysis, control = gaussian()
+    doubt = caution("implausible-data", "the times are 1 us apart, but dt of the file is 2")
+    observations = replace(analysis.problem.observations, doubts=(doubt,))
+    analysis = replace(analysis, problem=replace(analysis.problem, observations=observations))
+    assert examine(analysis, control) == (doubt,)
 
 
 @pytest.mark.parametrize(("shrunk", "told"), [(1.5, False), (0.4, False), (0.3, True), (1e-3, True), (0.0, True)])

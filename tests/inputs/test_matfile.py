@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as arrays
 from mat_damage import RADIUS, seeds
 from scipy.io import loadmat, savemat
 
-from en4dvar.inputs.matfile import mat_vectors
+from en4dvar.inputs.matfile import mat_variables
 
 KINDS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "c16", "?", ">f8")
 VALUES = st.sampled_from(KINDS).flatmap(
@@ -25,7 +25,8 @@ WORDS = {"V": "a struct", "O": "a cell array", "U": "text", "c": "complex"}
 def assert_same(path: Path) -> None:
     """Every variable is what scipy says: a vector with these numbers, or the same words."""
     expected = {k: v for k, v in loadmat(path).items() if not k.startswith("__")}
-    vectors, scalars, others = mat_vectors(path)
+    found = mat_variables(path)
+    vectors, scalars, others = found.vectors, found.scalars, found.others
     outermost = {re.split(r"[.({]", name)[0] for name in vectors.keys() | others.keys()}
     assert outermost == expected.keys()
     for name, value in expected.items():
@@ -39,6 +40,8 @@ def assert_same(path: Path) -> None:
                 assert scalars[name] == float(value.flat[0])
         else:
             assert others[name] == f"an array of {' x '.join(map(str, value.shape))}"
+            if value.ndim == 2:
+                assert np.array_equal(found.matrices[name], value.astype(float), equal_nan=True)
 
 
 def bubbles(count: int) -> np.ndarray:
@@ -55,7 +58,8 @@ def test_what_is_in_structs_and_cells_has_matlabs_name(tmp_path, compressed):
     cells[:] = [np.arange(3.0), np.arange(4.0)]
     content = {"expts": bubbles(3), "film": {"R": np.arange(4.0), "lens": {"size": 1.5}}, "C": cells}
     savemat(tmp_path / "a.mat", content, do_compression=compressed)
-    vectors, scalars, others = mat_vectors(tmp_path / "a.mat")
+    found = mat_variables(tmp_path / "a.mat")
+    vectors, scalars, others = found.vectors, found.scalars, found.others
     for k in range(3):
         assert vectors[f"expts({k + 1}).Roft"].tolist() == (9.0 - np.arange(5) + k).tolist()
         assert scalars[f"expts({k + 1}).Req"] == 2.0 + k
@@ -77,6 +81,7 @@ def test_any_arrays(tmp_path, content, compressed):
 def test_every_kind_of_variable_in_both_byte_orders(tmp_path, number):
     (tmp_path / "a.mat").write_bytes(seeds()[number])
     assert_same(tmp_path / "a.mat")
-    vectors, scalars, _ = mat_vectors(tmp_path / "a.mat")
+    found = mat_variables(tmp_path / "a.mat")
+    vectors, scalars = found.vectors, found.scalars
     assert len(vectors["R"]) == len(RADIUS)
     assert "dt" in scalars

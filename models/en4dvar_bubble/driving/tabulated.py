@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from en4dvar.inputs.readers import Column, Format, read_series
+from en4dvar.inputs.readers import Column, Format, Layout, read_series
 from en4dvar.state import Array
 from en4dvar_bubble.driving.base import Driving
 
@@ -95,7 +95,7 @@ def from_file(
 
     Raises :class:`~en4dvar.errors.DataError` for a file that cannot be read, ValueError as :func:`tabulated`.
     """
-    series = read_series(path, Column(*time, "s"), Column(*pressure, "Pa"), format)
+    series = read_series(path, Column(*time, "s"), Column(*pressure, "Pa"), Layout(format))
     try:
         return tabulated(series.times, series.values, delay, scale)
     except ValueError as error:

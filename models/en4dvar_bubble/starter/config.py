@@ -14,8 +14,8 @@ from en4dvar.config.document import parse_document
 from en4dvar.config.find_files import find_files, with_parts
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.files import expanded
-from en4dvar.inputs.readers import Column, DataFile, Readings, TimeStep, read_series
-from en4dvar.inputs.text_table import Decimal
+from en4dvar.inputs.readers import ANY, Column, DataFile, Layout, Readings, TimeStep, read_series
+from en4dvar.inputs.steps import step_doubts
 from en4dvar.units import UnitError, convert, parse_quantity, parse_unit
 from en4dvar_bubble.starter.look import Start
 from en4dvar_bubble.starter.page import Source, quoted, yaml_text
@@ -43,7 +43,7 @@ def propose_config(
     radius: tuple[str, str],
     time: tuple[str, str] | None = None,
     time_step: str | None = None,
-    decimal: Decimal = ".",
+    layout: Layout = ANY,
     start: Start | None = None,
     law: str | None = None,
     folder: str | Path = ".",
@@ -51,6 +51,7 @@ def propose_config(
     errors: tuple[str, ...] = (),
     command: str = "en4dvar_bubble.starter.propose_config",
     step_unit: str | None = None,
+    rate: str | None = None,
 ) -> Proposed:
     """A commented configuration for radius histories that loads and whose data can be read.
 
@@ -59,10 +60,11 @@ def propose_config(
     data: a CSV or ``.mat`` file, a folder or a pattern, relative to the current folder.
     radius, time: name of the column and its unit, never guessed; ``time_step`` instead of ``time``: a quantity such
         as ``"3.7 us"``, or with ``step_unit`` the name of a scalar of the file.
-    decimal: decimal sign of the numbers in CSV files.
+    layout: decimal sign, sheet, column that says which data set a row belongs to, what is done with disorder.
     start, law: instead of what the data suggest.
     folder: where the file will be; the path of the data inside it is relative to this folder.
     name: of the run, whose results go to ``runs/<name>``; default: that of the data.
+    rate: of the camera's frames, e.g. ``"270 kHz"``, that the times are compared with.
     errors: columns of the standard deviations of radii and times, in the units of ``radius`` and ``time``.
     command: told in the head of the file.
 
@@ -74,14 +76,16 @@ def propose_config(
     """
     if (time is None) == (time_step is None):
         raise ConfigError("give either the column of times and its unit, or a constant time step")
-    source = Source(path_from(Path(folder), str(data)), time, time_step, radius, decimal, errors, step_unit)
-    files = with_parts(find_files(Path.cwd(), [str(data)]), Column(*source.radius, "m"))
+    source = Source(path_from(Path(folder), str(data)), time, time_step, radius, layout, errors, step_unit, rate)
+    files = with_parts(
+        find_files(Path.cwd(), [str(data)]), Column(*source.radius, "m"), layout, time[0] if time else None
+    )
     found, unusable = histories(files, source)
     proposal = propose({name: (series.times, series.values) for name, series in found.items()}, start, law)
     proposal = _with_rest(proposal, found, source.radius[1])
     if errors:
         proposal = with_columns(proposal, errors)
-    proposal = replace(proposal, warnings=(*proposal.warnings, *doubts(source), *unusable))
+    proposal = replace(proposal, warnings=(*proposal.warnings, *doubts(source), *_steps(found, source), *unusable))
     text = yaml_text(name or run_name(str(data)), source, proposal, command)
     config = resolve(parse_document(text), Path(folder).absolute())
     for dataset in found:
@@ -101,9 +105,7 @@ def histories(files: Mapping[str, DataFile], source: Source) -> tuple[dict[str, 
     unusable: list[str] = []
     for name, file in files.items():
         try:
-            series = read_series(
-                file.path, time, Column(*source.radius, "m", positive=True), decimal=source.decimal, part=file.part
-            )
+            series = read_series(file.path, time, Column(*source.radius, "m", True), source.layout, part=file.part)
         except DataError as error:
             unusable.append(str(error))
         else:
@@ -118,7 +120,20 @@ def _times(source: Source) -> Column | TimeStep:
         return TimeStep(Column(source.time_step or "", source.step_unit, "s"))
     if source.time_step:
         return TimeStep(value=parse_quantity(source.time_step, "s"))
-    return Column(*(source.time or ("", "s")), "s")
+    rate = None if source.rate is None else parse_quantity(source.rate, "1/s")
+    return Column(*(source.time or ("", "s")), "s", rate=rate)
+
+
+def _steps(found: Mapping[str, Readings], source: Source) -> list[str]:
+    """Where the times of a data set contradict the file's step or the rate given, or are no frames of a film."""
+    time = _times(source)
+    if not isinstance(time, Column):
+        return []
+    told = []
+    for name, series in found.items():
+        words = step_doubts(series.times, "s", time.unit, series.scalars, time.rate)
+        told += [one.words if len(found) == 1 else f"{name}: {one.words}" for one in words]
+    return told
 
 
 def _with_rest(proposal: Proposal, found: Mapping[str, Readings], unit: str) -> Proposal:

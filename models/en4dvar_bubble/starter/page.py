@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from en4dvar.inputs.text_table import Decimal
+from en4dvar.inputs.readers import ANY, Layout
 from en4dvar_bubble.starter.proposal import Entry, Proposal
 
 SCHEMA_FILE = "en4dvar.schema.json"
@@ -20,16 +20,23 @@ class Source:
     """How the data are read: ``path`` as the file says it, the column (or constant step) of times, that of radii.
 
     ``errors``: columns of the standard deviations of radii and times, where the file states them. ``step_unit``: that
-    of a constant step which is a scalar of the file.
+    of a constant step which is a scalar of the file. ``rate``: of the frames, that the times are compared with.
     """
 
     path: str
     time: tuple[str, str] | None
     time_step: str | None
     radius: tuple[str, str]
-    decimal: Decimal = "."
+    layout: Layout = ANY
     errors: tuple[str, ...] = ()
     step_unit: str | None = None
+    rate: str | None = None
+
+    @property
+    def layout_entries(self) -> list[str]:
+        """What is said about the layout, line by line."""
+        told = {name: getattr(self.layout, name) for name in ("decimal", "by", "sheet", "unsorted", "repeated")}
+        return [f"  {name}: {quoted(it)}" for name, it in told.items() if it is not None and it != getattr(ANY, name)]
 
     @property
     def time_entry(self) -> str:
@@ -38,7 +45,8 @@ class Source:
             return f"{{step: {quoted(self.time_step or '')}, unit: {quoted(self.step_unit)}}}"
         if self.time is None:
             return f"{{step: {quoted(self.time_step or '')}}}"
-        return f"{{name: {quoted(self.time[0])}, unit: {quoted(self.time[1])}}}"
+        rate = f", rate: {quoted(self.rate)}" if self.rate is not None else ""
+        return f"{{name: {quoted(self.time[0])}, unit: {quoted(self.time[1])}{rate}}}"
 
     @property
     def radius_entry(self) -> str:
@@ -71,7 +79,7 @@ def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> st
         "seed: 1 # the same seed gives the same bits",
         "data:",
         f"  path: {quoted(source.path)}",
-        *(['  decimal: ","'] if source.decimal == "," else []),
+        *source.layout_entries,
         "  columns:",
         f"    time: {source.time_entry}",
         f"    radius: {source.radius_entry}",

@@ -1,0 +1,142 @@
+"""Tables of Excel workbooks (``.xlsx``), cells as text.
+
+Numbers are those that Excel stored: no formula is evaluated, no macro, link or query is looked at. A workbook is a zip
+archive from anybody: what it unpacks to is bounded, and XML that declares entities is refused, before openpyxl sees it.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from en4dvar.errors import DataError
+from en4dvar.hints import listed, suggest
+from en4dvar.inputs.text_table import WIDEST, Lines
+
+if TYPE_CHECKING:
+    from openpyxl.worksheet._read_only import ReadOnlyWorksheet
+
+LARGEST = 1 << 28  # bytes that the parts of a workbook unpack to
+MOST_PARTS = 2_000
+MOST_ROWS = 1 << 20  # of a sheet: what Excel itself allows
+_RANGE = re.compile(r"\$?[A-Za-z]{1,3}\$?[1-9]\d{0,6}(:\$?[A-Za-z]{1,3}\$?[1-9]\d{0,6})?")
+
+
+def sheet_lines(path: Path, asked: str) -> Lines:
+    """Rows of a sheet that are not blank, with their numbers; ``asked`` is a sheet, ``Sheet!A3:D40`` or ``A3:D40``.
+
+    Raises :class:`DataError`.
+    """
+    name, area = _parts(asked)
+    _check(path)
+    try:
+        stored = _rows(path, name, area, formulas=False)
+        rows = [(number, _texts(cells)) for number, cells in stored]
+        blank = any(None in cells for _, cells in stored)
+        if blank:
+            _refuse_formulas(path, stored, _rows(path, name, area, formulas=True))
+    except DataError:
+        raise
+    except Exception as error:  # whatever openpyxl stumbles over: it trusts what is in the archive
+        raise DataError(f"{path}: not a workbook that can be read ({type(error).__name__}); save it as CSV") from None
+    return [(number, cells) for number, cells in rows if cells]
+
+
+def _parts(asked: str) -> tuple[str, str]:
+    """Name of the sheet and the range, "" where it is not said."""
+    name, _, area = asked.rpartition("!")
+    if _RANGE.fullmatch(area):
+        return name.strip("'"), area.upper().replace("$", "")
+    return asked.strip("'"), ""
+
+
+def _check(path: Path) -> None:
+    """Raise :class:`DataError` where the archive is none, or not to be unpacked."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            parts = archive.infolist()
+            size = sum(part.file_size for part in parts)
+            if size > LARGEST or len(parts) > MOST_PARTS:
+                raise DataError(f"{path}: {len(parts)} parts that unpack to {size / 2**20:.0f} MiB; save it as CSV")
+            for part in parts:
+                if part.filename.endswith((".xml", ".rels")) and _declares(archive.read(part)):
+                    raise DataError(f"{path}: {part.filename} declares entities, as no workbook does")
+    except DataError:
+        raise
+    except Exception as error:  # BadZipFile, zlib.error and whatever else a damaged archive gives
+        raise DataError(f"{path}: not an Excel workbook ({error})") from None
+
+
+def _declares(xml: bytes) -> bool:
+    return b"<!D" in xml or any("<!D".encode(coding) in xml for coding in ("utf-16-le", "utf-16-be"))
+
+
+def _rows(path: Path, name: str, area: str, formulas: bool) -> list[tuple[int, tuple[Any, ...]]]:
+    """Numbered rows of cells."""
+    try:
+        from openpyxl import load_workbook
+    except ImportError:
+        raise DataError(f"{path}: Excel needs: pip install 'en4dvar[tables]'; or save the sheet as CSV") from None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of styles and extensions that openpyxl leaves out
+        book = load_workbook(path, read_only=True, data_only=not formulas, keep_links=False)
+        try:
+            sheet = _sheet(book, name, path)
+            sheet.reset_dimensions()  # the stated ones may be wrong
+            bounds = _bounds(area)
+            found = []
+            for number, cells in enumerate(sheet.iter_rows(**bounds, values_only=True), bounds.get("min_row", 1)):
+                if number > MOST_ROWS or len(cells) > WIDEST:
+                    raise DataError(f"{path}: more than {MOST_ROWS} rows or {WIDEST} columns in sheet {sheet.title!r}")
+                found.append((number, cells))
+            return found
+        finally:
+            book.close()
+
+
+def _bounds(area: str) -> dict[str, int]:
+    from openpyxl.utils import range_boundaries
+
+    if not area:
+        return {}
+    keys = ("min_col", "min_row", "max_col", "max_row")
+    return dict(zip(keys, range_boundaries(area), strict=True))
+
+
+def _sheet(book: Any, name: str, path: Path) -> ReadOnlyWorksheet:
+    """The sheet of a name, or the only one with anything in it. Raises :class:`DataError`."""
+    sheets = {sheet.title: sheet for sheet in book.worksheets}
+    if name:
+        if name not in sheets:
+            raise DataError(f"{path}: no sheet {name!r}{suggest(name, sheets)}")
+        return sheets[name]
+    used = [sheet for sheet in sheets.values() if any(map(_texts, sheet.iter_rows(values_only=True)))]
+    if len(used) != 1:
+        which = f"say which (data.sheet): {listed(sheet.title for sheet in used)}" if used else "none holds anything"
+        raise DataError(f"{path}: {len(used)} sheets hold something; {which}" if used else f"{path}: {which}")
+    return used[0]
+
+
+def _texts(cells: tuple[Any, ...]) -> list[str]:
+    """Cells as text, without the blank ones at the end."""
+    texts = ["" if cell is None else repr(cell) if isinstance(cell, float) else str(cell).strip() for cell in cells]
+    while texts and not texts[-1]:
+        texts.pop()
+    return texts
+
+
+def _refuse_formulas(path: Path, stored: Any, written: Any) -> None:
+    """Raise :class:`DataError` where a formula has no stored value, which would read as a blank cell."""
+    from openpyxl.utils import get_column_letter
+
+    for (number, values), (_, texts) in zip(stored, written, strict=False):
+        for i, (value, text) in enumerate(zip(values, texts, strict=False)):
+            if value is None and isinstance(text, str) and text.startswith("="):
+                where = f"{get_column_letter(i + 1)}{number}"
+                raise DataError(
+                    f"{path}:{number}: cell {where} holds a formula without a stored value, and none is evaluated; "
+                    "open and save the workbook in Excel or LibreOffice, or save the sheet as CSV"
+                )

@@ -1,0 +1,79 @@
+"""Times beside the camera's frames: whether steps between readings can be what the file, or its user, says.
+
+Readings of a film lie whole frames apart, also where some frames could not be read. A step that is none, among many
+that are, is a time that was written wrongly. Steps of all kinds are those of another instrument, and nothing is said.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from en4dvar.caution import Caution, caution
+from en4dvar.state import Array
+from en4dvar.units import convert
+
+MOSTLY = 0.8  # of the steps are whole frames: this is a film
+WHOLE = 0.1  # of a frame: times may be rounded
+ODD = 0.25  # of a frame off the next whole number
+SAME = 0.01  # rates that agree within this are the same
+_STEP = re.compile(r"(?i)(.*\.)?(delta_?t|dt|t_?step|time_?step)")
+_RATE = re.compile(r"(?i)(.*\.)?(fps|frame_?rate|f_?rate)")
+
+
+def step_doubts(
+    times: Array, unit: str, display: str, scalars: Mapping[str, float], rate: float | None = None
+) -> tuple[Caution, ...]:
+    """What contradicts times (K,) in ``unit``, increasing, K > 1.
+
+    ``scalars``: of the file, whose units nobody said, so factors of 1000 are not told from agreement. ``rate``: of the
+    frames, as the user says, per ``unit``. ``display``: the unit that messages use.
+    """
+    return (*_rates(times, unit, display, scalars, rate), *_odd(times, unit, display))
+
+
+def frame(times: Array) -> float:
+    """The step between frames, NaN where the steps are not mostly whole numbers of one."""
+    steps = np.diff(times)
+    base = float(np.median(steps))
+    return base if np.mean(_off(steps / base) < WHOLE) >= MOSTLY else float("nan")
+
+
+def _off(frames: Array) -> Array:
+    """How far steps (K,) in frames are from a whole number of them, at least one."""
+    return np.abs(frames - np.maximum(np.rint(frames), 1))
+
+
+def _rates(
+    times: Array, unit: str, display: str, scalars: Mapping[str, float], rate: float | None
+) -> Iterator[Caution]:
+    step = frame(times)
+    if not np.isfinite(step):
+        step = float(np.median(np.diff(times)))
+    told = f"the times are {convert(step, unit, display):.4g} {display} apart"
+    if rate is not None and _off(np.array([step * rate]))[0] > SAME * step * rate:
+        said = convert(1 / rate, unit, display)
+        yield caution("implausible-data", f"{told}, which is no whole number of frames: at the rate given one takes "
+                      f"{said:.4g} {display}")  # fmt: skip
+    for name, value in scalars.items():
+        if value > 0 and (_STEP.fullmatch(name) or _RATE.fullmatch(name)):
+            frames = step / value if _STEP.fullmatch(name) else step * value
+            frames /= 1000.0 ** np.rint(np.log10(frames) / 3)
+            if abs(frames - 1) > SAME and _off(np.array([frames]))[0] > SAME * frames:
+                yield caution("implausible-data", f"{told}, but {name} of the file is {value:g}")
+
+
+def _odd(times: Array, unit: str, display: str) -> Iterator[Caution]:
+    step = frame(times)
+    if not np.isfinite(step):
+        return
+    odd = np.flatnonzero(_off(np.diff(times) / step) > ODD)
+    if len(odd):
+        first, after, base = convert(np.array([*times[odd[0] : odd[0] + 2], step]), unit, display)
+        words = (
+            f"{len(odd)} of {len(times) - 1} steps between readings are no whole number of frames of {base:.4g} "
+            f"{display}, the first from {first:.6g} to {after:.6g} {display}: is a time wrong?"
+        )
+        yield caution("implausible-data", words, "caution")

@@ -1,0 +1,113 @@
+"""What a ``.mat`` file of any version holds, under the names MATLAB has for it.
+
+What is in a struct or a cell array is ``film.R``, ``expts(2).R``, ``R{3}``; column and row of a matrix are ``M(:,2)``
+and ``M(2,:)``.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from en4dvar.inputs.text_table import WIDEST
+from en4dvar.state import Array
+
+T = TypeVar("T")
+MOST = 1 << 25  # numbers in all vectors of a file: 256 MiB, whatever a small compressed file may unpack to
+MOST_IN_MATRICES = 1 << 22  # in all matrices of a file: what is larger is a film, not a table
+SHOWN = 12  # columns of a matrix that are told one by one
+_INDEX = re.compile(r"\((\d+)\)|\{(\d+)\}")
+_OF_MATRIX = re.compile(r"(.+)\((?::,([1-9]\d{0,8})|([1-9]\d{0,8}),:)\)")
+
+
+@dataclass(frozen=True)
+class Variables:
+    """Real ``vectors`` (K,) and ``matrices`` (n, m), finite ``scalars``, and in words what else there is.
+
+    A matrix is among the ``others`` too, and a scalar among the vectors.
+    """
+
+    vectors: Mapping[str, Array]
+    matrices: Mapping[str, Array]
+    scalars: Mapping[str, float]
+    others: Mapping[str, str]
+
+    def vector(self, name: str) -> Array | None:
+        """A vector by its name, also of a matrix; None where there is none."""
+        found = _OF_MATRIX.fullmatch(name)
+        if name in self.vectors or found is None or found[1] not in self.matrices:
+            return self.vectors.get(name)
+        matrix, index = self.matrices[found[1]], int(found[2] or found[3]) - 1
+        of = matrix.T if found[2] else matrix
+        return of[index] if index < len(of) else None
+
+    def matching(self, pattern: str) -> tuple[str, ...]:
+        """The names that a pattern with ``*`` stands for, columns and rows of matrices among them."""
+        return tuple(name for name in self._names() if fnmatch.fnmatchcase(name, pattern))
+
+    def _names(self) -> Iterator[str]:
+        yield from self.vectors
+        for name, matrix in self.matrices.items():
+            if max(matrix.shape) <= WIDEST:
+                yield from (f"{name}(:,{k + 1})" for k in range(matrix.shape[1]))
+                yield from (f"{name}({k + 1},:)" for k in range(matrix.shape[0]))
+
+    def of(self, part: str) -> Variables:
+        """What is not inside an array, and of arrays the element ``part`` under names without the index."""
+        return Variables(
+            _element(self.vectors, part),
+            _element(self.matrices, part),
+            _element(self.scalars, part),
+            _element(self.others, part),
+        )
+
+    def of_first(self) -> Variables:
+        """Each array by its first element, under names without the index."""
+        return Variables(_first(self.vectors), _first(self.matrices), _first(self.scalars), _first(self.others))
+
+    def columns(self) -> dict[str, Array]:
+        """Vectors of more than one number, and the columns of narrow matrices."""
+        found = {name: vector for name, vector in self.vectors.items() if vector.size > 1}
+        for name, matrix in self.matrices.items():
+            if matrix.shape[1] <= SHOWN:
+                found |= {f"{name}(:,{k + 1})": column for k, column in enumerate(matrix.T)}
+        return found
+
+
+def array_words(shape: Sequence[int]) -> str:
+    """What an array that is no vector is called."""
+    return f"an array of {' x '.join(map(str, shape))}"
+
+
+def gathered(found: Iterable[tuple[str, Array | str]]) -> Variables:
+    """Variables of named vectors and matrices, or words in their place; of two with one name the last."""
+    every = dict(found)
+    numbers = {name: it for name, it in every.items() if not isinstance(it, str)}
+    vectors = {name: it for name, it in numbers.items() if it.ndim == 1}
+    matrices = {name: it for name, it in numbers.items() if it.ndim == 2}
+    scalars = {name: float(it[0]) for name, it in vectors.items() if it.size == 1 and np.isfinite(it[0])}
+    words = {name: it for name, it in every.items() if isinstance(it, str)}
+    return Variables(vectors, matrices, scalars, words | {name: array_words(m.shape) for name, m in matrices.items()})
+
+
+def indexed(name: str) -> tuple[str, str]:
+    """``expts(2).R`` as ``expts.R`` and ``2``, ``C{3}`` as ``C`` and ``3``; by the first index, "" without one."""
+    found = _INDEX.search(name)
+    return (name[: found.start()] + name[found.end() :], found[1] or found[2]) if found else (name, "")
+
+
+def _element(found: Mapping[str, T], part: str) -> dict[str, T]:
+    inside = {name: value for whole, value in found.items() for name, i in (indexed(whole),) if i and i == part}
+    return {**found, **inside}
+
+
+def _first(found: Mapping[str, T]) -> dict[str, T]:
+    kept: dict[str, T] = {}
+    for whole, value in found.items():
+        kept.setdefault(indexed(whole)[0], value)
+    return kept
