@@ -28,7 +28,8 @@ FEW = settings(deadline=None, database=None, derandomize=True, suppress_health_c
 def folder(tmp_path_factory):
     """A folder with the data that the shipped configurations name."""
     here = tmp_path_factory.mktemp("fuzz")
-    (here / "data").symlink_to(seeds.CONFIGS / "data")
+    for name in ("data", "programs"):
+        (here / name).symlink_to(seeds.CONFIGS / name)
     return here
 
 
