@@ -43,6 +43,7 @@ def test_seeds_are_accepted(folder, target):
         assert all(accepted)
 
 
+@pytest.mark.slow
 @given(st.data())
 @settings(FEW, max_examples=250)
 def test_configurations_of_the_right_shape(folder, data):
