@@ -118,6 +118,7 @@ def test_a_forward_model_and_its_field(result):
     assert_closed_form(wells, G, np.concatenate([V1, V2, cells["f"].to_numpy()[used]]), R)
 
 
+@pytest.mark.slow
 def test_units_and_a_run_directory(tmp_path):
     units = {"time": "s", "p": "m", "q": "cm", "a": "m", "b": "m/s"}
     priors = {
@@ -128,7 +129,7 @@ def test_units_and_a_run_directory(tmp_path):
     kept = fit(units=units, priors=priors, directory=run)
     assert kept.observed_data["q"].attrs["units"] == "cm"
     assert (run / "report.html").is_file()
-    assert fit(units=units, priors=priors, directory=run, resume=True).posterior.identical(kept.posterior)
+    assert fit(units=units, priors=priors, directory=run, resume=True, report=False).posterior.identical(kept.posterior)
     with pytest.raises(en4dvar.OutputError, match=r"data\.csv: holds other readings"):
         fit(data={"p": (T1, V1), "q": (T2, V2 + 1)}, units=units, priors=priors, directory=run)
 
