@@ -58,6 +58,8 @@ def join(
         config, results = _recorded(run_dir, trust, ask)
         first = first or config
         for result in results:
+            if len(result.axes) > 1:  # the file and page of a joint estimate know one series a data set
+                raise ConfigError(f"{run_dir}: {result.name} has several series; it cannot be estimated jointly")
             problem = problem_of(config, result.observations())
             if problem.varying:
                 raise ConfigError(f"{run_dir}: parameters that vary in time cannot be estimated jointly")

@@ -12,10 +12,12 @@ from problem.series_models import all_series, problem_of
 
 import en4dvar
 from en4dvar.assimilate import assimilate
+from en4dvar.errors import ConfigError
 from en4dvar.problem import AssimilationSettings
 from en4dvar.report.figures import all_figures
 from en4dvar.report.page import render_set
 from en4dvar.report.result import Result
+from en4dvar.runs.joint_run import join
 from en4dvar.runs.rerun import rerun
 from en4dvar.storage.store import load_stored, save
 
@@ -87,3 +89,5 @@ def test_a_run_is_repeated_to_the_bit(tmp_path: Path):
     assert not again.sets[0].data
     (tmp_path / "f.csv").write_text("changed", encoding="utf-8")
     assert "has changed since" in rerun(tmp_path / "out").sets[0].data
+    with pytest.raises(ConfigError, match="out: .* has several series; it cannot be estimated jointly"):
+        join([tmp_path / "out"], ["a"], tmp_path / "joint")
