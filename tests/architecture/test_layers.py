@@ -30,6 +30,8 @@ LAYERS = (
     ("descent",),
     ("cycling",),
     ("sampling",),
+    ("loop_state", "conclusions"),
+    ("stages",),
     ("assimilate",),
     ("joint",),
     ("population",),

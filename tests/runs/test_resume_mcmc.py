@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 from run_files import assert_same_results, configuration, kill_after_writes, make_campaign, resumed_until_done, run_cli
 
-from en4dvar.assimilate import LoopState, mcmc
+from en4dvar.assimilate import LoopState
 from en4dvar.inputs.readers import DataFile
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.runner import run_campaign
+from en4dvar.sampling import mcmc
 from en4dvar.storage.checkpoint import read_checkpoint
 from en4dvar.storage.fingerprint import identity
 

@@ -1,0 +1,233 @@
+"""The stages of an assimilation: prior forecast, start, iterations, search for other minima, refinement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from en4dvar import diagnostics as diag
+from en4dvar.analysis import Progress, Record
+from en4dvar.descent.loop import iterate
+from en4dvar.descent.marginal import marginal_members
+from en4dvar.descent.minima import Minimum, merged
+from en4dvar.descent.noise_scale import mean_beyond_mode
+from en4dvar.descent.search import Found, Search, SearchState
+from en4dvar.descent.start import StartState, choose_start
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.descent.window import DataWindow, Descent
+from en4dvar.ensemble.forecast import Forecast, check_problem, plotting_times
+from en4dvar.errors import ConfigError
+from en4dvar.executor import Executor
+from en4dvar.loop_state import Keep, LoopState, Refinement
+from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.sampling.mcmc import ChainState
+from en4dvar.sampling.refine import Refined, in_doubt, refined, samples
+from en4dvar.sampling.shape import CLEARED, examine_shape
+from en4dvar.schemes import window_scheme
+from en4dvar.schemes.base import Weights
+from en4dvar.schemes.en4dvar import En4DVar
+from en4dvar.state import Array
+
+
+@dataclass(frozen=True)
+class Ends:
+    """An ensemble (N, n), transformed, about the ``mode`` (n,) of J, and what came of running both."""
+
+    members: Array
+    mode: Array
+    run: Forecast
+    central: Forecast
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """The posterior's ensemble; how it was sampled, or the ``shape`` of one that was not."""
+
+    ends: Ends
+    refined: Refined | None
+    shape: Mapping[str, float]
+
+
+class Stages:
+    """One data set, in the order of the methods; each keeps a state to resume from as it goes on."""
+
+    def __init__(
+        self,
+        problem: InverseProblem,
+        settings: AssimilationSettings,
+        seed: int,
+        executor: Executor,
+        progress: Progress | None,
+        keep: Keep | None,
+    ):
+        self.fixed_parameters = check_problem(problem)
+        self.problem, self.settings, self.seed = problem, settings, seed
+        self.progress, self._keep = progress, keep
+        self.scheme = window_scheme(settings)
+        robust = np.isfinite(problem.observations.noise.counts_within)
+        estimated = any(p.name in problem.prior.names for p in problem.discrepancy)
+        if not self.scheme.searches and (problem.has_noise_scale or robust or estimated):
+            raise ConfigError(
+                f"{settings.scheme} takes Gaussian errors of known covariance: neither sigma nor a robust cost nor a "
+                "discrepancy; use en4dvar"
+            )
+        self.space = WeightSpace(problem, settings, seed, executor)
+        self.grid = plotting_times(problem)
+
+    def descend(self, resume: LoopState | None = None) -> tuple[Forecast, LoopState, Descent]:
+        """The prior forecast, where the iterations started, and their end."""
+        space = self.space
+        prior_run = space.forecast(np.vstack([space.members, space.mean]), self.grid)
+        space.require_members(prior_run[:-1].failures, "prior forecast")
+        if not self.settings.stochastic_model:
+            space.check_repeats(prior_run, self.grid)
+        start = self.start(prior_run, resume) if resume is None or resume.descent is None else resume
+        return prior_run, start, self.iterate(start, prior_run)
+
+    def start(self, prior_run: Forecast, resume: LoopState | None) -> LoopState:
+        """The state from which the iterations go on."""
+        space = self.space
+        if not isinstance(self.scheme, En4DVar):
+            return LoopState(space.forward_runs, descent=Descent(Weights.prior(len(space.members))))
+        if resume is not None:
+            space.forward_runs = resume.forward_runs
+
+        def keep(comparison: Callable[[], StartState]) -> None:
+            self.keep(lambda: LoopState(space.forward_runs, comparison()))
+
+        before = resume.comparison if resume else None
+        begun = choose_start(space, self.scheme, prior_run, self.seed, before, keep, self.tell)
+        for record in begun.descent.records:
+            self.tell(record)
+        return LoopState(space.forward_runs, None, begun.descent, begun.minima, begun.tried, begun.warnings)
+
+    def iterate(self, state: LoopState, prior_run: Forecast) -> Descent:
+        """The end of the iterations."""
+        space = self.space
+        space.forward_runs = state.forward_runs
+        assert state.descent is not None
+        descent = state.descent.kept
+
+        def keep() -> None:
+            kept = replace(state, forward_runs=space.forward_runs, descent=descent.kept)
+            self.latest = kept
+            self.keep(lambda: kept)
+
+        window = DataWindow(space, self.seed, keep, self.tell, prior_run, self.grid)
+        iterate(window, self.scheme, [descent])
+        return descent
+
+    def searched(self, start: LoopState, descent: Descent, prior_run: Forecast) -> tuple[Found, Ends]:
+        """All minima, the lowest descent, and the ensemble about it.
+
+        After the first descents one from a member far from the minimum looks for another. Of a cheap model, or for a
+        chain, many are tried where there is one or where J of the posterior members is not that of a Gaussian; else
+        some, where the lowest minimum is that of one descent alone.
+        """
+        space, scheme, before = self.space, self.scheme, self.latest.descent
+        assert before is not None
+        if not isinstance(scheme, En4DVar):
+            return Found(descent, before, (), ()), self.gaussian(descent)
+        begun, minima = start.search or SearchState(), start.minima
+        if start.search is None:
+            minima = merged([Minimum.of(space, descent), *minima])
+        found = Found(descent, before, minima, start.tried, begun.runs)
+        if self.settings.starts < 2 or not scheme.economical(space.basis):
+            return found, self.gaussian(descent)
+        if start.search is not None:
+            space.forward_runs = start.forward_runs
+        search = Search(space, scheme, prior_run, self.seed, begun, self.keep_search, self.tell)
+        found = search.challenged(found)
+        if not (self.settings.refine == "mcmc" or samples(space)):
+            found = search.settled(found)
+            return found, self.gaussian(found.descent)
+        ends = self.gaussian(found.descent)
+        if begun.over > 1 and not begun.lower:
+            space.forward_runs = start.forward_runs  # they were counted before the second round
+        fit = diag.gaussianity(ends.members, ends.mode, self.costs(ends.members, ends.run))["gaussian_fit"]
+        rest = search.rest(found)
+        if rest and (len(found.minima) > 1 or not fit >= CLEARED):
+            earlier, found = found, search.round(found, rest)
+            ends = ends if found.descent is earlier.descent else self.gaussian(found.descent)
+        return found, ends
+
+    def keep_search(self, state: Callable[[], tuple[Found, SearchState]]) -> None:
+        runs = self.space.forward_runs
+
+        def kept() -> LoopState:
+            found, search = state()
+            return replace(
+                self.latest,
+                forward_runs=runs,
+                descent=found.before,
+                minima=found.minima,
+                tried=found.tried,
+                search=search,
+            )
+
+        self.latest = kept()
+        self.keep(lambda: self.latest)
+
+    def gaussian(self, descent: Descent) -> Ends:
+        """The ensemble at the end of a descent, and its forecast."""
+        space, problem = self.space, self.problem
+        transform = descent.newton.hessian.economical_transform if self.scheme.searches else descent.weights.T
+        ends = space.ensemble(descent.weights.w, transform)
+        members, mode = ends[:-1], ends[-1]
+        members = members + mean_beyond_mode(problem, mode, members, descent.records[-1].dfs)
+        if not self.scheme.searches:  # the last ensemble that was run is the posterior
+            return Ends(members, mode, descent.iterate.members, descent.iterate.central)
+        if problem.discrepancy and descent.iterate.linear is not None:
+            members = marginal_members(space, descent.iterate.linear, mode, members, self.seed)
+        final = space.forecast(np.vstack([members, mode]), self.grid)
+        return Ends(members, mode, final[:-1], final[-1:])
+
+    def sampled(self, ends: Ends, minima: Sequence[Minimum], agree: bool, earlier: Refinement | None) -> Sampled:
+        """The ensemble, sampled where that is asked for or there is a doubt.
+
+        ``agree``: descents from different members ended in the lowest of the ``minima`` that count. ``earlier``: where
+        a chain was interrupted.
+        """
+        space = self.space
+        if self.settings.refine != "mcmc":
+            shape = examine_shape(space, ends.members, ends.mode, self.costs(ends.members, ends.run), self.seed)
+            if not (samples(space) and minima and in_doubt(minima, agree, shape)):
+                return Sampled(ends, None, shape)
+        sampled = self.refine(ends.members, minima, earlier)
+        run = space.forecast(sampled.members, self.grid)
+        central = ends.central if self.scheme.searches else space.forecast(ends.mode[None], self.grid)
+        return Sampled(Ends(sampled.members, ends.mode, run, central), sampled, {})
+
+    def refine(self, posterior: Array, minima: Sequence[Minimum], earlier: Refinement | None) -> Refined:
+        """What takes the place of the posterior ensemble (N, n). ``earlier``: where a chain was interrupted."""
+        space = self.space
+
+        def cost(x: Array) -> Array:
+            return self.costs(x, space.forecast(x))
+
+        def keep(state: ChainState) -> None:
+            self.keep(lambda: replace(self.latest, refinement=Refinement(state, space.forward_runs)))
+
+        def resume() -> ChainState | None:
+            """What came before the chain is made again after an interruption, from the same runs."""
+            if earlier is None:
+                return None
+            space.forward_runs = earlier.forward_runs
+            return earlier.chain
+
+        return refined(space, cost, posterior, minima, self.seed, resume=resume, keep=keep, look=self.tell)
+
+    def costs(self, members: Array, run: Forecast) -> Array:
+        """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""
+        z = self.problem.prior.white(members)
+        return np.where(run.active, 0.5 * np.sum(z**2, axis=1) + self.space.observation_cost(run), np.inf)
+
+    def keep(self, state: Callable[[], LoopState]) -> None:
+        if self._keep is not None:
+            self._keep(state)
+
+    def tell(self, record: Record) -> None:
+        if self.progress is not None:
+            self.progress(self.problem.observations.name, record)

@@ -1,0 +1,140 @@
+"""``en4dvar init``: what it notices of units, scales, names and files that cannot be right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from init_files import UNITS, call, proposed, simulate, write
+from scipy.io import savemat
+
+from en4dvar.config import load_config
+from en4dvar.config.build import build
+from en4dvar.inputs.readers import Column, read_series
+from en4dvar_bubble.collapse import RAYLEIGH
+
+pytestmark = pytest.mark.usefixtures("own_folder")
+
+
+def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
+    done = call("init", "--data", write(tmp_path / "b.csv"), "--time-unit", "ms", "--radius-unit", "um")
+    assert done.exit_code == 0, done.output
+    assert "are the units of both columns right?" in done.stderr
+    assert "# MIND: the collapse takes" in Path("b.yaml").read_text()
+    done = call("init", "--data", "b.csv", "--time-unit", "s", "--radius-unit", "m", "--force")  # both, by as much
+    assert "no bubble has such a radius; are the units of both columns right?" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("header", "options", "told"),
+    [
+        ("t_us,R [mm]", UNITS, ["the name of column 'R [mm]' says mm, but its unit is given as um"]),
+        ("time (ms),R_um", UNITS, ["the name of column 'time (ms)' says ms, but its unit is given as us"]),
+        ("frame,R_um", UNITS, ["'frame' seems to count frames; then give --time-step"]),
+        ("t_us,D_um", UNITS, ["'D_um' seems to hold diameters"]),
+        ("t_us,radius_px", UNITS, ["'radius_px' seems to hold pixels"]),
+        ("t_us,R_um", UNITS, []),
+        ("Time (µs),R [µm]", UNITS, []),
+        ("t,radius at equator", UNITS, []),
+    ],
+)
+def test_a_name_that_says_something_else_is_noticed(
+    tmp_path: Path, header: str, options: tuple[str, ...], told: list[str]
+) -> None:
+    text = write(tmp_path / "b.csv").read_text()
+    Path("b.csv").write_text(text.replace("t_us,R_um", header), encoding="utf-8")
+    time, radius = header.split(",")
+    done = call("init", "--data", "b.csv", *options, "--time-column", time, "--radius-column", radius)
+    assert done.exit_code == 0, done.output
+    doubts = [line for line in done.stderr.splitlines() if "seems to" in line or "the name of column" in line]
+    assert len(doubts) == len(told)
+    assert all(words in doubts[0] for words in told)
+
+
+def test_decimal_commas_are_noticed(tmp_path: Path) -> None:
+    text = write(tmp_path / "b.csv").read_text().replace(",", ";").replace(".", ",")
+    Path("b.csv").write_text(text)
+    done = call("init", "--data", "b.csv", *UNITS)
+    assert done.exit_code == 0, done.output
+    assert "b.csv, decimal commas: t_us (60 values, 0 to 41.3)" in done.stderr
+    config = proposed(Path("b.yaml"))
+    assert config.document.data["data"]["decimal"] == ","
+    assert build(config)[0].observations.values.max() == pytest.approx(195e-6)
+
+
+def test_vectors_that_a_mat_file_hides_are_told(tmp_path: Path) -> None:
+    savemat("b.mat", {"film": {"note": "by hand"}})
+    done = call("init", "--data", "b.mat", *UNITS)
+    assert (done.exit_code, done.stderr) == (2, f"{tmp_path}/b.mat: film is a struct; save what is in it as vectors\n")
+    savemat("b.mat", {"t": np.arange(9.0), "R": np.ones((3, 9))})
+    done = call("init", "--data", "b.mat", *UNITS)
+    assert "b.mat: R is an array of 3 x 9; its columns are R(:,1), R(:,2), …, its rows R(1,:), …\n" in done.stderr
+    assert "R(:,9); units are never guessed: add --radius-column NAME" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t,R\nus,um\n", "b.csv:2: 'us' in column 't' is not a number"),
+        ("t,R\n", "b.csv: no line follows the header"),
+    ],
+)
+def test_without_a_column_of_numbers_the_reason_is_told(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "b.csv").write_text(text)
+    done = call("init", "--data", "b.csv", *UNITS)
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert "columns with numbers" not in done.stderr
+
+
+def test_a_scale_that_cannot_be_is_told_and_no_prior_is_taken_from_it(tmp_path: Path) -> None:
+    """At 0.7 of its collapse time a laser bubble is one in a very stiff gel: G is not guessed from it."""
+    data = simulate("laser", "0 us:70 us:0.63 us", "1 um", tmp_path / "bubble.csv")
+    done = call("init", "--data", data, *UNITS)
+    assert "Rayleigh time 0.915" not in done.stderr
+    assert "first guess from collapse time" in Path("bubble.yaml").read_text()
+    series = read_series(data, Column("t_us", "us", "us"), Column("radius_um", "um", "um"))
+    t, R = series.times, series.values
+    rows = "".join(f"{a},{b}\n" for a, b in zip(0.68 * t, R, strict=True))
+    Path("fast.csv").write_text(f"t_us,radius_um\n{rows}")
+    done = call("init", "--data", "fast.csv", *UNITS)
+    assert "or the time step 1.38" in done.stderr
+    written = Path("fast.yaml").read_text()
+    assert "first guess from collapse time" not in written
+    assert "# MIND: the collapse takes 0.7" in written
+    done = call("validate", "fast.yaml")
+    assert "warning: fast: the collapse takes 0.7" in done.stderr
+
+
+def test_a_rate_that_the_times_contradict_is_told(tmp_path: Path) -> None:
+    write(tmp_path / "b.csv")
+    done = call("init", "--data", "b.csv", *UNITS, "--frame-rate", "270 kHz")
+    told = "the times are 0.7 us apart, which is no whole number of frames: at the rate given one takes 3.704 us"
+    assert told in done.stderr
+    assert f"# MIND: {told}" in Path("b.yaml").read_text()
+    assert f"warning: b: {told}" in call("validate", "b.yaml").stderr
+    (problem,) = build(load_config("b.yaml"))
+    assert [c.code for c in problem.observations.doubts] == ["implausible-data"]
+    assert call("init", "--data", "b.csv", *UNITS, "--frame-rate", f"{1 / 0.7} MHz", "--force").exit_code == 0
+    assert build(load_config("b.yaml"))[0].observations.doubts == ()
+    Path("b.yaml").write_text(Path("b.yaml").read_text().replace("MHz", "parsec"))
+    assert "b.yaml:" in call("validate", "b.yaml").stderr
+    assert "data.columns.time.rate: " in call("validate", "b.yaml").stderr
+
+
+def test_rows_of_summaries_are_explained(tmp_path: Path) -> None:
+    radius = np.array([365e-6, 399e-6, 298e-6])
+    rows = np.column_stack([radius, [6.1, 5.9, 6.3], 0.9 * RAYLEIGH * radius / 10])
+    savemat("b.mat", {"pIMR_array": rows})
+    done = call("init", "--data", "b.mat")
+    assert done.exit_code == 2
+    assert "pIMR_array(:,3) are 3 rows of R_max, R_max/R_eq and collapse time in SI units" in done.stderr
+    savemat("b.mat", {"a": rows * [1e6, 1, 1]})  # in micrometres, which nobody said
+    assert "--radius-column NAME" in call("init", "--data", "b.mat").stderr
+
+
+def test_a_pixel_that_the_file_holds_is_told(tmp_path: Path) -> None:
+    savemat("b.mat", {"R": np.arange(9.0), "deltat": 3.7e-6, "deltax": 2.76e-6})
+    done = call("init", "--data", "b.mat", "--time-unit", "s")
+    assert "deltax is the size of one in m, '2.76e-06*m')" in done.stderr

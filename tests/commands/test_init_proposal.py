@@ -1,0 +1,198 @@
+"""``en4dvar init``: from data alone to a configuration that validates, runs and expects the truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from init_files import TRUTH, UNITS, call, proposed, simulate
+from jsonschema import Draft202012Validator
+from scipy.integrate import solve_ivp
+from scipy.io import loadmat, savemat
+
+from en4dvar.config import load_config, resolve
+from en4dvar.config.build import build
+from en4dvar.config.document import parse_document, read_document
+from en4dvar.errors import DataError
+from en4dvar.inputs.readers import Column, read_series
+from en4dvar.report.result import load_result
+from en4dvar_bubble.collapse import RAYLEIGH, lobe
+from en4dvar_bubble.laws import REGISTRY
+from en4dvar_bubble.starter.look import look, noise
+from en4dvar_bubble.starter.page import Source, yaml_text
+from en4dvar_bubble.starter.proposal import starter
+
+ROOT = Path(__file__).resolve().parents[2]
+MEASURED = ROOT.parent / "shared" / "data"
+
+pytestmark = pytest.mark.usefixtures("own_folder")
+
+
+@pytest.mark.parametrize(
+    ("start", "times", "noise_std"),
+    [
+        ("acoustic", "5.6 us:30.1 us:1.4 us", "1.4 um"),  # multi-flash imaging: some 18 frames
+        ("acoustic", "0 us:60 us:0.5 us", "1.4 um"),  # from the nucleus through rebounds
+        # A high-speed film from R_max on, the bubble not yet at rest.
+        pytest.param("laser", "0 us:70 us:0.63 us", "2 um", marks=pytest.mark.slow),
+    ],
+)
+def test_synthetic_data_to_a_run(tmp_path: Path, start: str, times: str, noise_std: str) -> None:
+    data = simulate(start, times, noise_std, tmp_path / "bubble.csv")
+    done = call("init", "--data", data, "--time-unit", "us", "--radius-unit", "um")
+    assert done.exit_code == 0, done.output
+    text = Path("bubble.yaml").read_text(encoding="utf-8")
+    config = proposed(Path("bubble.yaml"))
+    assert config.document.data["model"]["start"] == start
+    (problem,) = build(config)
+    std = float(np.median(problem.observations.std))
+    assert std == pytest.approx(float(noise_std.split()[0]) * 1e-6, rel=0.35)
+    for term in problem.prior.terms:  # the truth is no surprise to the prior
+        truth = TRUTH[start][term.parameter.name]
+        transformed = np.log(truth) if term.transform == "lognormal" else truth
+        assert abs(transformed - term.mean) < 3 * term.std, term.parameter.name
+    assert text.startswith("# yaml-language-server: $schema=en4dvar.schema.json\n")
+    schema = json.loads(Path("en4dvar.schema.json").read_text(encoding="utf-8"))
+    assert list(Draft202012Validator(schema).iter_errors(read_document(Path("bubble.yaml")).data)) == []
+    assert call("validate", "bubble.yaml").exit_code == 0
+    run = call("run", "bubble.yaml", "--no-report")
+    assert run.exit_code == 0, run.output
+    result = load_result(Path("runs") / "bubble" / "posterior.nc")
+    assert result.sample_stats.attrs["converged"] == 1
+    assert result.sample_stats.attrs["nrmse"] > 0.9
+    rows = {row.name: row for row in result.summary()}
+    assert rows["mu"].unit == "Pa s"
+    assert abs(rows["mu"].mean - TRUTH[start]["mu"]) < 4 * rows["mu"].std
+
+
+def test_the_lines_to_be_uncommented_are_right(tmp_path: Path) -> None:
+    data = simulate("laser", "0 us:70 us:0.63 us", "2 um", tmp_path / "bubble.csv")
+    call("init", "--data", data, "--time-unit", "us", "--radius-unit", "um")
+    text = Path("bubble.yaml").read_text(encoding="utf-8")
+    for line in ("discrepancy: estimated", "sigma: {prior"):
+        assert text.count(f"# {line}") == 1
+        text = text.replace(f"# {line}", line)
+    Path("bubble.yaml").write_text(text, encoding="utf-8")
+    (problem,) = build(load_config(Path("bubble.yaml")))
+    assert {"sigma", "discrepancy_amplitude", "discrepancy_length"} < set(problem.prior.names)
+
+
+def test_the_collapse_time_is_rayleigh_s() -> None:
+    """In a liquid without viscosity, gas and surface tension the lobe is Rayleigh's, integrated here."""
+    rho, p, radius = 998.0, 101325.0, 200e-6
+
+    def rhs(_: float, y: np.ndarray) -> list[float]:
+        return [y[1], (-p / rho - 1.5 * y[1] ** 2) / y[0]]
+
+    times = np.linspace(0, 0.9 * RAYLEIGH * radius * np.sqrt(rho / p), 12)
+    path = solve_ivp(rhs, (0, times[-1]), [radius, 0.0], t_eval=times, rtol=1e-10, atol=1e-14)
+    found = lobe(times, path.y[0])
+    assert found.R_max == pytest.approx(radius, rel=0.01)
+    assert found.t_c == pytest.approx(RAYLEIGH * radius * np.sqrt(rho / p), rel=0.02)
+
+
+def test_the_noise_is_what_was_added() -> None:
+    times = np.linspace(-0.9, 0.9, 25)
+    exact = 100e-6 * (1 - times**2) ** 0.4
+    stream = np.random.default_rng(0)
+    found = [noise(times, exact + 1e-6 * stream.standard_normal(25)) for _ in range(200)]
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(1e-6, rel=0.05)
+    assert np.isnan(noise(times[::8], exact[::8]))
+
+
+def test_what_is_no_bubble_is_told() -> None:
+    with pytest.raises(DataError, match="fewer than four samples"):
+        look(np.arange(10.0), np.arange(10.0))
+
+
+def test_a_shallow_rebound_is_in_the_window(tmp_path: Path) -> None:
+    """Two minima between which the radius rises by 7 % of its range."""
+    times = np.arange(90) * 0.5
+    radius = np.where(times < 18, 195 * np.clip(1 - (times / 18.5) ** 2, 0, 1) ** 0.4, 0)
+    after = times >= 18
+    radius[after] = 40 + 7 * (1 - np.cos(2 * np.pi * (times[after] - 18) / 12))
+    (tmp_path / "b.csv").write_text("t,R\n" + "".join(f"{t:g},{r:g}\n" for t, r in zip(times, radius, strict=True)))
+    assert call("init", "--data", "b.csv", *UNITS).exit_code == 0
+    config = proposed(Path("b.yaml"))
+    assert config.document.data["data"]["window"] == {"from": "R_max", "to": "minimum 2", "prominence": "5 %"}
+    (problem,) = build(config)
+    assert problem.observations.times[-1] == pytest.approx(30e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("start", ["acoustic", "laser"])
+@pytest.mark.parametrize("law", sorted(REGISTRY))
+def test_every_law_has_a_starter_that_validates(tmp_path: Path, start: str, law: str) -> None:
+    source = Source("b.csv", ("t", "us"), None, ("R", "um"))
+    text = yaml_text("a", source, starter(start, law), "test")  # type: ignore[arg-type]
+    config = resolve(parse_document(text, "a.yaml"), tmp_path)
+    assert {e.parameter.name for e in config.parameters} == {*(p.name for p in config.model.parameters), "t_s"}
+
+
+def laser_film(**scalars: float) -> None:
+    t = np.arange(0, 90, 0.63)
+    R = 194 * np.maximum(0.14, np.abs(np.cos(np.pi * t / 37)) ** 0.6 * np.exp(-t / 90))
+    savemat("film.mat", {"R": R, **scalars})
+
+
+def test_the_radius_at_rest_is_that_of_the_file(tmp_path: Path) -> None:
+    laser_film(Req=21.79, deltat=0.63)
+    done = call("init", "--data", "film.mat", *UNITS)
+    assert done.exit_code == 0, done.output
+    assert "others in the file: Req 21.79, deltat 0.63" in done.stderr
+    (problem,) = build(load_config("film.yaml"))
+    assert problem.fixed["R_eq"] == pytest.approx(21.79e-6)
+    assert np.diff(problem.observations.times) == pytest.approx(0.63e-6)  # no column of times: the file's step
+    laser_film(Req=21.79e-6, deltat=0.63)  # in another unit than the radii, which is not guessed
+    done = call("init", "--data", "film.mat", *UNITS, "--force")
+    assert "Req 2.179e-05 of the file is not used: it is no radius at rest in um" in done.stderr
+    (problem,) = build(load_config("film.yaml"))
+    assert "R_eq" in problem.prior.names
+
+
+def rescaled(path: Path, factor: float) -> Path:
+    data = loadmat(path)
+    savemat(path.name, {"t": data["t"], "Rnew": factor * data["Rnew"]})
+    return Path(path.name)
+
+
+@pytest.mark.parametrize(
+    ("file", "unit", "G", "rest"),
+    [
+        ("A_E2_002.mat", "um", 1.9e3, 21.8e-6),
+        ("PA1_exp2_RofTdata_0.mat", "0.7452 m", 5.1e3, 47e-6),  # 2.76 µm a pixel, not 3.7037 µs
+    ],
+)
+def test_measured_films(file: str, unit: str, G: float, rest: float) -> None:
+    """G of a least-squares fit, R_eq of the file: within what the proposed prior expects."""
+    path = MEASURED / file
+    if not path.exists():
+        pytest.skip(f"measured data not present: {path}")
+    if unit.startswith("0"):
+        path, unit = rescaled(path, float(unit.split()[0])), "m"
+    done = call("init", "--data", path, "--time-unit", "s", "--radius-unit", unit)
+    assert done.exit_code == 0, done.output
+    assert "Rayleigh time 0.915" not in done.stderr
+    config = proposed(Path(f"{path.stem}.yaml"))
+    assert config.document.data["model"]["start"] == "laser"
+    (problem,) = build(config)
+    terms = {term.parameter.name: term for term in problem.prior.terms}
+    if "R_eq" in problem.fixed:  # that of the file
+        assert problem.fixed["R_eq"] == pytest.approx(rest, rel=1e-3)
+    for name, value in {"G": G, "R_eq": rest}.items():
+        if name in problem.fixed:
+            continue
+        assert abs(np.log(value) - terms[name].mean) < 2 * terms[name].std, name
+
+
+def test_zeros_before_the_bubble_are_no_readings(tmp_path: Path) -> None:
+    data = simulate("laser", "0 us:70 us:0.63 us", "1 um", tmp_path / "bubble.csv")
+    series = read_series(data, Column("t_us", "us", "us"), Column("radius_um", "um", "um"))
+    t, R = series.times, series.values
+    t, R = np.append(np.arange(-3, 0) * 0.63, t), np.append(np.zeros(3), R)
+    Path("film.csv").write_text("t_us,R_um\n" + "".join(f"{a},{b}\n" for a, b in zip(t, R, strict=True)))
+    done = call("init", "--data", "film.csv", *UNITS)
+    assert "start: laser (the history begins at" in done.stdout
+    (problem,) = build(load_config("film.yaml", {"data.window": {"from": "start", "to": "end"}}))
+    assert problem.observations.values.min() > 0
