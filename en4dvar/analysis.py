@@ -91,19 +91,20 @@ class Descents:
     def words(self) -> str:
         """In one sentence."""
         of = {n: [i for i, m in zip(self.members, self.minimum, strict=True) if m == n] for n in set(self.minimum)}
-        parts = [f"J {self.costs[0]:.6g} by {_members(of.get(0, []))}"]
+        parts = [f"J {self.costs[0]:.6g} from {_members(of.get(0, []))}"]
         if len(of.get(0, [])) > 1:
             parts[0] += f" (within {self.spread:.2g})"
-        parts += [f"{self.costs[n]:.6g} by {_members(of[n])}" for n in sorted(of) if n > 0]
+        parts += [f"{self.costs[n]:.6g} from {_members(of[n])}" for n in sorted(of) if n > 0]
         if -1 in of:
-            parts.append(f"no minimum by {_members(of[-1])}")
+            parts.append(f"no minimum from {_members(of[-1])}")
         return f"{len(self.members)} descent{'s' * (len(self.members) > 1)} ended at {', '.join(parts)}"
 
 
 def _members(numbers: Sequence[int]) -> str:
     """Where descents started."""
     known = [str(i) for i in numbers if i >= 0]
-    names = [f"member{'s' * (len(known) > 1)} {' '.join(known)}"] if known else []
+    listed = " and ".join(part for part in (", ".join(known[:-1]), *known[-1:]) if part)
+    names = [f"member{'s' * (len(known) > 1)} {listed}"] if known else []
     return " and ".join([*names, *(["the prior mean"] if -1 in numbers else [])])
 
 

@@ -77,11 +77,18 @@ class FunctionModel(ForwardModel):
         parameters = {p.name: float(value) for p, value in zip(self.parameters, theta, strict=True)}
         try:
             returned = self.function(parameters, times.copy())
-            columns = returned if isinstance(returned, Mapping) else {self._path.names[0]: returned}
+            columns = returned if isinstance(returned, Mapping) else self._alone(returned)
             states = np.stack([_values(columns, name, len(times)) for name in self._path.names], axis=1)
         except BaseException as error:  # a function may fail in any way; the reason is kept
             return Failure(reason_of(error))
         return Trajectory(times, states, self._path)
+
+    def _alone(self, values: Any) -> Mapping[str, Any]:
+        """Values without a name are those of the only observable. Raises ValueError where there are more."""
+        if len(self._path.names) > 1:
+            words = " and ".join(self._path.names)
+            raise ValueError(f"the function returned one array, but {words} were observed; return a dict of arrays")
+        return {self._path.names[0]: values}
 
 
 def _values(columns: Mapping[str, Any], name: str, count: int) -> Array:

@@ -83,6 +83,45 @@ def _numbers(name: str, column: Any) -> Array:
     return numbers
 
 
+def tables_of(data: Any, time: str = TIME, names: Sequence[str] | None = None) -> dict[str, Any] | None:
+    """The readings of each series by its name, where ``data`` holds several of them; else None.
+
+    Several are a dict of series, each in one of :data:`FORMS` (a dict with a column of times is one table), or the
+    columns ``names`` of one table. Raises :class:`DataError`: it has no such column.
+    """
+    if names is not None:
+        columns = columns_of(data, time)
+        require_columns(columns, names)
+        beside = {name: column for name, column in columns.items() if name not in names}
+        times = beside.pop(TIME)
+        return {name: {time: times, name: columns[name], **beside} for name in names}
+    plain = isinstance(data, Mapping) and not hasattr(data, "data_vars")
+    if plain and data and time not in data and all(map(_is_table, data.values())):
+        return {str(name): table for name, table in data.items()}
+    return None
+
+
+def _is_table(data: Any) -> bool:
+    """Whether it is in one of :data:`FORMS`, not the numbers of a column."""
+    if isinstance(data, Sequence):
+        return len(data) == 2 and not isinstance(data, str) and all(np.ndim(part) for part in data)
+    return isinstance(data, Mapping) or hasattr(data, "dims") or hasattr(data, "index")
+
+
+def stacked(tables: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+    """One table of several that all have a column :data:`TIME`, their rows one below the other; NaN where one has none.
+
+    >>> stacked([{"time": np.array([1.0]), "u": np.array([2.0])}, {"time": np.array([0.5]), "v": np.array([3.0])}])
+    {'time': array([1. , 0.5]), 'u': array([ 2., nan]), 'v': array([nan,  3.])}
+    """
+    ends = np.cumsum([len(table[TIME]) for table in tables])
+    found = {name: np.full(ends[-1], np.nan) for table in tables for name in table}
+    for table, end in zip(tables, ends, strict=True):
+        for name, column in table.items():
+            found[name][end - len(column) : end] = column
+    return found
+
+
 def csv_of(columns: Mapping[str, Array]) -> str:
     """The columns as a CSV file that reads back to the bit."""
     text = io.StringIO()

@@ -9,7 +9,7 @@ import numpy as np
 
 from en4dvar.assimilate import assimilate
 from en4dvar.caution import Caution, caution
-from en4dvar.ensemble.forecast import Forecast
+from en4dvar.ensemble.forecast import Forecast, plotting_times
 from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.joint.arrow import Arrow
@@ -24,7 +24,6 @@ from en4dvar.state import Array
 TOLD = 0.5  # of J, by which descents differ that ended in different minima
 LEAST = 1e-3  # of the prior's precision: what a single estimate that learned nothing is taken to know
 TRIED = 6  # experiments whose own estimate of what is shared is tried as a start
-GRID_POINTS = 200
 
 
 @dataclass(frozen=True)
@@ -120,8 +119,7 @@ class _Estimate:
         lowest = min(descents, key=lambda one: one.at.cost)
         self.tell(f"J {lowest.at.cost:.4g} after {len(lowest.costs) - 1} iterations, {lowest.stop}")
         members, cautions = self._members(lowest)
-        ends = [one.observations.times[[0, -1]] for one in joint.experiments]
-        grids = tuple(np.linspace(first, last, GRID_POINTS) for first, last in ends)
+        grids = tuple(plotting_times(one) for one in joint.experiments)
         forecasts = tuple(
             one.run(
                 joint.standard(

@@ -38,6 +38,7 @@ class JointRow:
     q95: float
     unit: str
     untrusted: tuple[str, ...]
+    modal: bool = False
 
 
 def estimates(found: StoredJoint) -> tuple[JointRow, ...]:

@@ -99,7 +99,9 @@ def _descents(stats: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
     if "n_descents" not in stats:
         return []
     total, agreeing = int(stats["n_descents"]), int(stats["n_agreeing"])
-    words = f"to the lowest minimum: {stats['descents']}; {stats['search_runs']} forward runs to look for another one"
+    words = (
+        f"ended in the lowest minimum. {stats['descents']}; {stats['search_runs']} forward runs looked for another one"
+    )
     return [("Descents", f"{agreeing} of {total}", words, agreeing < 2)]
 
 

@@ -150,7 +150,7 @@ def refined(
         emulated=emulated,
         proposal=draws.proposal if several and draws is not None else None,
     )
-    shares = np.bincount(nearest(prior, minima, walked.flat)) / len(walked.flat) if several else np.ones(1)
+    shares = shares_of(prior, minima, walked.flat) if several else np.ones(1)
     known = draws is not None and draws.effective >= TOO_FEW
     return Refined(
         walked.thin(len(posterior), exact),
@@ -160,6 +160,11 @@ def refined(
         float(-walked.log_density.max()),
         () if walked.converged else (caution("chain-not-converged", walked.warning()),),
     )
+
+
+def shares_of(prior: Prior, minima: Sequence[Minimum], draws: Array) -> Array:
+    """(M,) shares of draws (D, n) that belong to each of M minima; 0 where the chain has left one."""
+    return np.asarray(np.bincount(nearest(prior, minima, draws), minlength=len(minima)) / len(draws))
 
 
 def _in_all(minima: Sequence[Minimum], count: int, seed: int) -> Array:

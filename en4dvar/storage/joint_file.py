@@ -131,16 +131,16 @@ def _fit(found: JointEstimate) -> dict[str, Variable]:
     experiments = found.joint.experiments
     most = max(len(one.observations) for one in experiments)
     times, values = np.full((2, len(experiments), most), np.nan)
-    bands = np.full((len(experiments), len(found.grids[0]), 4), np.nan)
+    bands = np.full((len(experiments), max(map(len, found.grids)), 4), np.nan)
     for e, (one, run, grid) in enumerate(zip(experiments, found.forecasts, found.grids, strict=True)):
         to_time = (one.model.time_unit, one.model.time_display_unit)
         to_value = (one.observable.unit, one.observable.display_unit)
         k = len(one.observations)
         times[e, :k] = convert(one.observations.times, *to_time)
         values[e, :k] = convert(one.observations.values, *to_value)
-        bands[e, :, 0] = convert(grid, *to_time)
+        bands[e, : len(grid), 0] = convert(grid, *to_time)
         alive = run.path[:-1][run.active[:-1]]
-        bands[e, :, 1:] = convert(np.quantile(alive, QUANTILES, axis=0).T, *to_value)
+        bands[e, : len(grid), 1:] = convert(np.quantile(alive, QUANTILES, axis=0).T, *to_value)
     labels = np.array([one.observable.label for one in experiments], dtype=object)
     units = np.array([one.observable.display_unit for one in experiments], dtype=object)
     time_units = np.array([one.model.time_display_unit for one in experiments], dtype=object)

@@ -9,8 +9,7 @@ import pytest
 
 from en4dvar.config import load_config
 from en4dvar.errors import ConfigError
-from en4dvar_bubble import WATER_25C, BubbleModel, Liquid, NeoHookeanKelvinVoigt, histotripsy, silence, simulate
-from en4dvar_bubble.laws.parameters import MU
+from en4dvar_bubble import WATER_25C, BubbleModel, NeoHookeanKelvinVoigt, get_law, histotripsy, silence, simulate
 from en4dvar_bubble.numbers import ALL, OF_MEDIUM
 from en4dvar_bubble.packing import pack
 
@@ -69,17 +68,12 @@ def test_amplitude_of_the_driving():
 
 def test_gas_content_is_that_of_another_equilibrium_radius_where_nothing_else_depends_on_it():
     """Without a spring R_eq is only the gas: (p∞ + 2S/R) R³ is proportional to its amount."""
-    model = BubbleModel(law=_Newtonian(), gas="polytropic", start="laser").with_parameters(["gas_content"])
+    model = BubbleModel(law=get_law("newtonian"), gas="polytropic", start="laser").with_parameters(["gas_content"])
     R = np.array([30e-6, 33e-6])
     amount = (WATER_25C.p_inf + 2 * WATER_25C.S / R) * R**3
     theta = {"mu": np.full(2, 0.05), "R_max": np.full(2, 200e-6), "R_eq": R}
     x = model.initial_states({**theta, "gas_content": np.array([amount[1] / amount[0], 1.0])})
     np.testing.assert_allclose(x[0, model.layout["p_b"]], x[1, model.layout["p_b"]], rtol=1e-14)
-
-
-class _Newtonian(Liquid):
-    name = "newtonian-of-the-test"
-    parameters = (MU,)
 
 
 def test_a_path_goes_on_from_the_radius_and_velocity_it_has_reached():

@@ -59,6 +59,7 @@ def test_a_member_without_gas_fails_alone():
     assert np.array_equal(run.predictions[0], forecast(problem, np.array([[8.0, 0.0, 0.0]])).predictions[0])
 
 
+@pytest.mark.slow
 def test_twin_with_a_moving_wall_is_recovered():
     """Truth: 2500 Pa, 3 m/s outwards. A model that starts at rest cannot explain the data."""
     problem = laser()

@@ -202,6 +202,7 @@ def test_lost_ensemble(tmp_path: Path) -> None:
     assert "failed: TooFewMembersError" in (tmp_path / "out" / "run.log").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_figure")
 def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(*_: object, **__: object) -> None:
@@ -221,6 +222,7 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "resumed: 0 of 1 data sets are done" in (out / "run.log").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_figure")
 def test_force_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None:
     path, out = write_toy(tmp_path), tmp_path / "out"

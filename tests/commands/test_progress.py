@@ -83,9 +83,11 @@ def test_iterations_of_data_sets_side_by_side_are_seen(tmp_path: Path, monkeypat
     log = (tmp_path / "run" / "run.log").read_text()
     iterations = [one.iterations.sizes["iteration"] for one in campaign]
     assert log.count(": iteration ") == sum(iterations)
-    rounds = log.count(": start, ")
+    rounds = log.count(": start, ") + log.count(": search for another minimum, ")
     assert rounds >= 3
-    assert len(told) == 1 + rounds + sum(iterations) + 3  # begin, each round and iteration, each end
+    searched = log.count(" descents ended at J ")
+    assert searched == 3
+    assert len(told) == 1 + rounds + sum(iterations) + searched + 3  # begin, each round and iteration, each end
     assert told[-1] == ("", 3)
 
 

@@ -149,6 +149,7 @@ def test_discrepancy_is_scaled_to_the_data_or_as_it_is_given(tmp_path: Path) -> 
     assert (noise.kernel.smoothness, noise.kernel.grows_beyond, noise.threshold) == (1.5, 2e-3, 1.345)
 
 
+@pytest.mark.slow
 def test_a_discrepancy_from_yaml_to_the_page(tmp_path: Path) -> None:
     """A slow wave that the model lacks: posterior variables, what is kept, and what the page says."""
     lines = csv_text().splitlines()

@@ -69,6 +69,7 @@ def test_laser_with_a_viscosity_that_is_halved(tmp_path):
     assert mean[1] + 3 * std[1] < mean[0]
 
 
+@pytest.mark.slow
 def test_soft_polyacrylamide(tmp_path):
     """A least-squares fit of the same model (polytropic gas, saturated vapour): G 1.9 kPa, μ 0.084 Pa s, NRMSE
     0.957.

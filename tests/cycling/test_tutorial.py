@@ -44,6 +44,7 @@ def test_every_block_is_used():
     assert [command.split()[0] for command in COMMANDS] == ["simulate", "validate", "run", "run"]
 
 
+@pytest.mark.slow
 def test_estimation_from_yaml(folder):
     for command in COMMANDS[:3]:
         call(command)

@@ -260,6 +260,7 @@ def test_a_taper_of_ones_is_no_localisation(linearisation):
     assert rmse(local, 3) == pytest.approx(rmse(experiment, 3), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_smoother_of_few_members_needs_localisation():
     """Ten members of Lorenz-96 and the IEnKS, lag 1: the whole diverges, the local one is as good as the local ETKF."""
     etkf = load_twin(CONFIGS / "lorenz96_letkf.yaml", {"twin.cycles": 150, "twin.burn_in": 50}).experiment

@@ -98,7 +98,8 @@ def test_a_search_goes_on_from_any_state_to_the_same_bits():
 def test_where_descents_ended_in_words():
     told = Descents((4, 17, -1, 9), (0, 0, 1, -1), (5.25, 9.5), 0.125, 20)
     assert told.words == (
-        "4 descents ended at J 5.25 by members 4 17 (within 0.12), 9.5 by the prior mean, no minimum by member 9"
+        "4 descents ended at J 5.25 from members 4 and 17 (within 0.12), 9.5 from the prior mean, "
+        "no minimum from member 9"
     )
     assert told.agreeing == 2
     assert np.isclose(told.spread, 0.125)

@@ -50,6 +50,7 @@ def test_exception_fails_only_the_batch_that_raised(kind):
         assert np.array_equal(results[4].states[0], model.step(x[4], 0.0, 0.1))
 
 
+@pytest.mark.slow
 def test_death_of_a_worker_is_a_failure_and_the_pool_recovers():
     model = Dying()
     good = np.tile(model.initial_state({"a": 1.0, "b": 1.0}), (4, 1))

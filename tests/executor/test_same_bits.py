@@ -29,6 +29,7 @@ def few(tmp_path_factory):
     return undisturbed(tmp_path_factory.mktemp("few"), 2, large=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "workers"), EVERYWHERE)
 def test_campaign_on_any_executor(quiet, tmp_path, kind, workers):
     path, run = quiet

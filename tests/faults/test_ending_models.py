@@ -109,6 +109,7 @@ def test_a_call_that_exits_has_raised(make):
     assert [str(found[i]) for i in (0, 1)] == ["SystemExit: sys.exit(0)", "SystemExit: sys.exit(7)"]
 
 
+@pytest.mark.slow
 @pytest.mark.fault("model-os-exit-here")
 def test_the_end_of_the_process_of_the_run(tmp_path, monkeypatch):
     """Nothing can catch it, and its exit code is the model's; what was done is kept."""

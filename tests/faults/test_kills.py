@@ -4,6 +4,7 @@ import pytest
 from killing import survive
 
 
+@pytest.mark.slow
 @pytest.mark.fault("kill")
 def test_killed_at_some_file_operations():
     """Checkpoints, netCDF, lists of files: a write half done, a rename not done, a folder not made."""

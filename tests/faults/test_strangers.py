@@ -65,6 +65,7 @@ def again(project, **more):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.fault("rerun-stranger")
 def test_code_from_elsewhere_is_refused_and_can_be_trusted(project):
     folder, mark = project

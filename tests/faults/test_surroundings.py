@@ -103,6 +103,7 @@ def test_first_starts_at_once(tmp_path, count):
     assert start_together(tmp_path, count) == count
 
 
+@pytest.mark.slow
 @pytest.mark.fault("paths")
 def test_names_in_any_script(tmp_path):
     folder = tmp_path / "Messung 50 % – ゲル"

@@ -28,7 +28,8 @@ FEW = settings(deadline=None, database=None, derandomize=True, suppress_health_c
 def folder(tmp_path_factory):
     """A folder with the data that the shipped configurations name."""
     here = tmp_path_factory.mktemp("fuzz")
-    (here / "data").symlink_to(seeds.CONFIGS / "data")
+    for name in ("data", "programs"):
+        (here / name).symlink_to(seeds.CONFIGS / name)
     return here
 
 
@@ -42,6 +43,7 @@ def test_seeds_are_accepted(folder, target):
         assert all(accepted)
 
 
+@pytest.mark.slow
 @given(st.data())
 @settings(FEW, max_examples=250)
 def test_configurations_of_the_right_shape(folder, data):

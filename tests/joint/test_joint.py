@@ -15,6 +15,7 @@ from en4dvar.joint.arrow import Arrow
 from en4dvar.joint.problem import JointProblem, sharing
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.storage.joint_file import Alone, load_joint, save_joint
 
 MEAN, STD = np.array([0.5, -0.5, 0.2]), np.array([0.8, 1.2, 0.9])
 SETTINGS = AssimilationSettings(what_if=False, emulator="off", refine="none")
@@ -211,3 +212,17 @@ def test_what_cannot_be_shared(change, message):
 def _wider(prior):
     first, *rest = prior.terms
     return Prior((PriorTerm.normal(first.parameter, first.mean, 2 * first.std), *rest))
+
+
+def test_a_model_is_asked_for_the_observations_alone_unless_more_is_free(tmp_path):
+    problems = _experiments(count=2)
+    dense = Vectorised(names=("a", "b", "c"), compiled=True)
+    problems[1] = replace(problems[1], model=dense, observable=dense.observables[0])
+    found = estimate.estimate_jointly(_joint(problems), SETTINGS, seed=3)
+    np.testing.assert_array_equal(found.grids[0], problems[0].observations.times)
+    np.testing.assert_allclose(found.forecasts[0].path, found.forecasts[0].predictions, rtol=0, atol=0)
+    assert found.grids[1].shape == (200,)
+    save_joint(tmp_path / "joint.nc", found, [Alone(("a", "b", "c"), np.zeros((3, 3)))] * 2, {})
+    band = load_joint(tmp_path / "joint.nc").group("fit")["band"].values
+    assert np.isfinite(band[0]).all(axis=1).sum() == len(problems[0].observations)
+    assert np.isfinite(band[1]).all()

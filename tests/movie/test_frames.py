@@ -36,6 +36,7 @@ def test_sixteen_bits(tmp_path):
     assert np.array_equal(read(tmp_path / "m.raw", "48x32x12"), deep)
 
 
+@pytest.mark.slow
 def test_video(tmp_path):
     import av
 

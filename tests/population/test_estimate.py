@@ -136,6 +136,7 @@ def test_repeated_estimates_are_as_good_as_they_say(runs):
     assert np.mean([found.log_evidence for found in several]) == pytest.approx(evidence, abs=0.05)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_with_any_number_of_threads():
     runs = Curved()
     found = estimated(runs, 3)

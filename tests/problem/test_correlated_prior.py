@@ -63,6 +63,7 @@ def test_posterior_is_the_closed_one(members):
     assert np.max(np.abs(independent - mean)) > 0.01  # the correlations matter
 
 
+@pytest.mark.slow
 def test_sampled_posterior_and_evidence_are_the_closed_ones():
     problem = linear_problem()
     mean, expected, evidence = closed_form(problem)

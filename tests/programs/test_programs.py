@@ -140,6 +140,7 @@ def test_a_failed_run_is_tried_again_and_leaves_nothing_behind(folder):
     assert {p.name for p in folder.iterdir()} == {"in.json.j2", "flag"}
 
 
+@pytest.mark.slow
 def test_a_rerun_asks_before_it_runs_a_program(folder, monkeypatch):
     monkeypatch.chdir(folder)
     fit(section(), directory="run", report=False)

@@ -135,6 +135,7 @@ def with_parameters(analysis, *parameters):
     return replace(analysis, problem=replace(analysis.problem, prior=Prior(terms)))
 
 
+@pytest.mark.slow
 def test_strings_of_data_and_configuration_are_escaped(write_run, analysis, renamed):
     evil = "<script>alert(1)</script>"
     bad = replace(analysis, cautions=(Caution(evil, "serious", evil, evil),), stop_reason=evil)
@@ -146,6 +147,7 @@ def test_strings_of_data_and_configuration_are_escaped(write_run, analysis, rena
     assert "script" not in Page(html).tags
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_as_pdf_and_png(reported):
     for name in FIGURES:
         assert (reported / "figures" / f"{name}.pdf").read_bytes().startswith(b"%PDF")
@@ -157,6 +159,7 @@ def test_figures_are_drawn_as_pdf_and_png(reported):
     assert len(list((reported / "figures").iterdir())) == 2 * len(FIGURES)
 
 
+@pytest.mark.slow
 def test_report_is_the_same_every_time(reported):
     files = sorted(p for p in reported.rglob("*") if p.is_file())
     before = [p.read_bytes() for p in files]
@@ -223,6 +226,7 @@ def test_the_script_that_runs_is_the_one_the_policy_names(campaign_dir):
     assert f"script-src 'sha256-{digest}'" in unescape(policy)
 
 
+@pytest.mark.slow
 def test_large_campaign_gets_pages_on_demand(campaign_dir, tmp_path, monkeypatch):
     shutil.copytree(campaign_dir / "datasets", tmp_path / "datasets")
     monkeypatch.setattr(report, "all_figures", first_figure)
@@ -286,6 +290,7 @@ def test_overview_of_many_data_sets_stays_small(analysis):
     assert html.count("<tr>") == 2001
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("survivors", [0, 1])
 def test_lost_ensemble_still_gets_a_report(write_run, make_analysis, survivors):
     base = make_analysis()

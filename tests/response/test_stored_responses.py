@@ -90,6 +90,7 @@ def test_the_page_shows_both_and_escapes_words(run_dir):
     assert 'id="ledger"' in page
 
 
+@pytest.mark.slow
 def test_a_page_without_them_is_silent(run_dir, tmp_path):
     model = Acting()
     model.path_quantities = ()

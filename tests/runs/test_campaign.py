@@ -149,6 +149,7 @@ def test_unicode_blanks_and_same_names(tmp_path):
     assert campaign.exit_code == 0
 
 
+@pytest.mark.slow
 def test_command_line(tmp_path):
     path = make_campaign(tmp_path, 2)
     (tmp_path / "data" / "bad.csv").write_text("t_ms,x_um\n0,1\n")

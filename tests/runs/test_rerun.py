@@ -29,6 +29,7 @@ def test_a_campaign_is_repeated(campaign):
     assert str(found).splitlines()[-1] == "not repeated, for they have no result: empty"
 
 
+@pytest.mark.slow
 def test_without_the_data_and_with_other_data(campaign):
     (campaign / "data" / "set0.csv").unlink()
     (campaign / "data" / "set1.csv").write_text("t_ms,x_um\n0,1\n1,2\n2,3\n")
@@ -42,6 +43,7 @@ def test_without_the_data_and_with_other_data(campaign):
     assert "set1.csv has changed since, the recorded observations were used" in second
 
 
+@pytest.mark.slow
 def test_what_differs_is_named(campaign):
     file = campaign / "run" / "datasets" / "set1.nc"
     result = load_result(file)

@@ -124,6 +124,7 @@ def test_other_sources_are_refused(tmp_path, monkeypatch):
     assert "+  execution_models: another" in str(refused.value)
 
 
+@pytest.mark.slow
 def test_workers_and_place_may_change(quiet, tmp_path):
     path, run, _ = quiet
     interrupt(path, tmp_path / "run", 9)
@@ -190,6 +191,7 @@ def test_a_changed_result_is_named_and_estimated_again(quiet, tmp_path, change):
     assert_same_results(out, run)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.fault("interrupt")
 def test_signals_leave_a_run_that_says_how_to_continue(tmp_path, number):

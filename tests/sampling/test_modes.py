@@ -13,7 +13,7 @@ from en4dvar.executor import ThreadsExecutor
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings
 from en4dvar.sampling import mcmc
-from en4dvar.sampling.refine import Refined, mode_cautions
+from en4dvar.sampling.refine import Refined, mode_cautions, shares_of
 from en4dvar.state import Parameter
 from en4dvar.summary import summarise
 
@@ -95,6 +95,13 @@ def test_the_evidence_is_that_of_both_wells():
     exact = np.logaddexp.reduce(logs) + np.log(cell) - problem.observations.log_normalisation()
     analysis = assimilate(problem, AssimilationSettings(), 1)
     assert analysis.log_evidence == pytest.approx(exact, abs=0.1)
+
+
+def test_a_mode_that_the_chain_has_left_has_no_share() -> None:
+    prior = Prior((PriorTerm.normal(Parameter("a", "m"), 0.0, 1.0),))
+    minima = [Minimum(np.array([x]), np.eye(1) * 0.01, cost, 1) for x, cost in ((0.0, 1.0), (1.0, 3.0), (-1.0, 5.0))]
+    draws = np.array([[0.01], [-0.02], [1.01], [0.0]])
+    np.testing.assert_array_equal(shares_of(prior, minima, draws), [0.75, 0.25, 0.0])
 
 
 @pytest.mark.parametrize(("apart", "severity"), [(1.5, "note"), (2.5, "caution")])
