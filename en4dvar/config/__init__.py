@@ -6,18 +6,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from en4dvar.config.document import document_from, override
+from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.load import Config, load_config, resolve, time_grid
 from en4dvar.config.twin import TwinConfig, resolve_twin
 from en4dvar.errors import ConfigError, Fault
 
-__all__ = ["Config", "TwinConfig", "load_any", "load_config", "load_twin", "resolve", "time_grid"]
+__all__ = ["Config", "TwinConfig", "load_any", "load_config", "load_twin", "resolve", "resolve_any", "time_grid"]
 
 
 def load_any(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Config | TwinConfig:
     """A twin experiment where the file has a ``twin:`` section, else what :func:`load_config` gives."""
     document, base = document_from(source)
-    document = override(document, overrides or {})
+    return resolve_any(override(document, overrides or {}), base)
+
+
+def resolve_any(document: Document, base: Path) -> Config | TwinConfig:
+    """As :func:`load_any`, of a document that has been read; ``base`` is where its relative paths start."""
     return resolve_twin(document, base) if "twin" in document.data else resolve(document, base)
 
 

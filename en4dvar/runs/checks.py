@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from en4dvar.config import Config, TwinConfig, load_any
+from en4dvar.config import Config, TwinConfig, resolve_any
 from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.load import context_of, in_order
@@ -31,10 +31,12 @@ def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any
     ------
     ConfigError: every fault of the file *and* of the data files it names, each with file, line and column.
     """
+    document, base = document_from(source)
+    document = override(document, overrides or {})
     try:
-        config = load_any(source, overrides)
+        config = resolve_any(document, base)
     except ConfigError as error:
-        raise ConfigError(in_order([*error.problems, *_data_faults(source, overrides)])) from None
+        raise ConfigError(in_order([*error.problems, *_data_faults(document, base)])) from None
     if isinstance(config, Config):
         faults = list(_problem_faults(config))
         if faults:
@@ -52,13 +54,8 @@ def _problem_faults(config: Config) -> Iterator[Fault]:
     yield from _file_faults(config.document, plan, partial(build_one, config))
 
 
-def _data_faults(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None) -> Iterator[Fault]:
+def _data_faults(document: Document, base: Path) -> Iterator[Fault]:
     """Faults of the data files, for a configuration that has faults elsewhere than in its data section."""
-    try:
-        document, base = document_from(source)
-        document = override(document, overrides or {})
-    except ConfigError:
-        return
     context = context_of(document, base, None)
     observed = context.observed
     found = check(_DataSection, {"data": document.data.get("data")}, (), document, [], context)

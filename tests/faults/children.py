@@ -1,7 +1,7 @@
 """Commands in forked children: on a disk that takes files up to a size only, with a failing call, killed half-way.
 
-``python children.py`` has imported everything, so that a child costs tenths of a second; it reads tasks as JSON and
-writes what came of them.
+``python children.py`` has imported everything, so that a child costs tenths of a second; for each line of tasks (JSON)
+it writes a line of what came of them. :class:`Children` is one such process, for all tests of a module.
 """
 
 from __future__ import annotations
@@ -13,8 +13,11 @@ import resource
 import shutil
 import subprocess
 import sys
+import threading
 import traceback
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -47,15 +50,36 @@ class Outcome:
     operations: int
 
 
-def attempt(tasks: list[Task], timeout: float = 300) -> list[Outcome]:
-    """What came of each task, in order."""
-    environment = {**os.environ, "PYTHONPATH": str(TESTS), "EN4DVAR_TEST_PAUSE": "0", "MPLBACKEND": "agg"}
-    done = subprocess.run(
-        [sys.executable, __file__], input=json.dumps([asdict(t) for t in tasks]), capture_output=True, text=True,
-        env=environment, timeout=timeout,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-4000:]
-    return [Outcome(**found) for found in json.loads(done.stdout)]
+class Children:
+    """The process that forks them; what it says itself goes to standard error."""
+
+    def __init__(self) -> None:
+        environment = {**os.environ, "PYTHONPATH": _path(), "EN4DVAR_TEST_PAUSE": "0", "MPLBACKEND": "agg"}
+        self.process = subprocess.Popen(
+            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        )
+
+    def attempt(self, tasks: list[Task], timeout: float = 300) -> list[Outcome]:
+        """What came of each task, in order."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        watch = threading.Timer(timeout, self.process.kill)
+        watch.start()
+        try:
+            self.process.stdin.write(json.dumps([asdict(t) for t in tasks]) + "\n")
+            self.process.stdin.flush()
+            line = self.process.stdout.readline()
+        finally:
+            watch.cancel()
+        assert line, f"the process that forks ended, or was not done after {timeout:g} s"
+        return [Outcome(**found) for found in json.loads(line)]
+
+    def close(self) -> None:
+        self.process.communicate()
+
+
+def _path() -> str:
+    return os.pathsep.join(filter(None, (str(TESTS), os.environ.get("PYTHONPATH"))))
 
 
 def _child(task: Task, told: int) -> None:
@@ -110,15 +134,38 @@ def _do(task: Task) -> Outcome:
     return Outcome(code, told, int(operations))
 
 
-def main() -> None:
-    sys.path.insert(0, str(TESTS))
+def _of_few(draw: Callable[..., Any]) -> Callable[..., Any]:
+    """Drawing is nearly all of a report; a second figure shows whatever could happen to the files of a tenth."""
+
+    def few(figures: Iterable[Any], *rest: Any, **options: Any) -> Any:
+        return draw(islice(figures, 2), *rest, **options)
+
+    return few
+
+
+def _import_everything() -> None:
+    import matplotlib.backends.backend_agg
+    import matplotlib.backends.backend_pdf
+    import matplotlib.backends.backend_svg
+    import matplotlib.pyplot  # noqa: F401
+
     import en4dvar.report.overlay
     import en4dvar.report.twin
-    import en4dvar.runs.runner  # noqa: F401
+    import en4dvar.runs.runner
+    import en4dvar_agarose.commands  # noqa: F401
+    import en4dvar_bubble  # noqa: F401
     from en4dvar.storage.fingerprint import source_digest
 
     source_digest("en4dvar")
-    print(json.dumps([asdict(_do(Task(**task))) for task in json.loads(sys.stdin.read())]))
+    for module in (en4dvar.report, en4dvar.report.twin):
+        module.draw = _of_few(module.draw)  # type: ignore[attr-defined]
+
+
+def main() -> None:
+    sys.path.insert(0, str(TESTS))
+    _import_everything()
+    for line in sys.stdin:
+        print(json.dumps([asdict(_do(Task(**task))) for task in json.loads(line)]), flush=True)
 
 
 if __name__ == "__main__":

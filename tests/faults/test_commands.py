@@ -6,7 +6,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from children import Task, attempt
+from children import Children, Task
 from rows import row
 from run_files import command, environment, make_campaign, run_cli
 
@@ -17,23 +17,50 @@ model: {name: lorenz96, size: 12}
 twin: {cycles: 5, burn_in: 1, interval: 0.05, error: {x_std: 1}, initial_std: {x: 0.1}}
 assimilation: {scheme: etkf, members: 15, inflation: 1.02}
 """
+CAMPAIGN = """\
+name: synthetic
+seed: 2
+model: {name: "toy_models:Oscillator", mass: 2 g}
+campaign:
+  directory: data/synthetic
+  first: [4 ms, 5 ms]
+  spacing: [4 ms, 5 ms]
+  stop: 0.35
+  fewest: 5
+  noise: 1 um
+  groups:
+    a:
+      datasets: 3
+      parameters:
+        A: {prior: normal, mean: 100 um, std: 1 um}
+        k: {prior: lognormal, median: 3 N/m, log_std: 0.3}
+        c: 0.02 N s/m
+"""
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reason="limits and forks of POSIX")]
 
 
 @pytest.fixture(scope="module")
-def quiet(tmp_path_factory):
-    return prepare(tmp_path_factory.mktemp("quiet"))
+def children():
+    forks = Children()
+    yield forks
+    forks.close()
 
 
-def prepare(folder):
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory, children):
+    return prepare(tmp_path_factory.mktemp("quiet"), children)
+
+
+def prepare(folder, children):
     """A folder with configurations and what the commands make of them on a good disk."""
     make_campaign(folder, 2)
     (folder / "twin.yaml").write_text(TWIN)
+    (folder / "synthetic.yaml").write_text(CAMPAIGN)
     tasks = [
         Task(["run", str(folder / f"{config}.yaml"), "--out", str(folder / name), "--no-report"])
         for config, name in (("toy", "done"), ("toy", "other"), ("twin", "twin"))
     ]
-    for found in attempt(tasks):
+    for found in children.attempt(tasks):
         assert found.code == 0, found.told
     return folder
 
@@ -41,7 +68,6 @@ def prepare(folder):
 def calls(folder, out):
     """Words of each command that writes, and the folder that it starts from."""
     toy, done, twin, other = (str(folder / name) for name in ("toy.yaml", "done", "twin", "other"))
-    quick = str(CONFIGS / "quickstart.yaml")
     study = str(CONFIGS / "agarose_study.yaml")
     return {
         "run": (["run", toy, "--out", out], ""),
@@ -53,11 +79,11 @@ def calls(folder, out):
         "compare": (["compare", done, other, "--out", out], ""),
         "export": (["export", done, "--out", f"{out}.csv"], ""),
         "simulate": (["simulate", toy, "--set", "parameters.A=1 mm", "--out", f"{out}.csv"], ""),
-        "simulate a campaign": (["simulate", str(CONFIGS / "agarose_twin.yaml"), "--out", out], ""),
+        "simulate a campaign": (["simulate", f"{folder}/synthetic.yaml", "--out", out], ""),
         "validate --plot": (["validate", toy, "--plot", "--set", f"output.directory={out}/x"], ""),
         "schema": (["schema", "--out", f"{out}.json"], ""),
         "init": (["init", "--out", f"{out}.yaml"], ""),
-        "sweep": (["sweep", quick, "--trajectories", "64", "--step", "0.2 us", "--out", out], ""),
+        "sweep": (["sweep", toy, "--trajectories", "64", "--shift", "1 ns", "--step", "1 ms", "--out", out], ""),
         "study": (["study", study, "--out", out], ""),
     }
 
@@ -80,7 +106,7 @@ def assert_told(task, found, reason):
 
 @pytest.mark.parametrize("fault", [("fsync", "EIO"), ("replace", "EDQUOT"), ("fsync", "ENOSPC")], ids="-".join)
 @pytest.mark.fault("disk-failing")
-def test_a_call_that_fails(quiet, tmp_path, fault):
+def test_a_call_that_fails(quiet, children, tmp_path, fault):
     """Injected where the operating system is asked; every command flushes and renames what it writes."""
     tasks = []
     for number, name in enumerate(calls(quiet, "")):
@@ -88,25 +114,25 @@ def test_a_call_that_fails(quiet, tmp_path, fault):
         if name in ("run", "run of a twin", "report", "compare") or (fault[1] == "EIO" and name != "study"):
             tasks.append(Task(words, before, str(tmp_path / f"out{number}"), fails=fault[0], error=fault[1]))
     reason = {"EIO": "Input/output error", "EDQUOT": "Disk quota exceeded", "ENOSPC": "No space left on device"}
-    for task, found in zip(tasks, attempt(tasks), strict=True):
+    for task, found in zip(tasks, children.attempt(tasks), strict=True):
         assert_told(task, found, reason[fault[1]])
         assert row("disk-failing").told(found.told) or "cannot be used as run directory" in found.told
 
 
 @pytest.mark.parametrize("limit", [0, 300, 9000])
 @pytest.mark.fault("disk-failing")
-def test_no_room(quiet, tmp_path, limit):
+def test_no_room(quiet, children, tmp_path, limit):
     """The kernel refuses bytes beyond a size, also those of libraries (HDF5, PDF)."""
     tasks = []
     for number, name in enumerate(calls(quiet, "")):
         words, before = calls(quiet, str(tmp_path / f"out{number}"))[name]
         if name != "study" or limit < 9000:  # it would be computed first
             tasks.append(Task(words, before, str(tmp_path / f"out{number}"), limit=limit))
-    for task, found in zip(tasks, attempt(tasks), strict=True):
+    for task, found in zip(tasks, children.attempt(tasks), strict=True):
         if limit == 0 or found.code:
             assert_told(task, found, "File too large")
     begun = [t for t in tasks if t.words[0] == "run" and t.copy == ""]
-    for found in attempt([Task([*task.words, "--resume", "--no-report"]) for task in begun]):
+    for found in children.attempt([Task([*task.words, "--resume", "--no-report"]) for task in begun]):
         assert found.code == 0, found.told
 
 
@@ -129,27 +155,27 @@ def test_output_that_cannot_be_written(quiet, tmp_path, words):
 
 @pytest.mark.parametrize("name", ["report", "report of a twin", "export", "compare"])
 @pytest.mark.fault("kill-commands")
-def test_killed_commands_are_given_again(quiet, tmp_path, name):
-    """At every so many of their operations on files."""
-    out = tmp_path / "out"
-    words, before = calls(quiet, str(out))[name]
-    whole, base = tmp_path / "whole", attempt([Task(words, before, str(out))])[0]
+def test_killed_commands_are_given_again(quiet, children, tmp_path, name):
+    """At every so many of their operations on files; what is left is that of an undisturbed command."""
+    words, before = calls(quiet, str(tmp_path / "whole"))[name]
+    base = children.attempt([Task(words, before, str(tmp_path / "whole"))])[0]
     assert base.code == 0
-    target = out if out.exists() else Path(f"{out}.csv")
-    shutil.copytree(out, whole) if out.is_dir() else shutil.copy(target, whole)
-    every = range(1, base.operations + 1, max(1, base.operations // 4))
-    again = [*words, *(["--force"] if name == "export" else [])]
-    for number in every:
-        killed, repeated = attempt([Task(again, before, str(out), kill_at=number), Task(again)])
-        assert killed.code == -9
-        assert repeated.code == 0, repeated.told
-        if out.is_dir():
-            ours = {p: c for p, c in files(out).items() if not p.name.startswith(".")}
-            wanted = {p: c for p, c in files(whole).items() if not p.name.startswith(".")}
-            assert ours.keys() == wanted.keys()
-            assert all(ours[p] == wanted[p] for p in ours if p.suffix in (".nc", ".csv", ".png", ".pdf"))
-        else:
-            assert target.read_bytes() == whole.read_bytes()
+    whole = files(tmp_path)
+    tasks = []
+    for number in range(1, base.operations + 1, max(1, base.operations // 4)):
+        out = tmp_path / f"killed{number}" / "whole"
+        out.parent.mkdir()
+        words, _ = calls(quiet, str(out))[name]
+        again = [*words, *(["--force"] if name == "export" else [])]
+        tasks += [Task(again, before, str(out), kill_at=number), Task(again)]
+    found = children.attempt(tasks)
+    assert {killed.code for killed in found[::2]} == {-9}
+    assert {repeated.code for repeated in found[1::2]} == {0}, found
+    for task in tasks[::2]:
+        ours = files(Path(task.to).parent)
+        seen = {p for p in ours if not p.name.startswith(".")}
+        assert seen == {p for p in whole if not p.name.startswith(".")}
+        assert all(ours[p] == whole[p] for p in seen if p.suffix in (".nc", ".csv", ".png", ".pdf"))
 
 
 @pytest.mark.fault("kill-commands")
