@@ -32,6 +32,7 @@ class Terminal:
         def take_over():
             fcntl.ioctl(0, termios.TIOCSCTTY)
             signal.signal(signal.SIGINT, signal.SIG_DFL)
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which tests run under nohup ignore, and so would it
 
         self.process = subprocess.Popen(
             words, stdin=theirs, stdout=theirs, stderr=theirs, env=environment(TERM="xterm", **variables),
