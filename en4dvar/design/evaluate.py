@@ -29,7 +29,7 @@ class Effort:
 
     draws: Annotated[int, Ge(20), "Draws of the prior at which the model is linearised."] = 200
     simulated: Annotated[int, Ge(20), "Draws whose readings are simulated and explained anew (``nested``)."] = 100
-    inner: Annotated[int, Ge(50), "Runs behind each of two densities of simulated readings (``nested``)."] = 100
+    inner: Annotated[int, Ge(50), "Runs behind each of two densities of simulated readings (``nested``)."] = 200
 
 
 @dataclass(frozen=True)

@@ -19,18 +19,20 @@ variate): the spread that is left is that of what is not linear.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from en4dvar.design.laplace import about, precision, require_alive, standard_error
-from en4dvar.design.planned import Planned
+from en4dvar.design.planned import Planned, Tangents
 from en4dvar.prior import member_stream
-from en4dvar.sampling.importance import FEWEST, Importance
+from en4dvar.sampling.importance import Importance
 from en4dvar.sampling.mixture import StudentMixture
 from en4dvar.state import Array
 
 ROUNDS = 4  # of proposals, while few draws have a weight
+ENOUGH = 25.0  # effective draws; proposals fitted to draws that they are weighed with make the integral too small
+OTHERS, PLAUSIBLE = 6, 8.0  # draws that explain the readings best, and the J above the lowest that they may promise
 FROM_PRIOR = 0.1  # share of a proposal that is the prior's: a second minimum is found, no weight is without bound
 WIDER = 1.2  # than the Gaussian that it is made of
 
@@ -72,48 +74,58 @@ def nested(planned: Planned, u: Array, inner: int, seed: int) -> Nested:
     noise = planned.problem.observations.noise
     streams = [member_stream(seed, "design readings", int(i)) for i in truths.alive]
     values = np.stack([noise.drawn(one.prediction, s) for one, s in zip(truths.at, streams, strict=True)])
-    d, rows = truths.whitened(planned, values)
-    matrices = precision(rows)
-    pull = np.einsum("rki,rk->ri", rows, d + np.einsum("rki,ri->rk", rows, truths.u))
-    centres = np.linalg.solve(matrices, pull[..., None])[..., 0]
     plain, effective = np.empty(len(values)), np.empty(len(values))
     for i, (y, stream) in enumerate(zip(values, streams, strict=True)):
-        plain[i], effective[i] = _gain(planned, y, truths.u[i], centres[i], matrices[i], inner, stream)
+        near = _near(planned, truths, y, i)
+        known, of_known = _log_integral(planned, y, truths.u[i, : planned.asked], near, inner, stream)
+        log, of_all = _log_integral(planned, y, truths.u[i, :0], near, inner, stream)
+        plain[i], effective[i] = known - log, min(of_known, of_all)
     alive = np.isfinite(plain)
     require_alive(int(alive.sum()), len(u))
-    gains = plain - control_variate(d, truths.whitened(planned)[1], truths.u, planned.asked)
-    linearised = 0.5 * np.linalg.slogdet(about(matrices, planned.asked))[1]
+    innovations, (_, rows) = truths.whitened(planned, values)[0], truths.whitened(planned)
+    gains = plain - control_variate(innovations, rows, truths.u, planned.asked)
+    linearised = 0.5 * np.linalg.slogdet(about(precision(rows), planned.asked))[1]
     return Nested(gains[alive], linearised[alive], effective[alive])
 
 
-def _gain(
-    planned: Planned, values: Array, truth: Array, centre: Array, matrix: Array, inner: int, stream: np.random.Generator
-) -> tuple[float, float]:
-    """ln p(y | a) − ln p(y) of readings (K,), and the effective draws behind it; N(centre, M⁻¹) is near."""
-    known, effective = _log_integral(planned, values, truth[: planned.asked], centre, matrix, inner, stream)
-    log, of_all = _log_integral(planned, values, truth[:0], centre, matrix, inner, stream)
-    return known - log, min(effective, of_all)
+def _near(planned: Planned, truths: Tangents, values: Array, i: int) -> tuple[Array, Array]:
+    """Gaussians where readings (K,) of draw i have a posterior: centres (M, n) and precisions (M, n, n).
+
+    Each is one step of Gauss and Newton away from the draw itself, or from another one that explains the readings.
+    """
+    observations = replace(planned.problem.observations, values=values)
+    costs = [float(observations.cost(one.prediction)) for one in truths.at] + 0.5 * np.sum(truths.u**2, axis=1)
+    others = [k for k in np.argsort(costs)[:OTHERS].tolist() if k != i]
+    found = truths.some([i, *others])
+    d, rows = found.whitened(planned, np.tile(values, (len(found.at), 1)))
+    matrices = precision(rows)
+    step = np.linalg.solve(matrices, (np.einsum("rki,rk->ri", rows, d) - found.u)[..., None])[..., 0]
+    lowest = costs[[i, *others]] - 0.5 * np.einsum("ri,rij,rj->r", step, matrices, step)
+    plausible = lowest < lowest.min() + PLAUSIBLE
+    plausible[0] = True
+    return (found.u + step)[plausible], matrices[plausible]
 
 
 def _log_integral(
-    planned: Planned, values: Array, known: Array, centre: Array, matrix: Array, inner: int, stream: np.random.Generator
+    planned: Planned, values: Array, known: Array, near: tuple[Array, Array], inner: int, stream: np.random.Generator
 ) -> tuple[float, float]:
     """ln ∫ e^{−J_o} N(·; 0, I) over the coordinates behind the ``known`` ones, and the effective draws behind it."""
-    k, n = len(known), len(centre)
-    if k == n:
+    (centres, matrices), k = near, len(known)
+    if k == len(planned.names):
         return -float(planned.cost(values, planned.run(known[None]))[0]), np.inf
-    own = matrix[k:, k:]
-    middle = centre[k:] - np.linalg.solve(own, matrix[k:, :k] @ (known - centre[:k]))
-    root = np.linalg.inv(np.linalg.cholesky(own)).T
+    own = matrices[:, k:, k:]
+    shift = np.linalg.solve(own, (matrices[:, k:, :k] @ (known - centres[:, :k])[..., None]))[..., 0]
+    roots = WIDER * np.linalg.inv(np.linalg.cholesky(own)).transpose(0, 2, 1)
+    shares = np.append(np.full(len(own), (1 - FROM_PRIOR) / len(own)), FROM_PRIOR)
+    n = own.shape[1]
     first = StudentMixture(
-        np.array([1 - FROM_PRIOR, FROM_PRIOR]), np.stack([middle, 0 * middle]), np.stack([WIDER * root, np.eye(n - k)])
+        shares, np.vstack([centres[:, k:] - shift, np.zeros(n)]), np.vstack([roots, np.eye(n)[None]])
     )
     draws = Importance(first, stream, inner, WIDER)
     for _ in range(ROUNDS):
         z = draws.draw()
-        run = planned.run(np.hstack([np.tile(known, (inner, 1)), z]))
-        draws.add(z, -planned.cost(values, run))
-        if draws.effective >= FEWEST:
+        draws.add(z, -planned.cost(values, planned.run(np.hstack([np.tile(known, (inner, 1)), z]))))
+        if draws.effective >= ENOUGH:
             break
     if not np.isfinite(draws.log):
         return -np.inf, 0.0

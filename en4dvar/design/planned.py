@@ -88,6 +88,11 @@ class Tangents:
     u: Array
     at: tuple[Linearisation, ...]
 
+    def some(self, which: Sequence[int]) -> Tangents:
+        """At some of the points."""
+        chosen = list(which)
+        return Tangents(self.alive[chosen], self.u[chosen], tuple(self.at[k] for k in chosen))
+
     def whitened(self, planned: Planned, values: Array | None = None) -> tuple[Array, Array]:
         """Innovations d (R, K') and sensitivities S (R, K', n) for readings (R, K); by default those predicted."""
         observations = planned.problem.observations

@@ -39,11 +39,13 @@ def choose(planned: Planned, u: Array, count: int, apart: float = 0.0) -> Indice
     np.fill_diagonal(near, True)
     taken: list[int] = []
     for _ in range(count):
-        free = np.logical_not(near[taken].any(axis=0))
-        if not free.any():
+        order = np.argsort(-search.gains(), kind="stable").tolist()
+        possible = (k for k in order if not near[taken, k].any() and _room(near, [*taken, k]) >= count)
+        best = next(possible, None)
+        if best is None:
             raise ConfigError(f"no {count} of {len(observations)} readings lie so far apart from each other")
-        taken.append(search.best(free))
-        search.add(taken[-1], 1)
+        taken.append(best)
+        search.add(best, 1)
     for _ in range(SWEEPS):
         moved = False
         for place, one in enumerate(taken):
@@ -77,9 +79,14 @@ class _Search:
         a = self.asked
         return _added(self.rows, self.precision) - _added(self.others, self.precision[:, a:, a:])
 
-    def best(self, free: npt.NDArray[np.bool_]) -> int:
-        """Of those that are free."""
-        return int(np.argmax(np.where(free, self.gains(), -np.inf)))
+
+def _room(near: npt.NDArray[np.bool_], taken: list[int]) -> int:
+    """How many readings can be taken in all beside these, the earliest that is free each time."""
+    blocked, count = np.asarray(near[taken].any(axis=0)), len(taken)
+    for k in range(len(blocked)):
+        if not blocked[k]:
+            blocked, count = blocked | near[k], count + 1
+    return count
 
 
 def _added(rows: Array, precision: Array) -> Array:
