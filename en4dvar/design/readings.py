@@ -37,28 +37,28 @@ def choose(planned: Planned, u: Array, count: int, apart: float = 0.0) -> Indice
     search = _Search(rows.reshape(len(rows), -1, len(observations), rows.shape[2]), planned.asked)
     near = np.abs(np.subtract.outer(observations.times, observations.times)) < apart * (1 - 1e-9)
     np.fill_diagonal(near, True)
-    taken: list[int] = []
+    chosen: list[int] = []
     for _ in range(count):
         order = np.argsort(-search.gains(), kind="stable").tolist()
-        possible = (k for k in order if not near[taken, k].any() and _room(near, [*taken, k]) >= count)
+        possible = (k for k in order if not near[chosen, k].any() and _room(near, [*chosen, k]) >= count)
         best = next(possible, None)
         if best is None:
             raise ConfigError(f"no {count} of {len(observations)} readings lie so far apart from each other")
-        taken.append(best)
+        chosen.append(best)
         search.add(best, 1)
     for _ in range(SWEEPS):
         moved = False
-        for place, one in enumerate(taken):
+        for place, one in enumerate(chosen):
             search.add(one, -1)
-            others = [k for k in taken if k != one]
+            others = [k for k in chosen if k != one]
             gains = np.where(near[others].any(axis=0), -np.inf, search.gains())
             better = int(np.argmax(gains))
             if gains[better] > gains[one] + WORTH:
-                taken[place], moved = better, True
-            search.add(taken[place], 1)
+                chosen[place], moved = better, True
+            search.add(chosen[place], 1)
         if not moved:
             break
-    return np.sort(np.array(taken, dtype=np.intp))
+    return np.sort(np.array(chosen, dtype=np.intp))
 
 
 class _Search:
@@ -80,9 +80,9 @@ class _Search:
         return _added(self.rows, self.precision) - _added(self.others, self.precision[:, a:, a:])
 
 
-def _room(near: npt.NDArray[np.bool_], taken: list[int]) -> int:
-    """How many readings can be taken in all beside these, the earliest that is free each time."""
-    blocked, count = np.asarray(near[taken].any(axis=0)), len(taken)
+def _room(near: npt.NDArray[np.bool_], chosen: list[int]) -> int:
+    """How many readings can be chosen in all beside these, the earliest that is free each time."""
+    blocked, count = np.asarray(near[chosen].any(axis=0)), len(chosen)
     for k in range(len(blocked)):
         if not blocked[k]:
             blocked, count = blocked | near[k], count + 1
