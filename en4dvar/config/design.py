@@ -14,7 +14,7 @@ from en4dvar.config.context import Context, Made, quantity, time_unit
 from en4dvar.config.schema import QuantityText, Section, section_of
 from en4dvar.config.times import Times, read_times
 from en4dvar.config.validate import Faults
-from en4dvar.design.evaluate import Effort
+from en4dvar.design.evaluate import SampleSizes
 from en4dvar.state import Array
 
 MOST = 2000  # designs
@@ -48,10 +48,10 @@ class Price(Section):
     """Of an experiment, beside its readings."""
 
 
-_Effort: Any = section_of(Effort)
+_SampleSizes: Any = section_of(SampleSizes)
 
 
-class Design(_Effort):
+class Design(_SampleSizes):
     """Which experiments ``en4dvar design`` compares, and about what."""
 
     about: tuple[str, ...] = ()
@@ -80,9 +80,9 @@ class Design(_Effort):
             faults.add(("knobs",), f"{prod(sizes)} combinations; at most {MOST}", at_key=True)
 
     @property
-    def effort(self) -> Effort:
+    def sizes(self) -> SampleSizes:
         """How many runs."""
-        return Effort(**{field.name: getattr(self, field.name) for field in fields(Effort)})
+        return SampleSizes(**{field.name: getattr(self, field.name) for field in fields(SampleSizes)})
 
     def settings(self) -> Iterator[dict[str, Value]]:
         """Name of the knob → value, of every combination."""

@@ -24,8 +24,8 @@ FAN = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
 @dataclass(frozen=True)
-class Effort:
-    """How many runs an evaluation may take; the one declaration of these keys of ``design:``."""
+class SampleSizes:
+    """How many draws and runs an evaluation takes; the one declaration of these keys of ``design:``."""
 
     draws: Annotated[int, Ge(20), "Draws of the prior at which the model is linearised."] = 200
     simulated: Annotated[int, Ge(20), "Draws whose readings are simulated and explained anew (``nested``)."] = 100
@@ -62,7 +62,7 @@ class Evaluated:
 def evaluate(
     problem: InverseProblem,
     about: Sequence[str],
-    effort: Effort,
+    sizes: SampleSizes,
     method: Method,
     seed: int,
     alike: Sequence[int] = (1,),
@@ -81,12 +81,12 @@ def evaluate(
     planned = Planned(problem, about, executor)
     before = 0
     if choice is not None:
-        taken = choose(planned, planned.draws(effort.draws, own_seed(seed, "choice of readings")), *choice)
+        chosen = choose(planned, planned.draws(sizes.draws, own_seed(seed, "choice of readings")), *choice)
         weights = np.zeros(len(problem.observations))
-        weights[taken] = 1
+        weights[chosen] = 1
         problem = replace(problem, observations=replace(problem.observations, weights=weights))
         before, planned = planned.forward_runs, Planned(problem, about, executor)
-    u = planned.draws(effort.draws, seed)
+    u = planned.draws(sizes.draws, seed)
     grid = plotting_times(problem)
     run = planned.run(u, grid)
     require_alive(int(run.active.sum()), len(u))
@@ -99,7 +99,7 @@ def evaluate(
         values = expected(planned, tangents, tried, n)
         gain, error, by = values.gain, values.error, str("laplace" if method == "nested" else method)
         if method == "nested" and n == 1:
-            more, its_error = nested(planned, u[: effort.simulated], effort.inner, seed).correction
+            more, its_error = nested(planned, u[: sizes.simulated], sizes.inner, seed).correction
             gain, error, by = gain + more, float(np.hypot(error, its_error)), method
         std, relative = _in_units(planned, values, tangents.u)
         found.append(

@@ -178,7 +178,7 @@ def _one(candidate: Candidate, method: Method, seed: int) -> tuple[Evaluated, ..
     design = config.design
     try:
         problem = planned_problem(config)
-        return evaluate(problem, design.about, design.effort, method, seed, design.experiments, candidate.readings)
+        return evaluate(problem, design.about, design.sizes, method, seed, design.experiments, candidate.readings)
     except En4dvarError as error:
         return str(error)
 
