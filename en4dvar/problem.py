@@ -98,7 +98,7 @@ class InverseProblem:
 
     def varied(self, varying: Sequence[Varying]) -> InverseProblem:
         """The same with what varies; the changes join the control vector at its end."""
-        changes = (change for one in varying for change in one.changes)
+        changes = (term for one in varying for term in one.terms)
         return replace(
             self, model=PiecewiseModel(self.model, varying), prior=self.prior.of((*self.prior.terms, *changes))
         )
@@ -108,7 +108,7 @@ class InverseProblem:
         """The same with every parameter constant, and a model without error."""
         if not isinstance(self.model, PiecewiseModel):
             return self
-        changes = {change.parameter.name for one in self.varying for change in one.changes}
+        changes = {term.parameter.name for one in self.varying for term in one.terms}
         terms = tuple(term for term in self.prior.terms if term.parameter.name not in changes)
         return replace(self, model=self.model.model, prior=self.prior.of(terms))
 

@@ -252,7 +252,8 @@ class Uncertain:
             message = f"relative to the mean, which is zero; give it in {self.parameter.unit}"
             raise ConfigError([Fault(message, "varies.std")])
         try:
-            return RandomWalk.of(model, term, varies.knots(times), varies.std.absolute(centre) / term.slope(term.mean))
+            std = varies.std.absolute(centre) / term.slope(term.mean)
+            return RandomWalk.of(model, term, varies.knots(times), std, varies.estimated)
         except ConfigError as error:
             raise ConfigError(
                 [replace(f, path=f"varies.{f.path}" if f.path else "varies") for f in error.problems]

@@ -19,6 +19,7 @@ from en4dvar.state import Array, Field
 from en4dvar.varying import StateChanges
 
 MOST_KNOTS = 1000
+ESTIMATED = Spread(0.5, relative=True)  # of a half-normal prior
 
 
 class Knots(Section):
@@ -58,12 +59,21 @@ class Knots(Section):
         return found
 
 
+def _change_std(text: Any, context: Context) -> Spread:
+    return ESTIMATED if text == "estimated" else parse_spread(text, subject_unit(context))
+
+
 class VariesSection(Knots):
     """A parameter that varies in time: constant pieces, and at each knot between two a random change."""
 
-    std: Annotated[Spread, Made(lambda text, context: parse_spread(text, subject_unit(context)))]
+    std: Annotated[Spread, Made(_change_std)]
     """Standard deviation of each change: in % of the value (lognormal: of its logarithm), or in the parameter's
-    unit, which holds at the centre of the prior."""
+    unit, which holds at the centre of the prior; or ``estimated``, with a half-normal prior of 50 %."""
+
+    @property
+    def estimated(self) -> bool:
+        """Whether ``std`` is that of the prior of the changes' standard deviation."""
+        return self.std is ESTIMATED
 
 
 class ModelErrorSection(Knots):
