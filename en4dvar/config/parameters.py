@@ -25,7 +25,7 @@ from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel
 from en4dvar.hints import brief, shown, suggest
 from en4dvar.prior import PriorTerm
-from en4dvar.state import OF_READINGS, TIME_SHIFT, Array, Parameter
+from en4dvar.state import OF_READINGS, READING_SCALE, TIME_SHIFT, Array, Parameter
 from en4dvar.units import parse_quantity
 from en4dvar.varying import RandomWalk
 from en4dvar.varying.model import can_vary
@@ -327,7 +327,9 @@ def entries(kind: str = "") -> Made:
         model = context.model
         shift = replace(TIME_SHIFT, unit=model.time_unit, display_unit=model.time_display_unit)
         known = {p.name: p for p in model.parameters}  # a model's own sigma goes before
-        known |= {p.name: p for p in (*OF_READINGS, shift) if p.name not in known}
+        # what makes its own readings makes them to scale
+        offered = (p for p in (*OF_READINGS, shift) if not (kind and p is READING_SCALE))
+        known |= {p.name: p for p in offered if p.name not in known}
         defaults: Mapping[str, float] = getattr(model, "defaults", {})
 
         def unknown(name: str) -> str:
