@@ -19,7 +19,10 @@ from en4dvar.state import Array, Field
 from en4dvar.varying import StateChanges
 
 MOST_KNOTS = 1000
-ESTIMATED = Spread(0.5, relative=True)  # of a half-normal prior
+
+
+class Estimated(Spread):
+    """A standard deviation that is estimated, by that of its half-normal prior."""
 
 
 class Knots(Section):
@@ -60,7 +63,9 @@ class Knots(Section):
 
 
 def _change_std(text: Any, context: Context) -> Spread:
-    return ESTIMATED if text == "estimated" else parse_spread(text, subject_unit(context))
+    if text == "estimated":
+        return Estimated(0.5, relative=True)
+    return parse_spread(text, subject_unit(context))
 
 
 class VariesSection(Knots):
@@ -73,7 +78,7 @@ class VariesSection(Knots):
     @property
     def estimated(self) -> bool:
         """Whether ``std`` is that of the prior of the changes' standard deviation."""
-        return self.std is ESTIMATED
+        return isinstance(self.std, Estimated)
 
 
 class ModelErrorSection(Knots):

@@ -201,7 +201,7 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
         if names:
             raise ConfigError(f"{', '.join(sorted(names))}: {message}")
     if problem.has_reading_scale and problem.observations.parts:
-        raise ConfigError("reading_scale: one factor for several series or for places means nothing")
+        raise ConfigError("reading_scale: several series, or places, have no common scale; leave it out")
     _operators(problem)
     return tuple(known[name] for name in problem.fixed)
 
