@@ -107,7 +107,7 @@ def _ledger(problem: InverseProblem, response: LinearResponse, std: Array, names
         (model.layout[name].start, prior.to_physical(x)[j]) for name, j, x in zip(names, columns, moved, strict=True)
     ]
     local = _localised(problem, states[:-1], edges[:-1], shift, changes)
-    local *= scale / (CHANGE * std[columns])[:, None, None]
+    local = scale * local / (CHANGE * std[columns])[:, None, None]
     kernel = np.stack(
         [gain @ _whitened(response, one) for gain, one in zip(response.gain[columns], local, strict=True)]
     )
