@@ -17,7 +17,8 @@ import time
 
 import numpy as np
 
-from en4dvar.descent.field import FieldData, field_en4dvar, field_esmda
+from en4dvar.descent.field import field_en4dvar, field_esmda
+from en4dvar.descent.field_data import FieldData
 from en4dvar.schemes.local_gain import ByDistance
 
 

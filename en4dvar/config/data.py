@@ -12,11 +12,12 @@ from pydantic import AfterValidator, Field
 from en4dvar.config.columns import Columns
 from en4dvar.config.context import Context, Made, OfObservable
 from en4dvar.config.error import Error
-from en4dvar.config.places import PLACES, Placing, field_of
+from en4dvar.config.places import PLACES, Placing
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
 from en4dvar.config.weights import WEIGHTS, Weighing
 from en4dvar.config.window import WindowSection, read_time_zero
+from en4dvar.forward import field_of
 from en4dvar.hints import shown, suggest
 from en4dvar.inputs.readers import Disorder, Format, Layout, Repeated
 from en4dvar.inputs.text_table import Decimal
