@@ -10,6 +10,7 @@ import pytest
 from en4dvar.config import load_config
 from en4dvar.config.build import build
 from en4dvar.errors import ConfigError, DataError
+from en4dvar.noise import BlockNoise
 from en4dvar.runs.checks import validate
 
 YAML = """\
@@ -75,7 +76,8 @@ def test_what_is_said_once_holds_for_all(tmp_path: Path) -> None:
     assert found.parts[2].places is not None
     assert found.parts[2].places.positions.tolist() == [0, 2.5, 0, 2.5]
     assert found.weights[14:].tolist() == [0.5, 1.5, 0.5, 1.5]
-    matrix = found.noise.matrices()["correlation"][0]
+    assert isinstance(found.noise, BlockNoise)
+    matrix = found.noise.correlation.toarray()
     assert np.array_equal(matrix[:7, 7:14], 0.5 * np.eye(7))
 
 
