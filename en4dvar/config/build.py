@@ -124,8 +124,9 @@ def _discrepancy(config: Config, observations: Observations) -> tuple[PriorTerm,
 def data_files(plan: DataPlan) -> dict[str, DataFile]:
     """Name of the data set → file: the file's stem, made unique by its folders, then by a number.
 
-    Data sets of one file have the name of their part behind its name. Several series name as many files each: of one
-    data set the first series gives the name, of several they have the same names in every series.
+    A name of its own (``data.name``) goes before. Data sets of one file have the name of their part behind its name.
+    Several series name as many files each: of one data set the first series gives the name, of several they have the
+    same names in every series.
 
     Raises
     ------
@@ -133,6 +134,10 @@ def data_files(plan: DataPlan) -> dict[str, DataFile]:
     """
     found = [_files_of(one) for one in plan.series]
     first, *others = found
+    if (own := plan.series[0].data.name) is not None:
+        if len(first) != 1:
+            raise DataError(f"name: {own} is that of one data set, and there are {len(first)}; leave it out")
+        first = {own: next(iter(first.values()))}
     for one, files in zip(plan.series[1:], others, strict=True):
         if len(files) != len(first) or (len(first) > 1 and files.keys() != first.keys()):
             rest = [name for name in (*first, *files) if (name in first) != (name in files)]

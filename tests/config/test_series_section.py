@@ -81,6 +81,31 @@ def test_what_is_said_once_holds_for_all(tmp_path: Path) -> None:
     assert np.array_equal(matrix[:7, 7:14], 0.5 * np.eye(7))
 
 
+def test_a_data_set_has_the_name_that_is_given(tmp_path: Path) -> None:
+    path = write(tmp_path, ("  path: pq.csv", "  path: pq.csv\n  name: gel 3"))
+    (problem,) = build(load_config(path))
+    assert problem.observations.name == "gel 3"
+    again = tmp_path / "again.yaml"
+    again.write_text(load_config(path).resolved, encoding="utf-8")
+    (problem,) = build(load_config(again))
+    assert problem.observations.name == "gel 3"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("path: pq.csv", "path: pq.csv\n  name: a/b", "data.name:"),
+        ("path: pq.csv", "path: [pq.csv, f.csv]\n  name: gel", "name: gel is that of one data set, and there are 2"),
+        ("      observable: f", "      name: g\n      observable: f", "a data set has one name; write it above"),
+    ],
+)
+def test_names_that_cannot_be(tmp_path: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises((ConfigError, DataError)) as error:
+        validate(write(tmp_path, (old, new)))
+    assert str(error.value).count("two.yaml:") == 1, str(error.value)
+    assert message in str(error.value)
+
+
 def test_the_resolved_file_says_the_same(tmp_path: Path) -> None:
     config = load_config(write(tmp_path))
     (tmp_path / "sub").mkdir()
