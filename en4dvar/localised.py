@@ -32,7 +32,7 @@ from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.schemes.local_gain import ByDistance
 from en4dvar.state import Array
 
-PATHS = 1 << 25  # numbers of the paths that are held at a time, unless half the ensemble has more
+PATHS = 1 << 23  # numbers of the paths that are held at a time, unless a quarter of the ensemble has more
 
 
 def assimilate_localised(
@@ -60,7 +60,7 @@ class _Localised:
         self.everyone = np.arange(settings.members)
         self.fewest = max(2, math.ceil(settings.min_active_fraction * settings.members))
         numbers = problem.model.layout.size * (len(problem.observations.instants[0]) + 2)
-        self.at_once = max(1, max(PATHS, self.ensemble.size // 2) // numbers)
+        self.at_once = max(1, max(PATHS, self.ensemble.size // 4) // numbers)
         self.forward_runs = 0
         self.records: list[IterationRecord] = []
         self.failures: tuple[str, ...] = ()
