@@ -39,6 +39,23 @@ class Fragile(Line):
         return x
 
 
+class Many(ForwardModel):
+    """2000 parameters and nothing else."""
+
+    parameters = tuple(Parameter(f"k_{i}", "1") for i in range(2000))
+    layout = StateLayout((Field("k", 2000),))
+    observables = (Observable("k", "1", StateField("k")),)
+
+    def initial_state(self, theta):
+        return np.array([theta[p.name] for p in self.parameters])
+
+    def initial_states(self, theta):
+        return np.stack([theta[p.name] for p in self.parameters], axis=1)
+
+    def step(self, x, t0, t1):
+        return x
+
+
 YAML = """\
 name: line
 seed: 4

@@ -16,7 +16,7 @@ from en4dvar.descent.preview import preview
 from en4dvar.errors import ConfigError
 from en4dvar.report.result import load_result
 from en4dvar.runs.checks import validate
-from en4dvar.runs.runner import run
+from en4dvar.runs.runner import run, run_campaign
 
 
 def test_units_are_those_of_the_coordinates(tmp_path: Path) -> None:
@@ -65,6 +65,16 @@ def test_a_run_shows_a_field_as_a_field(tmp_path: Path, scheme: str) -> None:
     assert "of 0 estimated" not in page
     assert (tmp_path / "run" / "figures" / "fields.png").exists()
     assert not (tmp_path / "run" / "figures" / "posterior.png").exists()
+
+
+def test_a_campaign_of_fields(tmp_path: Path) -> None:
+    path = write_line(tmp_path, ("path: line.csv", "path: [line.csv, other.csv]"))
+    (tmp_path / "other.csv").write_text((tmp_path / "line.csv").read_text(encoding="utf-8"), encoding="utf-8")
+    campaign = run_campaign(path, overrides={"output.directory": str(tmp_path / "run")})
+    assert [result.name for result in campaign] == ["line", "other"]
+    first, second = (result.dataset("fields")["u_mean"].values for result in campaign)
+    assert np.max(np.abs(first - second)) > 0  # streams of their own
+    assert (tmp_path / "run" / "posterior.nc").exists()
 
 
 @pytest.mark.parametrize(
