@@ -123,6 +123,18 @@ def test_a_field_is_read_at_its_places():
     assert G[-4:, 0] == pytest.approx(AT)
 
 
+def test_many_readings_of_a_large_field_take_no_field_each():
+    places = Places.at_indices(np.arange(0, 100_000, 200))
+    values = np.arange(200_000.0).reshape(1, 2, 100_000)
+    rows_ = np.repeat([0, 1], 250)
+    tracemalloc.start()
+    found = places.read(values, rows_)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert np.array_equal(found[0], np.arange(0, 100_000, 200) + 100_000.0 * rows_)
+    assert most < 1e6
+
+
 def test_curves_of_the_series_that_have_one():
     grid = np.linspace(0.1, 1.0, 5)
     run = forecast(problem_of(all_series()), np.array([[1.2, -0.4]]), extra_times=grid)
