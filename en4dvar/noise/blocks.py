@@ -59,7 +59,7 @@ class BlockNoise(Noise):
 
     def _blocks(self) -> Iterator[Block]:
         alone = np.ones(len(self.std), dtype=bool)
-        for where, matrix in self._correlated():
+        for where, matrix in self._groups():
             alone[where] = False
             yield Block(where, CorrelatedNoise(self.std[where], self.time_std[where], Correlation(matrix)))
         for threshold in np.unique(self.thresholds[alone]):
@@ -67,7 +67,7 @@ class BlockNoise(Noise):
             errors = self.std[where], self.time_std[where]
             yield Block(where, HuberNoise(*errors, float(threshold)) if math.isfinite(threshold) else Noise(*errors))
 
-    def _correlated(self) -> Iterator[tuple[Indices, Array]]:
+    def _groups(self) -> Iterator[tuple[Indices, Array]]:
         """Sets of readings that are correlated with each other and with no other, and their matrices."""
         if self.correlation is None:
             return
@@ -96,6 +96,9 @@ class BlockNoise(Noise):
 
     def whitened_residual(self, values: Array, predicted: Predicted) -> Array:
         return self._each(predicted, lambda n, y, p: n.whitened_residual(y, p), values)
+
+    def drawn(self, predicted: Predicted, stream: np.random.Generator) -> Array:
+        return self._each(predicted, lambda n, y, p: n.drawn(p, stream), predicted.values)
 
     def influence(self, residual: Array) -> Array:
         return np.asarray(self.thresholds / np.maximum(np.abs(residual), self.thresholds), dtype=float)
@@ -162,7 +165,7 @@ class BlockNoise(Noise):
         """(…, K) of what each block gives of its readings (…, K')."""
         found = np.empty(np.broadcast_shapes(predicted.values.shape, values.shape))
         for block in self.blocks:
-            found[..., block.where] = of(block.noise, values[block.where], part(predicted, block.where))
+            found[..., block.where] = of(block.noise, values[..., block.where], part(predicted, block.where))
         return found
 
 
