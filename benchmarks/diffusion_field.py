@@ -9,11 +9,15 @@ import argparse
 
 import numpy as np
 
-from en4dvar.descent.field import FieldData, field_en4dvar, field_esmda
+from en4dvar.descent.field import field_en4dvar, field_esmda
+from en4dvar.descent.field_data import FieldData
+from en4dvar.field_prior import FieldPrior
 from en4dvar.schemes.local_gain import ByCorrelation, ByDistance
-from en4dvar_diffusion.aquifer import Aquifer, gaussian_fields
+from en4dvar.state import Array
+from en4dvar_diffusion import Aquifer
 
 ERROR = 0.02  # of the largest head
+TIMES = np.array([4.0, 12.0, 32.0])
 
 
 def main() -> None:
@@ -26,12 +30,17 @@ def main() -> None:
     asked.add_argument("--seed", type=int, default=1)
     given = asked.parse_args()
     rng, shape = np.random.default_rng(given.seed), (given.side, given.side)
-    aquifer = Aquifer(shape, np.sort(rng.choice(given.side**2, given.wells, replace=False)))
-    truth, *prior = gaussian_fields(shape, given.length, given.members + 1, rng)
-    heads = aquifer(truth[None])[0]
+    aquifer, wells = Aquifer(shape), np.sort(rng.choice(given.side**2, given.wells, replace=False))
+    field = FieldPrior(aquifer.layout.fields[1], 1.0, "gaussian", given.length)
+    truth, *prior = (field.draw(given.seed, i) for i in range(given.members + 1))
+
+    def forward(fields: Array) -> Array:
+        return aquifer.heads(fields, wells, TIMES)
+
+    heads = forward(truth[None])[0]
     std = np.full(len(heads), ERROR * heads.max())
-    data = FieldData(heads + std * rng.standard_normal(len(heads)), std, aquifer)
-    near = ByDistance(aquifer.places, aquifer.observed, given.radius)
+    data = FieldData(heads + std * rng.standard_normal(len(heads)), std, forward)
+    near = ByDistance(aquifer.places, np.tile(aquifer.places[wells], (len(TIMES), 1)), given.radius)
 
     def tell(name: str, ensemble: np.ndarray, more: str = "") -> None:
         error = np.sqrt(np.mean((ensemble.mean(axis=0) - truth) ** 2))

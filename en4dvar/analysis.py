@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from en4dvar.caution import Caution
+from en4dvar.field_prior import FieldPrior
 from en4dvar.influence import Influence
 from en4dvar.observations import Observations
 from en4dvar.problem import AssimilationSettings, InverseProblem
@@ -139,6 +140,22 @@ class Mode:
 
 
 @dataclass(frozen=True)
+class FieldEstimate:
+    """What became of a field of the initial state: values of its cells, in its unit.
+
+    ``members`` (N, size) of the posterior; ``centre``, ``mean`` and ``std`` (size,) of it, and of the prior.
+    """
+
+    prior: FieldPrior
+    members: Array
+    centre: Array
+    mean: Array
+    std: Array
+    prior_mean: Array
+    prior_std: Array
+
+
+@dataclass(frozen=True)
 class Analysis:
     """The outcome for one data set: members in order, physical SI values, NaN where a member failed.
 
@@ -182,6 +199,7 @@ class Analysis:
     modes: tuple[Mode, ...] = ()  # minima of J that count, the lowest first; () of a scheme that does not search
     descents: Descents | None = None  # where all of them ended; None of a scheme that does not search
     ledger: Ledger | None = None  # what the path went through where it informed the parameters
+    fields: tuple[FieldEstimate, ...] = ()  # of the initial state, in the order of ``problem.fields``
 
     @property
     def observations(self) -> Observations:

@@ -15,6 +15,7 @@ from en4dvar.ensemble.forecast import Forecast, cost, forecast, log_posterior
 from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.honesty import ControlEnsembles, examine
+from en4dvar.localised import assimilate_localised
 from en4dvar.loop_state import Keep, LoopState
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.response.ledger import ledger
@@ -52,6 +53,8 @@ def assimilate(
     ConfigError: the problem is not complete. TooFewMembersError: too few members survive a forecast.
     """
     with one_blas_thread():
+        if settings.localisation is not None or problem.fields:
+            return assimilate_localised(problem, settings, seed, executor or SerialExecutor(), progress)
         return _through(Stages(problem, settings, seed, executor or SerialExecutor(), progress, keep), resume)
 
 

@@ -8,18 +8,35 @@ Gaussian scores of the others (a Gaussian copula): each parameter has the prior 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.spatial.distance import cdist
 
 from en4dvar.errors import ConfigError
 from en4dvar.state import Array
 
 MOST_CORRELATED = 5000  # names in one block: its root takes 200 MB and 2 s
 LEAST_INDEPENDENT = 1e-10  # share of its variance that a parameter must keep, given those before it
+NUGGET = 1e-8  # share of the variance that close neighbours keep to themselves: a smooth kernel is singular to rounding
+KERNELS: Mapping[str, Callable[[Array], Array]] = {  # of distances in correlation lengths
+    "exponential": lambda r: np.exp(-r),
+    "matern-3/2": lambda r: (1 + np.sqrt(3) * r) * np.exp(-np.sqrt(3) * r),
+    "matern-5/2": lambda r: (1 + np.sqrt(5) * r + 5 / 3 * r**2) * np.exp(-np.sqrt(5) * r),
+    "gaussian": lambda r: np.exp(-0.5 * r**2),
+}
+KernelName = Literal["exponential", "matern-3/2", "matern-5/2", "gaussian"]
+
+
+def correlation_of_places(kernel: str, places: Array, length: float) -> Array:
+    """Correlation matrix (m, m) of what has ``places`` (m, D), by a kernel of their distances over ``length``."""
+    found = (1 - NUGGET) * KERNELS[kernel](cdist(places, places) / length)
+    np.fill_diagonal(found, 1.0)
+    return np.asarray(found)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from typing import ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from en4dvar.state import Array, Parameter, StateLayout
+from en4dvar.state import Array, Field, Parameter, StateLayout
 from en4dvar.user_code import reason_of
 
 
@@ -329,3 +329,10 @@ class ForwardModel(ABC):
                 return Failure("non-finite state", t)
             states[k] = x
         return Trajectory(np.asarray(times, dtype=float), states, self.layout)
+
+
+def field_of(model: ForwardModel, observable: Observable) -> Field | None:
+    """The field of the state that an observable reads, where it reads one as it is."""
+    if not isinstance(observable.operator, StateField):
+        return None
+    return next((block for block in model.layout if block.name == observable.operator.name), None)

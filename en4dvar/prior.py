@@ -218,8 +218,6 @@ class Prior:
     blocks: tuple[Dependence, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.terms:
-            raise ConfigError("prior: at least one parameter must be estimated")
         if len(set(self.names)) != len(self.names):
             raise ConfigError(f"prior: a parameter is given twice in {', '.join(self.names)}")
         correlated = [name for block in self.blocks for name in block.names]

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, MinLen
 
+from en4dvar.field_prior import FieldPrior
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior
@@ -47,6 +49,8 @@ class InverseProblem:
     named ``reading_scale`` the predictions, where the model has no parameter of that name. ``discrepancy_amplitude``
     and ``discrepancy_length`` are those of the discrepancy that the observations allow for. ``perturbations`` act on
     the initial state, ``tied`` follow what is estimated. ``fixed`` are physical SI values of the other parameters.
+    ``fields`` of the initial state are estimated cell by cell: a control vector then goes on with their cells, and the
+    scheme has to be localised.
 
     Where the observations have parts, these say what was observed, and ``observable`` is that of the first.
     """
@@ -58,12 +62,19 @@ class InverseProblem:
     fixed: Mapping[str, float] = field(default_factory=dict)
     perturbations: tuple[StatePerturbation, ...] = ()
     tied: tuple[Tie, ...] = ()
+    fields: tuple[FieldPrior, ...] = ()
 
     @property
     def parts(self) -> tuple[Part, ...]:
         """The series of the data set, one at least."""
         whole = Part(self.observable.name, self.observable, 0, len(self.observations))
         return self.observations.parts or (whole,)
+
+    @property
+    def columns_of_fields(self) -> list[tuple[FieldPrior, slice]]:
+        """Each field with its cells among those of a control vector, counted from the first of them."""
+        ends = accumulate(one.field.size for one in self.fields)
+        return [(one, slice(end - one.field.size, end)) for one, end in zip(self.fields, ends, strict=True)]
 
     @property
     def has_noise_scale(self) -> bool:
@@ -126,13 +137,28 @@ Positive = Annotated[float, Gt(0)]
 
 
 @dataclass(frozen=True)
+class Localising:
+    """How the gain of an ensemble is localised (:mod:`en4dvar.schemes.local_gain`).
+
+    By distance with a ``radius``, in the unit of the model's coordinates, where ``at`` are the coordinates of
+    parameters and of series that are no part of a field; or by correlation, ``radius`` None, with a ``threshold`` or
+    its default.
+    """
+
+    radius: float | None = None
+    at: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    threshold: float | None = None
+
+
+@dataclass(frozen=True)
 class AssimilationSettings:
     """The scheme's settings; defaults are the recommended ones.
 
     This is the one declaration of the keys of ``assimilation:`` in YAML: type, bounds, description and default of each.
     ``full`` takes the whole step or, where that raises J, none. The guidance of ``refine: mcmc`` uses the ``emulator``
     as well (see :mod:`en4dvar.sampling.shape`). ES-MDA reads, besides ``members``, ``sampling`` and
-    ``min_active_fraction``, only ``mda_coefficients`` and ``mda_form`` (see :mod:`en4dvar.schemes.esmda`).
+    ``min_active_fraction``, only ``mda_coefficients`` and ``mda_form`` (see :mod:`en4dvar.schemes.esmda`). What a
+    localised scheme reads: see :mod:`en4dvar.localised`.
     """
 
     scheme: str = "en4dvar"  # one of those registered in en4dvar.schemes
@@ -190,3 +216,6 @@ class AssimilationSettings:
     mda_form: Annotated[
         Literal["perturbed", "square-root"], "Analysis of es-mda: perturbed observations, or a square root."
     ] = "perturbed"
+    localisation: Annotated[
+        Localising | None, "Which readings act on what: by distance, or by correlation; default: all on everything."
+    ] = None

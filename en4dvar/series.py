@@ -60,10 +60,10 @@ class Places:
         """Whether all readings were taken at the same place."""
         return bool(np.all(self.indices == self.indices[0]) and np.all(self.shares == self.shares[0]))
 
-    def read(self, values: Array) -> Array:
-        """(…, K) of a field at the time of each reading, (…, K, n)."""
-        readings = np.arange(values.shape[-2])[:, None]
-        return np.asarray(np.sum(values[..., readings, self.indices] * self.shares, axis=-1))
+    def read(self, values: Array, rows: npt.NDArray[np.intp] | slice = slice(None)) -> Array:
+        """(…, K) of a field at T instants, (…, T, n), each reading at one of the ``rows`` (K,)."""
+        instants = np.arange(values.shape[-2])[rows]
+        return np.asarray(np.sum(values[..., instants[:, None], self.indices] * self.shares, axis=-1))
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,8 @@ DISCREPANCY = (
 class Field:
     """A named block of a state vector; a perturbed initial state must lie strictly inside its ``bounds``.
 
-    ``coordinates`` (size,) in ``coordinate_unit`` say where its components are, so that data may say it as well.
+    ``coordinates`` (size,), or (size, D) in D dimensions, in ``coordinate_unit`` say where its components are, so that
+    data may say it as well. ``label``, ``symbol`` and ``display_unit`` are as of a parameter.
     """
 
     name: str
@@ -118,6 +119,13 @@ class Field:
     bounds: tuple[float, float] = (-np.inf, np.inf)
     coordinates: Array | None = field(default=None, compare=False)
     coordinate_unit: str = "1"
+    label: str = ""
+    symbol: str = ""
+    display_unit: str = ""
+
+    def __post_init__(self) -> None:
+        for key, value in (("label", self.name), ("symbol", self.name), ("display_unit", self.unit)):
+            object.__setattr__(self, key, getattr(self, key) or value)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 
 from en4dvar.config import Config
 from en4dvar.descent.preview import Preview
+from en4dvar.field_prior import FieldPrior
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.refine import may_sample
 from en4dvar.series import Part
@@ -25,13 +26,16 @@ def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
     first = problems[0]
     settings, rows = config.assimilation, [row for problem in problems for row in _data_rows(problem)]
     parts = [
-        f"{config.name}: {len(first.prior.names)} parameters from {len(problems)} data set(s) with "
+        f"{config.name}: {len(first.prior.names)} parameters{_and_cells(first)} from {len(problems)} data set(s) with "
         f"{settings.scheme}, {settings.members} members, weights {config.weights}, seed {config.seed}",
         table([("data set", "observations", "window", "maximum", "error std"), *rows]),
     ]
     for problem in problems if any(e.needs_data for e in config.parameters) else problems[:1]:
         title = f"estimated ({problem.observations.name})" if len(problems) > 1 else "estimated"
         parts.append(table([(title, "unit", "prior", "median", "5 %", "95 %"), *_prior_rows(problem)]))
+        if problem.fields:
+            fields = [_field_row(one) for one in problem.fields]
+            parts.append(table([("field", "cells", "std", "correlation"), *fields]))
         if correlated := _correlation_rows(problem):
             parts.append(table([("correlated in the prior", "correlation"), *correlated]))
         if problem.tied:
@@ -43,6 +47,16 @@ def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
             parts.append(table([("fixed", "value", "unit"), *fixed]))
     parts.append(f"run directory: {config.directory}")
     return "\n\n".join(parts)
+
+
+def _field_row(one: FieldPrior) -> tuple[str, ...]:
+    std = f"{100 * one.std:g} %" if one.relative else f"{one.std:g} {one.field.unit}"
+    return one.field.name, str(one.field.size), std, f"{one.kernel}, length {one.length:g} {one.field.coordinate_unit}"
+
+
+def _and_cells(problem: InverseProblem) -> str:
+    cells = sum(one.field.size for one in problem.fields)
+    return f" and {cells} cells of fields" if cells else ""
 
 
 def cost_summary(config: Config, one: Preview, count: int) -> str:

@@ -8,11 +8,14 @@ from functools import partial
 
 from en4dvar.config import Config
 from en4dvar.config.find_files import find_files, with_parts
+from en4dvar.config.initial_state import Perturbed
 from en4dvar.config.parameters import Fixed, Tied, Uncertain, inside_bounds
 from en4dvar.config.reading import read_observations
 from en4dvar.config.series import DataPlan, SeriesPlan
+from en4dvar.descent.field_gain import gain_of
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.errors import ConfigError, DataError, Fault
+from en4dvar.field_prior import FieldPrior
 from en4dvar.inputs.readers import Column, DataFile
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
@@ -59,22 +62,30 @@ def build_one(config: Config, name: str, file: DataFile) -> InverseProblem:
 def problem_of(config: Config, observations: Observations) -> InverseProblem:
     """The inverse problem of observations, wherever they come from. Raises :class:`ConfigError`."""
     terms, fixed = resolve_parameters(config, observations)
-    terms = (*terms, *(perturbed.term for perturbed in config.initial_state), *_discrepancy(config, observations))
+    perturbed = [one for one in config.initial_state if isinstance(one, Perturbed)]
+    terms = (*terms, *(one.term for one in perturbed), *_discrepancy(config, observations))
     estimated = {term.parameter.name for term in terms}
     tied = tuple(
         Tie(e.parameter, e.to, e.factor) for e in config.parameters if isinstance(e, Tied) and e.to in estimated
     )
-    perturbations = tuple(perturbed.perturbation for perturbed in config.initial_state)
+    perturbations = tuple(one.perturbation for one in perturbed)
+    fields = tuple(one for one in config.initial_state if isinstance(one, FieldPrior))
     varying = _varying(config, observations, terms)
     asked, count = config.assimilation, len(terms) + sum(len(one.terms) for one in varying)
-    if asked.sampling == "exact" and asked.members <= count:
+    localised = bool(fields) or asked.localisation is not None
+    if asked.sampling == "exact" and asked.members <= count and not localised:
         message = f"{asked.members} are too few for {count} parameters; at least {count + 1}"
         raise ConfigError([config.document.fault(("assimilation", "members"), message)])
     prior = Prior(terms, config.dependence)
-    problem = InverseProblem(config.model, config.observable, observations, prior, fixed, perturbations, tied)
+    problem = InverseProblem(config.model, config.observable, observations, prior, fixed, perturbations, tied, fields)
     if varying:
         problem = problem.varied(varying)
     check_problem(problem)
+    if localised:
+        try:
+            gain_of(problem, asked)
+        except ConfigError as error:
+            raise ConfigError([config.document.fault(("assimilation", "localisation"), str(error))]) from None
     return problem
 
 
@@ -113,8 +124,9 @@ def _discrepancy(config: Config, observations: Observations) -> tuple[PriorTerm,
 def data_files(plan: DataPlan) -> dict[str, DataFile]:
     """Name of the data set → file: the file's stem, made unique by its folders, then by a number.
 
-    Data sets of one file have the name of their part behind its name. Several series name as many files each: of one
-    data set the first series gives the name, of several they have the same names in every series.
+    A name of its own (``data.name``) goes before. Data sets of one file have the name of their part behind its name.
+    Several series name as many files each: of one data set the first series gives the name, of several they have the
+    same names in every series.
 
     Raises
     ------
@@ -122,6 +134,10 @@ def data_files(plan: DataPlan) -> dict[str, DataFile]:
     """
     found = [_files_of(one) for one in plan.series]
     first, *others = found
+    if (own := plan.series[0].data.name) is not None:
+        if len(first) != 1:
+            raise DataError(f"name: {own} is that of one data set, and there are {len(first)}; leave it out")
+        first = {own: next(iter(first.values()))}
     for one, files in zip(plan.series[1:], others, strict=True):
         if len(files) != len(first) or (len(first) > 1 and files.keys() != first.keys()):
             rest = [name for name in (*first, *files) if (name in first) != (name in files)]

@@ -12,11 +12,12 @@ from pydantic import AfterValidator, Field
 from en4dvar.config.columns import Columns
 from en4dvar.config.context import Context, Made, OfObservable
 from en4dvar.config.error import Error
-from en4dvar.config.places import PLACES, Placing, field_of
-from en4dvar.config.schema import Section
+from en4dvar.config.places import PLACES, Placing
+from en4dvar.config.schema import Name, Section
 from en4dvar.config.validate import Faults
 from en4dvar.config.weights import WEIGHTS, Weighing
 from en4dvar.config.window import WindowSection, read_time_zero
+from en4dvar.forward import field_of
 from en4dvar.hints import shown, suggest
 from en4dvar.inputs.readers import Disorder, Format, Layout, Repeated
 from en4dvar.inputs.text_table import Decimal
@@ -45,6 +46,8 @@ class Data(Section):
 
     path: Annotated[Files, Made(_files, Annotated[str | tuple[str, ...], AfterValidator(_not_empty)])]
     """A data file, a folder, a pattern such as data/*.csv, or a list of them; relative to this file's folder."""
+    name: Name | None = None
+    """Name of the data set, where there is one; default: that of its file (of several series, of the first's)."""
     format: Format | None = None
     """Format of the files; default: by their suffix."""
     decimal: Decimal = "."

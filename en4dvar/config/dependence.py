@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, cast
 
 import numpy as np
 from pydantic import Field
@@ -17,7 +17,7 @@ from en4dvar.config.document import Document
 from en4dvar.config.parameters import Entry, Uncertain
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
-from en4dvar.dependence import Dependence
+from en4dvar.dependence import Dependence, KernelName, correlation_of_places
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.files import expanded
 from en4dvar.hints import suggest
@@ -27,13 +27,6 @@ from en4dvar.prior import PriorTerm
 from en4dvar.state import Array, Parameter, TransformName
 
 KINDS = ("correlation", "matrix", "file", "kernel")
-NUGGET = 1e-8  # share of the variance that close neighbours keep to themselves: a smooth kernel is singular to rounding
-KERNELS: Mapping[str, Callable[[Array], Array]] = {  # of distances in correlation lengths
-    "exponential": lambda r: np.exp(-r),
-    "matern-3/2": lambda r: (1 + np.sqrt(3) * r) * np.exp(-np.sqrt(3) * r),
-    "matern-5/2": lambda r: (1 + np.sqrt(5) * r + 5 / 3 * r**2) * np.exp(-np.sqrt(5) * r),
-    "gaussian": lambda r: np.exp(-0.5 * r**2),
-}
 
 
 def _path(text: str, context: Context) -> Path:
@@ -54,7 +47,7 @@ class PriorCorrelation(Section):
     """Rows of the correlation matrix, in the order of the names."""
     file: Annotated[Path | None, Made(_path, Annotated[str, Field(min_length=1)], {"type": "string"})] = None
     """CSV file of the correlation matrix, without header, relative to the configuration's folder."""
-    kernel: Literal["exponential", "matern-3/2", "matern-5/2", "gaussian"] | None = None
+    kernel: KernelName | None = None
     """PriorCorrelation as a function of distance, for parameters with places: needs ``at`` and ``length``."""
     at: tuple[Position, ...] | None = None
     """Place of each parameter, a number or a list of coordinates."""
@@ -92,11 +85,7 @@ class PriorCorrelation(Section):
         places = [np.atleast_1d(np.asarray(place, dtype=float)) for place in self.at or ()]
         if len(places) != len(self.between) or len({len(place) for place in places}) != 1:
             raise ConfigError(f"at: give {len(self.between)} places, one a parameter, all with as many coordinates")
-        where = np.stack(places) / (self.length or 1.0)
-        distance = np.sqrt(np.sum((where[:, None] - where) ** 2, axis=-1))
-        found = (1 - NUGGET) * KERNELS[self.kernel or ""](distance)
-        np.fill_diagonal(found, 1.0)
-        return np.asarray(found)
+        return correlation_of_places(self.kernel or "", np.stack(places), self.length or 1.0)
 
 
 class PriorFile(Section):

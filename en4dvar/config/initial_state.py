@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NamedTuple, TypeVar
 
-from en4dvar.config.context import Context, Made, parse_spread, read_each
+from en4dvar.config.context import Context, Made, Spread, parse_spread, quantity, read_each
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
+from en4dvar.dependence import KernelName
+from en4dvar.field_prior import FieldPrior
 from en4dvar.forward import ForwardModel
 from en4dvar.hints import shown, suggest
 from en4dvar.prior import PriorTerm
@@ -18,10 +20,13 @@ T = TypeVar("T")
 
 
 class Perturbed(NamedTuple):
-    """What is estimated of a field, and what it does to the initial state."""
+    """What is estimated of a field as one number, and what it does to the initial state."""
 
     term: PriorTerm
     perturbation: StatePerturbation
+
+
+Initial = Perturbed | FieldPrior
 
 
 def perturbation(field: Field, std: str | float) -> Perturbed:
@@ -42,10 +47,27 @@ def perturbation(field: Field, std: str | float) -> Perturbed:
 
 
 class InitialSpread(Section):
-    """Spread of the initial value of a state field: in its unit (added), or in ``%`` (a factor)."""
+    """Spread of the initial value of a state field: in its unit (added), or in ``%`` (a factor).
 
-    std: Annotated[Perturbed, Made(lambda text, context: perturbation(context.subject, text))]
+    One number for all components, or, with ``kernel`` and ``length``, each component by itself, correlated by a
+    function of their distance; the scheme then has to be localised.
+    """
+
+    std: Annotated[Spread, Made(lambda text, context: parse_spread(text, context.subject.unit))]
     """Standard deviation: in the field's unit (added to it), or in % (a factor)."""
+    kernel: KernelName | None = None
+    """Correlation of the components as a function of their distance."""
+    length: Annotated[float, quantity(lambda context: str(context.subject.coordinate_unit), "positive")] | None = None
+    """Correlation length of the kernel, in the unit of the field's coordinates."""
+
+    @classmethod
+    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        for key, other in (("kernel", "length"), ("length", "kernel")):
+            if key in given and other not in given:
+                faults.add((key,), f"kernel and length go together; give {other} as well", at_key=True)
+        if "kernel" in given and context.subject.coordinates is None:
+            name = context.subject.name
+            faults.add(("kernel",), f"the model gives no coordinates for {name}, so that no distance is known")
 
 
 def dynamic_fields(model: ForwardModel) -> dict[str, Field]:
@@ -69,9 +91,12 @@ def read_fields(
         return tuple(read_each(given, fields, context, faults, read, unknown).values())
 
 
-def _perturbed(given: Mapping[str, Any], context: Context) -> tuple[Perturbed, ...]:
-    def read(entry: Any, context: Context) -> Perturbed:
-        return InitialSpread.model_validate(entry, context=context).std
+def _perturbed(given: Mapping[str, Any], context: Context) -> tuple[Initial, ...]:
+    def read(entry: Any, context: Context) -> Initial:
+        section, field = InitialSpread.model_validate(entry, context=context), context.subject
+        if section.kernel is None or section.length is None:
+            return perturbation(field, entry["std"])
+        return FieldPrior(field, section.std.value, section.kernel, section.length, section.std.relative)
 
     return read_fields(given, context, "give it a prior in parameters", read)
 

@@ -14,7 +14,7 @@ from en4dvar.config.data import Data
 from en4dvar.config.dependence import PriorCorrelation, PriorFile, resolved
 from en4dvar.config.design import Design
 from en4dvar.config.document import Document, document_from, override
-from en4dvar.config.initial_state import PERTURBED, Perturbed
+from en4dvar.config.initial_state import PERTURBED, Initial, Perturbed
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, entries
 from en4dvar.config.schema import Assimilation, Execution, File, Output, Section
@@ -47,8 +47,9 @@ class Estimation(File):
     """A file of members, for the parameters with ``{prior: ensemble}``."""
     prior_correlation: tuple[PriorCorrelation, ...] | None = None
     """Which parameters are correlated in the prior, and how."""
-    initial_state: Annotated[tuple[Perturbed, ...], PERTURBED] | None = None
-    """Fields of the initial state that are uncertain, each with its ``std``."""
+    initial_state: Annotated[tuple[Initial, ...], PERTURBED] | None = None
+    """Fields of the initial state that are uncertain, each with its ``std``; with a ``kernel`` and a ``length`` cell by
+    cell."""
     model_error: Annotated[tuple[ErrorOf, ...], MODEL_ERROR] | None = None
     """Fields of the state that change at knots by what the model does not know, each with its ``std``."""
     assimilation: Assimilation = Assimilation()
@@ -89,7 +90,7 @@ class Config:
     directory: Path
     simulate_times: Array | None
     resolved: str
-    initial_state: tuple[Perturbed, ...] = ()
+    initial_state: tuple[Initial, ...] = ()
     model_error: tuple[ErrorOf, ...] = ()
     dependence: tuple[Dependence, ...] = ()
     design: Design = field(default_factory=Design)
@@ -127,7 +128,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
     file = read.file
     own = {p.name for p in read.model.parameters}
     apart = {} if NOISE_SCALE.name in own else {NOISE_SCALE.name: "it is the scale of the errors"}
-    others = [perturbed.term.parameter.name for perturbed in file.initial_state or ()]
+    others = [one.term.parameter.name for one in file.initial_state or () if isinstance(one, Perturbed)]
     parameters, blocks = resolved(file.parameters, file.prior, file.prior_correlation or (), others, apart, document)
     return Config(
         document=document,

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Discriminator, Field, StrictInt, Tag
 from en4dvar.config.context import Context, Made
 from en4dvar.config.schema import Section
 from en4dvar.errors import ConfigError, DataError, Fault
-from en4dvar.forward import ForwardModel, Observable, StateField
+from en4dvar.forward import field_of
 from en4dvar.inputs.readers import Column
 from en4dvar.series import Places
 from en4dvar.state import Array
@@ -77,16 +77,12 @@ def placing(given: Any, context: Context) -> Placing:
     return Placing(positions=np.array([parse_quantity(e, target.coordinate_unit) for e in entries]), of=target)
 
 
-def field_of(model: ForwardModel, observable: Observable) -> StateBlock | None:
-    """The field of the state that an observable reads, where it reads one as it is."""
-    if not isinstance(observable.operator, StateField):
-        return None
-    return next((block for block in model.layout if block.name == observable.operator.name), None)
-
-
 def _coordinates(block: StateBlock | None, key: str) -> StateBlock:
     if block is None or block.coordinates is None:
         message = "the model gives no coordinates for what is observed; write indices, counted from 0, without a unit"
+        raise ConfigError([Fault(message, key)])
+    if np.ndim(block.coordinates) > 1:
+        message = f"{block.name} has several coordinates a place; write indices, counted from 0, without a unit"
         raise ConfigError([Fault(message, key)])
     return block
 

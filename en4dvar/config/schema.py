@@ -24,12 +24,12 @@ from pydantic import (
 from pydantic.functional_validators import ModelWrapValidatorHandler
 from pydantic_core import from_json, to_json
 
-from en4dvar.config.context import Context, Unknown
+from en4dvar.config.context import Context, Made, Unknown, quantity
 from en4dvar.config.validate import Faults
 from en4dvar.executor.limits import Limits, parse_bytes
-from en4dvar.problem import AssimilationSettings
+from en4dvar.problem import AssimilationSettings, Localising
 from en4dvar.schemes import ON_A_WINDOW
-from en4dvar.units import Quantity
+from en4dvar.units import Quantity, parse_quantity
 
 QuantityText = str | int | float
 Name = Annotated[str, Field(pattern=r"^\w[\w.+ -]*$", max_length=100)]
@@ -153,6 +153,41 @@ class Execution(Section):
         return self
 
 
+def _of_coordinates(context: Context) -> str:
+    """The unit of the first field of the state that has coordinates."""
+    return next((f.coordinate_unit for f in context.units.layout if f.coordinates is not None), "1")
+
+
+class Localise(Section):
+    """Which readings act on what: by distance, or by correlation for what has no place."""
+
+    by: Literal["distance", "correlation"] = "distance"
+    """distance: covariances are tapered (Gaspari and Cohn); correlation: a reading acts on what the ensemble correlates
+    it with by more than chance (es-mda)."""
+    radius: Annotated[float, quantity(_of_coordinates, "positive")] | None = None
+    """Radius of the taper, in the unit of the model's coordinates; no influence from twice this distance on."""
+    at: dict[str, QuantityText | tuple[QuantityText, ...]] | None = None
+    """Places of parameters, and of series that are no part of a field: ``{k_1: [0, 50], well: [10, 20]}``."""
+    threshold: Annotated[float, Field(gt=0, lt=1)] | None = None
+    """Size of correlations below which they are taken for chance; default 3/√N."""
+
+    @classmethod
+    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        by = given.get("by", "distance")
+        if by == "distance" and not {"radius", "threshold"} & given.keys():
+            faults.add(("radius",), "required: how far a reading acts, or write by: correlation")
+        for key in {"distance": ("threshold",), "correlation": ("radius", "at")}.get(str(by), ()):
+            if key in given:
+                faults.add((key,), f"not with by: {by}", at_key=True)
+
+
+def _localising(section: Localise, context: Context) -> Localising:
+    unit = _of_coordinates(context)
+    places = {name: where if isinstance(where, tuple) else (where,) for name, where in (section.at or {}).items()}
+    at = {name: tuple(parse_quantity(text, unit) for text in where) for name, where in places.items()}
+    return Localising(section.radius, at, section.threshold)
+
+
 _Settings: Any = section_of(AssimilationSettings)
 if TYPE_CHECKING:
     OnAWindow = str
@@ -169,6 +204,9 @@ class Assimilation(_Settings):
     weights: Literal["sum", "mean", "balanced"] = "sum"
     """sum: every observation counts (the Bayesian posterior); mean: β = 1/K, as in the published code; balanced: every
     series, or group of series, counts as if it had as many readings as the others. The latter two are not Bayesian."""
+    localisation: Annotated[Localising, Made(_localising, Localise)] | None = None
+    """Which readings act on what, for fields and for many parameters; schemes en4dvar and es-mda. Default: all readings
+    on everything."""
 
     @property
     def settings(self) -> AssimilationSettings:

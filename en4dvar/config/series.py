@@ -64,8 +64,8 @@ class DataPlan:
         common, written = _common(given), dict[str, Any]()
         for one in self.series:
             section = one.data.as_written(_merged(common, given["series"][one.name]))
-            written[one.name] = {key: value for key, value in section.items() if value is not None}
-        rest = {"correlation": given["correlation"]} if given.get("correlation") else {}
+            written[one.name] = {key: value for key, value in section.items() if value is not None and key != "name"}
+        rest = {key: given[key] for key in ("name", "correlation") if given.get(key)}
         return {"series": written, **rest}
 
 
@@ -109,6 +109,10 @@ def _plan(section: DataOfSeries, context: Context) -> DataPlan:
                 faults.add(("series", name), "expected 'key: value' lines")
                 continue
 
+            if "name" in own:
+                words = "a data set has one name; write it above the series"
+                faults.add(("series", name, "name"), words, at_key=True)
+                continue
             if fault := _name_fault(name, {**common, **own}, context):
                 faults.add(("series", name), fault, at_key=True)
                 continue

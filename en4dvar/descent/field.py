@@ -1,4 +1,4 @@
-r"""Fields and many parameters from Python: localised ES-MDA and En4D-Var on arrays.
+r"""Fields and many parameters: localised ES-MDA and En4D-Var on arrays.
 
 What is estimated is an ensemble (N, n) that is changed in place, n up to millions: nothing of its size is made beside
 it but a few vectors (n,) and what the model makes of a few members at a time.
@@ -20,51 +20,18 @@ Geosciences 55, 3 (ES-MDA).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
+from en4dvar.descent.field_data import FieldData, Members, Pass, mean_of, silent
 from en4dvar.errors import En4dvarError
-from en4dvar.prior import member_stream
 from en4dvar.schemes.esmda import ESMDA
-from en4dvar.schemes.local_gain import ByDistance, Gain, parts
+from en4dvar.schemes.local_gain import ByDistance, Gain, Update, parts
 from en4dvar.state import Array
 
-Forward = Callable[[Array], Array]  # members (M, n) → predictions (M, K)
 TRIALS, SHORTER = 8, 0.3  # steps that are tried, each so much shorter than the one before
-
-
-@dataclass(frozen=True)
-class FieldData:
-    """Readings ``values`` (K,) with independent errors ``std`` (K,), and the model that predicts them.
-
-    ``forward``: members (M, n) → predictions (M, K); it gets ``at_once`` members in a call.
-    """
-
-    values: Array
-    std: Array
-    forward: Forward
-    at_once: int = 16
-
-    def predict(self, members: Callable[[slice], Array], count: int) -> Array:
-        """Predictions (count, K) of members that are made a few at a time. Raises :class:`En4dvarError`."""
-        found = np.empty((count, len(self.values)))
-        for first in range(0, count, self.at_once):
-            some = slice(first, min(first + self.at_once, count))
-            found[some] = np.asarray(self.forward(members(some)), dtype=float)
-        if not np.isfinite(found).all():
-            lost = np.flatnonzero(~np.isfinite(found).all(axis=1))
-            raise En4dvarError(f"{len(lost)} of {count} members have predictions that are not finite, first {lost[0]}")
-        return found
-
-    def width(self, members: int) -> int:
-        """Numbers that a cell takes in an update."""
-        return max(len(self.values), members)
-
-    def perturbations(self, seed: int, purpose: str, count: int) -> Array:
-        """Centred draws (count, K) of the errors."""
-        z = np.stack([member_stream(seed, purpose, i).standard_normal(len(self.values)) for i in range(count)])
-        return np.asarray(self.std * (z - z.mean(axis=0)))
 
 
 def field_esmda(
@@ -73,29 +40,49 @@ def field_esmda(
     gain: Gain,
     coefficients: Sequence[float] = (4.0, 4.0, 4.0, 4.0),
     seed: int = 0,
-) -> None:
+    fewest: int | None = None,
+    first: Array | None = None,
+    tell: Callable[[Pass], None] = silent,
+) -> Members:
     """Prior members (N, n) → posterior members, in place, by ES-MDA with a localised gain.
+
+    Returns the members that came through all passes, ``fewest`` at least, by default all; the others stay where they
+    failed. ``first`` (N, K): predictions of the prior members, where they are known. ``tell`` hears of each pass.
 
     Raises :class:`En4dvarError`: predictions that are not finite.
     """
-    n_members = len(ensemble)
+    alive = np.arange(len(ensemble))
     for a, alpha in enumerate(ESMDA(tuple(coefficients)).inflations):
-        predictions = data.predict(lambda some: ensemble[some], n_members)
-        errors = np.sqrt(alpha) * data.perturbations(seed, f"ES-MDA {a}", n_members)
-        Y = predictions - predictions.mean(axis=0)
-        update = gain.update(Y, alpha * data.std**2, data.values + errors - predictions)
-        for part in parts(ensemble.shape[1], data.width(n_members)):
-            here = ensemble[:, part]
-            here += update(part, here - here.mean(axis=0))
+        predictions = _of_some(ensemble, alive, data, fewest) if a or first is None else first
+        found = np.isfinite(predictions).all(axis=1)
+        alive, predictions = alive[found], predictions[found]
+        errors = np.sqrt(alpha) * data.perturbations(seed, f"ES-MDA {a}", alive)
+        mean = predictions.mean(axis=0)
+        tell(Pass(mean_of(ensemble, alive), mean, partial(_part_of, ensemble, alive)))
+        update = gain.update(predictions - mean, alpha * data.std**2, data.values + errors - predictions)
+        for part in parts(ensemble.shape[1], data.width(len(ensemble))):
+            here = ensemble[alive, part]
+            ensemble[alive, part] = here + update(part, here - here.mean(axis=0))
+    return alive
+
+
+def _of_some(ensemble: Array, alive: Members, data: FieldData, fewest: int | None) -> Array:
+    return data.predict(lambda some: ensemble[alive[some]], len(alive), fewest)
+
+
+def _part_of(ensemble: Array, alive: Members, part: slice) -> Array:
+    return np.asarray(ensemble[alive, part])
 
 
 @dataclass
 class FieldDescent:
-    """Where a descent ended: the ``centre`` (n,), ``costs`` J of each iterate, and whether it ``converged``."""
+    """Where a descent ended: the ``centre`` (n,), ``costs`` J of each iterate, whether it ``converged``, and why it
+    stopped."""
 
     centre: Array
     costs: list[float] = field(default_factory=list)
     converged: bool = False
+    stop: str = ""
     forward_runs: int = 0
 
 
@@ -109,17 +96,18 @@ def field_en4dvar(
     tolerance: float = 1e-3,
     cost_tolerance: float = 1e-3,
     seed: int = 0,
+    tell: Callable[[Pass], None] = silent,
 ) -> FieldDescent:
     """Prior members (N, n) → posterior members, in place, by En4D-Var with localised covariances.
 
-    It has converged where the next step is shorter than ``tolerance`` prior standard deviations of the predictions that
-    it moves most, or J falls by less than ``cost_tolerance`` of it: where H is not local, the tapered tangent is not
-    quite the gradient of J, and further steps creep. Raises :class:`En4dvarError`: predictions that are not finite.
-    ValueError: another gain, for which there is no J.
+    It has converged where the next step is shorter than ``tolerance`` posterior standard deviations of the prediction
+    that it moves most, or J falls by less than ``cost_tolerance`` of it: where H is not local, the tapered tangent is
+    not quite the gradient of J, and further steps creep. ``tell`` hears of each iterate. Raises
+    :class:`En4dvarError`: predictions that are not finite. ValueError: another gain, for which there is no J.
     """
     if not isinstance(gain, ByDistance):
         raise ValueError("En4D-Var is localised by distance; without places use field_esmda(…, ByCorrelation())")
-    return _Descent(ensemble, data, gain, epsilon).run(max_iterations, tolerance, cost_tolerance, seed)
+    return _Descent(ensemble, data, gain, epsilon, seed, tell).run(max_iterations, tolerance, cost_tolerance)
 
 
 @dataclass(frozen=True)
@@ -138,15 +126,30 @@ class _Local:
         return np.asarray(np.linalg.solve(system, self.innovation + a * self.moved), dtype=np.float64)
 
     @property
+    def dfs(self) -> float:
+        """The trace of H B Hᵀ (H B Hᵀ + R)⁻¹."""
+        return float(np.trace(np.linalg.solve(self.covariance + np.diag(self.variance), self.covariance)))
+
+    @property
     def length(self) -> float:
-        """Of the full step: the largest change of a prediction, in its prior standard deviations."""
-        spread = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
-        return float(np.max(np.abs(self.covariance @ self.dual() - self.moved) / spread))
+        """Of the full step: the largest change of a prediction, in its posterior standard deviations."""
+        C = self.covariance
+        variance = np.diag(C) - np.sum(C * np.linalg.solve(C + np.diag(self.variance), C), axis=0)
+        return float(np.max(np.abs(C @ self.dual() - self.moved) / np.sqrt(np.maximum(variance, 1e-300))))
 
 
 class _Descent:
-    def __init__(self, ensemble: Array, data: FieldData, gain: ByDistance, epsilon: float):
-        self.data, self.gain, self.epsilon = data, gain, epsilon
+    def __init__(
+        self,
+        ensemble: Array,
+        data: FieldData,
+        gain: ByDistance,
+        epsilon: float,
+        seed: int,
+        tell: Callable[[Pass], None],
+    ):
+        self.data, self.gain, self.epsilon, self.tell = data, gain, epsilon, tell
+        self.errors = data.perturbations(seed, "En4D-Var field", range(len(ensemble)))
         self.mean = ensemble.mean(axis=0)
         self.anomalies = ensemble
         self.anomalies -= self.mean  # in place: this is the ensemble from now on, until :meth:`spread` ends it
@@ -154,7 +157,7 @@ class _Descent:
         self.duals: list[Array] = []  # λ_k (K,)
         self.at = FieldDescent(self.mean.copy())
 
-    def run(self, max_iterations: int, tolerance: float, cost_tolerance: float, seed: int) -> FieldDescent:
+    def run(self, max_iterations: int, tolerance: float, cost_tolerance: float) -> FieldDescent:
         at = self.at
         try:
             prediction = self.predict_one(at.centre)
@@ -162,23 +165,30 @@ class _Descent:
             while True:
                 tangent = self.tangent(prediction)
                 here = self.local(prediction, tangent)
-                at.converged = here.length <= tolerance or self._creeps(cost_tolerance)
-                moved = None
-                if not at.converged and len(at.costs) <= max_iterations:
-                    moved = self.move(here)
+                before, moved = self._pass(prediction, here), None
+                self._judge(here.length, max_iterations, tolerance, cost_tolerance)
+                if not at.stop and (moved := self.move(here)) is None:
+                    at.stop = "no decrease of J along the step"
+                share, prediction = moved or (0.0, prediction)
+                self.tell(replace(before, share=share))
                 if moved is None:
                     break
-                prediction = moved
-            self.spread(tangent, seed)
+            self.spread(tangent)
         except BaseException:
             self.anomalies += self.mean  # the prior, as it was
             raise
         return at
 
-    def _creeps(self, cost_tolerance: float) -> bool:
-        """Whether the last move lowered J by too little to go on."""
-        costs = self.at.costs
-        return len(costs) > 1 and costs[-2] - costs[-1] < cost_tolerance * costs[-1]
+    def _judge(self, length: float, max_iterations: int, tolerance: float, cost_tolerance: float) -> None:
+        """Whether the descent ends here, and why."""
+        at, costs = self.at, self.at.costs
+        if length <= tolerance:
+            at.stop = f"step of {length:.2g} posterior standard deviations"
+        elif len(costs) > 1 and costs[-2] - costs[-1] < cost_tolerance * costs[-1]:
+            at.stop = f"relative decrease of J below {cost_tolerance:g}"
+        at.converged = bool(at.stop)
+        if not at.stop and len(costs) > max_iterations:
+            at.stop = f"iteration limit ({max_iterations}) reached"
 
     def predict_one(self, x: Array) -> Array:
         self.at.forward_runs += 1
@@ -204,13 +214,28 @@ class _Descent:
 
     def cost(self, prediction: Array, tangents: Sequence[Array], duals: Sequence[Array]) -> float:
         """J of the iterate x̄0 + Σ_k L_k λ_k."""
-        pairs = list(zip(tangents, duals, strict=True))
-        background = sum(float(a @ self.gain.between(Y, Z) @ b) for Y, a in pairs for Z, b in pairs)
         misfit = (self.data.values - prediction) / self.data.std
-        return 0.5 * background + 0.5 * float(misfit @ misfit)
+        return self.background(tangents, duals) + 0.5 * float(misfit @ misfit)
 
-    def move(self, here: _Local) -> Array | None:
-        """Take the longest step that lowers J; the prediction there, None where none does."""
+    def background(self, tangents: Sequence[Array], duals: Sequence[Array]) -> float:
+        """J_b of the iterate x̄0 + Σ_k L_k λ_k."""
+        pairs = list(zip(tangents, duals, strict=True))
+        return 0.5 * sum(float(a @ self.gain.between(Y, Z) @ b) for Y, a in pairs for Z, b in pairs)
+
+    def _pass(self, prediction: Array, here: _Local) -> Pass:
+        """The iterate as it is told, with the posterior ensemble of its tangent."""
+        centre, update = self.at.centre, self.update(here.tangent)
+
+        def members(part: slice) -> Array:
+            anomalies = self.anomalies[:, part]
+            return np.asarray(centre[part] + anomalies + update(part, anomalies))
+
+        background = self.background(self.tangents, self.duals)
+        return Pass(centre, prediction, members, background, here.length, dfs=here.dfs)
+
+    def move(self, here: _Local) -> tuple[float, Array] | None:
+        """Take the longest step that lowers J; its share of the full one and the prediction there, None where none
+        does."""
         for k in range(TRIALS):
             a = SHORTER**k
             dual = a * here.dual(a)
@@ -226,13 +251,16 @@ class _Descent:
             if cost < self.at.costs[-1]:
                 self.at.centre, self.tangents, self.duals = x, tangents, duals
                 self.at.costs.append(cost)
-                return prediction
+                return a, prediction
         return None
 
-    def spread(self, tangent: Array, seed: int) -> None:
+    def update(self, tangent: Array) -> Update:
+        """What turns prior anomalies into posterior ones."""
+        return self.gain.update(tangent, self.data.std**2, self.errors - tangent)
+
+    def spread(self, tangent: Array) -> None:
         """The posterior ensemble about the centre, in place of the anomalies."""
-        errors = self.data.perturbations(seed, "En4D-Var field", len(self.anomalies))
-        update = self.gain.update(tangent, self.data.std**2, errors - tangent)
+        update = self.update(tangent)
         for part in parts(self.anomalies.shape[1], self.data.width(len(self.anomalies))):
             here = self.anomalies[:, part]
             here += update(part, here)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from en4dvar.descent.field_data import prior_members
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.forecast import Forecast, forecast, plotting_times
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
@@ -26,9 +27,9 @@ CHALLENGER = 0.5  # of a descent, until one from a far member has come to the sa
 class Preview:
     """The prior ensemble of one data set before any assimilation.
 
-    ``run`` is the forecast of its ``members`` (N, n), physical: predictions (N, K) and, along ``grid`` (M,), paths
-    (N, M); of the first ones only where all would take long. ``seconds`` is the time of one forward run on one thread,
-    ``runs`` how many an estimate takes, typically.
+    ``run`` is the forecast of its ``members`` (N, n), physical and without whole fields: predictions (N, K) and, along
+    ``grid`` (M,), paths (N, M); of the first ones only where all would take long. ``seconds`` is the time of one
+    forward run on one thread, ``runs`` how many an estimate takes, typically.
     """
 
     problem: InverseProblem
@@ -58,15 +59,19 @@ def preview(problem: InverseProblem, settings: AssimilationSettings, seed: int, 
     grid = plotting_times(problem)
     executor = SerialExecutor()
     with one_blas_thread():
-        space = WeightSpace(problem, settings, seed, executor)
-        forecast(problem, space.members[:1], executor, grid)
-        seconds, count = _seconds_per_run(problem, space.members, executor)
-        members = space.members if whole or seconds * len(space.members) < LONGEST else space.members[:count]
-        run = forecast(problem, members, executor, grid)
-        runs = expected_runs(space)
-        if problem.varying:  # its evidence takes a second fit
+        if problem.fields or settings.localisation:
+            every, runs = prior_members(problem, settings, seed), localised_runs(settings)
+        else:
+            space = WeightSpace(problem, settings, seed, executor)
+            every, runs = space.members, expected_runs(space)
+        if problem.varying and not settings.localisation:  # its evidence takes a second fit
             runs += expected_runs(WeightSpace(problem.constant, settings, seed, executor))
-    return Preview(problem, grid, problem.prior.to_physical(members), run, seconds, runs)
+        forecast(problem, every[:1], executor, grid)
+        seconds, count = _seconds_per_run(problem, every, executor)
+        members = every if whole or seconds * len(every) < LONGEST else every[:count]
+        run = forecast(problem, members, executor, grid)
+    named = problem.prior.to_physical(members[:, : len(problem.prior.terms)])
+    return Preview(problem, grid, named, run, seconds, runs)
 
 
 def _seconds_per_run(problem: InverseProblem, members: Array, executor: Executor) -> tuple[float, int]:
@@ -79,6 +84,14 @@ def _seconds_per_run(problem: InverseProblem, members: Array, executor: Executor
         if elapsed > ENOUGH or count == len(members):
             return elapsed / count, count
         count = min(len(members), 2 * count)
+
+
+def localised_runs(settings: AssimilationSettings) -> int:
+    """Forward runs of a localised estimate, with a typical number of iterations."""
+    n_members = settings.members
+    if settings.scheme == "en4dvar":
+        return 2 * n_members + 2 + min(ITERATIONS, settings.max_iterations) * (n_members + SEARCH)
+    return (len(settings.mda_coefficients) + 1) * n_members + 1
 
 
 def expected_runs(space: WeightSpace) -> int:

@@ -90,9 +90,10 @@ class Composite:
         """
         problem = self.problem
         times, reading, size, at_observations, at_extra = self._reading(extra_times)
-        physical = problem.prior.to_physical(x)
+        named = len(problem.prior.terms)
+        physical = problem.prior.to_physical(x[:, :named])
         failures = out_of_bounds(problem.prior, physical)
-        alive, states = self._initial_states(physical, failures)
+        alive, states = self._initial_states(physical, failures, x[:, named:])
         shift = time_shift(problem, physical)
         shifted = times + shift[alive, None]
         outcomes = self.executor.trajectories(problem.model, states, shifted) if len(states) else ()
@@ -183,6 +184,8 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
     ConfigError: a parameter neither fixed nor estimated, both, or unknown to the model; a timing error on an
         observable without a rate.
     """
+    if not problem.prior.terms and not problem.fields:
+        raise ConfigError("prior: at least one parameter must be estimated")
     perturbed = [p.parameter for p in problem.perturbations]
     discrepancy = problem.discrepancy
     known = {p.name: p for p in (*OF_READINGS, *discrepancy, *perturbed, *problem.model.parameters)}

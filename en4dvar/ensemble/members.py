@@ -18,7 +18,7 @@ from en4dvar.executor import Outcome
 from en4dvar.forward import Failure, ValidityLimit
 from en4dvar.prior import Prior
 from en4dvar.problem import InverseProblem, Tie
-from en4dvar.state import Array
+from en4dvar.state import Array, Field
 from en4dvar.user_code import own_fault, reason_of
 
 Indices = npt.NDArray[np.intp] | slice
@@ -50,28 +50,28 @@ class InitialStates:
         self.fixed = tuple((name, float(problem.fixed[name])) for name in own if name in problem.fixed)
         self.perturbed = tuple((p, columns.get(p.parameter.name)) for p in problem.perturbations)
 
-    def __call__(self, physical: Array, failures: list[str]) -> tuple[Indices, Array]:
+    def __call__(self, physical: Array, failures: list[str], cells: Array | None = None) -> tuple[Indices, Array]:
         """Which members (B', of B) have an initial state, and the states (B', n_state).
 
-        ``physical`` (B, n) is the control vector. Members with an entry in ``failures`` (B,) have no state; the reasons
-        of those that the model refuses are added there.
+        ``physical`` (B, n) is the control vector, ``cells`` (B, m) what it says of whole fields. Members with an entry
+        in ``failures`` (B,) have no state; the reasons of those that the model refuses are added there.
         """
-        alive = _without(failures)
+        alive, cells = _without(failures), np.empty((len(physical), 0)) if cells is None else cells
         if all(failures):
             return alive, np.empty((0, self.size))
         try:
-            return alive, self._build(physical[alive])
+            return alive, self._build(physical[alive], cells[alive])
         except BaseException as error:  # some member has no state: find out which, one by one
             own_fault(error)
             states = []
         for i in np.arange(len(failures))[alive]:
             try:
-                states.append(self._build(physical[i : i + 1]))
+                states.append(self._build(physical[i : i + 1], cells[i : i + 1]))
             except BaseException as error:  # a model may refuse parameters in any way; the reason is kept
                 failures[i] = reason_of(error)
         return _without(failures), np.concatenate([np.empty((0, self.size)), *states])
 
-    def _build(self, physical: Array) -> Array:
+    def _build(self, physical: Array, cells: Array) -> Array:
         """States (B, n_state); ValueError where one is not a state."""
         theta = {name: physical[:, j] for name, j in self.estimated}
         theta |= {name: np.full(len(physical), value) for name, value in self.fixed}
@@ -79,26 +79,34 @@ class InitialStates:
         states = np.asarray(self.problem.model.initial_states(theta), dtype=float)
         if states.shape != (len(physical), self.size):
             raise ValueError("misshapen initial state")
-        if self.perturbed:
-            states = self._perturb(states.copy(), physical)
+        if self.perturbed or self.problem.fields:
+            states = self._perturb(states.copy(), physical, cells)
         if not np.isfinite(states).all():
             raise ValueError("non-finite initial state")
         return states
 
-    def _perturb(self, states: Array, physical: Array) -> Array:
+    def _perturb(self, states: Array, physical: Array, cells: Array) -> Array:
         """States (B, n_state) with the perturbations of the control vector; ValueError outside a field's bounds."""
         layout = self.problem.model.layout
         fields = {f.name: f for f in layout}
+        for prior, columns in self.problem.columns_of_fields:
+            where = layout[prior.field.name]
+            states[:, where] = prior.applied(states[:, where], cells[:, columns])
+            _require_inside(states[:, where], prior.field)
         for perturbation, column in self.perturbed:
             fixed = self.problem.fixed
             value = fixed[perturbation.parameter.name] if column is None else physical[:, column, None]
             where = layout[perturbation.field]
             states[:, where] = states[:, where] * value if perturbation.relative else states[:, where] + value
-            low, high = fields[perturbation.field].bounds
-            if not np.all((states[:, where] > low) & (states[:, where] < high)):
-                unit = fields[perturbation.field].unit
-                raise ValueError(f"perturbed initial {perturbation.field} outside ({low:g}, {high:g}) {unit}")
+            _require_inside(states[:, where], fields[perturbation.field])
         return states
+
+
+def _require_inside(values: Array, block: Field) -> None:
+    """ValueError where a perturbed field leaves its bounds."""
+    low, high = block.bounds
+    if not np.all((values > low) & (values < high)):
+        raise ValueError(f"perturbed initial {block.name} outside ({low:g}, {high:g}) {block.unit}")
 
 
 def _followed(tie: Tie, values: Array) -> Array:

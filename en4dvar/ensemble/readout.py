@@ -43,7 +43,7 @@ class Readout:
             if part.places is None:
                 found.append(values[..., rows])
             else:
-                found.append(part.places.read(values[..., rows, :]))
+                found.append(part.places.read(values, rows))
             if part.has_path:
                 at = values[..., self.along] if part.places is None else values[..., self.along, :]
                 curves.append(part.read_along(at))

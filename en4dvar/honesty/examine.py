@@ -32,13 +32,14 @@ NO_SPREAD = 1e-8  # of the prior's: members that agree to rounding
 class ControlEnsembles:
     """The ensembles of an analysis as control vectors, that is in transformed space, and J of the posterior.
 
-    N members, n parameters. ``costs`` (N,) are +inf where a member failed.
+    N members, n parameters. ``costs`` (N,) are +inf where a member failed, and None of a localised scheme, whose J is
+    not that of these members; whole fields are no part of it.
     """
 
     prior: Array  # (N, n)
     posterior: Array  # (N, n)
     centre: Array  # (n,)
-    costs: Array
+    costs: Array | None
     centre_cost: float
 
 
@@ -64,14 +65,13 @@ def examine(
         *checks.down_weighted(a),
         *checks.weighted(a),
         *unfinished(a),
-        *checks.rank(prior, control.prior, control.posterior[alive]),
-        *collapse(prior, control, alive),
+        *_whole(prior, control, alive),
         *loss("prior forecast", a.prior_failures, prior, control.prior),
         *loss("iterations", worst_loss, prior),
         *loss("posterior forecast", a.posterior_failures, prior, control.posterior),
         *_fit(a, odd),
         *odd,
-        *checks.conflict(prior, control.centre),
+        *(checks.conflict(prior, control.centre) if control.costs is not None else ()),
         *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
         *_validity(a, alive),
         *checks.gaussian(prior, members, a.shape),
@@ -79,6 +79,13 @@ def examine(
     silent = {name for name in prior.names if untrusted(warnings, name)} | _changes(a)
     little = checks.information(prior, control.posterior[alive], a.dfs_per_parameter, silent)
     return worst_first((*warnings, *little))
+
+
+def _whole(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool_]) -> checks.Findings:
+    """What spoils the directions and the size of an ensemble that stands for the whole covariance."""
+    if control.costs is not None:
+        yield from checks.rank(prior, control.prior, control.posterior[alive])
+        yield from collapse(prior, control, alive)
 
 
 def _changes(a: Analysis) -> set[str]:
@@ -154,7 +161,9 @@ def collapse(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool
 
     The lowest J met, of a member or of the centre, stands for the minimum.
     """
-    alive = alive & np.isfinite(control.costs)
+    assert control.costs is not None
+    costs = control.costs
+    alive = alive & np.isfinite(costs)
     if alive.sum() < 2:
         return
     narrow = control.posterior[alive].std(axis=0) <= NO_SPREAD * prior.std
@@ -163,8 +172,8 @@ def collapse(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool
         words = f"the ensemble has collapsed: all members have the same {names}"
         yield caution("ensemble-collapse", words, parameters=tuple(names.split(", ")))
         return
-    lowest = min(control.centre_cost, float(control.costs[alive].min()))
-    allowed = float(np.mean(2 * (control.costs[alive] - lowest))) / len(control.centre)
+    lowest = min(control.centre_cost, float(costs[alive].min()))
+    allowed = float(np.mean(2 * (costs[alive] - lowest))) / len(control.centre)
     if allowed < COLLAPSED:
         words = f"its spread is about {math.sqrt(allowed):.2g} of what the data and the prior allow"
         yield caution("ensemble-collapse", f"the ensemble has collapsed: {words}")

@@ -40,6 +40,8 @@ class JointProblem:
             raise ConfigError(f"data sets of a joint estimate need names of their own: {', '.join(again)} twice")
         for one, groups in zip(self.experiments, self.groups, strict=True):
             check_problem(one)
+            if one.fields:
+                raise ConfigError(f"{one.observations.name}: whole fields cannot be estimated jointly")
             if one.prior.blocks:
                 raise ConfigError(f"{one.observations.name}: a joint estimate needs priors that are not correlated")
             if missing := sorted(set(groups) - set(one.prior.names)):

@@ -15,6 +15,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_array
 
 from en4dvar.noise.correlated import CorrelatedNoise, Correlation
 from en4dvar.noise.gaussian import Noise, ScaleSkewness
@@ -35,17 +36,15 @@ class Block:
 
 @dataclass(frozen=True)
 class BlockNoise(Noise):
-    """``correlation`` of all K readings, None where no two are correlated; ``thresholds`` (K,) of the robust cost, inf
-    where the errors are Gaussian.
+    """``correlation`` (K, K) of the readings, None where no two are correlated; ``thresholds`` (K,) of the robust cost,
+    inf where the errors are Gaussian.
     """
 
-    correlation: Correlation | None
+    correlation: csr_array | None
     thresholds: Array
 
     def check(self, weights: Array) -> None:
         super().check(weights)
-        if self.correlation is not None:
-            self.correlation.check_size(len(weights))
         if self.thresholds.shape != weights.shape:
             raise ValueError(f"thresholds of the robust cost have shape {self.thresholds.shape}, not {weights.shape}")
         for block in self.blocks:
@@ -60,29 +59,25 @@ class BlockNoise(Noise):
 
     def _blocks(self) -> Iterator[Block]:
         alone = np.ones(len(self.std), dtype=bool)
-        for where in self._groups():
+        for where, matrix in self._groups():
             alone[where] = False
-            matrix = Correlation(self._matrix[np.ix_(where, where)])
-            yield Block(where, CorrelatedNoise(self.std[where], self.time_std[where], matrix))
+            yield Block(where, CorrelatedNoise(self.std[where], self.time_std[where], Correlation(matrix)))
         for threshold in np.unique(self.thresholds[alone]):
             where = np.flatnonzero(alone & (self.thresholds == threshold))
             errors = self.std[where], self.time_std[where]
             yield Block(where, HuberNoise(*errors, float(threshold)) if math.isfinite(threshold) else Noise(*errors))
 
-    @property
-    def _matrix(self) -> Array:
-        return np.eye(len(self.std)) if self.correlation is None else self.correlation.matrix
-
-    def _groups(self) -> Iterator[Indices]:
-        """Sets of readings that are correlated with each other and with no other."""
+    def _groups(self) -> Iterator[tuple[Indices, Array]]:
+        """Sets of readings that are correlated with each other and with no other, and their matrices."""
         if self.correlation is None:
             return
         from scipy.sparse.csgraph import connected_components
 
-        count, label = connected_components(self.correlation.matrix != 0, directed=False)
-        sizes = np.bincount(label, minlength=count)
-        for one in np.flatnonzero(sizes > 1):
-            yield np.flatnonzero(label == one)
+        _, label = connected_components(self.correlation, directed=False)
+        order, edges = np.argsort(label, kind="stable"), np.cumsum(np.bincount(label))
+        for where in np.split(order, edges[:-1]):
+            if len(where) > 1:
+                yield where, self.correlation[where][:, where].toarray()
 
     @property
     def words(self) -> str:  # type: ignore[override]
@@ -159,7 +154,12 @@ class BlockNoise(Noise):
     def matrices(self) -> dict[str, tuple[Array, str]]:
         if self.correlation is None:
             return {}
-        return {"correlation": (self.correlation.matrix, "correlation of the observation errors")}
+        entries = self.correlation.tocoo()
+        return {
+            "correlation": (entries.data, "correlation of the errors of two readings, of those that are correlated"),
+            "correlation_row": (entries.row, "which reading, counted from 0"),
+            "correlation_column": (entries.col, "and which other"),
+        }
 
     def _each(self, predicted: Predicted, of: Callable[[Noise, Array, Predicted], Array], values: Array) -> Array:
         """(…, K) of what each block gives of its readings (…, K')."""

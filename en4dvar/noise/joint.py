@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.sparse import block_array, csr_array, eye_array
 
 from en4dvar.noise.blocks import BlockNoise
 from en4dvar.noise.correlated import CorrelatedNoise, Correlation
@@ -15,15 +16,15 @@ from en4dvar.state import Array
 
 
 def noise_of_readings(
-    std: Array, time_std: Array, correlation: Array | None = None, thresholds: Array | None = None
+    std: Array, time_std: Array, correlation: csr_array | None = None, thresholds: Array | None = None
 ) -> Noise:
     """Errors of K readings: ``std``, ``time_std`` and, where some are robust, ``thresholds`` (K,), inf where Gaussian;
-    a ``correlation`` (K, K) where some are correlated.
+    a ``correlation`` (K, K) where some are correlated, with a unit diagonal.
 
     Where all are of one kind it is that kind. Raises :class:`ValueError` where the matrix is no correlation.
     """
     within = np.full(len(std), math.inf) if thresholds is None else thresholds
-    noise = BlockNoise(std, time_std, None if correlation is None else Correlation(correlation), within)
+    noise = BlockNoise(std, time_std, correlation, within)
     return noise.blocks[0].noise if len(noise.blocks) == 1 else noise
 
 
@@ -32,7 +33,7 @@ def joint_noise(times: Sequence[Array], noises: Sequence[Noise], between: Array)
 
     Errors of series i and j that are independent in time have the correlation ρ_ij at equal times (equal to the bit)
     and none else. Where both are correlated in time they need the same times and the same correlation C, and have
-    ρ_ij C (a Kronecker product).
+    ρ_ij C (a Kronecker product). What is not correlated takes no memory.
 
     Raises
     ------
@@ -40,35 +41,43 @@ def joint_noise(times: Sequence[Array], noises: Sequence[Noise], between: Array)
     """
     Correlation(between)
     matrices = [_correlation_of(noise) for noise in noises]
-    edges = np.cumsum([0, *map(len, times)])
-    whole = np.eye(edges[-1])
+    blocks = [[None] * len(noises) for _ in noises]
     for i, matrix in enumerate(matrices):
-        here = slice(edges[i], edges[i + 1])
-        whole[here, here] = matrix
+        blocks[i][i] = matrix
         for j in range(i):
             if between[i, j]:
-                there = slice(edges[j], edges[j + 1])
-                whole[here, there] = between[i, j] * _across(times[i], times[j], matrix, matrices[j])
-                whole[there, here] = whole[here, there].T
+                across = between[i, j] * _across(times[i], times[j], matrix, matrices[j])
+                blocks[i][j], blocks[j][i] = across, across.T
+    whole = block_array(blocks, format="csr")
+    whole.eliminate_zeros()
     thresholds = np.concatenate([np.full(len(n.std), n.counts_within) for n in noises])
     std, time_std = (np.concatenate([getattr(n, key) for n in noises]) for key in ("std", "time_std"))
-    correlated = np.count_nonzero(whole) > len(whole)
-    return noise_of_readings(std, time_std, whole if correlated else None, thresholds)
+    return noise_of_readings(std, time_std, whole if _correlated(whole) else None, thresholds)
 
 
-def _correlation_of(noise: Noise) -> Array:
+def _correlation_of(noise: Noise) -> csr_array:
     """C (K, K) of the errors of one series. Raises :class:`ValueError` for those that have none to be joined."""
-    if type(noise) not in (Noise, HuberNoise, CorrelatedNoise, BlockNoise):
+    if isinstance(noise, BlockNoise) and noise.correlation is not None:
+        return noise.correlation
+    if isinstance(noise, CorrelatedNoise):
+        return csr_array(noise.correlation.matrix)
+    if type(noise) not in (Noise, HuberNoise, BlockNoise):
         raise ValueError("a discrepancy of the model is not possible beside other series; leave one of them out")
-    matrices = noise.matrices()
-    return matrices["correlation"][0] if matrices else np.eye(len(noise.std))
+    return eye_array(len(noise.std), format="csr")
 
 
-def _across(times: Array, others: Array, own: Array, of_others: Array) -> Array:
+def _correlated(matrix: csr_array) -> bool:
+    """Whether there is more than a diagonal."""
+    return bool(matrix.count_nonzero() > matrix.shape[0])
+
+
+def _across(times: Array, others: Array, own: csr_array, of_others: csr_array) -> csr_array:
     """What the correlation of two series is multiplied by, (K, K') over their times."""
-    if np.count_nonzero(own) == len(own) and np.count_nonzero(of_others) == len(of_others):
-        return (times[:, None] == others).astype(float)
-    if not np.array_equal(times, others) or not np.array_equal(own, of_others):
+    if not _correlated(own) and not _correlated(of_others):
+        instants, label = np.unique(np.concatenate([times, others]), return_inverse=True)
+        at = csr_array((np.ones(len(label)), (np.arange(len(label)), label)), shape=(len(label), len(instants)))
+        return csr_array(at[: len(times)] @ at[len(times) :].T)
+    if not np.array_equal(times, others) or (own != of_others).nnz:
         raise ValueError(
             "two series with errors correlated in time need the same times and the same correlation in time to be "
             "correlated with each other"

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from en4dvar.report import readings, varying
+from en4dvar.report import fields, readings, varying
 from en4dvar.report.history import MANY, history
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, Captioned, panels, scaled_histogram, styled
 from en4dvar.report.text import estimate, pretty_unit, shown, with_unit
@@ -140,12 +140,16 @@ def pairs(result: StoredResult) -> Figure:
 
 def all_figures(result: StoredResult) -> Iterator[Captioned]:
     """Everything that the result has enough members for."""
-    yield (
-        "posterior",
-        "Posterior (blue) over prior (grey), each scaled to its peak. Bar: 5–95 % of the posterior, none and (?) where "
-        "it is not to be trusted; ticks: members; dashed: the centre, where J is smallest.",
-        histograms(result),
-    )
+    named = bool(result.posterior.data_vars)
+    if named:
+        yield (
+            "posterior",
+            "Posterior (blue) over prior (grey), each scaled to its peak. Bar: 5–95 % of the posterior, none and (?) "
+            "where it is not to be trusted; ticks: members; dashed: the centre, where J is smallest.",
+            histograms(result),
+        )
+    if fields.stored_fields(result)[1]:
+        yield "fields", fields.CAPTION, fields.maps(result)
     yield (
         "history",
         "Data with their standard deviation, noise-free predictions of the prior and posterior ensembles (bands hold "
@@ -169,8 +173,14 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
         )
     if f"{result.observable}_prior_distance" in result.sample_stats:
         yield "influence", readings.CAPTION, readings.influence(result)
-    yield "cost", "The cost J and its two terms at the iterate that starts each iteration.", cost(result)
-    yield "iterations", "Parameters over the iterations: ensemble mean ± std (blue), centre (dashed).", traces(result)
+    if np.isfinite(result.iterations["J"]).any():
+        yield "cost", "The cost J and its two terms at the iterate that starts each iteration.", cost(result)
+    if named:
+        yield (
+            "iterations",
+            "Parameters over the iterations: ensemble mean ± std (blue), centre (dashed).",
+            traces(result),
+        )
     if 2 <= len(result.posterior.data_vars) <= MAX_PAIRS and result.alive.sum() > 2:
         yield "pairs", "Posterior members in pairs of parameters; above the diagonal the correlation.", pairs(result)
 

@@ -131,7 +131,7 @@ def overview_figures(sets: Sequence[SetSummary]) -> list[Captioned]:
         "trusted); prior mean ± std (grey band; of the first "
         "data set where priors depend on the data)."
     )
-    return [("estimates", caption, estimates(sets))]
+    return [("estimates", caption, estimates(sets))] if _parameters(sets) else []
 
 
 def _parameters(sets: Sequence[SetSummary]) -> list[str]:

@@ -78,6 +78,8 @@ def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
     rows = result.summary()
     shares, doubted = sum(row.dfs for row in rows), any(row.untrusted for row in rows)  # of what is reported
     informed = f"numbers determined by the data, of {n_estimated} estimated: the sum of the shares below"
+    if "fields" in result.tree.children:
+        shares, informed = dfs, "numbers determined by the data, of cells and parameters"
     information = (
         ("–", "cannot be told where intervals are not to be trusted")
         if doubted

@@ -9,15 +9,15 @@ import numpy as np
 
 from en4dvar.config import Config, time_grid
 from en4dvar.config.build import data_files, resolve_parameters
-from en4dvar.config.data import Data
 from en4dvar.config.error_std import parse_error_std
 from en4dvar.config.parameters import Tied
 from en4dvar.config.reading import read_observations
-from en4dvar.config.series import DataPlan
+from en4dvar.config.series import DataPlan, SeriesPlan
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import run_chunk
-from en4dvar.forward import Failure
+from en4dvar.forward import Failure, Observable
 from en4dvar.inputs.readers import Column
+from en4dvar.series import Places
 from en4dvar.state import READING_SCALE, TIME_SHIFT, Array
 from en4dvar.units import UnitError, convert
 from en4dvar.user_code import reason_of
@@ -25,16 +25,23 @@ from en4dvar.user_code import reason_of
 
 @dataclass(frozen=True)
 class Simulation:
-    """``values`` (K,) of the observable at ``times`` (K,), model units; ``theta`` what it was run with (SI)."""
+    """``series``: values (K,) of each by name, at ``times`` (K,), model units; ``theta`` what it was run with (SI)."""
 
     times: Array
-    values: Array
+    series: Mapping[str, Array]
     theta: Mapping[str, float]
 
-    def with_noise(self, std: float, seed: int) -> Simulation:
-        """Independent Gaussian noise of standard deviation ``std`` (observable's unit) added to the values."""
+    @property
+    def values(self) -> Array:
+        """(K,) of the first series."""
+        return next(iter(self.series.values()))
+
+    def with_noise(self, stds: Mapping[str, float], seed: int) -> Simulation:
+        """Independent Gaussian noise added, its standard deviation by the name of the series, in the observable's
+        unit."""
         stream = np.random.Generator(np.random.Philox(seed))
-        return replace(self, values=self.values + std * stream.standard_normal(len(self.values)))
+        noisy = {name: v + stds[name] * stream.standard_normal(len(v)) for name, v in self.series.items()}
+        return replace(self, series=noisy)
 
 
 def simulate(config: Config, times: Array | None = None) -> Simulation:
@@ -42,24 +49,25 @@ def simulate(config: Config, times: Array | None = None) -> Simulation:
 
     Parameters
     ----------
-    times: (K,) instants; default ``simulate.times`` of the configuration, else those of the first data set.
+    times: (K,) instants, of every series; default ``simulate.times`` of the configuration, else those of the first
+        data set.
 
     Raises
     ------
     ConfigError, DataError: no times, or a value that only the data know. En4dvarError: the model fails.
     """
-    if isinstance(config.data, DataPlan):
-        raise ConfigError("a simulation is of one observable; the data of this file are several series")
+    for one in _plan(config).series if config.data is not None else ():
+        _places(one, 1)
     times = config.simulate_times if times is None else times
     observations = None
     if config.data is not None and (times is None or any(entry.needs_data for entry in config.parameters)):
-        plan = DataPlan.of(config.data, config.observable)
+        plan = _plan(config)
         name, file = next(iter(data_files(plan).items()))
         observations = read_observations(plan, file, name)
     if times is None:
         if observations is None:
             raise ConfigError("no instants to simulate: give simulate.times in the file, or --times FROM:TO:STEP")
-        times = observations.times
+        times = observations.instants[0]
     terms, fixed = resolve_parameters(config, observations)
     theta = {**fixed, **{t.parameter.name: float(t.to_physical(np.array(t.mean))) for t in terms}}
     theta |= {
@@ -68,6 +76,22 @@ def simulate(config: Config, times: Array | None = None) -> Simulation:
         if isinstance(e, Tied) and e.parameter.name not in theta
     }
     return Simulation(times, _forward(config, theta, times), theta)
+
+
+def _plan(config: Config) -> DataPlan:
+    """The series of the data."""
+    assert config.data is not None
+    return DataPlan.of(config.data, config.observable)
+
+
+def _places(one: SeriesPlan, count: int) -> Places | None:
+    """Where on a field it is read, the same at ``count`` instants. Raises :class:`ConfigError` of several places."""
+    places = one.data.places
+    if places is None:
+        return None
+    if places.positions is None or len(places.positions) != 1:
+        raise ConfigError(f"{one.name} is read at many places; a table has one value of it at a time: give one place")
+    return places.places(count, None)
 
 
 def parse_times(text: str, unit: str) -> Array:
@@ -79,15 +103,25 @@ def parse_times(text: str, unit: str) -> Array:
     return time_grid(start, end, step, unit)
 
 
-def noise_level(text: str, config: Config, simulation: Simulation) -> float:
-    """``"1.4 um"`` or ``"1 % of maximum"`` in the observable's unit. Raises :class:`UnitError`."""
-    spread = parse_error_std(text, config.observable.unit)
-    if not spread.value > 0:
-        raise UnitError(f"the noise must be positive, not {text}")
-    return spread.absolute(float(simulation.values.max()))
+def noise_level(text: str, config: Config, simulation: Simulation) -> dict[str, float]:
+    """``"1.4 um"`` or ``"1 % of maximum"`` in the unit of each series. Raises :class:`UnitError`."""
+    found = {}
+    for name, observable in _observables(config).items():
+        spread = parse_error_std(text, observable.unit)
+        if not spread.value > 0:
+            raise UnitError(f"the noise must be positive, not {text}")
+        found[name] = spread.absolute(float(simulation.series[name].max()))
+    return found
 
 
-def _forward(config: Config, theta: Mapping[str, float], times: Array) -> Array:
+def _observables(config: Config) -> dict[str, Observable]:
+    """By the name of the series."""
+    if config.data is None:
+        return {config.observable.name: config.observable}
+    return {one.name: one.observable for one in _plan(config).series}
+
+
+def _forward(config: Config, theta: Mapping[str, float], times: Array) -> dict[str, Array]:
     model = config.model
     shift, names = theta.get(TIME_SHIFT.name, 0.0), {p.name for p in model.parameters}
     scale = 1.0 if READING_SCALE.name in names else theta.get(READING_SCALE.name, 1.0)
@@ -100,29 +134,42 @@ def _forward(config: Config, theta: Mapping[str, float], times: Array) -> Array:
     (path,) = run_chunk(model, state[None], times + shift)
     if isinstance(path, Failure):
         raise En4dvarError(f"the model failed: {path.reason}")
-    try:
-        return np.asarray(config.observable.operator(path), dtype=float) * scale
-    except BaseException as error:
-        raise En4dvarError(f"{config.observable.name} cannot be read from the run: {reason_of(error)}") from None
+    where = {one.name: _places(one, len(times)) for one in _plan(config).series} if config.data is not None else {}
+    found = {}
+    for name, observable in _observables(config).items():
+        try:
+            values = np.asarray(observable.operator(path), dtype=float)
+        except BaseException as error:
+            raise En4dvarError(f"{observable.name} cannot be read from the run: {reason_of(error)}") from None
+        places = where.get(name)
+        found[name] = scale * (values if places is None else places.read(values))
+    return found
 
 
 def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:
     """The simulation as a CSV file with the columns and units of ``data.columns`` (else in display units)."""
-    model, observable, data = config.model, config.observable, config.data
+    model, observable = config.model, config.observable
     time = Column(f"t_{model.time_display_unit}", model.time_display_unit, model.time_unit)
     value = Column(f"{observable.name}_{observable.display_unit}", observable.display_unit, observable.unit)
-    if isinstance(data, Data):
-        time = data.columns.time if isinstance(data.columns.time, Column) else time
-        value = data.columns.observable
+    columns = [value]
+    if config.data is not None:
+        series = _plan(config).series
+        stated = series[0].data.columns.time
+        time = stated if isinstance(stated, Column) else time
+        columns = [one.data.columns.observable for one in series]
+        if len({column.name for column in columns}) < len(columns):  # series of several files
+            columns = [replace(column, name=one.name) for column, one in zip(columns, series, strict=True)]
     units = {entry.parameter.name: entry.parameter.unit for entry in config.parameters}
     truth = ", ".join(f"{name} = {v:.9g} {units[name]}" for name, v in simulation.theta.items())
     times = convert(simulation.times, time.target, time.unit)
-    values = convert(simulation.values, value.target, value.unit)
+    values = [
+        convert(v, column.target, column.unit) for column, v in zip(columns, simulation.series.values(), strict=True)
+    ]
     lines = [
         *(f"# {line}" for line in comment.splitlines()),
         f"# parameters: {truth}",
-        f"# {time.name} in {time.unit}, {value.name} in {value.unit}",
-        f"{time.name},{value.name}",
-        *(f"{t:.9g},{v:.9g}" for t, v in zip(times, values, strict=True)),
+        f"# {', '.join(f'{column.name} in {column.unit}' for column in (time, *columns))}",
+        ",".join(column.name for column in (time, *columns)),
+        *(",".join(f"{v:.9g}" for v in row) for row in zip(times, *values, strict=True)),
     ]
     return "\n".join(lines) + "\n"

@@ -47,7 +47,7 @@ class Gain(Protocol):
 class ByDistance:
     """``places`` (n, D) of the cells and ``observed`` (K, D) of the observations; the taper is Gaspari & Cohn's.
 
-    It falls to 5/24 at ``radius`` and to 0 at twice that.
+    It falls to 5/24 at ``radius`` and to 0 at twice that. All observations act on what has no place (NaN).
     """
 
     places: Array
@@ -63,7 +63,8 @@ class ByDistance:
 
     def taper(self, part: slice) -> Array:
         """ρ_xy (m, K) of some of the cells."""
-        return gaspari_cohn(cdist(self.places[part], self.observed), self.radius)
+        rho = gaspari_cohn(cdist(self.places[part], self.observed), self.radius)
+        return np.nan_to_num(rho, copy=False, nan=1.0)
 
     def between(self, Y: Array, Z: Array) -> Array:
         """ρ_yy ∘ YᵀZ/(N−1) (K, K), of anomalies of predictions about two points."""

@@ -155,8 +155,7 @@ def _copy(group: netCDF4.Group, source: netCDF4.Group, i: int) -> None:
             key = variable.getncattr("attribute")
             if key in source.ncattrs():
                 variable[i] = source.getncattr(key)
-        elif variable.name in source.variables:
-            given = source[variable.name]
+        elif variable.name in source.variables and (given := source[variable.name]).size:  # no parameter, no value
             where = (
                 places if dim == PARAMETER else slice(n) for dim, n in zip(given.dimensions, given.shape, strict=True)
             )

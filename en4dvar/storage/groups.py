@@ -20,6 +20,7 @@ from en4dvar.analysis import Analysis
 from en4dvar.caution import codes
 from en4dvar.diagnostics import active_members, nrmse
 from en4dvar.state import Array, Parameter
+from en4dvar.storage.fields import field_groups
 from en4dvar.storage.modes import descent_scalars, mode_variables
 from en4dvar.storage.netcdf import Group, netcdf_attributes
 from en4dvar.storage.netcdf import variable as _variable
@@ -78,6 +79,7 @@ def build_groups(a: Analysis, attributes: Mapping[str, Any]) -> dict[str, Group]
         "/sample_stats": group(_sample_stats(a), _scalars(a)),
         "/log_likelihood": group(log_likelihood(a)),
         "/iterations": group(_iterations(a)),
+        **field_groups(a),
     }
 
 

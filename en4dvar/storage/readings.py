@@ -80,7 +80,7 @@ def observed(a: Analysis) -> tuple[Variables, dict[str, Any]]:
         matrices, dims, numbers = stated.noise.matrices(), ("reading", "reading_column"), _thresholds(stated)
         names = {key: key for key in matrices}
     for key, (matrix, words) in matrices.items():
-        variables[names[key]] = _variable(dims, matrix, "1", words)
+        variables[names[key]] = _variable(dims if matrix.ndim == 2 else "correlated_pair", matrix, "1", words)
     return variables, {"name": stated.name, "data_source": stated.source, **scalars, **numbers}
 
 

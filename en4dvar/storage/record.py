@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
+from scipy.sparse import csr_array
 
 from en4dvar.forward import Observable, Trajectory
 from en4dvar.noise import noise_of_readings, noise_of_record
@@ -31,7 +32,7 @@ def observations_of(
 
     times, parts = own("time"), _parts(data, axes, observables)
     if parts:
-        matrix = data["correlation"].values if "correlation" in data else None
+        matrix = _correlation(data, len(times)) if "correlation" in data else None
         within = [float(attributes.get(f"{p.name}_huber_threshold", math.inf)) for p in parts]
         thresholds = np.repeat(within, [p.end - p.begin for p in parts])
         noise = noise_of_readings(each("_reading_std"), own("time_std"), matrix, thresholds)
@@ -48,6 +49,15 @@ def observations_of(
         scalars={k.removeprefix(SCALAR): float(v) for k, v in attributes.items() if k.startswith(SCALAR)},
         parts=parts,
     )
+
+
+def _correlation(data: xr.Dataset, count: int) -> csr_array:
+    """Of all readings, from the matrix or from its entries that are not zero."""
+    values = data["correlation"].values
+    if values.ndim == 2:
+        return csr_array(values)
+    rows, columns = (data[f"correlation_{side}"].values for side in ("row", "column"))
+    return csr_array((values, (rows, columns)), shape=(count, count))
 
 
 def _parts(data: xr.Dataset, axes: Sequence[Axis], observables: Mapping[str, Observable]) -> tuple[Part, ...]:

@@ -1,61 +1,104 @@
 """Heads of a confined aquifer on a grid: storage ∂h/∂t = ∇·(T ∇h) + recharge, h = 0 at the boundary and at first.
 
-Cells have side 1; T = exp(x), with the field x that is estimated. Finite volumes with harmonic means of T between
-cells, implicit Euler steps, one factorisation a member. Source: Bear (1979), *Hydraulics of Groundwater*, § 5-1.
+Cells have side 1; T = exp(ln_T), a field of the state that stays as it is. Finite volumes with harmonic means of T
+between cells, implicit Euler steps, one factorisation a member. Source: Bear (1979), Hydraulics of Groundwater, § 5-1.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict
+from pydantic import Field as Setting
 from scipy.sparse import coo_matrix, csc_matrix, identity
 from scipy.sparse.linalg import splu
 
+from en4dvar import Failure, Field, ForwardModel, Observable, Parameter, StateField, StateLayout, Trajectory
+
 Array = npt.NDArray[np.float64]
+Side = Annotated[int, Setting(ge=2)]
+SOURCE = "Bear (1979), Hydraulics of Groundwater, § 5-1"
 
 
-@dataclass(frozen=True)
-class Aquifer:
-    """``shape`` (rows, columns) of the grid; ``wells`` (W,) indices of the cells whose heads are read.
+class AquiferSettings(BaseModel):
+    """The grid, and the steps in time."""
 
-    They are read after each number of ``reads`` implicit steps of length ``dt``.
-    """
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    shape: tuple[Side, Side] = (100, 100)
+    """Rows and columns of cells, each of side 1."""
+    step: Annotated[float, Setting(gt=0)] = 2.0
+    """Longest implicit step in time."""
 
-    shape: tuple[int, int]
-    wells: npt.NDArray[np.intp]
-    reads: tuple[int, ...] = (2, 6, 16)
-    dt: float = 2.0
-    storage: float = 0.1
-    recharge: float = 0.01
 
-    @property
-    def size(self) -> int:
-        return self.shape[0] * self.shape[1]
+class Aquifer(ForwardModel):
+    """A confined aquifer on a grid: its heads, and the logarithm of its transmissivity, a field to estimate."""
 
-    @property
-    def places(self) -> Array:
-        """Coordinates (n, 2) of the cells."""
-        return np.indices(self.shape, dtype=float).reshape(2, -1).T
+    Settings = AquiferSettings
+    parameters = (
+        Parameter("recharge", "1", bounds=(-np.inf, np.inf), label="recharge", symbol="$q$", source=SOURCE),
+        Parameter("storage", "1", "lognormal", (0.0, np.inf), "storage coefficient", "$S$", source=SOURCE),
+    )
+    defaults: Mapping[str, float] = {"recharge": 0.01, "storage": 0.1}
+    observables = (Observable("head", "1", StateField("head"), "$h$", label="head"),)
+    time_unit = time_display_unit = "1"
 
-    @property
-    def observed(self) -> Array:
-        """Coordinates (K, 2) of the readings in the order of the predictions: all wells, and again at each time."""
-        return np.tile(self.places[self.wells], (len(self.reads), 1))
+    def __init__(self, shape: tuple[int, int], step: float = 2.0):
+        self.shape, self.longest, self.size = shape, step, shape[0] * shape[1]
+        self.places = np.indices(shape, dtype=float).reshape(2, -1).T
+        head = Field("head", self.size, coordinates=self.places, symbol="$h$")
+        ln_T = Field("ln_T", self.size, coordinates=self.places, label="log transmissivity", symbol=r"$\ln T$")
+        self.layout = StateLayout((head, ln_T, Field("recharge"), Field("storage")))
 
-    def __call__(self, fields: Array) -> Array:
-        """Heads (M, K) at the wells, of fields ln T (M, n)."""
-        return np.array([self._heads(field) for field in fields])
+    @classmethod
+    def from_settings(cls, settings: AquiferSettings) -> Aquifer:
+        return cls(settings.shape, settings.step)
 
-    def _heads(self, field: Array) -> Array:
-        system = identity(self.size, format="csc") * (self.storage / self.dt) + self.conductances(field)
-        solve, head, read = splu(system.tocsc()).solve, np.zeros(self.size), []
-        for step in range(1, max(self.reads) + 1):
-            head = solve(head * (self.storage / self.dt) + self.recharge)
-            if step in self.reads:
-                read.append(head[self.wells])
-        return np.concatenate(read)
+    def initial_state(self, theta: Mapping[str, float]) -> Array:
+        """No head anywhere, T = 1."""
+        return np.concatenate([np.zeros(2 * self.size), [theta["recharge"], theta["storage"]]])
+
+    def step(self, x: Array, t0: float, t1: float) -> Array:
+        x[: self.size] = next(iter(self._heads(x, [t1 - t0])))
+        return x
+
+    def trajectories(self, x: Array, times: Array) -> Sequence[Trajectory | Failure]:
+        own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+        return [self._path(state, instants) for state, instants in zip(x, own, strict=True)]
+
+    def heads(self, fields: Array, cells: npt.NDArray[np.intp], times: Array) -> Array:
+        """Heads (M, K) at ``cells`` (W,) and ``times`` (T,), all cells at each time, of fields ln T (M, n)."""
+        states = np.tile(self.initial_state(self.defaults), (len(fields), 1))
+        states[:, self.layout["ln_T"]] = fields
+        return np.array([self._path(state, times)["head"][:, cells].ravel() for state in states])
+
+    def _path(self, state: Array, times: Array) -> Trajectory:
+        states = np.tile(state, (len(times), 1))
+        for row, head in zip(states, self._heads(state, np.diff(times, prepend=0.0)), strict=True):
+            row[: self.size] = head
+        return Trajectory(np.asarray(times, dtype=float), states, self.layout)
+
+    def _heads(self, state: Array, durations: Sequence[float] | Array) -> list[Array]:
+        """Heads (n,) after each of the durations, one after the other."""
+        head, (recharge, storage) = state[: self.size].copy(), state[-2:]
+        flow, solvers, found = (
+            self.conductances(state[self.layout["ln_T"]]),
+            dict[float, Callable[[Array], Array]](),
+            [],
+        )
+        for duration in durations:
+            steps = math.ceil(duration / self.longest - 1e-9)
+            rate = round(storage * steps / duration, 12) if steps else 0.0  # of times as they are rounded, one
+            for _ in range(steps):
+                if rate not in solvers:
+                    system = (identity(self.size, format="csc") * rate + flow).tocsc()
+                    solvers[rate] = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve
+                head = solvers[rate](head * rate + recharge)
+            found.append(head)
+        return found
 
     def conductances(self, field: Array) -> csc_matrix:
         """−∇·(T ∇·) (n, n): symmetric, with the boundary, half a cell away, at head 0."""
@@ -80,15 +123,3 @@ class Aquifer:
         values.append(diagonal.ravel())
         entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
         return coo_matrix(entries, shape=(self.size, self.size)).tocsc()
-
-
-def gaussian_fields(shape: tuple[int, int], length: float, count: int, rng: np.random.Generator) -> Array:
-    """Gaussian fields (count, n) of mean 0 and variance 1, correlated as exp(−½ (r/length)²): cut out of a torus."""
-    wide = tuple(side + int(np.ceil(5 * length)) for side in shape)
-    squares = sum(np.minimum(i, side - i) ** 2 for i, side in zip(np.indices(wide, dtype=float), wide, strict=True))
-    power = np.maximum(np.fft.fft2(np.exp(-0.5 * squares / length**2)).real, 0.0)
-    found = np.empty((count, shape[0] * shape[1]))
-    for i in range(count):
-        white = np.fft.fft2(rng.standard_normal(wide))
-        found[i] = np.fft.ifft2(np.sqrt(power) * white).real[: shape[0], : shape[1]].ravel()
-    return found

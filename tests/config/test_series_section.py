@@ -10,6 +10,7 @@ import pytest
 from en4dvar.config import load_config
 from en4dvar.config.build import build
 from en4dvar.errors import ConfigError, DataError
+from en4dvar.noise import BlockNoise
 from en4dvar.runs.checks import validate
 
 YAML = """\
@@ -75,8 +76,34 @@ def test_what_is_said_once_holds_for_all(tmp_path: Path) -> None:
     assert found.parts[2].places is not None
     assert found.parts[2].places.positions.tolist() == [0, 2.5, 0, 2.5]
     assert found.weights[14:].tolist() == [0.5, 1.5, 0.5, 1.5]
-    matrix = found.noise.matrices()["correlation"][0]
+    assert isinstance(found.noise, BlockNoise)
+    matrix = found.noise.correlation.toarray()
     assert np.array_equal(matrix[:7, 7:14], 0.5 * np.eye(7))
+
+
+def test_a_data_set_has_the_name_that_is_given(tmp_path: Path) -> None:
+    path = write(tmp_path, ("  path: pq.csv", "  path: pq.csv\n  name: gel 3"))
+    (problem,) = build(load_config(path))
+    assert problem.observations.name == "gel 3"
+    again = tmp_path / "again.yaml"
+    again.write_text(load_config(path).resolved, encoding="utf-8")
+    (problem,) = build(load_config(again))
+    assert problem.observations.name == "gel 3"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("path: pq.csv", "path: pq.csv\n  name: a/b", "data.name:"),
+        ("path: pq.csv", "path: [pq.csv, f.csv]\n  name: gel", "name: gel is that of one data set, and there are 2"),
+        ("      observable: f", "      name: g\n      observable: f", "a data set has one name; write it above"),
+    ],
+)
+def test_names_that_cannot_be(tmp_path: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises((ConfigError, DataError)) as error:
+        validate(write(tmp_path, (old, new)))
+    assert str(error.value).count("two.yaml:") == 1, str(error.value)
+    assert message in str(error.value)
 
 
 def test_the_resolved_file_says_the_same(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import en4dvar
+from en4dvar_diffusion.synthetic import truth
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"
@@ -57,6 +58,17 @@ def test_predator_and_prey_observed_together(tmp_path):
         mean, std = mean_and_std(result, name)
         assert abs(mean - value) < 0.5 * spread, name
         assert 0.7 < std / spread < 1.4, name
+
+
+@pytest.mark.slow
+def test_a_field_from_heads(tmp_path):
+    """Few members and iterations; docs/fields.md tells of the whole run."""
+    few = {"output.report": False, "assimilation.members": 15, "assimilation.max_iterations": 3}
+    result = run("diffusion_field", tmp_path, **few)
+    fields, exact = result.dataset("fields"), truth()
+    error = np.sqrt(np.mean((fields["ln_T_mean"].values - exact) ** 2))
+    assert error < 0.8 * np.sqrt(np.mean(exact**2))
+    assert np.sqrt(np.mean(fields["ln_T_std"].values ** 2)) > 0.8 * error
 
 
 def test_laser_with_a_viscosity_that_is_halved(tmp_path):

@@ -9,7 +9,8 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-from en4dvar.descent.field import FieldData, field_en4dvar, field_esmda
+from en4dvar.descent.field import field_en4dvar, field_esmda
+from en4dvar.descent.field_data import FieldData
 from en4dvar.errors import En4dvarError
 from en4dvar.prior import member_stream
 from en4dvar.schemes.local_gain import ByCorrelation, ByDistance

@@ -54,7 +54,6 @@ def test_constructors_speak_physical():
         lambda: PriorTerm.lognormal_moments(A, 1.0, -1.0),
         lambda: PriorTerm.logit(A, (0.0, 1.0), 1.0, 1.0),
         lambda: PriorTerm.logit(A, (0.0, math.inf), 1.0, 1.0),
-        lambda: Prior(()),
         lambda: Prior((TERMS[0], TERMS[0])),
         lambda: Prior(TERMS).sample(3, 0, "exact"),
         lambda: Prior(TERMS).sample(1, 0, "random"),

@@ -1,5 +1,6 @@
 """Several series in one problem against closed forms: cross-correlations, places, weights, balance, order."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -122,6 +123,18 @@ def test_a_field_is_read_at_its_places():
     assert G[-4:, 0] == pytest.approx(AT)
 
 
+def test_many_readings_of_a_large_field_take_no_field_each():
+    places = Places.at_indices(np.arange(0, 100_000, 200))
+    values = np.arange(200_000.0).reshape(1, 2, 100_000)
+    rows_ = np.repeat([0, 1], 250)
+    tracemalloc.start()
+    found = places.read(values, rows_)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert np.array_equal(found[0], np.arange(0, 100_000, 200) + 100_000.0 * rows_)
+    assert most < 1e6
+
+
 def test_curves_of_the_series_that_have_one():
     grid = np.linspace(0.1, 1.0, 5)
     run = forecast(problem_of(all_series()), np.array([[1.2, -0.4]]), extra_times=grid)
@@ -200,6 +213,24 @@ def test_the_score_of_blocks_is_the_gradient_of_their_cost():
 def test_series_of_one_kind_are_that_kind():
     assert type(problem_of(all_series()).observations.noise) is Noise
     assert type(noise_of_readings(np.ones(3), np.zeros(3), thresholds=np.full(3, 2.0))).__name__ == "HuberNoise"
+
+
+def test_readings_that_are_not_correlated_take_no_matrix():
+    """10 000 readings of three series; of 40 the errors are correlated in time, a matrix of all would have 800 MB."""
+    times = [np.linspace(0.0, 1.0, 40), np.linspace(0.0, 1.0, 5000), np.linspace(0.0, 1.0, 4960)]
+    in_time = np.exp(-np.abs(np.subtract.outer(times[0], times[0])))
+    noises = [noise_of(np.full(40, 0.1), correlation=in_time), *(noise_of(np.full(len(t), 0.2)) for t in times[1:])]
+    tracemalloc.start()
+    noise = joint_noise(times, noises, np.eye(3))
+    cost = noise.cost(np.ones(10_000), np.ones(10_000), Predicted(np.zeros((2, 10_000))))
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert isinstance(noise, BlockNoise)
+    assert [len(block.where) for block in noise.blocks] == [40, 9960]
+    exact = 0.5 * np.ones(40) @ np.linalg.solve(0.01 * in_time, np.ones(40)) + 0.5 * 9960 / 0.04
+    assert cost == pytest.approx([exact, exact], rel=1e-12)
+    assert most < 20e6
+    assert max(matrix.size for matrix, _ in noise.matrices().values()) < 12_000
 
 
 def test_times_that_differ_by_rounding_are_one_instant():

@@ -1,0 +1,76 @@
+"""The localised gain of a problem: which one its settings ask for, and where its readings and unknowns are."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from en4dvar.errors import ConfigError
+from en4dvar.field_prior import places_of
+from en4dvar.forward import field_of
+from en4dvar.problem import AssimilationSettings, InverseProblem, Localising
+from en4dvar.schemes.local_gain import ByCorrelation, ByDistance, Gain
+from en4dvar.state import Array
+
+SCHEMES = ("en4dvar", "es-mda")
+
+
+def gain_of(problem: InverseProblem, settings: AssimilationSettings) -> Gain:
+    """The gain that the settings ask for. Raises :class:`ConfigError` where the problem does not suit it."""
+    asked = settings.localisation
+    if asked is None:
+        raise ConfigError("a field estimated cell by cell needs a localised gain, e.g. {radius: 10}")
+    if settings.scheme not in SCHEMES or settings.mda_form != "perturbed":
+        form = " with perturbed observations" if settings.scheme == "es-mda" else ""
+        raise ConfigError(f"a scheme for data that can be localised is {' or '.join(SCHEMES)}{form}")
+    if not problem.observations.noise.plain or problem.has_noise_scale:
+        raise ConfigError(
+            "takes independent Gaussian errors of known std: no covariance, correlation time, timing error, robust "
+            "cost, discrepancy or sigma"
+        )
+    if asked.radius is None:
+        if settings.scheme != "es-mda":
+            raise ConfigError("by correlation there is no cost that en4dvar could minimise; use scheme: es-mda")
+        return ByCorrelation(asked.threshold)
+    observed = _observed(problem, asked)
+    places = _places(problem, asked, observed.shape[1])
+    lost = [name for name, where in zip(problem.prior.names, places, strict=False) if np.isnan(where[0])]
+    if lost and settings.scheme != "es-mda":
+        raise ConfigError(f"{lost[0]} has no place; give it one, 'at: {{{lost[0]}: 0}}', or use scheme: es-mda")
+    return ByDistance(places, observed[problem.observations.used], asked.radius)
+
+
+def _observed(problem: InverseProblem, asked: Localising) -> Array:
+    """Coordinates (K, D) of the readings. Raises :class:`ConfigError`."""
+    found = []
+    for part in problem.parts:
+        block = field_of(problem.model, part.observable)
+        if part.name in asked.at:
+            found.append(np.broadcast_to(asked.at[part.name], (part.end - part.begin, len(asked.at[part.name]))))
+        elif part.places is not None and block is not None and block.coordinates is not None:
+            found.append(np.einsum("kj,kjd->kd", part.places.shares, places_of(block)[part.places.indices]))
+        else:
+            raise ConfigError(
+                f"{part.name} has no place: it is no part of a field with coordinates; write 'at: {{{part.name}: 0}}'"
+            )
+    if len({where.shape[1] for where in found}) > 1:
+        raise ConfigError("the places of the readings have different numbers of coordinates")
+    return np.concatenate(found)
+
+
+def _places(problem: InverseProblem, asked: Localising, dimensions: int) -> Array:
+    """Coordinates (n + m, D) of what is estimated, NaN where there are none. Raises :class:`ConfigError`."""
+    known = {*problem.prior.names, *(part.name for part in problem.parts)}
+    for name, where in asked.at.items():
+        if name not in known:
+            raise ConfigError(f"at: {name!r} is no parameter with a prior and no series")
+        if len(where) != dimensions:
+            raise ConfigError(f"at: {name} has {len(where)} coordinates, the readings have {dimensions}")
+    unknown = (math.nan,) * dimensions
+    named = np.array([asked.at.get(name, unknown) for name in problem.prior.names]).reshape(-1, dimensions)
+    of_fields = [one.places for one in problem.fields]
+    for one, own in zip(problem.fields, of_fields, strict=True):
+        if own.shape[1] != dimensions:
+            raise ConfigError(f"{one.field.name} has {own.shape[1]} coordinates, the readings have {dimensions}")
+    return np.concatenate([named, *of_fields])

@@ -1,0 +1,196 @@
+"""A data set with a localised gain against formulas written out, and what becomes of members that fail."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from field_models import PLACES, READ, TIMES, VALUES, Fragile, Line, Many
+from scipy.spatial.distance import cdist
+
+from en4dvar.assimilate import assimilate
+from en4dvar.errors import ConfigError, TooFewMembersError
+from en4dvar.field_prior import FieldPrior
+from en4dvar.joint.problem import sharing
+from en4dvar.noise import noise_of
+from en4dvar.observations import Observations
+from en4dvar.prior import Prior, PriorTerm, member_stream
+from en4dvar.problem import AssimilationSettings, InverseProblem, Localising
+from en4dvar.schemes.local_gain import ByCorrelation
+from en4dvar.schemes.localisation import gaspari_cohn
+from en4dvar.series import Places, Series
+
+STD, SEED, N, RADIUS = 0.3, 4, 12, 3.0
+NEAR = Localising(RADIUS)
+
+
+def line(model=None, weights=None, estimated=False, level=False) -> InverseProblem:
+    model = model or Line()
+    u, of_level = model.observables
+    series = [Series(u, TIMES, VALUES, noise_of(np.full(6, STD)), weights, places=Places.at_indices(READ))]
+    if level:
+        series.append(Series(of_level, np.array([1.0, 2.0]), np.array([4.0, 4.2]), noise_of(np.full(2, STD))))
+    field = FieldPrior(model.layout.fields[0], 1.0, "gaussian", 1.5)
+    terms = (PriorTerm.normal(model.parameters[0], 1.0, 0.5),) if estimated else ()
+    return InverseProblem(
+        model, u, Observations.of_series(series), Prior(terms), {} if estimated else {"offset": 0.0}, fields=(field,)
+    )
+
+
+def settings(scheme="en4dvar", localisation: Localising | None = NEAR, **more) -> AssimilationSettings:
+    return AssimilationSettings(scheme=scheme, members=N, localisation=localisation, **more)
+
+
+def prior_of(problem: InverseProblem) -> np.ndarray:
+    """What is drawn (N, 30), centred."""
+    drawn = np.array([problem.fields[0].draw(SEED, i) for i in range(N)])
+    return drawn - drawn.mean(axis=0)
+
+
+def errors(purpose: str, count: int) -> np.ndarray:
+    z = np.array([member_stream(SEED, purpose, i).standard_normal(count) for i in range(N)])
+    return STD * (z - z.mean(axis=0))
+
+
+def gain(ensemble: np.ndarray, read: np.ndarray) -> np.ndarray:
+    """(ρ∘P)Hᵀ[H(ρ∘P)Hᵀ + R]⁻¹ with every matrix written out."""
+    H, places = np.eye(30)[read], PLACES[:, None]
+    P = gaspari_cohn(cdist(places, places), RADIUS) * np.cov(ensemble.T)
+    return P @ H.T @ np.linalg.inv(H @ P @ H.T + STD**2 * np.eye(len(read)))
+
+
+def test_one_pass_is_the_update_of_the_schur_product():
+    problem = line()
+    before = prior_of(problem)
+    found = assimilate(problem, settings("es-mda", mda_coefficients=(1.0,)), SEED)
+    innovation = VALUES + errors("ES-MDA 0", 6) - (2.0 + before[:, READ])
+    expected = 2.0 + before + innovation @ gain(before, READ).T
+    (field,) = found.fields
+    assert field.members == pytest.approx(expected, abs=1e-10)
+    assert field.mean == pytest.approx(expected.mean(axis=0), abs=1e-10)
+    assert field.std == pytest.approx(expected.std(axis=0, ddof=1), abs=1e-10)
+    assert field.prior_mean == pytest.approx(np.full(30, 2.0), abs=1e-10)
+    assert field.prior_std == pytest.approx(before.std(axis=0, ddof=1), abs=1e-10)
+    assert found.posterior_predictions == pytest.approx(expected[:, READ], abs=1e-10)
+    assert found.forward_runs == 2 * N + 2 + 1  # prior, two members again, posterior and its mean
+
+
+def test_the_minimum_of_en4dvar_is_that_of_the_schur_product():
+    problem = line()
+    before = prior_of(problem)
+    found = assimilate(problem, settings(epsilon=1.0), SEED)
+    K = gain(before, READ)
+    (field,) = found.fields
+    centre = 2.0 + K @ (VALUES - 2.0)
+    assert found.converged
+    assert field.centre == pytest.approx(centre, abs=1e-10)
+    spread = before + (errors("En4D-Var field", 6) - before[:, READ]) @ K.T
+    assert field.members == pytest.approx(centre + spread, abs=1e-10)
+    assert found.iterations[-1].dfs == pytest.approx(np.trace(K[READ]), abs=1e-10)
+    assert found.iterations[-1].cost < found.iterations[0].cost
+
+
+def test_readings_without_weight_are_left_out():
+    weights = np.array([1.0, 1, 0, 1, 1, 1])
+    found = assimilate(line(weights=weights), settings(epsilon=1.0), SEED)
+    before, kept = prior_of(line()), weights > 0
+    centre = 2.0 + gain(before, READ[kept]) @ (VALUES[kept] - 2.0)
+    assert found.fields[0].centre == pytest.approx(centre, abs=1e-10)
+
+
+def test_a_factor_is_that_of_the_logarithm():
+    """Values of a relative field are those of the model times e to what is drawn."""
+    problem = line()
+    relative = replace(problem, fields=(replace(problem.fields[0], relative=True, std=0.2),))
+    found = assimilate(relative, settings(), SEED)
+    before = 0.2 * prior_of(problem)
+    (field,) = found.fields
+    assert field.prior_mean == pytest.approx((2 * np.exp(before)).mean(axis=0), rel=1e-12)
+    assert np.all(field.members > 0)
+    assert found.centre_predictions == pytest.approx(field.centre[READ], rel=1e-12)
+    assert np.abs(found.centre_predictions - VALUES).max() < np.abs(2.0 - VALUES).max()
+
+
+def test_a_parameter_with_a_place_beside_a_field():
+    """Its covariances are tapered by its distance: far away it stays as it was."""
+    near = Localising(RADIUS, {"level": (0.5,), "offset": (0.5,)})
+    far = Localising(RADIUS, {"level": (0.5,), "offset": (100.0,)})
+    found, kept = (assimilate(line(estimated=True, level=True), settings("es-mda", one), SEED) for one in (near, far))
+    assert kept.posterior == pytest.approx(kept.prior, abs=1e-12)
+    assert found.posterior.std() < 0.8 * found.prior.std()
+    assert found.dfs_per_parameter[0] == pytest.approx(1 - found.posterior.var(ddof=1) / found.prior.var(ddof=1))
+
+
+def test_without_a_place_all_readings_act_on_a_parameter_and_en4dvar_refuses():
+    somewhere = Localising(RADIUS, {"level": (0.5,)})
+    problem = line(estimated=True, level=True)
+    found = assimilate(problem, settings("es-mda", somewhere), SEED)
+    assert found.posterior.std() < 0.8 * found.prior.std()
+    with pytest.raises(ConfigError, match="offset has no place"):
+        assimilate(problem, settings("en4dvar", somewhere), SEED)
+
+
+def test_by_correlation_is_the_adaptive_gain_in_each_pass():
+    problem = line(estimated=True)
+    adaptive = Localising(threshold=0.4)
+    found = assimilate(problem, settings("es-mda", adaptive, mda_coefficients=(1.0,)), SEED)
+    cells = prior_of(problem)
+    before = np.column_stack([problem.prior.sample(N, SEED, "exact"), cells])
+    Y = 2.0 + cells[:, READ]
+    update = ByCorrelation(0.4).update(Y - Y.mean(axis=0), np.full(6, STD**2), VALUES + errors("ES-MDA 0", 6) - Y)
+    after = before + update(slice(0, 31), before - before.mean(axis=0))
+    assert found.posterior == pytest.approx(after[:, :1], abs=1e-10)
+    assert found.fields[0].members == pytest.approx(2.0 + after[:, 1:], abs=1e-10)
+
+
+def test_members_that_fail_are_left_where_they_failed_and_told():
+    found = assimilate(line(Fragile()), settings("es-mda"), SEED)
+    lost = np.flatnonzero(prior_of(line())[:, 0] > 1)
+    assert len(lost)
+    assert [i for i, reason in enumerate(found.posterior_failures) if reason] == lost.tolist()
+    assert "too hot" in found.posterior_failures[lost[0]]
+    assert any(c.code == "members-lost" for c in found.cautions)
+    alive = np.array([not reason for reason in found.posterior_failures])
+    assert np.abs(found.posterior_predictions[alive].mean(axis=0) - VALUES).max() < 1
+    with pytest.raises(TooFewMembersError, match=r"failed; at least 12 must survive.*too hot"):
+        assimilate(line(Fragile()), settings("es-mda", min_active_fraction=1.0), SEED)
+
+
+@pytest.mark.slow
+def test_spread_of_2000_named_parameters_by_correlation():
+    """100 members, 200 readings of a parameter each, that nothing names: within 10 % of the exact spread."""
+    model, rng = Many(), np.random.default_rng(1)
+    of = rng.permutation(2000)[:200]
+    places = Places.at_indices(of)
+    series = Series(
+        model.observables[0], np.ones(200), rng.standard_normal(200), noise_of(np.full(200, 0.7)), places=places
+    )
+    prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
+    problem = InverseProblem(model, model.observables[0], Observations.of_series([series]), prior)
+    asked = AssimilationSettings("es-mda", members=100, localisation=Localising())
+    found = assimilate(problem, asked, 0)
+    exact = np.ones(2000)
+    exact[of] = 0.7 / np.sqrt(1 + 0.7**2)
+    spread = found.posterior.std(axis=0, ddof=1)
+    assert np.sqrt(np.mean(spread[of] ** 2)) == pytest.approx(exact[of[0]], rel=0.1)
+    assert np.sqrt(np.mean(spread**2)) == pytest.approx(np.sqrt(np.mean(exact**2)), rel=0.1)
+    assert found.prior.mean(axis=0) == pytest.approx(np.zeros(2000), abs=1e-12)
+
+
+def test_a_field_is_not_estimated_jointly():
+    named = [replace(one, observations=replace(one.observations, name=name))
+             for one, name in ((line(estimated=True), "a"), (line(estimated=True), "b"))]  # fmt: skip
+    with pytest.raises(ConfigError, match="a: whole fields cannot be estimated jointly"):
+        sharing(named, ["offset"])
+
+
+def test_what_cannot_be_localised():
+    with pytest.raises(ConfigError, match="needs a localised gain"):
+        assimilate(line(), settings(localisation=None), SEED)
+    with pytest.raises(ConfigError, match="is en4dvar or es-mda"):
+        assimilate(line(), settings("etkf"), SEED)
+    with pytest.raises(ConfigError, match="with perturbed observations"):
+        assimilate(line(), settings("es-mda", mda_form="square-root"), SEED)
+    with pytest.raises(ConfigError, match="at least one parameter must be estimated"):
+        assimilate(replace(line(), fields=()), settings(), SEED)

@@ -1,0 +1,72 @@
+"""``en4dvar simulate`` of several series: one table, against the closed form, that the same file reads again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from problem.series_models import CELLS
+
+from en4dvar.config import load_config
+from en4dvar.config.build import build
+from en4dvar.errors import ConfigError
+from en4dvar.runs.simulation import noise_level, simulate, to_csv
+
+YAML = """\
+name: two
+model: {name: "problem.series_models:Two"}
+data:
+  path: two.csv
+  columns:
+    time: {name: t, unit: ms}
+  series:
+    p: {columns: {p: {name: p, unit: "1"}}, error: {p_std: 0.1}}
+    q: {columns: {q: {name: q, unit: cm}}, error: {q_std: 5 cm}}
+    well: {observable: f, places: 3.5 m, columns: {f: {name: f, unit: "1"}}, error: {f_std: 0.1}}
+parameters:
+  a: {prior: normal, mean: 3, std: 2}
+  b: 2
+simulate: {times: {from: 100 ms, to: 500 ms, step: 100 ms}}
+assimilation: {members: 12}
+"""
+TIMES = np.linspace(0.1, 0.5, 5)
+
+
+def write(folder: Path, text: str = YAML) -> Path:
+    (folder / "two.yaml").write_text(text, encoding="utf-8")
+    return folder / "two.yaml"
+
+
+def test_all_series_at_the_same_instants_in_one_table_that_is_read_again(tmp_path: Path) -> None:
+    config = load_config(write(tmp_path))
+    found = simulate(config)
+    at = np.interp(3.5, CELLS, CELLS)
+    exact = {"p": 3 + 2 * TIMES, "q": 6 - 2 * TIMES**2, "well": 3 * at + 2 * TIMES}
+    assert found.times == pytest.approx(TIMES)
+    assert list(found.series) == list(exact)
+    for name, values in exact.items():
+        assert found.series[name] == pytest.approx(values), name
+    (tmp_path / "two.csv").write_text(to_csv(found, config), encoding="utf-8")
+    (problem,) = build(config)
+    assert problem.observations.values == pytest.approx(np.concatenate(list(exact.values())), rel=1e-8)
+    again = simulate(load_config(write(tmp_path, YAML.replace("simulate:", "# simulate:"))))
+    assert again.times == pytest.approx(TIMES)  # those of the data
+
+
+def test_noise_is_a_share_of_each_series(tmp_path: Path) -> None:
+    config = load_config(write(tmp_path))
+    found = simulate(config, np.linspace(0.1, 0.5, 4000))
+    stds = noise_level("1 % of maximum", config, found)
+    assert stds == pytest.approx({name: 0.01 * values.max() for name, values in found.series.items()})
+    noisy = found.with_noise(stds, 3)
+    noise = {name: noisy.series[name] - values for name, values in found.series.items()}
+    for name, values in noise.items():
+        assert values.std() == pytest.approx(stds[name], rel=0.05), name
+    assert abs(np.corrcoef(noise["p"], noise["q"])[0, 1]) < 0.05
+
+
+def test_a_series_of_many_places_is_refused(tmp_path: Path) -> None:
+    config = load_config(write(tmp_path, YAML.replace("places: 3.5 m", "places: {column: x, unit: m}")))
+    with pytest.raises(ConfigError, match="well is read at many places"):
+        simulate(config)
