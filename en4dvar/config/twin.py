@@ -19,6 +19,7 @@ from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.schema import File, Output, Section, section_of
 from en4dvar.config.validate import Faults
 from en4dvar.cycling.sequential import SequentialSettings
+from en4dvar.cycling.smoothers import EnKS, EnRTS
 from en4dvar.cycling.twin import TwinExperiment
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.files import expanded
@@ -113,6 +114,26 @@ class Local(Section):
         return self
 
 
+class Smoothing(Section):
+    """A smoother behind a filter: the states of earlier cycles given later observations; the filter is as without."""
+
+    method: Literal["enks", "enrts"]
+    """enks: the weights of each analysis act on the cycles before it. enrts: one pass back from the end of the series,
+    which keeps every ensemble until then."""
+    lag: Annotated[int, Field(ge=1)] = 10
+    """enks: cycles that an observation acts back on."""
+
+    @model_validator(mode="after")
+    def _lag_of_enks(self) -> Self:
+        if self.method == "enrts" and "lag" in self.model_fields_set:
+            raise ValueError("lag: only with method enks; enrts smooths by all later observations")
+        return self
+
+    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """As given, without what the method does not take."""
+        return {key: value for key, value in super().as_written(given).items() if self.method == "enks" or key != "lag"}
+
+
 _KINDS = ON_A_SERIES
 _KEYS = {name: {field.name for field in fields(kind)} for name, kind in _KINDS.items()}
 _FOREIGN = {name: set().union(*_KEYS.values()) - keys for name, keys in _KEYS.items()}  # keys of other schemes
@@ -124,7 +145,7 @@ else:
 
 class _Scheme(Section):
     scheme: OnASeries
-    """A filter (one analysis a cycle), or ienks (sliding-window smoother)."""
+    """A filter (one analysis a cycle), ienks (sliding-window smoother), or a baseline to judge them by."""
     members: Annotated[int, Field(ge=3)]
     """Ensemble size N."""
 
@@ -143,6 +164,8 @@ class Sequential(_Iterations):
     """Rotate the ensemble at random after each analysis, mean and covariance kept."""
     localisation: Local | None = None
     """Gaspari–Cohn taper over the indices of the observed field."""
+    smoother: Smoothing | None = None
+    """What smooths the states behind a filter."""
     stochastic_model: bool = False
     """true: accept a model that gives other numbers when a member is run again; by default that is an error."""
 
@@ -155,11 +178,14 @@ class Sequential(_Iterations):
         return self
 
     def built(self, localisation: Localisation | None) -> SequentialSettings:
-        """What the loop needs."""
+        """What the loop needs. Raises :class:`ValueError` where it does not go together."""
         scheme = _KINDS[self.scheme](**{key: getattr(self, key) for key in _KEYS[self.scheme]})
         inflation = Inflation(self.inflation, self.rtps)
+        smoother = None
+        if self.smoother:
+            smoother = EnKS(self.smoother.lag) if self.smoother.method == "enks" else EnRTS()
         return SequentialSettings(
-            scheme, inflation, self.rotation, localisation, stochastic_model=self.stochastic_model
+            scheme, inflation, self.rotation, localisation, stochastic_model=self.stochastic_model, smoother=smoother
         )
 
     def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -236,10 +262,15 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
             where = ("assimilation", "localisation")
             raise ConfigError([document.fault((*where, f.path) if f.path else where, f.message)
                                for f in error.problems]) from None  # fmt: skip
+    try:
+        sequential = file.assimilation.built(local)
+    except ValueError as error:
+        key = "smoother" if file.assimilation.smoother else "localisation"
+        raise ConfigError([document.fault(("assimilation", key), str(error))]) from None
     terms = tuple(entry.term() for entry in file.parameters if isinstance(entry, Uncertain))
     experiment = TwinExperiment(
         model=model,
-        sequential=file.assimilation.built(local),
+        sequential=sequential,
         members=file.assimilation.members,
         cycles=twin.cycles,
         interval=twin.interval,

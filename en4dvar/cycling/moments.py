@@ -14,18 +14,22 @@ BLOCK_SIZE = 2_000_000  # numbers in them, at most
 
 @dataclass(frozen=True)
 class Moments:
-    """Ensemble mean and standard deviation (K, n_state) at the observation times; NaN where there is none."""
+    """Ensemble mean and standard deviation (K, n_state) at the observation times; NaN where there is none.
+
+    ``rank`` is that of the truth among the N members, counted from ½ to N + ½ and divided by N + 1.
+    """
 
     mean: Array
     std: Array
+    rank: Array
 
     @classmethod
     def empty(cls, cycles: int, size: int) -> Moments:
-        return cls(np.full((cycles, size), np.nan), np.full((cycles, size), np.nan))
+        return cls(*(np.full((cycles, size), np.nan) for _ in range(3)))
 
     def until(self, cycle: int) -> Moments:
         """Copy of the rows before ``cycle``."""
-        return Moments(self.mean[:cycle].copy(), self.std[:cycle].copy())
+        return Moments(self.mean[:cycle].copy(), self.std[:cycle].copy(), self.rank[:cycle].copy())
 
 
 class MomentsRecorder:
@@ -34,11 +38,13 @@ class MomentsRecorder:
     The moments of a cycle do not depend on which cycles share its block.
     """
 
-    def __init__(self, cycles: int, size: int, before: Moments | None = None):
+    def __init__(self, cycles: int, size: int, before: Moments | None = None, truth: Array | None = None):
+        self._truth = truth
         self._moments = Moments.empty(cycles, size)
         if before is not None:
             self._moments.mean[: len(before.mean)] = before.mean
             self._moments.std[: len(before.std)] = before.std
+            self._moments.rank[: len(before.rank)] = before.rank
         self._cycles: list[int] = []
         self._scales: list[float] = []
         self._ensembles = np.empty((0, 0, size))
@@ -68,6 +74,11 @@ class MomentsRecorder:
         anomalies = ensembles - mean[:, None]
         variance = np.einsum("kij,kij->kj", anomalies, anomalies) / (n_members - 1)
         self._moments.mean[self._cycles] = mean
-        self._moments.std[self._cycles] = np.array(self._scales)[:, None] * np.sqrt(variance)
+        scales = np.array(self._scales)[:, None]
+        self._moments.std[self._cycles] = scales * np.sqrt(variance)
+        if self._truth is not None:
+            error = self._truth[self._cycles] - mean
+            below = np.count_nonzero(scales[:, None] * anomalies < error[:, None], axis=1)
+            self._moments.rank[self._cycles] = (below + 0.5) / (n_members + 1)
         self._cycles.clear()
         self._scales.clear()

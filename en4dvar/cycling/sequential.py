@@ -19,6 +19,7 @@ from en4dvar.batch import Batch
 from en4dvar.cycling.moments import Moments, MomentsRecorder
 from en4dvar.cycling.rotation import Rotations, rotate
 from en4dvar.cycling.series import CycleSeries
+from en4dvar.cycling.smoothers import EnKS, Smoother
 from en4dvar.descent.loop import iterate
 from en4dvar.ensemble.linalg import centre
 from en4dvar.ensemble.repeat import check_repeats
@@ -30,6 +31,7 @@ from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import LocalDescent, Localisation
+from en4dvar.schemes.particle_filter import ParticleFilter
 from en4dvar.state import Array
 
 NO_INFLATION = Inflation()
@@ -41,6 +43,11 @@ class SequentialSettings:
 
     ``rotation``: every analysis is turned by a random mean-preserving rotation (:mod:`en4dvar.cycling.rotation`).
     ``stochastic_model``: a model that gives other numbers when a member is run again is accepted.
+    ``smoother``: what goes behind a filter (:mod:`en4dvar.cycling.smoothers`).
+
+    Raises
+    ------
+    ValueError: a smoother behind what is no cycled filter, localisation of what has no local analysis.
     """
 
     scheme: Scheme
@@ -49,6 +56,15 @@ class SequentialSettings:
     localisation: Localisation | None = None
     min_active_fraction: float = 0.5
     stochastic_model: bool = False
+    smoother: Smoother | None = None
+
+    def __post_init__(self) -> None:
+        if self.smoother and (self.scheme.lag or not self.scheme.cycled):
+            raise ValueError("a smoother goes behind a filter that is cycled, not behind ienks or a baseline")
+        if self.localisation and isinstance(self.smoother, EnKS):
+            raise ValueError("enks needs the weights of one analysis for all of the state; with localisation use enrts")
+        if self.localisation and isinstance(self.scheme, ParticleFilter):
+            raise ValueError("particles survive as a whole: the particle filter takes no localisation")
 
 
 @dataclass(frozen=True)
@@ -66,15 +82,18 @@ class SequentialState:
     analysis: Moments
     smoothed: Moments
     iterations: Array
+    effective: Array
     forward_runs: int
     failures: tuple[str, ...] = ()
+    trail: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True)
 class SequentialResult:
     """What a run leaves: moments of forecast, analysis (by y_1…y_k) and smoothed ensemble (by y_1…y_{k+L}).
 
-    The last L smoothed rows, and all of a filter's, are NaN. ``iterations`` (K,) forecasts of the window,
+    The last L smoothed rows of the IEnKS, and all of a filter without a smoother, are NaN. ``iterations`` (K,)
+    forecasts of the window, ``effective`` (K,) members that the weights of a particle filter leave (NaN: all),
     ``members`` (N', n) the final ensemble, ``failures`` the reasons of the members lost.
     """
 
@@ -82,6 +101,7 @@ class SequentialResult:
     analysis: Moments
     smoothed: Moments
     iterations: Array
+    effective: Array
     members: Array
     failures: tuple[str, ...] = ()
     forward_runs: int = 0
@@ -98,6 +118,7 @@ def run_sequential(
     on_cycle: Callable[[int], None] | None = None,
     resume: SequentialState | None = None,
     keep: Callable[[Callable[[], SequentialState]], None] | None = None,
+    truth: Array | None = None,
 ) -> SequentialResult:
     """Assimilate ``series`` into ``members`` (N, n_state), the ensemble at time zero.
 
@@ -108,6 +129,7 @@ def run_sequential(
     seed: of the rotations. on_cycle: called with the number of each cycle, from 0.
     resume: where an earlier call with the same arguments was interrupted; the result has the same bits as without.
     keep: called after each cycle with a function that gives the state to resume from.
+    truth: (K, n_state) in a twin experiment, for its rank among the members.
 
     Raises
     ------
@@ -117,7 +139,9 @@ def run_sequential(
     if settings.localisation is not None and series.correlation is not None:
         raise ValueError("localisation needs observations with independent errors")
     with one_blas_thread():
-        run = _Run(model, tuple(observables), members, series, settings, seed, executor or SerialExecutor(), resume)
+        run = _Run(
+            model, tuple(observables), members, series, settings, seed, executor or SerialExecutor(), resume, truth
+        )
         if not settings.stochastic_model:
             run.check_repeats()
         for cycle in range(resume.cycle if resume else 0, len(series.times)):
@@ -181,6 +205,7 @@ class _Run:
         seed: int,
         executor: Executor,
         resume: SequentialState | None,
+        truth: Array | None,
     ):
         self.model, self.observables, self.seed, self.executor = model, observables, seed, executor
         self.series, self.settings, self.scheme = series, settings, settings.scheme
@@ -188,16 +213,18 @@ class _Run:
         self.rotations = Rotations(seed, self.initial_members) if settings.rotation else None
         self.times = [0.0, *series.times.tolist()]
         cycles = len(series.times)
-        self.iterations = np.zeros(cycles)
+        self.iterations, self.effective = np.zeros(cycles), np.full(cycles, np.nan)
+        self.trail: list[Array] = []
         self.ensemble, self.start, self.forward_runs = members, 0, 0  # start: k is the k-th observation time
         self.failures: list[str] = []
         earlier: tuple[Moments | None, ...] = (None, None, None)
         if resume is not None:
             self.ensemble, self.start, self.forward_runs = resume.ensemble, resume.start, resume.forward_runs
             self.failures = list(resume.failures)
-            self.iterations[: resume.cycle] = resume.iterations
+            self.iterations[: resume.cycle], self.effective[: resume.cycle] = resume.iterations, resume.effective
+            self.trail = list(resume.trail)
             earlier = resume.forecast, resume.analysis, resume.smoothed
-        self.before, self.after, self.smooth = (MomentsRecorder(cycles, size, moments) for moments in earlier)
+        self.before, self.after, self.smooth = (MomentsRecorder(cycles, size, moments, truth) for moments in earlier)
         self.cycles_done = resume.cycle if resume else 0
 
     def state(self) -> SequentialState:
@@ -205,14 +232,17 @@ class _Run:
         before, after, smooth = (recorder.moments().until(done) for recorder in (self.before, self.after, self.smooth))
         return SequentialState(
             done, self.start, self.ensemble, before, after, smooth, self.iterations[:done].copy(),
-            self.forward_runs, tuple(self.failures),
+            self.effective[:done].copy(), self.forward_runs, tuple(self.failures), tuple(self.trail),
         )  # fmt: skip
 
     def result(self) -> SequentialResult:
+        if self.settings.smoother is not None:
+            self.settings.smoother.ended(self.trail, len(self.iterations) - 1, self.smooth.put)
         before, after, smooth = (recorder.moments() for recorder in (self.before, self.after, self.smooth))
         return SequentialResult(
-            before, after, smooth, self.iterations, self.ensemble, tuple(self.failures), self.forward_runs
-        )
+            before, after, smooth, self.iterations, self.effective, self.ensemble, tuple(self.failures),
+            self.forward_runs,
+        )  # fmt: skip
 
     def cycle(self, k: int) -> None:
         """Assimilate observation k (index k + 1 of ``times``) and move the window to its next start."""
@@ -220,16 +250,24 @@ class _Run:
         if lag == 0:
             (self.ensemble,) = self.run(self.ensemble, [newest])
             self.start = newest
-        mean, anomalies = self.analyse(k)
+        mean, anomalies, weights = self.analyse(k)
+        transform = weights.T
         if self.rotations is not None:
-            anomalies = rotate(anomalies, self.rotations.of_cycle(k, len(anomalies)))
-        self.ensemble = mean + self.settings.inflation.apply(self.ensemble, anomalies)
+            turned = self.rotations.of_cycle(k, len(anomalies))
+            anomalies = rotate(anomalies, turned)
+            if self.settings.smoother is not None:
+                transform = rotate(transform, turned)
+        forecast = self.ensemble
+        self.ensemble = mean + self.settings.inflation.apply(forecast, anomalies)
+        if self.settings.smoother is not None:
+            rows = weights.w + transform
+            self.settings.smoother.passed(self.trail, k, forecast, mean + anomalies, rows, self.smooth.put)
         next_start = max(self.start, newest + 1 - lag) if lag else newest
         if 0 < self.start < next_start:
             self.smooth.put(self.start - 1, self.ensemble)
         at = self.run(self.ensemble, sorted({next_start, newest}))
         self.after.put(k, at[-1])
-        self.ensemble, self.start = at[0], next_start
+        self.ensemble, self.start = at[0] if self.scheme.cycled else forecast, next_start
         self.cycles_done = newest
 
     def check_repeats(self) -> None:
@@ -254,8 +292,11 @@ class _Run:
         states, failures = run(both)
         check_repeats(self.model, states, failures, lambda again: run([both[i] for i in again]))
 
-    def analyse(self, k: int) -> tuple[Array, Array]:
-        """Mean and anomalies of the posterior at the start of the window; members lost are dropped from the prior."""
+    def analyse(self, k: int) -> tuple[Array, Array, Weights]:
+        """Mean and anomalies of the posterior at the start of the window; members lost are dropped from the prior.
+
+        The weights are those of the analysis where it is not local.
+        """
         while True:
             window = _CycleWindow(self, k)
             descent = _Cycle(Weights.prior(len(self.ensemble)))
@@ -265,10 +306,10 @@ class _Run:
                 self.drop(lost.reasons)
                 self.ensemble = self.ensemble[[not reason for reason in lost.reasons]]
                 continue
-            if window.localised is not None:
-                return centre(window.localised)
             weights = descent.weights
-            return window.mean + weights.w @ window.anomalies, weights.T @ window.anomalies
+            if window.localised is not None:
+                return *centre(window.localised), weights
+            return window.mean + weights.w @ window.anomalies, weights.T @ window.anomalies, weights
 
     def predict(self, states: Array, index: int) -> Array:
         """Predictions (N, p): H acts at one instant, so members stand where it expects times."""
@@ -296,6 +337,7 @@ class _Run:
                 states = states[[not reason for reason in lost.reasons]]
 
     def drop(self, failed: Sequence[str]) -> None:
+        self.trail = [ensembles[..., [not reason for reason in failed], :] for ensembles in self.trail]
         self.failures += [reason for reason in failed if reason]
         alive = self.initial_members - len(self.failures)
         needed = max(2, int(np.ceil(self.settings.min_active_fraction * self.initial_members)))
@@ -355,9 +397,10 @@ class _CycleWindow:
             self.localised = self.of.settings.localisation.analysis(scheme, self.of.ensemble, evaluation, self.draw)
         return evaluation
 
-    def draw(self, purpose: str) -> Array:
+    def draw(self, purpose: str, columns: int | None = None) -> Array:
+        size = columns or self.of.series.values.shape[1]
         streams = (member_stream(self.of.seed, f"{purpose}, cycle {self.k}", i) for i in range(len(self.anomalies)))
-        return np.stack([stream.standard_normal(self.of.series.values.shape[1]) for stream in streams])
+        return np.stack([stream.standard_normal(size) for stream in streams])
 
     def move(self, scheme: Scheme, going: Sequence[_Cycle]) -> None:
         (descent,) = going
@@ -371,6 +414,7 @@ class _CycleWindow:
             self.localised = self.local.members(lambda weights: weights.rows)
         descent.iteration += 1
         self.of.iterations[self.k] = descent.iteration
+        self.of.effective[self.k] = getattr(descent.step, "effective", np.nan)
 
     def _local_step(self, scheme: Scheme, local: LocalDescent, iteration: int) -> float:
         """The blocks' own steps from the same runs, of which the largest tells when a cycle ends."""

@@ -98,7 +98,7 @@ class TwinResult:
     def scores(self) -> dict[str, Score]:
         """Of the forecast, the analysis and (with a lag) the smoothed ensemble."""
         kinds = {"forecast": self.run.forecast, "analysis": self.run.analysis}
-        if self.experiment.sequential.scheme.lag:
+        if self.experiment.sequential.scheme.lag or self.experiment.sequential.smoother:
             kinds["smoothed"] = self.run.smoothed
         return {name: self._score(moments) for name, moments in kinds.items()}
 
@@ -116,6 +116,11 @@ class TwinResult:
             found.append(
                 f"{still.sum()} variables of {', '.join(dict.fromkeys(names[still]))} never change and have the values "
                 "of parameters, but count in RMSE and spread; give each parameter in the state a field with its name"
+            )
+        if alone := int(np.sum(self.run.effective < 2)):
+            found.append(
+                f"in {alone} of {len(self.run.effective)} cycles one particle had nearly all of the weight; give more "
+                "members, more jitter or larger observation errors"
             )
         score = self.scores["analysis"]
         if score.mean_spread < OVERCONFIDENT * score.mean_rmse:
@@ -194,6 +199,7 @@ def conduct(
         on_cycle,
         resume,
         keep,
+        truth,
     )
     return TwinResult(experiment, seed, truth, series, run)
 

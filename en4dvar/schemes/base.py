@@ -11,7 +11,6 @@ centre and row i of the ensemble transform T.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, cast
 
@@ -21,7 +20,12 @@ from en4dvar.ensemble.linalg import Hessian
 from en4dvar.ensemble.near_prior import NearPrior
 from en4dvar.state import Array
 
-Draw = Callable[[str], Array]  # standard normal numbers (N, K') by the name of their purpose, the same ones each time
+
+class Draw(Protocol):
+    """Standard normal numbers by the name of their purpose, the same ones each time."""
+
+    def __call__(self, purpose: str, columns: int | None = None) -> Array:
+        """(N, K'), a column an observation, or (N, ``columns``) whatever the observations."""
 
 
 @dataclass(frozen=True)
@@ -78,10 +82,14 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Step:
-    """The weights that a scheme would take next, and how far that is in posterior standard deviations."""
+    """The weights that a scheme would take next, and how far that is in posterior standard deviations.
+
+    ``effective``: how many members the analysis is of, where it weighs them.
+    """
 
     weights: Weights
     norm: float
+    effective: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -134,6 +142,7 @@ class Scheme(Protocol):
     ``searches``: steps are Gauss–Newton steps of J, and how far to go is found by J of the central run
     (:mod:`en4dvar.descent.step_control`). Other schemes take their step as it is; their ensemble is run as a whole, and
     R is that at its mean, ``passes`` times. ``lag``: cycles of a series that the window is long; 0 is a filter.
+    ``cycled``: the next forecast starts from the analysis; a baseline's from the forecast, as if nothing was observed.
     """
 
     @property
@@ -144,6 +153,8 @@ class Scheme(Protocol):
     def passes(self) -> int: ...
     @property
     def lag(self) -> int: ...
+    @property
+    def cycled(self) -> bool: ...
 
     def members(self, weights: Weights, basis: Array | None = None) -> Array:
         """Weights (M, N) of the members to be run next, as rows."""

@@ -23,6 +23,7 @@ class ETKF:
     """The filter: a window without length, analysed once. Filters with another analysis say so in :meth:`advance`."""
 
     on: ClassVar[tuple[str, ...]] = ("window", "series")
+    cycled: ClassVar[bool] = True
     searches: ClassVar[bool] = False
     passes: ClassVar[int] = 1
     lag: ClassVar[int] = 0

@@ -46,6 +46,7 @@ class IEnKS:
 
     on: ClassVar[tuple[str, ...]] = ("series",)
     passes: ClassVar[int] = 1
+    cycled: ClassVar[bool] = True
     searches: ClassVar[bool] = False
 
     def members(self, weights: Weights, basis: Array | None = None) -> Array:
