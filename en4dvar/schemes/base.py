@@ -156,3 +156,14 @@ class Scheme(Protocol):
 
     def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
         """Whether iterations end with this step, which is taken (a scheme that searches is not asked)."""
+
+
+class SeriesScheme(Scheme, Protocol):
+    """A scheme on a series: ``shift``, by how many cycles its window moves on, and ``mda_weights``, the shares by which
+    an observation is assimilated in one window after the other.
+    """
+
+    @property
+    def shift(self) -> int: ...
+    @property
+    def mda_weights(self) -> tuple[float, ...]: ...
