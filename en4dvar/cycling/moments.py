@@ -82,3 +82,34 @@ class MomentsRecorder:
             self._moments.rank[self._cycles] = (below + 0.5) / (n_members + 1)
         self._cycles.clear()
         self._scales.clear()
+
+
+class InnovationRecorder(MomentsRecorder):
+    """Moments of predictions (N, p), and the ranks (K, p) of observations (K, p) with errors ``std``, (p,) or (K, p).
+
+    A rank is the probability that the mixture of the members' Gaussians gives to what lies below the observation: the
+    share of members below it, errors of the observations added, without the chance of a draw. NaN where there is none.
+    """
+
+    def __init__(self, values: Array, std: Array, before: Moments | None = None, ranks: Array | None = None):
+        super().__init__(values.shape[0], values.shape[1], before)
+        self._values, self._std = values, np.broadcast_to(std, values.shape)
+        self._ranks = np.full(values.shape, np.nan)
+        if ranks is not None:
+            self._ranks[: len(ranks)] = ranks
+
+    @property
+    def ranks(self) -> Array:
+        """Of everything recorded so far."""
+        self._flush()
+        return self._ranks
+
+    def _flush(self) -> None:
+        if not self._cycles:
+            return
+        from scipy.special import ndtr
+
+        at = self._cycles
+        gaps = (self._values[at][:, None] - self._ensembles[: len(at)]) / self._std[at][:, None]
+        self._ranks[at] = ndtr(gaps).mean(axis=1)
+        super()._flush()

@@ -142,7 +142,6 @@ class Scheme(Protocol):
     ``searches``: steps are Gauss–Newton steps of J, and how far to go is found by J of the central run
     (:mod:`en4dvar.descent.step_control`). Other schemes take their step as it is; their ensemble is run as a whole, and
     R is that at its mean, ``passes`` times. ``lag``: cycles of a series that the window is long; 0 is a filter.
-    ``cycled``: the next forecast starts from the analysis; a baseline's from the forecast, as if nothing was observed.
     """
 
     @property
@@ -153,8 +152,6 @@ class Scheme(Protocol):
     def passes(self) -> int: ...
     @property
     def lag(self) -> int: ...
-    @property
-    def cycled(self) -> bool: ...
 
     def members(self, weights: Weights, basis: Array | None = None) -> Array:
         """Weights (M, N) of the members to be run next, as rows."""
@@ -167,3 +164,17 @@ class Scheme(Protocol):
 
     def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
         """Whether iterations end with this step, which is taken (a scheme that searches is not asked)."""
+
+
+class SeriesScheme(Scheme, Protocol):
+    """A scheme on a series: ``shift``, by how many cycles its window moves on, and ``mda_weights``, the shares by which
+    an observation is assimilated in one window after the other. ``cycled``: the next forecast starts from the analysis;
+    a baseline's from the forecast, as if nothing was observed.
+    """
+
+    @property
+    def cycled(self) -> bool: ...
+    @property
+    def shift(self) -> int: ...
+    @property
+    def mda_weights(self) -> tuple[float, ...]: ...

@@ -36,7 +36,6 @@ class En4DVar:
 
     on: ClassVar[tuple[str, ...]] = ("window",)
     passes: ClassVar[int] = 1
-    cycled: ClassVar[bool] = True
     searches: ClassVar[bool] = True
     lag: ClassVar[int] = 0
 

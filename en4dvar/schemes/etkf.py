@@ -27,6 +27,8 @@ class ETKF:
     searches: ClassVar[bool] = False
     passes: ClassVar[int] = 1
     lag: ClassVar[int] = 0
+    shift: ClassVar[int] = 1
+    mda_weights: ClassVar[tuple[float, ...]] = (1.0,)
 
     def members(self, weights: Weights, basis: Array | None = None) -> Array:
         """I (N, N): the members are the forecast."""
