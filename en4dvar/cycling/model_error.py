@@ -77,6 +77,8 @@ def fresh_noise(anomalies: Array, draws: Array) -> Array:
     Where N > rank + q it is second-order exact: of unit sample covariance, uncorrelated with the ``anomalies`` (N, m).
     """
     centred = draws - draws.mean(axis=0)
+    if len(draws) - 1 < draws.shape[1]:
+        return np.asarray(centred)
     size = np.linalg.norm(anomalies, axis=0)
     u, s, _ = np.linalg.svd(anomalies / np.where(size > 0, size, 1.0), full_matrices=False)
     basis = u[:, s > SPANNED * s.max(initial=0.0)]

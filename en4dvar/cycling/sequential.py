@@ -111,11 +111,11 @@ class SequentialResult:
     """What a run leaves: moments of forecast, analysis (by y_1…y_k) and smoothed ensemble (by y_1…y_{k+L}).
 
     The last L smoothed rows of the IEnKS, unless ``to_end``, and all of a filter without a smoother are NaN.
-    ``predicted``: moments (K, p) of the forecast where it was observed. ``ranks`` (K, p): share of the members, with the
-    errors of the observations, that lie below the observation, NaN where there was none. ``iterations`` (K,) forecasts
-    of the window. ``effective`` (K,): members that the weights of a particle filter leave, NaN: all. ``members`` (N', n)
-    the final ensemble at the start of the last window; ``kept``: index of a time → analysis members (N', n), physical;
-    ``failures`` the reasons of the members lost.
+    ``predicted``: moments (K, p) of the forecast where it was observed. ``ranks`` (K, p): share of the members, with
+    the errors of the observations, that lie below the observation, NaN where there was none. ``iterations`` (K,)
+    forecasts of the window. ``effective`` (K,): members that the weights of a particle filter leave, NaN: all.
+    ``members`` (N', n) the final ensemble at the start of the last window; ``kept``: index of a time → analysis members
+    (N', n), physical; ``failures`` the reasons of the members lost.
     """
 
     forecast: Moments

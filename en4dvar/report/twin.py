@@ -1,4 +1,6 @@
-"""Page and figures of a twin experiment, from ``twin.nc`` alone: RMSE and spread in time, the state and its truth."""
+"""Page and figures of a twin experiment, from ``twin.nc`` alone: RMSE and spread in time, the state and its truth,
+ranks of the truth among the members, and whether the spread says how large the error is.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +25,8 @@ from en4dvar.storage.twin_file import MEAN
 COLOURS = {"forecast": "prior", "analysis": "posterior", "smoothed": "background"}
 SHOWN = 4  # variables of the state in the second figure
 LAST = 200  # cycles in it
+MOST_BARS = 21  # of a rank histogram
+BINS = 12  # of spreads
 
 
 def write_twin_report(run_dir: Path) -> Path:
@@ -60,6 +64,18 @@ def twin_figures(data: xr.Dataset) -> Iterator[Captioned]:
     yield "scores", f"RMSE against the truth (line) and spread (dashed) of each estimate in time.{words}", scores(data)
     shown = f"Error of the analysis within two standard deviations, last {min(LAST, data.sizes['time'])} cycles"
     yield "errors", f"{shown}, some variables of the state. A reliable ensemble has 95 % within.", errors(data)
+    yield (
+        "ranks",
+        "Rank of the truth among the members, over all cycles and variables that count, relative to a flat histogram. A "
+        "hollow means too little spread, a hill too much, a slope a bias.",
+        ranks(data),
+    )
+    yield (
+        "reliability",
+        "RMSE of the values in twelve groups of the same size, by their spread, against that spread. A reliable ensemble "
+        "lies on the diagonal: where it is spread wide, its error is large.",
+        reliability(data),
+    )
 
 
 @styled
@@ -100,6 +116,52 @@ def errors(data: xr.Dataset) -> Figure:
         ax.set_title(f"{name}: {100 * inside[i]:.0f} % within 2 std", loc="left")
         ax.set_ylabel(with_unit("error", str(data["units"].values[i])))
     return _labelled(figure, stack, data)
+
+
+@styled
+def ranks(data: xr.Dataset) -> Figure:
+    """Histogram of the rank of the truth, one panel an estimate; 1 is what a flat one has."""
+    kinds = _kinds(data)
+    figure, stack = _stack(len(kinds), 2.6)
+    size = int(data.attrs["members"]) - int(data.attrs["members_lost"]) + 1
+    edges = np.round(np.linspace(0, size, min(size, MOST_BARS) + 1)) / size  # whole ranks in a bar
+    for ax, kind in zip(stack, kinds, strict=True):
+        found = _counted(data, data[f"{kind}_rank"].values)
+        count, _ = np.histogram(found, edges)
+        relative = count / (np.diff(edges) * max(1, len(found)))
+        ax.stairs(relative, edges, fill=True, color=LIGHT[COLOURS[kind]], alpha=0.6)
+        ax.axhline(1, color=LIGHT["ink"], lw=0.8, ls="--")
+        ax.set_title(kind, loc="left")
+        ax.set_ylabel("frequency")
+        ax.set_xlim(0, 1)
+    stack[-1].set_xlabel("share of the members below the truth")
+    return figure
+
+
+@styled
+def reliability(data: xr.Dataset) -> Figure:
+    """RMSE against spread, in groups of the same size, one line an estimate."""
+    figure = Figure(figsize=(COLUMN, COLUMN), layout="constrained")
+    ax = figure.subplots()
+    largest = 0.0
+    for kind in _kinds(data):
+        spread = _counted(data, data[f"{kind}_std"].values)
+        error = _counted(data, (data[f"{kind}_mean"] - data["truth"]).values)
+        groups = np.array_split(np.argsort(spread, kind="stable"), min(BINS, max(1, len(spread))))
+        x, y = (np.array([np.sqrt(np.mean(v[g] ** 2)) for g in groups]) for v in (spread, error))
+        ax.plot(x, y, color=LIGHT[COLOURS[kind]], lw=1, marker="o", ms=3, label=kind)
+        largest = max(largest, float(x.max(initial=0)), float(y.max(initial=0)))
+    ax.plot([0, largest], [0, largest], color=LIGHT["ink"], lw=0.8, ls="--")
+    ax.set_xlabel(with_unit("spread", _unit(data)))
+    ax.set_ylabel(with_unit("RMSE", _unit(data)))
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper right", ncols=3)
+    return figure
+
+
+def _counted(data: xr.Dataset, values: np.ndarray) -> np.ndarray:
+    """Values (K, n) that are there, after the burn-in, of the variables that scores count, as one row."""
+    wanted = values[int(data.attrs["burn_in"]) :, data["dynamic"].values.astype(bool)].ravel()
+    return np.asarray(wanted[np.isfinite(wanted)])
 
 
 def _stack(n: int, height: float) -> tuple[Figure, Sequence[Axes]]:

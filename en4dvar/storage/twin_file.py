@@ -39,6 +39,9 @@ def dataset(result: TwinResult, attributes: Mapping[str, Any]) -> xr.Dataset:
         "iterations": ("time", result.run.iterations, {"long_name": "forecasts of the window", "units": "1"}),
     }
     run = result.run
+    if np.isfinite(run.effective).any():
+        text = {"long_name": "members that the weights leave, 1 / sum of their squares", "units": "1"}
+        variables["effective"] = ("time", run.effective, text)
     for kind, moments in (("forecast", run.forecast), ("analysis", run.analysis), ("smoothed", run.smoothed)):
         if (score := result.scores.get(kind)) is None:
             continue
@@ -47,6 +50,7 @@ def dataset(result: TwinResult, attributes: Mapping[str, Any]) -> xr.Dataset:
         variables |= {
             f"{kind}_mean": (along, moments.mean, {"long_name": f"mean of the {kind} ensemble"}),
             f"{kind}_std": (along, moments.std, {"long_name": f"standard deviation of the {kind} ensemble"}),
+            f"{kind}_rank": (along, moments.rank, {"long_name": f"share of the {kind} members below the truth"}),
             f"{kind}_rmse": ("time", score.rmse, rmse),
             f"{kind}_spread": ("time", score.spread, spread),
         }
@@ -61,6 +65,7 @@ def dataset(result: TwinResult, attributes: Mapping[str, Any]) -> xr.Dataset:
         "time": ("time", result.series.times, {"units": model.time_unit, "long_name": "observation time"}),
         "state": ("state", names, {"long_name": "variable of the state"}),
         "units": ("state", units, {"long_name": "unit of the variable"}),
+        "dynamic": ("state", experiment.dynamic.astype(np.int8), {"long_name": "1: counts in RMSE and spread"}),
     }
     root = {
         "Conventions": "CF-1.10, ACDD-1.3",

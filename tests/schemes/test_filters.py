@@ -62,12 +62,13 @@ def test_enkf_n_minimises_its_cost(seed, k):
     h = 1e-5
     gradient = [(cost(found.w + h * u) - cost(found.w - h * u)) / (2 * h) for u in np.eye(n)]
     assert np.abs(gradient).max() < 1e-5
-    # the transform is the inverse root of the Hessian of that cost
+    # the transform is a root of the inverse Hessian of that cost
     hessian = np.array([
         [(cost(found.w + 1e-3 * (a + b)) - cost(found.w + 1e-3 * (a - b)) - cost(found.w + 1e-3 * (b - a))
           + cost(found.w - 1e-3 * (a + b))) / 4e-6 for a in np.eye(n)] for b in np.eye(n)
     ])  # fmt: skip
-    assert found.T @ hessian @ found.T == pytest.approx((n - 1) * np.eye(n), abs=2e-3)
+    assert found.T @ hessian @ found.T.T == pytest.approx((n - 1) * np.eye(n), abs=2e-3)
+    assert np.abs(found.T.sum(axis=0) - found.T.sum() / n).max() < 1e-12
 
 
 def test_without_information_enkf_n_keeps_the_mean():
