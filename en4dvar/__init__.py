@@ -54,6 +54,8 @@ if TYPE_CHECKING:
     from en4dvar.runs.simulation import Simulation as Simulation
     from en4dvar.runs.simulation import simulate as simulate
     from en4dvar.runs.twin_run import run_twin as run_twin
+    from en4dvar.runs.twin_sweep import TwinSweep as TwinSweep
+    from en4dvar.runs.twin_sweep import sweep_twin as sweep_twin
     from en4dvar.series import Places as Places
     from en4dvar.series import Series as Series
     from en4dvar.state import Field as Field
@@ -85,6 +87,7 @@ _HOME = {
     "state": ("Field", "Parameter", "StateLayout"),
     "report.result": ("Result", "load_result"),
     "runs.twin_run": ("run_twin",),
+    "runs.twin_sweep": ("TwinSweep", "sweep_twin"),
     "units": ("Quantity",),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}

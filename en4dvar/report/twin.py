@@ -66,14 +66,14 @@ def twin_figures(data: xr.Dataset) -> Iterator[Captioned]:
     yield "errors", f"{shown}, some variables of the state. A reliable ensemble has 95 % within.", errors(data)
     yield (
         "ranks",
-        "Rank of the truth among the members, over all cycles and variables that count, relative to a flat histogram. A "
-        "hollow means too little spread, a hill too much, a slope a bias.",
+        "Rank of the truth among the members, over all cycles and variables that count, relative to a flat histogram. "
+        "A hollow means too little spread, a hill too much, a slope a bias.",
         ranks(data),
     )
     yield (
         "reliability",
-        "RMSE of the values in twelve groups of the same size, by their spread, against that spread. A reliable ensemble "
-        "lies on the diagonal: where it is spread wide, its error is large.",
+        "RMSE of the values in twelve groups of the same size, by their spread, against that spread. A reliable "
+        "ensemble lies on the diagonal: where it is spread wide, its error is large.",
         reliability(data),
     )
 
