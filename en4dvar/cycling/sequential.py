@@ -37,9 +37,9 @@ from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.prior import member_stream
 from en4dvar.schemes.base import SeriesScheme, Weights
+from en4dvar.schemes.bootstrap_filter import BootstrapFilter
 from en4dvar.schemes.inflation import Inflation
 from en4dvar.schemes.localisation import Localisation
-from en4dvar.schemes.particle_filter import ParticleFilter
 from en4dvar.state import Array
 
 NO_INFLATION = Inflation()
@@ -78,8 +78,8 @@ class SequentialSettings:
             raise ValueError("a smoother goes behind a filter that is cycled, not behind ienks or a baseline")
         if self.localisation and isinstance(self.smoother, EnKS):
             raise ValueError("enks needs the weights of one analysis for all of the state; with localisation use enrts")
-        if self.localisation and isinstance(self.scheme, ParticleFilter):
-            raise ValueError("particles survive as a whole: the particle filter takes no localisation")
+        if self.localisation and isinstance(self.scheme, BootstrapFilter):
+            raise ValueError("members survive as a whole: the particle filter takes no localisation")
 
 
 @dataclass(frozen=True)

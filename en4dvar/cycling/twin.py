@@ -119,7 +119,7 @@ class TwinResult:
             )
         if alone := int(np.sum(self.run.effective < 2)):
             found.append(
-                f"in {alone} of {len(self.run.effective)} cycles one particle had nearly all of the weight; give more "
+                f"in {alone} of {len(self.run.effective)} cycles one member had nearly all of the weight; give more "
                 "members, more jitter or larger observation errors"
             )
         score = self.scores["analysis"]

@@ -7,6 +7,7 @@ from typing import Any
 
 from en4dvar.schemes.base import Scheme
 from en4dvar.schemes.baselines import Climatology, OptimalInterpolation
+from en4dvar.schemes.bootstrap_filter import BootstrapFilter
 from en4dvar.schemes.denkf import DEnKF
 from en4dvar.schemes.en4dvar import En4DVar
 from en4dvar.schemes.enkf import EnKF
@@ -15,7 +16,6 @@ from en4dvar.schemes.esmda import ESMDA
 from en4dvar.schemes.esrf import ESRF
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
-from en4dvar.schemes.particle_filter import ParticleFilter
 
 # name in a configuration → class; its fields are keys of the section ``assimilation:``
 SCHEMES: dict[str, Any] = {
@@ -27,7 +27,7 @@ SCHEMES: dict[str, Any] = {
     "esrf": ESRF,
     "enkf-n": EnKFN,
     "ienks": IEnKS,
-    "particle-filter": ParticleFilter,
+    "particle-filter": BootstrapFilter,
     "optimal-interpolation": OptimalInterpolation,
     "climatology": Climatology,
 }

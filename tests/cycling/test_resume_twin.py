@@ -23,12 +23,12 @@ from en4dvar.forward import Failure
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.twin_run import run_twin
 from en4dvar.schemes.baselines import OptimalInterpolation
+from en4dvar.schemes.bootstrap_filter import BootstrapFilter
 from en4dvar.schemes.enkf import EnKF
 from en4dvar.schemes.esrf import ESRF
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation
-from en4dvar.schemes.particle_filter import ParticleFilter
 from en4dvar.storage.codec import decode, encode
 
 YAML = """\
@@ -73,7 +73,7 @@ def assert_same(a, b):
     ("scheme", "smoother"),
     [
         (ETKF(), None), (IEnKS(1), None), (IEnKS(3), None), (IEnKS(2, "bundle"), None), (EnKF(), EnKS(3)),
-        (ESRF(), EnRTS()), (ParticleFilter(0.5), None), (OptimalInterpolation(), None),
+        (ESRF(), EnRTS()), (BootstrapFilter(0.5), None), (OptimalInterpolation(), None),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("model", [Ring(), Losing()])

@@ -8,8 +8,8 @@ import pytest
 from en4dvar.cycling.sequential import CycleSeries, SequentialSettings, run_sequential
 from en4dvar.ensemble.linalg import centre
 from en4dvar.schemes.base import Evaluation, Weights
+from en4dvar.schemes.bootstrap_filter import BootstrapFilter, likelihood_shares, systematic
 from en4dvar.schemes.localisation import Localisation
-from en4dvar.schemes.particle_filter import ParticleFilter, likelihood_shares, systematic
 from en4dvar_lorenz import Linear
 from en4dvar_lorenz.linear import LinearSettings
 
@@ -40,7 +40,7 @@ def test_shares_are_the_likelihoods():
 
 def test_without_jitter_members_are_those_that_survive():
     x = centre(np.random.default_rng(2).standard_normal((200, 1)))[1]
-    step = ParticleFilter(jitter=0).advance(Weights.prior(200), Evaluation(np.array([0.5]), x.T), 0, draws)
+    step = BootstrapFilter(jitter=0).advance(Weights.prior(200), Evaluation(np.array([0.5]), x.T), 0, draws)
     moved = step.weights.rows @ x
     assert all(np.isclose(value, x[:, 0], atol=1e-13).any() for value in moved[:, 0])
     shares = likelihood_shares(Evaluation(np.array([0.5]), x.T))
@@ -61,7 +61,7 @@ def test_jitter_adds_its_share_of_the_covariance():
         def draw(purpose, columns=None, rng=rng):
             return rng.standard_normal((200, columns))
 
-        step = ParticleFilter(jitter=0.7).advance(Weights.prior(200), e, 0, draw)
+        step = BootstrapFilter(jitter=0.7).advance(Weights.prior(200), e, 0, draw)
         found.append(np.cov((step.weights.T @ x).T))
         means.append(step.weights.w @ x)
     assert np.mean(means, axis=0) == pytest.approx(shares @ x, abs=0.02)
@@ -73,7 +73,7 @@ def test_the_posterior_of_a_linear_model_within_sampling_error():
     model, rng, n = Linear.from_settings(LinearSettings(oscillators=1)), np.random.default_rng(4), 1500
     members = np.hstack([rng.standard_normal((n, 2)), np.full((n, 1), 0.1)])
     series = CycleSeries(0.3 * np.arange(1, 4), np.array([[0.5, 0.2], [0.1, 0.6], [0.3, 0.4]]), np.array([0.8, 0.9]))
-    particles = run_sequential(model, model.observables, members, series, SequentialSettings(ParticleFilter(0.0)))
+    particles = run_sequential(model, model.observables, members, series, SequentialSettings(BootstrapFilter(0.0)))
     unit = np.hstack([np.eye(2), np.full((2, 1), 0.1)])
     m = np.array([model.step(row, 0.0, 0.3)[:2] for row in unit]).T
     mean, cov = np.zeros(2), np.eye(2)
@@ -90,4 +90,4 @@ def test_the_posterior_of_a_linear_model_within_sampling_error():
 def test_no_localisation():
     local = Localisation([np.arange(2)], np.ones((1, 2)))
     with pytest.raises(ValueError, match="particle filter takes no localisation"):
-        SequentialSettings(ParticleFilter(), localisation=local)
+        SequentialSettings(BootstrapFilter(), localisation=local)

@@ -29,7 +29,7 @@ from en4dvar.state import Array
 
 
 @dataclass(frozen=True)
-class ParticleFilter(ETKF):
+class BootstrapFilter(ETKF):
     """The filter; it takes no localisation."""
 
     jitter: Annotated[
