@@ -12,7 +12,7 @@ from en4dvar.cycling.moments import Moments
 from en4dvar.cycling.problem import SeriesResult, normalised_innovations
 from en4dvar.cycling.sequential import SequentialResult
 from en4dvar.cycling.series import CycleSeries
-from en4dvar.forward import ForwardModel
+from en4dvar.forward import ForwardModel, Observable, StateField
 from en4dvar.state import Array
 from en4dvar.tables import csv_text
 
@@ -87,12 +87,27 @@ def dataset(result: SeriesResult, attributes: Mapping[str, Any]) -> xr.Dataset:
     }
     of_columns = {observable.name: observable for observable in problem.observables}
     columns = [of_columns[name.split(" at ")[0]] for name in series.names]  # of a field the place stands behind
+    of_state = [_field_read(column, model) for column in columns]
+    shown = {p.name: p.display_unit for p in model.parameters}
+    shown |= {name: o.display_unit for name, o in zip(of_state, columns, strict=True) if name}
+    along = {"units": model.time_unit, "display_units": model.time_display_unit, "long_name": "observation time"}
     coordinates = {
-        "time": ("time", series.times, {"units": model.time_unit, "long_name": "observation time"}),
+        "time": ("time", series.times, along),
         "state": ("state", names, {"long_name": "variable of the state"}),
         "units": ("state", units, {"long_name": "unit of the variable"}),
+        "display_units": (
+            "state",
+            [shown.get(name, unit) for name, unit in zip(names, units, strict=True)],
+            {"long_name": "unit of the variable in reports"},
+        ),
         "observation": ("observation", list(series.names), {"long_name": "what was observed"}),
         "observation_units": ("observation", [o.unit for o in columns], {"long_name": "unit of the observation"}),
+        "observation_display_units": (
+            "observation",
+            [o.display_unit for o in columns],
+            {"long_name": "unit of the observation in reports"},
+        ),
+        "observation_state": ("observation", of_state, {"long_name": "variable of the state that was observed"}),
         "member_time": ("member_time", series.times[[k for k, _ in run.kept]], {"units": model.time_unit}),
     }
     root = {
@@ -107,6 +122,13 @@ def dataset(result: SeriesResult, attributes: Mapping[str, Any]) -> xr.Dataset:
         **attributes,
     }
     return xr.Dataset(variables, coordinates, root)
+
+
+def _field_read(observable: Observable, model: ForwardModel) -> str:
+    """The variable of the state that an observable reads as it is; "" where it is more than that."""
+    name = observable.operator.name if isinstance(observable.operator, StateField) else ""
+    one = name in model.layout.names and model.layout[name].stop - model.layout[name].start == 1
+    return name if one else ""
 
 
 def _members(run: SequentialResult, n_members: int) -> Array:
