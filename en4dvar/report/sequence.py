@@ -1,4 +1,4 @@
-"""Page and figures of a sequence, from ``sequence.nc`` alone: state and data, innovations, ranks, parameters in time."""
+"""Page and figures of a sequence, from ``sequence.nc`` alone: state, parameters, innovations in time, and ranks."""
 
 from __future__ import annotations
 
@@ -75,7 +75,8 @@ def in_time(data: xr.Dataset, kind: str, chosen: npt.NDArray[np.intp]) -> Figure
         unit, shown = str(data["units"].values[i]), str(data["display_units"].values[i])
         mean, std = (convert(data[f"{kind}_{what}"].values[:, i], unit, shown) for what in ("mean", "std"))
         colour = LIGHT["posterior"]
-        ax.fill_between(time, mean - 2 * std, mean + 2 * std, color=colour, alpha=0.25, lw=0, label="± 2 std")
+        low, high = _band(mean, std, bool(data["positive"].values[i]))
+        ax.fill_between(time, low, high, color=colour, alpha=0.25, lw=0, label="± 2 std")
         ax.plot(time, mean, color=colour, lw=0.9, label=kind)
         if name in read_as:
             readings = convert(data["observations"].values[:, read_as.index(name)], unit, shown)
@@ -83,6 +84,15 @@ def in_time(data: xr.Dataset, kind: str, chosen: npt.NDArray[np.intp]) -> Figure
         ax.set_ylabel(with_unit(name, shown))
     stack = sorted(stack, key=lambda ax: len(ax.get_lines()), reverse=True)[:1] + list(stack)  # its legend has it all
     return labelled(figure, stack, str(data["time"].attrs["display_units"]))
+
+
+def _band(mean: Array, std: Array, positive: bool) -> tuple[Array, Array]:
+    """± 2 std, of what is positive by the lognormal of the same mean and standard deviation."""
+    if not positive:
+        return mean - 2 * std, mean + 2 * std
+    width = np.sqrt(np.log1p((std / mean) ** 2))
+    centre = np.log(mean) - width**2 / 2
+    return np.exp(centre - 2 * width), np.exp(centre + 2 * width)
 
 
 @styled

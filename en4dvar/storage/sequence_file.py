@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 from en4dvar.cycling.moments import Moments
-from en4dvar.cycling.problem import SeriesResult, normalised_innovations
+from en4dvar.cycling.problem import SeriesProblem, SeriesResult, normalised_innovations
 from en4dvar.cycling.sequential import SequentialResult
 from en4dvar.cycling.series import CycleSeries
 from en4dvar.forward import ForwardModel, Observable, StateField
@@ -100,6 +101,7 @@ def dataset(result: SeriesResult, attributes: Mapping[str, Any]) -> xr.Dataset:
             [shown.get(name, unit) for name, unit in zip(names, units, strict=True)],
             {"long_name": "unit of the variable in reports"},
         ),
+        "positive": ("state", _positive(problem), {"long_name": "1: the ensemble holds its logarithm"}),
         "observation": ("observation", list(series.names), {"long_name": "what was observed"}),
         "observation_units": ("observation", [o.unit for o in columns], {"long_name": "unit of the observation"}),
         "observation_display_units": (
@@ -129,6 +131,15 @@ def _field_read(observable: Observable, model: ForwardModel) -> str:
     name = observable.operator.name if isinstance(observable.operator, StateField) else ""
     one = name in model.layout.names and model.layout[name].stop - model.layout[name].start == 1
     return name if one else ""
+
+
+def _positive(problem: SeriesProblem) -> npt.NDArray[np.int8]:
+    """(n,) 1 where the ensemble holds the logarithm of a variable."""
+    coordinates = problem.settings.coordinates
+    found = np.zeros(problem.start.model.layout.size, dtype=np.int8)
+    found[list(coordinates.logarithms)] = 1
+    found[[column for column, term in coordinates.terms if term.transform == "lognormal"]] = 1
+    return found
 
 
 def _members(run: SequentialResult, n_members: int) -> Array:
