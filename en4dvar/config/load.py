@@ -29,6 +29,8 @@ from en4dvar.problem import AssimilationSettings
 from en4dvar.state import NOISE_SCALE, Array
 from en4dvar.units import UnitError, parse_quantity
 
+KINDS = {"twin": "a twin experiment", "sequence": "a sequence"}  # sections that mark other kinds of files
+
 
 def time_grid(start: str | float, end: str | float, step: str | float, unit: str) -> Array:
     """Instants (K,) from ``start`` to ``end``, both included. Raises :class:`UnitError`."""
@@ -146,8 +148,9 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
 
     ``model``: one that is there already; the ``model:`` section then only records what it is.
     """
-    if "twin" in document.data:
-        raise ConfigError([document.fault(("twin",), "a twin experiment: it can be run and validated", at_key=True)])
+    for kind, words in KINDS.items():
+        if kind in document.data:
+            raise ConfigError([document.fault((kind,), f"{words}: it can be run and validated", at_key=True)])
     read = read_file(Estimation, document, base, model)
     file = read.file
     own = {p.name for p in read.model.parameters}
@@ -159,7 +162,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
         name=file.name,
         seed=file.seed,
         model=read.model,
-        observable=_observable(file.data, read),
+        observable=observed_in(file.data, read),
         parameters=parameters,
         data=file.data,
         assimilation=file.assimilation.settings,
@@ -175,7 +178,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
     )
 
 
-def _observable(data: Data | DataPlan | None, read: Read[Any]) -> Observable:
+def observed_in(data: Data | DataPlan | None, read: Read[Any]) -> Observable:
     """What the data hold; of several series that of the first."""
     if isinstance(data, DataPlan):
         return data.series[0].observable

@@ -17,6 +17,8 @@ from en4dvar.observations import Observations
 from en4dvar.series import Part, Series
 from en4dvar.state import Array
 
+UNEXPECTED = 1.5  # root mean square of normalised innovations that calls for a warning, or its inverse
+
 
 @dataclass(frozen=True)
 class SeriesProblem:
@@ -59,6 +61,20 @@ class SeriesResult:
     def normalised(self) -> Array:
         """(K, p) innovations over their expected standard deviations, √(forecast + observation variance)."""
         return normalised_innovations(self.problem.series, self.run)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What keeps a reader from trusting the spread."""
+        squares = self.normalised[np.isfinite(self.normalised)] ** 2
+        size = float(np.sqrt(squares.mean())) if len(squares) else 1.0
+        if size > UNEXPECTED:
+            return (
+                f"innovations are {size:.2g} times as large as forecast and errors say: the ensemble is too sure of "
+                "itself; give model_error, inflation or larger errors",
+            )
+        if size < 1 / UNEXPECTED:
+            return (f"innovations are only {size:.2g} times what forecast and errors say: these are too large",)
+        return ()
 
 
 def normalised_innovations(series: CycleSeries, run: SequentialResult) -> Array:

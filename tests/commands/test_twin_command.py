@@ -150,7 +150,7 @@ def test_validate(tmp_path):
         (
             "inflation: 1.02",
             "smoother: {method: enks}",
-            r"twin\.yaml:14:\d+: assimilation\.smoother: a smoother goes behind a filter that is cycled, not behind",
+            r"twin\.yaml:11:\d+: assimilation: a smoother goes behind a filter that is cycled, not behind ienks",
         ),
         ("inflation: 1.02", "smoother: {method: enrts, lag: 3}", r"twin\.yaml:14:\d+: .*lag: only with method enks"),
         ("inflation: 1.02", "smoother: {method: enks, lag: 0}", r"twin\.yaml:14:\d+: assimilation\.smoother\.lag: "),
@@ -167,12 +167,12 @@ def test_validate(tmp_path):
         (
             "scheme: ienks\n  lag: 2",
             "scheme: particle-filter\n  localisation: {radius: 2}",
-            r"twin\.yaml:12:\d+: assimilation\.localisation: .*the particle filter takes no localisation",
+            r"twin\.yaml:11:\d+: assimilation: .*the particle filter takes no localisation",
         ),
         (
             "scheme: ienks\n  lag: 2",
             "scheme: etkf\n  smoother: {method: enks}\n  localisation: {radius: 2}",
-            r"twin\.yaml:12:\d+: assimilation\.smoother: .*with localisation use enrts",
+            r"twin\.yaml:11:\d+: assimilation: .*with localisation use enrts",
         ),
         ("model: {name: lorenz96, size: 12}", "model: {name: lorenz69}", r"unknown model 'lorenz69'; did you mean"),
         (

@@ -193,7 +193,9 @@ def test_workers_and_report_may_change(interrupted):
     assert_same_files(out, quiet)
     assert "spread / RMSE" in (out / "report.html").read_text()
     names = {p.name for p in (out / "figures").iterdir()}
-    assert names == {f"{n}.{end}" for n in ("errors", "ranks", "reliability", "scores") for end in ("pdf", "png")}
+    assert names == {
+        f"{n}.{end}" for n in ("errors", "ranks", "reliability", "scores", "truth_ranks") for end in ("pdf", "png")
+    }
 
 
 def kill_and_resume(tmp_path: Path, kills: int, seed: int) -> None:
