@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import test_model_error as with_error
 from test_exact import CYCLES, batch_posterior, chaotic_twin, close, linear_twin
 from test_loop import Breaking, Forced, members, series
 
+from en4dvar.cycling.model_error import ModelError
 from en4dvar.cycling.sequential import SequentialSettings, run_sequential
 from en4dvar.cycling.smoothers import EnKS, EnRTS
 from en4dvar.schemes.baselines import Climatology
@@ -61,6 +63,23 @@ def test_the_past_of_lost_members_is_not_smoothed(smoother):
     assert result.analysis.mean[1, 1] == pytest.approx(start[:, 1].mean(), abs=1e-9)
     assert result.smoothed.mean[1, 1] == pytest.approx(alone.mean(), abs=1e-9)
     assert result.smoothed.std[1, 1] == pytest.approx(alone.std(ddof=1), abs=1e-9)
+
+
+def test_enrts_smooths_over_the_model_error():
+    """The mean is that of the Rauch–Tung–Striebel smoother with Q; what draws leave of the spread tends to its."""
+    errors = []
+    for n_members in (12, 400):
+        model, observed, start, y = with_error.twin(n_members)
+        settings = SequentialSettings(ETKF(), model_error=ModelError(with_error.RATE), smoother=EnRTS())
+        result = run_sequential(model, observed, start, y, settings)
+        exact = with_error.given(model, start, y, with_error.RATE)
+        last, variables = len(y.times), slice(0, with_error.N)
+        for k in range(last):
+            mean, std = exact(last, k + 1)
+            assert result.smoothed.mean[k, variables] == pytest.approx(mean, abs=1e-10)
+            errors.append(np.abs(result.smoothed.std[k, variables] / std - 1).max())
+    assert max(errors[last:]) < 0.06
+    assert max(errors[last:]) < 0.5 * max(errors[:last])
 
 
 def test_what_takes_no_smoother():
