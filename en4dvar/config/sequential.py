@@ -133,7 +133,7 @@ class Sequential(_Iterations):
             raise ValueError(f"{', '.join(sorted(others))}: only with scheme {' or '.join(takers)}")
         if self.additive == "square-root" and self.made.lag:
             raise ValueError("additive: square-root is for filters; a smoother estimates the model error")
-        anywhere = Localisation((), np.empty((0, 0)))
+        anywhere = Localisation((), np.empty((0, 0)))  # settings that do not go together are told here, in their place
         SequentialSettings(
             self.made, localisation=anywhere if self.localisation else None,
             smoother=self.smoother.made if self.smoother else None,

@@ -16,7 +16,7 @@ BLOCK_SIZE = 2_000_000  # numbers in them, at most
 class Moments:
     """Ensemble mean and standard deviation (K, n_state) at the observation times; NaN where there is none.
 
-    ``rank`` is that of the truth among the N members, counted from ½ to N + ½ and divided by N + 1.
+    ``rank`` is that of the truth among the N members, counted from ½ to N + ½ and divided by N + 1; (K, 0) without one.
     """
 
     mean: Array
@@ -24,8 +24,8 @@ class Moments:
     rank: Array
 
     @classmethod
-    def empty(cls, cycles: int, size: int) -> Moments:
-        return cls(*(np.full((cycles, size), np.nan) for _ in range(3)))
+    def empty(cls, cycles: int, size: int, ranked: bool) -> Moments:
+        return cls(*(np.full((cycles, width), np.nan) for width in (size, size, size if ranked else 0)))
 
     def until(self, cycle: int) -> Moments:
         """Copy of the rows before ``cycle``."""
@@ -40,7 +40,7 @@ class MomentsRecorder:
 
     def __init__(self, cycles: int, size: int, before: Moments | None = None, truth: Array | None = None):
         self._truth = truth
-        self._moments = Moments.empty(cycles, size)
+        self._moments = Moments.empty(cycles, size, truth is not None)
         if before is not None:
             self._moments.mean[: len(before.mean)] = before.mean
             self._moments.std[: len(before.std)] = before.std

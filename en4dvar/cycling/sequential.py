@@ -81,6 +81,11 @@ class SequentialSettings:
         if self.localisation and isinstance(self.scheme, BootstrapFilter):
             raise ValueError("members survive as a whole: the particle filter takes no localisation")
 
+    @property
+    def smooths(self) -> bool:
+        """Whether there are smoothed states."""
+        return bool(self.scheme.lag or self.smoother)
+
 
 @dataclass(frozen=True)
 class SequentialState:

@@ -98,7 +98,7 @@ class TwinResult:
     def scores(self) -> dict[str, Score]:
         """Of the forecast, the analysis and (with a lag) the smoothed ensemble."""
         kinds = {"forecast": self.run.forecast, "analysis": self.run.analysis}
-        if self.experiment.sequential.scheme.lag or self.experiment.sequential.smoother:
+        if self.experiment.sequential.smooths:
             kinds["smoothed"] = self.run.smoothed
         return {name: self._score(moments) for name, moments in kinds.items()}
 

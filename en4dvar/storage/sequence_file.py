@@ -61,6 +61,15 @@ def innovation_variables(series: CycleSeries, run: SequentialResult) -> dict[str
     }
 
 
+def run_variables(run: SequentialResult) -> dict[str, Any]:
+    """How the cycles went."""
+    found = {"iterations": ("time", run.iterations, {"long_name": "forecasts of the window", "units": "1"})}
+    if np.isfinite(run.effective).any():
+        text = {"long_name": "members that the weights leave, 1 / sum of their squares", "units": "1"}
+        found["effective"] = ("time", run.effective, text)
+    return found
+
+
 def run_attributes(run: SequentialResult) -> dict[str, Any]:
     """What became of the members."""
     return {
@@ -76,14 +85,14 @@ def dataset(result: SeriesResult, attributes: Mapping[str, Any]) -> xr.Dataset:
     model = problem.start.model
     names, units = state_names(model)
     kinds = {"forecast": run.forecast, "analysis": run.analysis}
-    if problem.settings.scheme.lag:
+    if problem.settings.smooths:
         kinds["smoothed"] = run.smoothed
     of_members = ("member_time", "member", "state")
     variables = {
         **series_variables(series),
         **moment_variables(kinds),
         **innovation_variables(series, run),
-        "iterations": ("time", run.iterations, {"long_name": "forecasts of the window", "units": "1"}),
+        **run_variables(run),
         "members": (of_members, _members(run, problem.members), {"long_name": "analysis ensemble"}),
     }
     of_columns = {observable.name: observable for observable in problem.observables}

@@ -13,6 +13,7 @@ from en4dvar.storage.sequence_file import (
     innovation_variables,
     moment_variables,
     run_attributes,
+    run_variables,
     series_variables,
     state_names,
 )
@@ -42,12 +43,9 @@ def dataset(result: TwinResult, attributes: Mapping[str, Any]) -> xr.Dataset:
         "truth": (along, result.truth, {"long_name": "state of the truth"}),
         **series_variables(result.series),
         **innovation_variables(result.series, result.run),
-        "iterations": ("time", result.run.iterations, {"long_name": "forecasts of the window", "units": "1"}),
+        **run_variables(result.run),
     }
     run = result.run
-    if np.isfinite(run.effective).any():
-        text = {"long_name": "members that the weights leave, 1 / sum of their squares", "units": "1"}
-        variables["effective"] = ("time", run.effective, text)
     for kind, moments in (("forecast", run.forecast), ("analysis", run.analysis), ("smoothed", run.smoothed)):
         if (score := result.scores.get(kind)) is None:
             continue
