@@ -103,7 +103,8 @@ class Sequential(_Iterations):
         if others:
             takers = [name for name, keys in _KEYS.items() if keys >= others]
             raise ValueError(f"{', '.join(sorted(others))}: only with scheme {' or '.join(takers)}")
-        if self.additive == "square-root" and self.made.lag:
+        made = self.made
+        if self.additive == "square-root" and made.lag:
             raise ValueError("additive: square-root is for filters; a smoother estimates the model error")
         return self
 
