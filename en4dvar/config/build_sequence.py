@@ -38,9 +38,10 @@ def build_sequence(config: SequenceConfig) -> SeriesProblem:
     ((name, file),) = sequence_data(config).items()
     observations = read_observations(plan, file, name)
     terms, fixed = resolve_parameters(config, observations)
-    positive = [name for name, spread in config.sequence.initial_std.items() if spread.relative]
+    positive = {name for name, spread in config.sequence.initial_std.items() if spread.relative}
+    positive |= set(config.sequence.positive)
     prior = Prior(terms) if terms else None
-    coordinates = Coordinates.of(config.model, prior, positive)
+    coordinates = Coordinates.of(config.model, prior, sorted(positive))
     try:
         rate = error_rates(config.model, config.model_error, positive) + _walks(config, terms)
         settings = config.assimilation.built(None, rate, coordinates)

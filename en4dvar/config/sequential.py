@@ -161,7 +161,7 @@ def error_rates(model: ForwardModel, errors: Sequence[ErrorOf], positive: Collec
     for one in errors:
         name, std = one.field.name, one.spec.std
         if std.relative != (name in positive):
-            other = "in % as its initial_std is" if name in positive else "in its unit, or its initial_std in % as well"
+            other = "in %, for it is positive" if name in positive else "in its unit, or its initial_std in % as well"
             raise ConfigError([Fault(f"give the std of {name} {other}", f"model_error.{name}.std")])
         rate[model.layout[name]] = per_time(one.spec, std.value, f"model_error.{name}")
     return rate

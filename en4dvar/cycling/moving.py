@@ -103,7 +103,10 @@ class Flow:
             return states[:, None].repeat(len(times), axis=1)
         physical = self.coordinates.to_physical(states)
         paths = propagate(self.model, physical, self.times[start], times, self.executor)
-        return self.coordinates.from_physical(paths, states)
+        found = self.coordinates.from_physical(paths, states)
+        if not np.isfinite(found).all():
+            raise MembersLost(["" if np.isfinite(path).all() else "non-finite state" for path in found])
+        return found
 
     def noise_of(self, members: Array, start: int, index: int) -> Array:
         """The changes (N, q) at the time of ``index``."""

@@ -167,6 +167,8 @@ SCHEME = BASE["assimilation"]
         (with_error("correlation_time", 1), "data.error.correlation_time", "not in a sequence"),
         ({"sequence": {"initial_std": {"y": 1}}}, "sequence.initial_std.y", "unknown key"),
         ({"sequence": {"initial_std": {"x": -1}}}, "sequence.initial_std.x", "must be positive"),
+        ({"sequence": {"positive": ["y"]}}, "sequence.positive", "unknown field 'y'"),
+        ({"sequence": {"initial_std": {"x": 1}, "positive": ["x"]}, "model_error": None}, "sequence.initial_std.x", "in %"),
         ({"sequence": {"members_every": -1}}, "sequence.members_every", "greater than or equal to 0"),
         ({"sequence": {"burn_in": 1}}, "sequence.burn_in", "unknown key"),
         ({"sequence": {}, "parameters": {"c": 1}, "model_error": None}, "sequence", "nothing is uncertain"),
@@ -262,8 +264,15 @@ def test_the_bubble_in_time():
     config = load_sequence(path)
     if not (config.data.path.base / config.data.path.texts[0]).is_file():
         pytest.skip("A_E2_002.mat is not here")
-    result = assimilate_series(build_sequence(config), config.seed)
-    at = result.problem.start.model.layout
-    mu, std = (float(values[-1, at["mu"].start]) for values in (result.run.analysis.mean, result.run.analysis.std))
+    plain = {"data.error.radius_std": "1 % of maximum", "model_error": {}, "sequence.positive": []}
+    found = []
+    for given in (config, load_sequence(path, plain)):
+        result = assimilate_series(build_sequence(given), given.seed)
+        where = result.problem.start.model.layout["mu"].start
+        moments = result.run.analysis
+        found.append((moments.mean[-1, where], moments.std[-1, where], np.sqrt(np.mean(result.normalised**2))))
+    (erring, wide, size), (mu, narrow, _) = found
     assert mu == pytest.approx(0.0848, abs=0.004)  # of a long Markov chain on the same readings
-    assert std < 0.003
+    assert 3 * narrow < wide
+    assert 0.8 < size < 1.2
+    assert abs(erring - 0.118) < 3 * wide  # published: 0.118 ± 0.015
