@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from en4dvar.cycling.problem import SeriesResult as SeriesResult
     from en4dvar.cycling.problem import assimilate_series as assimilate_series
     from en4dvar.cycling.sequential import SequentialSettings as SequentialSettings
-    from en4dvar.cycling.start import Start as Start
+    from en4dvar.cycling.start import InitialEnsemble as InitialEnsemble
     from en4dvar.descent.preview import Preview as Preview
     from en4dvar.descent.preview import preview as preview
     from en4dvar.errors import ConfigError as ConfigError
@@ -80,7 +80,7 @@ _HOME = {
     "config": ("Config", "SequenceConfig", "TwinConfig", "load_config", "load_sequence", "load_twin"),
     "cycling.problem": ("SeriesProblem", "SeriesResult", "assimilate_series"),
     "cycling.sequential": ("SequentialSettings",),
-    "cycling.start": ("Start",),
+    "cycling.start": ("InitialEnsemble",),
     "cycling.model_error": ("ModelError",),
     "errors": ("ConfigError", "DataError", "En4dvarError", "OutputError", "TooFewMembersError"),
     "report.export": ("export_table",),

@@ -15,7 +15,7 @@ from en4dvar.config.initial_state import dynamic_fields
 from en4dvar.config.schema import Section, section_of
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import ErrorOf, Knots
-from en4dvar.cycling.coordinates import Coordinates
+from en4dvar.cycling.coordinates import EnsembleCoordinates
 from en4dvar.cycling.model_error import ModelError
 from en4dvar.cycling.sequential import SequentialSettings
 from en4dvar.errors import ConfigError, Fault
@@ -113,7 +113,9 @@ class Sequential(_Iterations):
         """The scheme. Raises ValueError where its keys do not suit each other."""
         return _KINDS[self.scheme](**{key: getattr(self, key) for key in _KEYS[self.scheme]})
 
-    def built(self, localisation: Localisation | None, rate: Array, coordinates: Coordinates) -> SequentialSettings:
+    def built(
+        self, localisation: Localisation | None, rate: Array, coordinates: EnsembleCoordinates
+    ) -> SequentialSettings:
         """What the loop needs; ``rate`` (n,) is the model error's variance per unit of time."""
         return SequentialSettings(
             self.made,

@@ -16,7 +16,7 @@ from en4dvar.state import Array
 
 
 @dataclass(frozen=True)
-class Coordinates:
+class EnsembleCoordinates:
     """``terms``: columns of the state and priors of the parameters that they hold; ``logarithms``: columns that are
     positive, and the ``lowest`` values, which these do not reach.
     """
@@ -26,7 +26,7 @@ class Coordinates:
     lowest: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, model: ForwardModel, prior: Prior | None, positive: Sequence[str] = ()) -> Coordinates:
+    def of(cls, model: ForwardModel, prior: Prior | None, positive: Sequence[str] = ()) -> EnsembleCoordinates:
         """For the parameters of ``prior`` that the state has fields of; fields named in ``positive`` by logarithms, of
         what they exceed a lower bound by, where they have one.
         """

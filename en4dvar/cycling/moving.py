@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.batch import Batch
-from en4dvar.cycling.coordinates import Coordinates
+from en4dvar.cycling.coordinates import EnsembleCoordinates
 from en4dvar.cycling.model_error import ModelError
 from en4dvar.executor import Executor
 from en4dvar.forward import Failure, ForwardModel, Observable, Trajectory
@@ -73,7 +73,7 @@ class Flow:
     observables: tuple[Observable, ...]
     times: Sequence[float]
     executor: Executor
-    coordinates: Coordinates
+    coordinates: EnsembleCoordinates
     error: ModelError | None
     runs: int = 0
 

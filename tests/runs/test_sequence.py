@@ -112,7 +112,10 @@ def test_arrays_and_series_objects_give_the_same_bits(folder):
     model = Drift()
     prior = en4dvar.Prior((PriorTerm.normal(model.parameters[0], 0.5, 0.3),))
     problem = en4dvar.SeriesProblem.of_series(
-        en4dvar.Start(model, {"x": 0.5}, prior), [series], build_sequence(load_sequence("drift.yaml")).settings, 8
+        en4dvar.InitialEnsemble(model, {"x": 0.5}, prior),
+        [series],
+        build_sequence(load_sequence("drift.yaml")).settings,
+        8,
     )
     by_hand = assimilate_series(problem, 3)
     for other in (of_arrays, by_hand):
