@@ -14,9 +14,9 @@ from en4dvar.config.sequence import SequenceConfig
 from en4dvar.config.sequential import Local, error_rates, localisation_of, per_time
 from en4dvar.config.series import DataPlan
 from en4dvar.cycling.aligned import AtPlaces
-from en4dvar.cycling.coordinates import Coordinates
+from en4dvar.cycling.coordinates import EnsembleCoordinates
 from en4dvar.cycling.problem import SeriesProblem
-from en4dvar.cycling.start import Start
+from en4dvar.cycling.start import InitialEnsemble
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.inputs.readers import DataFile
 from en4dvar.prior import Prior, PriorTerm
@@ -38,9 +38,10 @@ def build_sequence(config: SequenceConfig) -> SeriesProblem:
     ((name, file),) = sequence_data(config).items()
     observations = read_observations(plan, file, name)
     terms, fixed = resolve_parameters(config, observations)
-    positive = [name for name, spread in config.sequence.initial_std.items() if spread.relative]
+    positive = {name for name, spread in config.sequence.initial_std.items() if spread.relative}
+    positive |= set(config.sequence.positive)
     prior = Prior(terms) if terms else None
-    coordinates = Coordinates.of(config.model, prior, positive)
+    coordinates = EnsembleCoordinates.of(config.model, prior, sorted(positive))
     try:
         rate = error_rates(config.model, config.model_error, positive) + _walks(config, terms)
         settings = config.assimilation.built(None, rate, coordinates)
@@ -49,7 +50,7 @@ def build_sequence(config: SequenceConfig) -> SeriesProblem:
             [config.document.fault(tuple(f.path.split(".")), f.message) for f in error.problems]
         ) from None
     std = {name: spread.value for name, spread in config.sequence.initial_std.items()}
-    start = Start(config.model, std, prior, fixed, coordinates)
+    start = InitialEnsemble(config.model, std, prior, fixed, coordinates)
     settings = replace(settings, members_every=config.sequence.members_every)
     problem = SeriesProblem.of(start, config.observable, observations, settings, config.assimilation.members)
     if config.assimilation.localisation is None:

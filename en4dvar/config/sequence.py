@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from en4dvar.config.context import Context, Spread
+from en4dvar.config.context import Context, Made, Spread
 from en4dvar.config.data import Data
 from en4dvar.config.document import Document
 from en4dvar.config.initial_state import dynamic_fields
@@ -20,10 +20,22 @@ from en4dvar.config.sequential import Sequential, Workers, spreads
 from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
-from en4dvar.errors import ConfigError
+from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel, Observable
+from en4dvar.hints import shown, suggest
 
 APART = ("time_std", "correlation_time", "covariance", "robust", "discrepancy")  # keys of data.error
+
+
+def _known_fields(names: tuple[str, ...], context: Context) -> tuple[str, ...]:
+    """Names of fields of the state. Raises :class:`ConfigError`."""
+    known = dynamic_fields(context.model)
+    faults = [
+        Fault(f"unknown field {shown(n)}{suggest(n, known)}", str(k)) for k, n in enumerate(names) if n not in known
+    ]
+    if faults:
+        raise ConfigError(faults)
+    return names
 
 
 class Sequence(Section):
@@ -32,6 +44,8 @@ class Sequence(Section):
     initial_std: Annotated[dict[str, Spread], spreads(dynamic_fields)] = Field({}, validate_default=True)
     """Spread of the model's initial state, by field, each of its values for itself: in the field's unit, or in % of a
     field that is positive and then estimated by its logarithm."""
+    positive: Annotated[tuple[str, ...], Made(_known_fields, tuple[str, ...])] = ()
+    """Further fields that are estimated by their logarithm, of what exceeds their lower bound: none falls below it."""
     members_every: Annotated[int, Field(ge=0)] = 0
     """Ensembles are stored after every so many observation times, and the last; 0: the last alone."""
 
@@ -107,6 +121,11 @@ def resolve_sequence(document: Document, base: Path, model: ForwardModel | None 
     read: Read[SequenceFile] = read_file(SequenceFile, document, base, model)
     file = read.file
     faults = [
+        document.fault(("sequence", "initial_std", name), "give it in %: the field is positive")
+        for name in file.sequence.positive
+        if name in file.sequence.initial_std and not file.sequence.initial_std[name].relative
+    ]
+    faults += [
         document.fault(("parameters", entry.parameter.name), words)
         for entry in file.parameters
         if (words := _unfit(entry, read.model))

@@ -15,7 +15,7 @@ from en4dvar.config.initial_state import dynamic_fields
 from en4dvar.config.schema import Section, section_of
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import ErrorOf, Knots
-from en4dvar.cycling.coordinates import Coordinates
+from en4dvar.cycling.coordinates import EnsembleCoordinates
 from en4dvar.cycling.model_error import ModelError
 from en4dvar.cycling.sequential import SequentialSettings
 from en4dvar.cycling.smoothers import EnKS, EnRTS
@@ -131,7 +131,8 @@ class Sequential(_Iterations):
         if others:
             takers = [name for name, keys in _KEYS.items() if keys >= others]
             raise ValueError(f"{', '.join(sorted(others))}: only with scheme {' or '.join(takers)}")
-        if self.additive == "square-root" and self.made.lag:
+        made = self.made
+        if self.additive == "square-root" and made.lag:
             raise ValueError("additive: square-root is for filters; a smoother estimates the model error")
         anywhere = Localisation((), np.empty((0, 0)))  # settings that do not go together are told here, in their place
         SequentialSettings(
@@ -145,7 +146,9 @@ class Sequential(_Iterations):
         """The scheme. Raises ValueError where its keys do not suit each other."""
         return _KINDS[self.scheme](**{key: getattr(self, key) for key in _KEYS[self.scheme]})
 
-    def built(self, localisation: Localisation | None, rate: Array, coordinates: Coordinates) -> SequentialSettings:
+    def built(
+        self, localisation: Localisation | None, rate: Array, coordinates: EnsembleCoordinates
+    ) -> SequentialSettings:
         """What the loop needs; ``rate`` (n,) is the model error's variance per unit of time."""
         return SequentialSettings(
             self.made,
@@ -194,7 +197,7 @@ def error_rates(model: ForwardModel, errors: Sequence[ErrorOf], positive: Collec
     for one in errors:
         name, std = one.field.name, one.spec.std
         if std.relative != (name in positive):
-            other = "in % as its initial_std is" if name in positive else "in its unit, or its initial_std in % as well"
+            other = "in %, for it is positive" if name in positive else "in its unit, or its initial_std in % as well"
             raise ConfigError([Fault(f"give the std of {name} {other}", f"model_error.{name}.std")])
         rate[model.layout[name]] = per_time(one.spec, std.value, f"model_error.{name}")
     return rate

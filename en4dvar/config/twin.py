@@ -18,7 +18,7 @@ from en4dvar.config.schema import File, Output, Section
 from en4dvar.config.sequential import Sequential, Workers, error_rates, localisation_of, stds
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
-from en4dvar.cycling.coordinates import Coordinates
+from en4dvar.cycling.coordinates import EnsembleCoordinates
 from en4dvar.cycling.twin import TwinExperiment
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.files import expanded
@@ -142,7 +142,7 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
         raise ConfigError([document.fault(tuple(f.path.split(".")), f.message) for f in error.problems]) from None
     experiment = TwinExperiment(
         model=model,
-        sequential=file.assimilation.built(local, rate, Coordinates.of(model, prior)),
+        sequential=file.assimilation.built(local, rate, EnsembleCoordinates.of(model, prior)),
         members=file.assimilation.members,
         cycles=twin.cycles,
         interval=twin.interval,

@@ -16,20 +16,27 @@ from en4dvar.state import Array
 
 
 @dataclass(frozen=True)
-class Coordinates:
-    """``terms``: columns of the state and priors of the parameters that they hold; ``logarithms``: positive columns."""
+class EnsembleCoordinates:
+    """``terms``: columns of the state and priors of the parameters that they hold; ``logarithms``: columns that are
+    positive, and the ``lowest`` values, which these do not reach.
+    """
 
     terms: tuple[tuple[int, PriorTerm], ...] = ()
     logarithms: tuple[int, ...] = ()
+    lowest: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, model: ForwardModel, prior: Prior | None, positive: Sequence[str] = ()) -> Coordinates:
-        """For the parameters of ``prior`` that the state has fields of; fields named in ``positive`` by logarithms."""
+    def of(cls, model: ForwardModel, prior: Prior | None, positive: Sequence[str] = ()) -> EnsembleCoordinates:
+        """For the parameters of ``prior`` that the state has fields of; fields named in ``positive`` by logarithms, of
+        what they exceed a lower bound by, where they have one.
+        """
         held = [term for term in (prior.terms if prior else ()) if term.parameter.name in model.layout.names]
-        slices = [model.layout[name] for name in positive]
+        low = {field.name: max(0.0, field.bounds[0]) for field in model.layout}
+        columns = [(c, low[name]) for name in positive for c in range(*model.layout[name].indices(model.layout.size))]
         return cls(
             tuple((model.layout[t.parameter.name].start, t) for t in held if t.transform != "normal"),
-            tuple(column for s in slices for column in range(s.start, s.stop)),
+            tuple(column for column, _ in columns),
+            tuple(lowest for _, lowest in columns),
         )
 
     def to_physical(self, x: Array) -> Array:
@@ -40,7 +47,7 @@ class Coordinates:
         with np.errstate(over="ignore"):
             for column, term in self.terms:
                 found[..., column] = term.to_physical(x[..., column])
-            found[..., self.logarithms] = np.exp(x[..., self.logarithms])
+            found[..., self.logarithms] = self.lowest + np.exp(x[..., self.logarithms])
         return found
 
     def from_physical(self, states: Array, origin: Array) -> Array:
@@ -54,5 +61,5 @@ class Coordinates:
         for column, _ in self.terms:
             found[..., column] = origin[:, None, column]
         with np.errstate(invalid="ignore", divide="ignore"):
-            found[..., self.logarithms] = np.log(states[..., self.logarithms])
+            found[..., self.logarithms] = np.log(states[..., self.logarithms] - np.array(self.lowest))
         return found

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.batch import Batch
-from en4dvar.cycling.coordinates import Coordinates
+from en4dvar.cycling.coordinates import EnsembleCoordinates
 from en4dvar.cycling.model_error import ModelError
 from en4dvar.executor import Executor
 from en4dvar.forward import Failure, ForwardModel, Observable, Trajectory
@@ -73,7 +73,7 @@ class Flow:
     observables: tuple[Observable, ...]
     times: Sequence[float]
     executor: Executor
-    coordinates: Coordinates
+    coordinates: EnsembleCoordinates
     error: ModelError | None
     runs: int = 0
 
@@ -103,7 +103,10 @@ class Flow:
             return states[:, None].repeat(len(times), axis=1)
         physical = self.coordinates.to_physical(states)
         paths = propagate(self.model, physical, self.times[start], times, self.executor)
-        return self.coordinates.from_physical(paths, states)
+        found = self.coordinates.from_physical(paths, states)
+        if not np.isfinite(found).all():
+            raise MembersLost(["" if np.isfinite(path).all() else "non-finite state" for path in found])
+        return found
 
     def noise_of(self, members: Array, start: int, index: int) -> Array:
         """The changes (N, q) at the time of ``index``."""

@@ -10,7 +10,7 @@ import numpy as np
 from en4dvar.cycling.aligned import aligned
 from en4dvar.cycling.sequential import SequentialResult, SequentialSettings, SequentialState, run_sequential
 from en4dvar.cycling.series import CycleSeries
-from en4dvar.cycling.start import Start
+from en4dvar.cycling.start import InitialEnsemble
 from en4dvar.executor import Executor
 from en4dvar.forward import Observable
 from en4dvar.observations import Observations
@@ -24,7 +24,7 @@ UNEXPECTED = 1.5  # root mean square of normalised innovations that calls for a 
 class SeriesProblem:
     """``observables`` are the p outputs that ``series`` holds; ``members`` N."""
 
-    start: Start
+    start: InitialEnsemble
     observables: tuple[Observable, ...]
     series: CycleSeries
     settings: SequentialSettings
@@ -33,14 +33,24 @@ class SeriesProblem:
 
     @classmethod
     def of_series(
-        cls, start: Start, series: Sequence[Series], settings: SequentialSettings, members: int, name: str = "series"
+        cls,
+        start: InitialEnsemble,
+        series: Sequence[Series],
+        settings: SequentialSettings,
+        members: int,
+        name: str = "series",
     ) -> SeriesProblem:
         """Of readings of one or several observables, each series with its own times. Raises :class:`DataError`."""
         return cls.of(start, series[0].observable, Observations.of_series(series, name=name), settings, members)
 
     @classmethod
     def of(
-        cls, start: Start, observable: Observable, data: Observations, settings: SequentialSettings, members: int
+        cls,
+        start: InitialEnsemble,
+        observable: Observable,
+        data: Observations,
+        settings: SequentialSettings,
+        members: int,
     ) -> SeriesProblem:
         """Of a data set; ``observable`` is that of one without parts. Raises :class:`DataError`."""
         whole = Part(observable.name, observable, 0, len(data))

@@ -21,7 +21,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.cycling.coordinates import Coordinates
+from en4dvar.cycling.coordinates import EnsembleCoordinates
 from en4dvar.cycling.model_error import ModelError, fresh_noise
 from en4dvar.cycling.moments import InnovationRecorder, Moments, MomentsRecorder
 from en4dvar.cycling.moving import Flow, MembersLost
@@ -68,7 +68,7 @@ class SequentialSettings:
     min_active_fraction: float = 0.5
     stochastic_model: bool = False
     model_error: ModelError | None = None
-    coordinates: Coordinates = field(default_factory=Coordinates)
+    coordinates: EnsembleCoordinates = field(default_factory=EnsembleCoordinates)
     to_end: bool = False
     members_every: int = 0
     smoother: Smoother | None = None

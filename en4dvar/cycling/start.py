@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from en4dvar.cycling.coordinates import Coordinates
+from en4dvar.cycling.coordinates import EnsembleCoordinates
 from en4dvar.errors import En4dvarError
 from en4dvar.forward import ForwardModel
 from en4dvar.prior import Prior, member_stream, whiten_sample
@@ -16,7 +16,7 @@ from en4dvar.user_code import reason_of
 
 
 @dataclass(frozen=True)
-class Start:
+class InitialEnsemble:
     """What is known at time zero: the model's initial state plus N(0, ``initial_std``²), by field, and the parameters.
 
     ``prior`` draws parameters, ``fixed`` are the values of the others. In the ensemble's coordinates, where a positive
@@ -27,7 +27,7 @@ class Start:
     initial_std: Mapping[str, float]
     prior: Prior | None = None
     fixed: Mapping[str, float] = field(default_factory=dict)
-    coordinates: Coordinates = field(default_factory=Coordinates)
+    coordinates: EnsembleCoordinates = field(default_factory=EnsembleCoordinates)
 
     def members(self, n_members: int, seed: int, exact: bool = False) -> Array:
         """(N, n_state) in the ensemble's coordinates, each from its own stream.

@@ -20,7 +20,7 @@ from en4dvar.cycling.moments import Moments
 from en4dvar.cycling.moving import Flow, MembersLost, predictions
 from en4dvar.cycling.sequential import SequentialResult, SequentialSettings, SequentialState, run_sequential
 from en4dvar.cycling.series import CycleSeries
-from en4dvar.cycling.start import Start
+from en4dvar.cycling.start import InitialEnsemble
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.forward import ForwardModel, Observable, Trajectory
@@ -53,9 +53,9 @@ class TwinExperiment:
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def start(self) -> Start:
+    def start(self) -> InitialEnsemble:
         """What is known at time zero, of the truth and of each member."""
-        return Start(self.model, self.initial_std, self.prior, self.fixed, self.sequential.coordinates)
+        return InitialEnsemble(self.model, self.initial_std, self.prior, self.fixed, self.sequential.coordinates)
 
     @property
     def observables(self) -> tuple[Observable, ...]:

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from annotated_types import Ge, Gt, Le, MinLen
+from annotated_types import Ge, Gt, Le
 
 from en4dvar.ensemble.linalg import centre
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton
@@ -52,7 +52,6 @@ class IEnKS:
     shift: Annotated[int, Ge(1), "Cycles that the window moves on at once, no more than lag."] = 1
     mda_weights: Annotated[
         tuple[Annotated[float, Gt(0)], ...],
-        MinLen(1),
         "Multiple data assimilation: how much an observation counts when it is new, one window later, and so on, lag "
         "numbers relative to each other; by default it counts once.",
     ] = (1.0,)
@@ -65,7 +64,8 @@ class IEnKS:
     def __post_init__(self) -> None:
         if self.shift > max(1, self.lag):
             raise ValueError(f"the window moves on by {self.shift} cycles, but is only {self.lag} long")
-        if len(self.mda_weights) > 1 and (len(self.mda_weights) != self.lag or self.shift > 1):
+        count = len(self.mda_weights)
+        if count == 0 or (count > 1 and (count != self.lag or self.shift > 1)):
             raise ValueError(f"mda_weights are {self.lag}, one a cycle of the window, and the shift is 1 with them")
         if not all(weight > 0 for weight in self.mda_weights):
             raise ValueError(f"mda_weights must be positive, not {self.mda_weights}")

@@ -96,8 +96,16 @@ def test_etkf_with_model_error_is_the_kalman_filter(form, members, inflation):
 
 @pytest.mark.parametrize(
     "scheme",
-    [IEnKS(1), IEnKS(2), IEnKS(len(TIMES) + 1), IEnKS(2, "bundle", epsilon=1e-3), IEnKS(3, shift=2), IEnKS(2, shift=2)]
-    + [IEnKS(3, mda_weights=(1, 1, 1)), IEnKS(2, mda_weights=(3, 1))],
+    [
+        IEnKS(1),
+        IEnKS(2),
+        IEnKS(len(TIMES) + 1),
+        IEnKS(2, "bundle", epsilon=1e-3),
+        IEnKS(3, shift=2),
+        IEnKS(2, shift=2),
+        IEnKS(3, mda_weights=(1, 1, 1)),
+        IEnKS(2, mda_weights=(3, 1)),
+    ],
     ids=str,
 )
 @pytest.mark.parametrize("rate", [RATE, None], ids=["Q", "no Q"])
