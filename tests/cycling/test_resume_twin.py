@@ -178,7 +178,7 @@ def test_workers_and_report_may_change(interrupted):
     assert_same_files(out, quiet)
     assert "spread / RMSE" in (out / "report.html").read_text()
     names = {p.name for p in (out / "figures").iterdir()}
-    assert names == {"errors.pdf", "errors.png", "scores.pdf", "scores.png"}
+    assert names == {f"{name}.{kind}" for name in ("errors", "ranks", "scores") for kind in ("pdf", "png")}
 
 
 def kill_and_resume(tmp_path: Path, kills: int, seed: int) -> None:
