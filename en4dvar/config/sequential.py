@@ -156,6 +156,7 @@ class Sequential(_Iterations):
             self.rotation,
             localisation,
             stochastic_model=self.stochastic_model,
+            innovations=True,
             model_error=ModelError(rate, self.additive) if np.any(rate) else None,
             coordinates=coordinates,
             smoother=self.smoother.made if self.smoother else None,

@@ -51,7 +51,14 @@ def propagate(model: ForwardModel, states: Array, start: float, times: Array, ex
     reasons = [outcome.reason if isinstance(outcome, Failure) else "" for outcome in outcomes]
     if any(reasons):
         raise MembersLost(reasons)
-    return np.array([outcome.states for outcome in outcomes if isinstance(outcome, Trajectory)])
+    return require_finite(np.array([outcome.states for outcome in outcomes if isinstance(outcome, Trajectory)]))
+
+
+def require_finite(paths: Array) -> Array:
+    """Paths (N, K, n) as they are. Raises :class:`MembersLost` for those that are not finite."""
+    if not np.isfinite(paths).all():
+        raise MembersLost(["" if np.isfinite(path).all() else "non-finite state" for path in paths])
+    return paths
 
 
 def predictions(observables: Sequence[Observable], trajectory: Trajectory) -> Array:
@@ -104,9 +111,7 @@ class Flow:
         physical = self.coordinates.to_physical(states)
         paths = propagate(self.model, physical, self.times[start], times, self.executor)
         found = self.coordinates.from_physical(paths, states)
-        if not np.isfinite(found).all():
-            raise MembersLost(["" if np.isfinite(path).all() else "non-finite state" for path in found])
-        return found
+        return require_finite(found) if self.coordinates.logarithms else found
 
     def noise_of(self, members: Array, start: int, index: int) -> Array:
         """The changes (N, q) at the time of ``index``."""

@@ -55,7 +55,7 @@ class SeriesProblem:
         """Of a data set; ``observable`` is that of one without parts. Raises :class:`DataError`."""
         whole = Part(observable.name, observable, 0, len(data))
         observables, series = aligned(data, data.parts or (whole,))
-        settings = replace(settings, to_end=True, coordinates=start.coordinates)
+        settings = replace(settings, to_end=True, innovations=True, coordinates=start.coordinates)
         return cls(start, observables, series, settings, members, data.name)
 
 

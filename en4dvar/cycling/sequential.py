@@ -43,7 +43,8 @@ from en4dvar.schemes.localisation import Localisation
 from en4dvar.state import Array
 
 NO_INFLATION = Inflation()
-Rows = npt.NDArray[np.intp]
+ALL = slice(None)
+Rows = npt.NDArray[np.intp] | slice  # of an ensemble: those that survive
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,8 @@ class SequentialSettings:
     ``rotation``: every analysis is turned by a random mean-preserving rotation (:mod:`en4dvar.cycling.rotation`).
     ``stochastic_model``: a model that gives other numbers when a member is run again is accepted.
     ``to_end``: the last times, which no whole window follows, are smoothed by the observations that there are.
-    ``members_every``: analysis ensembles are kept after so many observation times, and the last; 0: the last alone.
+    ``innovations``: what was expected of each observation is recorded. ``members_every``: analysis ensembles are kept
+    after so many observation times, and the last; 0: the last alone.
     ``smoother``: what goes behind a filter (:mod:`en4dvar.cycling.smoothers`).
 
     Raises
@@ -70,6 +72,7 @@ class SequentialSettings:
     model_error: ModelError | None = None
     coordinates: EnsembleCoordinates = field(default_factory=EnsembleCoordinates)
     to_end: bool = False
+    innovations: bool = False
     members_every: int = 0
     smoother: Smoother | None = None
 
@@ -255,7 +258,7 @@ class _Run:
         self.iterations[newest - 1] = descent.iteration
         self.effective[newest - 1] = getattr(descent.step, "effective", np.nan)
         mean, anomalies = window.posterior(descent)
-        posterior = mean + anomalies
+        posterior = mean + anomalies if repeated else self.ensemble
         transform = descent.weights.T
         if self.rotations is not None:
             turned = self.rotations.of_cycle(newest - 1, len(anomalies))
@@ -365,6 +368,8 @@ class _Run:
         """What was expected of observations before they were assimilated."""
         for at in found:
             self.before.put(at.index - 1, self.physical(at.states), 1 / at.width)
+            if not self.settings.innovations:
+                continue
             predicted = at.predicted
             if at.width != 1:
                 mean, anomalies = centre(predicted)
@@ -396,18 +401,18 @@ class _Run:
 
     def analyse(self, members: Array, batch: Batch) -> tuple[Rows, CycleWindow, CycleDescent]:
         """Which rows of the members survive, their window, and its descent; members lost are dropped from the prior."""
-        rows, settings = np.arange(len(members)), self.settings
+        rows: Rows = ALL
         while True:
+            alive = members[rows]
             window = CycleWindow(
-                self.flow, self.series, members[rows], self.start, batch, settings.localisation,
-                is_filter(self.scheme), partial(self.stream, len(rows)),
+                self.flow, self.series, alive, self.start, batch, self.settings.localisation,
+                is_filter(self.scheme), partial(self.stream, len(alive)),
             )  # fmt: skip
-            descent = CycleDescent(Weights.prior(len(rows)))
+            descent = CycleDescent(Weights.prior(len(alive)))
             try:
                 iterate(window, self.scheme, [descent])
             except MembersLost as lost:
-                self.drop(lost.reasons)
-                rows = rows[[not reason for reason in lost.reasons]]
+                rows = self.survivors(rows, lost.reasons)
                 continue
             return rows, window, descent
 
@@ -417,21 +422,23 @@ class _Run:
 
     def run(self, members: Array, indices: Sequence[int]) -> tuple[Rows, list[Array]]:
         """Which rows survive, and the states (N', n) at the times of ``indices``."""
-        rows = np.arange(len(members))
+        rows: Rows = ALL
         while True:
             try:
                 return rows, self.flow.forecast(members[rows], self.start, indices)
             except MembersLost as lost:
-                self.drop(lost.reasons)
-                rows = rows[[not reason for reason in lost.reasons]]
+                rows = self.survivors(rows, lost.reasons)
 
-    def drop(self, failed: Sequence[str]) -> None:
-        self.trail = [ensembles[..., [not reason for reason in failed], :] for ensembles in self.trail]
+    def survivors(self, rows: Rows, failed: Sequence[str]) -> Rows:
+        """Those of ``rows`` that did not fail. Raises :class:`TooFewMembersError`."""
         self.failures += [reason for reason in failed if reason]
-        alive = self.initial_members - len(self.failures)
+        left = self.initial_members - len(self.failures)
         needed = max(2, int(np.ceil(self.settings.min_active_fraction * self.initial_members)))
-        if alive < needed:
+        if left < needed:
             raise TooFewMembersError(
                 f"{len(self.failures)} of {self.initial_members} members failed, at least {needed} must survive; "
                 f"the last: {self.failures[-1]}"
             )
+        alive = np.flatnonzero([not reason for reason in failed])
+        self.trail = [ensembles[..., alive, :] for ensembles in self.trail]
+        return alive if isinstance(rows, slice) else rows[alive]
