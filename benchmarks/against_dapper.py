@@ -20,15 +20,20 @@ import copy
 import time
 import warnings
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from en4dvar.cycling.model_error import ModelError
 from en4dvar.cycling.sequential import CycleSeries, SequentialSettings, run_sequential
+from en4dvar.forward import Observable
 from en4dvar.prior import member_stream
+from en4dvar.schemes.base import SeriesScheme
+from en4dvar.schemes.enkf_n import EnKFN
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation
+from en4dvar.schemes.localisation import Localisation
 from en4dvar_lorenz import Lorenz63, Lorenz96
 from en4dvar_lorenz.lorenz63 import Lorenz63Settings
 from en4dvar_lorenz.lorenz96 import Lorenz96Settings
@@ -51,82 +56,141 @@ class System:
 # In Lorenz-63 a window of four intervals loses its way now and then; the iterations go as far as DAPPER's there.
 L63 = System("L63", Lorenz63.from_settings(Lorenz63Settings()), 0.01, 25, 2**0.5, 2**0.5, tolerance=1e-5)
 L96 = System("L96", Lorenz96.from_settings(Lorenz96Settings()), 0.05, 1, 1.0, 0.001**0.5)
-# system, members, lag (0: ETKF), inflation
+
+
+@dataclass(frozen=True)
+class Case:
+    """``scheme``: ETKF, EnKF-N or the lag of an IEnKS. ``seen``: every how many variables are observed.
+
+    ``noise``: variance per unit of time of an additive model error, of the truth too, and its ``form`` in the ensemble.
+    ``radius``: of the localisation, as DAPPER counts.
+    """
+
+    system: System
+    members: int
+    scheme: str | int
+    inflation: float = 1.0
+    seen: int = 1
+    radius: float | None = None
+    noise: float = 0.0
+    form: Literal["drawn", "square-root"] = "drawn"
+
+    @property
+    def name(self) -> str:
+        scheme = f"lag {self.scheme}" if isinstance(self.scheme, int) else "L" * bool(self.radius) + self.scheme
+        return f"{self.system.name} N={self.members} {scheme}" + f", Q {self.form}" * bool(self.noise)
+
+
 CASES = [
-    (L63, 10, 0, 1.02),
-    (L63, 10, 1, 1.02),
-    (L63, 10, 4, 1.02),
-    (L96, 25, 0, 1.02),
-    (L96, 25, 1, 1.02),
-    (L96, 25, 4, 1.02),
-    (L96, 40, 0, 1.01),
-    (L96, 40, 1, 1.01),
-    (L96, 40, 4, 1.01),
+    Case(L63, 10, "ETKF", 1.02),
+    Case(L63, 10, 1, 1.02),
+    Case(L63, 10, 4, 1.02),
+    Case(L96, 25, "ETKF", 1.02),
+    Case(L96, 25, 1, 1.02),
+    Case(L96, 25, 4, 1.02),
+    Case(L96, 40, "ETKF", 1.01),
+    Case(L96, 40, 1, 1.01),
+    Case(L96, 40, 4, 1.01),
+    Case(L96, 25, "EnKF-N"),
+    Case(L63, 10, "EnKF-N"),
+    Case(L96, 15, "ETKF", 1.05, seen=2, radius=4.0),
+    Case(L96, 40, "ETKF", 1.02, noise=0.2),
+    Case(L96, 40, "ETKF", 1.02, noise=0.2, form="square-root"),
 ]
 
 
-def draw(system: System, cycles: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Truth at every step (K + 1, n), its observations (cycles, n) and the state all start around."""
+def draw(case: Case, cycles: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Truth at every step (K + 1, n), its observations (cycles, p) and the state all start around."""
+    system = case.system
     mean = system.model.initial_state(system.model.defaults)
     n = len(mean) - len(system.model.defaults)
     stream = member_stream(seed, "truth")
     start = mean.copy()
     start[:n] += system.initial_std * stream.standard_normal(n)
-    (path,) = system.model.trajectories(start[None], system.step * np.arange(1, cycles * system.every + 1))
-    truth = np.vstack([start[:n], path.states[:, :n]])
-    seen = truth[system.every :: system.every]
+    if case.noise:
+        states, one, width = [start], np.array([system.step]), np.sqrt(case.noise * system.step)
+        for _ in range(cycles * system.every):
+            (path,) = system.model.trajectories(states[-1][None], one)
+            states.append(path.states[0] + np.append(width * stream.standard_normal(n), np.zeros(len(mean) - n)))
+        truth = np.array(states)[:, :n]
+    else:
+        (path,) = system.model.trajectories(start[None], system.step * np.arange(1, cycles * system.every + 1))
+        truth = np.vstack([start[:n], path.states[:, :n]])
+    seen = truth[system.every :: system.every, :: case.seen]
     return truth, seen + system.error_std * stream.standard_normal(seen.shape), mean
 
 
-def ours(
-    system: System,
-    members: int,
-    lag: int,
-    inflation: float,
-    truth: np.ndarray,
-    y: np.ndarray,
-    mean: np.ndarray,
-    seed: int,
-) -> tuple[np.ndarray, float]:
+def settings_of(case: Case, size: int, n: int) -> SequentialSettings:
+    """Ours, for states (size,) of which ``n`` variables move."""
+    if isinstance(case.scheme, int):
+        scheme: SeriesScheme = IEnKS(case.scheme, tolerance=case.system.tolerance)
+    else:
+        scheme = EnKFN() if case.scheme == "EnKF-N" else ETKF()
+    local, error, moves = None, None, np.arange(size) < n
+    if case.radius:
+        places = np.where(moves, np.arange(size), np.nan)
+        # DAPPER's radius is where the taper is exp(−½), ours where it is 5/24; two variables share an analysis in both
+        radius = 1.82 * case.radius
+        local = Localisation.on_line(places, np.arange(0.0, n, case.seen), radius, float(n), block_size=2)
+    if case.noise:
+        error = ModelError(np.where(moves, case.noise, 0.0), case.form)
+    return SequentialSettings(scheme, Inflation(case.inflation), rotation=True, localisation=local, model_error=error)
+
+
+def ours(case: Case, truth: np.ndarray, y: np.ndarray, mean: np.ndarray, seed: int) -> tuple[np.ndarray, float]:
     """Analysis RMSE of every cycle and the seconds it took."""
-    n = truth.shape[1]
-    ensemble = np.tile(mean, (members, 1))
-    ensemble[:, :n] += system.initial_std * member_stream(seed, "members").standard_normal((members, n))
+    system, n = case.system, truth.shape[1]
+    ensemble = np.tile(mean, (case.members, 1))
+    ensemble[:, :n] += system.initial_std * member_stream(seed, "members").standard_normal((case.members, n))
     times = system.step * system.every * np.arange(1, len(y) + 1)
-    series = CycleSeries(times, y, np.full(n, system.error_std))
-    scheme = IEnKS(lag, tolerance=system.tolerance) if lag else ETKF()
-    settings = SequentialSettings(scheme, Inflation(inflation), rotation=True)
+    series = CycleSeries(times, y, np.full(y.shape[1], system.error_std))
+    observed = system.model.observables
+    if case.seen > 1:
+        observed = (Observable("some", "1", lambda path: path.states[:, : n : case.seen]),)
+    settings = settings_of(case, len(mean), n)
     began = time.process_time()
-    result = run_sequential(system.model, system.model.observables, ensemble, series, settings, seed)
+    result = run_sequential(system.model, observed, ensemble, series, settings, seed)
     took = time.process_time() - began
     error = result.analysis.mean[:, :n] - truth[system.every :: system.every]
     return np.sqrt(np.mean(error**2, axis=1)), took
 
 
-def theirs(
-    system: System, members: int, lag: int, inflation: float, truth: np.ndarray, y: np.ndarray, seed: int, lean: bool
-) -> tuple[np.ndarray, float]:
+def theirs(case: Case, truth: np.ndarray, y: np.ndarray, seed: int, lean: bool) -> tuple[np.ndarray, float]:
     """The same by DAPPER."""
     warnings.simplefilter("ignore")  # DAPPER's own, about plots that are not asked for
     import dapper as dpr
     import dapper.da_methods as methods
+    from dapper.mods.utils import partial_Id_Obs
     from dapper.tools import progressbar
+    from dapper.tools.localization import nd_Id_localization
+    from dapper.tools.randvars import GaussRV
     from dapper.tools.seeding import set_seed
 
     progressbar.disable_progbar = True
-    if system is L63:
+    if case.system is L63:
         from dapper.mods.Lorenz63.sakov2012 import HMM as original
     else:
         from dapper.mods.Lorenz96.sakov2008 import HMM as original
-    hmm = copy.deepcopy(original)
+    hmm, system = copy.deepcopy(original), case.system
     hmm.tseq.Ko = len(y) - 1
     assert (hmm.tseq.dt, hmm.tseq.dko, hmm.tseq.K) == (system.step, system.every, len(truth) - 1)
     dpr.rc.comps["error_only"] = lean
-    options = {"N": members, "infl": inflation, "rot": True}
-    if lag:
-        method = methods.iEnKS("Sqrt", Lag=lag, wtol=1e-5 if lean else 0, **options)
+    n = truth.shape[1]
+    if case.seen > 1:
+        observed = partial_Id_Obs(n, np.arange(0, n, case.seen))
+        observed |= {"noise": 1, "localizer": nd_Id_localization((n,), (2,), np.arange(0, n, case.seen))}
+        hmm.Obs = type(hmm)(hmm.Dyn, observed, hmm.tseq, hmm.X0).Obs
+    if case.noise:
+        hmm.Dyn.noise = GaussRV(C=case.noise, M=n)
+    options: dict[str, Any] = {"N": case.members, "infl": case.inflation, "rot": True}
+    if case.form == "square-root":
+        options["fnoise_treatm"] = "Sqrt-Core"
+    if isinstance(case.scheme, int):
+        method = methods.iEnKS("Sqrt", Lag=case.scheme, wtol=1e-5 if lean else 0, **options)
+    elif case.radius:
+        method = methods.LETKF(loc_rad=case.radius, **options)
     else:
-        method = methods.EnKF("Sqrt", **options)
+        method = methods.EnKF_N(**options) if case.scheme == "EnKF-N" else methods.EnKF("Sqrt", **options)
     set_seed(1 + seed)
     began = time.process_time()
     method.assimilate(hmm, truth, y, liveplots=False)
@@ -155,30 +219,27 @@ def main() -> None:
     parser.add_argument("--only", default="", help="cases whose name contains this, e.g. 'L96 N=25'")
     arguments = parser.parse_args()
     for system in (L63, L96):  # compile
-        ours(system, 4, 1, 1.0, *draw(system, 2, 0), 0)
+        ours(warm := Case(system, 4, 1), *draw(warm, 2, 0), 0)
     print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD), flush=True)
     for case in CASES:
-        system, members, lag, _ = case
-        name = f"{system.name} N={members} " + (f"lag {lag}" if lag else "ETKF")
-        if arguments.only in name:
-            print(f"| {name} | " + " | ".join(compare(case, arguments.cycles, arguments.seeds)) + " |", flush=True)
+        if arguments.only in case.name:
+            print(f"| {case.name} | " + " | ".join(compare(case, arguments.cycles, arguments.seeds)) + " |", flush=True)
 
 
-def compare(case: tuple[System, int, int, float], cycles: int, seeds: int) -> list[str]:
+def compare(case: Case, cycles: int, seeds: int) -> list[str]:
     """The row of a case."""
-    system, members, lag, inflation = case
-    seeds = 4 * seeds if system is L63 else seeds
+    seeds = 4 * seeds if case.system is L63 else seeds
     counted = slice(cycles // 10, None)
     errors = np.empty((2, seeds))
     spent = {"ours": 0.0, "shipped": 0.0, "lean": 0.0}
     for seed in range(seeds):
-        truth, y, mean = draw(system, cycles, seed)
-        rmse, took = ours(system, members, lag, inflation, truth, y, mean, seed)
+        truth, y, mean = draw(case, cycles, seed)
+        rmse, took = ours(case, truth, y, mean, seed)
         errors[0, seed], spent["ours"] = rmse[counted].mean(), spent["ours"] + took / seeds
-        rmse, took = theirs(system, members, lag, inflation, truth, y, seed, lean=True)
+        rmse, took = theirs(case, truth, y, seed, lean=True)
         errors[1, seed], spent["lean"] = rmse[counted].mean(), spent["lean"] + took / seeds
         if seed == 0:  # its time does not depend on the seed
-            spent["shipped"] = theirs(system, members, lag, inflation, truth, y, seed, lean=False)[1]
+            spent["shipped"] = theirs(case, truth, y, seed, lean=False)[1]
     a, b = errors.mean(axis=1)
     scatter = np.std(errors[0] - a / b * errors[1], ddof=1) / b / np.sqrt(seeds) if seeds > 1 else np.nan
     each = {who: 1e3 * seconds / cycles for who, seconds in spent.items()}

@@ -17,9 +17,17 @@ if TYPE_CHECKING:
     from en4dvar.analysis import Analysis as Analysis
     from en4dvar.batch import Batch as Batch
     from en4dvar.config import Config as Config
+    from en4dvar.config import SequenceConfig as SequenceConfig
     from en4dvar.config import TwinConfig as TwinConfig
     from en4dvar.config import load_config as load_config
+    from en4dvar.config import load_sequence as load_sequence
     from en4dvar.config import load_twin as load_twin
+    from en4dvar.cycling.model_error import ModelError as ModelError
+    from en4dvar.cycling.problem import SeriesProblem as SeriesProblem
+    from en4dvar.cycling.problem import SeriesResult as SeriesResult
+    from en4dvar.cycling.problem import assimilate_series as assimilate_series
+    from en4dvar.cycling.sequential import SequentialSettings as SequentialSettings
+    from en4dvar.cycling.start import InitialEnsemble as InitialEnsemble
     from en4dvar.descent.preview import Preview as Preview
     from en4dvar.descent.preview import preview as preview
     from en4dvar.errors import ConfigError as ConfigError
@@ -48,12 +56,16 @@ if TYPE_CHECKING:
     from en4dvar.runs.campaign import Campaign as Campaign
     from en4dvar.runs.checks import validate as validate
     from en4dvar.runs.estimate import estimate as estimate
+    from en4dvar.runs.estimate import estimate_sequence as estimate_sequence
     from en4dvar.runs.runner import run as run
     from en4dvar.runs.runner import run_campaign as run_campaign
     from en4dvar.runs.runner import write_report as write_report
+    from en4dvar.runs.sequence_run import run_sequence as run_sequence
     from en4dvar.runs.simulation import Simulation as Simulation
     from en4dvar.runs.simulation import simulate as simulate
     from en4dvar.runs.twin_run import run_twin as run_twin
+    from en4dvar.runs.twin_sweep import TwinSweep as TwinSweep
+    from en4dvar.runs.twin_sweep import sweep_twin as sweep_twin
     from en4dvar.series import Places as Places
     from en4dvar.series import Series as Series
     from en4dvar.state import Field as Field
@@ -67,7 +79,11 @@ _HOME = {
     "descent.preview": ("Preview", "preview"),
     "runs.checks": ("validate",),
     "report.compare": ("Comparison", "compare_runs"),
-    "config": ("Config", "TwinConfig", "load_config", "load_twin"),
+    "config": ("Config", "SequenceConfig", "TwinConfig", "load_config", "load_sequence", "load_twin"),
+    "cycling.problem": ("SeriesProblem", "SeriesResult", "assimilate_series"),
+    "cycling.sequential": ("SequentialSettings",),
+    "cycling.start": ("InitialEnsemble",),
+    "cycling.model_error": ("ModelError",),
     "errors": ("ConfigError", "DataError", "En4dvarError", "OutputError", "TooFewMembersError"),
     "report.export": ("export_table",),
     "forward": ("Failure", "ForwardModel", "Observable", "StateField", "Trajectory"),
@@ -78,13 +94,15 @@ _HOME = {
     "analysis": ("Analysis",),
     "programs.control": ("from_pest",),
     "problem": ("AssimilationSettings", "InverseProblem"),
-    "runs.estimate": ("estimate",),
+    "runs.estimate": ("estimate", "estimate_sequence"),
     "runs.runner": ("run", "run_campaign", "write_report"),
     "series": ("Places", "Series"),
     "runs.simulation": ("Simulation", "simulate"),
     "state": ("Field", "Parameter", "StateLayout"),
     "report.result": ("Result", "load_result"),
+    "runs.sequence_run": ("run_sequence",),
     "runs.twin_run": ("run_twin",),
+    "runs.twin_sweep": ("TwinSweep", "sweep_twin"),
     "units": ("Quantity",),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}

@@ -21,6 +21,7 @@ from en4dvar.commands.plugin_commands import PluginCommand, plugin_commands
 from en4dvar.commands.results import compare, export, report, rerun
 from en4dvar.commands.run import run
 from en4dvar.commands.simulate import simulate
+from en4dvar.commands.sweep_twin import sweep_twin
 from en4dvar.commands.validate import validate
 from en4dvar.errors import En4dvarError
 
@@ -96,7 +97,7 @@ def main() -> None:
     """
 
 
-for command in (compare, design, export, joint, models, report, rerun, run, schema, simulate, validate):
+for command in (compare, design, export, joint, models, report, rerun, run, schema, simulate, sweep_twin, validate):
     main.add_command(command)
 
 if __name__ == "__main__":

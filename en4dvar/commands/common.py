@@ -6,7 +6,7 @@ import functools
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,6 +49,17 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
+def parted(items: Iterable[str], option: str) -> dict[str, str]:
+    """Dotted keys → values of ``items`` KEY=VALUE, given with an ``option``."""
+    found = {}
+    for item in items:
+        key, equals, value = item.partition("=")
+        if not equals:
+            raise click.BadParameter(f"{item!r} is not KEY=VALUE", param_hint=option)
+        found[key.strip()] = value
+    return found
+
+
 @dataclass(frozen=True)
 class Source:
     """The configuration that a command was given: its file, and what --data and --set change in it."""
@@ -65,12 +76,7 @@ class Source:
 
     def overrides(self, **special: Any) -> dict[str, Any]:
         """Dotted keys → values of --set and --data; ``special`` are further keys, left out where None."""
-        found: dict[str, Any] = {}
-        for item in self.settings:
-            key, equals, value = item.partition("=")
-            if not equals:
-                raise click.BadParameter(f"{item!r} is not KEY=VALUE", param_hint="--set")
-            found[key.strip()] = value
+        found: dict[str, Any] = {**parted(self.settings, "--set")}
         # A path on the command line is relative to the shell's folder, one in the file to the file's.
         special["data.path"] = [str(Path(self.data).absolute())] if self.data else None
         return found | {key: value for key, value in special.items() if value is not None}

@@ -11,7 +11,9 @@ import click
 from en4dvar.commands.common import Failed, Source, command_line, config_options, continuable, note_beginning
 
 if TYPE_CHECKING:
-    from en4dvar.config import Config, TwinConfig
+    from en4dvar.config import Config, SequenceConfig, TwinConfig
+    from en4dvar.cycling.problem import SeriesResult
+    from en4dvar.cycling.twin import TwinResult
     from en4dvar.runs.campaign import Campaign
 
 MOST_TOLD = 30  # data sets, warnings and failures on the terminal; all of them are in the run directory
@@ -41,13 +43,14 @@ def run(
     """Estimate the parameters; write posterior and report to the run directory.
 
     Several data files (a list, a pattern or a folder) are a campaign; one that cannot be used does not end it.
-    A configuration with a 'twin:' section is a twin experiment: RMSE and spread against its truth.
+    A configuration with a 'twin:' section is a twin experiment: RMSE and spread against its truth. One with a
+    'sequence:' section is followed in time by a filter or a sliding-window smoother.
 
     \b
     Example:
       en4dvar run configs/quickstart.yaml --out runs/first --set assimilation.members=96
     """
-    from en4dvar.config import TwinConfig, load_any
+    from en4dvar.config import Config, TwinConfig, load_any
 
     special = {
         "output.directory": str(out) if out else None,
@@ -58,12 +61,14 @@ def run(
     with chdir("."):  # own code of a configuration may leave this folder, which --out refers to
         config = load_any(source.path, source.overrides(**special))
     note_beginning(config.directory, resume)
-    if not isinstance(config, TwinConfig):
+    if isinstance(config, Config):
         _estimate(config, force, resume)
     elif scheduler:
-        raise click.UsageError("a twin experiment takes no --scheduler: its cycles are too short to be sent away")
-    else:
+        raise click.UsageError("a series takes no --scheduler: its cycles are too short to be sent away")
+    elif isinstance(config, TwinConfig):
         _conduct(config, force, resume)
+    else:
+        _follow(config, force, resume)
 
 
 def _estimate(config: Config, force: bool, resume: bool) -> None:
@@ -113,11 +118,29 @@ def _conduct(config: TwinConfig, force: bool, resume: bool) -> None:
     with continuable(), cycle_progress(config.experiment.cycles) as on_cycle:
         result = run_twin(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
     click.echo(scores_table(result))
+    _tell_series(config, "twin.nc", config.experiment.members, result)
+
+
+def _follow(config: SequenceConfig, force: bool, resume: bool) -> None:
+    from en4dvar.config.build_sequence import build_sequence
+    from en4dvar.runs.progress import cycle_progress
+    from en4dvar.runs.sequence_run import estimates_table, run_sequence
+
+    with continuable(), cycle_progress(len(build_sequence(config).series.times)) as on_cycle:
+        result = run_sequence(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
+    click.echo(estimates_table(result))
+    _tell_series(config, "sequence.nc", config.assimilation.members, result)
+
+
+def _tell_series(
+    config: TwinConfig | SequenceConfig, file: str, members: int, result: TwinResult | SeriesResult
+) -> None:
+    """Warnings on standard error, and where the files are."""
     if result.run.failures:
-        lost = f"{len(result.run.failures)} of {config.experiment.members} members lost"
+        lost = f"{len(result.run.failures)} of {members} members lost"
         click.echo(f"warning: {config.name}: {lost}, the last: {result.run.failures[-1]}", err=True)
     for warning in result.warnings:
         click.echo(f"warning: {config.name}: {warning}", err=True)
-    click.echo(f"result: {config.directory / 'twin.nc'}")
+    click.echo(f"result: {config.directory / file}")
     if config.report:
         click.echo(f"report: {config.directory / 'report.html'}")

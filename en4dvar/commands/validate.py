@@ -28,7 +28,7 @@ def validate(source: Source, plot: bool) -> None:
     Example:
       en4dvar validate configs/quickstart.yaml --plot
     """
-    from en4dvar.config import TwinConfig
+    from en4dvar.config import SequenceConfig, TwinConfig
     from en4dvar.runs.checks import validate as check
 
     loaded = check(source.path, source.overrides())
@@ -38,6 +38,14 @@ def validate(source: Source, plot: bool) -> None:
         if plot:
             raise click.UsageError("a twin experiment has no data to plot the prior over")
         click.echo(twin_summary(loaded))
+        return
+    if isinstance(loaded, SequenceConfig):
+        from en4dvar.config.build_sequence import build_sequence
+        from en4dvar.runs.sequence_run import sequence_summary
+
+        if plot:
+            raise click.UsageError("--plot is for estimations; the report of a sequence shows its forecasts")
+        click.echo(sequence_summary(loaded, build_sequence(loaded)))
         return
     from en4dvar.commands.describe import cost_summary, problem_summary
     from en4dvar.config.build import build

@@ -8,21 +8,29 @@ from typing import Any
 
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.load import Config, load_config, resolve
+from en4dvar.config.sequence import SequenceConfig, resolve_sequence
 from en4dvar.config.times import time_grid
 from en4dvar.config.twin import TwinConfig, resolve_twin
 from en4dvar.errors import ConfigError, Fault
 
-__all__ = ["Config", "TwinConfig", "load_any", "load_config", "load_twin", "resolve", "resolve_any", "time_grid"]
+__all__ = [
+    "AnyConfig", "Config", "SequenceConfig", "TwinConfig", "load_any", "load_config", "load_sequence", "load_twin",
+    "resolve", "resolve_any", "resolve_sequence", "time_grid",
+]  # fmt: skip
+
+AnyConfig = Config | TwinConfig | SequenceConfig
 
 
-def load_any(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Config | TwinConfig:
-    """A twin experiment where the file has a ``twin:`` section, else what :func:`load_config` gives."""
+def load_any(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> AnyConfig:
+    """A twin experiment or a sequence where the file has a section ``twin:`` or ``sequence:``, else an estimation."""
     document, base = document_from(source)
     return resolve_any(override(document, overrides or {}), base)
 
 
-def resolve_any(document: Document, base: Path) -> Config | TwinConfig:
+def resolve_any(document: Document, base: Path) -> AnyConfig:
     """As :func:`load_any`, of a document that has been read; ``base`` is where its relative paths start."""
+    if "sequence" in document.data and "twin" not in document.data:
+        return resolve_sequence(document, base)
     return resolve_twin(document, base) if "twin" in document.data else resolve(document, base)
 
 
@@ -31,4 +39,12 @@ def load_twin(source: str | Path | Mapping[str, Any], overrides: Mapping[str, An
     config = load_any(source, overrides)
     if not isinstance(config, TwinConfig):
         raise ConfigError([Fault("not a twin experiment: it has no twin: section", file=config.document.file)])
+    return config
+
+
+def load_sequence(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> SequenceConfig:
+    """As :func:`load_config`, for a sequence. Raises :class:`ConfigError`."""
+    config = load_any(source, overrides)
+    if not isinstance(config, SequenceConfig):
+        raise ConfigError([Fault("not a sequence: it has no sequence: section", file=config.document.file)])
     return config

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
-from en4dvar.config import Config
+from en4dvar.config import Config, SequenceConfig
 from en4dvar.config.find_files import find_files, with_parts
 from en4dvar.config.initial_state import Perturbed
 from en4dvar.config.parameters import Fixed, Tied, Uncertain, inside_bounds
@@ -162,7 +162,7 @@ def _files_of(one: SeriesPlan) -> dict[str, DataFile]:
 
 
 def resolve_parameters(
-    config: Config, observations: Observations | None
+    config: Config | SequenceConfig, observations: Observations | None
 ) -> tuple[tuple[PriorTerm, ...], dict[str, float]]:
     """Prior terms and fixed values, evaluated on the data where they refer to them.
 
@@ -203,7 +203,7 @@ def resolve_parameters(
     return tuple(terms), fixed
 
 
-def _maximum(entry: Uncertain, config: Config, observations: Observations | None) -> float | None:
+def _maximum(entry: Uncertain, config: Config | SequenceConfig, observations: Observations | None) -> float | None:
     """The observed maximum in the parameter's unit, where the entry asks for it."""
     if observations is None or not entry.needs_data:
         return None

@@ -18,6 +18,7 @@ from en4dvar.config.context import TEXT
 from en4dvar.config.load import Estimation
 from en4dvar.config.models import COMMAND, GROUP, find_model, settings_of
 from en4dvar.config.parameters import FromFile, PriorSection, TiedSection
+from en4dvar.config.sequence import SequenceFile
 from en4dvar.config.series import SeriesData
 from en4dvar.config.synthetic import CampaignFile
 from en4dvar.config.twin import TwinFile
@@ -39,15 +40,17 @@ def json_schema() -> Json:
     definitions["series"] = _partial(_of(SeriesData.model_json_schema()))  # the rest is said for all series
     models = list(_models(definitions))
     definitions["model"] = _model_section(models)
-    for name, kind in (("estimation", Estimation), ("twin", TwinFile), ("campaign", CampaignFile)):
+    for name, kind in (
+        ("estimation", Estimation), ("twin", TwinFile), ("sequence", SequenceFile), ("campaign", CampaignFile)
+    ):  # fmt: skip
         definitions[name] = _of(kind.model_json_schema())
-    for name in ("estimation", "twin"):
+    for name in ("estimation", "twin", "sequence"):
         definitions[name]["allOf"] = [
             _if({"required": ["model"], "properties": {"model": _names(model)}},
                 {"properties": {"parameters": {"$ref": f"#/$defs/parameters_{model}"}}})
             for model in models
         ]  # fmt: skip
-    kinds = {"twin": "twin", "campaign": "campaign"}
+    kinds = {"twin": "twin", "sequence": "sequence", "campaign": "campaign"}
     for entry in entry_points(group=KINDS):
         definitions[f"{entry.name}_file"] = _of(entry.load().model_json_schema())
         kinds[entry.name] = f"{entry.name}_file"

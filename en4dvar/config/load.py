@@ -28,6 +28,8 @@ from en4dvar.forward import ForwardModel, Observable
 from en4dvar.problem import AssimilationSettings
 from en4dvar.state import NOISE_SCALE, Array
 
+KINDS = {"twin": "a twin experiment", "sequence": "a sequence"}  # sections that mark other kinds of files
+
 
 class Simulate(Section):
     """Settings of ``en4dvar simulate``: when the synthetic observations are taken."""
@@ -122,8 +124,9 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
 
     ``model``: one that is there already; the ``model:`` section then only records what it is.
     """
-    if "twin" in document.data:
-        raise ConfigError([document.fault(("twin",), "a twin experiment: it can be run and validated", at_key=True)])
+    for kind, words in KINDS.items():
+        if kind in document.data:
+            raise ConfigError([document.fault((kind,), f"{words}: it can be run and validated", at_key=True)])
     read = read_file(Estimation, document, base, model)
     file = read.file
     own = {p.name for p in read.model.parameters}
@@ -135,7 +138,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
         name=file.name,
         seed=file.seed,
         model=read.model,
-        observable=_observable(file.data, read),
+        observable=observed_in(file.data, read),
         parameters=parameters,
         data=file.data,
         assimilation=file.assimilation.settings,
@@ -152,7 +155,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
     )
 
 
-def _observable(data: Data | DataPlan | None, read: Read[Any]) -> Observable:
+def observed_in(data: Data | DataPlan | None, read: Read[Any]) -> Observable:
     """What the data hold; of several series that of the first."""
     if isinstance(data, DataPlan):
         return data.series[0].observable

@@ -14,18 +14,22 @@ BLOCK_SIZE = 2_000_000  # numbers in them, at most
 
 @dataclass(frozen=True)
 class Moments:
-    """Ensemble mean and standard deviation (K, n_state) at the observation times; NaN where there is none."""
+    """Ensemble mean and standard deviation (K, n_state) at the observation times; NaN where there is none.
+
+    ``rank`` is that of the truth among the N members, counted from ½ to N + ½ and divided by N + 1; (K, 0) without one.
+    """
 
     mean: Array
     std: Array
+    rank: Array
 
     @classmethod
-    def empty(cls, cycles: int, size: int) -> Moments:
-        return cls(np.full((cycles, size), np.nan), np.full((cycles, size), np.nan))
+    def empty(cls, cycles: int, size: int, ranked: bool) -> Moments:
+        return cls(*(np.full((cycles, width), np.nan) for width in (size, size, size if ranked else 0)))
 
     def until(self, cycle: int) -> Moments:
         """Copy of the rows before ``cycle``."""
-        return Moments(self.mean[:cycle].copy(), self.std[:cycle].copy())
+        return Moments(self.mean[:cycle].copy(), self.std[:cycle].copy(), self.rank[:cycle].copy())
 
 
 class MomentsRecorder:
@@ -34,11 +38,13 @@ class MomentsRecorder:
     The moments of a cycle do not depend on which cycles share its block.
     """
 
-    def __init__(self, cycles: int, size: int, before: Moments | None = None):
-        self._moments = Moments.empty(cycles, size)
+    def __init__(self, cycles: int, size: int, before: Moments | None = None, truth: Array | None = None):
+        self._truth = truth
+        self._moments = Moments.empty(cycles, size, truth is not None)
         if before is not None:
             self._moments.mean[: len(before.mean)] = before.mean
             self._moments.std[: len(before.std)] = before.std
+            self._moments.rank[: len(before.rank)] = before.rank
         self._cycles: list[int] = []
         self._scales: list[float] = []
         self._ensembles = np.empty((0, 0, size))
@@ -68,6 +74,42 @@ class MomentsRecorder:
         anomalies = ensembles - mean[:, None]
         variance = np.einsum("kij,kij->kj", anomalies, anomalies) / (n_members - 1)
         self._moments.mean[self._cycles] = mean
-        self._moments.std[self._cycles] = np.array(self._scales)[:, None] * np.sqrt(variance)
+        scales = np.array(self._scales)[:, None]
+        self._moments.std[self._cycles] = scales * np.sqrt(variance)
+        if self._truth is not None:
+            error = self._truth[self._cycles] - mean
+            below = np.count_nonzero(scales[:, None] * anomalies < error[:, None], axis=1)
+            self._moments.rank[self._cycles] = (below + 0.5) / (n_members + 1)
         self._cycles.clear()
         self._scales.clear()
+
+
+class InnovationRecorder(MomentsRecorder):
+    """Moments of predictions (N, p), and the ranks (K, p) of observations (K, p) with errors ``std``, (p,) or (K, p).
+
+    A rank is the probability that the mixture of the members' Gaussians gives to what lies below the observation: the
+    share of members below it, errors of the observations added, without the chance of a draw. NaN where there is none.
+    """
+
+    def __init__(self, values: Array, std: Array, before: Moments | None = None, ranks: Array | None = None):
+        super().__init__(values.shape[0], values.shape[1], before)
+        self._values, self._std = values, np.broadcast_to(std, values.shape)
+        self._ranks = np.full(values.shape, np.nan)
+        if ranks is not None:
+            self._ranks[: len(ranks)] = ranks
+
+    @property
+    def ranks(self) -> Array:
+        """Of everything recorded so far."""
+        self._flush()
+        return self._ranks
+
+    def _flush(self) -> None:
+        if not self._cycles:
+            return
+        from scipy.special import ndtr
+
+        at = self._cycles
+        gaps = (self._values[at][:, None] - self._ensembles[: len(at)]) / self._std[at][:, None]
+        self._ranks[at] = ndtr(gaps).mean(axis=1)
+        super()._flush()

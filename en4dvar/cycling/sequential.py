@@ -1,8 +1,12 @@
 """Sequential assimilation of a long series, cycle by cycle: filters, and smoothers on a sliding window.
 
-The ensemble stands at the start of a window of ``lag`` observation times. A cycle runs it to the newest observation,
-iterates the scheme's weights at the start, inflates, and moves the window on by one (shift 1); a filter is a window
-without length. The control vector is the whole state, parameters included.
+The ensemble stands at the start of a window that reaches ``lag`` observation times ahead. A cycle runs it to the newest
+observations, iterates the scheme's weights at the start, inflates, and moves the window on by ``shift`` times; a filter
+is a window without length. The control vector is the whole state, parameters included, and with a model error what it
+changed in the window.
+
+With ``mda_weights`` an observation is assimilated in every window that holds it, by a share each time. What a cycle
+says of the states is then that of a second analysis beside it, with the shares that are still missing.
 
 A member that cannot be integrated is dropped and the window done again with the survivors, so that the statistics stay
 those of one ensemble; its reason is kept.
@@ -11,28 +15,36 @@ those of one ensemble; its reason is kept.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 
-from en4dvar.batch import Batch
-from en4dvar.cycling.moments import Moments, MomentsRecorder
+from en4dvar.cycling.coordinates import EnsembleCoordinates
+from en4dvar.cycling.model_error import ModelError, fresh_noise
+from en4dvar.cycling.moments import InnovationRecorder, Moments, MomentsRecorder
+from en4dvar.cycling.moving import Flow, MembersLost
 from en4dvar.cycling.rotation import Rotations, rotate
 from en4dvar.cycling.series import CycleSeries
+from en4dvar.cycling.smoothers import EnKS, Smoother
+from en4dvar.cycling.window import Ahead, Batch, CycleDescent, CycleWindow, is_filter
 from en4dvar.descent.loop import iterate
 from en4dvar.ensemble.linalg import centre
 from en4dvar.ensemble.repeat import check_repeats
 from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
-from en4dvar.forward import Failure, ForwardModel, Observable, Trajectory
+from en4dvar.forward import ForwardModel, Observable
 from en4dvar.prior import member_stream
-from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights
-from en4dvar.schemes.etkf import ETKF
+from en4dvar.schemes.base import SeriesScheme, Weights
+from en4dvar.schemes.bootstrap_filter import BootstrapFilter
 from en4dvar.schemes.inflation import Inflation
-from en4dvar.schemes.localisation import LocalDescent, Localisation
+from en4dvar.schemes.localisation import Localisation
 from en4dvar.state import Array
 
 NO_INFLATION = Inflation()
+ALL = slice(None)
+Rows = npt.NDArray[np.intp] | slice  # of an ensemble: those that survive
 
 
 @dataclass(frozen=True)
@@ -41,22 +53,49 @@ class SequentialSettings:
 
     ``rotation``: every analysis is turned by a random mean-preserving rotation (:mod:`en4dvar.cycling.rotation`).
     ``stochastic_model``: a model that gives other numbers when a member is run again is accepted.
+    ``to_end``: the last times, which no whole window follows, are smoothed by the observations that there are.
+    ``innovations``: what was expected of each observation is recorded. ``members_every``: analysis ensembles are kept
+    after so many observation times, and the last; 0: the last alone.
+    ``smoother``: what goes behind a filter (:mod:`en4dvar.cycling.smoothers`).
+
+    Raises
+    ------
+    ValueError: a smoother behind what is no cycled filter, localisation of what has no local analysis.
     """
 
-    scheme: Scheme
+    scheme: SeriesScheme
     inflation: Inflation = NO_INFLATION
     rotation: bool = False
     localisation: Localisation | None = None
     min_active_fraction: float = 0.5
     stochastic_model: bool = False
+    model_error: ModelError | None = None
+    coordinates: EnsembleCoordinates = field(default_factory=EnsembleCoordinates)
+    to_end: bool = False
+    innovations: bool = False
+    members_every: int = 0
+    smoother: Smoother | None = None
+
+    def __post_init__(self) -> None:
+        if self.smoother and (self.scheme.lag or not self.scheme.cycled):
+            raise ValueError("a smoother goes behind a filter that is cycled, not behind ienks or a baseline")
+        if self.localisation and isinstance(self.smoother, EnKS):
+            raise ValueError("enks needs the weights of one analysis for all of the state; with localisation use enrts")
+        if self.localisation and isinstance(self.scheme, BootstrapFilter):
+            raise ValueError("members survive as a whole: the particle filter takes no localisation")
+
+    @property
+    def smooths(self) -> bool:
+        """Whether there are smoothed states."""
+        return bool(self.scheme.lag or self.smoother)
 
 
 @dataclass(frozen=True)
 class SequentialState:
     """All that the rest of a run depends on, besides its arguments, and what it has found so far.
 
-    ``cycle`` is the next one; ``ensemble`` (N', n_state) stands at ``start`` (0: time zero, k: observation time k).
-    Random numbers are drawn by cycle, so that no generator has a state. Rows of the arrays are the cycles done.
+    ``cycle`` observation times are done; ``ensemble`` (N', n_state + changes) stands at ``start`` (0: time zero, k:
+    observation time k). Random numbers are drawn by cycle, so that no generator has a state.
     """
 
     cycle: int
@@ -65,24 +104,37 @@ class SequentialState:
     forecast: Moments
     analysis: Moments
     smoothed: Moments
+    predicted: Moments
+    ranks: Array
     iterations: Array
+    effective: Array
+    kept: tuple[tuple[int, Array], ...]
     forward_runs: int
     failures: tuple[str, ...] = ()
+    trail: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True)
 class SequentialResult:
     """What a run leaves: moments of forecast, analysis (by y_1…y_k) and smoothed ensemble (by y_1…y_{k+L}).
 
-    The last L smoothed rows, and all of a filter's, are NaN. ``iterations`` (K,) forecasts of the window,
-    ``members`` (N', n) the final ensemble, ``failures`` the reasons of the members lost.
+    The last L smoothed rows of the IEnKS, unless ``to_end``, and all of a filter without a smoother are NaN.
+    ``predicted``: moments (K, p) of the forecast where it was observed. ``ranks`` (K, p): share of the members, with
+    the errors of the observations, that lie below the observation, NaN where there was none. ``iterations`` (K,)
+    forecasts of the window. ``effective`` (K,): members that the weights of a particle filter leave, NaN: all.
+    ``members`` (N', n) the final ensemble at the start of the last window; ``kept``: index of a time → analysis members
+    (N', n), physical; ``failures`` the reasons of the members lost.
     """
 
     forecast: Moments
     analysis: Moments
     smoothed: Moments
+    predicted: Moments
+    ranks: Array
     iterations: Array
+    effective: Array
     members: Array
+    kept: tuple[tuple[int, Array], ...] = ()
     failures: tuple[str, ...] = ()
     forward_runs: int = 0
 
@@ -98,6 +150,7 @@ def run_sequential(
     on_cycle: Callable[[int], None] | None = None,
     resume: SequentialState | None = None,
     keep: Callable[[Callable[[], SequentialState]], None] | None = None,
+    truth: Array | None = None,
 ) -> SequentialResult:
     """Assimilate ``series`` into ``members`` (N, n_state), the ensemble at time zero.
 
@@ -105,71 +158,39 @@ def run_sequential(
 
     Parameters
     ----------
-    seed: of the rotations. on_cycle: called with the number of each cycle, from 0.
+    members: in ``settings.coordinates``. seed: of the rotations and model errors.
+    on_cycle: called with the index of the last observation time of each cycle, from 0.
     resume: where an earlier call with the same arguments was interrupted; the result has the same bits as without.
     keep: called after each cycle with a function that gives the state to resume from.
+    truth: (K, n_state) in a twin experiment, for its rank among the members.
 
     Raises
     ------
-    TooFewMembersError: the ensemble is lost. ValueError: localisation with correlated errors. ConfigError: the model
-        gives other numbers when a member is run again.
+    TooFewMembersError: the ensemble is lost. ValueError: localisation with correlated errors, a square root of the
+        model error with a smoother. ConfigError: the model gives other numbers when a member is run again.
     """
     if settings.localisation is not None and series.correlation is not None:
         raise ValueError("localisation needs observations with independent errors")
+    error = settings.model_error
+    if error is not None and error.form == "square-root" and settings.scheme.lag:
+        raise ValueError("the square root of a model error is that of a filter; a smoother estimates the error")
     with one_blas_thread():
-        run = _Run(model, tuple(observables), members, series, settings, seed, executor or SerialExecutor(), resume)
+        run = _Run(
+            model, tuple(observables), members, series, settings, seed, executor or SerialExecutor(), resume, truth
+        )
         if not settings.stochastic_model:
             run.check_repeats()
-        for cycle in range(resume.cycle if resume else 0, len(series.times)):
-            run.cycle(cycle)
+        while run.done < len(series.times):
+            run.cycle()
             if on_cycle is not None:
-                on_cycle(cycle)
+                on_cycle(run.done - 1)
             if keep is not None:
                 keep(run.state)
         return run.result()
 
 
-class _Started(ForwardModel):
-    """A model seen from a later time zero, member by member."""
-
-    def __init__(self, model: ForwardModel, start: float):
-        self.model, self.start = model, start
-        self.parameters, self.layout, self.observables = model.parameters, model.layout, model.observables
-
-    def initial_state(self, theta: object) -> Array:
-        raise NotImplementedError("the ensemble is already under way")
-
-    def step(self, x: Array, t0: float, t1: float) -> Array:
-        return self.model.step(x, self.start + t0, self.start + t1)
-
-
-class MembersLost(Exception):
-    """Members that failed: ``reasons`` (N,), "" for the others."""
-
-    def __init__(self, reasons: list[str]):
-        self.reasons = reasons
-
-
-def propagate(model: ForwardModel, states: Array, start: float, times: Array, executor: Executor) -> Array:
-    """Members (N, n_state) from ``start`` to later ``times`` (K,): (N, K, n_state). Raises :class:`MembersLost`."""
-    mover = model if model.autonomous or start == 0 else _Started(model, start)
-    outcomes = executor.trajectories(mover, states, times - start)
-    if isinstance(outcomes, Batch) and outcomes.whole:
-        return outcomes.states
-    reasons = [outcome.reason if isinstance(outcome, Failure) else "" for outcome in outcomes]
-    if any(reasons):
-        raise MembersLost(reasons)
-    return np.array([outcome.states for outcome in outcomes if isinstance(outcome, Trajectory)])
-
-
-def predictions(observables: Sequence[Observable], trajectory: Trajectory) -> Array:
-    """(K, p): outputs (K,) or (K, q) of the operators along a trajectory, side by side."""
-    outputs = [observable.operator(trajectory) for observable in observables]
-    return outputs[0] if len(outputs) == 1 and outputs[0].ndim == 2 else np.column_stack(outputs)
-
-
 class _Run:
-    """The ensemble (N, n) at the start of the window and what has been recorded."""
+    """The ensemble at the start of the window and what has been recorded."""
 
     def __init__(
         self,
@@ -181,202 +202,243 @@ class _Run:
         seed: int,
         executor: Executor,
         resume: SequentialState | None,
+        truth: Array | None,
     ):
-        self.model, self.observables, self.seed, self.executor = model, observables, seed, executor
-        self.series, self.settings, self.scheme = series, settings, settings.scheme
+        self.series, self.settings, self.scheme, self.seed = series, settings, settings.scheme, seed
         self.initial_members, size = members.shape
+        self.error = settings.model_error
+        times = [0.0, *series.times.tolist()]
+        self.flow = Flow(model, observables, times, executor, settings.coordinates, self.error)
         self.rotations = Rotations(seed, self.initial_members) if settings.rotation else None
-        self.times = [0.0, *series.times.tolist()]
         cycles = len(series.times)
-        self.iterations = np.zeros(cycles)
-        self.ensemble, self.start, self.forward_runs = members, 0, 0  # start: k is the k-th observation time
+        self.iterations, self.effective = np.zeros(cycles), np.full(cycles, np.nan)
+        self.trail: list[Array] = []
+        self.ensemble, self.start = members, 0  # start: k is the k-th observation time
         self.failures: list[str] = []
+        self.kept: list[tuple[int, Array]] = []
         earlier: tuple[Moments | None, ...] = (None, None, None)
+        self.done = 0
         if resume is not None:
-            self.ensemble, self.start, self.forward_runs = resume.ensemble, resume.start, resume.forward_runs
-            self.failures = list(resume.failures)
-            self.iterations[: resume.cycle] = resume.iterations
+            self.ensemble, self.start, self.flow.runs = resume.ensemble, resume.start, resume.forward_runs
+            self.failures, self.kept, self.done = list(resume.failures), list(resume.kept), resume.cycle
+            self.iterations[: resume.cycle], self.effective[: resume.cycle] = resume.iterations, resume.effective
+            self.trail = list(resume.trail)
             earlier = resume.forecast, resume.analysis, resume.smoothed
-        self.before, self.after, self.smooth = (MomentsRecorder(cycles, size, moments) for moments in earlier)
-        self.cycles_done = resume.cycle if resume else 0
+        self.before, self.after, self.smooth = (MomentsRecorder(cycles, size, moments, truth) for moments in earlier)
+        found = (resume.predicted, resume.ranks) if resume else (None, None)
+        self.predicted = InnovationRecorder(series.values, series.std, *found)
 
     def state(self) -> SequentialState:
-        done = self.cycles_done
-        before, after, smooth = (recorder.moments().until(done) for recorder in (self.before, self.after, self.smooth))
+        done = self.done  # the next forecast may be there already
+        before, predicted = (recorder.moments().until(done + 1) for recorder in (self.before, self.predicted))
+        after, smooth = (recorder.moments().until(done) for recorder in (self.after, self.smooth))
         return SequentialState(
-            done, self.start, self.ensemble, before, after, smooth, self.iterations[:done].copy(),
-            self.forward_runs, tuple(self.failures),
+            done, self.start, self.ensemble, before, after, smooth, predicted, self.predicted.ranks[: done + 1].copy(),
+            self.iterations[:done].copy(), self.effective[:done].copy(), tuple(self.kept), self.flow.runs,
+            tuple(self.failures), tuple(self.trail),
         )  # fmt: skip
 
     def result(self) -> SequentialResult:
+        if self.settings.smoother is not None:
+            self.settings.smoother.ended(self.trail, len(self.iterations) - 1, self.put_smoothed)
         before, after, smooth = (recorder.moments() for recorder in (self.before, self.after, self.smooth))
         return SequentialResult(
-            before, after, smooth, self.iterations, self.ensemble, tuple(self.failures), self.forward_runs
-        )
+            before, after, smooth, self.predicted.moments(), self.predicted.ranks, self.iterations, self.effective,
+            self.ensemble, tuple(self.kept), tuple(self.failures), self.flow.runs,
+        )  # fmt: skip
 
-    def cycle(self, k: int) -> None:
-        """Assimilate observation k (index k + 1 of ``times``) and move the window to its next start."""
-        newest, lag = k + 1, self.scheme.lag
-        if lag == 0:
-            (self.ensemble,) = self.run(self.ensemble, [newest])
-            self.start = newest
-        mean, anomalies = self.analyse(k)
+    def cycle(self) -> None:
+        """Assimilate the next observations and move the window to its next start."""
+        first, newest = self.done + 1, min(self.done + self.scheme.shift, len(self.series.times))
+        members = self.forecast(first, newest)
+        repeated = len(self.scheme.mda_weights) > 1
+        batch = self.shares(newest) if repeated else [(i, 1.0) for i in range(first, newest + 1)]
+        rows, window, descent = self.analyse(members, batch)
+        members = members[rows]
+        self.iterations[newest - 1] = descent.iteration
+        self.effective[newest - 1] = getattr(descent.step, "effective", np.nan)
+        mean, anomalies = window.posterior(descent)
+        posterior = mean + anomalies if repeated else self.ensemble
+        transform = descent.weights.T
         if self.rotations is not None:
-            anomalies = rotate(anomalies, self.rotations.of_cycle(k, len(anomalies)))
-        self.ensemble = mean + self.settings.inflation.apply(self.ensemble, anomalies)
-        next_start = max(self.start, newest + 1 - lag) if lag else newest
-        if 0 < self.start < next_start:
-            self.smooth.put(self.start - 1, self.ensemble)
-        at = self.run(self.ensemble, sorted({next_start, newest}))
-        self.after.put(k, at[-1])
-        self.ensemble, self.start = at[0], next_start
-        self.cycles_done = newest
+            turned = self.rotations.of_cycle(newest - 1, len(anomalies))
+            anomalies = rotate(anomalies, turned)
+            if self.settings.smoother is not None:
+                transform = rotate(transform, turned)
+        if self.settings.smoother is not None:
+            weights, analysis = descent.weights.w + transform, mean + anomalies
+            self.settings.smoother.passed(self.trail, newest - 1, members, analysis, weights, self.put_smoothed)
+        self.ensemble = mean + self.settings.inflation.apply(members, anomalies)
+        if not repeated or first == 1:
+            self.record_ahead([at for at in window.ahead if at.index >= first])
+        complete = self.completed(posterior, newest) if repeated else self.ensemble
+        self.advance(complete, first, newest, repeated)
+        if not self.scheme.cycled:
+            self.ensemble = members
+        self.done = newest
+
+    def forecast(self, first: int, newest: int) -> Array:
+        """The members that are to be analysed: of a filter at the newest time, else with the changes up to there."""
+        members = self.ensemble
+        if self.scheme.lag == 0:
+            _, (members,) = self.run(members, [newest])
+            self.start = newest
+            if self.error is None:
+                return members
+            if self.error.form == "square-root":
+                return self.error.widened(members, self.flow.elapsed(newest))
+            return self.flow.changed(members, self.noise(members, newest), newest)
+        for index in range(first, newest + 1) if self.error else ():
+            members = np.hstack([members, self.noise(members, index)])
+        return members
+
+    def noise(self, members: Array, index: int) -> Array:
+        """Standard normal changes (N, q) of the state at the time of ``index``, independent of what members hold."""
+        assert self.error is not None
+        stream = member_stream(self.seed, "model error", index)
+        draws = stream.standard_normal((self.initial_members, len(self.error.where)))
+        return fresh_noise(centre(members)[1], draws[: len(members)])
+
+    def shares(self, newest: int, missing: bool = False) -> Batch:
+        """Which observations count in the window that ends at the ``newest``, and how much; or how much is missing."""
+        shares = np.array(self.scheme.mda_weights)
+        if missing:
+            shares = 1 - np.cumsum(shares)
+        oldest = max(self.start, newest - len(shares)) + 1
+        return [(i, float(shares[newest - i])) for i in range(oldest, newest + 1) if shares[newest - i] > 1e-12]
+
+    def completed(self, posterior: Array, newest: int) -> Array:
+        """The members after the shares of the observations that later windows will give."""
+        missing = self.shares(newest, missing=True)
+        if not missing:
+            return posterior
+        rows, window, descent = self.analyse(posterior, missing)
+        self.ensemble = self.ensemble[rows]
+        mean, anomalies = window.posterior(descent)
+        return np.asarray(mean + anomalies)
+
+    def advance(self, complete: Array, first: int, newest: int, repeated: bool) -> None:
+        """Record what the ``complete`` members at the start say of later times, and move the ensemble on."""
+        lag, last = self.scheme.lag, len(self.series.times)
+        next_start = min(newest, max(self.start, newest + self.scheme.shift - lag)) if lag else newest
+        smoothed = range(max(self.start, 1), next_start)
+        if lag and newest == last and self.settings.to_end:
+            smoothed = range(max(self.start, 1), last + 1)
+        if self.start in smoothed:
+            self.smooth.put(self.start - 1, self.physical(complete[:, : self.flow.size]))
+        beyond = repeated and newest < last
+        if beyond and self.error is not None:
+            complete = np.hstack([complete, self.noise(complete, newest + 1)])
+        wanted = {next_start, *smoothed, *range(first, newest + 1), *((newest + 1,) if beyond else ())}
+        indices = sorted(i for i in wanted if i >= self.start)
+        rows, states = self.run(complete, indices)
+        self.ensemble = self.ensemble[rows]
+        at = dict(zip(indices, states, strict=True))
+        for index in range(first, newest + 1):
+            self.after.put(index - 1, self.physical(at[index]))
+        for index in smoothed:
+            if index > self.start:
+                self.smooth.put(index - 1, self.physical(at[index]))
+        if beyond:
+            ahead = at[newest + 1]
+            self.record_ahead([Ahead(newest + 1, ahead, self.flow.predict(ahead, newest + 1), 1.0)])
+        self.keep_members(first, newest, at[newest])
+        if repeated:
+            rows, (moved,) = self.run(self.ensemble, [next_start])
+            self.ensemble = self.ensemble[rows]
+        else:
+            moved = at[next_start]
+        changes = (next_start - self.start) * len(self.error.where) if self.error and lag else 0
+        rest = self.ensemble[:, self.flow.size + changes :]
+        self.ensemble = np.hstack([moved, rest]) if rest.size else moved
+        self.start = next_start
+
+    def keep_members(self, first: int, newest: int, states: Array) -> None:
+        every, last = self.settings.members_every, len(self.series.times)
+        if newest == last or (every and any(i % every == 0 for i in range(first, newest + 1))):
+            self.kept.append((newest - 1, self.physical(states)))
+
+    def put_smoothed(self, cycle: int, states: Array) -> None:
+        self.smooth.put(cycle, self.physical(states))
+
+    def physical(self, states: Array) -> Array:
+        return self.settings.coordinates.to_physical(states)
+
+    def record_ahead(self, found: Sequence[Ahead]) -> None:
+        """What was expected of observations before they were assimilated."""
+        for at in found:
+            self.before.put(at.index - 1, self.physical(at.states), 1 / at.width)
+            if not self.settings.innovations:
+                continue
+            predicted = at.predicted
+            if at.width != 1:
+                mean, anomalies = centre(predicted)
+                predicted = mean + anomalies / at.width
+            self.predicted.put(at.index - 1, predicted)
 
     def check_repeats(self) -> None:
         """Two members, over the first interval, twice: in one order and in the other; no cycle uses these runs.
 
         Raises :class:`ConfigError`: they differ.
         """
-        if self.start + 1 >= len(self.times):
+        flow, start = self.flow, self.start
+        end = next((i for i in range(start + 1, len(flow.times)) if flow.times[i] > flow.times[start]), None)
+        if end is None:
             return
-        start, end = self.times[self.start : self.start + 2]
 
         def run(members: list[int]) -> tuple[Array, list[str]]:
-            states, failures = np.full((len(members), self.ensemble.shape[1]), np.nan), [""] * len(members)
+            states, failures = np.full((len(members), flow.size), np.nan), [""] * len(members)
             for row, i in enumerate(members):  # one by one: where one is lost, the other is not
                 try:
-                    states[row] = propagate(self.model, self.ensemble[[i]], start, np.array([end]), self.executor)[0, 0]
+                    states[row] = flow.move(self.ensemble[[i], : flow.size], start, [end])[0, 0]
                 except MembersLost as lost:
                     (failures[row],) = lost.reasons
             return states, failures
 
         both = [0, len(self.ensemble) - 1]
         states, failures = run(both)
-        check_repeats(self.model, states, failures, lambda again: run([both[i] for i in again]))
+        check_repeats(flow.model, states, failures, lambda again: run([both[i] for i in again]))
 
-    def analyse(self, k: int) -> tuple[Array, Array]:
-        """Mean and anomalies of the posterior at the start of the window; members lost are dropped from the prior."""
+    def analyse(self, members: Array, batch: Batch) -> tuple[Rows, CycleWindow, CycleDescent]:
+        """Which rows of the members survive, their window, and its descent; members lost are dropped from the prior."""
+        rows: Rows = ALL
         while True:
-            window = _CycleWindow(self, k)
-            descent = _Cycle(Weights.prior(len(self.ensemble)))
+            alive = members[rows]
+            window = CycleWindow(
+                self.flow, self.series, alive, self.start, batch, self.settings.localisation,
+                is_filter(self.scheme), partial(self.stream, len(alive)),
+            )  # fmt: skip
+            descent = CycleDescent(Weights.prior(len(alive)))
             try:
                 iterate(window, self.scheme, [descent])
             except MembersLost as lost:
-                self.drop(lost.reasons)
-                self.ensemble = self.ensemble[[not reason for reason in lost.reasons]]
+                rows = self.survivors(rows, lost.reasons)
                 continue
-            if window.localised is not None:
-                return centre(window.localised)
-            weights = descent.weights
-            return window.mean + weights.w @ window.anomalies, weights.T @ window.anomalies
+            return rows, window, descent
 
-    def predict(self, states: Array, index: int) -> Array:
-        """Predictions (N, p): H acts at one instant, so members stand where it expects times."""
-        return predictions(
-            self.observables, Trajectory(np.full(len(states), self.times[index]), states, self.model.layout)
-        )
+    def stream(self, n_members: int, name: str, size: int) -> Array:
+        """Standard normal numbers (N, size), a stream a member."""
+        return np.stack([member_stream(self.seed, name, i).standard_normal(size) for i in range(n_members)])
 
-    def forecast(self, states: Array, indices: Sequence[int]) -> list[Array]:
-        """Members at the start of the window → ensembles (N, n) at times of ``indices``, or :class:`MembersLost`."""
-        ahead = [i for i in indices if i > self.start]
-        if not ahead:
-            return [states] * len(indices)
-        self.forward_runs += len(states)
-        times = np.array([self.times[i] for i in ahead])
-        paths = propagate(self.model, states, self.times[self.start], times, self.executor)
-        return [states] * (len(indices) - len(ahead)) + [paths[:, j] for j in range(len(ahead))]
-
-    def run(self, states: Array, indices: Sequence[int]) -> list[Array]:
-        """As :meth:`forecast`, again with the survivors where members are lost."""
+    def run(self, members: Array, indices: Sequence[int]) -> tuple[Rows, list[Array]]:
+        """Which rows survive, and the states (N', n) at the times of ``indices``."""
+        rows: Rows = ALL
         while True:
             try:
-                return self.forecast(states, indices)
+                return rows, self.flow.forecast(members[rows], self.start, indices)
             except MembersLost as lost:
-                self.drop(lost.reasons)
-                states = states[[not reason for reason in lost.reasons]]
+                rows = self.survivors(rows, lost.reasons)
 
-    def drop(self, failed: Sequence[str]) -> None:
+    def survivors(self, rows: Rows, failed: Sequence[str]) -> Rows:
+        """Those of ``rows`` that did not fail. Raises :class:`TooFewMembersError`."""
         self.failures += [reason for reason in failed if reason]
-        alive = self.initial_members - len(self.failures)
+        left = self.initial_members - len(self.failures)
         needed = max(2, int(np.ceil(self.settings.min_active_fraction * self.initial_members)))
-        if alive < needed:
+        if left < needed:
             raise TooFewMembersError(
                 f"{len(self.failures)} of {self.initial_members} members failed, at least {needed} must survive; "
                 f"the last: {self.failures[-1]}"
             )
-
-
-@dataclass
-class _Cycle:
-    """The descent of one cycle."""
-
-    weights: Weights
-    iteration: int = 0
-    step: Step | GaussNewtonStep | None = None
-    ended: bool = False
-
-
-class _CycleWindow:
-    """The window of one cycle: the members at its start, its newest observation."""
-
-    def __init__(self, run: _Run, k: int):
-        self.of, self.k = run, k
-        self.mean, self.anomalies = centre(run.ensemble)
-        self.localised: Array | None = None
-        local = run.settings.localisation
-        self.local = LocalDescent(local, run.ensemble) if local and not isinstance(run.scheme, ETKF) else None
-        self.runs: Runs | None = None
-
-    def begin(self, going: Sequence[_Cycle]) -> None:
-        pass  # a cycle is short: what is kept is the ensemble between two
-
-    def run(self, scheme: Scheme, going: Sequence[_Cycle]) -> list[Runs | None]:
-        (descent,) = going
-        rows = scheme.members(descent.weights)
-        if descent.iteration == 0:  # here w = 0 and the members are those of the window, or close to their mean
-            width = float(rows[0, 0])
-            members = self.of.ensemble if width == 1 else self.mean + width * self.anomalies
-        elif self.local:
-            members = self.local.members(scheme.members)
-        else:
-            members = self.mean + rows @ self.anomalies
-        (states,) = self.of.forecast(members, [self.k + 1])
-        if descent.iteration == 0:
-            self.of.before.put(self.k, states, 1 / width)
-        predicted = self.of.predict(states, self.k + 1)
-        if not np.isfinite(predicted).all():
-            raise MembersLost(["" if row.all() else "non-finite prediction" for row in np.isfinite(predicted)])
-        self.runs = Runs(predicted)
-        return [self.runs]
-
-    def whiten(self, scheme: Scheme, descent: _Cycle, reference: Array, anomalies: Array) -> Evaluation:
-        evaluation = Evaluation(*self.of.series.whiten(self.k, reference, anomalies))
-        if self.of.settings.localisation is not None and self.local is None:
-            self.localised = self.of.settings.localisation.analysis(scheme, self.of.ensemble, evaluation, self.draw)
-        return evaluation
-
-    def draw(self, purpose: str) -> Array:
-        streams = (member_stream(self.of.seed, f"{purpose}, cycle {self.k}", i) for i in range(len(self.anomalies)))
-        return np.stack([stream.standard_normal(self.of.series.values.shape[1]) for stream in streams])
-
-    def move(self, scheme: Scheme, going: Sequence[_Cycle]) -> None:
-        (descent,) = going
-        assert descent.step is not None
-        if self.local is None:
-            descent.weights = descent.step.weights
-        else:
-            descent.step = Step(descent.weights, self._local_step(scheme, self.local, descent.iteration))
-        descent.ended = scheme.done(descent.iteration, descent.step)
-        if self.local and descent.ended:
-            self.localised = self.local.members(lambda weights: weights.rows)
-        descent.iteration += 1
-        self.of.iterations[self.k] = descent.iteration
-
-    def _local_step(self, scheme: Scheme, local: LocalDescent, iteration: int) -> float:
-        """The blocks' own steps from the same runs, of which the largest tells when a cycle ends."""
-        assert self.runs is not None
-
-        def whiten(reference: Array, anomalies: Array) -> Evaluation:
-            return Evaluation(*self.of.series.whiten(self.k, reference, anomalies))
-
-        return local.advance(scheme, self.runs, whiten, iteration, self.draw)
+        alive = np.flatnonzero([not reason for reason in failed])
+        self.trail = [ensembles[..., alive, :] for ensembles in self.trail]
+        return alive if isinstance(rows, slice) else rows[alive]

@@ -17,21 +17,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from en4dvar.cycling.moments import Moments
-from en4dvar.cycling.sequential import (
-    SequentialResult,
-    SequentialSettings,
-    SequentialState,
-    predictions,
-    run_sequential,
-)
+from en4dvar.cycling.moving import Flow, MembersLost, predictions
+from en4dvar.cycling.sequential import SequentialResult, SequentialSettings, SequentialState, run_sequential
 from en4dvar.cycling.series import CycleSeries
+from en4dvar.cycling.start import InitialEnsemble
 from en4dvar.errors import ConfigError, En4dvarError
-from en4dvar.executor import Executor, SerialExecutor, run_chunk
-from en4dvar.forward import Failure, ForwardModel, Observable
+from en4dvar.executor import Executor, SerialExecutor
+from en4dvar.forward import ForwardModel, Observable, Trajectory
 from en4dvar.noise import Correlation
 from en4dvar.prior import Prior, member_stream
 from en4dvar.state import Array
-from en4dvar.user_code import reason_of
 
 OVERCONFIDENT = 0.5  # spread over RMSE of an ensemble that has lost the truth
 
@@ -56,6 +51,11 @@ class TwinExperiment:
     error_correlation: Correlation | None = None
     prior: Prior | None = None
     fixed: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def start(self) -> InitialEnsemble:
+        """What is known at time zero, of the truth and of each member."""
+        return InitialEnsemble(self.model, self.initial_std, self.prior, self.fixed, self.sequential.coordinates)
 
     @property
     def observables(self) -> tuple[Observable, ...]:
@@ -98,7 +98,7 @@ class TwinResult:
     def scores(self) -> dict[str, Score]:
         """Of the forecast, the analysis and (with a lag) the smoothed ensemble."""
         kinds = {"forecast": self.run.forecast, "analysis": self.run.analysis}
-        if self.experiment.sequential.scheme.lag:
+        if self.experiment.sequential.smooths:
             kinds["smoothed"] = self.run.smoothed
         return {name: self._score(moments) for name, moments in kinds.items()}
 
@@ -116,6 +116,11 @@ class TwinResult:
             found.append(
                 f"{still.sum()} variables of {', '.join(dict.fromkeys(names[still]))} never change and have the values "
                 "of parameters, but count in RMSE and spread; give each parameter in the state a field with its name"
+            )
+        if alone := int(np.sum(self.run.effective < 2)):
+            found.append(
+                f"in {alone} of {len(self.run.effective)} cycles one member had nearly all of the weight; give more "
+                "members, more jitter or larger observation errors"
             )
         score = self.scores["analysis"]
         if score.mean_spread < OVERCONFIDENT * score.mean_rmse:
@@ -143,10 +148,8 @@ def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, CycleSe
     En4dvarError: the truth cannot be integrated. ConfigError: the correlation of the errors does not fit.
     """
     model, times = experiment.model, experiment.times
-    start = _initial(experiment, [member_stream(seed, "truth")])
-    (outcome,) = run_chunk(model, start, times)
-    if isinstance(outcome, Failure):
-        raise En4dvarError(f"the truth cannot be integrated: {outcome.reason}")
+    states = _truth(experiment, seed)
+    outcome = Trajectory(times, states, model.layout)
     exact = predictions(experiment.observables, outcome)
     widths = [predictions([o], outcome).shape[1] for o in experiment.observables]
     std = np.repeat([experiment.error_std[o.name] for o in experiment.observables], widths)
@@ -157,12 +160,32 @@ def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, CycleSe
         except ValueError as error:
             raise ConfigError(f"twin.error_correlation: {error}") from None
         noise = experiment.error_correlation.correlated(noise)
-    return outcome.states, CycleSeries(times, exact + std * noise, std, experiment.error_correlation)
+    return states, CycleSeries(times, exact + std * noise, std, experiment.error_correlation)
+
+
+def _truth(experiment: TwinExperiment, seed: int) -> Array:
+    """(K, n_state), with a model error where the members have one. Raises :class:`En4dvarError`."""
+    model, error = experiment.model, experiment.sequential.model_error
+    start = experiment.start.drawn([member_stream(seed, "truth")])
+    coordinates = experiment.start.coordinates
+    times = [0.0, *experiment.times.tolist()]
+    flow = Flow(model, experiment.observables, times, SerialExecutor(), coordinates, error)
+    try:
+        if error is None:
+            (states,) = flow.move(start, 0, range(1, len(times)))
+            return coordinates.to_physical(states)
+        draws = member_stream(seed, "model error of the truth").standard_normal((experiment.cycles, len(error.where)))
+        path = [start]
+        for k, noise in enumerate(draws, 1):
+            path.append(flow.changed(flow.move(path[-1], k - 1, [k])[:, 0], noise[None], k))
+    except MembersLost as lost:
+        raise En4dvarError(f"the truth cannot be integrated: {lost.reasons[0]}") from None
+    return coordinates.to_physical(np.concatenate(path[1:]))
 
 
 def initial_ensemble(experiment: TwinExperiment, seed: int) -> Array:
     """Members (N, n_state) at time zero, each from its own stream."""
-    return _initial(experiment, [member_stream(seed, "initial state", i) for i in range(experiment.members)])
+    return experiment.start.members(experiment.members, seed)
 
 
 def conduct(
@@ -184,35 +207,7 @@ def conduct(
     truth, series = observe_truth(experiment, seed)
     members = initial_ensemble(experiment, seed)
     run = run_sequential(
-        experiment.model,
-        experiment.observables,
-        members,
-        series,
-        experiment.sequential,
-        seed,
-        executor or SerialExecutor(),
-        on_cycle,
-        resume,
-        keep,
-    )
+        experiment.model, experiment.observables, members, series, experiment.sequential, seed, executor, on_cycle,
+        resume, keep, truth,
+    )  # fmt: skip
     return TwinResult(experiment, seed, truth, series, run)
-
-
-def _initial(experiment: TwinExperiment, streams: list[np.random.Generator]) -> Array:
-    model, prior = experiment.model, experiment.prior
-    theta = {name: np.full(len(streams), value) for name, value in experiment.fixed.items()}
-    if prior is not None:
-        x = prior.from_white(np.array([stream.standard_normal(len(prior.terms)) for stream in streams]))
-        theta |= dict(zip(prior.names, prior.to_physical(x).T, strict=True))
-    try:
-        states = np.array(
-            model.initial_states(theta) if theta else [model.initial_state({})] * len(streams), dtype=float
-        )
-    except BaseException as error:  # a model may fail in any way
-        raise En4dvarError(f"the initial state cannot be made: {reason_of(error)}") from error
-    if states.shape != (len(streams), model.layout.size):
-        raise En4dvarError(
-            f"initial_state returned shape {states.shape[1:]}, but the layout has ({model.layout.size},)"
-        )
-    std = np.concatenate([np.full(f.size, experiment.initial_std.get(f.name, 0.0)) for f in model.layout])
-    return states + std * np.array([stream.standard_normal(model.layout.size) for stream in streams])

@@ -39,8 +39,8 @@ class Window(Protocol[D]):
     def whiten(self, scheme: Scheme, descent: D, reference: Array, anomalies: Array) -> Evaluation:
         """R^{-1/2} applied to a linearisation."""
 
-    def draw(self, purpose: str) -> Array:
-        """Random numbers for a scheme that perturbs observations."""
+    def draw(self, purpose: str, columns: int | None = None) -> Array:
+        """Random numbers for a scheme, see :class:`~en4dvar.schemes.base.Draw`."""
 
     def move(self, scheme: Scheme, going: Sequence[D]) -> None:
         """Take the steps, as far as they go; record, tell, and end the descents that are done."""

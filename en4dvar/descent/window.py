@@ -142,8 +142,8 @@ class DataWindow:
         noise = self.observations.noise.frozen(mean)
         return Evaluation(*noise.whiten(self.observations.values, self.observations.weights, linear))
 
-    def draw(self, purpose: str) -> Array:
-        n_members, size = len(self.space.members), len(self.observations)
+    def draw(self, purpose: str, columns: int | None = None) -> Array:
+        n_members, size = len(self.space.members), columns or len(self.observations)
         return np.stack([member_stream(self.seed, purpose, i).standard_normal(size) for i in range(n_members)])
 
     def move(self, scheme: Scheme, going: Sequence[Descent]) -> None:

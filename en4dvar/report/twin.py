@@ -1,28 +1,27 @@
-"""Page and figures of a twin experiment, from ``twin.nc`` alone: RMSE and spread in time, the state and its truth."""
+"""Page and figures of a twin experiment, from ``twin.nc`` alone: RMSE and spread in time, the state and its truth,
+ranks of the truth among the members, and whether the spread says how large the error is.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from en4dvar.errors import OutputError
-from en4dvar.files import inside, write_text
-from en4dvar.report.html import render
-from en4dvar.report.page import provenance_rows
-from en4dvar.report.style import COLUMN, LIGHT, Captioned, draw, styled
+from en4dvar.report.cycles import RANKS, labelled, ranks, read_cycles, stacked_axes, write_cycles_page
+from en4dvar.report.style import COLUMN, LIGHT, Captioned, styled
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
-from en4dvar.storage.seal import check_seal
 from en4dvar.storage.twin_file import MEAN
 
 COLOURS = {"forecast": "prior", "analysis": "posterior", "smoothed": "background"}
 SHOWN = 4  # variables of the state in the second figure
 LAST = 200  # cycles in it
+MOST_BARS = 21  # of the histogram of the truth's rank
+GROUPS = 12  # of spreads
 
 
 def write_twin_report(run_dir: Path) -> Path:
@@ -30,27 +29,18 @@ def write_twin_report(run_dir: Path) -> Path:
 
     Raises :class:`~en4dvar.errors.OutputError` where there is nothing to read or the directory cannot be written.
     """
-    check_seal(run_dir / "twin.nc")
-    try:
-        with xr.open_dataset(run_dir / "twin.nc") as file:
-            data = file.load()
-    except (OSError, ValueError) as error:
-        raise OutputError(f"{run_dir / 'twin.nc'}: not a readable result: {error}") from None
-    a = data.attrs
-    page = render(
-        "twin.html.j2",
-        title=str(a["name"]),
-        created=str(a.get("date_created", "")),
+    data = read_cycles(run_dir / "twin.nc")
+    columns = ["estimate", with_unit("RMSE", _unit(data)), with_unit("spread", _unit(data)), "spread / RMSE"]
+    words = "Averages over the cycles after the burn-in. The spread of a reliable ensemble is about its RMSE."
+    return write_cycles_page(
+        run_dir,
+        data,
+        kind="Twin experiment",
+        what="a truth is drawn and observed, and the assimilation is judged against it.",
         facts=_facts(data),
-        scores=_scores(data),
-        unit=_unit(data),
-        figures=draw(twin_figures(data), inside(run_dir, "figures")),
-        warnings=_lines(a.get("warnings", "")),
-        lost=_lines(a["members_lost_why"]),
-        provenance=provenance_rows(a),
-        configuration=str(a["configuration_resolved"]),
+        tables=[("Scores", columns, _scores(data), words)],
+        figures=twin_figures(data),
     )
-    return write_text(run_dir / "report.html", page)
 
 
 def twin_figures(data: xr.Dataset) -> Iterator[Captioned]:
@@ -60,13 +50,25 @@ def twin_figures(data: xr.Dataset) -> Iterator[Captioned]:
     yield "scores", f"RMSE against the truth (line) and spread (dashed) of each estimate in time.{words}", scores(data)
     shown = f"Error of the analysis within two standard deviations, last {min(LAST, data.sizes['time'])} cycles"
     yield "errors", f"{shown}, some variables of the state. A reliable ensemble has 95 % within.", errors(data)
+    yield (
+        "truth_ranks",
+        "Rank of the truth among the members, over all cycles and variables that count, relative to a flat histogram.",
+        truth_ranks(data),
+    )
+    yield (
+        "reliability",
+        f"RMSE of the values in {GROUPS} groups of the same size, by their spread, against that spread. A reliable "
+        "ensemble lies on the diagonal: where it is spread wide, its error is large.",
+        reliability(data),
+    )
+    yield "ranks", RANKS, ranks(data.isel(time=slice(burn_in, None)))
 
 
 @styled
 def scores(data: xr.Dataset) -> Figure:
     """RMSE and spread in time, one panel an estimate, averages after the burn-in as thin lines."""
     kinds, time = _kinds(data), data["time"].values
-    figure, stack = _stack(len(kinds), 3.0)
+    figure, stack = stacked_axes(len(kinds), 3.0)
     for ax, kind in zip(stack, kinds, strict=True):
         colour = LIGHT[COLOURS[kind]]
         rmse, spread = data[f"{kind}_rmse"], data[f"{kind}_spread"]
@@ -78,7 +80,7 @@ def scores(data: xr.Dataset) -> Figure:
         ax.set_title(f"{kind}: RMSE {plain_number(float(rmse.attrs[MEAN]), 3)}", loc="left")
         ax.set_ylim(0, _upper(rmse.values, spread.values))
         ax.set_ylabel(with_unit("error", _unit(data)))
-    return _labelled(figure, stack, data)
+    return labelled(figure, stack, str(data["time"].attrs["units"]))
 
 
 @styled
@@ -89,7 +91,7 @@ def errors(data: xr.Dataset) -> Figure:
     inside = np.mean(np.abs(error[burn_in:]) <= 2 * std[burn_in:], axis=0)
     varied = np.flatnonzero(std.max(axis=0) > 1e-9 * np.abs(data["truth"].values).max(axis=0))  # not what is held fixed
     chosen = np.unique([*varied[: SHOWN - 1], varied[-1]])  # the last is an estimated parameter, if there is one
-    figure, stack = _stack(len(chosen), 2.6)
+    figure, stack = stacked_axes(len(chosen), 2.6)
     time = data["time"].values[-LAST:]
     for i, ax in zip(chosen, stack, strict=True):
         width = 2 * std[-LAST:, i]
@@ -99,25 +101,53 @@ def errors(data: xr.Dataset) -> Figure:
         name = str(data["state"].values[i])
         ax.set_title(f"{name}: {100 * inside[i]:.0f} % within 2 std", loc="left")
         ax.set_ylabel(with_unit("error", str(data["units"].values[i])))
-    return _labelled(figure, stack, data)
+    return labelled(figure, stack, str(data["time"].attrs["units"]))
 
 
-def _stack(n: int, height: float) -> tuple[Figure, Sequence[Axes]]:
-    """``n`` axes below each other, of a height in cm, under room for a legend."""
-    figure = Figure(figsize=(COLUMN, (1.2 + height * n) / 2.54), layout="constrained")
-    return figure, list(figure.subplots(n, 1, sharex=True, squeeze=False)[:, 0])
-
-
-def _labelled(figure: Figure, stack: Sequence[Axes], data: xr.Dataset) -> Figure:
-    for ax in stack:
-        ax.margins(x=0)
-    figure.legend(*stack[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
-    stack[-1].set_xlabel(with_unit("time", str(data["time"].attrs["units"])))
+@styled
+def truth_ranks(data: xr.Dataset) -> Figure:
+    """Histogram of the rank of the truth, one panel an estimate; 1 is what a flat one has."""
+    kinds = _kinds(data)
+    figure, stack = stacked_axes(len(kinds), 2.6)
+    size = int(data.attrs["members"]) - int(data.attrs["members_lost"]) + 1
+    edges = np.round(np.linspace(0, size, min(size, MOST_BARS) + 1)) / size  # whole ranks in a bar
+    for ax, kind in zip(stack, kinds, strict=True):
+        found = _counted(data, data[f"{kind}_rank"].values)
+        count, _ = np.histogram(found, edges)
+        relative = count / (np.diff(edges) * max(1, len(found)))
+        ax.stairs(relative, edges, fill=True, color=LIGHT[COLOURS[kind]], alpha=0.6)
+        ax.axhline(1, color=LIGHT["ink"], lw=0.8, ls="--")
+        ax.set_title(kind, loc="left")
+        ax.set_ylabel("frequency")
+        ax.set_xlim(0, 1)
+    stack[-1].set_xlabel("share of the members below the truth")
     return figure
 
 
-def _lines(text: object) -> list[str]:
-    return [line for line in str(text).split("\n") if line]
+@styled
+def reliability(data: xr.Dataset) -> Figure:
+    """RMSE against spread, in groups of the same size, one line an estimate."""
+    figure = Figure(figsize=(COLUMN, COLUMN), layout="constrained")
+    ax = figure.subplots()
+    largest = 0.0
+    for kind in _kinds(data):
+        spread = _counted(data, data[f"{kind}_std"].values)
+        error = _counted(data, (data[f"{kind}_mean"] - data["truth"]).values)
+        groups = np.array_split(np.argsort(spread, kind="stable"), min(GROUPS, max(1, len(spread))))
+        x, y = (np.array([np.sqrt(np.mean(v[g] ** 2)) for g in groups]) for v in (spread, error))
+        ax.plot(x, y, color=LIGHT[COLOURS[kind]], lw=1, marker="o", ms=3, label=kind)
+        largest = max(largest, float(x.max(initial=0)), float(y.max(initial=0)))
+    ax.plot([0, largest], [0, largest], color=LIGHT["ink"], lw=0.8, ls="--")
+    ax.set_xlabel(with_unit("spread", _unit(data)))
+    ax.set_ylabel(with_unit("RMSE", _unit(data)))
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper right", ncols=3)
+    return figure
+
+
+def _counted(data: xr.Dataset, values: np.ndarray) -> np.ndarray:
+    """Values (K, n) that are there, after the burn-in, of the variables that scores count, as one row."""
+    wanted = values[int(data.attrs["burn_in"]) :, data["dynamic"].values.astype(bool)].ravel()
+    return np.asarray(wanted[np.isfinite(wanted)])
 
 
 def _kinds(data: xr.Dataset) -> list[str]:

@@ -7,8 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from en4dvar.config import Config, TwinConfig, resolve_any
+from en4dvar.config import AnyConfig, Config, SequenceConfig, resolve_any
 from en4dvar.config.build import build_one, data_files, inverse_plan
+from en4dvar.config.build_sequence import build_sequence
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.load import context_of, in_order
 from en4dvar.config.reading import read_observations
@@ -19,7 +20,7 @@ from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.inputs.readers import DataFile
 
 
-def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Config | TwinConfig:
+def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> AnyConfig:
     """Load a configuration and read its data files; nothing is computed or written.
 
     Parameters
@@ -41,6 +42,11 @@ def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any
         faults = list(_problem_faults(config))
         if faults:
             raise ConfigError(in_order(faults))
+    if isinstance(config, SequenceConfig):
+        try:
+            build_sequence(config)
+        except DataError as error:
+            raise ConfigError([document.fault(_place_of(error, document), str(error))]) from None
     return config
 
 

@@ -11,10 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from en4dvar.config.document import document_of
+from en4dvar.config.document import Document, document_of
 from en4dvar.config.load import Config, resolve
+from en4dvar.config.sequence import SequenceConfig, resolve_sequence
+from en4dvar.cycling.problem import SeriesResult
 from en4dvar.errors import ConfigError, OutputError
 from en4dvar.files import make_folder, write_text
 from en4dvar.forward import ForwardModel
@@ -24,6 +26,7 @@ from en4dvar.runs.given import Given
 from en4dvar.runs.progress import terminal_progress
 from en4dvar.runs.rundir import GIVEN, holds_run
 from en4dvar.runs.runner import run_campaign
+from en4dvar.runs.sequence_run import run_sequence
 from en4dvar.state import Array
 
 ARGUMENTS = {
@@ -32,6 +35,7 @@ ARGUMENTS = {
     ("data", "series"): "series",
     ("data", "correlation"): "correlation",
     ("parameters",): "priors",
+    ("sequence", "initial_std"): "initial_std",
 }
 ARRAYS = "arrays of a script"
 
@@ -101,7 +105,7 @@ def estimate(
     }
     with ExitStack() as held:
         where = Path(directory or Path(held.enter_context(tempfile.TemporaryDirectory())) / "run")
-        config = replace(_checked(content, where, ready), directory=where)
+        config = replace(_checked(content, where, ready, resolve), directory=where)
         _keep_data(where / GIVEN, given.csv, resume or force)
         shown = held.enter_context(terminal_progress(1)) if progress else None
         campaign = run_campaign(config, force=force, resume=resume, progress=shown, command="en4dvar.estimate")
@@ -111,10 +115,69 @@ def estimate(
     return result
 
 
-def _checked(content: Mapping[str, Any], directory: Path, model: ForwardModel) -> Config:
+def estimate_sequence(
+    model: ForwardModel | type[ForwardModel] | Mapping[str, Any] | str,
+    data: Any,
+    priors: Mapping[str, Any] | None = None,
+    *,
+    error: Any,
+    initial_std: Mapping[str, Any] | None = None,
+    time: str = TIME,
+    observable: str | Sequence[str] | None = None,
+    series: Mapping[str, Mapping[str, Any]] | None = None,
+    correlation: Mapping[str, Mapping[str, float]] | None = None,
+    name: str = "sequence",
+    seed: int = 0,
+    directory: str | Path | None = None,
+    force: bool = False,
+    resume: bool = False,
+    report: bool = True,
+    **sections: Any,
+) -> SeriesResult:
+    """Follow a series of readings that a script holds, by a filter or a sliding-window smoother.
+
+    Parameters
+    ----------
+    model: with ``step`` or ``resumed``; data, priors, error, time, observable, series, correlation, directory, force,
+        resume: as of :func:`estimate`.
+    initial_std: spread of the initial state by field, as ``sequence.initial_std`` of a file.
+    sections: further sections of a file by name: ``assimilation`` (required), ``model_error``, ``execution``.
+
+    Raises
+    ------
+    ConfigError, DataError: says which argument, and what to do. Others as of :func:`run_sequence`.
+    """
+    given = Given(model, data, time, observable, error, {}, priors or {}, series or {}, correlation)
+    ready, model_section = given.model(model)
+    content = {
+        "name": name,
+        "seed": seed,
+        "model": model_section,
+        "data": given.data(ready),
+        "parameters": priors or {},
+        "sequence": {"initial_std": initial_std or {}},
+        "output": {"report": report and directory is not None},
+        **sections,
+    }
+    with ExitStack() as held:
+        where = Path(directory or Path(held.enter_context(tempfile.TemporaryDirectory())) / "run")
+        config = replace(_checked(content, where, ready, resolve_sequence), directory=where)
+        _keep_data(where / GIVEN, given.csv, resume or force)
+        return run_sequence(config, force=force, resume=resume, command="en4dvar.estimate_sequence")
+
+
+C = TypeVar("C", Config, SequenceConfig)
+
+
+def _checked(
+    content: Mapping[str, Any],
+    directory: Path,
+    model: ForwardModel,
+    resolved: Callable[[Document, Path, ForwardModel], C],
+) -> C:
     """The configuration. Raises :class:`ConfigError` in the words of the arguments."""
     try:
-        return resolve(document_of(content), directory.absolute(), model)
+        return resolved(document_of(content), directory.absolute(), model)
     except ConfigError as error:
         raise ConfigError([replace(fault, path=_argument(fault.path)) for fault in error.problems]) from None
 

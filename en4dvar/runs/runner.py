@@ -118,6 +118,10 @@ def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 
             from en4dvar.runs.twin_run import report_twin
 
             return report_twin(directory)
+        if (directory.work / "sequence.nc").exists():
+            from en4dvar.runs.sequence_run import report_sequence
+
+            return report_sequence(directory)
         return _report(directory, datasets, workers)
 
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from en4dvar.config import Config, TwinConfig
+from en4dvar.config import AnyConfig, TwinConfig
 from en4dvar.errors import ConfigError, OutputError
 from en4dvar.executor import ExecutorError
 from en4dvar.files import write_text
@@ -31,7 +31,7 @@ class Session:
     once its directory says what it is.
     """
 
-    config: Config | TwinConfig
+    config: AnyConfig
     directory: RunDirectory
     resumed: bool
     log: RunLog
@@ -90,7 +90,7 @@ def directory_mode(force: bool, resume: bool) -> Mode:
 
 @contextmanager
 def session(
-    config: Config | TwinConfig,
+    config: AnyConfig,
     data: Mapping[str, DataFile],
     directory: RunDirectory,
     command: str,

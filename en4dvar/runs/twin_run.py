@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from en4dvar.config import TwinConfig, load_twin
-from en4dvar.cycling.sequential import SequentialState
 from en4dvar.cycling.twin import TwinResult, conduct
 from en4dvar.executor import make_executor
 from en4dvar.files import write_text
+from en4dvar.runs.cycles import kept_cycles
 from en4dvar.runs.interrupt import terminate_as_interrupt
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.runs.session import Session, directory_mode, session
-from en4dvar.storage.checkpoint import FOLDER, Keeper, digest
+from en4dvar.storage.checkpoint import FOLDER
 from en4dvar.storage.netcdf import netcdf_file
 from en4dvar.storage.twin_file import dataset, summary_csv
 from en4dvar.tables import table
@@ -65,25 +65,12 @@ def report_twin(directory: RunDirectory) -> Path:
 
 
 def _conduct(config: TwinConfig, run: Session, on_cycle: Callable[[int], None] | None) -> TwinResult:
-    """The experiment, from its latest checkpoint on; what it ends with is kept, too, so that it is never repeated."""
-    experiment, fingerprint = config.experiment, digest(run.identity.settings.encode())
-    resume = None
-    if run.resumed:
-        resume = run.restore(STATE, fingerprint, SequentialState, "the experiment is conducted from the start")
-    if resume is not None:
-        run.log.write(f"continued after {resume.cycle} of {experiment.cycles} cycles")
-    keeper = Keeper(run.directory.at(STATE), fingerprint, config.execution.checkpoint_every)
-    latest: list[Callable[[], SequentialState]] = []
-
-    def keep(state: Callable[[], SequentialState]) -> None:
-        latest[:] = [state]
-        keeper.keep(state)
-
-    with make_executor(experiment.model, config.execution.workers) as executor:
-        result = conduct(experiment, config.seed, executor, on_cycle, resume, keep)
-    for state in latest:
-        keeper.write(state())
-    return result
+    experiment = config.experiment
+    with (
+        make_executor(experiment.model, config.execution.workers) as executor,
+        kept_cycles(run, STATE, config.execution.checkpoint_every, experiment.cycles) as (resume, keep),
+    ):
+        return conduct(experiment, config.seed, executor, on_cycle, resume, keep)
 
 
 def scores_table(result: TwinResult) -> str:

@@ -6,10 +6,14 @@ from dataclasses import fields
 from typing import Any
 
 from en4dvar.schemes.base import Scheme
+from en4dvar.schemes.baselines import Climatology, OptimalInterpolation
+from en4dvar.schemes.bootstrap_filter import BootstrapFilter
 from en4dvar.schemes.denkf import DEnKF
 from en4dvar.schemes.en4dvar import En4DVar
+from en4dvar.schemes.enkf import EnKF
 from en4dvar.schemes.enkf_n import EnKFN
 from en4dvar.schemes.esmda import ESMDA
+from en4dvar.schemes.esrf import ESRF
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 
@@ -19,8 +23,13 @@ SCHEMES: dict[str, Any] = {
     "es-mda": ESMDA,
     "etkf": ETKF,
     "denkf": DEnKF,
+    "enkf": EnKF,
+    "esrf": ESRF,
     "enkf-n": EnKFN,
     "ienks": IEnKS,
+    "particle-filter": BootstrapFilter,
+    "optimal-interpolation": OptimalInterpolation,
+    "climatology": Climatology,
 }
 ON_A_WINDOW, ON_A_SERIES = ({n: kind for n, kind in SCHEMES.items() if on in kind.on} for on in ("window", "series"))
 

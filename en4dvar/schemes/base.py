@@ -11,7 +11,6 @@ centre and row i of the ensemble transform T.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, cast
 
@@ -21,7 +20,12 @@ from en4dvar.ensemble.linalg import Hessian
 from en4dvar.ensemble.near_prior import NearPrior
 from en4dvar.state import Array
 
-Draw = Callable[[str], Array]  # standard normal numbers (N, K') by the name of their purpose, the same ones each time
+
+class Draw(Protocol):
+    """Standard normal numbers by the name of their purpose, the same ones each time."""
+
+    def __call__(self, purpose: str, columns: int | None = None) -> Array:
+        """(N, K'), a column an observation, or (N, ``columns``) whatever the observations."""
 
 
 @dataclass(frozen=True)
@@ -78,10 +82,14 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Step:
-    """The weights that a scheme would take next, and how far that is in posterior standard deviations."""
+    """The weights that a scheme would take next, and how far that is in posterior standard deviations.
+
+    ``effective``: how many members the analysis is of, where it weighs them.
+    """
 
     weights: Weights
     norm: float
+    effective: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -156,3 +164,17 @@ class Scheme(Protocol):
 
     def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
         """Whether iterations end with this step, which is taken (a scheme that searches is not asked)."""
+
+
+class SeriesScheme(Scheme, Protocol):
+    """A scheme on a series: ``shift``, by how many cycles its window moves on, and ``mda_weights``, the shares by which
+    an observation is assimilated in one window after the other. ``cycled``: the next forecast starts from the analysis;
+    a baseline's from the forecast, as if nothing was observed.
+    """
+
+    @property
+    def cycled(self) -> bool: ...
+    @property
+    def shift(self) -> int: ...
+    @property
+    def mda_weights(self) -> tuple[float, ...]: ...

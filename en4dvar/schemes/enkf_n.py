@@ -9,7 +9,7 @@ whose minimum is that of ½ ‖d − Sw‖² + ½ ζ ‖w‖² with the precisio
 
     D(ζ) = ½ dᵀ (I + SSᵀ/ζ)⁻¹ d + ½ ε_N ζ + ½ (N+1) ln((N+1)/ζ) − ½ (N+1),   0 < ζ ≤ (N+1)/ε_N.
 
-The transform is √(N−1) H^{-1/2} with the Hessian of J at its minimum, H = SᵀS + ζ I − 2 ζ²/(N+1) w wᵀ.
+The transform is a root of (N−1) H⁻¹ with the Hessian of J at its minimum, H = SᵀS + ζ I − 2 ζ²/(N+1) w wᵀ.
 
 Sources: Bocquet (2011), Nonlin. Processes Geophys. 18, 735; dual: Bocquet & Sakov (2012), Nonlin. Processes Geophys.
 19, 383, § 3; Bocquet, Raanes & Hannart (2015), Nonlin. Processes Geophys. 22, 645.
@@ -43,30 +43,45 @@ class EnKFN(ETKF):
         projected = np.zeros_like(squares)
         projected[informed] = (hessian.rows[informed] @ slope) ** 2 / squares[informed] ** 2
         zeta = prior_precision(projected, squares, n_members)
-        damping = zeta / hessian.prior_precision - 1
-        w = hessian.solve(slope, damping=damping)
-        second = hessian.rows.T @ hessian.rows + zeta * np.eye(n_members)
-        second -= 2 * zeta**2 / (n_members + 1) * np.outer(w, w)
-        values, vectors = np.linalg.eigh(second)
-        transform = (vectors * np.sqrt(hessian.prior_precision / values)) @ vectors.T
-        return Step(Weights(w, transform), math.sqrt(max(0.0, float(w @ second @ w))))
+        w = hessian.solve(slope, damping=zeta / hessian.prior_precision - 1)
+        seen = hessian.rows @ w
+        length = float(seen @ seen) + zeta * float(w @ w) - 2 * zeta**2 / (n_members + 1) * float(w @ w) ** 2
+        return Step(Weights(w, transform(hessian, zeta, w)), math.sqrt(max(0.0, length)))
+
+
+def transform(hessian: Hessian, zeta: float, w: Array) -> Array:
+    """T = √(N−1) (I + b z zᵀ) G^{-1/2}, a root of (N−1) H⁻¹, with G = SᵀS + ζ I and z = G^{-1/2} w.
+
+    H = G^{1/2} (I − c z zᵀ) G^{1/2}, c = 2 ζ²/(N+1), takes one decomposition. 1ᵀT ∝ 1ᵀ, as z ⟂ 1.
+    """
+    root = np.sqrt(hessian.singular_values**2 + zeta)
+    shrink = 1 / (math.sqrt(zeta) * root * (math.sqrt(zeta) + root))  # (1/√ζ − 1/root) / σ²
+    inverse_root = np.eye(len(w)) / math.sqrt(zeta) - (hessian.rows.T * shrink) @ hessian.rows
+    z = inverse_root @ w
+    square = float(z @ z)
+    c = 2 * zeta**2 / (len(w) + 1)
+    kept = math.sqrt(1 - c * square)
+    stretch = c / (kept * (1 + kept))  # (1/kept − 1) / |z|²
+    found = inverse_root + np.outer(stretch * z, z @ inverse_root)
+    return np.asarray(math.sqrt(hessian.prior_precision) * found)
 
 
 def prior_precision(projected: Array, squares: Array, n_members: int) -> float:
-    """The minimiser ζ of the dual cost.
+    """The minimiser ζ of the dual cost, a zero of its slope 2 dD/d ln ζ.
 
     ``projected`` (m,) are the squares of d along the left singular vectors of S, ``squares`` (m,) those of its singular
     values.
     """
-    from scipy.optimize import minimize_scalar
+    from scipy.optimize import brentq
 
     epsilon = 1 + 1 / n_members
 
-    def dual(log_zeta: float) -> float:
+    def slope(log_zeta: float) -> float:
         zeta = math.exp(log_zeta)
-        misfit = float(np.sum(projected * zeta / (zeta + squares)))
-        return 0.5 * (misfit + epsilon * zeta - (n_members + 1) * log_zeta)
+        return float(projected @ (zeta * squares / (zeta + squares) ** 2)) + epsilon * zeta - (n_members + 1)
 
     largest = math.log((n_members + 1) / epsilon)
-    found = minimize_scalar(dual, bounds=(largest - 12, largest), method="bounded", options={"xatol": 1e-8})
-    return math.exp(float(found.x))
+    smallest = largest - 12
+    if slope(smallest) >= 0:
+        return math.exp(smallest)
+    return math.exp(float(brentq(slope, smallest, largest + 1e-9, xtol=1e-12)))

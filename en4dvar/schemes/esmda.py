@@ -22,6 +22,7 @@ import numpy as np
 
 from en4dvar.ensemble.linalg import Hessian
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights
+from en4dvar.schemes.enkf import perturbed_transform
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.state import Array
 
@@ -64,9 +65,5 @@ class ESMDA(ETKF):
         w, norm = weights.w + shift @ weights.T, hessian.norm(shift)
         if self.mda_form == "square-root":
             return Step(Weights(w, hessian.transform @ weights.T), norm)
-        perturbations = draw(f"ES-MDA {iteration}")
-        # anomalies of the members' innovations: −S_i of the predictions and the perturbations
-        innovations = perturbations - perturbations.mean(axis=0) - S.T
-        if len(S) < S.shape[1]:  # the cheaper order of the same product
-            return Step(Weights(w, weights.T + innovations @ (hessian.solve(S) @ weights.T)), norm)
-        return Step(Weights(w, weights.T + hessian.solve(innovations @ S) @ weights.T), norm)
+        noise = draw(f"ES-MDA {iteration}")
+        return Step(Weights(w, perturbed_transform(hessian, S, noise, weights.T)), norm)

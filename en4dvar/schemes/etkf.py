@@ -23,9 +23,12 @@ class ETKF:
     """The filter: a window without length, analysed once. Filters with another analysis say so in :meth:`advance`."""
 
     on: ClassVar[tuple[str, ...]] = ("window", "series")
+    cycled: ClassVar[bool] = True
     searches: ClassVar[bool] = False
     passes: ClassVar[int] = 1
     lag: ClassVar[int] = 0
+    shift: ClassVar[int] = 1
+    mda_weights: ClassVar[tuple[float, ...]] = (1.0,)
 
     def members(self, weights: Weights, basis: Array | None = None) -> Array:
         """I (N, N): the members are the forecast."""

@@ -1,7 +1,7 @@
-"""IEnKS: the iterative ensemble Kalman smoother on a sliding window, lag L, shift 1, single data assimilation.
+"""IEnKS: the iterative ensemble Kalman smoother on a sliding window, lag L, shift S.
 
-The window [t_{k−L}, t_k] holds one new observation vector, y_k: each is assimilated once (SDA), earlier ones live in
-the ensemble at the start of the window. The weights act there,
+The window [t_{k−L}, t_k] holds S new observation vectors; with S = 1 it is y_k. Each is assimilated once (SDA), earlier
+ones live in the ensemble at the start of the window. The weights act there,
 
     J(w) = ½ ‖y_k − H F_{k←k−L}(x̄ + Xᵀw)‖²_R + (N−1)/2 ‖w‖²,
 
@@ -9,10 +9,16 @@ and are found by Gauss–Newton iterations. L = 1 is the IEnKF, L = 0 the maximu
 one iteration is the ETKF. The predictions' anomalies are those of the members, not projected on the anomalies of the
 state, as in the papers: Sakov, Oliver & Bertino (2012), Mon. Wea. Rev. 140, 1988; Bocquet & Sakov (2014), Q. J. R.
 Meteorol. Soc. 140, 1521.
+
+With multiple data assimilation (MDA) all of y_{k−L+1} … y_k count in each window, with weights β_0 (the newest) to
+β_{L−1} that sum to one over the windows that an observation is in: short steps towards each, so that a long window of a
+strongly nonlinear F keeps to one minimum. In the linear case it is the same smoother. Bocquet & Sakov (2014), § 4, and
+(2013), Nonlin. Processes Geophys. 20, 803.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
@@ -43,10 +49,27 @@ class IEnKS:
     tolerance: Annotated[
         float, Gt(0), "Iterations end where the step is shorter than this, in posterior standard deviations."
     ] = 0.05
+    shift: Annotated[int, Ge(1), "Cycles that the window moves on at once, no more than lag."] = 1
+    mda_weights: Annotated[
+        tuple[Annotated[float, Gt(0)], ...],
+        "Multiple data assimilation: how much an observation counts when it is new, one window later, and so on, lag "
+        "numbers relative to each other; by default it counts once.",
+    ] = (1.0,)
 
     on: ClassVar[tuple[str, ...]] = ("series",)
     passes: ClassVar[int] = 1
+    cycled: ClassVar[bool] = True
     searches: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if self.shift > max(1, self.lag):
+            raise ValueError(f"the window moves on by {self.shift} cycles, but is only {self.lag} long")
+        count = len(self.mda_weights)
+        if count == 0 or (count > 1 and (count != self.lag or self.shift > 1)):
+            raise ValueError(f"mda_weights are {self.lag}, one a cycle of the window, and the shift is 1 with them")
+        if not all(weight > 0 for weight in self.mda_weights):
+            raise ValueError(f"mda_weights must be positive, not {self.mda_weights}")
+        object.__setattr__(self, "mda_weights", tuple(w / math.fsum(self.mda_weights) for w in self.mda_weights))
 
     def members(self, weights: Weights, basis: Array | None = None) -> Array:
         """Rows (N, N) of 1wᵀ + T or 1wᵀ + εI."""

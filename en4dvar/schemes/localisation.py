@@ -125,4 +125,4 @@ def _tapered(evaluation: Evaluation, taper: Array) -> Evaluation:
 
 def _of_some(draw: Draw, near: npt.NDArray[np.bool_]) -> Draw:
     """The numbers of the observations ``near`` (K',): an observation is perturbed in the same way in every block."""
-    return lambda purpose: draw(purpose)[:, near]
+    return lambda purpose, columns=None: draw(purpose, columns) if columns else draw(purpose)[:, near]

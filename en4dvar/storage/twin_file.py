@@ -9,6 +9,14 @@ import numpy as np
 import xarray as xr
 
 from en4dvar.cycling.twin import TwinResult
+from en4dvar.storage.sequence_file import (
+    innovation_variables,
+    moment_variables,
+    run_attributes,
+    run_variables,
+    series_variables,
+    state_names,
+)
 from en4dvar.tables import csv_text
 
 MEAN = "mean_after_burn_in"  # attribute of the scores
@@ -28,15 +36,14 @@ def summary_csv(result: TwinResult) -> str:
 def dataset(result: TwinResult, attributes: Mapping[str, Any]) -> xr.Dataset:
     """Truth, observations, moments and scores over (time, state), with units."""
     experiment, model = result.experiment, result.experiment.model
-    names = [f"{f.name}_{j}" if f.size > 1 else f.name for f in model.layout for j in range(f.size)]
-    units = [f.unit for f in model.layout for _ in range(f.size)]
+    names, units = state_names(model)
     unit = units[int(np.argmax(experiment.dynamic))]
     along = ("time", "state")
     variables: dict[str, Any] = {
         "truth": (along, result.truth, {"long_name": "state of the truth"}),
-        "observations": (("time", "observation"), result.series.values, {"long_name": "observations of the truth"}),
-        "observation_std": ("observation", result.series.std, {"long_name": "std of the observation errors"}),
-        "iterations": ("time", result.run.iterations, {"long_name": "forecasts of the window", "units": "1"}),
+        **series_variables(result.series),
+        **innovation_variables(result.series, result.run),
+        **run_variables(result.run),
     }
     run = result.run
     for kind, moments in (("forecast", run.forecast), ("analysis", run.analysis), ("smoothed", run.smoothed)):
@@ -45,22 +52,16 @@ def dataset(result: TwinResult, attributes: Mapping[str, Any]) -> xr.Dataset:
         rmse = {"long_name": f"RMSE of the {kind} mean", "units": unit, MEAN: score.mean_rmse}
         spread = {"long_name": f"spread of the {kind}", "units": unit, MEAN: score.mean_spread}
         variables |= {
-            f"{kind}_mean": (along, moments.mean, {"long_name": f"mean of the {kind} ensemble"}),
-            f"{kind}_std": (along, moments.std, {"long_name": f"standard deviation of the {kind} ensemble"}),
+            **moment_variables({kind: moments}),
+            f"{kind}_rank": (along, moments.rank, {"long_name": f"share of the {kind} members below the truth"}),
             f"{kind}_rmse": ("time", score.rmse, rmse),
             f"{kind}_spread": ("time", score.spread, spread),
         }
-    if result.series.correlation is not None:
-        text = {"long_name": "correlation of the observation errors", "units": "1"}
-        variables["observation_correlation"] = (
-            ("observation", "observation_column"),
-            result.series.correlation.matrix,
-            text,
-        )
     coordinates = {
         "time": ("time", result.series.times, {"units": model.time_unit, "long_name": "observation time"}),
         "state": ("state", names, {"long_name": "variable of the state"}),
         "units": ("state", units, {"long_name": "unit of the variable"}),
+        "dynamic": ("state", experiment.dynamic.astype(np.int8), {"long_name": "1: counts in RMSE and spread"}),
     }
     root = {
         "Conventions": "CF-1.10, ACDD-1.3",
@@ -68,9 +69,7 @@ def dataset(result: TwinResult, attributes: Mapping[str, Any]) -> xr.Dataset:
         "seed": result.seed,
         "members": experiment.members,
         "burn_in": experiment.burn_in,
-        "forward_runs": run.forward_runs,
-        "members_lost": len(run.failures),
-        "members_lost_why": "\n".join(run.failures),
+        **run_attributes(run),
         "warnings": "\n".join(result.warnings),
         **attributes,
     }

@@ -147,6 +147,33 @@ def test_validate(tmp_path):
         ("burn_in: 10", "burn_in: 30", r"twin: burn_in \(30\) leaves none of 30 cycles"),
         ("scheme: ienks", "scheme: etkf", r"assimilation: lag: only with scheme ienks"),
         ("scheme: ienks", "scheme: best", r"twin\.yaml:11:\d+: assimilation\.scheme: 'best' is not one of etkf, denkf"),
+        (
+            "inflation: 1.02",
+            "smoother: {method: enks}",
+            r"twin\.yaml:11:\d+: assimilation: a smoother goes behind a filter that is cycled, not behind ienks",
+        ),
+        ("inflation: 1.02", "smoother: {method: enrts, lag: 3}", r"twin\.yaml:14:\d+: .*lag: only with method enks"),
+        ("inflation: 1.02", "smoother: {method: enks, lag: 0}", r"twin\.yaml:14:\d+: assimilation\.smoother\.lag: "),
+        (
+            "inflation: 1.02",
+            "smoother: {method: rts}",
+            r"twin\.yaml:14:\d+: assimilation\.smoother\.method: 'rts' is not",
+        ),
+        (
+            "inflation: 1.02",
+            "jitter: 0.1",
+            r"twin\.yaml:11:\d+: assimilation: jitter: only with scheme particle-filter",
+        ),
+        (
+            "scheme: ienks\n  lag: 2",
+            "scheme: particle-filter\n  localisation: {radius: 2}",
+            r"twin\.yaml:11:\d+: assimilation: .*the particle filter takes no localisation",
+        ),
+        (
+            "scheme: ienks\n  lag: 2",
+            "scheme: etkf\n  smoother: {method: enks}\n  localisation: {radius: 2}",
+            r"twin\.yaml:11:\d+: assimilation: .*with localisation use enrts",
+        ),
         ("model: {name: lorenz96, size: 12}", "model: {name: lorenz69}", r"unknown model 'lorenz69'; did you mean"),
         (
             "burn_in: 10",

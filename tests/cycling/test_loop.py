@@ -128,7 +128,7 @@ def test_progress_is_told_each_cycle():
     ("times", "values", "std", "message"),
     [
         (np.array([1.0, 1.0]), np.zeros((2, 1)), np.ones(1), "increase"),
-        (np.array([0.0, 1.0]), np.zeros((2, 1)), np.ones(1), "increase from zero"),
+        (np.array([-0.1, 1.0]), np.zeros((2, 1)), np.ones(1), "increase from zero"),
         (np.array([1.0]), np.zeros((2, 1)), np.ones(1), "do not match times"),
         (np.array([1.0]), np.zeros((1, 2)), np.ones(1), "does not match values"),
         (np.array([1.0]), np.zeros((1, 1)), np.zeros(1), "positive"),

@@ -17,10 +17,15 @@ from en4dvar.config import load_twin
 from en4dvar.cycling.moments import Moments
 from en4dvar.cycling.sequential import SequentialSettings, SequentialState, run_sequential
 from en4dvar.cycling.series import CycleSeries
+from en4dvar.cycling.smoothers import EnKS, EnRTS
 from en4dvar.errors import OutputError
 from en4dvar.forward import Failure
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.twin_run import run_twin
+from en4dvar.schemes.baselines import OptimalInterpolation
+from en4dvar.schemes.bootstrap_filter import BootstrapFilter
+from en4dvar.schemes.enkf import EnKF
+from en4dvar.schemes.esrf import ESRF
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation
@@ -55,25 +60,38 @@ def assert_same(a, b):
         left, right = getattr(a, field.name), getattr(b, field.name)
         if isinstance(left, Moments):
             assert_same(left, right)
+        elif field.name == "kept":
+            assert repr(left) == repr(right)
+            assert all(np.array_equal(a, b) for (_, a), (_, b) in zip(left, right, strict=True))
         elif isinstance(left, np.ndarray):
             assert np.array_equal(left, right, equal_nan=True), field.name
         else:
             assert left == right, field.name
 
 
-@pytest.mark.parametrize("scheme", [ETKF(), IEnKS(1), IEnKS(3), IEnKS(2, "bundle")])
+@pytest.mark.parametrize(
+    ("scheme", "smoother"),
+    [
+        (ETKF(), None), (IEnKS(1), None), (IEnKS(3), None), (IEnKS(2, "bundle"), None), (EnKF(), EnKS(3)),
+        (ESRF(), EnRTS()), (BootstrapFilter(0.5), None), (OptimalInterpolation(), None),
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize("model", [Ring(), Losing()])
-def test_resumed_from_any_cycle(scheme, model):
+def test_resumed_from_any_cycle(scheme, smoother, model):
     rng = np.random.default_rng(0)
     members = model.initial_state({}) + 0.8 * rng.standard_normal((14, 12))
     series = CycleSeries(0.5 * np.arange(1, 12), rng.standard_normal((11, 6)), np.full(6, 0.7))
-    settings = SequentialSettings(scheme, Inflation(1.02, rtps=0.3), rotation=True, min_active_fraction=0.1)
+    truth = rng.standard_normal((11, 12))
+    settings = SequentialSettings(
+        scheme, Inflation(1.02, rtps=0.3), rotation=True, min_active_fraction=0.1, smoother=smoother
+    )
 
     def run(resume=None):
         states = []
         result = run_sequential(
-            model, model.observables, members, series, settings, 3, resume=resume, keep=lambda now: states.append(now())
-        )
+            model, model.observables, members, series, settings, 3, resume=resume,
+            keep=lambda now: states.append(now()), truth=truth,
+        )  # fmt: skip
         return result, states
 
     whole, states = run()
@@ -175,7 +193,9 @@ def test_workers_and_report_may_change(interrupted):
     assert_same_files(out, quiet)
     assert "spread / RMSE" in (out / "report.html").read_text()
     names = {p.name for p in (out / "figures").iterdir()}
-    assert names == {"errors.pdf", "errors.png", "scores.pdf", "scores.png"}
+    assert names == {
+        f"{n}.{end}" for n in ("errors", "ranks", "reliability", "scores", "truth_ranks") for end in ("pdf", "png")
+    }
 
 
 def kill_and_resume(tmp_path: Path, kills: int, seed: int) -> None:

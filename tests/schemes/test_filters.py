@@ -1,4 +1,4 @@
-"""The analyses of DEnKF and EnKF-N against closed forms and a direct minimisation."""
+"""The analyses of DEnKF, EnKF, ESRF and EnKF-N against closed forms and a direct minimisation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from en4dvar.ensemble.linalg import centre
 from en4dvar.problem import AssimilationSettings
 from en4dvar.schemes.base import Evaluation, Weights
 from en4dvar.schemes.denkf import DEnKF
+from en4dvar.schemes.enkf import EnKF
 from en4dvar.schemes.enkf_n import EnKFN
+from en4dvar.schemes.esrf import ESRF
 from en4dvar.schemes.etkf import ETKF
 
 
@@ -60,12 +62,13 @@ def test_enkf_n_minimises_its_cost(seed, k):
     h = 1e-5
     gradient = [(cost(found.w + h * u) - cost(found.w - h * u)) / (2 * h) for u in np.eye(n)]
     assert np.abs(gradient).max() < 1e-5
-    # the transform is the inverse root of the Hessian of that cost
+    # the transform is a root of the inverse Hessian of that cost
     hessian = np.array([
         [(cost(found.w + 1e-3 * (a + b)) - cost(found.w + 1e-3 * (a - b)) - cost(found.w + 1e-3 * (b - a))
           + cost(found.w - 1e-3 * (a + b))) / 4e-6 for a in np.eye(n)] for b in np.eye(n)
     ])  # fmt: skip
-    assert found.T @ hessian @ found.T == pytest.approx((n - 1) * np.eye(n), abs=2e-3)
+    assert found.T @ hessian @ found.T.T == pytest.approx((n - 1) * np.eye(n), abs=2e-3)
+    assert np.abs(found.T.sum(axis=0) - found.T.sum() / n).max() < 1e-12
 
 
 def test_without_information_enkf_n_keeps_the_mean():
@@ -73,7 +76,7 @@ def test_without_information_enkf_n_keeps_the_mean():
     assert analysed(EnKFN(), e).w == pytest.approx(np.zeros(6), abs=1e-12)
 
 
-@pytest.mark.parametrize("scheme", ["etkf", "denkf", "enkf-n"])
+@pytest.mark.parametrize("scheme", ["etkf", "denkf", "enkf", "esrf", "enkf-n"])
 def test_filters_estimate_parameters_too(scheme):
     """One analysis of a linear model has the mean of the Kalman update, and two ensembles are run with their mean.
 
@@ -89,3 +92,30 @@ def test_filters_estimate_parameters_too(scheme):
     tolerance = 1e-10 if scheme != "enkf-n" else 0.05  # which allows for the sampling error of the prior
     assert np.abs(analysis.posterior.mean(axis=0) - exact).max() < tolerance
     assert analysis.forward_runs == 2 * 21 + 2
+
+
+@pytest.mark.parametrize("k", [3, 20])
+def test_serial_updates_have_the_moments_of_the_batch_analysis(k):
+    """Mean and covariance of ESRF and ETKF agree, and those are the Kalman filter's of the ensemble's moments."""
+    e = evaluation(k=k, seed=2)
+    serial, batch = analysed(ESRF(), e), analysed(ETKF(), e)
+    assert serial.w == pytest.approx(batch.w, abs=1e-13)
+    assert np.abs(serial.T.T @ serial.T - batch.T.T @ batch.T).max() < 1e-13
+    assert np.abs(serial.T - batch.T).max() > 1e-3  # another root of it
+    x = centre(np.random.default_rng(1).standard_normal((8, 4)))[1]
+    assert (serial.T @ x).sum(axis=0) == pytest.approx(np.zeros(4), abs=1e-12)
+
+
+def test_perturbed_observations_move_every_member_by_the_gain():
+    """x_i + K (y + e_i − H x_i), with the sample covariance of the ensemble; the mean as without perturbations."""
+    rng = np.random.default_rng(3)
+    members, std, y = rng.standard_normal((7, 4)), np.array([0.5, 0.8]), np.array([1.3, -0.4])
+    noise = rng.standard_normal((7, 2))
+    mean, x = centre(members)
+    p = np.cov(members.T)
+    gain = p[:, :2] @ np.linalg.inv(p[:2, :2] + np.diag(std**2))
+    e = Evaluation((y - mean[:2]) / std, (x[:, :2] / std).T)
+    found = EnKF().advance(Weights.prior(7), e, 0, lambda purpose: noise).weights
+    errors = np.sqrt(7 / 6) * (noise - noise.mean(axis=0)) * std
+    assert mean + found.rows @ x == pytest.approx(members + (y + errors - members[:, :2]) @ gain.T, abs=1e-12)
+    assert found.w == pytest.approx(analysed(ETKF(), e).w, abs=1e-12)

@@ -1,0 +1,167 @@
+"""A series of data that is assimilated cycle by cycle: the file has a ``sequence:`` section beside ``data:``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from en4dvar.config.context import Context, Made, Spread
+from en4dvar.config.data import Data
+from en4dvar.config.document import Document
+from en4dvar.config.initial_state import dynamic_fields
+from en4dvar.config.load import Read, observed_in, read_file
+from en4dvar.config.parameters import Entry, Tied, Uncertain, entries
+from en4dvar.config.schema import File, Output, Section
+from en4dvar.config.sequential import Sequential, Workers, spreads
+from en4dvar.config.series import DATA, DataPlan
+from en4dvar.config.validate import Faults
+from en4dvar.config.varies import MODEL_ERROR, ErrorOf
+from en4dvar.errors import ConfigError, Fault
+from en4dvar.forward import ForwardModel, Observable
+from en4dvar.hints import shown, suggest
+
+APART = ("time_std", "correlation_time", "covariance", "robust", "discrepancy")  # keys of data.error
+
+
+def _known_fields(names: tuple[str, ...], context: Context) -> tuple[str, ...]:
+    """Names of fields of the state. Raises :class:`ConfigError`."""
+    known = dynamic_fields(context.model)
+    faults = [
+        Fault(f"unknown field {shown(n)}{suggest(n, known)}", str(k)) for k, n in enumerate(names) if n not in known
+    ]
+    if faults:
+        raise ConfigError(faults)
+    return names
+
+
+class Sequence(Section):
+    """What is known of the state at time zero, and what is kept."""
+
+    initial_std: Annotated[dict[str, Spread], spreads(dynamic_fields)] = Field({}, validate_default=True)
+    """Spread of the model's initial state, by field, each of its values for itself: in the field's unit, or in % of a
+    field that is positive and then estimated by its logarithm."""
+    positive: Annotated[tuple[str, ...], Made(_known_fields, tuple[str, ...])] = ()
+    """Further fields that are estimated by their logarithm, of what exceeds their lower bound: none falls below it."""
+    members_every: Annotated[int, Field(ge=0)] = 0
+    """Ensembles are stored after every so many observation times, and the last; 0: the last alone."""
+
+
+class SequenceFile(File):
+    """A series of data, assimilated by a filter or a smoother of a sliding window."""
+
+    data: DATA
+    """Where the observations are, what they mean and how well they are known."""
+    parameters: Annotated[tuple[Entry, ...], entries()] = Field({}, validate_default=True)
+    """For each parameter a prior (estimated beside the state), a quantity or a scalar of the data file (fixed)."""
+    sequence: Sequence
+    """What is known of the state at time zero, and what is kept."""
+    model_error: Annotated[tuple[ErrorOf, ...], MODEL_ERROR] | None = None
+    """Fields of the state that the model misses in part: each changes at random between two observations, its variance
+    growing by ``std`` squared in a time of ``every``."""
+    assimilation: Sequential
+    """The scheme and what it does to the ensemble."""
+    execution: Workers = Workers()
+    """Where members are integrated; never changes the numbers."""
+    output: Output = Output()
+    """Where results go."""
+
+    @classmethod
+    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        for place, error in _errors(given.get("data")):
+            for key in APART:
+                if key in error:
+                    message = "not in a sequence, where the errors of every instant are Gaussian and for themselves"
+                    faults.add((*place, key), message, at_key=True)
+        if not context.model.resumable:
+            faults.add(("model",), "has no step: it cannot go on from a state on its way, as a sequence needs")
+
+
+def _errors(data: Any) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
+    """The sections of errors, of one series or of several, and where they are."""
+    if not isinstance(data, dict):
+        return
+    series = data.get("series")
+    each = [(("series", name), one) for name, one in series.items()] if isinstance(series, dict) else []
+    for place, one in [((), data), *each]:
+        if isinstance(one, dict) and isinstance(one.get("error"), dict):
+            yield ("data", *place, "error"), one["error"]
+
+
+@dataclass(frozen=True)
+class SequenceConfig:
+    """A validated configuration of a sequence. Nothing of the data file has been read yet."""
+
+    document: Document
+    name: str
+    seed: int
+    model: ForwardModel
+    observable: Observable
+    data: Data | DataPlan
+    parameters: tuple[Entry, ...]
+    sequence: Sequence
+    model_error: tuple[ErrorOf, ...]
+    assimilation: Sequential
+    execution: Workers
+    directory: Path
+    report: bool
+    resolved: str
+
+    @property
+    def text(self) -> str:
+        """The file, verbatim."""
+        return self.document.text
+
+
+def resolve_sequence(document: Document, base: Path, model: ForwardModel | None = None) -> SequenceConfig:
+    """Validate a document with a ``sequence:`` section. Raises :class:`ConfigError`, every fault at once."""
+    read: Read[SequenceFile] = read_file(SequenceFile, document, base, model)
+    file = read.file
+    faults = [
+        document.fault(("sequence", "initial_std", name), "give it in %: the field is positive")
+        for name in file.sequence.positive
+        if name in file.sequence.initial_std and not file.sequence.initial_std[name].relative
+    ]
+    faults += [
+        document.fault(("parameters", entry.parameter.name), words)
+        for entry in file.parameters
+        if (words := _unfit(entry, read.model))
+    ]
+    uncertain = file.sequence.initial_std or any(isinstance(entry, Uncertain) for entry in file.parameters)
+    if not uncertain:
+        faults.append(document.fault(("sequence",), "nothing is uncertain: give initial_std, or a parameter a prior"))
+    if faults:
+        raise ConfigError(faults)
+    return SequenceConfig(
+        document=document,
+        name=file.name,
+        seed=file.seed,
+        model=read.model,
+        observable=observed_in(file.data, read),
+        data=file.data,
+        parameters=file.parameters,
+        sequence=file.sequence,
+        model_error=file.model_error or (),
+        assimilation=file.assimilation,
+        execution=file.execution,
+        directory=file.output.directory or Path("runs") / file.name,
+        report=file.output.report,
+        resolved=read.resolved(file.parameters),
+    )
+
+
+def _unfit(entry: Entry, model: ForwardModel) -> str:
+    """Why a sequence cannot have this entry; "" where it can."""
+    name = entry.parameter.name
+    if name not in {p.name for p in model.parameters}:
+        return "a sequence knows parameters of the model alone: neither time shift nor noise scale"
+    if isinstance(entry, Tied):
+        return "a sequence has no tied parameters; give a value or a prior"
+    if isinstance(entry, Uncertain) and entry.from_ensemble:
+        return "a sequence takes no ensemble as a prior; give its moments"
+    if isinstance(entry, Uncertain) and name not in model.layout.names:
+        return f"the state of the model has no field {name!r}, through which a sequence estimates it; give it a value"
+    return ""

@@ -1,0 +1,237 @@
+"""How a series is assimilated, of a twin experiment and of data: scheme, inflation, localisation, model error."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from en4dvar.config.context import TEXT, Context, Made, Spread, parse_spread, quantity, read_each, subject_unit
+from en4dvar.config.initial_state import dynamic_fields
+from en4dvar.config.schema import Section, section_of
+from en4dvar.config.validate import Faults
+from en4dvar.config.varies import ErrorOf, Knots
+from en4dvar.cycling.coordinates import EnsembleCoordinates
+from en4dvar.cycling.model_error import ModelError
+from en4dvar.cycling.sequential import SequentialSettings
+from en4dvar.cycling.smoothers import EnKS, EnRTS
+from en4dvar.errors import ConfigError, Fault
+from en4dvar.forward import ForwardModel
+from en4dvar.schemes import ON_A_SERIES
+from en4dvar.schemes.inflation import Inflation
+from en4dvar.schemes.localisation import Localisation
+from en4dvar.state import Array
+
+
+def stds(known: Callable[[ForwardModel], Mapping[str, Any]]) -> Made:
+    """Standard deviations by the name of a thing that the model knows."""
+
+    positive = quantity(subject_unit, "positive")
+
+    def read(given: Mapping[str, Any], context: Context) -> dict[str, float]:
+        things = known(context.model)
+        with Faults() as faults:
+            if not given:
+                faults.add((), f"give at least one of: {', '.join(things)}")
+            return read_each(given, things, context, faults, positive.make)
+
+    json = {"type": "object", "minProperties": 1, "additionalProperties": TEXT}
+    return Made(read, dict[str, Any], json)
+
+
+class Local(Section):
+    """Gaspari–Cohn taper over the indices of the observed field; it vanishes from ``2 radius`` on."""
+
+    radius: Annotated[float, Field(gt=0)]
+    """Radius of the taper, in indices: an observation has no influence from twice this distance on."""
+    periodic: bool = False
+    """The field is a circle: the last index is next to the first."""
+    block_size: Annotated[int, Field(ge=1)] = 1
+    """Neighbouring indices that share one analysis."""
+    shape: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] | None = None
+    """Cells along each axis of a field in two or three dimensions, the last running fastest; distances are then in
+    cells of this grid. Default: the indices lie on a line."""
+
+    @model_validator(mode="after")
+    def _one_cell_each(self) -> Local:
+        if self.shape and self.block_size > 1:
+            raise ValueError("block_size: only without shape")
+        return self
+
+
+class Smoothing(Section):
+    """A smoother behind a filter: the states of earlier cycles given later observations; the filter is as without."""
+
+    method: Literal["enks", "enrts"]
+    """enks: the weights of each analysis act on the cycles before it. enrts: one pass back from the end of the series,
+    which keeps every ensemble until then."""
+    lag: Annotated[int, Field(ge=1)] = 10
+    """enks: cycles that an observation acts back on."""
+
+    @model_validator(mode="after")
+    def _lag_of_enks(self) -> Smoothing:
+        if self.method == "enrts" and "lag" in self.model_fields_set:
+            raise ValueError("lag: only with method enks; enrts smooths by all later observations")
+        return self
+
+    @property
+    def made(self) -> EnKS | EnRTS:
+        """The smoother."""
+        return EnKS(self.lag) if self.method == "enks" else EnRTS()
+
+    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """As given, without what the method does not take."""
+        return {key: value for key, value in super().as_written(given).items() if self.method == "enks" or key != "lag"}
+
+
+_KINDS = ON_A_SERIES
+_KEYS = {name: {field.name for field in fields(kind)} for name, kind in _KINDS.items()}
+_FOREIGN = {name: set().union(*_KEYS.values()) - keys for name, keys in _KEYS.items()}  # keys of other schemes
+if TYPE_CHECKING:
+    OnASeries = str
+else:
+    OnASeries = Literal[tuple(ON_A_SERIES)]
+
+
+class _Scheme(Section):
+    scheme: OnASeries
+    """A filter (one analysis a cycle), ienks (sliding-window smoother), or a baseline to judge them by."""
+    members: Annotated[int, Field(ge=3)]
+    """Ensemble size N."""
+
+
+_Iterations: Any = section_of(*_KINDS.values(), base=_Scheme)
+
+
+class Sequential(_Iterations):
+    """The scheme and what it does to the ensemble."""
+
+    inflation: Annotated[float, Field(gt=0)] = 1.0
+    """Factor on the anomalies after each analysis; 1 is none."""
+    rtps: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Relaxation to the prior spread, 0 (none) to 1."""
+    rotation: bool = False
+    """Rotate the ensemble at random after each analysis, mean and covariance kept."""
+    additive: Literal["drawn", "square-root"] = "drawn"
+    """How a model error enters the ensemble of a filter: drawn, or by a square root in the space of the ensemble."""
+    localisation: Local | None = None
+    """Gaspari–Cohn taper over the indices of the observed field."""
+    smoother: Smoothing | None = None
+    """What smooths the states behind a filter."""
+    stochastic_model: bool = False
+    """true: accept a model that gives other numbers when a member is run again; by default that is an error."""
+
+    @model_validator(mode="after")
+    def _belongs_together(self) -> Sequential:
+        others = self.model_fields_set & _FOREIGN[self.scheme]
+        if others:
+            takers = [name for name, keys in _KEYS.items() if keys >= others]
+            raise ValueError(f"{', '.join(sorted(others))}: only with scheme {' or '.join(takers)}")
+        made = self.made
+        if self.additive == "square-root" and made.lag:
+            raise ValueError("additive: square-root is for filters; a smoother estimates the model error")
+        anywhere = Localisation((), np.empty((0, 0)))  # settings that do not go together are told here, in their place
+        SequentialSettings(
+            self.made, localisation=anywhere if self.localisation else None,
+            smoother=self.smoother.made if self.smoother else None,
+        )  # fmt: skip
+        return self
+
+    @property
+    def made(self) -> Any:
+        """The scheme. Raises ValueError where its keys do not suit each other."""
+        return _KINDS[self.scheme](**{key: getattr(self, key) for key in _KEYS[self.scheme]})
+
+    def built(
+        self, localisation: Localisation | None, rate: Array, coordinates: EnsembleCoordinates
+    ) -> SequentialSettings:
+        """What the loop needs; ``rate`` (n,) is the model error's variance per unit of time."""
+        return SequentialSettings(
+            self.made,
+            Inflation(self.inflation, self.rtps),
+            self.rotation,
+            localisation,
+            stochastic_model=self.stochastic_model,
+            innovations=True,
+            model_error=ModelError(rate, self.additive) if np.any(rate) else None,
+            coordinates=coordinates,
+            smoother=self.smoother.made if self.smoother else None,
+        )
+
+    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """As given, without what the scheme does not take."""
+        written = super().as_written(given)
+        return {key: value for key, value in written.items() if key not in _FOREIGN[self.scheme]}
+
+
+class Workers(Section):
+    """Where members are integrated; never changes the numbers. A cycle is short: one worker is the default."""
+
+    workers: Annotated[int, Field(ge=1)] = 1
+    """Parallel workers."""
+    checkpoint_every: Annotated[float, Field(ge=0)] = 2.0
+    """Seconds between two checkpoints, 0: one after every cycle. Each holds the moments of all cycles done."""
+
+
+def spreads(known: Callable[[ForwardModel], Mapping[str, Any]]) -> Made:
+    """Standard deviations, some in %, by the name of a thing that the model knows."""
+
+    def read(given: Mapping[str, Any], context: Context) -> dict[str, Spread]:
+        with Faults() as faults:
+            return read_each(
+                given, known(context.model), context, faults, lambda text, at: parse_spread(text, at.subject.unit)
+            )
+
+    return Made(read, dict[str, Any], {"type": "object", "additionalProperties": TEXT})
+
+
+def error_rates(model: ForwardModel, errors: Sequence[ErrorOf], positive: Collection[str] = ()) -> Array:
+    """Variance (n_state,) per unit of time of the model error, in the ensemble's coordinates.
+
+    ``positive``: fields whose coordinate is their logarithm. Raises :class:`ConfigError`, its path the faulty key.
+    """
+    rate = np.zeros(model.layout.size)
+    for one in errors:
+        name, std = one.field.name, one.spec.std
+        if std.relative != (name in positive):
+            other = "in %, for it is positive" if name in positive else "in its unit, or its initial_std in % as well"
+            raise ConfigError([Fault(f"give the std of {name} {other}", f"model_error.{name}.std")])
+        rate[model.layout[name]] = per_time(one.spec, std.value, f"model_error.{name}")
+    return rate
+
+
+def per_time(spec: Knots, std: float, path: str) -> float:
+    """Variance per unit of time. Raises :class:`ConfigError`."""
+    if spec.every is None:
+        raise ConfigError([Fault("give every, the time after which it is std: in a series it grows all along", path)])
+    return std**2 / spec.every
+
+
+def localisation_of(
+    settings: Local, model: ForwardModel, observed: Set[str], cells: Array | None = None
+) -> Localisation:
+    """Positions are indices of the one observed field, which fills the state but for the parameters.
+
+    ``cells`` (p,) are the indices of the observations, by default all. Raises :class:`ConfigError`.
+    """
+    fields = list(dynamic_fields(model).values())
+    if len(fields) != 1 or observed != {fields[0].name}:
+        raise ConfigError("needs a model whose state is one field, and this field observed")
+    (field,) = fields
+    if settings.shape:
+        if math.prod(settings.shape) != field.size:
+            grid_cells = " x ".join(map(str, settings.shape))
+            raise ConfigError([Fault(f"{grid_cells} cells, but {field.name} has {field.size}", "shape")])
+        where = np.arange(model.layout.size)[model.layout[field.name]]
+        grid = Localisation.on_grid(where, settings.shape, settings.radius, settings.periodic)
+        return grid if cells is None else replace(grid, taper=grid.taper[:, np.rint(cells).astype(int)])
+    positions = np.arange(field.size, dtype=float)
+    state = np.full(model.layout.size, np.nan)
+    state[model.layout[field.name]] = positions
+    period = float(field.size) if settings.periodic else None
+    at = positions if cells is None else cells
+    return Localisation.on_line(state, at, settings.radius, period, settings.block_size)

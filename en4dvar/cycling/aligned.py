@@ -1,0 +1,91 @@
+"""From the readings of a data set to a series of cycles: what was read at each instant side by side, gaps as NaN."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.cycling.series import CycleSeries
+from en4dvar.errors import DataError
+from en4dvar.forward import Observable, ObservationOperator, Trajectory
+from en4dvar.noise import Correlation
+from en4dvar.observations import Observations
+from en4dvar.series import Part, Places
+from en4dvar.state import Array
+
+
+@dataclass(frozen=True)
+class AtPlaces:
+    """H that reads a field at places (q,), the same at every instant."""
+
+    whole: ObservationOperator
+    places: Places
+
+    def __call__(self, trajectory: Trajectory) -> Array:
+        values = self.whole(trajectory)
+        return np.asarray(np.sum(values[..., self.places.indices] * self.places.shares, axis=-1))
+
+
+def aligned(observations: Observations, parts: Sequence[Part]) -> tuple[tuple[Observable, ...], CycleSeries]:
+    """What is observed at an instant, and its series; ``parts`` say which readings are of what.
+
+    Weights divide variances; a reading of weight zero is none.
+
+    Raises
+    ------
+    DataError: errors of different instants that are not independent, of a timing error, robust or with a discrepancy;
+        a field read twice at one place and instant.
+    """
+    noise, where = observations.noise, observations.source or observations.name
+    if np.any(noise.time_std > 0) or noise.attributes() or noise.matrices().keys() - {"correlation"}:
+        raise DataError(f"{where}: a series takes plain Gaussian errors: no time_std, robust or discrepancy")
+    times, row = observations.instants
+    row = np.arange(len(times)) if isinstance(row, slice) else row
+    columns = np.empty(len(observations), dtype=np.intp)
+    names: list[str] = []
+    observables = []
+    for part in parts:
+        own, observable, labels = _columns(part)
+        columns[part.where] = len(names) + own
+        names += labels
+        observables.append(observable)
+    values, std = np.full((len(times), len(names)), np.nan), np.ones((len(times), len(names)))
+    counts = observations.weights > 0
+    if len(np.unique(row[counts] * len(names) + columns[counts])) < counts.sum():
+        raise DataError(f"{where}: a field is read twice at one place and instant; average the readings")
+    values[row[counts], columns[counts]] = observations.values[counts]
+    std[row[counts], columns[counts]] = (observations.std / np.sqrt(np.where(counts, observations.weights, 1)))[counts]
+    correlation = None
+    if (given := noise.matrices().get("correlation")) is not None:
+        correlation = _of_an_instant(given[0], row, columns, len(names), where)
+    return tuple(observables), CycleSeries(times, values, std, correlation, tuple(names))
+
+
+def _columns(part: Part) -> tuple[npt.NDArray[np.intp], Observable, list[str]]:
+    """Which column, of those of the part, each reading stands in, what gives the columns, and their names."""
+    own = replace(part.observable, name=part.name)
+    if part.places is None:
+        return np.zeros(part.end - part.begin, dtype=np.intp), own, [part.name]
+    places = part.places
+    _, first, column = np.unique(
+        np.hstack([places.indices, places.shares]), axis=0, return_index=True, return_inverse=True
+    )
+    at = places[first]
+    names = [f"{part.name} at {position:g}" for position in at.positions]
+    return column.ravel(), replace(own, operator=AtPlaces(part.observable.operator, at)), names
+
+
+def _of_an_instant(
+    whole: Array, row: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], size: int, where: str
+) -> Correlation:
+    """The correlation of the columns, from that of all readings. Raises :class:`DataError`."""
+    same = row[:, None] == row
+    found = np.eye(size)
+    i, j = np.nonzero(same)
+    found[columns[i], columns[j]] = whole[i, j]
+    if np.any(whole[~same]) or np.any(found[columns[i], columns[j]] != whole[i, j]):
+        raise DataError(f"{where}: in a series the errors of different instants must be independent")
+    return Correlation(found)

@@ -1,0 +1,238 @@
+"""A twin experiment for several settings and seeds: a run each, and a table of what they reach.
+
+Settings are compared on the same truths and observations, which depend on the seed and the ``twin:`` section alone.
+Every run is kept as it ends, under what it depends on: more seeds or values find those that are there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from en4dvar.config import TwinConfig, load_twin
+from en4dvar.config.document import parse_document
+from en4dvar.cycling.twin import TwinExperiment, conduct
+from en4dvar.errors import ConfigError, En4dvarError
+from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, available_cores
+from en4dvar.files import readable, write_text
+from en4dvar.runs.interrupt import terminate_as_interrupt
+from en4dvar.runs.rundir import RunDirectory
+from en4dvar.runs.session import Session, directory_mode, session
+from en4dvar.storage.checkpoint import FOLDER, digest, write_checkpoint
+from en4dvar.storage.fingerprint import identity
+from en4dvar.tables import csv_text, table
+
+
+@dataclass(frozen=True)
+class TwinRun:
+    """What came of one run: (estimate, RMSE, spread) after the burn-in, or why it failed."""
+
+    scores: tuple[tuple[str, float, float], ...] = ()
+    failure: str = ""
+
+
+@dataclass(frozen=True)
+class Average:
+    """Mean of RMSE and spread over ``runs`` seeds, each with its standard error; NaN where there are too few."""
+
+    runs: int
+    rmse: float
+    rmse_error: float
+    spread: float
+    spread_error: float
+
+
+@dataclass(frozen=True)
+class TwinSweep:
+    """``values`` of the varied ``keys``, one tuple a setting, and the ``runs`` of each, one a seed."""
+
+    keys: tuple[str, ...]
+    values: tuple[tuple[Any, ...], ...]
+    seeds: tuple[int, ...]
+    runs: tuple[tuple[TwinRun, ...], ...]
+    directory: Path
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """A row a setting and estimate, as for ``pandas.DataFrame``."""
+        return [
+            dict(zip(self.keys, values, strict=True)) | {"estimate": name} | vars(average)
+            | {"failed": sum(bool(run.failure) for run in runs)}
+            for values, runs in zip(self.values, self.runs, strict=True)
+            for name, average in averages(runs).items()
+        ]  # fmt: skip
+
+    def __str__(self) -> str:
+        head = [*(key.rpartition(".")[2] for key in self.keys), "estimate", "runs", "RMSE", "spread"]
+        lines = [
+            [*(_text(row[key]) for key in self.keys), row["estimate"],
+             f"{row['runs']}" + (f" ({row['failed']} failed)" if row["failed"] else ""),
+             _with_error(row["rmse"], row["rmse_error"]), _with_error(row["spread"], row["spread_error"])]
+            for row in self.rows
+        ]  # fmt: skip
+        return table([head, *lines])
+
+
+def averages(runs: Sequence[TwinRun]) -> dict[str, Average]:
+    """Of each estimate, over the runs that did not fail; of a setting whose runs all did, an empty analysis."""
+    names = dict.fromkeys(name for run in runs for name, _, _ in run.scores) or {"analysis": None}
+    found = {}
+    for name in names:
+        both = np.array([numbers for run in runs for own, *numbers in run.scores if own == name]).reshape(-1, 2)
+        n = len(both)
+        mean = both.mean(axis=0) if n else np.full(2, np.nan)
+        error = both.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else np.full(2, np.nan)
+        found[name] = Average(n, float(mean[0]), float(error[0]), float(mean[1]), float(error[1]))
+    return found
+
+
+def sweep_twin(
+    config: str | Path | Mapping[str, Any],
+    vary: Mapping[str, Sequence[Any] | str],
+    seeds: int = 5,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    out: str | Path | None = None,
+    workers: int | None = None,
+    force: bool = False,
+    resume: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+    command: str = "",
+) -> TwinSweep:
+    """Conduct a twin experiment with every combination of values, each for ``seeds`` seeds from that of the file on.
+
+    Writes ``sweep.csv`` (averages) and ``runs.csv`` (every run) to ``out``, by default runs/<name>_sweep.
+
+    Parameters
+    ----------
+    vary: dotted key → its values, a list, or text that is one in YAML. overrides: as of :func:`en4dvar.run`.
+    workers: processes, by default one a core; the numbers do not depend on it.
+    resume: take over the finished runs that are in ``out``; seeds and values may have been added at the end.
+    progress: called with the number of runs that are done and of all.
+
+    Raises
+    ------
+    ConfigError: a setting is at fault, before any run. OutputError: ``out`` cannot be used.
+    """
+    values = {key: _values(key, given) for key, given in vary.items()}
+    if not values or seeds < 1:
+        raise ConfigError("a sweep takes at least one key to vary, with its values, and at least one seed")
+    combinations = tuple(product(*values.values()))
+    configs = [load_twin(config, {**(overrides or {}), **dict(zip(values, c, strict=True))}) for c in combinations]
+    first = configs[0]
+    all_seeds = tuple(range(first.seed, first.seed + seeds))
+    path = Path(out) if out else first.directory.with_name(f"{first.directory.name}_sweep")
+    with (
+        terminate_as_interrupt(),
+        RunDirectory.open(path, directory_mode(force, resume)) as directory,
+        session(first, {}, directory, command, lambda: f"the finished runs are kept in {path}") as run,
+        _executor(workers or available_cores()) as executor,
+    ):
+        run.begin("sweep.csv", "runs.csv")
+        done = _Runs(run, configs, all_seeds, progress).all(executor)
+        found = TwinSweep(tuple(values), combinations, all_seeds, done, path)
+        write_text(directory.at("sweep.csv"), sweep_csv(found))
+        write_text(directory.at("runs.csv"), runs_csv(found))
+    return found
+
+
+class _Runs:
+    """The runs of a sweep, those that are there taken over."""
+
+    def __init__(
+        self,
+        session: Session,
+        configs: Sequence[TwinConfig],
+        seeds: tuple[int, ...],
+        progress: Callable[[int, int], None] | None,
+    ):
+        self.session, self.progress = session, progress
+        prints = [identity(c.resolved, c.experiment.model, {}).settings for c in configs]
+        self.jobs = [
+            (c.experiment, seed, digest(f"{text}\nseed of the run: {seed}".encode()))
+            for c, text in zip(configs, prints, strict=True)
+            for seed in seeds
+        ]
+        self.seeds = len(seeds)
+
+    def all(self, executor: Executor) -> tuple[tuple[TwinRun, ...], ...]:
+        found = {i: run for i, job in enumerate(self.jobs) if (run := self._restored(job[2])) is not None}
+        left = [i for i in range(len(self.jobs)) if i not in found]
+        self._tell(len(found))
+        for n, value in executor.map(_one, (self.jobs[i][:2] for i in left)):
+            if isinstance(value, Exception):
+                raise value
+            found[left[n]], fingerprint = value, self.jobs[left[n]][2]
+            write_checkpoint(self.session.directory.claim(self._file(fingerprint)), fingerprint, value)
+            self._tell(len(found))
+        runs = [found[i] for i in range(len(self.jobs))]
+        return tuple(tuple(runs[i : i + self.seeds]) for i in range(0, len(runs), self.seeds))
+
+    def _restored(self, fingerprint: str) -> TwinRun | None:
+        if not self.session.resumed:
+            return None
+        return self.session.restore(self._file(fingerprint), fingerprint, TwinRun, "its run is conducted again")
+
+    def _file(self, fingerprint: str) -> str:
+        return f"{FOLDER}/{fingerprint[:24]}.run"
+
+    def _tell(self, done: int) -> None:
+        if self.progress is not None:
+            self.progress(done, len(self.jobs))
+
+
+def _one(experiment: TwinExperiment, seed: int) -> TwinRun:
+    try:
+        scores = conduct(experiment, seed).scores
+    except En4dvarError as error:
+        return TwinRun(failure=readable(error))
+    return TwinRun(tuple((name, score.mean_rmse, score.mean_spread) for name, score in scores.items()))
+
+
+@contextmanager
+def _executor(workers: int) -> Iterator[Executor]:
+    """Processes: a cycle is more of the interpreter than of the model, also where that is compiled."""
+    with SerialExecutor() if workers == 1 else ProcessesExecutor(workers) as executor:
+        yield executor
+
+
+def _values(key: str, given: Sequence[Any] | str) -> tuple[Any, ...]:
+    """The values of a key. Raises :class:`ConfigError`."""
+    if isinstance(given, str):
+        given = parse_document(f"values: {given}", f"--vary {key}").data["values"]
+    if not isinstance(given, list | tuple) or not given:
+        raise ConfigError(f"--vary {key}: give a list of values, e.g. --vary '{key}=[1.01, 1.05]'")
+    return tuple(given)
+
+
+def sweep_csv(sweep: TwinSweep) -> str:
+    """The averages as CSV."""
+    rows = sweep.rows
+    head = [*rows[0]]
+    return csv_text([head, *([_text(row[name]) for name in head] for row in rows)])
+
+
+def runs_csv(sweep: TwinSweep) -> str:
+    """A line a run and estimate, as CSV."""
+    lines: list[list[str]] = [[*sweep.keys, "seed", "estimate", "rmse", "spread", "failure"]]
+    for values, runs in zip(sweep.values, sweep.runs, strict=True):
+        own = [_text(value) for value in values]
+        for seed, run in zip(sweep.seeds, runs, strict=True):
+            lines += [[*own, str(seed), name, repr(rmse), repr(spread), ""] for name, rmse, spread in run.scores]
+            if run.failure:
+                lines.append([*own, str(seed), "", "", "", run.failure])
+    return csv_text(lines)
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else repr(value)
+
+
+def _with_error(value: float, error: float) -> str:
+    return f"{value:.4g}" + (f" ± {error:.2g}" if np.isfinite(error) else "")

@@ -1,0 +1,93 @@
+"""The bootstrap particle filter: its resampling, its kernel, and a posterior that is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from en4dvar.cycling.sequential import CycleSeries, SequentialSettings, run_sequential
+from en4dvar.ensemble.linalg import centre
+from en4dvar.schemes.base import Evaluation, Weights
+from en4dvar.schemes.bootstrap_filter import BootstrapFilter, likelihood_shares, systematic
+from en4dvar.schemes.localisation import Localisation
+from en4dvar_lorenz import Linear
+from en4dvar_lorenz.linear import LinearSettings
+
+
+def draws(purpose, columns=None):
+    return np.random.default_rng(sum(map(ord, purpose))).standard_normal((200, columns))
+
+
+@pytest.mark.parametrize("start", [1e-12, 0.3, 1 - 1e-12])
+def test_every_member_survives_as_often_as_its_share_says(start):
+    shares = np.random.default_rng(0).dirichlet(np.full(50, 0.3))
+    count = np.bincount(systematic(shares, start), minlength=50)
+    assert count.sum() == 50
+    assert np.all(np.abs(count - 50 * shares) < 1 + 1e-9)
+
+
+def test_shares_are_the_likelihoods():
+    rng = np.random.default_rng(1)
+    members, std, y = rng.standard_normal((200, 2)), np.array([0.5, 2.0]), np.array([0.7, -1.0])
+    mean, x = centre(members)
+    shares = likelihood_shares(Evaluation((y - mean) / std, (x / std).T))
+    exact = np.exp(-0.5 * (((y - members) / std) ** 2).sum(axis=1))
+    assert shares == pytest.approx(exact / exact.sum(), rel=1e-12)
+    far = likelihood_shares(Evaluation((y + 1e4 - mean) / std, (x / std).T))
+    assert np.isfinite(far).all()
+    assert far.sum() == pytest.approx(1.0)
+
+
+def test_without_jitter_members_are_those_that_survive():
+    x = centre(np.random.default_rng(2).standard_normal((200, 1)))[1]
+    step = BootstrapFilter(jitter=0).advance(Weights.prior(200), Evaluation(np.array([0.5]), x.T), 0, draws)
+    moved = step.weights.rows @ x
+    assert all(np.isclose(value, x[:, 0], atol=1e-13).any() for value in moved[:, 0])
+    shares = likelihood_shares(Evaluation(np.array([0.5]), x.T))
+    assert step.effective == pytest.approx(1 / np.sum(shares**2))
+
+
+def test_jitter_adds_its_share_of_the_covariance():
+    """E of the covariance is (1 + h²) times that of the weighted members, E of the mean theirs."""
+    x = centre(np.random.default_rng(2).standard_normal((200, 3)))[1]
+    e = Evaluation(np.array([0.4, 0.1]), x[:, :2].T)
+    shares = likelihood_shares(e)
+    spread = x - shares @ x
+    exact = spread.T @ (shares[:, None] * spread)
+    found, means = [], []
+    for trial in range(40):
+        rng = np.random.default_rng(trial)
+
+        def draw(purpose, columns=None, rng=rng):
+            return rng.standard_normal((200, columns))
+
+        step = BootstrapFilter(jitter=0.7).advance(Weights.prior(200), e, 0, draw)
+        found.append(np.cov((step.weights.T @ x).T))
+        means.append(step.weights.w @ x)
+    assert np.mean(means, axis=0) == pytest.approx(shares @ x, abs=0.02)
+    assert np.mean(found, axis=0) == pytest.approx(1.49 * exact, abs=0.06)
+
+
+def test_the_posterior_of_a_linear_model_within_sampling_error():
+    """Three cycles against the Kalman filter: means within 5 standard errors, spreads within 15 %."""
+    model, rng, n = Linear.from_settings(LinearSettings(oscillators=1)), np.random.default_rng(4), 1500
+    members = np.hstack([rng.standard_normal((n, 2)), np.full((n, 1), 0.1)])
+    series = CycleSeries(0.3 * np.arange(1, 4), np.array([[0.5, 0.2], [0.1, 0.6], [0.3, 0.4]]), np.array([0.8, 0.9]))
+    particles = run_sequential(model, model.observables, members, series, SequentialSettings(BootstrapFilter(0.0)))
+    unit = np.hstack([np.eye(2), np.full((2, 1), 0.1)])
+    m = np.array([model.step(row, 0.0, 0.3)[:2] for row in unit]).T
+    mean, cov = np.zeros(2), np.eye(2)
+    for k in range(3):
+        mean, cov = m @ mean, m @ cov @ m.T
+        gain = cov @ np.linalg.inv(cov + np.diag(series.std**2))
+        mean, cov = mean + gain @ (series.values[k] - mean), cov - gain @ cov
+        std = np.sqrt(np.diag(cov))
+        assert np.all(np.abs(particles.analysis.mean[k, :2] - mean) < 5 * std / np.sqrt(200))
+        assert particles.analysis.std[k, :2] == pytest.approx(std, rel=0.15)
+    assert np.all((particles.effective > 200) & (particles.effective < n))
+
+
+def test_no_localisation():
+    local = Localisation([np.arange(2)], np.ones((1, 2)))
+    with pytest.raises(ValueError, match="particle filter takes no localisation"):
+        SequentialSettings(BootstrapFilter(), localisation=local)
