@@ -263,6 +263,7 @@ def test_model_error_in_a_twin():
     assert np.abs(np.nanmean(known.run.ranks) - 0.5) < 0.03
 
 
+@pytest.mark.slow
 def test_a_field_read_at_places_is_localised(folder):
     """Lorenz-96, every second variable, 15 members: with a taper it is followed, without it is lost."""
     model = Lorenz96.from_settings(Lorenz96Settings())
