@@ -184,6 +184,8 @@ SCHEME = BASE["assimilation"]
         ({"model_error": {"z": {"std": 1, "every": 1}}}, "model_error.z", "unknown field"),
         ({"parameters": {"c": {**BASE["parameters"]["c"], "varies": {"std": 0.1, "at": [1]}}}}, "parameters.c.varies",
          "give every"),
+        ({"parameters": {"c": {**BASE["parameters"]["c"], "varies": {"std": "estimated", "every": 1}}}}, "parameters.c",
+         "does not estimate the std"),
         ({"parameters": {"c": 1, "t_s": {"prior": "normal", "mean": 0, "std": 1}}}, "parameters.t_s", "time shift"),
         ({"model": {"name": "lorenz63", "steps": 3}}, "model.steps", "unknown key"),
         ({"assimilation": {**SCHEME, "additive": "root"}}, "assimilation.additive", "not one of drawn, square-root"),
