@@ -162,6 +162,8 @@ def _unfit(entry: Entry, model: ForwardModel) -> str:
         return "a sequence has no tied parameters; give a value or a prior"
     if isinstance(entry, Uncertain) and entry.from_ensemble:
         return "a sequence takes no ensemble as a prior; give its moments"
+    if isinstance(entry, Uncertain) and entry.spec.varies is not None and entry.spec.varies.estimated:
+        return "a sequence does not estimate the std of a walk; give it in % or in the unit of the parameter"
     if isinstance(entry, Uncertain) and name not in model.layout.names:
         return f"the state of the model has no field {name!r}, through which a sequence estimates it; give it a value"
     return ""

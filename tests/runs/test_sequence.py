@@ -23,6 +23,8 @@ from en4dvar.runs.checks import validate
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.sequence_run import run_sequence
 from en4dvar.schemes.ienks import IEnKS
+from en4dvar_lorenz import Lorenz96
+from en4dvar_lorenz.lorenz96 import Lorenz96Settings
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 TIMES = np.array([0.2, 0.5, 1.1, 1.3, 2.0, 2.2, 3.1])
@@ -182,6 +184,8 @@ SCHEME = BASE["assimilation"]
         ({"model_error": {"z": {"std": 1, "every": 1}}}, "model_error.z", "unknown field"),
         ({"parameters": {"c": {**BASE["parameters"]["c"], "varies": {"std": 0.1, "at": [1]}}}}, "parameters.c.varies",
          "give every"),
+        ({"parameters": {"c": {**BASE["parameters"]["c"], "varies": {"std": "estimated", "every": 1}}}}, "parameters.c",
+         "does not estimate the std"),
         ({"parameters": {"c": 1, "t_s": {"prior": "normal", "mean": 0, "std": 1}}}, "parameters.t_s", "time shift"),
         ({"model": {"name": "lorenz63", "steps": 3}}, "model.steps", "unknown key"),
         ({"assimilation": {**SCHEME, "additive": "root"}}, "assimilation.additive", "not one of drawn, square-root"),
@@ -259,6 +263,27 @@ def test_model_error_in_a_twin():
     score = known.scores["analysis"]
     assert score.mean_spread == pytest.approx(score.mean_rmse, rel=0.1)
     assert np.abs(np.nanmean(known.run.ranks) - 0.5) < 0.03
+
+
+@pytest.mark.slow
+def test_a_field_read_at_places_is_localised(folder):
+    """Lorenz-96, every second variable, 15 members: with a taper it is followed, without it is lost."""
+    model = Lorenz96.from_settings(Lorenz96Settings())
+    start = model.trajectories(model.initial_state({"F": 8.0})[None], np.array([20.0]))[0].states
+    times, noise = 0.1 * np.arange(1, 81), np.random.default_rng(0)
+    truth = model.trajectories(start, times)[0].states[:, :40]
+    rows = [(t, c, x[c] + noise.standard_normal()) for t, x in zip(times, truth, strict=True) for c in range(0, 40, 2)]
+    Path("field.csv").write_text("t,cell,x\n" + "".join(f"{t:.3f},{c},{x:.4f}\n" for t, c, x in rows))
+    data = {**BASE["data"], "path": "field.csv", "places": {"column": "cell"}, "error": {"x_std": 1}}
+    errors = []
+    for local in ({"radius": 4, "periodic": True}, None):
+        scheme = {"scheme": "etkf", "members": 15, "inflation": 1.04, "localisation": local}
+        changes = {"model": {"name": "lorenz96"}, "parameters": None, "model_error": None, "data": data}
+        path = written(folder, **changes, assimilation=scheme, sequence={"initial_std": {"x": 4}})
+        run = assimilate_series(build_sequence(load_sequence(path)), 0).run
+        errors.append(np.sqrt(np.mean((run.analysis.mean[50:, :40] - truth[50:]) ** 2)))
+    assert errors[0] < 0.75
+    assert errors[1] > 2
 
 
 @pytest.mark.slow
