@@ -330,10 +330,11 @@ def entries(kind: str = "") -> Made:
         shift = replace(TIME_SHIFT, unit=model.time_unit, display_unit=model.time_display_unit)
         known = {p.name: p for p in model.parameters}  # a model's own sigma goes before
         known |= {p.name: p for p in (shift, NOISE_SCALE) if p.name not in known}
+        possible = [p.name for p in model.optional_parameters if p.name not in known]
         defaults: Mapping[str, float] = getattr(model, "defaults", {})
 
         def unknown(name: str) -> str:
-            return f"unknown parameter {shown(name)}{suggest(name, known)}"
+            return f"unknown parameter {shown(name)}{suggest(name, [*known, *possible])}"
 
         found: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in defaults.items()}
         with Faults() as faults:
