@@ -51,10 +51,8 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packe
     rho = model.medium_of(own).rho
     initial, par = _states(model, x, own)
     n_members = len(x)
-    clock, pulse = model.driving.of_members(own)
-    par[:, rows.PULSE_SHIFT], par[:, rows.PULSE_RATE] = clock
-    if len(pulse) > model.driving.cells:
-        par[:, rows.PULSE_TABLE] = np.arange(n_members, dtype=float) * (model.driving.cells * 8)
+    clocks = model.driving.of_members(own)
+    par[:, rows.PULSE_SHIFT], par[:, rows.PULSE_RATE], par[:, rows.PULSE_TABLE] = clocks[:3]
     memory = viscous = _NO_TABLE
     if system.memory:
         memory = _memory(model, values, initial, par, x, model.medium_of(own, 1).rho)
@@ -104,7 +102,7 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packe
         factor=1.0 if own_density else 1 / rho,
         tables=elastic,
     )
-    return Packed(members, memory, viscous, pulse, complete)
+    return Packed(members, memory, viscous, clocks.table, complete)
 
 
 def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array, Array]:

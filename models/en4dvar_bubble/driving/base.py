@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -33,6 +33,15 @@ class PulseNumber:
     key: str
     value: float
     role: Role
+
+
+class Clocks(NamedTuple):
+    """How N members read the driving: at t_ref = (t − shift) · rate, in µs, from so many numbers on in the table."""
+
+    shift: float | Array
+    rate: float | Array
+    offset: float | Array
+    table: Array
 
 
 @dataclass(frozen=True)
@@ -87,37 +96,34 @@ class Driving:
         table[:, :6] = samples @ _TO_COEFFICIENTS.T
         return table
 
-    def of_members(self, values: Mapping[str, Array]) -> tuple[tuple[float | Array, float | Array], Array]:
-        """Shift (µs) and rate of the members' clocks, t_ref = (t − shift) · rate; the table, or one for each member.
-
-        ``values``: name → (N,) of the parameters, any of which may be :attr:`numbers`.
-        """
-        named = [number for number in self.numbers if number.parameter.name in values]
-        if not named:
-            return (0.0, 1.0), self.table
+    def of_members(self, values: Mapping[str, Array]) -> Clocks:
+        """How members read the driving; ``values``: name → (N,) of parameters, any of which may be :attr:`numbers`."""
         rate: float | Array = 1.0
-        zero = next(number.value for number in self.numbers if number.role == "delay")
+        zero = next((number.value for number in self.numbers if number.role == "delay"), 0.0)
         delay: float | Array = zero
-        for number in named:
-            value = values[number.parameter.name]
-            if number.role == "delay":
+        shapes: dict[str, Array] = {}
+        for number in self.numbers:
+            if (value := values.get(number.parameter.name)) is None:
+                continue
+            if number.role == "shape":
+                shapes[number.key] = value
+            elif number.role == "delay":
                 delay = value
-            elif number.role != "shape":
+            else:
                 rate = rate * (value / number.value if number.role == "rate" else number.value / value)
-        shift = 1e6 * (delay - zero / rate)
-        shapes = {number.key: values[number.parameter.name] for number in named if number.role == "shape"}
-        return self._of_shapes(shapes, shift, rate) if shapes else ((shift, rate), self.table)
+        clocks = Clocks(1e6 * (delay - zero / rate), rate, 0.0, self.table)
+        return self._of_shapes(clocks, shapes) if shapes else clocks
 
-    def _of_shapes(
-        self, shapes: Mapping[str, Array], shift: float | Array, rate: float | Array
-    ) -> tuple[tuple[Array, Array], Array]:
-        """The same where each member has a shape of its own: its table is stretched to the span of this one."""
+    def _of_shapes(self, clocks: Clocks, shapes: Mapping[str, Array]) -> Clocks:
+        """The same where members have shapes of their own: each table is stretched to the span of this one."""
         assert self.remade is not None
-        each = [self.remade(**dict(zip(shapes, of, strict=True))) for of in zip(*shapes.values(), strict=True)]
-        tables = np.concatenate([replace(one, cells=self.cells).table for one in each])
-        begin = np.array([1e6 * one.begin for one in each])
-        stretch = (self.end - self.begin) / np.array([one.end - one.begin for one in each])
-        return (shift + (begin - 1e6 * self.begin / stretch) / rate, rate * stretch), tables
+        different, which = np.unique(np.column_stack(list(shapes.values())), axis=0, return_inverse=True)
+        each = [self.remade(**dict(zip(shapes, of, strict=True))) for of in different.tolist()]
+        table = np.concatenate([replace(one, cells=self.cells).table for one in each])
+        begin = np.array([1e6 * one.begin for one in each])[which]
+        stretch = ((self.end - self.begin) / np.array([one.end - one.begin for one in each]))[which]
+        shift = clocks.shift + (begin - 1e6 * self.begin / stretch) / clocks.rate
+        return Clocks(shift, clocks.rate * stretch, np.asarray(8.0 * self.cells * which), table)
 
     @cached_property
     def span(self) -> Array:

@@ -56,12 +56,19 @@ def pulse(kind: str) -> Callable[[Pulse], Pulse]:
             bound = signature(function).bind(*positional, **keys)
             bound.apply_defaults()
             numbers = tuple(_changeable(function, bound.arguments))
-            return replace(function(**bound.arguments), numbers=numbers, remade=partial(made, **bound.arguments))
+            return replace(
+                function(**bound.arguments), numbers=numbers, remade=partial(_remade, kind, **bound.arguments)
+            )
 
         PULSES[kind] = made
         return made
 
     return register
+
+
+def _remade(kind: str, **keys: Any) -> Driving:
+    """A pulse with other keys, without its numbers, which take longer to find."""
+    return PULSES[kind].__wrapped__(**keys)  # type: ignore[attr-defined]
 
 
 def numbers_of(function: Pulse) -> Iterator[tuple[str, Role, Parameter]]:
