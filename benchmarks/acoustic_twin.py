@@ -60,23 +60,32 @@ def make_twin(
     A truth that cannot be integrated, or whose bubble yields fewer than 5 readings, is drawn again.
     """
     rng = np.random.default_rng([20210, seed])
-    truths = truths or of
     while True:
-        truth = truths.mean + truths.std * rng.standard_normal(len(truths.names))
-        times = 5.6e-6 + np.cumsum(rng.uniform(1.25e-6, 1.75e-6, 60))
-        design = Observations(times, np.ones(60), noise_of(np.full(60, std), np.full(60, time_std)), np.ones(60))
-        problem = InverseProblem(MODEL, MODEL.observables[0], design, of)
-        run = world.run(problem, truth, seed)
-        noise = rng.standard_normal((2, 60))
-        if run.failures[0]:
-            continue
-        values = world.values(problem, run, noise[0], seed)
-        if run.predicted.rates is not None:
-            values += time_std * run.predicted.rates[0] * noise[1]
-        last = np.flatnonzero(values < STOP * np.maximum.accumulate(values))
-        count = last[0] + 1 if len(last) else 60
-        if count >= FEWEST:
-            break
+        truth = (truths or of).mean + (truths or of).std * rng.standard_normal(len(of.names))
+        twin = read_twin(seed, rng, of, truth, std=std, time_std=time_std, world=world)
+        if twin is not None:
+            return twin
+
+
+def read_twin(
+    seed: int, rng: np.random.Generator, of: Prior, truth: Array, *, std: float = 1.4e-6, time_std: float = 0.0,
+    world: World = RIGHT,
+) -> Twin | None:  # fmt: skip
+    """Readings of a truth (n,), transformed; None where it cannot be integrated, or yields too few."""
+    times = 5.6e-6 + np.cumsum(rng.uniform(1.25e-6, 1.75e-6, 60))
+    design = Observations(times, np.ones(60), noise_of(np.full(60, std), np.full(60, time_std)), np.ones(60))
+    problem = InverseProblem(MODEL, MODEL.observables[0], design, of)
+    run = world.run(problem, truth, seed)
+    noise = rng.standard_normal((2, 60))
+    if run.failures[0]:
+        return None
+    values = world.values(problem, run, noise[0], seed)
+    if run.predicted.rates is not None:
+        values += time_std * run.predicted.rates[0] * noise[1]
+    last = np.flatnonzero(values < STOP * np.maximum.accumulate(values))
+    count = last[0] + 1 if len(last) else 60
+    if count < FEWEST:
+        return None
     ones = np.ones(count)
     observed = Observations(
         times[:count], values[:count], noise_of(std * ones, time_std * ones), ones, name=f"twin{seed:04d}"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import functools
 import os
+import re
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,9 @@ import click
 
 if TYPE_CHECKING:
     from en4dvar.config import Config
+
+
+LONGEST = 120  # name of a folder
 
 
 class Failed(click.ClickException):
@@ -80,6 +84,19 @@ class Source:
         # A path on the command line is relative to the shell's folder, one in the file to the file's.
         special["data.path"] = [str(Path(self.data).absolute())] if self.data else None
         return found | {key: value for key, value in special.items() if value is not None}
+
+
+def folder_of(kind: str, run_dirs: Sequence[Path]) -> Path:
+    """Where what a command makes of several runs goes unless told: a folder beside the first, named after them all.
+
+    Raises :class:`OutputError` where it would be a link to elsewhere.
+    """
+    from en4dvar.files import inside
+
+    names = [run_dir.resolve().name for run_dir in run_dirs]
+    names = names if len(set(names)) == len(names) else [str(run_dir) for run_dir in run_dirs]
+    named = "_".join(re.sub(r"[^\w.+-]", "_", name) for name in names)
+    return inside(run_dirs[0].absolute().parent, f"{kind}_{named}"[:LONGEST])
 
 
 def config_options(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -8,14 +8,16 @@ from pathlib import Path
 
 import click
 
+from en4dvar.commands.common import folder_of
+
 
 @click.command()
 @click.argument("run_dirs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN_DIR [RUN_DIR...]")
 @click.option(
-    "--share", "names", multiple=True, required=True, metavar="NAME",
-    help="A parameter that has one value in all data sets, e.g. G; any number of times.",
+    "--share", "names", multiple=True, metavar="NAME",
+    help="A parameter that has one value in all data sets, e.g. G; default: what their configurations share.",
 )  # fmt: skip
-@click.option("--out", type=click.Path(path_type=Path), help="Folder of the result; default: that of the first run.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder of the result; default joint_... beside.")
 @click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
 @click.option("--trust", is_flag=True, help="Run code that the files name, wherever it lies: read it before.")
 def joint(
@@ -37,7 +39,7 @@ def joint(
         return sys.stdin.isatty() and click.confirm(question)
 
     found, page = join(
-        run_dirs, names, out or run_dirs[0], workers=workers, trust=trust, ask=ask,
+        run_dirs, names, out or folder_of("joint", run_dirs), workers=workers, trust=trust, ask=ask,
         tell=lambda words: click.echo(words, err=True),
     )  # fmt: skip
     click.echo(joint_table(found))

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 from pathlib import Path
 
 import click
 
-from en4dvar.commands.common import Failed, deliver, refuse_to_replace
+from en4dvar.commands.common import Failed, deliver, folder_of, refuse_to_replace
 
 MOST_ROWS = 60  # of estimates on the terminal
-LONGEST = 120  # name of the folder of a comparison
 
 
 @click.command()
@@ -54,12 +52,9 @@ def compare(run_dirs: tuple[Path, ...], out: Path | None, no_report: bool) -> No
         click.echo(f"{estimates_table(comparison)}\n")
     click.echo(comparison_table(comparison))
     if not no_report:
-        from en4dvar.files import inside
         from en4dvar.report.overlay import write_comparison
 
-        names = "_".join(re.sub(r"[^\w.+-]", "_", name) for name in comparison.runs)
-        folder = out or inside(run_dirs[0].absolute().parent, f"compare_{names}"[:LONGEST])
-        page = write_comparison(comparison, folder)
+        page = write_comparison(comparison, out or folder_of("compare", run_dirs))
         click.echo(f"report: {page if out else os.path.relpath(page)}")
 
 

@@ -87,6 +87,8 @@ def _estimate(config: Config, force: bool, resume: bool) -> None:
 
 def _tell(campaign: Campaign, with_report: bool) -> None:
     """The posterior on standard output, warnings on standard error. Raises :class:`Failed` where a data set has."""
+    from en4dvar.report.joint import joint_table
+    from en4dvar.storage.joint_file import FILE, load_joint
     from en4dvar.summary import results_table
 
     if len(campaign) <= MOST_TOLD:
@@ -94,9 +96,13 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
     for outcome in campaign.outcomes[:MOST_TOLD]:
         for remark in outcome.remarks:
             click.echo(f"{outcome.name}: {remark}")
+    together = load_joint(campaign.directory / FILE) if (campaign.directory / FILE).exists() else None
+    if together:
+        click.echo(f"\n{joint_table(together)}")
     for notice in campaign.notices:
         click.echo(f"warning: {notice}", err=True)
     found = [(o.name, warning) for o in campaign.outcomes for warning in o.warnings]
+    found += [("all together", warning) for warning in (together.cautions if together else ())]
     told = sorted(found, key=lambda of_set: of_set[1].rank)  # the worst first; the mildest are left out
     for name, warning in told[:MOST_TOLD]:
         click.echo(f"{warning.kind}: {name}: {warning}", err=True)

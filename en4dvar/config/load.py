@@ -19,6 +19,7 @@ from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, entries
 from en4dvar.config.schema import Assimilation, Execution, File, Output, Section
 from en4dvar.config.series import DATA, DataPlan
+from en4dvar.config.sharing import Groups, Sharing, sharing_of
 from en4dvar.config.times import Times, read_times
 from en4dvar.config.validate import check
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
@@ -45,6 +46,9 @@ class Estimation(File):
     """Where the observations are, what they mean and how well they are known."""
     parameters: Annotated[tuple[Entry, ...], entries()]
     """For each parameter a prior (estimated), a quantity (fixed), or a scalar of the data file (fixed)."""
+    groups: Groups | None = None
+    """What data sets have in common, e.g. ``gel: {soft: 'a_*', stiff: [b_*, c_01]}``: under each kind of group the
+    groups, with patterns of the names of their data sets."""
     prior: PriorFile | None = None
     """A file of members, for the parameters with ``{prior: ensemble}``."""
     prior_correlation: tuple[PriorCorrelation, ...] | None = None
@@ -92,6 +96,7 @@ class Config:
     directory: Path
     simulate_times: Array | None
     resolved: str
+    sharing: Sharing
     initial_state: tuple[Initial, ...] = ()
     model_error: tuple[ErrorOf, ...] = ()
     dependence: tuple[Dependence, ...] = ()
@@ -148,6 +153,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
         directory=file.output.directory or Path("runs") / file.name,
         simulate_times=file.simulate.times if file.simulate else None,
         resolved=read.resolved(file.parameters),
+        sharing=sharing_of(parameters, file.groups or {}, bool(blocks), document),
         initial_state=file.initial_state or (),
         model_error=file.model_error or (),
         dependence=blocks,

@@ -93,6 +93,9 @@ class PriorSection(Section):
     """Of an ensemble: unit of the numbers in the file, where that does not tell it."""
     varies: VariesSection | None = None
     """The parameter varies in time; the prior is that of its first piece."""
+    shared: Annotated[str | None, Field(min_length=1)] = None
+    """The data sets have one value of it, estimated together after each by itself: ``all`` of them, or those of one
+    group of a kind in ``groups:``, e.g. gel."""
 
 
 class FromFile(Section):
@@ -219,7 +222,7 @@ class Uncertain:
 
     @property
     def _given(self) -> set[str]:
-        return self.spec.model_fields_set - {"prior", "varies"}
+        return self.spec.model_fields_set - {"prior", "varies", "shared"}
 
     def _recipe(self) -> ConfigError:
         takes, has = _RECIPES[self.spec.prior], ", ".join(sorted(self._given)) or "none of these"
@@ -330,10 +333,11 @@ def entries(kind: str = "") -> Made:
         # what makes its own readings makes them to scale
         offered = (p for p in (*OF_READINGS, shift) if not (kind and p is READING_SCALE))
         known |= {p.name: p for p in offered if p.name not in known}
+        possible = [p.name for p in model.optional_parameters if p.name not in known]
         defaults: Mapping[str, float] = getattr(model, "defaults", {})
 
         def unknown(name: str) -> str:
-            return f"unknown parameter {shown(name)}{suggest(name, known)}"
+            return f"unknown parameter {shown(name)}{suggest(name, [*known, *possible])}"
 
         found: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in defaults.items()}
         with Faults() as faults:
@@ -350,6 +354,8 @@ def entries(kind: str = "") -> Made:
                     faults.add((name, "prior"), f"{kind} has no ensemble of its own; give it another prior")
                 if kind and isinstance(entry, Uncertain) and entry.spec.varies is not None:
                     faults.add((name, "varies"), f"{kind} has constant parameters")
+                if kind and isinstance(entry, Uncertain) and entry.spec.shared is not None:
+                    faults.add((name, "shared"), f"{kind} estimates no data sets together")
             for parameter in model.parameters:
                 if parameter.name not in {**given, **defaults}:
                     faults.add((parameter.name,), _missing(parameter))

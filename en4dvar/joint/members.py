@@ -4,8 +4,9 @@ What is shared, s, is drawn from Student's t about the mode; given s each experi
 
     p(s | y) ∝ p(s) Π_e L_e(s),      L_e(s) = ∫ p(y_e | s, v) p(v) dv ≈ mean_k p(y_e | s, v_k) p(v_k) / q(v_k | s)
 
-with v_k from the Gaussian of the arrow given s, widened. The estimate of L_e is unbiased, and with it the weights of s
-and the choice of one v_k for each member are those of the exact posterior (Andrieu & Roberts 2009, Ann. Stat. 37, 697).
+with v_k from a Gaussian about where J is low given s, widened. The estimate of L_e is unbiased, and with it the
+weights of s and the choice of one v_k for each member are those of the exact posterior (Andrieu & Roberts 2009,
+Ann. Stat. 37, 697).
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln, logsumexp
 
-from en4dvar.joint.arrow import Arrow
 from en4dvar.joint.descent import Joined
 from en4dvar.joint.problem import JointProblem
 from en4dvar.joint.tangent import Experiment
@@ -24,6 +24,7 @@ from en4dvar.prior import member_stream
 from en4dvar.state import Array
 
 DRAWS, INNER = 192, 12  # of what is shared, and of the own quantities for each of them
+STEPS = 2  # linearisations that the own quantities given what is shared are sought by
 FREEDOM = 7.0  # degrees of freedom of Student's t
 WIDER = 1.2  # the proposals than the Gaussian
 FEWEST = 24.0  # effective draws below which the weights say nothing
@@ -58,12 +59,12 @@ def sampled(
     joint: JointProblem, experiments: Sequence[Experiment], at: Joined, seed: int, count: int
 ) -> JointMembers | None:
     """By importance; None where the proposal does not reach the posterior."""
-    stream, arrow = member_stream(seed, "joint importance"), at.arrow
+    stream = member_stream(seed, "joint importance")
     border, log_weights = _proposed(at, stream)
     chosen_own: list[Array] = []
     logs: list[Array] = []
     for experiment in experiments:
-        own, log_ratio = _own(joint, experiment, at, border, arrow, stream)
+        own, log_ratio = _own(joint, experiment, at, border, stream)
         log_weights = log_weights + logsumexp(log_ratio, axis=1) - np.log(INNER)
         chosen_own.append(own)
         logs.append(log_ratio)
@@ -102,19 +103,45 @@ def _proposed(at: Joined, stream: np.random.Generator) -> tuple[Array, Array]:
 
 
 def _own(
-    joint: JointProblem, experiment: Experiment, at: Joined, border: Array, arrow: Arrow, stream: np.random.Generator
+    joint: JointProblem, experiment: Experiment, at: Joined, border: Array, stream: np.random.Generator
 ) -> tuple[Array, Array]:
     """Own quantities (M, INNER, n_e) of an experiment given border (M, c), and ln p(y, v)/q(v) (M, INNER)."""
-    e, middle = experiment.e, at.place.own[experiment.e]
-    n = len(middle)
-    means = middle - np.linalg.solve(arrow.blocks[e], arrow.edges[e].T @ (border - at.place.border).T).T
-    root = np.linalg.cholesky(arrow.blocks[e]) if n else np.eye(0)
+    e, n = experiment.e, len(at.place.own[experiment.e])
+    means, precisions = _given(joint, experiment, at, border)
+    roots = np.linalg.cholesky(precisions)
     z = stream.standard_normal((len(border), INNER, n))
-    own = means[:, None] + WIDER * (np.linalg.solve(root.T, z.reshape(-1, n).T).T.reshape(z.shape) if n else z)
-    log_q = -0.5 * np.sum(z**2, axis=2) + float(np.log(np.diag(root)).sum()) - n * np.log(WIDER)
+    own = means[:, None] + WIDER * np.linalg.solve(np.swapaxes(roots, 1, 2)[:, None], z[..., None])[..., 0]
+    logs = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)[:, None]
+    log_q = logs - 0.5 * np.sum(z**2, axis=2) - n * np.log(WIDER)
     points = joint.standard(e, np.repeat(border, INNER, axis=0), own.reshape(-1, n))
     costs = experiment.costs(points).reshape(len(border), INNER)
     return own, -costs - 0.5 * np.sum(own**2, axis=2) - log_q
+
+
+def _given(joint: JointProblem, experiment: Experiment, at: Joined, border: Array) -> tuple[Array, Array]:
+    """The Gaussian of an experiment's own quantities given border (M, c): mean (M, n_e), precision (M, n_e, n_e).
+
+    That of the arrow, moved by a step of Gauss and Newton where J is lower there: what one experiment knows much better
+    alone than what is shared, as a time shift, is off the arrow's straight line by many of its standard deviations.
+    """
+    e, arrow = experiment.e, at.arrow
+    middle, own = at.place.own[e], joint.columns(e)[1]
+    block = arrow.blocks[e]
+    precision = np.broadcast_to(block, (len(border), *block.shape))
+    if not own:
+        return np.zeros((len(border), 0)), precision
+    mean = middle - np.linalg.solve(block, arrow.edges[e].T @ (border - at.place.border).T).T
+    lowest = np.full(len(border), np.inf)
+    there = mean
+    for _ in range(STEPS):
+        cost, gradient, hessian = experiment.linearise_own(joint.standard(e, border, there), own)
+        cost = cost + 0.5 * np.sum(there**2, axis=1)
+        lower = (cost < lowest) & np.isfinite(gradient).all(axis=1)
+        lowest, mean = np.where(lower, cost, lowest), np.where(lower[:, None], there, mean)
+        precision = np.where(lower[:, None, None], np.eye(len(own)) + hessian, precision)
+        step = np.linalg.solve(precision, (mean + gradient)[..., None])[..., 0]
+        there = np.where(lower[:, None], mean - step, mean)
+    return mean, precision
 
 
 def _one(own: Array, log: Array, stream: np.random.Generator) -> Array:

@@ -62,3 +62,19 @@ class Experiment:
             return None
         d, S = observations.whiten(Linearisation.of_stacked(run.predicted[0], stacked[0], change))
         return LocalForm(cost, -S.T @ d, S.T @ S, run[:1])
+
+    def linearise_own(self, z: Array, columns: list[int]) -> tuple[Array, Array, Array]:
+        """J_o (M,), its gradient (M, k) and Gauss–Newton Hessian (M, k, k) in k ``columns`` alone, at places (M, n).
+
+        They are NaN where a run fails.
+        """
+        size, k, observations = self.epsilon, len(columns), self.problem.observations
+        beside = z[:, None] + size * np.vstack([np.zeros(z.shape[1]), np.eye(z.shape[1])[columns]])
+        run = self.run(beside.reshape(-1, z.shape[1]))
+        stacked = run.predicted.stacked.reshape(len(z), k + 1, -1)
+        gradient, hessian = np.full((len(z), k), np.nan), np.full((len(z), k, k), np.nan)
+        for i in np.flatnonzero(np.isfinite(stacked).all(axis=(1, 2))).tolist():
+            change = (stacked[i, 1:] - stacked[i, 0]) / size
+            d, S = observations.whiten(Linearisation.of_stacked(run.predicted[i * (k + 1)], stacked[i, 0], change))
+            gradient[i], hessian[i] = -S.T @ d, S.T @ S
+        return observations.cost(run.predicted)[:: k + 1], gradient, hessian

@@ -16,12 +16,14 @@ from en4dvar.executor import ProcessesExecutor, SerialExecutor, WorkerLostError
 from en4dvar.files import inside, make_folder, write_text
 from en4dvar.hints import suggest
 from en4dvar.report.figures import all_figures
+from en4dvar.report.joint import PAGE_FILES
 from en4dvar.report.overview import SetSummary, overview_figures, render_overview
 from en4dvar.report.page import IDENTIFIERS, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, Lines, response_lines
 from en4dvar.report.style import draw
 from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
 from en4dvar.storage.campaign_file import failed_datasets
+from en4dvar.storage.joint_file import FILE
 from en4dvar.storage.store import StoredResult, load_stored, result_files
 from en4dvar.summary import summary_csv
 from en4dvar.tables import csv_text
@@ -107,8 +109,9 @@ def _write_campaign(
             elif isinstance(value, Exception):
                 raise value
     figures = draw(overview_figures(sets), inside(run_dir, "figures"))
+    joint = PAGE_FILES[0] if (run_dir / FILE).exists() else ""
     pages = {s.stem: quote(f"pages/{s.stem}.html") for s in paged}
-    return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures))
+    return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures, joint))
 
 
 def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:

@@ -62,11 +62,12 @@ def render_overview(
     pages: Mapping[str, str],
     failures: Mapping[str, str],
     figures: Sequence[Drawing],
+    joint: str = "",
 ) -> str:
     """The page as HTML.
 
-    ``pages``: stem of a data set → address of its page, for those that have one; ``failures``: name of a data set
-    without a posterior → reason.
+    ``joint``: address of the page of a joint estimate. ``pages``: stem of a data set → address of its page, for those
+    that have one; ``failures``: name of a data set without a posterior → reason.
     """
     return render(
         "campaign.html.j2",
@@ -78,6 +79,7 @@ def render_overview(
         failures=failures,
         sets=sets,
         pages=pages,
+        joint=joint,
         without_page=sum(1 for one in sets if one.stem not in pages),
         warned=sum(1 for one in sets if one.cautions),
         tally=_tally(sets),

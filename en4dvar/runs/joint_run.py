@@ -1,10 +1,13 @@
-"""``en4dvar joint``: finished runs estimated together, from what their result files record."""
+"""Data sets estimated together, from what the result files of their single estimates record: those of a run whose
+configuration shares parameters, or of several finished runs (``en4dvar joint``).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,19 +17,61 @@ from en4dvar.config.build import problem_of
 from en4dvar.config.document import parse_document
 from en4dvar.config.load import resolve
 from en4dvar.errors import ConfigError, OutputError
-from en4dvar.executor import choose_executor
+from en4dvar.executor import Executor, choose_executor
 from en4dvar.files import make_folder
 from en4dvar.joint.estimate import Single, estimate_jointly
-from en4dvar.joint.problem import sharing
+from en4dvar.joint.problem import JointProblem, sharing
 from en4dvar.problem import InverseProblem
 from en4dvar.report.joint import write_joint
 from en4dvar.runs.trust import Ask, of_strangers
+from en4dvar.runs.worklist import Worklist
+from en4dvar.storage.checkpoint import FOLDER, digest, file_digest, write_checkpoint
 from en4dvar.storage.joint_file import FILE, Alone, StoredJoint, load_joint, save_joint
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.store import StoredResult, load_stored, result_files
 
 CARRIED = ("implausible-data", "misfit", "residual-structure", "model-validity")
 MOST_NAMES = 4
+JOINED = f"{FOLDER}/joint"
+
+
+@dataclass
+class Gathered:
+    """Finished estimates of data sets that are to be estimated together, in order."""
+
+    problems: list[InverseProblem] = field(default_factory=list)
+    groups: list[Mapping[str, str]] = field(default_factory=list)
+    singles: list[Single] = field(default_factory=list)
+    alone: list[Alone] = field(default_factory=list)
+    cautions: list[tuple[str, Caution]] = field(default_factory=list)
+
+    def add(self, config: Config, result: StoredResult, where: Path) -> None:
+        """One more; its configuration says what it shares. Raises :class:`ConfigError`, :class:`OutputError`."""
+        if len(result.axes) > 1:  # the file and page of a joint estimate know one series a data set
+            raise ConfigError(f"{where}: {result.name} has several series; it cannot be estimated jointly")
+        problem = problem_of(config, result.observations())
+        if problem.varying:
+            raise ConfigError(f"{where}: parameters that vary in time cannot be estimated jointly")
+        members = _members(result, problem)
+        centre = result.sample_stats["centre"].sel(parameter=list(problem.prior.names)).values
+        self.problems.append(problem)
+        self.groups.append(config.sharing.of_dataset(result.name))
+        self.singles.append(_single(problem, members, np.asarray(centre, dtype=float)))
+        self.alone.append(Alone(problem.prior.names, members))
+        self.cautions += [(result.name, one) for one in result.cautions]
+
+    def save(
+        self, joint: JointProblem, config: Config, executor: Executor, attributes: Mapping[str, Any], path: Path,
+        tell: Callable[[str], None],
+    ) -> Path:  # fmt: skip
+        """Estimate them together, with the settings and the seed of ``config``, and write the file.
+
+        Raises :class:`TooFewMembersError`, :class:`OutputError`.
+        """
+        found = estimate_jointly(joint, config.assimilation, config.seed, executor, self.singles, tell)
+        found = replace(found, cautions=(*found.cautions, *_carried(self.cautions)))
+        shared = " ".join(dict.fromkeys(name for name, _ in joint.shared))
+        return save_joint(path, found, self.alone, {**attributes, "seed": config.seed, "shared": shared})
 
 
 def join(
@@ -39,8 +84,9 @@ def join(
     ask: Ask | None = None,
     tell: Callable[[str], None] = lambda words: None,
 ) -> tuple[StoredJoint, Path]:
-    """Estimate the data sets of finished runs together, with the parameters ``names`` in common; writes ``joint.nc``,
-    ``joint.csv`` and ``joint.html`` to ``out``. Returns what was found and the path of the page.
+    """Estimate the data sets of finished runs together, with the parameters ``names`` in common, or what their
+    configurations say where there are none; writes ``joint.nc``, ``joint.csv`` and ``joint.html`` to ``out``. Returns
+    what was found and the path of the page.
 
     Settings of the ensemble and the seed are those of the first run.
 
@@ -49,40 +95,49 @@ def join(
     RefusedError: code of a stranger, see :func:`~en4dvar.runs.rerun.rerun`. OutputError: there is no result, or it is
         damaged. ConfigError: the data sets cannot share these parameters. TooFewMembersError: the ensemble is lost.
     """
-    problems: list[InverseProblem] = []
-    singles: list[Single] = []
-    alone: list[Alone] = []
-    cautions: list[tuple[str, Caution]] = []
-    first: Config | None = None
+    gathered = Gathered()
+    configs: list[Config] = []
     for run_dir in run_dirs:
         config, results = _recorded(run_dir, trust, ask)
-        first = first or config
+        configs.append(config)
         for result in results:
-            if len(result.axes) > 1:  # the file and page of a joint estimate know one series a data set
-                raise ConfigError(f"{run_dir}: {result.name} has several series; it cannot be estimated jointly")
-            problem = problem_of(config, result.observations())
-            if problem.varying:
-                raise ConfigError(f"{run_dir}: parameters that vary in time cannot be estimated jointly")
-            members = _members(result, problem)
-            centre = result.sample_stats["centre"].sel(parameter=list(problem.prior.names)).values
-            problems.append(problem)
-            singles.append(_single(problem, members, np.asarray(centre, dtype=float)))
-            alone.append(Alone(problem.prior.names, members))
-            cautions += [(result.name, one) for one in result.cautions]
-    if first is None:
-        raise ConfigError("a joint estimate takes at least two data sets")
-    joint = sharing(list(_named_apart(problems, run_dirs)), names)
+            gathered.add(config, result, run_dir)
+    apart = tuple(_named_apart(gathered.problems))
+    if not names and not any(config.sharing for config in configs):
+        raise ConfigError("nothing is shared: give --share NAME, or 'shared:' in the configurations of the runs")
+    joint = sharing(apart, names) if names else JointProblem(apart, tuple(gathered.groups))
+    attributes = {**provenance("", None), "runs": ", ".join(run_dir.name for run_dir in run_dirs)}
+    first = configs[0]
     with choose_executor(first.model, None, workers) as executor:
-        found = estimate_jointly(joint, first.assimilation, first.seed, executor, singles, tell)
-    found = replace(found, cautions=(*found.cautions, *_carried(cautions)))
-    attributes = {
-        **provenance("", None),
-        "seed": first.seed,
-        "shared": " ".join(names),
-        "runs": ", ".join(run_dir.name for run_dir in run_dirs),
-    }
-    stored = load_joint(save_joint(make_folder(out) / FILE, found, alone, attributes))
+        path = gathered.save(joint, first, executor, attributes, make_folder(out) / FILE, tell)
+    stored = load_joint(path)
     return stored, write_joint(stored, out)
+
+
+def join_within(work: Worklist, executor: Executor) -> None:
+    """The joint estimate of a run whose configuration shares parameters: ``joint.nc`` in its directory.
+
+    One that a resumed run finds, made of the same single estimates, is kept.
+
+    Raises :class:`ConfigError`, :class:`TooFewMembersError`, :class:`OutputError`.
+    """
+    config, run = work.config, work.run
+    good = [d for d in work.sets if not work.ended[d.name].failure]
+    if len(good) < 2:
+        run.notice("no joint estimate, for which two data sets need a posterior")
+        return
+    made_of = [run.identity.settings, *(f"{d.name}: {work.ended[d.name].sha256}" for d in good)]
+    fingerprint, path = digest("\n".join(made_of).encode()), run.directory.at(FILE)
+    done = run.restore(JOINED, fingerprint, str, "the joint estimate is made again")
+    if done is not None and path.exists() and file_digest(path) == done:
+        return
+    gathered = Gathered()
+    for d in good:
+        gathered.add(config, load_stored(run.directory.at(d.file)), run.directory.path)
+    joint = JointProblem(tuple(gathered.problems), tuple(gathered.groups))
+    attributes = {**run.attributes, "identity": run.identity.settings, "runs": config.name}
+    gathered.save(joint, config, executor, attributes, path, lambda words: run.log.write(f"joint: {words}"))
+    write_checkpoint(run.directory.at(JOINED), fingerprint, file_digest(path))
 
 
 def _carried(cautions: Sequence[tuple[str, Caution]]) -> Iterator[Caution]:
@@ -121,7 +176,7 @@ def _single(problem: InverseProblem, members: np.ndarray, centre: np.ndarray) ->
         raise OutputError(f"{problem.observations.name}: {error}") from None
 
 
-def _named_apart(problems: Sequence[InverseProblem], run_dirs: Sequence[Path]) -> Iterator[InverseProblem]:
+def _named_apart(problems: Sequence[InverseProblem]) -> Iterator[InverseProblem]:
     """Data sets of one name in several runs get a number."""
     seen: dict[str, int] = {}
     for problem in problems:

@@ -15,13 +15,16 @@ from en4dvar.executor import Executor, choose_executor, one_blas_thread
 from en4dvar.files import write_text
 from en4dvar.inputs.readers import DataFile
 from en4dvar.report import TABLES, write_pages
+from en4dvar.report.joint import PAGE_FILES, write_joint
 from en4dvar.report.result import Result
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
 from en4dvar.runs.interrupt import terminate_as_interrupt
+from en4dvar.runs.joint_run import JOINED, join_within
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.runs.session import directory_mode, session
 from en4dvar.runs.worklist import Worklist, datasets
 from en4dvar.storage.campaign_file import save_campaign
+from en4dvar.storage.joint_file import FILE, load_joint
 from en4dvar.summary import summary_csv
 
 
@@ -72,7 +75,8 @@ def run_campaign(
     """As :func:`run`, for any number of data sets, each estimated by itself.
 
     A data set that cannot be read or loses its ensemble does not end the campaign: it is named with its reason in
-    ``Campaign.failures``, in ``summary.csv`` and in the log.
+    ``Campaign.failures``, in ``summary.csv`` and in the log. Where the configuration shares parameters, all that have a
+    posterior are then estimated together (``joint.nc``).
 
     ``report_workers``: processes that draw the report. They import the main script, which must guard what it does then.
     """
@@ -97,6 +101,8 @@ def run_campaign(
             try:
                 _begin(work)
                 work.work(executor)
+                if config.sharing:
+                    join_within(work, executor)
                 _finish(work, report_workers)
             except BaseException:  # no worker writes once the directory is free for others
                 work.stop.set()
@@ -126,7 +132,11 @@ def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 
 
 
 def _require_one_usable(config: Config, files: Mapping[str, DataFile]) -> None:
-    """Raise what is wrong with the data files where none of them can be used, before anything is written."""
+    """Raise what is wrong with the data files where none of them can be used, or one is in no group, before anything is
+    written.
+    """
+    for name in files:
+        config.sharing.of_dataset(name)  # before anything is computed
     faults: list[Fault] = []
     unusable: list[DataError] = []
     for name, file in files.items():
@@ -152,7 +162,8 @@ def _begin(work: Worklist) -> None:
     """Write what the run is; of one that is resumed, take over what is done. What has failed is tried again."""
     run, sets = work.run, work.sets
     results = (file for d in sets for file in (d.file, d.iteration, d.done))
-    run.begin("posterior.nc", *results, retried=work.failed_earlier())
+    together = (FILE, JOINED) if work.config.sharing else ()
+    run.begin("posterior.nc", *together, *results, retried=work.failed_earlier())
     if len(sets) > 1:
         run.directory.folder("datasets")
     if run.resumed:
@@ -177,6 +188,9 @@ def _finish(work: Worklist, report_workers: int) -> None:
 
 def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int = 1) -> Path:
     directory.claim("report.html", "summary.csv", *TABLES)
+    if (directory.work / FILE).exists():
+        directory.claim(*PAGE_FILES)
+        write_joint(load_joint(directory.work / FILE), directory.work)
     with directory.claiming("figures", "pages"):
         return write_pages(directory.work, datasets, workers)
 

@@ -164,7 +164,8 @@ def _dataset(model: BubbleModel, theta: Mapping[str, Array], t: Array, out: _Out
     data["steps"] = (member, record[:, STEPS].astype(int), {"long_name": "accepted time steps"})
     data["max_wall_mach"] = (member, record[:, MAX_MACH], {"units": "1", "long_name": "largest wall Mach number"})
     if model.system.gas:
-        hottest = medium.T_inf * from_kirchhoff(record[:, MAX_THETA], model.medium_of(theta))
+        own = model.medium_of(theta)
+        hottest = own.T_inf * from_kirchhoff(record[:, MAX_THETA], own)
         data["max_temperature"] = (member, hottest, {"units": "K", "long_name": "highest temperature near the centre"})
     coordinates: dict[str, Any] = {"time": ("time", t, {"units": "s", "long_name": "time"})}
     for p in model.parameters:

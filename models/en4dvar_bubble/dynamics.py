@@ -127,21 +127,25 @@ class Dynamics:
     def parameters(self) -> tuple[Parameter, ...]:
         """Those of the law, then R0, or R_eq and R_max for the laser start, then the optional ones that are named."""
         radii = (R0,) if self.start == "acoustic" else (R_EQ, R_MAX)
-        return (*self.law.parameters, *radii, *(p for p in ALL if p.name in self.named))
+        return (*self.law.parameters, *radii, *(p for p in self.optional_parameters if p.name in self.named))
 
     @property
     def optional_parameters(self) -> tuple[Parameter, ...]:
         """The :mod:`numbers` that the equations contain; a law's own parameter of such a name goes before."""
         heat, transport = self.gas == "heat", self.vapour == "transport"
-        acts = dict.fromkeys((p.name for p in ALL), True)
+        pulse = {number.parameter.name: number.parameter for number in self.driving.numbers}
+        acts = {p.name: not p.name.startswith("pulse_") for p in ALL} | dict.fromkeys(pulse, True)
         acts |= dict.fromkeys(("A", "B"), heat) | dict.fromkeys(("K_m", "c_m"), bool(self.system.wall))
         acts |= dict.fromkeys(("tait_B", "tait_n"), self.radial in ("keller-miksis-enthalpy", "gilmore"))
-        acts |= {"D_v": transport, "L_v": transport and bool(self.system.wall), "p_v": self.vapour == "none"}
+        acts |= dict.fromkeys(("D_v", "D_p", "D_T"), transport)
+        acts |= dict.fromkeys(("L_v", "M_v"), transport and bool(self.system.wall))
+        # a constant vapour pressure would not follow the temperature
+        acts |= {"p_v": self.vapour == "none", "T_inf": (heat or self.vapour != "none") and not self.medium.p_v}
         acts |= {"c": self.radial != "rayleigh-plesset", "kappa": self.gas != "isothermal"}
         acts |= {P_A.name: not self.driving.silent}
         acts |= dict.fromkeys((R_START.name, RDOT_START.name), self.start == "acoustic")
         own = {p.name for p in self.law.parameters}
-        return tuple(p for p in ALL if acts[p.name] and p.name not in own)
+        return tuple(pulse.get(p.name, p) for p in ALL if acts[p.name] and p.name not in own)
 
     def medium_of(self, values: Mapping[str, Array], axes: int = 0) -> Medium:
         """The medium of members with parameters name → (N,): constants that are parameters are (N, 1, …), with as

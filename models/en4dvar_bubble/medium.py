@@ -25,7 +25,7 @@ def _constant(value: float, unit: str, description: str, source: str, **bounds: 
 class Medium:
     """SI values; the defaults are water and air at 25 °C (``water-25C``).
 
-    The gas conducts heat with K(T) = A T + B (Prosperetti 1991), the vapour with A_v T + B_v; vapour diffuses in the
+    Gas and vapour conduct heat with K(T) = A T + B (Prosperetti 1991), whatever their mixture; vapour diffuses in the
     gas with D_v (p_inf/p)^D_p (T/T_inf)^D_T (0 and 0: the constant of the rheometry codes; 1 and 1.75: Fuller et al.
     1966). The liquid of the enthalpy form and Gilmore's equation is Tait's,
     (p + tait_B)/(p_inf + tait_B) = (ρ/rho)^tait_n. ``p_v`` is a constant vapour pressure in Pa that adds to the gas
@@ -51,20 +51,6 @@ class Medium:
         0.55, "W/(m K)", f"Thermal conductivity of the medium {_CONDUCTING}.", f"{_IMR_V2} (Km)", gt=0
     )
     c_m: float = _constant(4181.0, "J/(kg K)", f"Specific heat of the medium {_CONDUCTING}.", f"{_IMR_V2} (Cp)", gt=0)
-    A_v: float = _constant(
-        3.30e-5,
-        "W/(m K^2)",
-        f"Conductivity of the vapour, K(T) = A_v T + B_v {_VAPOUR}.",
-        f"{_IMR_V2} (ATv)",
-        ge=0,
-    )
-    B_v: float = _constant(
-        1.742e-2,
-        "W/(m K)",
-        f"Conductivity of the vapour, K(T) = A_v T + B_v {_VAPOUR}.",
-        f"{_IMR_V2} (BTv)",
-        ge=0,
-    )
     D_v: float = _constant(
         24.2e-6,
         "m^2/s",
@@ -157,8 +143,6 @@ CONSTANT_SETS: Mapping[str, Medium] = MappingProxyType(
             tait_n=7.15,
             K_m=0.55,
             c_m=4181.0,
-            A_v=3.30e-5,
-            B_v=1.742e-2,
             D_v=24.2e-6,
             L_v=2264.76e3,
             M_g=28.966e-3,

@@ -144,7 +144,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         if order is not None:
             micro = np.take_along_axis(np.abs(micro), order, axis=1)
         packed = pack(self, x, t0 * 1e6, micro)
-        kernel, solved = self.solver.prepared(packed.members, packed.memory, packed.viscous)
+        kernel, solved = self.solver.prepared(packed.members, packed.memory, packed.viscous, packed.pulse)
         once = Lock()
 
         def work() -> None:

@@ -1,6 +1,6 @@
 """Numbers of a bubble that are known unless told otherwise; ``parameters:`` may name them, to fix or to estimate them.
 
-Constants of the medium and the gas, the amplitude of the driving, and the state at time zero.
+Constants of the medium and the gas, amplitude, time and shape of the driving, and the state at time zero.
 """
 
 from __future__ import annotations
@@ -13,11 +13,16 @@ from typing import Any
 import numpy as np
 
 from en4dvar.state import Parameter
+from en4dvar_bubble.driving.pulses import PULSES, numbers_of
+from en4dvar_bubble.driving.tabulated import OF_RECORD
 from en4dvar_bubble.medium import CONSTANTS
 
-# Not estimated: the temperature, from which saturation and the start follow, molar masses and exponents of diffusion.
-_KNOWN = ("T_inf", "M_g", "M_v", "D_p", "D_T", "A_v", "B_v")
+_KNOWN = ("M_g",)  # no path depends on it: the mass fraction of vapour is only told
 _NAMES = {"S": "surface_tension"}  # the state has a field S, the stress integral
+_LABELS = {
+    "D_p": "exponent of the pressure in the diffusivity",
+    "D_T": "exponent of the temperature in the diffusivity",
+}
 _SYMBOLS = {"rho": r"\rho", "p_inf": r"p_\infty", "surface_tension": "S", "kappa": r"\kappa"}
 _SYMBOLS |= {"tait_B": r"B_\mathrm{Tait}", "tait_n": r"n_\mathrm{Tait}"}
 
@@ -25,11 +30,12 @@ _SYMBOLS |= {"tait_B": r"B_\mathrm{Tait}", "tait_n": r"n_\mathrm{Tait}"}
 def _of(constant: Field[Any]) -> Parameter:
     about, name = constant.metadata, _NAMES.get(constant.name, constant.name)
     words = about["description"].partition(" (")[0].rstrip(".")
-    label = words if words.startswith("Tait") else words[0].lower() + words[1:]
-    least = about["bounds"].get("gt", about["bounds"].get("ge", 0.0))
+    label = words if words.startswith("Tait") else _LABELS.get(name, words[0].lower() + words[1:])
+    bounds = about["bounds"]
+    least, most = bounds.get("gt", bounds.get("ge", 0.0)), bounds.get("le", np.inf)
     shown = "kPa" if about["unit"] == "Pa" else ""
     symbol = f"${_SYMBOLS.get(name, name)}$"
-    return Parameter(name, about["unit"], "lognormal", (least, np.inf), label, symbol, shown, about["source"])
+    return Parameter(name, about["unit"], "lognormal", (least, most), label, symbol, shown, about["source"])
 
 
 def _of_medium() -> Iterator[tuple[str, Parameter]]:
@@ -53,4 +59,6 @@ GAS_CONTENT = Parameter(
 )
 R_START = Parameter("R_start", "m", "lognormal", (0.0, np.inf), "radius at time zero", "$R(0)$", "um")
 RDOT_START = Parameter("Rdot_start", "m/s", "normal", label="velocity of the wall at time zero", symbol=r"$\dot{R}(0)$")
-ALL = (*OF_MEDIUM.values(), P_A, GAS_CONTENT, R_START, RDOT_START)
+_OF_PULSES = {p.name: p for made in PULSES.values() for _, _, p in numbers_of(made)}
+_OF_PULSES |= {number.parameter.name: number.parameter for number in OF_RECORD}
+ALL = (*OF_MEDIUM.values(), P_A, GAS_CONTENT, R_START, RDOT_START, *_OF_PULSES.values())

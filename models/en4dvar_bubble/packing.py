@@ -40,6 +40,7 @@ class Packed(NamedTuple):
     members: Members
     memory: Array
     viscous: Array
+    pulse: Array
     complete: Callable[[], None]
 
 
@@ -50,6 +51,8 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packe
     rho = model.medium_of(own).rho
     initial, par = _states(model, x, own)
     n_members = len(x)
+    clocks = model.driving.of_members(own)
+    par[:, rows.PULSE_SHIFT], par[:, rows.PULSE_RATE], par[:, rows.PULSE_TABLE] = clocks[:3]
     memory = viscous = _NO_TABLE
     if system.memory:
         memory = _memory(model, values, initial, par, x, model.medium_of(own, 1).rho)
@@ -99,7 +102,7 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packe
         factor=1.0 if own_density else 1 / rho,
         tables=elastic,
     )
-    return Packed(members, memory, viscous, complete)
+    return Packed(members, memory, viscous, clocks.table, complete)
 
 
 def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array, Array]:
@@ -116,20 +119,21 @@ def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array,
     gas = (column["p_b"] - medium.p_v) / medium.rho
     if system.gas:
         m = system.gas
-        theta = x[:, layout["T"]] / medium.T_inf
-        initial[:, :m] = kirchhoff(theta[:, :m], model.medium_of(own, 1))
+        around = model.medium_of(own, 1)
+        theta = x[:, layout["T"]] / around.T_inf
+        initial[:, :m] = kirchhoff(theta[:, :m], around)
         wall = theta[:, m] if system.wall else np.ones(len(x))
         share = ball(m).weights[:m] / theta[:, :m]
         at_wall = ball(m).weights[m] / wall
         outside = np.zeros(len(x))
         if system.vapour:
-            gas_fraction = 1 - mole_fraction(x[:, layout["C"]], medium)
+            gas_fraction = 1 - mole_fraction(x[:, layout["C"]], around)
             initial[:, m : 2 * m] = gas_fraction
             share = share * gas_fraction
             outside = saturated_vapour_pressure(wall * medium.T_inf) / medium.rho * at_wall
         par[:, rows.LOG_GAS] = np.log(gas * (share.sum(axis=1) + at_wall) - outside) + 3 * log_R
         if system.wall:
-            initial[:, system.first_medium : system.wall_row] = x[:, layout["T_m"]] / medium.T_inf - 1
+            initial[:, system.first_medium : system.wall_row] = x[:, layout["T_m"]] / around.T_inf - 1
             initial[:, system.wall_row] = kirchhoff(wall, medium)
     else:
         par[:, rows.LOG_GAS] = np.log(gas) + 3 * model.exponent(medium) * log_R

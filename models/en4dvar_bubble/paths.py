@@ -118,11 +118,11 @@ class Paths(Batch):
         return 1 - self.solution.states[:, :, system.first_vapour : system.first_medium]
 
     def _C(self) -> Array:
-        return mass_fraction(self["chi"], self.model.medium)
+        return mass_fraction(self["chi"], self.medium(2))
 
     def _T_m(self) -> Array:
         system = self.model.system
-        return (1 + self.solution.states[:, :, system.first_medium : system.wall_row]) * self.model.medium.T_inf
+        return (1 + self.solution.states[:, :, system.first_medium : system.wall_row]) * self.medium(2).T_inf
 
     def _Z(self) -> Array:
         return self.solution.states[:, :, self.model.system.first_memory : -2] * self.medium(2).rho
@@ -135,8 +135,8 @@ class Paths(Batch):
             return np.asarray(np.exp(gas - 3 * self.model.exponent(medium) * log_R) * medium.rho + medium.p_v)
         m, weights = system.gas, ball(system.gas).weights
         T = self["T"]
-        share = weights[:m] * medium.T_inf / T[:, :, :m]
-        wall = T[:, :, m] if system.wall else np.full(log_R.shape, medium.T_inf)
+        share = weights[:m] * self.medium(2).T_inf / T[:, :, :m]
+        wall = T[:, :, m] if system.wall else np.broadcast_to(medium.T_inf, log_R.shape)
         at_wall = weights[m] * medium.T_inf / wall
         content = np.exp(gas - 3 * log_R) * medium.rho
         if system.vapour:

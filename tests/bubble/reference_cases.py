@@ -11,6 +11,7 @@ from en4dvar_bubble import WATER_25C, Accuracy, BubbleModel, Medium, get_law, si
 
 ACCURATE = Accuracy(nodes=24, medium_nodes=48, rtol=1e-7)
 LASER = {"G": 2770.0, "mu": 0.186, "R_max": 230e-6, "R_eq": 230e-6 / 7}
+A_V, B_V = 3.30e-5, 1.742e-2  # conductivity of the vapour in the suite: W/(m K²), W/(m K)
 NEO_HOOKEAN = "neo-hookean-kelvin-voigt"
 RADIAL = {1: "rayleigh-plesset", 2: "keller-miksis", 3: "keller-miksis-enthalpy", 4: "gilmore"}
 LAW = {0: "newtonian", 1: NEO_HOOKEAN, 2: "quadratic-kelvin-voigt", 5: "upper-convected-maxwell"}
@@ -29,12 +30,12 @@ def initial_mass_fraction(vapour, gas):
     return 1 / (1 + M_G / M_V * gas / vapour)
 
 
-def averaged(medium, fraction):
+def averaged(medium, fraction, A_v=A_V, B_v=B_V):
     """The conductivity that the public codes use: of gas and vapour, averaged at a mass fraction of vapour."""
     return replace(
         medium,
-        A=fraction * medium.A_v + (1 - fraction) * medium.A,
-        B=fraction * medium.B_v + (1 - fraction) * medium.B,
+        A=fraction * A_v + (1 - fraction) * medium.A,
+        B=fraction * B_v + (1 - fraction) * medium.B,
     )
 
 
@@ -63,8 +64,8 @@ def laser_as_suite_case():
         "radial": 2, "stress": 1, "bubtherm": 1, "medtherm": 1, "masstrans": 1, "vapor": 1,
         "R0": LASER["R_max"], "Req": LASER["R_eq"], "mu": LASER["mu"], "G": LASER["G"], "alphax": 0.0,
         "lambda1": 1e-7, "lambda2": 0.0, "P0_gas": gas, "P8": m.p_inf, "rho8": m.rho, "C8": m.c, "GAM": m.tait_B,
-        "nstate": m.tait_n, "surft": m.S, "kappa": m.kappa, "T8": m.T_inf, "ATg": m.A, "BTg": m.B, "ATv": m.A_v,
-        "BTv": m.B_v, "Km": m.K_m, "Cp": m.c_m, "D": m.D_v, "L": m.L_v,
+        "nstate": m.tait_n, "surft": m.S, "kappa": m.kappa, "T8": m.T_inf, "ATg": m.A, "BTg": m.B, "ATv": A_V,
+        "BTv": B_V, "Km": m.K_m, "Cp": m.c_m, "D": m.D_v, "L": m.L_v,
     }  # fmt: skip
 
 
@@ -83,12 +84,16 @@ def suite(c, times, accuracy=ACCURATE):
     pv = c["vapor"] * p_sat(c["T8"])
     medium = Medium(
         rho=c["rho8"], c=c["C8"], p_inf=c["P8"], S=c["surft"], T_inf=c["T8"], kappa=c["kappa"], A=c["ATg"], B=c["BTg"],
-        A_v=c["ATv"], B_v=c["BTv"], K_m=c["Km"], c_m=c["Cp"], tait_B=c["GAM"], tait_n=c["nstate"],
+        K_m=c["Km"], c_m=c["Cp"], tait_B=c["GAM"], tait_n=c["nstate"],
     )  # fmt: skip
     if c["radial"] == 4:
         medium = replace(medium, c=float(np.sqrt(c["nstate"] * (c["P8"] + c["GAM"]) / c["rho8"])))
     heat = bool(c["bubtherm"])
-    medium = averaged(medium, initial_mass_fraction(pv, c["P0_gas"])) if heat else replace(medium, p_v=pv)
+    medium = (
+        averaged(medium, initial_mass_fraction(pv, c["P0_gas"]), c["ATv"], c["BTv"])
+        if heat
+        else replace(medium, p_v=pv)
+    )
     model = BubbleModel(
         law=get_law(LAW[c["stress"]]),
         start="laser",

@@ -49,7 +49,7 @@ def test_constants_reach_the_equations_as_if_they_were_set(kind):
             np.testing.assert_allclose(*scaled, rtol=1e-15, err_msg=parameter.name)
 
 
-@pytest.mark.parametrize("name", ["rho", "surface_tension", "kappa", "p_v"])
+@pytest.mark.parametrize("name", ["rho", "surface_tension", "kappa", "p_v", "T_inf"])
 def test_paths_are_those_of_the_setting(name):
     constant = next(c for c, p in OF_MEDIUM.items() if p.name == name)
     value = 1.07 * getattr(WATER_25C, constant) or 2000.0

@@ -10,6 +10,7 @@ from toys import Decay, Fragile, Linear, Vectorised, make_observations
 
 from en4dvar.dependence import Dependence
 from en4dvar.errors import ConfigError
+from en4dvar.forward import Trajectory
 from en4dvar.joint import estimate
 from en4dvar.joint.arrow import Arrow
 from en4dvar.joint.problem import JointProblem, sharing
@@ -124,6 +125,39 @@ def test_importance_gives_the_same_posterior_and_evidence():
     members = np.column_stack([found.shared, *(found.control(e)[:-1, 2] for e in range(5))])
     np.testing.assert_allclose((members.mean(axis=0) - mean) / std, 0, atol=0.35)
     np.testing.assert_allclose(members.std(axis=0) / std, 1, atol=0.3)
+
+
+class Bent(Vectorised):
+    """y = c + 0.8 (exp(a) − 1): given a shared a, a reading fixes c sharply, and not in a straight line."""
+
+    def trajectories(self, x, times):
+        own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+        y = np.broadcast_to((x[:, 3] + 0.8 * np.expm1(x[:, 2]))[:, None], own.shape)
+        theta = np.broadcast_to(x[:, None, 2:], (*own.shape, 2))
+        states = np.concatenate([y[..., None], np.zeros((*own.shape, 1)), theta], axis=-1)
+        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+
+
+def test_own_quantities_that_follow_what_is_shared_on_a_bent_line():
+    """Against the integral: p(a) ∝ N(a; 0, 1) Π_e N(y_e − 0.8 (exp(a) − 1); 0, 1)."""
+    model, y = Bent(names=("a", "c"), compiled=True), np.array([0.3, -0.4, 0.1])
+    prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
+    problems = [
+        InverseProblem(
+            model, model.observables[0], make_observations([1.0, 2.0, 3.0], [value] * 3, std=0.01, name=f"{e}"), prior
+        )
+        for e, value in enumerate(y)
+    ]
+    settings = replace(SETTINGS, refine="auto", members=500)
+    found = estimate.estimate_jointly(sharing(problems, ("a",)), settings, seed=3)
+    a = np.linspace(-6, 4, 4001)
+    density = np.exp(-0.5 * (a**2 + np.sum((y[:, None] - 0.8 * np.expm1(a)) ** 2, axis=0)))
+    weights = density / density.sum()
+    mean = weights @ a
+    std = np.sqrt(weights @ (a - mean) ** 2)
+    assert found.members.effective > 50
+    assert abs(found.shared.mean() - mean) < 0.2 * std
+    assert 0.85 < found.shared.std() / std < 1.15
 
 
 def test_a_member_of_any_experiment_may_fail():

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from en4dvar.state import Array
+from en4dvar.state import Array, Parameter
 from en4dvar_bubble.tables import Grid
 
 Reading = Literal["instantaneous", "retarded", "as-printed"]
+Role = Literal["delay", "rate", "stretch", "shape"]
 
 # The quintic of a cell through its values at six Chebyshev–Lobatto points, both ends among them.
 _POINTS = 0.5 - 0.5 * np.cos(np.pi * np.arange(6) / 5)
@@ -21,12 +22,36 @@ _LARGEST_JUMP = 1e-6
 
 
 @dataclass(frozen=True)
+class PulseNumber:
+    """A number of a pulse that can be a parameter, the ``key`` that it has there, and the ``value`` in this pulse.
+
+    What it does: the pulse is read at t_ref = δ + (t − δ_i) r_i; it is the delay δ_i, in proportion to the rate r_i, a
+    stretch in proportion to 1/r_i, or changes the shape itself.
+    """
+
+    parameter: Parameter
+    key: str
+    value: float
+    role: Role
+
+
+class Clocks(NamedTuple):
+    """How N members read the driving: at t_ref = (t − shift) · rate, in µs, from so many numbers on in the table."""
+
+    shift: float | Array
+    rate: float | Array
+    offset: float | Array
+    table: Array
+
+
+@dataclass(frozen=True)
 class Driving:
     """p_f = amplitude · shape(t) on [begin, end] (seconds), zero outside.
 
     ``shape`` takes times in seconds (array) and is tabulated once on ``cells`` equal cells. It must be continuous,
     zero at both ends, and smooth inside every cell; where it is only continuous, at the edge of a cell, or would be
-    stepped over, name the instant in ``stops`` (seconds): no time step straddles one.
+    stepped over, name the instant in ``stops`` (seconds): no time step straddles one. ``numbers`` can be parameters;
+    those that change the shape are keys of ``remade``, which gives the driving with them.
 
     Raises
     ------
@@ -40,6 +65,8 @@ class Driving:
     shape: Callable[[Array], Array]
     cells: int = 512
     stops: tuple[float, ...] = ()
+    numbers: tuple[PulseNumber, ...] = ()
+    remade: Callable[..., Driving] | None = None
 
     def __post_init__(self) -> None:
         if not self.end > self.begin:
@@ -68,6 +95,35 @@ class Driving:
         table = np.zeros((self.cells, 8))
         table[:, :6] = samples @ _TO_COEFFICIENTS.T
         return table
+
+    def of_members(self, values: Mapping[str, Array]) -> Clocks:
+        """How members read the driving; ``values``: name → (N,) of parameters, any of which may be :attr:`numbers`."""
+        rate: float | Array = 1.0
+        zero = next((number.value for number in self.numbers if number.role == "delay"), 0.0)
+        delay: float | Array = zero
+        shapes: dict[str, Array] = {}
+        for number in self.numbers:
+            if (value := values.get(number.parameter.name)) is None:
+                continue
+            if number.role == "shape":
+                shapes[number.key] = value
+            elif number.role == "delay":
+                delay = value
+            else:
+                rate = rate * (value / number.value if number.role == "rate" else number.value / value)
+        clocks = Clocks(1e6 * (delay - zero / rate), rate, 0.0, self.table)
+        return self._of_shapes(clocks, shapes) if shapes else clocks
+
+    def _of_shapes(self, clocks: Clocks, shapes: Mapping[str, Array]) -> Clocks:
+        """The same where members have shapes of their own: each table is stretched to the span of this one."""
+        assert self.remade is not None
+        different, which = np.unique(np.column_stack(list(shapes.values())), axis=0, return_inverse=True)
+        each = [self.remade(**dict(zip(shapes, of, strict=True))) for of in different.tolist()]
+        table = np.concatenate([replace(one, cells=self.cells).table for one in each])
+        begin = np.array([1e6 * one.begin for one in each])[which]
+        stretch = ((self.end - self.begin) / np.array([one.end - one.begin for one in each]))[which]
+        shift = clocks.shift + (begin - 1e6 * self.begin / stretch) / clocks.rate
+        return Clocks(shift, clocks.rate * stretch, np.asarray(8.0 * self.cells * which), table)
 
     @cached_property
     def span(self) -> Array:

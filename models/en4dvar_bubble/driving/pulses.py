@@ -1,32 +1,47 @@
 """Driving pressures in closed form, a function each.
 
 :func:`pulse` makes a function a kind of ``driving:`` in YAML: its arguments are the keys, declared here with unit,
-bounds and description, and the first line of its docstring says what it is.
+bounds and description, and the first line of its docstring says what it is. A key that is declared as :class:`Number`
+can be a parameter of the model.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Annotated, Literal, TypeVar
+from functools import partial, wraps
+from inspect import signature
+from typing import Annotated, Any, Literal, get_type_hints
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from en4dvar.state import Array
+from en4dvar.state import Array, Parameter, TransformName
 from en4dvar.units import Quantity
-from en4dvar_bubble.driving.base import Driving
+from en4dvar_bubble.driving.base import Driving, PulseNumber, Role
+
+
+@dataclass(frozen=True)
+class Number:
+    """Of a key: it can be a parameter, ``pulse_`` and its name, and what that does to the pulse."""
+
+    role: Role
+    symbol: str
+    display_unit: str = ""
+
 
 Envelope = Literal["none", "hann", "tukey"]
 Pressure = Annotated[float, Quantity("Pa")]
-Frequency = Annotated[float, Quantity("Hz"), Gt(0)]
+Frequency = Annotated[float, Quantity("Hz"), Gt(0), Number("rate", "$f$", "MHz")]
 Time = Annotated[float, Quantity("s")]
-Delay = Annotated[Time, Ge(0)]
+Instant = Annotated[Time, Number("delay", r"$\delta$", "us")]
+Delay = Annotated[Instant, Ge(0)]
 Width = Annotated[Time, Gt(0)]
-Pulse = TypeVar("Pulse", bound=Callable[..., Driving])
+Pulse = Callable[..., Driving]
 
-PULSES: dict[str, Callable[..., Driving]] = {}
+PULSES: dict[str, Pulse] = {}
 
 _CELLS_PER_CYCLE = 128
 _WIDTHS = 7.0  # a Gaussian is cut where it has fallen to 2e-11
@@ -36,10 +51,49 @@ def pulse(kind: str) -> Callable[[Pulse], Pulse]:
     """Register a function under the name that ``driving.kind`` has in YAML."""
 
     def register(function: Pulse) -> Pulse:
-        PULSES[kind] = function
-        return function
+        @wraps(function)
+        def made(*positional: Any, **keys: Any) -> Driving:
+            bound = signature(function).bind(*positional, **keys)
+            bound.apply_defaults()
+            numbers = tuple(_changeable(function, bound.arguments))
+            return replace(
+                function(**bound.arguments), numbers=numbers, remade=partial(_remade, kind, **bound.arguments)
+            )
+
+        PULSES[kind] = made
+        return made
 
     return register
+
+
+def _remade(kind: str, **keys: Any) -> Driving:
+    """A pulse with other keys, without its numbers, which take longer to find."""
+    return PULSES[kind].__wrapped__(**keys)  # type: ignore[attr-defined]
+
+
+def numbers_of(function: Pulse) -> Iterator[tuple[str, Role, Parameter]]:
+    """Key, role and parameter of the numbers that the arguments of a pulse declare."""
+    for key, hint in get_type_hints(function, include_extras=True).items():
+        about = getattr(hint, "__metadata__", ())
+        for number in (one for one in about if isinstance(one, Number)):
+            unit = next((one.unit for one in about if isinstance(one, Quantity)), "1")
+            limits: dict[type, Any] = {type(one): one for one in about}
+            least = limits[Gt].gt if Gt in limits else limits[Ge].ge if Ge in limits else -np.inf
+            most = limits[Le].le if Le in limits else np.inf
+            words, shown = f"{key} of the pulse", number.display_unit
+            usual: TransformName = "normal" if least == -np.inf or number.role == "delay" else "lognormal"
+            parameter = Parameter(f"pulse_{key}", unit, usual, (least, most), words, number.symbol, shown)
+            yield key, number.role, parameter
+
+
+def _changeable(function: Pulse, arguments: Mapping[str, Any]) -> Iterator[PulseNumber]:
+    """Those of a pulse; a shape that cannot change, as that of a burst without envelope, is none of them."""
+    for key, role, parameter in numbers_of(function):
+        value = arguments[key]
+        with suppress(ValueError):
+            if role == "shape":
+                function(**{**arguments, key: value + 0.01})
+            yield PulseNumber(parameter, key, value, role)
 
 
 @pulse("none")
@@ -65,8 +119,8 @@ class _HalfCycle:
 def histotripsy(
     amplitude: Annotated[Pressure, "p_A; negative for rarefaction."] = -24e6,
     frequency: Annotated[Frequency, "ω/2π."] = 1e6,
-    exponent: Annotated[float, Ge(1), "n."] = 3.7,
-    delay: Annotated[Time, "δ: the instant of the peak."] = 5e-6,
+    exponent: Annotated[float, Ge(1), Number("shape", "$n$"), "n."] = 3.7,
+    delay: Annotated[Instant, "δ: the instant of the peak."] = 5e-6,
 ) -> Driving:
     """The rarefactional half cycle of a histotripsy pulse, p_A [(1 + cos ω(t−δ))/2]^n for |t−δ| ≤ π/ω.
 
@@ -96,9 +150,9 @@ class _Burst:
 def sine_burst(
     amplitude: Annotated[Pressure, "Pressure amplitude."],
     frequency: Annotated[Frequency, "Frequency."],
-    cycles: Annotated[float, Gt(0), Le(1000), "Length of the burst in periods."],
+    cycles: Annotated[float, Gt(0), Le(1000), Number("shape", "$N$"), "Length of the burst in periods."],
     delay: Annotated[Delay, "When the burst begins."] = 0.0,
-    phase: Annotated[float, "Phase at its beginning, in radians."] = 0.0,
+    phase: Annotated[float, Number("shape", r"$\varphi$"), "Phase at its beginning, in radians."] = 0.0,
     envelope: Annotated[
         Envelope, "Window that the burst is multiplied by; without one the burst must begin and end at zero."
     ] = "none",
@@ -137,7 +191,7 @@ class _Gaussian:
 def gaussian(
     amplitude: Annotated[Pressure, "Peak pressure."],
     delay: Annotated[Delay, "The instant of the peak."],
-    width: Annotated[Width, "Standard deviation of the pulse in time."],
+    width: Annotated[Width, Number("stretch", r"$\sigma$", "us"), "Standard deviation of the pulse in time."],
 ) -> Driving:
     """A Gaussian pulse p_A exp(−(t−δ)²/(2σ²)) with σ = ``width``.
 
@@ -162,7 +216,7 @@ class _Step:
 @pulse("step")
 def step(
     amplitude: Annotated[Pressure, "Pressure after the step."],
-    duration: Annotated[Width, "How long the pressure lasts."],
+    duration: Annotated[Width, Number("stretch", "$T$", "us"), "How long the pressure lasts."],
     delay: Annotated[Delay, "When it begins."] = 0.0,
     rise: Annotated[Width, "Rise time."] = 20e-9,
 ) -> Driving:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from en4dvar.inputs.readers import Column, Format, Layout, read_series
-from en4dvar.state import Array
-from en4dvar_bubble.driving.base import Driving
+from en4dvar.state import Array, Parameter
+from en4dvar_bubble.driving.base import Driving, PulseNumber
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
 _MOST_CELLS = 200_000
+_DELAY = Parameter("pulse_delay", "s", label="delay of the pulse", symbol=r"$\delta$", display_unit="us")
+_STRETCH = Parameter(
+    "pulse_stretch", "1", "lognormal", (0.0, np.inf), "time scale of the pulse over that of its record", "$s$"
+)
+OF_RECORD = (PulseNumber(_DELAY, "delay", 0.0, "delay"), PulseNumber(_STRETCH, "", 1.0, "stretch"))
+"""What can be a parameter of a record: its times are stretched about their zero, and then delayed."""
 _PROMINENCE = 0.02  # of the largest |p|: turning points that no time step may straddle
 
 
@@ -80,7 +86,8 @@ def tabulated(times: Array, pressure: Array, delay: float = 0.0, scale: float = 
     peaks = np.concatenate([find_peaks(sign * p, prominence=_PROMINENCE * largest)[0] for sign in (1, -1)])
     shape = _Record(CubicSpline(t, p / largest), float(t[0]), float(t[-1]), float(lead))
     stops = (float(t[0]), *(float(t[i]) for i in peaks), float(t[-1]))
-    return Driving(largest, float(t[0] - lead), float(t[-1] + lead), shape, inner + 2, stops)
+    numbers = tuple(replace(number, value=delay) if number.role == "delay" else number for number in OF_RECORD)
+    return Driving(largest, float(t[0] - lead), float(t[-1] + lead), shape, inner + 2, stops, numbers)
 
 
 def from_file(

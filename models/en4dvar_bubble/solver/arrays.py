@@ -61,7 +61,7 @@ class Equations(NamedTuple):
     memory: Array  # tables of the memory variables
     viscous: Array  # tables of ν against ln |V|
     viscous_span: Array
-    driving: Array  # table of the far-field pressure over its amplitude
+    driving: Array  # table of the far-field pressure over its amplitude; of members of their own shape, one each
     driving_span: Array
     reading: int  # when the driving is read, see :mod:`rows`
 
@@ -69,10 +69,10 @@ class Equations(NamedTuple):
 class Control(NamedTuple):
     """How steps are chosen and when a member has failed."""
 
-    breaks: Array  # increasing instants (µs) that no step straddles
+    breaks: Array  # increasing instants (µs, of the driving's table) that no step straddles
     tolerances: Array  # (2, n) absolute and relative
     first_step: float
-    longest_driven: float  # longest step while the driving acts, µs
+    longest_driven: float  # longest step while the driving acts, µs of its table
     step_limit: float
     mach_limit: float
     seconds: float  # of wall clock per member

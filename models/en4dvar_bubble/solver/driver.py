@@ -219,14 +219,12 @@ class Solver:
             return (0,) * system.gas, (0,) * system.size
         return np.zeros(system.gas), np.zeros(system.size)
 
-    def equations(self, memory: Array, viscous: Array) -> Equations:
-        """What the compiled equations read that is the same for all members; tables of the laws (…, cells, 8)."""
+    def equations(self, memory: Array, viscous: Array, pulse: Array) -> Equations:
+        """What the compiled equations read beside the members' parameters; tables of laws and pulses (…, cells, 8)."""
         system, driving = self.system, self.driving
         gas, medium = _gas_operators(system.gas), _medium_operators(system.medium)
         laws = (_ELASTIC_SPAN, memory, viscous, _VISCOUS_SPAN)
-        return Equations(
-            *self.lengths, system.dims, gas, medium, *laws, driving.table, driving.span, READINGS[self.reading]
-        )
+        return Equations(*self.lengths, system.dims, gas, medium, *laws, pulse, driving.span, READINGS[self.reading])
 
     @cached_property
     def control(self) -> Control:
@@ -244,7 +242,9 @@ class Solver:
             valid_mach=float(self.valid_mach),
         )
 
-    def prepared(self, members: Members, memory: Array, viscous: Array) -> tuple[Callable[[], object], Solution]:
+    def prepared(
+        self, members: Members, memory: Array, viscous: Array, pulse: Array
+    ) -> tuple[Callable[[], object], Solution]:
         """A call that integrates the members without the interpreter, and the solution that it fills.
 
         Threads that make the call at once share the members; each returns when no member is left to begin, and all are
@@ -256,5 +256,5 @@ class Solver:
             np.zeros(n_members, dtype=np.int64),
             np.zeros((n_members, integrate.RECORD)),
         )
-        call = partial(integrate.integrate, members, self.equations(memory, viscous), self.control, output)
+        call = partial(integrate.integrate, members, self.equations(memory, viscous, pulse), self.control, output)
         return call, Solution(*output)

@@ -27,7 +27,6 @@ from en4dvar_bubble.solver.lanes import exp, load, maximum, splat, sqrt, store
 from en4dvar_bubble.solver.lookup import driving, lookup
 from en4dvar_bubble.solver.rows import (
     AMBIENT,
-    AMPLITUDE,
     AS_PRINTED,
     CONDUCTION,
     INSTANTANEOUS,
@@ -108,7 +107,7 @@ def rhs(y, t, eq, loaded, work, out):
     when = load(t, 0)
     if reading != INSTANTANEOUS:
         when = when + Ric
-    f, g, _ = driving(when, eq.driving, eq.driving_span, load(par, AMPLITUDE))
+    f, g, _ = driving(when, eq, par)
     J, Jx, _ = lookup(loaded.elastic, load(par, TABLE), eq.elastic_span, u - load(par, LOG_R0))
     surface = load(par, SURFACE) / R
     nu4 = load(par, VISCOSITY) * 4.0
@@ -151,7 +150,7 @@ def jacobian(y, t, eq, loaded, w):
     when = load(t, 0)
     if reading != INSTANTANEOUS:
         when = when + Ric
-    f, g, h = driving(when, eq.driving, eq.driving_span, load(par, AMPLITUDE))
+    f, g, h = driving(when, eq, par)
     J, Jx, Jxx = lookup(loaded.elastic, load(par, TABLE), eq.elastic_span, u - load(par, LOG_R0))
     surface = load(par, SURFACE) / R
     nu4 = load(par, VISCOSITY) * 4.0

@@ -159,7 +159,7 @@ def general_rhs(y, t, eq, loaded, out):
     when = load(t, 0)
     if reading != INSTANTANEOUS:
         when = when + R * ic
-    f, g, _ = driving(when, eq.driving, eq.driving_span, load(par, rows.AMPLITUDE))
+    f, g, _ = driving(when, eq, par)
     surface = load(par, rows.SURFACE) / R
     wall_pressure = p + load(par, rows.VAPOUR) - surface + J - dashpot
     wall_slope = p * rate + surface * V + J_rate

@@ -14,7 +14,7 @@ from en4dvar.compiled import kernel
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.arrays import Lanes, Loaded, Workspace
 from en4dvar_bubble.solver.lanes import WIDTH, peek, take
-from en4dvar_bubble.solver.rows import AMPLITUDE, TABLE
+from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, TABLE
 from en4dvar_bubble.solver.step import LEAST_ERROR, attempt, interpolant
 from en4dvar_bubble.tables import fill
 
@@ -93,23 +93,31 @@ def _begin(i, lane, clock, members, lanes, control, out):
     lanes.t[0, lane], lanes.h[0, lane] = start, control.first_step
     lanes.last_h[lane], lanes.rejected[lane] = -1.0, False
     b = 0
-    while b < len(control.breaks) and control.breaks[b] <= start:
+    while b < len(control.breaks) and _break(b, lane, lanes, control) <= start:
         b += 1
     lanes.next_break[lane] = b
     return 1
 
 
 @nb.njit(inline="always")
+def _break(b, lane, lanes, control):
+    """The instant of a break on the clock of the lane's member."""
+    return control.breaks[b] / lanes.loaded.par[PULSE_RATE, lane] + lanes.loaded.par[PULSE_SHIFT, lane]
+
+
+@nb.njit(inline="always")
 def _cut_step(lane, lanes, eq, control):
     """Shorten a lane's step while the driving acts, and to end at a break."""
-    h, now, span, breaks = lanes.h, lanes.t[0, lane], eq.driving_span, control.breaks
-    driven = lanes.loaded.par[AMPLITUDE, lane] != 0.0 and span[0] <= now < span[1]
-    if driven and h[0, lane] > control.longest_driven:
-        h[0, lane] = control.longest_driven
+    h, now, span, par = lanes.h, lanes.t[0, lane], eq.driving_span, lanes.loaded.par
+    rate, b = par[PULSE_RATE, lane], lanes.next_break[lane]
+    driven = par[AMPLITUDE, lane] != 0.0 and span[0] <= (now - par[PULSE_SHIFT, lane]) * rate < span[1]
+    if driven and h[0, lane] > control.longest_driven / rate:
+        h[0, lane] = control.longest_driven / rate
     lanes.proposed[lane] = h[0, lane]
-    b = lanes.next_break[lane]
-    if b < len(breaks) and now + h[0, lane] * 1.0001 >= breaks[b]:
-        h[0, lane] = breaks[b] - now
+    if b < len(control.breaks):
+        end = _break(b, lane, lanes, control)
+        if now + h[0, lane] * 1.0001 >= end:
+            h[0, lane] = end - now
 
 
 @nb.njit(inline="always")
@@ -155,9 +163,9 @@ def _accept(lane, members, lanes, eq, control, w, have_dense, out):
     """Take a lane's step: outputs, state, record, next step; whether the interpolant has been made."""
     i, now, step = lanes.member[lane], lanes.t[0, lane], lanes.h[0, lane]
     b = lanes.next_break[lane]
-    cut = b < len(control.breaks) and now + step >= control.breaks[b]
-    end = control.breaks[b] if cut else now + step
-    if cut:
+    cut, end = False, now + step
+    if b < len(control.breaks) and end >= _break(b, lane, lanes, control):
+        cut, end = True, _break(b, lane, lanes, control)
         lanes.next_break[lane] += 1
     have_dense = _observe(lane, end, members, lanes, w, have_dense, out)
     for j in range(len(lanes.y)):

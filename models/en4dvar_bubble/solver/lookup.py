@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numba as nb
 
-from en4dvar_bubble.solver.lanes import any_lane, floor, gather, maximum, minimum, select, splat
+from en4dvar_bubble.solver.lanes import any_lane, floor, gather, load, maximum, minimum, select, splat
+from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, PULSE_TABLE
 
 
 @nb.njit(forceinline=True)
@@ -24,14 +25,15 @@ def lookup(table, offset, span, x):
 
 
 @nb.njit(forceinline=True)
-def driving(t, table, span, amplitude):
+def driving(t, eq, par):
     """p_f, dp_f/dt, d²p_f/dt² at the lanes' times; zero outside the table's span."""
-    zero = splat(0.0)
-    before = t < span[0]
-    after = t > span[1]
+    zero, span, rate = splat(0.0), eq.driving_span, load(par, PULSE_RATE)
+    read = (t - load(par, PULSE_SHIFT)) * rate
+    before = read < span[0]
+    after = read > span[1]
     inside = select(before, 0.0, select(after, 0.0, 1.0))
     if not any_lane(inside > 0.5):
         return zero, zero, zero
-    f, g, h = lookup(table, zero, span, t)
-    scale = amplitude * inside
-    return f * scale, g * scale, h * scale
+    f, g, h = lookup(eq.driving, load(par, PULSE_TABLE), span, read)
+    scale = load(par, AMPLITUDE) * inside
+    return f * scale, g * rate * scale, h * rate * rate * scale

@@ -27,7 +27,11 @@ HEATING = 20  # 12/(c_p T_∞) of the medium, of ν V²
 VISCOUS_TABLE = 21  # offset of the member's table of ν against ln(|V| in 1/s)
 DIFFUSION_P = 22  # exponents of D ∝ (p_∞/p)^… θ^…
 DIFFUSION_T = 23
-PARAMETERS = 24
+# Of the driving: t_ref = (t − PULSE_SHIFT) · PULSE_RATE is the time at which its table is read.
+PULSE_SHIFT = 24
+PULSE_RATE = 25
+PULSE_TABLE = 26  # offset of the member's table
+PARAMETERS = 27
 # Three further rows for each memory variable: relaxation time (µs), convection, offset of its two tables.
 MEMORY = PARAMETERS
 PER_MEMORY = 3
