@@ -17,6 +17,7 @@ from en4dvar.commands.common import Failed, give_up_output
 from en4dvar.commands.joint import joint
 from en4dvar.commands.listings import models, schema
 from en4dvar.commands.plugin_commands import PluginCommand, plugin_commands
+from en4dvar.commands.population import population
 from en4dvar.commands.results import compare, export, report, rerun
 from en4dvar.commands.run import run
 from en4dvar.commands.simulate import simulate
@@ -95,7 +96,7 @@ def main() -> None:
     """
 
 
-for command in (compare, export, joint, models, report, rerun, run, schema, simulate, validate):
+for command in (compare, export, joint, models, population, report, rerun, run, schema, simulate, validate):
     main.add_command(command)
 
 if __name__ == "__main__":
