@@ -27,11 +27,12 @@ MOST_NAMES = 4
 class Finished:
     """One data set: its problem, physical members (N, n) of its posterior that are alive, its centre (n,), warnings.
 
-    Data sets of one name in several runs get a number.
+    ``white``: the members in white coordinates of the prior. Data sets of one name in several runs get a number.
     """
 
     problem: InverseProblem
     members: Array
+    white: Array
     centre: Array
     cautions: tuple[Caution, ...]
 
@@ -59,9 +60,7 @@ def finished(run_dirs: Sequence[Path], trust: bool, ask: Ask | None) -> tuple[Co
             problem = problem_of(config, result.observations())
             if problem.varying:
                 raise ConfigError(f"{run_dir}: parameters that vary in time cannot be estimated with other data sets")
-            centre = result.sample_stats["centre"].sel(parameter=list(problem.prior.names)).values
-            members = _members(result, problem)
-            found.append(Finished(problem, members, np.asarray(centre, dtype=float), result.cautions))
+            found.append(_posterior(result, problem))
     if first is None:
         raise ConfigError("no run is given")
     return first, list(_named_apart(found))
@@ -78,14 +77,6 @@ def carried(sets: Sequence[Finished]) -> Iterator[Caution]:
             yield caution(code, f"of single data sets, {told}", "serious")
 
 
-def standard(one: Finished, physical: Array) -> Array:
-    """Physical control vectors (…, n) in units of the prior. Raises :class:`OutputError`: they are outside of it."""
-    try:
-        return one.problem.prior.white(one.problem.prior.from_physical(physical))
-    except ValueError as error:
-        raise OutputError(f"{one.name}: {error}") from None
-
-
 def _recorded(run_dir: Path, trust: bool, ask: Ask | None) -> tuple[Config, list[StoredResult]]:
     """The configuration of a run and its results."""
     results = [load_stored(file) for file in result_files(run_dir)]
@@ -97,10 +88,17 @@ def _recorded(run_dir: Path, trust: bool, ask: Ask | None) -> tuple[Config, list
         return resolve(document, run_dir.absolute()), results
 
 
-def _members(result: StoredResult, problem: InverseProblem) -> Array:
-    columns = [np.asarray(result.posterior[name].values, dtype=float).ravel() for name in problem.prior.names]
+def _posterior(result: StoredResult, problem: InverseProblem) -> Finished:
+    names, prior = problem.prior.names, problem.prior
+    columns = [np.asarray(result.posterior[name].values, dtype=float).ravel() for name in names]
     members = np.column_stack(columns)
-    return np.asarray(members[result.alive & np.isfinite(members).all(axis=1)])
+    members = members[result.alive & np.isfinite(members).all(axis=1)]
+    centre = np.asarray(result.sample_stats["centre"].sel(parameter=list(names)).values, dtype=float)
+    try:
+        white = prior.white(prior.from_physical(np.vstack([members, centre])))
+    except ValueError as error:
+        raise OutputError(f"{result.name}: {error}") from None
+    return Finished(problem, members, white[:-1], centre, result.cautions)
 
 
 def _named_apart(sets: Sequence[Finished]) -> Iterator[Finished]:

@@ -11,7 +11,7 @@ from en4dvar.files import make_folder
 from en4dvar.joint.estimate import Single, estimate_jointly
 from en4dvar.joint.problem import sharing
 from en4dvar.report.joint import write_joint
-from en4dvar.runs.finished import carried, finished, standard
+from en4dvar.runs.finished import carried, finished
 from en4dvar.runs.trust import Ask
 from en4dvar.storage.joint_file import FILE, Alone, StoredJoint, load_joint, save_joint
 from en4dvar.storage.provenance import provenance
@@ -39,7 +39,7 @@ def join(
     """
     first, sets = finished(run_dirs, trust, ask)
     alone = [Alone(one.problem.prior.names, one.members) for one in sets]
-    singles = [Single.of_members(standard(one, one.members), standard(one, one.centre)) for one in sets]
+    singles = [Single.of_physical(one.problem.prior, one.members, one.centre) for one in sets]
     joint = sharing([one.problem for one in sets], names)
     with choose_executor(first.model, None, workers) as executor:
         found = estimate_jointly(joint, first.assimilation, first.seed, executor, singles, tell)

@@ -12,7 +12,7 @@ from en4dvar.files import make_folder
 from en4dvar.population import Effort, HyperPrior
 from en4dvar.population.campaign import CampaignPopulation, population_of
 from en4dvar.report.population import write_population
-from en4dvar.runs.finished import carried, finished, standard
+from en4dvar.runs.finished import carried, finished
 from en4dvar.runs.trust import Ask
 from en4dvar.storage.population_file import FILE, StoredPopulation, load_population, save_population
 from en4dvar.storage.provenance import provenance
@@ -45,7 +45,7 @@ def population(
     tell(f"population of {', '.join(names)} behind {len(sets)} data sets")
     with choose_executor(first.model, None, workers) as executor:
         found = population_of(
-            [one.problem for one in sets], [standard(one, one.members) for one in sets], names, first.seed,
+            [one.problem for one in sets], [one.white for one in sets], names, first.seed,
             executor=executor, hyper=hyper, effort=effort, workers=workers or 1,
         )  # fmt: skip
     tell(f"{found.estimate.forward_runs} forward runs, {found.estimate.size:.0f} effective draws")
