@@ -159,6 +159,7 @@ class Observable:
     """A quantity that can be measured: its name in YAML and netCDF, its units, and the operator H that predicts it.
 
     ``positive``: it cannot be zero, so that zeros before the first reading of a file say that there was nothing yet.
+    ``fewest`` readings make a data set: 1 of a quantity of the whole path, 3 of one that is followed in time.
     """
 
     name: str
@@ -168,6 +169,7 @@ class Observable:
     display_unit: str = ""
     label: str = ""
     positive: bool = False
+    fewest: int = 3
 
     def __post_init__(self) -> None:
         for key, value in (("symbol", self.name), ("display_unit", self.unit), ("label", self.name)):
