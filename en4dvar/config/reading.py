@@ -31,7 +31,7 @@ def read_observations(plan: DataPlan, file: DataFile, name: str, weights: str = 
     series = []
     for one, where in zip(plan.series, files, strict=True):
         try:
-            series.append(read_one(one, where, fewest=plan.observable.fewest if plan.alone else 1))
+            series.append(read_one(one, where, fewest=one.observable.fewest if plan.alone else 1))
         except DataError as error:
             raise DataError(str(error), one.name) from None
     found = Observations.of_series(series, plan.correlation, name)
