@@ -29,7 +29,7 @@ from en4dvar_bubble import BubbleModel, NeoHookeanKelvinVoigt
 from en4dvar_bubble.medium import WATER_25C
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-CAMPAIGNS = {"LHS-simpool-x36_KV.mat": (1e-4, 5e-9), "pIMR_PA_10_Refined.mat": (0.005, 20e-9)}  # errors
+CAMPAIGNS = {"LHS-simpool-x36_KV.mat": (1e-4, 10e-9), "pIMR_PA_10_Refined.mat": (0.005, 20e-9)}  # errors
 P_INF, RHO, S, C, P_V = 101325.0, 998.2, 0.070, 1484.0, 3116.7757  # of the published code
 MEDIUM = replace(WATER_25C, p_inf=P_INF, rho=RHO, S=S, c=C, p_v=P_V)
 MODEL = BubbleModel(law=NeoHookeanKelvinVoigt(), start="laser", gas="polytropic", medium=MEDIUM)
