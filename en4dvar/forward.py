@@ -84,7 +84,8 @@ class Alternative:
 
     ``words`` complete "if …", e.g. "the pulse were 5 % stronger". ``model`` takes the place of the model, with the same
     parameters and observables; ``values`` and ``times`` multiply the observations and their errors; ``parameters`` are
-    factors of a parameter's value where it is fixed, of the centre of its prior where it is estimated.
+    factors of a parameter's value where it is fixed, of the centre of its prior where it is estimated. One about readings
+    of an ``observable`` is told where all readings are of that.
     """
 
     name: str
@@ -93,6 +94,7 @@ class Alternative:
     values: float = 1.0
     times: float = 1.0
     parameters: Mapping[str, float] = field(default_factory=dict)
+    observable: str = ""
 
 
 @dataclass(frozen=True)

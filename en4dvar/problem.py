@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, MinLen
 
-from en4dvar.forward import ForwardModel, Observable
+from en4dvar.forward import Alternative, ForwardModel, Observable
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior
 from en4dvar.series import Part
@@ -64,6 +64,12 @@ class InverseProblem:
         """The series of the data set, one at least."""
         whole = Part(self.observable.name, self.observable, 0, len(self.observations))
         return self.observations.parts or (whole,)
+
+    @property
+    def alternatives(self) -> tuple[Alternative, ...]:
+        """Those of the model that are about the problem's observables."""
+        observed = {part.observable.name for part in self.parts}
+        return tuple(one for one in self.model.alternatives if not one.observable or observed == {one.observable})
 
     @property
     def has_noise_scale(self) -> bool:

@@ -67,7 +67,7 @@ def what_if(
     """
     if not response.defined or not np.all(std > 0):
         return ()
-    shifts = [_shift(problem, response, std, cost, executor, one) for one in problem.model.alternatives]
+    shifts = [_shift(problem, response, std, cost, executor, one) for one in problem.alternatives]
     return tuple(sorted(shifts, key=lambda shift: -shift.largest))
 
 

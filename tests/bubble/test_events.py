@@ -102,6 +102,10 @@ def test_one_reading_is_a_data_set():
     problem = InverseProblem(MODEL, OBSERVED["collapse_time"], data, Prior((PriorTerm.lognormal(G, 1e4, 0.3),)), fixed)
     run = forecast(problem, np.log([[5e3], [2e4]]))
     assert run.predictions[0, 0] > run.predictions[1, 0]  # the stiffer one is sooner back
+    assert not {"length_scale", "time_scale"} & {one.name for one in problem.alternatives}  # those of a camera
+    assert {"length_scale", "time_scale"} <= {
+        one.name for one in replace(problem, observable=MODEL.observables[0]).alternatives
+    }
     with pytest.raises(DataError, match="no usable observation"):
         replace(data, times=one[:0], values=one[:0], weights=one[:0], noise=noise_of(one[:0]))
 
