@@ -93,12 +93,13 @@ def main() -> None:
     parser.add_argument("files", nargs="*", type=Path, default=[DATA / name for name in CAMPAIGNS])
     parser.add_argument("--radius-error", type=float)
     parser.add_argument("--time-error", type=float)
+    parser.add_argument("--every", type=int, default=1, help="take every n-th bubble")
     parser.add_argument("--gas", choices=("polytropic", "heat"), default="polytropic")
     asked = parser.parse_args()
     print("| campaign | bubbles | | G (kPa) | mu (Pa s) | chi2 a reading |")
     print("|---|---|---|---|---|---|")
     for file in asked.files:
-        campaign = loadmat(file)["pIMR_array"]
+        campaign = loadmat(file)["pIMR_array"][:: asked.every]
         radius_error, time_error = CAMPAIGNS.get(file.name, (0.005, 20e-9))
         radius_error, time_error = asked.radius_error or radius_error, asked.time_error or time_error
         began = time.process_time()

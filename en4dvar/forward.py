@@ -84,8 +84,8 @@ class Alternative:
 
     ``words`` complete "if …", e.g. "the pulse were 5 % stronger". ``model`` takes the place of the model, with the same
     parameters and observables; ``values`` and ``times`` multiply the observations and their errors; ``parameters`` are
-    factors of a parameter's value where it is fixed, of the centre of its prior where it is estimated. One about readings
-    of an ``observable`` is told where all readings are of that.
+    factors of a parameter's value where it is fixed, of the centre of its prior where it is estimated. One about the
+    readings of an ``observable`` is told where all readings are of that.
     """
 
     name: str
