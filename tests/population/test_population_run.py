@@ -14,7 +14,8 @@ from toys import Vectorised, make_problem
 from en4dvar.cli import main
 from en4dvar.errors import ConfigError, OutputError
 from en4dvar.population import Effort, HyperPrior
-from en4dvar.population.campaign import population_of
+from en4dvar.population.campaign import CampaignPopulation, Draws, population_of
+from en4dvar.population.estimate import Population
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.runs.population_run import population
 from en4dvar.runs.runner import run_campaign
@@ -113,6 +114,29 @@ def exact(problems, hyper):
         variances.append(np.broadcast_to(variance, means[-1].shape))
     weights = np.exp(total - total.max()) * np.gradient(tau)
     return weights / weights.sum(), nu, tau, np.array(means), np.array(variances)
+
+
+def test_what_is_determined_together_only():
+    """2 a + b is sharp, a and b are not: in units of their priors (std 0.5 and 1) it is the sum of both."""
+    rng, model = np.random.default_rng(1), Vectorised()
+    a, b = model.parameters
+    prior = Prior((PriorTerm.normal(a, 0.0, 0.5), PriorTerm.normal(b, 0.0, 1.0)))
+    problems = (replace(make_problem(model, [1.0, 0.4]), prior=prior),)
+    free, sharp = rng.standard_normal((2, 4000))
+    nu = np.stack([(free + 0.01 * sharp) / np.sqrt(2), (-free + 0.01 * sharp) / np.sqrt(2)], axis=1)
+    tau = np.abs(0.5 * rng.standard_normal(nu.shape))
+    draws = Draws(nu, tau, nu, nu, tau)
+    estimate = Population(("a", "b"), prior, nu, tau, nu[:, None], (400.0, 400.0), 0.0, 0)
+    found = CampaignPopulation(problems, HyperPrior(), estimate, draws, draws, nu[:, None])
+    (one,) = found.combinations()
+    exponents = dict(one.parts)
+    assert exponents["a"] / exponents["b"] == pytest.approx(2.0, rel=0.02)
+    together = exponents["a"] * 0.5 * nu[:, 0] + exponents["b"] * nu[:, 1]
+    assert one.std == pytest.approx(together.std())
+    assert one.std < 0.03
+    kept, effective = found.without_hyperprior(1)
+    assert kept.nu[:, 0].std() > 0.9 * nu[:, 0].std()
+    assert effective < 200
 
 
 @pytest.mark.slow
