@@ -35,6 +35,7 @@ LAYERS = (
     ("assimilate",),
     ("joint",),
     ("population",),
+    ("design",),
     ("inputs",),
     ("config",),
     ("storage",),
