@@ -18,6 +18,7 @@ from en4dvar.commands.design import design
 from en4dvar.commands.joint import joint
 from en4dvar.commands.listings import models, schema
 from en4dvar.commands.plugin_commands import PluginCommand, plugin_commands
+from en4dvar.commands.population import population
 from en4dvar.commands.results import compare, export, report, rerun
 from en4dvar.commands.run import run
 from en4dvar.commands.simulate import simulate
@@ -97,7 +98,9 @@ def main() -> None:
     """
 
 
-for command in (compare, design, export, joint, models, report, rerun, run, schema, simulate, sweep_twin, validate):
+for command in (
+    compare, design, export, joint, models, population, report, rerun, run, schema, simulate, sweep_twin, validate,
+):  # fmt: skip
     main.add_command(command)
 
 if __name__ == "__main__":

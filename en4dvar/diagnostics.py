@@ -48,7 +48,8 @@ def spread(members: Array, prior_variance: Array) -> Array:
 
 def nrmse(values: Array, predictions: Array) -> float:
     """Normalised fit 1 − ‖y − ŷ‖/‖y − ȳ‖ of the rheometry literature: 1 is perfect, 0 is no better than the mean."""
-    return float(1 - np.linalg.norm(values - predictions) / np.linalg.norm(values - np.mean(values)))
+    spread = np.linalg.norm(values - np.mean(values))
+    return float(1 - np.linalg.norm(values - predictions) / spread) if spread > 0 else float("nan")
 
 
 def log_evidence(cost: float, singular_values: Array, n_members: int, observations: Observations) -> float:

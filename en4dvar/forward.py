@@ -84,7 +84,8 @@ class Alternative:
 
     ``words`` complete "if …", e.g. "the pulse were 5 % stronger". ``model`` takes the place of the model, with the same
     parameters and observables; ``values`` and ``times`` multiply the observations and their errors; ``parameters`` are
-    factors of a parameter's value where it is fixed, of the centre of its prior where it is estimated.
+    factors of a parameter's value where it is fixed, of the centre of its prior where it is estimated. One about the
+    readings of an ``observable`` is told where all readings are of that.
     """
 
     name: str
@@ -93,6 +94,7 @@ class Alternative:
     values: float = 1.0
     times: float = 1.0
     parameters: Mapping[str, float] = field(default_factory=dict)
+    observable: str = ""
 
 
 @dataclass(frozen=True)
@@ -159,6 +161,7 @@ class Observable:
     """A quantity that can be measured: its name in YAML and netCDF, its units, and the operator H that predicts it.
 
     ``positive``: it cannot be zero, so that zeros before the first reading of a file say that there was nothing yet.
+    ``fewest`` readings make a data set: 1 of a quantity of the whole path, 3 of one that is followed in time.
     """
 
     name: str
@@ -168,6 +171,7 @@ class Observable:
     display_unit: str = ""
     label: str = ""
     positive: bool = False
+    fewest: int = 3
 
     def __post_init__(self) -> None:
         for key, value in (("symbol", self.name), ("display_unit", self.unit), ("label", self.name)):

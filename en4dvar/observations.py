@@ -114,8 +114,8 @@ class Observations:
         for key in ("values", "weights"):
             if np.shape(getattr(self, key)) != (k,):
                 raise DataError(f"{where}: {key} has shape {np.shape(getattr(self, key))}, not ({k},)")
-        if k < 3:
-            raise DataError(f"{where}: {k} usable observations in the window; at least 3 are needed")
+        if k < 1:
+            raise DataError(f"{where}: no usable observation in the window")
         if not (np.all(np.isfinite(self.times)) and np.all(np.isfinite(self.values))):
             raise DataError(f"{where}: observations must be finite")
         largest = float(np.max(np.abs([self.times, self.values])))

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Le, MinLen
 
 from en4dvar.field_prior import FieldPrior
-from en4dvar.forward import ForwardModel, Observable
+from en4dvar.forward import Alternative, ForwardModel, Observable
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior
 from en4dvar.series import Part
@@ -75,6 +75,12 @@ class InverseProblem:
         """Each field with its cells among those of a control vector, counted from the first of them."""
         ends = accumulate(one.field.size for one in self.fields)
         return [(one, slice(end - one.field.size, end)) for one, end in zip(self.fields, ends, strict=True)]
+
+    @property
+    def alternatives(self) -> tuple[Alternative, ...]:
+        """Those of the model that are about the problem's observables."""
+        observed = {part.observable.name for part in self.parts}
+        return tuple(one for one in self.model.alternatives if not one.observable or observed == {one.observable})
 
     @property
     def has_noise_scale(self) -> bool:

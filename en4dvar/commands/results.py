@@ -36,8 +36,16 @@ def report(run_dir: Path, datasets: tuple[str, ...]) -> None:
 @click.argument("run_dirs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN_DIR RUN_DIR...")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of figure and page; default compare_... beside.")
 @click.option("--no-report", is_flag=True, help="Print the tables only.")
-def compare(run_dirs: tuple[Path, ...], out: Path | None, no_report: bool) -> None:
+@click.option("--stored", is_flag=True, help="Evidences as the results have them: nothing is run.")
+@click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
+@click.option("--trust", is_flag=True, help="Run code that the files name, wherever it lies: read it before.")
+def compare(
+    run_dirs: tuple[Path, ...], out: Path | None, no_report: bool, stored: bool, workers: int | None, trust: bool
+) -> None:
     """Compare runs: posteriors over each other; on the same data also evidence and model probabilities.
+
+    Evidences are sampled with forward runs where the model is cheap. Code outside of the current folder and of
+    installed packages is run with --trust alone.
 
     The runs may be laws on the same data or different gels. Writes compare.html, a figure (PNG, PDF) and CSV tables.
 
@@ -48,6 +56,14 @@ def compare(run_dirs: tuple[Path, ...], out: Path | None, no_report: bool) -> No
     from en4dvar.report.compare import compare_runs, comparison_table, estimates_table
 
     comparison = compare_runs(run_dirs)
+    if not (stored or comparison.incomparable):
+        from en4dvar.runs.evidence_run import sampled_evidences
+
+        def tell(words: str) -> None:
+            click.echo(words, err=True)
+
+        evidences = [sampled_evidences(run_dir, workers, trust, None, tell) for run_dir in run_dirs]
+        comparison = compare_runs(run_dirs, evidences)
     if len(comparison.estimates) <= MOST_ROWS:
         click.echo(f"{estimates_table(comparison)}\n")
     click.echo(comparison_table(comparison))

@@ -31,7 +31,7 @@ def read_observations(plan: DataPlan, file: DataFile, name: str, weights: str = 
     series = []
     for one, where in zip(plan.series, files, strict=True):
         try:
-            series.append(read_one(one, where, fewest=3 if plan.alone else 1))
+            series.append(read_one(one, where, fewest=one.observable.fewest if plan.alone else 1))
         except DataError as error:
             raise DataError(str(error), one.name) from None
     found = Observations.of_series(series, plan.correlation, name)
@@ -65,6 +65,8 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int = 3) -> Series:
         stated = {key: beside(column) for key, column in _errors(data).items()}
         noise = errors_of(data, times, values, np.arange(len(read.times))[window], stated)
         weights, places = data.weights, data.places
+        if len(times) < fewest:
+            raise DataError(f"{len(times)} usable observations in the window; at least {fewest} are needed")
         return Series(
             observable=plan.observable,
             times=times,

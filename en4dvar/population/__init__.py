@@ -1,13 +1,15 @@
-"""Many data sets of one material: shared parameters, the spread between the sets, pooled evidence.
+"""Many data sets of one material: how much its parameters vary between the sets, pooled evidence.
 
 runs = ForwardRuns(problems)                                          # en4dvar.sampling.forward_runs
 estimate_population(runs, start, prior, ["a"], seed)                  # parameters that vary from set to set
-fit_shared(runs, starts, prior, ["a"])                                # parameters with one value in all sets
+population_of(problems, start, ["a"], seed)                           # the same of problems, in units of their priors
+
+Parameters with one value in all sets are for :mod:`en4dvar.joint`.
 """
 
+from en4dvar.population.campaign import CampaignPopulation, population_of
 from en4dvar.population.effort import Effort
 from en4dvar.population.estimate import Population, estimate_population
 from en4dvar.population.hyper import HyperPrior
-from en4dvar.population.shared import SharedFit, fit_shared
 
-__all__ = ["Effort", "HyperPrior", "Population", "SharedFit", "estimate_population", "fit_shared"]
+__all__ = ["CampaignPopulation", "Effort", "HyperPrior", "Population", "estimate_population", "population_of"]

@@ -36,18 +36,20 @@ from en4dvar.population.marginals import TEMPERATURE, SetPosterior
 from en4dvar.population.mixtures import Mixture, fit_mixtures
 from en4dvar.population.training import Training
 from en4dvar.population.weights import Weighed, normalised, with_emulators, with_runs
-from en4dvar.prior import Prior, member_stream
+from en4dvar.prior import Prior, PriorTerm, member_stream
 from en4dvar.sampling.forward_runs import CampaignRuns
 from en4dvar.sampling.mixture import StudentMixture
 from en4dvar.state import Array
 
 FEWEST = 100.0  # effective draws of a result that can be trusted
 WIDER = 1.3  # the interim prior than the population found
+NODES = 24  # of the quadrature
 
 
 @dataclass(frozen=True)
 class Population:
-    """Draws of ν and τ (M, p) in transformed coordinates, of the parameters ``names``.
+    """Draws of ν and τ (M, p) in transformed coordinates, of the parameters ``names``, and with each of them of the
+    control vectors ``sets`` (M, S, n) of the data sets, given all data.
 
     ``weighed`` are the effective sample sizes of the weights of stage 4, with emulators and with forward runs;
     ``log_evidence``: of all data, hyperpriors included, without Σ ln(std √2π).
@@ -57,6 +59,7 @@ class Population:
     prior: Prior
     nu: Array
     tau: Array
+    sets: Array
     weighed: tuple[float, float]
     log_evidence: float
     forward_runs: int
@@ -73,12 +76,7 @@ class Population:
 
     @property
     def mean(self) -> Array:
-        """(M, p) draws of the population mean, physical: exp(ν + τ²/2) of a lognormal, ν of a normal.
-
-        Raises
-        ------
-        ValueError: a prior that is neither normal nor lognormal, whose mean has no closed form.
-        """
+        """(M, p) draws of the population mean, physical: exp(ν + τ²/2) of a lognormal, ν of a normal."""
         return self._moments()[0]
 
     @property
@@ -92,15 +90,27 @@ class Population:
         return np.asarray(np.quantile(self.mean, (tail, 1 - tail), axis=0))
 
     def _moments(self) -> tuple[Array, Array]:
-        mean, std = self.nu.copy(), self.tau.copy()
-        for j, name in enumerate(self.names):
-            transform = self.prior.terms[self.prior.names.index(name)].transform
-            if transform not in ("normal", "lognormal"):
-                raise ValueError(f"{name}: the population mean of a {transform} prior has no closed form")
-            if transform == "lognormal":
-                mean[:, j] = np.exp(self.nu[:, j] + self.tau[:, j] ** 2 / 2)
-                std[:, j] = mean[:, j] * np.sqrt(np.expm1(self.tau[:, j] ** 2))
-        return mean, std
+        terms = [self.prior.terms[self.prior.names.index(name)] for name in self.names]
+        return moments(terms, self.nu, self.tau)
+
+
+def moments(terms: Sequence[PriorTerm], nu: Array, tau: Array) -> tuple[Array, Array]:
+    """Physical mean and standard deviation (M, p) of parameters whose coordinates are N(ν, τ²), (M, p) each.
+
+    In closed form for normal and lognormal ones, else by Gauss–Hermite quadrature.
+    """
+    mean, std = nu.copy(), tau.copy()
+    nodes, weights = np.polynomial.hermite_e.hermegauss(NODES)
+    weights = weights / weights.sum()
+    for j, term in enumerate(terms):
+        if term.transform == "lognormal":
+            mean[:, j] = np.exp(nu[:, j] + tau[:, j] ** 2 / 2)
+            std[:, j] = mean[:, j] * np.sqrt(np.expm1(tau[:, j] ** 2))
+        elif term.transform != "normal":
+            values = term.to_physical(nu[:, j, None] + tau[:, j, None] * nodes)
+            mean[:, j] = values @ weights
+            std[:, j] = np.sqrt((values - mean[:, j, None]) ** 2 @ weights)
+    return mean, std
 
 
 def estimate_population(
@@ -175,10 +185,11 @@ class _Estimate:
         emulated = self._weighed(sets, self._walked(mixtures))
         stream = member_stream(self.seed, "forward runs", turn)
         exact, count = with_runs(emulated, likelihoods, self.runs, self.effort.exact, stream)
-        h, p = exact.h[exact.resampled(self.effort.draws, stream)], len(self.where)
+        taken, p = exact.resampled(self.effort.draws, stream), len(self.where)
+        h, x = exact.h[taken], exact.x[taken, :, 0]
         evidence = normalised(emulated.logs)[1] + normalised(exact.logs)[1]
         sizes = emulated.effective, exact.effective
-        return Population(self.names, self.prior, h[:, :p], np.exp(h[:, p:]), sizes, evidence, 0), h, count
+        return Population(self.names, self.prior, h[:, :p], np.exp(h[:, p:]), x, sizes, evidence, 0), h, count
 
     def _narrow(self, h: Array) -> None:
         """Make the interim prior a little wider than populations (B, 2p)."""

@@ -27,7 +27,9 @@ BATCH = 50  # populations of one call for forward runs
 
 @dataclass(frozen=True)
 class Weighed:
-    """Draws ``h`` (B, 2p) with logs of their weights (B,), not normalised, and of each x (B, S, P, n) given h."""
+    """Draws ``h`` (B, 2p) with logs of their weights (B,), not normalised, and of each x (B, S, P, n) given h: from
+    forward runs P = 1, given the data as well.
+    """
 
     h: Array
     logs: Array
@@ -116,7 +118,11 @@ def with_runs(
             wanted[worst] *= 2
             errors[worst] /= 2
     logs = np.logaddexp.reduce(ratio, axis=2) - np.log(done)
-    return Weighed(weighed.h[kept], logs.sum(axis=1), x), count * int(done.sum())
+    # one of the draws of each x by its weight (Gumbel 1954), from a stream of its own
+    own = np.random.Generator(stream.bit_generator.jumped())  # type: ignore[attr-defined]
+    pick = np.argmax(ratio + own.gumbel(size=ratio.shape), axis=2)
+    chosen = np.take_along_axis(x, pick[:, :, None, None], axis=2)
+    return Weighed(weighed.h[kept], logs.sum(axis=1), chosen), count * int(done.sum())
 
 
 def _errors(

@@ -53,7 +53,7 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
     if kind == "members":
         return _members_csv(results)
     if kind == "latex":
-        return _latex([(r.name, r.summary(), r.cautions) for r in results])
+        return latex_table([(r.name, r.summary(), r.cautions) for r in results])
     return summary_csv(((r.name, r.summary(), r.cautions) for r in results), {})
 
 
@@ -88,7 +88,8 @@ LITTLE_NOTE = "the data say little about it: its posterior is close to its prior
 MODAL_NOTE = "5 to 95 % of a posterior of several modes, by their weights"
 
 
-def _latex(found: Sequence[Found]) -> str:
+def latex_table(found: Sequence[Found]) -> str:
+    """Mean ± std for a paper (package booktabs): a row a parameter, or of several ``found`` a row each."""
     header = "% en4dvar export: posterior mean and standard deviation; needs \\usepackage{booktabs}"
     warned = [f"% {c.severity}: {name}: {c}" for name, _, cautions in found for c in cautions]
     notes = Notes()

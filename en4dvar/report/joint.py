@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from en4dvar.files import write_text
 from en4dvar.report.html import render
 from en4dvar.report.style import COLUMN, LIGHT, PAGE, inline_svg, panels, styled
 from en4dvar.report.text import figure_text, with_unit
-from en4dvar.storage.joint_file import QUANTILES, StoredJoint
+from en4dvar.storage.joint_file import QUANTILES, StoredGroups, StoredJoint
 from en4dvar.tables import csv_text, table
 from en4dvar.units import convert
 
@@ -82,15 +83,18 @@ def _numbers(e: JointRow) -> list[str]:
 
 
 @styled
-def forest(found: StoredJoint) -> Figure:
-    """Each data set alone, and all together, one panel for each quantity that is shared."""
-    names, count = found.shared, len(found.datasets)
-    figure, axes = panels(len(names), COLUMN * (2 if len(names) > 1 else 1), 0.8 + 0.14 * min(count, 60))
+def forest(found: StoredGroups, datasets: Sequence[str], common: Mapping[str, xr.DataArray]) -> Figure:
+    """Each data set alone, and the draws of what is ``common``, one panel each.
+
+    Where the posterior has the parameter for each data set too, that is drawn below what the data set says alone.
+    """
+    count = len(datasets)
+    figure, axes = panels(len(common), COLUMN * (2 if len(common) > 1 else 1), 0.8 + 0.14 * min(count, 60))
     alone, posterior = found.group("alone"), found.group("posterior")
-    for ax, name in zip(axes, names, strict=True):
-        about = posterior[name].attrs
+    for ax, (name, draws) in zip(axes, common.items(), strict=True):
+        about = draws.attrs
         units = str(about["units"]), str(about["display_units"])
-        low, middle, high = convert(np.quantile(posterior[name].values, QUANTILES), *units)
+        low, middle, high = convert(np.quantile(draws.values, QUANTILES), *units)
         if not untrusted(found.cautions, name):
             ax.axvspan(low, high, color=LIGHT["posterior"], alpha=0.2, lw=0)
         ax.axvline(middle, color=LIGHT["posterior"])
@@ -98,8 +102,12 @@ def forest(found: StoredJoint) -> Figure:
         has = np.flatnonzero(np.isfinite(rows[:, 1]))
         ax.hlines(-has, rows[has, 0], rows[has, 2], color=LIGHT["prior"])
         ax.plot(rows[has, 1], -has, "o", ms=3, color=LIGHT["prior"])
+        if "dataset" in posterior.get(name, draws).dims:
+            low, middle, high = convert(posterior[name].quantile(QUANTILES, ("chain", "draw")).values, *units)
+            ax.hlines(-has - 0.3, low[has], high[has], color=LIGHT["posterior"])
+            ax.plot(middle[has], -has - 0.3, "o", ms=2, color=LIGHT["posterior"])
         ax.set(xlabel=with_unit(str(about["symbol"]), units[1]), ylim=(-count, 1))
-        ax.set_yticks(-np.arange(count), [figure_text(d) for d in found.datasets] if count <= 60 else [""] * count)
+        ax.set_yticks(-np.arange(count), [figure_text(d) for d in datasets] if count <= 60 else [""] * count)
         ax.tick_params(axis="y", length=0, labelsize=6)
         if np.all(rows[has] > 0) and rows[has].max() > 20 * rows[has].min():
             ax.set_xscale("log")
@@ -129,7 +137,7 @@ def write_joint(found: StoredJoint, folder: Path) -> Path:
     columns = ("name", "dataset", "mean", "std", "q05", "q50", "q95", "unit")
     cells = [[getattr(e, c) for c in columns] + [" ".join(e.untrusted)] for e in rows]
     write_text(folder / "joint.csv", csv_text([[*columns, "warnings"], *cells]))
-    fit = found.group("fit")
+    fit, shared = found.group("fit"), {name: found.group("posterior")[name] for name in found.shared}
     page = render(
         "joint.html.j2",
         title="Joint estimate",
@@ -138,7 +146,7 @@ def write_joint(found: StoredJoint, folder: Path) -> Path:
         count=len(found.datasets),
         shared=[e for e in rows if not e.dataset],
         own=[e for e in rows if e.dataset],
-        forest=inline_svg(forest(found), "forest", CAPTION),
+        forest=inline_svg(forest(found, found.datasets, shared), "forest", CAPTION),
         caption=CAPTION,
         fits=inline_svg(fits(found), "fits", FITS),
         fits_caption=FITS + (f" The first {MOST_FITS}." if len(found.datasets) > MOST_FITS else ""),

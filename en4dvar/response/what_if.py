@@ -68,7 +68,7 @@ def what_if(
     """
     if not response.defined or not np.all(std > 0):
         return ()
-    offered = [one for one in problem.model.alternatives if one.values == 1.0 or not problem.has_reading_scale]
+    offered = [one for one in problem.alternatives if one.values == 1.0 or not problem.has_reading_scale]
     shifts = [_shift(problem, response, std, cost, executor, one) for one in offered]
     return tuple(sorted(shifts, key=lambda shift: -shift.largest))
 

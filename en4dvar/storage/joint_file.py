@@ -157,19 +157,24 @@ def _fit(found: JointEstimate) -> dict[str, Variable]:
 
 
 @dataclass(frozen=True)
-class StoredJoint:
-    """A file of :func:`save_joint`: a thin view of ``tree``."""
+class StoredGroups:
+    """A file about several data sets together: a thin view of ``tree``."""
 
     tree: xr.DataTree
 
     @property
     def cautions(self) -> tuple[Caution, ...]:
-        """Warnings of the joint estimate, the worst first."""
+        """Warnings of the estimate, the worst first."""
         return worst_first(map(Caution.parse, str(self.tree.attrs["warnings"]).splitlines()))
 
     def group(self, name: str) -> xr.Dataset:
-        """``posterior``, ``prior``, ``alone`` or ``fit``."""
+        """The variables of a group."""
         return self.tree.children[name].to_dataset()
+
+
+@dataclass(frozen=True)
+class StoredJoint(StoredGroups):
+    """A file of :func:`save_joint`, with the groups ``posterior``, ``prior``, ``alone`` and ``fit``."""
 
     @property
     def datasets(self) -> tuple[str, ...]:
@@ -184,7 +189,12 @@ class StoredJoint:
 
 def load_joint(path: Path) -> StoredJoint:
     """Read the file into memory. Raises :class:`OutputError`: it is none, cut short or altered."""
+    return StoredJoint(load_groups(path, ("posterior", "prior", "alone", "fit"), "a joint estimate"))
+
+
+def load_groups(path: Path, groups: Sequence[str], what: str) -> xr.DataTree:
+    """A file with ``groups`` in memory. Raises :class:`OutputError`: it is not ``what``, cut short or altered."""
     nodes = read_groups(path)
-    if {"/posterior", "/prior", "/alone", "/fit"} - set(nodes):
-        raise OutputError(f"{path}: not a joint estimate")
-    return StoredJoint(xr.DataTree.from_dict(nodes))
+    if {f"/{group}" for group in groups} - set(nodes):
+        raise OutputError(f"{path}: not {what}")
+    return xr.DataTree.from_dict(nodes)

@@ -38,6 +38,14 @@ class Comparison:
         return int(np.sum(np.abs(self.single) < DECISIVE))
 
 
+@dataclass(frozen=True)
+class OneGel:
+    """One law with one value of its parameters in all data sets of a gel."""
+
+    log_evidence: float
+    chi2_per_observation: float
+
+
 def probability(difference: Array) -> Array:
     """Probability of the favoured-by-positive model at equal prior odds, 1/(1 + e^−Δ)."""
     return np.asarray(0.5 * (1 + np.tanh(np.asarray(difference) / 2)))

@@ -15,14 +15,16 @@ from en4dvar.assimilate import assimilate
 from en4dvar.config.build import build
 from en4dvar.executor import Executor, make_executor
 from en4dvar.forward import ForwardModel
-from en4dvar.population import Population, SharedFit, estimate_population, fit_shared
+from en4dvar.joint import estimate_jointly, sharing
+from en4dvar.joint.estimate import Single
+from en4dvar.population import Population, estimate_population
 from en4dvar.prior import Prior, own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.evidence import Evidence, sampled_evidence
 from en4dvar.sampling.forward_runs import ForwardRuns
 from en4dvar.sampling.sweep import SweepResult, run_sweep
 from en4dvar_agarose.checkpoints import D, StudyCheckpoints
-from en4dvar_agarose.evidence import Comparison
+from en4dvar_agarose.evidence import Comparison, OneGel
 from en4dvar_agarose.fits import Fit, Study, read_truth
 from en4dvar_agarose.paper import TABLE_2, Model
 from en4dvar_agarose.settings import StudyPlan
@@ -91,17 +93,17 @@ class _Parts:
         for (gel, model), sets in problems.items():
             groups.setdefault((model, tuple(sorted(sets[0].fixed.items()))), []).append((gel, model))
         found = {}
-        for sharing in groups.values():
-            every, began = one_model([p for key in sharing for p in problems[key]]), time.perf_counter()
-            folder = self.keep.sweep(*sharing[0]) if self.keep else None
+        for keys in groups.values():
+            every, began = one_model([p for key in keys for p in problems[key]]), time.perf_counter()
+            folder = self.keep.sweep(*keys[0]) if self.keep else None
             result = run_sweep(
                 every, self.plan.sweep, self.plan.seed, self.executor, folder, earliest=earliest_reading(every[0].model)
             )
             first = 0
-            for key in sharing:
+            for key in keys:
                 found[key] = result.part(slice(first, first + len(problems[key])))
                 first += len(problems[key])
-            words = " and ".join(f"{gel} {model}" for gel, model in sharing)
+            words = " and ".join(f"{gel} {model}" for gel, model in keys)
             spent = time.perf_counter() - began
             self.say(
                 f"{words}: sweep of {result.trajectories} trajectories against {len(every)} data sets in {spent:.1f} s"
@@ -169,7 +171,7 @@ class _Parts:
     def _comparison(self, models: Mapping[Model, Fit], populations: Mapping[Model, Population | None]) -> Comparison:
         nh, general = (models[m] for m in COMPARED)
         pooled = {m: math.nan if found is None else found.log_evidence for m, found in populations.items()}
-        one_nh, one_general = (self.kept(SharedFit, partial(self._one_gel, fit), fit) for fit in (nh, general))
+        one_nh, one_general = (self.kept(OneGel, partial(self._one_gel, fit), fit) for fit in (nh, general))
         return Comparison(
             single=general.log_evidence - nh.log_evidence,
             population=pooled["qlkv"] - pooled["nh"],
@@ -177,12 +179,17 @@ class _Parts:
             chi2=(one_nh.chi2_per_observation, one_general.chi2_per_observation),
         )
 
-    def _one_gel(self, fit: Fit) -> SharedFit:
+    def _one_gel(self, fit: Fit) -> OneGel:
         """All bubbles of a gel with the same material parameters."""
         names = [name for name in SHARED if fit.estimated(name)]
-        centres = fit.starts.mean(axis=1)
-        starts = np.stack([centres, (centres + fit.prior.mean) / 2])
-        return fit_shared(self._runs(fit), starts, fit.prior, names)
+        singles = [
+            Single.of_physical(fit.prior, a.posterior[np.isfinite(a.posterior).all(axis=1)], a.centre)
+            for a in fit.analyses
+        ]
+        settings = self.plan.configs[fit.gel][fit.model].assimilation
+        found = estimate_jointly(sharing(fit.problems, names), settings, self.plan.seed, self.executor, singles)
+        readings = np.array([len(p.observations) for p in fit.problems])
+        return OneGel(found.log_evidence, float(found.chi2 @ readings / readings.sum()))
 
 
 def one_model(problems: Sequence[InverseProblem]) -> list[InverseProblem]:

@@ -53,5 +53,5 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
     else:
         yield changed("vapour", "there were no vapour in the bubble (vapour: none)", vapour="none")
     yield Alternative("radius_at_rest", f"{rest} were 10 % larger", parameters={rest: REST})
-    yield Alternative("length_scale", "all radii were 1 % larger (µm per pixel)", values=SCALE)
-    yield Alternative("time_scale", "the time between frames were 1 % longer", times=CLOCK)
+    yield Alternative("length_scale", "all radii were 1 % larger (µm per pixel)", values=SCALE, observable="radius")
+    yield Alternative("time_scale", "the time between frames were 1 % longer", times=CLOCK, observable="radius")

@@ -24,6 +24,7 @@ from en4dvar.state import Array
 from en4dvar_bubble.alternatives import alternatives
 from en4dvar_bubble.collapse import doubts
 from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics
+from en4dvar_bubble.events import OBSERVABLES
 from en4dvar_bubble.packing import pack
 from en4dvar_bubble.paths import Paths
 from en4dvar_bubble.settings import BubbleSettings
@@ -48,6 +49,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
             label="bubble radius",
             positive=True,
         ),
+        *OBSERVABLES,
     )
 
     path_quantities = (
@@ -100,7 +102,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         self, observable: str, times: Array, values: Array, predicted: Array, members: Mapping[str, Array]
     ) -> Sequence[str]:
         """Whether the collapse time can be right, see :mod:`en4dvar_bubble.collapse`."""
-        return doubts(times, values, predicted, members, self.medium)
+        return doubts(times, values, predicted, members, self.medium) if observable == "radius" else ()
 
     def initial_state(self, theta: Mapping[str, float]) -> Array:
         return np.asarray(self.initial_states({p.name: np.array([theta[p.name]]) for p in self.parameters})[0])
@@ -159,6 +161,6 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
                 states = np.take_along_axis(solution.states, back[:, :, None], axis=1)
                 states[:, :, -2] *= np.where(times < 0, -1.0, 1.0)
                 solution = Solution(states, solution.status, solution.record)
-            return Paths(self, x, times, solution, packed.members.parameters)
+            return Paths(self, x, times, solution, packed.members.parameters, t0)
 
         return work, finish

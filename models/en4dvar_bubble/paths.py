@@ -23,13 +23,18 @@ from en4dvar_bubble.tables import evaluate
 
 @dataclass(frozen=True, eq=False)
 class Paths(Batch):
-    """Integrated members: ``initial`` states (N, n_state), ``times`` (N, K) in s, the raw solution."""
+    """Integrated members: ``initial`` states (N, n_state) at ``start`` (s), ``times`` (N, K) in s, the raw solution.
+
+    ``found``: what was computed from the paths as a whole (:mod:`en4dvar_bubble.events`).
+    """
 
     model: Dynamics
     initial: Array
     times: Array
     solution: Solution
     par: Array
+    start: Array | float = 0.0
+    found: dict[str, Any] = field(default_factory=dict)
     _fields: dict[str, Array] = field(default_factory=dict)
 
     @property
@@ -85,7 +90,7 @@ class Paths(Batch):
     def last(self) -> Array:
         """States (N, n_state) at the last instant."""
         solution = replace(self.solution, states=self.solution.states[:, -1:])
-        return replace(self, times=self.times[:, -1:], solution=solution, _fields={}).states[:, 0]
+        return replace(self, times=self.times[:, -1:], solution=solution, found={}, _fields={}).states[:, 0]
 
     def medium(self, axes: int) -> Medium:
         """See :meth:`Dynamics.medium_of`."""
@@ -162,31 +167,31 @@ class Paths(Batch):
 class BubbleTrajectory(Trajectory):
     """One member of a batch; fields are shared with the batch and computed on demand."""
 
-    _paths: Paths
-    _member: int
+    paths: Paths
+    member: int
 
     def __init__(self, paths: Paths, member: int):
-        self.__dict__.update(_paths=paths, _member=member)  # the dataclass is frozen
+        self.__dict__.update(paths=paths, member=member)  # the dataclass is frozen
 
     @property
     def times(self) -> Array:
-        return np.asarray(self._paths.times[self._member])
+        return np.asarray(self.paths.times[self.member])
 
     @property
     def layout(self) -> StateLayout:
-        return self._paths.model.layout
+        return self.paths.model.layout
 
     def __getitem__(self, name: str) -> Array:
-        return cast(Array, self._paths[name][self._member])
+        return cast(Array, self.paths[name][self.member])
 
     def largest(self, name: str) -> float:
         """See :meth:`Paths.largest`."""
-        return float(self._paths.largest(name)[self._member])
+        return float(self.paths.largest(name)[self.member])
 
     def beyond(self, limit: ValidityLimit) -> float:
         """See :meth:`Paths.beyond`."""
-        return float(self._paths.beyond(limit)[self._member])
+        return float(self.paths.beyond(limit)[self.member])
 
     @property
     def states(self) -> Array:
-        return np.asarray(self._paths.states[self._member])
+        return np.asarray(self.paths.states[self.member])

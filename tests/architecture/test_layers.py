@@ -49,7 +49,8 @@ FLOOR = {name: floor for floor, layer in enumerate(LAYERS) for name in layer}
 # the same inside the bubble, as the docstring of its package states
 BUBBLE = (
     "tables", "medium", "collapse", "gas", "driving", "numbers", "laws", "solver", "dynamics", "alternatives",
-    "packing", "paths", "settings", "model", "api", "battery", "starter", "examples", "commands", "commands_init",
+    "packing", "paths", "events", "settings", "model", "api", "battery", "starter", "examples", "commands",
+    "commands_init",
 )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Population, shared parameters, evidence and sweep on a campaign that is no bubble: linear, Gaussian, all is known."""
+"""Population, evidence and sweep on a campaign that is no bubble: linear, Gaussian, all is known."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from toys import Fragile, Vectorised, make_problem, with_noise
 
 from en4dvar.errors import ConfigError
 from en4dvar.executor import ProcessesExecutor
-from en4dvar.population import Effort, HyperPrior, estimate_population, fit_shared
+from en4dvar.population import Effort, HyperPrior, estimate_population
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.evidence import sampled_evidence
@@ -64,39 +64,6 @@ def test_population_of_a_linear_hierarchy(campaign):
     error = np.sqrt(weights.sum(axis=1) @ (nu - mean) ** 2 / found.size)
     assert found.mean.mean() == pytest.approx(mean, abs=4 * error)
     assert found.std.mean() == pytest.approx(spread, rel=0.15)
-
-
-def test_one_value_for_all_sets(campaign):
-    """b in common, a each set's own: the evidence is the normal density of all data at once."""
-    prior = campaign[0].prior
-    found = fit_shared(ForwardRuns(campaign), np.tile(prior.mean, (1, SETS, 1)), prior, ["b"])
-    blocks, columns = [], []
-    for p in campaign:
-        H = matrix(p)
-        blocks.append(STD**2 * np.eye(len(H)) + 0.9**2 * np.outer(H[:, 0], H[:, 0]))
-        columns.append(H[:, 1])
-    every = np.concatenate(columns)
-    covariance = 0.5**2 * np.outer(every, every)
-    edge = 0
-    for block in blocks:
-        rows = slice(edge, edge := edge + len(block))
-        covariance[rows, rows] += block
-    mean = np.concatenate([matrix(p) @ prior.mean for p in campaign])
-    y = np.concatenate([p.observations.values for p in campaign])
-    exact = multivariate_normal(mean, covariance).logpdf(y) + len(y) * np.log(STD * np.sqrt(2 * np.pi))
-    assert found.log_evidence == pytest.approx(exact, abs=1e-3)
-    posterior = 0.2 + 0.5**2 * every @ np.linalg.solve(covariance, y - mean)
-    assert found.common[0] == pytest.approx(posterior, abs=1e-3)
-
-
-def test_everything_shared_is_one_regression(campaign):
-    prior = campaign[0].prior
-    found = fit_shared(ForwardRuns(campaign), np.tile(prior.mean, (1, SETS, 1)), prior, ["a", "b"])
-    H, y = np.concatenate([matrix(p) for p in campaign]), np.concatenate([p.observations.values for p in campaign])
-    hessian = np.diag(prior.std**-2.0) + H.T @ H / STD**2
-    assert found.common == pytest.approx(
-        np.linalg.solve(hessian, prior.mean / prior.std**2 + H.T @ y / STD**2), abs=1e-3
-    )
 
 
 def test_evidence_of_each_set(campaign):

@@ -75,7 +75,9 @@ def test_equal_models_are_undecidable_on_the_command_line(tmp_path):
     done = CliRunner().invoke(main, ["compare", *runs, "--no-report"])
     assert done.exit_code == 0, done.output
     assert "undecidable: first and second differ by 0." in done.output
-    assert done.output.splitlines()[0].split()[:3] == ["parameter", "unit", "data"]
+    assert done.stdout.splitlines()[0].split()[:3] == ["parameter", "unit", "data"]
+    assert "do not record a configuration" in done.stderr
+    assert "* as the result has it" in done.stdout
     assert comparison_table(compare_runs(runs)) in done.output
 
 

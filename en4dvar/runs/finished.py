@@ -1,0 +1,115 @@
+"""The data sets of finished runs, from what their result files record: for estimates of several together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from en4dvar.caution import Caution, caution
+from en4dvar.config import Config
+from en4dvar.config.build import problem_of
+from en4dvar.config.document import parse_document
+from en4dvar.config.load import resolve
+from en4dvar.errors import ConfigError, OutputError
+from en4dvar.problem import InverseProblem
+from en4dvar.runs.trust import Ask, of_strangers
+from en4dvar.state import Array
+from en4dvar.storage.store import StoredResult, load_stored, result_files
+
+CARRIED = ("implausible-data", "misfit", "residual-structure", "model-validity")
+MOST_NAMES = 4
+
+
+@dataclass(frozen=True)
+class Finished:
+    """One data set: its problem, physical members (N, n) of its posterior that are alive, its centre (n,), warnings.
+
+    ``white``: the members in white coordinates of the prior; ``groups``: what its configuration shares, and with whom.
+    Data sets of one name in several runs get a number.
+    """
+
+    problem: InverseProblem
+    members: Array
+    white: Array
+    centre: Array
+    cautions: tuple[Caution, ...]
+    groups: Mapping[str, str]
+
+    @property
+    def name(self) -> str:
+        return self.problem.observations.name
+
+
+def finished(run_dirs: Sequence[Path], trust: bool, ask: Ask | None) -> tuple[Config, list[Finished]]:
+    """The configuration of the first run, and the data sets of all.
+
+    Raises
+    ------
+    RefusedError: code of a stranger, see :func:`~en4dvar.runs.rerun.rerun`. OutputError: there is no result, or it is
+        damaged. ConfigError: a data set of several series, or with parameters that vary in time.
+    """
+    first: Config | None = None
+    found: list[Finished] = []
+    for run_dir in run_dirs:
+        config, results = _recorded(run_dir, trust, ask)
+        first = first or config
+        found += [finished_set(config, result, run_dir) for result in results]
+    if first is None:
+        raise ConfigError("no run is given")
+    return first, list(_named_apart(found))
+
+
+def carried(sets: Sequence[Finished]) -> Iterator[Caution]:
+    """Warnings of single data sets that hold for an estimate of all of them too, each code once."""
+    for code in CARRIED:
+        of_it = [(s.name, one) for s in sets for one in s.cautions if one.code == code and one.severity == "serious"]
+        if of_it:
+            names = [name for name, _ in of_it]
+            others = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+            told = f"{', '.join(names[:MOST_NAMES])}{others}: {of_it[0][1].words}"
+            yield caution(code, f"of single data sets, {told}", "serious")
+
+
+def _recorded(run_dir: Path, trust: bool, ask: Ask | None) -> tuple[Config, list[StoredResult]]:
+    """The configuration of a run and its results."""
+    results = [load_stored(file) for file in result_files(run_dir)]
+    attributes = results[0].attributes
+    if "configuration_resolved" not in attributes:
+        raise OutputError(f"{run_dir}: its results do not record a configuration; they were written by a program")
+    document = parse_document(str(attributes["configuration_resolved"]), f"{run_dir}: configuration_resolved")
+    with of_strangers(run_dir, ask, trust):
+        return resolve(document, run_dir.absolute()), results
+
+
+def finished_set(config: Config, result: StoredResult, run_dir: Path) -> Finished:
+    """One data set of a run. Raises :class:`ConfigError`, :class:`OutputError`, see :func:`finished`."""
+    if len(result.axes) > 1:  # files and pages of such estimates know one series a data set
+        raise ConfigError(f"{run_dir}: {result.name} has several series; it cannot be estimated with others")
+    problem = problem_of(config, result.observations())
+    if problem.varying:
+        raise ConfigError(f"{run_dir}: parameters that vary in time cannot be estimated with other data sets")
+    names, prior = problem.prior.names, problem.prior
+    columns = [np.asarray(result.posterior[name].values, dtype=float).ravel() for name in names]
+    members = np.column_stack(columns)
+    members = members[result.alive & np.isfinite(members).all(axis=1)]
+    centre = np.asarray(result.sample_stats["centre"].sel(parameter=list(names)).values, dtype=float)
+    try:
+        white = prior.white(prior.from_physical(np.vstack([members, centre])))
+    except ValueError as error:
+        raise OutputError(f"{result.name}: {error}") from None
+    groups = config.sharing.of_dataset(result.name)
+    return Finished(problem, members, white[:-1], centre, result.cautions, groups)
+
+
+def _named_apart(sets: Sequence[Finished]) -> Iterator[Finished]:
+    seen: dict[str, int] = {}
+    for one in sets:
+        seen[one.name] = seen.get(one.name, 0) + 1
+        if seen[one.name] > 1:
+            o = one.problem.observations
+            problem = replace(one.problem, observations=replace(o, name=f"{one.name}_{seen[one.name]}"))
+            one = replace(one, problem=problem)
+        yield one

@@ -1,0 +1,38 @@
+"""All bubbles of one gel estimated together, and where no single gel fits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from en4dvar.config import load_config
+from en4dvar.config.build import build
+from en4dvar.joint import estimate_jointly, sharing
+from en4dvar.prior import member_stream
+from en4dvar.problem import AssimilationSettings
+from en4dvar.sampling.forward_runs import ForwardRuns
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+
+@pytest.mark.slow
+def test_bubbles_of_one_gel_are_recognised_and_those_of_several_are_not():
+    base = build(load_config(CONFIGS / "agarose_10_qlkv.yaml"))[:4]
+    prior, stream = base[0].prior, member_stream(3, "one gel")
+    truth = np.tile(prior.mean, (4, 1))
+    truth[:, 3:] += 0.5 * prior.std[3:] * stream.standard_normal((4, 2))
+    exact = ForwardRuns(base).predictions(truth[None])[0]
+    problems = []
+    for s, problem in enumerate(base):
+        o = problem.observations
+        values = exact[s, : len(o)] + o.std * stream.standard_normal(len(o))
+        problems.append(replace(problem, observations=replace(o, values=values)))
+    names, settings = ["G", "alpha", "mu"], AssimilationSettings(refine="none", what_if=False)
+    one = estimate_jointly(sharing(problems, names), settings, 1)
+    assert 0.5 < one.chi2.mean() < 1.6
+    assert one.shared_mode[2] == pytest.approx(0.15, rel=0.05)  # viscosity is what is told best
+    several = estimate_jointly(sharing(base, names), settings, 1)  # the twin's bubbles differ in G, α and μ
+    assert several.chi2.mean() > 3
