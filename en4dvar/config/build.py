@@ -13,7 +13,7 @@ from en4dvar.config.reading import read_observations
 from en4dvar.config.series import DataPlan, SeriesPlan
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.errors import ConfigError, DataError, Fault
-from en4dvar.inputs.readers import Column, DataFile
+from en4dvar.inputs.asked import Column, DataFile
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem, Tie, discrepancy_parameters

@@ -14,7 +14,7 @@ from en4dvar.config.error_std import QUANTITY_OR_COLUMN, read_error_std, read_ti
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
 from en4dvar.files import expanded
-from en4dvar.inputs.readers import Column, Matrix
+from en4dvar.inputs.asked import Column, Matrix
 
 HUBER = 1.345  # 95 % efficiency where the errors are Gaussian after all: Huber (1981), Robust Statistics
 

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from en4dvar.config.context import TEXT, Context, Spread, observable_unit, require_sign, time_unit
 from en4dvar.config.schema import Section
-from en4dvar.inputs.readers import Column
+from en4dvar.inputs.asked import Column
 from en4dvar.units import UnitError, convert, parse_quantity
 
 _RELATIVE = re.compile(r"(.*%)\s+of\s+(?:the\s+)?maximum")

@@ -17,7 +17,7 @@ from en4dvar.config.series import DataPlan
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import run_chunk
 from en4dvar.forward import Failure
-from en4dvar.inputs.readers import Column
+from en4dvar.inputs.asked import Column
 from en4dvar.state import TIME_SHIFT, Array
 from en4dvar.units import UnitError, convert
 from en4dvar.user_code import reason_of

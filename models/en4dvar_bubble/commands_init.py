@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 if TYPE_CHECKING:
-    from en4dvar.inputs.readers import Contents, Layout
+    from en4dvar.inputs.asked import Layout
+    from en4dvar.inputs.contents import Contents
     from en4dvar_bubble.starter.proposal import Proposal
 
 _TIME = re.compile(r"(?i)t|time|t[ _(\[].*|time[ _(\[].*")
@@ -84,7 +85,7 @@ def init(
     from en4dvar.config.json_schema import schema_text
     from en4dvar.errors import OutputError
     from en4dvar.files import write_text
-    from en4dvar.inputs.readers import Layout
+    from en4dvar.inputs.asked import Layout
     from en4dvar_bubble.starter.config import propose_config, run_name
     from en4dvar_bubble.starter.page import SCHEMA_FILE, Source, yaml_text
     from en4dvar_bubble.starter.proposal import starter
@@ -215,7 +216,7 @@ def _pixel(scalars: Mapping[str, float]) -> str:
 def _first_with_columns(files: Sequence[Path], layout: Layout) -> tuple[Path, Contents, Layout]:
     """The first file that holds columns of numbers, and with its decimal sign. Raises :class:`DataError`: none does."""
     from en4dvar.errors import DataError
-    from en4dvar.inputs.readers import read_contents
+    from en4dvar.inputs.contents import read_contents
 
     points, commas = (replace(layout, decimal=sign) for sign in (".", ","))
 

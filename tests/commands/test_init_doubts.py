@@ -11,7 +11,8 @@ from scipy.io import savemat
 
 from en4dvar.config import load_config
 from en4dvar.config.build import build
-from en4dvar.inputs.readers import Column, read_series
+from en4dvar.inputs.asked import Column
+from en4dvar.inputs.readers import read_series
 from en4dvar_bubble.collapse import RAYLEIGH
 
 pytestmark = pytest.mark.usefixtures("own_folder")

@@ -16,7 +16,8 @@ from en4dvar.config import load_config, resolve
 from en4dvar.config.build import build
 from en4dvar.config.document import parse_document, read_document
 from en4dvar.errors import DataError
-from en4dvar.inputs.readers import Column, read_series
+from en4dvar.inputs.asked import Column
+from en4dvar.inputs.readers import read_series
 from en4dvar.report.result import load_result
 from en4dvar_bubble.collapse import RAYLEIGH, lobe
 from en4dvar_bubble.laws import REGISTRY

@@ -9,7 +9,8 @@ import pytest
 from scipy.io import savemat
 
 from en4dvar.errors import DataError
-from en4dvar.inputs.readers import Column, Layout, Readings, TimeStep, read_series
+from en4dvar.inputs.asked import Column, Layout, TimeStep
+from en4dvar.inputs.readers import Readings, read_series
 
 TIME, RADIUS = Column("t", "us", "s"), Column("R", "um", "m")
 

@@ -14,7 +14,8 @@ from en4dvar.config.document import parse_document
 from en4dvar.config.find_files import find_files, with_parts
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.files import expanded
-from en4dvar.inputs.readers import ANY, Column, DataFile, Layout, Readings, TimeStep, read_series
+from en4dvar.inputs.asked import ANY, Column, DataFile, Layout, TimeStep
+from en4dvar.inputs.readers import Readings, read_series
 from en4dvar.inputs.steps import step_doubts
 from en4dvar.units import UnitError, convert, parse_quantity, parse_unit
 from en4dvar_bubble.starter.look import Start

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from en4dvar.inputs.readers import ANY, Layout
+from en4dvar.inputs.asked import ANY, Layout
 from en4dvar_bubble.starter.proposal import Entry, Proposal
 
 SCHEMA_FILE = "en4dvar.schema.json"
