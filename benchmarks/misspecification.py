@@ -33,6 +33,7 @@ from en4dvar.config.discrepancy import DiscrepancySection
 from en4dvar.noise import noise_of
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem, discrepancy_parameters
+from en4dvar.state import READING_SCALE
 from en4dvar_bubble import BubbleModel
 from en4dvar_bubble.laws.kelvin_voigt import FungKelvinVoigt, NeoHookeanKelvinVoigt, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.parameters import ALPHA, MU_P
@@ -63,7 +64,21 @@ def fung(seed: int) -> Twin:
     return make_laser_twin(seed, fit, World(made), (stiffens,))
 
 
+def knowing(make: Callable[[int], Twin], term: PriorTerm, model: BubbleModel | None = None) -> Callable[[int], Twin]:
+    """The same sets, fitted with what the laboratory does not know as one more parameter (of ``model``)."""
+
+    def twin(seed: int) -> Twin:
+        made = make(seed)
+        of = Prior((*made.problem.prior.terms, term))
+        return Twin(replace(made.problem, prior=of, model=model or made.problem.model), made.truth)
+
+    return twin
+
+
 STRONGER = replace(MODEL, driving=replace(MODEL.driving, amplitude=1.05 * MODEL.driving.amplitude))
+OF_PULSE = MODEL.with_parameters(("p_A",))
+PULSE = PriorTerm.normal(OF_PULSE.parameters[-1], MODEL.driving.amplitude, 0.05 * abs(MODEL.driving.amplitude))
+SCALE = PriorTerm.lognormal(READING_SCALE, 1.0, 0.03)
 MEMORY: dict[str, Any] = {"renamed": {"mu": MU_P}, "fixed": {"relaxation_time": 1e-6}}
 ROWS: dict[str, Callable[[int], Twin]] = {
     "acoustic, as stated": acoustic(),
@@ -77,6 +92,9 @@ ROWS: dict[str, Callable[[int], Twin]] = {
     "laser, errors correlated over 3 us": laser(correlation_time=3e-6),
     "acoustic, radii 3 % too large": acoustic(scale=1.03),
     "laser, radii 3 % too large": laser(scale=1.03),
+    "laser, radii 3 % too large, scale known to 3 %": knowing(laser(scale=1.03), SCALE),
+    "acoustic, pulse 5 % stronger, known to 5 %": knowing(acoustic(model=STRONGER), PULSE, OF_PULSE),
+    "laser, as stated, scale known to 3 %": knowing(laser(), SCALE),
     "laser, 5 % outliers of 8 std": laser(outliers=0.05),
     "laser, instants off by up to 0.5 us": laser(jitter=0.5e-6),
 }

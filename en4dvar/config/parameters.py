@@ -25,7 +25,7 @@ from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel
 from en4dvar.hints import brief, shown, suggest
 from en4dvar.prior import PriorTerm
-from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Array, Parameter
+from en4dvar.state import OF_READINGS, TIME_SHIFT, Array, Parameter
 from en4dvar.units import parse_quantity
 from en4dvar.varying import RandomWalk
 from en4dvar.varying.model import can_vary
@@ -317,7 +317,7 @@ def _missing(parameter: Parameter) -> str:
 
 
 def entries(kind: str = "") -> Made:
-    """One entry for every parameter of the model, in its order, then t_s and sigma if given.
+    """One entry for every parameter of the model, in its order, then those of the readings if given.
 
     ``kind``: what the file is, where it names no data from which a value could come.
     """
@@ -326,7 +326,7 @@ def entries(kind: str = "") -> Made:
         model = context.model
         shift = replace(TIME_SHIFT, unit=model.time_unit, display_unit=model.time_display_unit)
         known = {p.name: p for p in model.parameters}  # a model's own sigma goes before
-        known |= {p.name: p for p in (shift, NOISE_SCALE) if p.name not in known}
+        known |= {p.name: p for p in (*OF_READINGS, shift) if p.name not in known}
         defaults: Mapping[str, float] = getattr(model, "defaults", {})
 
         def unknown(name: str) -> str:
