@@ -11,7 +11,7 @@ from en4dvar.inputs.asked import ANY, Layout
 from en4dvar.inputs.matfile import mat_variables
 from en4dvar.inputs.opened import opened
 from en4dvar.inputs.parts import table_of
-from en4dvar.inputs.text_table import Table
+from en4dvar.inputs.text_table import Table, scalars_in
 from en4dvar.state import Array
 
 
@@ -31,7 +31,9 @@ class Contents:
 def read_contents(path: Path, layout: Layout = ANY) -> Contents:
     """Every column that holds numbers. Raises :class:`DataError`."""
     with opened(path, layout) as kind:
-        return _mat_contents(path) if kind == "mat" else _table_contents(table_of(path, kind, layout))
+        if kind == "mat":
+            return _mat_contents(path)
+        return _table_contents(table_of(path, kind, layout), scalars_in(path) if kind == "csv" else {})
 
 
 def _mat_contents(path: Path) -> Contents:
@@ -48,7 +50,7 @@ def _mat_contents(path: Path) -> Contents:
     return Contents(columns, found.scalars, words)
 
 
-def _table_contents(table: Table) -> Contents:
+def _table_contents(table: Table, scalars: Mapping[str, float]) -> Contents:
     columns: dict[str, Array] = {}
     others: dict[str, str] = {}
     for i, name in enumerate(table.names):
@@ -61,4 +63,4 @@ def _table_contents(table: Table) -> Contents:
             columns[name] = table.numbers(i, name)
         except DataError as error:
             others[name] = str(error)
-    return Contents(columns, {}, others)
+    return Contents(columns, scalars, others)

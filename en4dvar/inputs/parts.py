@@ -13,7 +13,7 @@ from en4dvar.inputs.asked import ANY, Column, Format, Layout
 from en4dvar.inputs.matfile import mat_variables
 from en4dvar.inputs.opened import opened
 from en4dvar.inputs.sheets import sheet_lines
-from en4dvar.inputs.text_table import Table, matches
+from en4dvar.inputs.text_table import Table, matches, scalars_in
 from en4dvar.inputs.variables import Variables, indexed
 from en4dvar.state import Array
 
@@ -30,7 +30,8 @@ def columns_of(
                     raise DataError(f"{path}: no row belongs to {part!r} by column {layout.by!r}")
                 at = table.position(layout.by)
                 table.rows = [(line, row) for line, row in table.rows if _cell(row, at) == part]
-            return _of_table(table, wanted), {}, [line for line, _ in table.rows]
+            scalars = scalars_in(path) if kind == "csv" else {}
+            return _of_table(table, wanted), scalars, [line for line, _ in table.rows]
         _refuse_by(path, layout)
         found = mat_variables(path).of(part)
         return {name: _of_mat(found, name, path) for name in wanted}, found.scalars, []

@@ -19,7 +19,7 @@ from en4dvar.inputs.readers import Readings, read_series
 from en4dvar.inputs.steps import step_doubts
 from en4dvar.units import UnitError, convert, parse_quantity, parse_unit
 from en4dvar_bubble.starter.look import Start
-from en4dvar_bubble.starter.page import Source, quoted, yaml_text
+from en4dvar_bubble.starter.page import TRACKED_COMMON, Source, quoted, yaml_text
 from en4dvar_bubble.starter.proposal import Entry, Proposal, propose, with_columns
 
 _NAMED_UNIT = re.compile(r"[_ \[(/]([a-zA-Zµμ]+)[\])]?$")
@@ -85,7 +85,8 @@ def propose_config(
     proposal = propose({name: (series.times, series.values) for name, series in found.items()}, start, law)
     proposal = _with_rest(proposal, found, source.radius[1])
     if errors:
-        proposal = with_columns(proposal, errors)
+        common = max(series.scalars.get(TRACKED_COMMON, 0.0) for series in found.values())
+        proposal = with_columns(proposal, errors, f"{common:g} {source.radius[1]}" if common > 0 else "")
     proposal = replace(proposal, warnings=(*proposal.warnings, *doubts(source), *_steps(found, source), *unusable))
     text = yaml_text(name or run_name(str(data)), source, proposal, command)
     config = resolve(parse_document(text), Path(folder).absolute())
