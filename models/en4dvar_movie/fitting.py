@@ -133,7 +133,10 @@ def _descend(
         inner = _innermost(trial, trial[SHAPE + 2 * (modes - 1) :])
         trial[RIM] = np.clip(trial[RIM], 0.1 * inner, 0.75 * inner)
         if not np.all(np.isfinite(trial)) or inner < 1 or trial[R] > 3 * max(image.shape):
-            return None
+            damping *= 10
+            if damping > 1e6:
+                return None
+            continue
         found = normal_equations(image, trial, modes, ring, cutoff)
         better = found[4] + 0.5 * float(precision @ (trial - centre) ** 2)
         if better <= cost and found[3] > 0:

@@ -45,9 +45,8 @@ def to_csv(readings: Sequence[Reading], scale: Scale, movie: str, command: str) 
         f"en4dvar track, version {version('en4dvar')}: {command}",
         f"movie: {movie}; pixel: {1e6 * scale.pixel:.9g} um; frame rate: {scale.rate:.9g} Hz; exposure: {exposure}"
         + (f"; flashes: {', '.join(f'{1e6 * t:g} us' for t in scale.flashes)}" if len(scale.flashes) > 1 else ""),
-        "R_std_um is independent from frame to frame; the level of the edge moves all radii together, by a std (um) of",
-        *(f"{COMMON} = {1e6 * scale.pixel * float(np.median(r)):.2g}" for r in [common] if r),
-        "the size of a pixel scales all radii",
+        "R_std_um is independent from frame to frame; a pixel's size moves all radii together, the edge's level by",
+        *[f"{COMMON} = {1e6 * scale.pixel * float(np.median(common or [0])):.2g}"] * bool(common),
     ]
     out = io.StringIO()
     out.writelines(f"# {' '.join(line.split())}\n" for line in head)

@@ -83,7 +83,7 @@ def test_flashes_raw_frames_and_corrections_go_through_that_step_too(tmp_path, m
     words = ["init", "--movie", "gel.raw", "--raw", "128x128x8", "--corrections", "by_hand.txt", *scale]
     outcome = CliRunner().invoke(main, [*words, "--start", "laser", "--out", "gel.yaml"])
     assert outcome.exit_code == 0, outcome.output
-    table = np.genfromtxt(tmp_path / "gel.csv", delimiter=",", comments="#", skip_header=4, usecols=(0, 1, 2))
+    table = np.genfromtxt(tmp_path / "gel.csv", delimiter=",", skip_header=5, usecols=(0, 1, 2))
     t, read = table[np.isfinite(table[:, 2]) & (table[:, 0] != 5)].T[1:]
     truth = dict(zip(np.round(times.ravel() + 7.5, 6), PIXEL * radii.ravel(), strict=True))  # after three empty frames
     assert len(t) == 22
