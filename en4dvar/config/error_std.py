@@ -48,6 +48,10 @@ def error_column(given: Any, context: Context, target: str) -> Column:
 def read_error_std(text: Any, context: Context) -> Spread | Column:
     if isinstance(text, Mapping):
         return error_column(text, context, observable_unit(context))
+    return read_spread(text, context)
+
+
+def read_spread(text: Any, context: Context) -> Spread:
     spread = parse_error_std(text, observable_unit(context))
     require_sign(spread.value, "positive", text)
     return spread

@@ -172,6 +172,8 @@ def _noise(
         read = stated["std"]
         assert read is not None
         std = read
+    if error.model_std is not None:
+        std = np.hypot(std, error.model_std.absolute(float(values.max())))
     if error.correlation_time is not None:
         correlation = np.exp(-np.abs(np.subtract.outer(times, times)) / error.correlation_time)
     return noise_of(std, time_std, correlation, error.huber, kernel)

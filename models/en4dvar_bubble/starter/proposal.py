@@ -123,7 +123,8 @@ def with_columns(proposal: Proposal, errors: Sequence[str], common: str) -> Prop
     ``common`` std of what moves all radii alike, "" where the file states none."""
     kept = [entry for entry in proposal.data if entry.key not in ("  radius_std", "  time_std", "  # time_std")]
     told = [
-        Entry("  radius_std", f"{{column: {errors[0]}}}", "each reading's own; a model is rarely better than 1 %"),
+        Entry("  radius_std", f"{{column: {errors[0]}}}", "each reading's own"),
+        Entry("  model_std", "1 % of maximum", "a model is rarely better; added to it in squares"),
         Entry("  time_std", f"{{column: {errors[1]}}}", "of the exposure"),
     ]
     alike = [
