@@ -35,6 +35,7 @@ def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
         ("frame,R_um", UNITS, ["'frame' seems to count frames; then give --time-step"]),
         ("t_us,D_um", UNITS, ["'D_um' seems to hold diameters"]),
         ("t_us,radius_px", UNITS, ["'radius_px' seems to hold pixels"]),
+        ("t_us,radius_px", ("--time-unit", "us", "--radius-unit", "1.0*um"), []),
         ("t_us,R_um", UNITS, []),
         ("Time (µs),R [µm]", UNITS, []),
         ("t,radius at equator", UNITS, []),

@@ -152,6 +152,19 @@ def test_the_radius_at_rest_is_that_of_the_file(tmp_path: Path) -> None:
     assert "R_eq" in problem.prior.names
 
 
+def test_the_radius_at_rest_is_that_of_each_element(tmp_path: Path) -> None:
+    laser_film()
+    R = loadmat("film.mat")["R"]
+    elements = [(0.63e-6 * np.arange(R.size), 1e-6 * R, 1e-6 * rest) for rest in (20, 22)]
+    fields = [("t", "O"), ("Roft", "O"), ("Req", "O")]
+    savemat("gel.mat", {"expts": np.array([elements], dtype=fields)})
+    words = ["--data", "gel.mat", "--time-unit", "s", "--radius-unit", "m"]
+    done = call("init", *words, "--time-column", "expts.t", "--radius-column", "expts.Roft")
+    assert done.exit_code == 0, done.output
+    problems = build(load_config("gel.yaml"))
+    assert [problem.fixed["R_eq"] for problem in problems] == pytest.approx([20e-6, 22e-6])
+
+
 def rescaled(path: Path, factor: float) -> Path:
     data = loadmat(path)
     savemat(path.name, {"t": data["t"], "Rnew": factor * data["Rnew"]})

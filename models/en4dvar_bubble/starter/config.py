@@ -17,6 +17,7 @@ from en4dvar.files import expanded
 from en4dvar.inputs.asked import ANY, Column, DataFile, Layout, TimeStep
 from en4dvar.inputs.readers import Readings, read_series
 from en4dvar.inputs.steps import step_doubts
+from en4dvar.inputs.variables import indexed
 from en4dvar.units import UnitError, convert, parse_quantity, parse_unit
 from en4dvar_bubble.starter.look import Start
 from en4dvar_bubble.starter.page import TRACKED_COMMON, Source, quoted, yaml_text
@@ -141,6 +142,7 @@ def _steps(found: Mapping[str, Readings], source: Source) -> list[str]:
 def _with_rest(proposal: Proposal, found: Mapping[str, Readings], unit: str) -> Proposal:
     """The radius at rest of the files, where every one has such a scalar that suits its radii in their unit."""
     names = {name for series in found.values() for name in series.scalars if _REST.fullmatch(name)}
+    names = {name for name in names if not indexed(name)[1]} or names  # of expts(1).Req, … one that means each its own
     if len(names) != 1:
         return proposal
     (name,) = names
@@ -163,7 +165,7 @@ def doubts(source: Source) -> list[str]:
         if column is None:
             continue
         name, unit = column
-        if _PIXELS.search(name):
+        if _PIXELS.search(name) and "*" not in unit:
             found.append(f"{name!r} seems to hold pixels; then give --radius-unit as the size of one, such as 2.76*um")
         if what == "times" and _FRAMES.match(name):
             found.append(f"{name!r} seems to count frames; then give --time-step with the time between two of them")
