@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -113,8 +114,8 @@ def main() -> None:
             options.records, map(str, range(options.start, options.start + options.n)), experiment, options.minutes
         ).values()
     )
-    warned = sorted({code for r in found for code in r.get("warned", ())})
-    print(f"{len(found)} movies; warnings: " + ", ".join(f"{c} {sum(c in r['warned'] for r in found)}" for c in warned))
+    warned = Counter(code for r in found for code in r.get("warned", ()))
+    print(f"{len(found)} movies; warnings: " + ", ".join(f"{code} {n}" for code, n in sorted(warned.items())))
     table(found, ("G", "mu", "R_eq", "R_max", "reading_offset"))
 
 
