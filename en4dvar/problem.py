@@ -14,7 +14,7 @@ from en4dvar.forward import Alternative, ForwardModel, Observable
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior
 from en4dvar.series import Part
-from en4dvar.state import DISCREPANCY, NOISE_SCALE, READING_SCALE, Parameter
+from en4dvar.state import DISCREPANCY, NOISE_SCALE, READING_OFFSET, READING_SCALE, Parameter
 from en4dvar.varying import PiecewiseModel, RandomWalk, Varying
 
 
@@ -46,7 +46,8 @@ class InverseProblem:
 
     The control vector holds ``prior.parameters`` in transformed space. A parameter named ``t_s`` shifts the observation
     times: member i is observed at t_k + t_s,i; one named ``sigma`` multiplies the std of every observation error, one
-    named ``reading_scale`` the predictions, where the model has no parameter of that name. ``discrepancy_amplitude``
+    named ``reading_scale`` the predictions, ``reading_offset`` is added to them, where the model has no parameter of
+    that name. ``discrepancy_amplitude``
     and ``discrepancy_length`` are those of the discrepancy that the observations allow for. ``perturbations`` act on
     the initial state, ``tied`` follow what is estimated. ``fixed`` are physical SI values of the other parameters.
     ``fields`` of the initial state are estimated cell by cell: a control vector then goes on with their cells, and the
@@ -91,6 +92,11 @@ class InverseProblem:
     def has_reading_scale(self) -> bool:
         """Whether ``reading_scale`` is given and scales the predictions (rather than being the model's own)."""
         return self._has(READING_SCALE)
+
+    @property
+    def has_reading_offset(self) -> bool:
+        """Whether ``reading_offset`` is given and is added to the predictions (rather than being the model's own)."""
+        return self._has(READING_OFFSET)
 
     def _has(self, parameter: Parameter) -> bool:
         given = parameter.name in self.prior.names or parameter.name in self.fixed

@@ -80,7 +80,17 @@ READING_SCALE = Parameter(
 )
 
 
-OF_READINGS = TIME_SHIFT, NOISE_SCALE, READING_SCALE  # what any model may be given beside its own parameters
+READING_OFFSET = Parameter(
+    name="reading_offset",
+    unit="1",
+    label="offset of the readings",
+    symbol="$c$",
+    source="what all readings are too large by, in the unit of the observable; a model's own parameter goes before it",
+)
+
+
+# what any model may be given beside its own parameters
+OF_READINGS = TIME_SHIFT, NOISE_SCALE, READING_SCALE, READING_OFFSET
 
 
 DISCREPANCY = (

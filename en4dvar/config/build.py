@@ -16,7 +16,7 @@ from en4dvar.descent.field_gain import gain_of
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.field_prior import FieldPrior
-from en4dvar.inputs.readers import Column, DataFile
+from en4dvar.inputs.asked import Column, DataFile
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem, Tie, discrepancy_parameters

@@ -18,7 +18,7 @@ from en4dvar.cycling.coordinates import EnsembleCoordinates
 from en4dvar.cycling.problem import SeriesProblem
 from en4dvar.cycling.start import InitialEnsemble
 from en4dvar.errors import ConfigError, DataError
-from en4dvar.inputs.readers import DataFile
+from en4dvar.inputs.asked import DataFile
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.schemes.localisation import Localisation
 from en4dvar.state import Array

@@ -11,7 +11,7 @@ from en4dvar.config.context import PLACEHOLDER, Context, Made, observable_unit, 
 from en4dvar.config.schema import QuantityText, Section
 from en4dvar.config.validate import Faults
 from en4dvar.errors import ConfigError, Fault
-from en4dvar.inputs.readers import Column, TimeStep
+from en4dvar.inputs.asked import Column, TimeStep
 from en4dvar.units import UnitError, parse_quantity
 
 

@@ -19,7 +19,7 @@ from en4dvar.config.weights import WEIGHTS, Weighing
 from en4dvar.config.window import WindowSection, read_time_zero
 from en4dvar.forward import field_of
 from en4dvar.hints import shown, suggest
-from en4dvar.inputs.readers import Disorder, Format, Layout, Repeated
+from en4dvar.inputs.asked import Disorder, Format, Layout, Repeated
 from en4dvar.inputs.text_table import Decimal
 
 

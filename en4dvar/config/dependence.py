@@ -22,7 +22,7 @@ from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.files import expanded
 from en4dvar.hints import suggest
 from en4dvar.inputs.members import read_members
-from en4dvar.inputs.readers import read_square
+from en4dvar.inputs.square import read_square
 from en4dvar.prior import PriorTerm
 from en4dvar.state import Array, Parameter, TransformName
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from en4dvar.config.context import Context, Made, Spread, observable_unit, quantity, require_sign, time_unit
-from en4dvar.config.error_std import read_error_std
+from en4dvar.config.error_std import read_spread
 from en4dvar.config.schema import Section
 from en4dvar.noise import SMOOTHNESS, Kernel
 from en4dvar.prior import PriorTerm
@@ -38,7 +38,7 @@ LogStd = Annotated[float, Field(gt=0)]
 class AmplitudeSection(Section):
     """Lognormal prior of the discrepancy's standard deviation."""
 
-    median: Annotated[Spread, Made(read_error_std)] = Field("0.5 % of maximum", validate_default=True)
+    median: Annotated[Spread, Made(read_spread)] = Field("0.5 % of maximum", validate_default=True)
     """A quantity in the observable's unit, or e.g. '2 % of maximum'."""
     log_std: LogStd = 1.5
     """Standard deviation of the natural logarithm."""

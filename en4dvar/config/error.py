@@ -10,11 +10,11 @@ from pydantic import BeforeValidator, ConfigDict, Field
 
 from en4dvar.config.context import PLACEHOLDER, Context, Made, Spread, observable_unit, quantity, time_unit, unit_of
 from en4dvar.config.discrepancy import DiscrepancySection, estimated
-from en4dvar.config.error_std import QUANTITY_OR_COLUMN, read_error_std, read_time_std
+from en4dvar.config.error_std import QUANTITY_OR_COLUMN, read_error_std, read_spread, read_time_std
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
 from en4dvar.files import expanded
-from en4dvar.inputs.readers import Column, Matrix
+from en4dvar.inputs.asked import Column, Matrix
 
 HUBER = 1.345  # 95 % efficiency where the errors are Gaussian after all: Huber (1981), Robust Statistics
 
@@ -47,6 +47,8 @@ class Error(Section):
     """Std of the observation error: a quantity, e.g. '1 % of maximum', or ``{column: NAME}``, one a reading."""
     time_std: Annotated[float | Column, Made(read_time_std, json=QUANTITY_OR_COLUMN)] = 0.0
     """Std of the observation times, a quantity or ``{column: NAME}``: adds (rate × time_std)²."""
+    model_std: Annotated[Spread | None, Made(read_spread)] = None
+    """Std of what the model misses from reading to reading, e.g. '1 % of maximum': added to the other in squares."""
     correlation_time: Annotated[float | None, quantity(time_unit, "positive")] = None
     """Errors are correlated as exp(−|Δt|/τ)."""
     covariance: Annotated[Matrix | None, Made(_matrix, CovarianceFile)] = None
@@ -66,6 +68,7 @@ class Error(Section):
         std = f"{PLACEHOLDER}_std"
         for name, other, reason in (
             ("covariance", std, "the file holds the variances"),
+            ("covariance", "model_std", "the file holds the variances"),
             ("covariance", "correlation_time", "the file holds the correlations"),
             ("robust", "correlation_time", "a robust cost needs independent observation errors"),
             ("robust", "covariance", "a robust cost needs independent observation errors"),

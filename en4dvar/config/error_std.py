@@ -10,7 +10,7 @@ from pydantic import Field
 
 from en4dvar.config.context import TEXT, Context, Spread, observable_unit, require_sign, time_unit
 from en4dvar.config.schema import Section
-from en4dvar.inputs.readers import Column
+from en4dvar.inputs.asked import Column
 from en4dvar.units import UnitError, convert, parse_quantity
 
 _RELATIVE = re.compile(r"(.*%)\s+of\s+(?:the\s+)?maximum")
@@ -48,6 +48,10 @@ def error_column(given: Any, context: Context, target: str) -> Column:
 def read_error_std(text: Any, context: Context) -> Spread | Column:
     if isinstance(text, Mapping):
         return error_column(text, context, observable_unit(context))
+    return read_spread(text, context)
+
+
+def read_spread(text: Any, context: Context) -> Spread:
     spread = parse_error_std(text, observable_unit(context))
     require_sign(spread.value, "positive", text)
     return spread

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from en4dvar.errors import DataError
 from en4dvar.files import PathError, expanded, readable
-from en4dvar.inputs.readers import ANY, SUFFIXES, Column, DataFile, Layout, parts_of
+from en4dvar.inputs.asked import ANY, SUFFIXES, Column, DataFile, Layout
+from en4dvar.inputs.parts import parts_of
 
 
 def with_parts(
@@ -20,7 +21,7 @@ def with_parts(
     layout: Layout = ANY,
     time: str | None = None,
 ) -> dict[str, DataFile]:
-    """Every data set that the files hold, see :func:`~en4dvar.inputs.readers.parts_of`."""
+    """Every data set that the files hold, see :func:`~en4dvar.inputs.parts.parts_of`."""
     found: dict[str, DataFile] = {}
     for name, path in files.items():
         try:

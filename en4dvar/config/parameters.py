@@ -25,7 +25,7 @@ from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel
 from en4dvar.hints import brief, shown, suggest
 from en4dvar.prior import PriorTerm
-from en4dvar.state import OF_READINGS, READING_SCALE, TIME_SHIFT, Array, Parameter
+from en4dvar.state import OF_READINGS, READING_OFFSET, READING_SCALE, TIME_SHIFT, Array, Parameter
 from en4dvar.units import parse_quantity
 from en4dvar.varying import RandomWalk
 from en4dvar.varying.model import can_vary
@@ -329,10 +329,12 @@ def entries(kind: str = "") -> Made:
     def read(given: Mapping[str, Any], context: Context) -> tuple[Entry, ...]:
         model = context.model
         shift = replace(TIME_SHIFT, unit=model.time_unit, display_unit=model.time_display_unit)
+        seen = context.observed
+        offset = replace(READING_OFFSET, unit=seen.unit, display_unit=seen.display_unit) if seen else READING_OFFSET
         known = {p.name: p for p in model.parameters}  # a model's own sigma goes before
         # what makes its own readings makes them to scale
-        offered = (p for p in (*OF_READINGS, shift) if not (kind and p is READING_SCALE))
-        known |= {p.name: p for p in offered if p.name not in known}
+        made = {READING_SCALE.name, READING_OFFSET.name} if kind else set()
+        known |= {p.name: p for p in (*OF_READINGS, shift, offset) if p.name not in known.keys() | made}
         possible = [p.name for p in model.optional_parameters if p.name not in known]
         defaults: Mapping[str, float] = getattr(model, "defaults", {})
 

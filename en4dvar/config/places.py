@@ -13,7 +13,7 @@ from en4dvar.config.context import Context, Made
 from en4dvar.config.schema import Section
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.forward import field_of
-from en4dvar.inputs.readers import Column
+from en4dvar.inputs.asked import Column
 from en4dvar.series import Places
 from en4dvar.state import Array
 from en4dvar.state import Field as StateBlock

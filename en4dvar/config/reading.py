@@ -15,7 +15,9 @@ from en4dvar.config.data import Data
 from en4dvar.config.series import DataPlan, SeriesPlan
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.files import readable
-from en4dvar.inputs.readers import Column, DataFile, Readings, read_covariance, read_series
+from en4dvar.inputs.asked import Column, DataFile
+from en4dvar.inputs.readers import Readings, read_series
+from en4dvar.inputs.square import read_covariance
 from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.window import select
 from en4dvar.noise import Noise, noise_of
@@ -172,6 +174,8 @@ def errors_of(
         read = stated["std"]
         assert read is not None
         std = read
+    if error.model_std is not None:
+        std = np.hypot(std, error.model_std.absolute(float(values.max())))
     if error.correlation_time is not None:
         correlation = np.exp(-np.abs(np.subtract.outer(times, times)) / error.correlation_time)
     return noise_of(std, time_std, correlation, error.huber, kernel)

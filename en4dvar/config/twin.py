@@ -23,7 +23,8 @@ from en4dvar.cycling.twin import TwinExperiment
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.files import expanded
 from en4dvar.forward import ForwardModel, Observable
-from en4dvar.inputs.readers import Matrix, read_covariance
+from en4dvar.inputs.asked import Matrix
+from en4dvar.inputs.square import read_covariance
 from en4dvar.noise import Correlation
 from en4dvar.prior import Prior
 

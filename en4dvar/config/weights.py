@@ -16,7 +16,7 @@ from en4dvar.config.schema import Section
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.files import PathError
 from en4dvar.hints import shown
-from en4dvar.inputs.readers import Column
+from en4dvar.inputs.asked import Column
 from en4dvar.inputs.window import minima
 from en4dvar.state import Array
 from en4dvar.user_code import loading, reason_of, require_permission

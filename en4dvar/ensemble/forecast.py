@@ -15,7 +15,7 @@ from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.noise import Predicted
 from en4dvar.problem import InverseProblem
-from en4dvar.state import NOISE_SCALE, OF_READINGS, READING_SCALE, TIME_SHIFT, Array, Parameter
+from en4dvar.state import NOISE_SCALE, OF_READINGS, READING_OFFSET, READING_SCALE, TIME_SHIFT, Array, Parameter
 
 NO_TIMES: Array = np.empty(0)
 GRID_POINTS = 200  # of a plot
@@ -78,12 +78,11 @@ class Composite:
         self._operators = _operators(problem)
         self._batched = batched(problem)
         self._scaled, self._discrepancy = problem.has_noise_scale, problem.discrepancy
-        self._reading_scaled = problem.has_reading_scale
 
     def __call__(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
         """Run control vectors ``x`` (B, n; transformed) through F and H.
 
-        Member i is observed at t_k + t_s,i, times its ``reading_scale``. ``extra_times`` (M,), on the clock of the
+        Member i is observed at t_k + t_s,i, see :func:`as_read`. ``extra_times`` (M,), on the clock of the
         observations, are read from the same run. A member fails, without disturbing the others, where a parameter
         leaves its bounds, ``initial_state`` raises, the model returns a :class:`Failure`, or H gives anything but
         finite numbers.
@@ -107,8 +106,7 @@ class Composite:
             observed[:, alive], limits[alive] = read
             for i, reason in zip(np.arange(len(x))[alive], reasons, strict=True):
                 failures[i] = reason
-        if self._reading_scaled:
-            observed = observed * reading_scale(problem, physical)[:, None]
+        observed = as_read(problem, physical, observed)
         predicted = Predicted(
             observed[0][:, at_observations],
             observed[1][:, at_observations] if len(observed) > 1 else None,
@@ -203,8 +201,9 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
     ):
         if names:
             raise ConfigError(f"{', '.join(sorted(names))}: {message}")
-    if problem.has_reading_scale and problem.observations.parts:
-        raise ConfigError("reading_scale: several series, or places, have no common scale; leave it out")
+    for given, parameter in ((problem.has_reading_scale, READING_SCALE), (problem.has_reading_offset, READING_OFFSET)):
+        if given and problem.observations.parts:
+            raise ConfigError(f"{parameter.name}: one number for several series or for places means nothing")
     _operators(problem)
     return tuple(known[name] for name in problem.fixed)
 
@@ -226,6 +225,16 @@ def reading_scale(problem: InverseProblem, physical: Array) -> Array:
     if not problem.has_reading_scale:
         return np.ones(len(physical))
     return _of_framework(problem, physical, READING_SCALE, 1.0)
+
+
+def as_read(problem: InverseProblem, physical: Array, observed: Array) -> Array:
+    """What is read of an observable, and of its rates, (Q, B, M): times ``reading_scale``, plus ``reading_offset``."""
+    if problem.has_reading_scale:
+        observed = observed * reading_scale(problem, physical)[:, None]
+    if problem.has_reading_offset:
+        read = observed[0] + _of_framework(problem, physical, READING_OFFSET, 0.0)[:, None]
+        observed = np.concatenate([read[None], observed[1:]])
+    return observed
 
 
 def _of_framework(problem: InverseProblem, physical: Array, parameter: Parameter, default: float) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 
 from en4dvar.errors import DataError
 from en4dvar.hints import listed, no_such_file, suggest
-from en4dvar.inputs.readers import read_contents
+from en4dvar.inputs.contents import read_contents
 from en4dvar.state import Array
 from en4dvar.units import UnitError, convert
 

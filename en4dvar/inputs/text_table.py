@@ -27,6 +27,7 @@ COMMENT = ("#", "%", "//")
 WIDEST = 10_000  # columns
 BLANK = ("", "nan", "na", "n/a", "-")
 PREAMBLE = 200  # lines among which the names of the columns are looked for
+_SCALAR = re.compile(r"(?:#|%|//)\s*([A-Za-z_]\w*)\s*=\s*([-+.\deE]+)\s*")
 _NAMELESS = re.compile(r"c[1-9]\d*")
 
 
@@ -34,6 +35,12 @@ def numbered_lines(path: Path) -> list[tuple[int, str]]:
     """Numbered lines that are neither blank nor comments."""
     lines = enumerate(_text(path).splitlines(), 1)
     return [(n, s) for n, s in lines if s.strip() and not s.lstrip().startswith(COMMENT)]
+
+
+def scalars_in(path: Path) -> dict[str, float]:
+    """What comments such as ``# Req = 21.79`` say, by name."""
+    said = filter(None, (_SCALAR.fullmatch(line.strip()) for line in _text(path).splitlines()))
+    return {found[1]: float(found[2]) for found in said if _is_number(found[2])}
 
 
 def _text(path: Path) -> str:

@@ -17,7 +17,7 @@ from en4dvar.config.schema import Section
 from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.validate import check
 from en4dvar.errors import ConfigError, DataError, Fault
-from en4dvar.inputs.readers import DataFile
+from en4dvar.inputs.asked import DataFile
 
 
 def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> AnyConfig:

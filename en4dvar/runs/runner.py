@@ -13,7 +13,7 @@ from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.executor import Executor, choose_executor, one_blas_thread
 from en4dvar.files import write_text
-from en4dvar.inputs.readers import DataFile
+from en4dvar.inputs.asked import DataFile
 from en4dvar.report import TABLES, write_pages
 from en4dvar.report.joint import PAGE_FILES, write_joint
 from en4dvar.report.result import Result

@@ -11,7 +11,7 @@ from en4dvar.config import AnyConfig, TwinConfig
 from en4dvar.errors import ConfigError, OutputError
 from en4dvar.executor import ExecutorError
 from en4dvar.files import write_text
-from en4dvar.inputs.readers import DataFile
+from en4dvar.inputs.asked import DataFile
 from en4dvar.runs.interrupt import Interrupted, tell_interrupt
 from en4dvar.runs.progress import RunLog
 from en4dvar.runs.rundir import Mode, RunDirectory

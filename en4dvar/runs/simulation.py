@@ -16,9 +16,9 @@ from en4dvar.config.series import DataPlan, SeriesPlan
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import run_chunk
 from en4dvar.forward import Failure, Observable
-from en4dvar.inputs.readers import Column
+from en4dvar.inputs.asked import Column
 from en4dvar.series import Places
-from en4dvar.state import READING_SCALE, TIME_SHIFT, Array
+from en4dvar.state import READING_OFFSET, READING_SCALE, TIME_SHIFT, Array
 from en4dvar.units import UnitError, convert
 from en4dvar.user_code import reason_of
 
@@ -124,7 +124,7 @@ def _observables(config: Config) -> dict[str, Observable]:
 def _forward(config: Config, theta: Mapping[str, float], times: Array) -> dict[str, Array]:
     model = config.model
     shift, names = theta.get(TIME_SHIFT.name, 0.0), {p.name for p in model.parameters}
-    scale = 1.0 if READING_SCALE.name in names else theta.get(READING_SCALE.name, 1.0)
+    read = {name: value for name, value in theta.items() if name not in names}
     try:
         own = {name: value for name, value in theta.items() if name in names}
         state = np.asarray(model.initial_state(own), dtype=float)
@@ -142,7 +142,8 @@ def _forward(config: Config, theta: Mapping[str, float], times: Array) -> dict[s
         except BaseException as error:
             raise En4dvarError(f"{observable.name} cannot be read from the run: {reason_of(error)}") from None
         places = where.get(name)
-        found[name] = scale * (values if places is None else places.read(values))
+        values = values if places is None else places.read(values)
+        found[name] = read.get(READING_SCALE.name, 1.0) * values + read.get(READING_OFFSET.name, 0.0)
     return found
 
 

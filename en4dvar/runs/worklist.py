@@ -15,7 +15,7 @@ from en4dvar.config.build import build_one
 from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
 from en4dvar.files import readable, write_bytes
-from en4dvar.inputs.readers import DataFile
+from en4dvar.inputs.asked import DataFile
 from en4dvar.prior import own_seed
 from en4dvar.runs.campaign import DatasetOutcome, file_names
 from en4dvar.runs.jobs import Estimate, Job, Records, estimate, estimate_and_tell

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.ensemble.forecast import reading_scale, time_shift
+from en4dvar.ensemble.forecast import as_read, time_shift
 from en4dvar.ensemble.members import InitialStates, Reading, out_of_bounds
 from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor
@@ -45,7 +45,7 @@ class Predictor:
         if len(states):
             outcomes = self.executor.trajectories(self.problem.model, states, times[alive])
             observed[alive] = self._reading.observe(outcomes, times.shape[1])[0][0]
-        return observed * reading_scale(self.problem, physical)[:, None]
+        return as_read(self.problem, physical, observed[None])[0]
 
     def time_shifts(self, x: Array) -> Array:
         """t_s (B,) of control vectors (B, n)."""

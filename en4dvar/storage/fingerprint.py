@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 
 from en4dvar.forward import ForwardModel
-from en4dvar.inputs.readers import DataFile
+from en4dvar.inputs.asked import DataFile
 from en4dvar.storage.checkpoint import digest, file_digest
 from en4dvar.storage.provenance import package_versions
 

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 if TYPE_CHECKING:
-    from en4dvar.inputs.readers import Contents, Layout
+    from en4dvar.inputs.asked import Layout
+    from en4dvar.inputs.contents import Contents
     from en4dvar_bubble.starter.proposal import Proposal
 
 _TIME = re.compile(r"(?i)t|time|t[ _(\[].*|time[ _(\[].*")
@@ -28,6 +29,9 @@ _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 @click.option("--pixel", metavar="LENGTH", help="Size of a pixel of the movie, e.g. '2.76 um'.")
 @click.option("--frame-rate", metavar="RATE", help="Frame rate of the movie, or of the data's, e.g. '270 kHz'.")
 @click.option("--exposure", metavar="TIME", help="Exposure of a frame of the movie, e.g. '500 ns'.")
+@click.option("--flashes", metavar="TIMES", help="Flashes of one exposure of the movie, as '0 us, 2 us, 4 us'.")
+@click.option("--raw", metavar="WxHxBITS", help="Shape of the frames of a movie without header, e.g. 512x128x8.")
+@click.option("--corrections", metavar="FILE", help="Frames of the movie corrected by hand.")
 @click.option("--example", type=click.Choice(["quickstart"]), help="An example and its synthetic data instead.")
 @click.option("--time-unit", metavar="UNIT", help="Unit of the times in the file, e.g. us.")
 @click.option("--radius-unit", metavar="UNIT", help="Unit of the radii in the file, e.g. um.")
@@ -45,9 +49,7 @@ _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 def init(
     data: str | None,
     movie: Path | None,
-    pixel: str | None,
     frame_rate: str | None,
-    exposure: str | None,
     example: str | None,
     time_unit: str | None,
     radius_unit: str | None,
@@ -62,6 +64,7 @@ def init(
     law: str | None,
     out: Path | None,
     force: bool,
+    **of_movie: str | None,
 ) -> None:
     """Write a commented starter configuration for bubble radius data, proposed from what they show.
 
@@ -74,8 +77,8 @@ def init(
     """
     if movie is not None and (data is not None or example is not None):
         raise click.UsageError("--movie makes the data; not together with --data or --example")
-    if movie is None and (pixel or exposure):
-        raise click.UsageError("--pixel and --exposure are of a --movie")
+    if movie is None and (given := [f"--{name}" for name, text in of_movie.items() if text is not None]):
+        raise click.UsageError(f"{given[0]} is of a --movie")
     if example is not None:
         if data is not None or out is not None:
             raise click.UsageError("--example comes with its own data and file names")
@@ -84,7 +87,7 @@ def init(
     from en4dvar.config.json_schema import schema_text
     from en4dvar.errors import OutputError
     from en4dvar.files import write_text
-    from en4dvar.inputs.readers import Layout
+    from en4dvar.inputs.asked import Layout
     from en4dvar_bubble.starter.config import propose_config, run_name
     from en4dvar_bubble.starter.page import SCHEMA_FILE, Source, yaml_text
     from en4dvar_bubble.starter.proposal import starter
@@ -97,14 +100,13 @@ def init(
     if not target.absolute().parent.is_dir():
         raise OutputError(f"{target}: the folder {target.parent} does not exist")
     if movie is not None:
-        scale = {"--pixel": pixel, "--frame-rate": frame_rate, "--exposure": exposure}
-        data = str(_tracked(movie, target, scale, force))
+        data = str(_tracked(movie, target, {**of_movie, "frame-rate": frame_rate}, force))
     if data is None:
         proposal = starter(start or "acoustic", law)
         text = yaml_text(name, Source("bubble.csv", ("t_us", "us"), None, ("R_um", "um")), proposal, words)
     else:
-        given = {"by": by, "sheet": sheet, "unsorted": unsorted, "repeated": repeated}
-        layout = Layout(**{name: it for name, it in given.items() if it is not None})  # type: ignore[arg-type]
+        stated = {"by": by, "sheet": sheet, "unsorted": unsorted, "repeated": repeated}
+        layout = Layout(**{name: it for name, it in stated.items() if it is not None})  # type: ignore[arg-type]
         asked = _Asked(
             time_unit, radius_unit, time_column, radius_column, time_step, frame_rate if movie is None else None
         )
@@ -116,7 +118,7 @@ def init(
     _tell(target, proposal, example_only=data is None)
 
 
-def _tracked(movie: Path, target: Path, scale: Mapping[str, str | None], force: bool) -> Path:
+def _tracked(movie: Path, target: Path, options: Mapping[str, str | None], force: bool) -> Path:
     """The table of a movie beside the configuration ``target``, by the command ``track`` of whoever provides it."""
     context = click.get_current_context()
     root = context.find_root()
@@ -124,7 +126,7 @@ def _tracked(movie: Path, target: Path, scale: Mapping[str, str | None], force: 
     if command is None:
         raise click.UsageError("no command 'track' is installed, which reads movies")
     table = target.with_suffix(".csv")
-    given = [word for option, text in scale.items() if text is not None for word in (option, text)]
+    given = [word for name, text in options.items() if text is not None for word in (f"--{name}", text)]
     words = ["--out", str(table), *given, *["--force"] * force, "--", str(movie)]
     with command.make_context("track", words, parent=context) as inner:
         inner.command.invoke(inner)
@@ -215,7 +217,7 @@ def _pixel(scalars: Mapping[str, float]) -> str:
 def _first_with_columns(files: Sequence[Path], layout: Layout) -> tuple[Path, Contents, Layout]:
     """The first file that holds columns of numbers, and with its decimal sign. Raises :class:`DataError`: none does."""
     from en4dvar.errors import DataError
-    from en4dvar.inputs.readers import read_contents
+    from en4dvar.inputs.contents import read_contents
 
     points, commas = (replace(layout, decimal=sign) for sign in (".", ","))
 

@@ -106,17 +106,18 @@ def smooth_surface(frames: Sequence[Frame]) -> Array:
     """A quadratic surface (H, W) through the background of frames that all hold a bubble."""
     typical = np.median(np.array(frames, dtype=np.float32), axis=0)
     y, x = np.mgrid[-1 : 1 : typical.shape[0] * 1j, -1 : 1 : typical.shape[1] * 1j]
-    terms = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=-1).reshape(-1, 6)
+    terms = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y]).reshape(6, -1)
     values = typical.ravel().astype(float)
     border = np.ones(typical.shape, dtype=bool)
     rim = max(2, min(typical.shape) // 10)
     border[rim:-rim, rim:-rim] = False
     kept = border.ravel()
     for _ in range(8):
-        fitted, *_ = np.linalg.lstsq(terms[kept], values[kept], rcond=None)
-        off = values - terms @ fitted
+        chosen = terms * kept
+        fitted = np.linalg.solve(chosen @ terms.T, chosen @ values)  # of terms within ±1, so that squares lose little
+        off = values - fitted @ terms
         kept = np.abs(off) <= 3 * max(1.4826 * float(np.median(np.abs(off[kept]))), 0.5)
-    return (terms @ fitted).reshape(typical.shape).astype(np.float32)
+    return (fitted @ terms).reshape(typical.shape).astype(np.float32)
 
 
 def _holds_a_blob(first: Image, noise: float) -> bool:

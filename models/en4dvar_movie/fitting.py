@@ -11,7 +11,7 @@ from en4dvar_movie.kernels import SHAPE, influence, normal_equations, residuals
 from en4dvar_movie.outline import MODES, Circle, Optics, Outline, share_inside
 
 ROUNDS = 30
-CLOSE = (1e-2, 1e-2, 1e-4)  # pixels: the step at which each turn ends
+CLOSE = (1e-2, 1e-2, 1e-3)  # pixels: the step at which each turn ends
 RIM_SHARE = 0.45  # of the radius: where the bright centre ends, before it is fitted
 LEVEL_SPREAD = 0.001  # of the background next to the bubble, in contrasts: halos are not the level of the background
 FIRST_SPREAD = (0.03, 0.0, 0.0)  # of the contrast in the first turns
@@ -133,7 +133,10 @@ def _descend(
         inner = _innermost(trial, trial[SHAPE + 2 * (modes - 1) :])
         trial[RIM] = np.clip(trial[RIM], 0.1 * inner, 0.75 * inner)
         if not np.all(np.isfinite(trial)) or inner < 1 or trial[R] > 3 * max(image.shape):
-            return None
+            damping *= 10
+            if damping > 1e6:
+                return None
+            continue
         found = normal_equations(image, trial, modes, ring, cutoff)
         better = found[4] + 0.5 * float(precision @ (trial - centre) ** 2)
         if better <= cost and found[3] > 0:

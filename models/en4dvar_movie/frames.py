@@ -31,7 +31,7 @@ class Movie:
     """``open`` runs through the frames from the first; ``count`` is 0 where only reading tells.
 
     ``pixel`` (m) and ``rate`` (1/s) are what the file itself says, NaN where it says nothing. ``notes`` are what
-    reading showed that a user should know.
+    reading showed that a user should know, ``damaged`` the frames of which it showed that they are not whole.
     """
 
     path: Path
@@ -40,6 +40,7 @@ class Movie:
     pixel: float = float("nan")
     rate: float = float("nan")
     notes: list[str] = field(default_factory=list)
+    damaged: set[int] = field(default_factory=set)
 
     def frames(self) -> Iterator[Frame]:
         """Frames (H, W), all of one shape. Raises :class:`DataError`, which names the frame."""
@@ -49,11 +50,10 @@ class Movie:
             for number, read in enumerate(self.open()):
                 if number == 0:
                     channel = _channel(read)
-                    if _is_coloured(read) and not self.notes:
-                        name = ("red", "green", "blue")[channel]
-                        self.notes.append(
-                            f"{self.path}: frames are in colour; the channel with most light, {name}, is used"
-                        )
+                    name = ("red", "green", "blue")[channel]
+                    words = f"{self.path}: frames are in colour; the channel with most light, {name}, is used"
+                    if _is_coloured(read) and words not in self.notes:
+                        self.notes.append(words)
                 frame = _grey(read, channel, f"{self.path}: frame {number}")
                 shape = shape or frame.shape
                 if frame.shape != shape:
@@ -166,7 +166,7 @@ def _tiff(path: Path) -> Movie:
     if pages == 1 < count and plain and path.stat().st_size >= start + count * frame:  # ImageJ's way beyond 4 GB
         return Movie(path, lambda: _blocks(path, start, count, kind, shape), count, pixel, rate)
     if pages < count or any("invalid page offset" in fault for fault in faults):
-        raise DataError(f"{path}: the file is damaged or cut off: of {count} frames not all are there")
+        raise DataError(f"{path}: the file is damaged or cut off: not all of its frames are there")
 
     def read() -> Iterator[Frame]:
         with tifffile.TiffFile(path) as file:
@@ -209,23 +209,32 @@ def _folder(path: Path) -> Movie:
 def _video(path: Path) -> Movie:
     av = library("av")
 
+    notes: list[str] = []
+    damaged: set[int] = set()
+
     def read() -> Iterator[Frame]:
         with av.open(str(path)) as file:
             if not file.streams.video:
                 raise DataError(f"{path}: holds no video")
             stream = file.streams.video[0]
             stream.thread_type = "AUTO"
-            for frame in file.decode(stream):
+            number = -1
+            for number, frame in enumerate(file.decode(stream)):
                 if frame.interlaced_frame:
                     raise DataError(f"{path}: the movie is interlaced; save whole frames (ffmpeg -vf yadif)")
+                if frame.is_corrupt:
+                    damaged.add(number)
                 yield frame.to_ndarray(format="gray" if frame.format.name.startswith("gray") else "rgb24")
+            short = f"{path}: the file is cut off: it says that it holds {stream.frames} frames, {number + 1} are there"
+            if number + 1 < stream.frames and short not in notes:
+                notes.append(short)
 
     try:
         with av.open(str(path)) as file:
             count = file.streams.video[0].frames if file.streams.video else 0
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read as a movie: {error}") from None
-    return Movie(path, read, int(count))
+    return Movie(path, read, int(count), notes=notes, damaged=damaged)
 
 
 def _raw(path: Path, raw: str) -> Movie:

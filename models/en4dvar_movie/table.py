@@ -13,6 +13,7 @@ import numpy as np
 from en4dvar_movie.tracking import Found, Reading
 
 COLUMNS = ("frame", "t_us", "R_um", "R_std_um", "t_std_us", "x_um", "y_um", "eccentricity", "used", "reason")
+COMMON = "R_common_um"
 STEADY = 0.1  # of the exposure: where its light may be centred
 UNKNOWN = 0.05  # of the step between frames, where no exposure is given
 
@@ -44,8 +45,8 @@ def to_csv(readings: Sequence[Reading], scale: Scale, movie: str, command: str) 
         f"en4dvar track, version {version('en4dvar')}: {command}",
         f"movie: {movie}; pixel: {1e6 * scale.pixel:.9g} um; frame rate: {scale.rate:.9g} Hz; exposure: {exposure}"
         + (f"; flashes: {', '.join(f'{1e6 * t:g} us' for t in scale.flashes)}" if len(scale.flashes) > 1 else ""),
-        f"R_std_um is independent from frame to frame; the level of the edge moves all radii together, by "
-        f"{1e6 * scale.pixel * float(np.median(common)) if common else 0:.2g} um; the pixel's size scales them",
+        "R_std_um is independent from frame to frame; a pixel's size moves all radii together, the edge's level by",
+        *[f"{COMMON} = {1e6 * scale.pixel * float(np.median(common or [0])):.2g}"] * bool(common),
     ]
     out = io.StringIO()
     out.writelines(f"# {' '.join(line.split())}\n" for line in head)

@@ -73,6 +73,8 @@ def track(
 
     def look(numbered: tuple[int, Frame]) -> list[Found]:
         number, frame = numbered
+        if number in movie.damaged:
+            return [Found(number, None, "the file is damaged here")]
         return find_bubble(number, frame, background, optics, fixed.get(number), len(flashes))
 
     found = []

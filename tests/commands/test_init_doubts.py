@@ -11,7 +11,8 @@ from scipy.io import savemat
 
 from en4dvar.config import load_config
 from en4dvar.config.build import build
-from en4dvar.inputs.readers import Column, read_series
+from en4dvar.inputs.asked import Column
+from en4dvar.inputs.readers import read_series
 from en4dvar_bubble.collapse import RAYLEIGH
 
 pytestmark = pytest.mark.usefixtures("own_folder")
@@ -34,6 +35,7 @@ def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
         ("frame,R_um", UNITS, ["'frame' seems to count frames; then give --time-step"]),
         ("t_us,D_um", UNITS, ["'D_um' seems to hold diameters"]),
         ("t_us,radius_px", UNITS, ["'radius_px' seems to hold pixels"]),
+        ("t_us,radius_px", ("--time-unit", "us", "--radius-unit", "1.0*um"), []),
         ("t_us,R_um", UNITS, []),
         ("Time (µs),R [µm]", UNITS, []),
         ("t,radius at equator", UNITS, []),

@@ -16,7 +16,8 @@ from en4dvar.config import load_config, resolve
 from en4dvar.config.build import build
 from en4dvar.config.document import parse_document, read_document
 from en4dvar.errors import DataError
-from en4dvar.inputs.readers import Column, read_series
+from en4dvar.inputs.asked import Column
+from en4dvar.inputs.readers import read_series
 from en4dvar.report.result import load_result
 from en4dvar_bubble.collapse import RAYLEIGH, lobe
 from en4dvar_bubble.laws import REGISTRY
@@ -149,6 +150,19 @@ def test_the_radius_at_rest_is_that_of_the_file(tmp_path: Path) -> None:
     assert "Req 2.179e-05 of the file is not used: it is no radius at rest in um" in done.stderr
     (problem,) = build(load_config("film.yaml"))
     assert "R_eq" in problem.prior.names
+
+
+def test_the_radius_at_rest_is_that_of_each_element(tmp_path: Path) -> None:
+    laser_film()
+    R = loadmat("film.mat")["R"]
+    elements = [(0.63e-6 * np.arange(R.size), 1e-6 * R, 1e-6 * rest) for rest in (20, 22)]
+    fields = [("t", "O"), ("Roft", "O"), ("Req", "O")]
+    savemat("gel.mat", {"expts": np.array([elements], dtype=fields)})
+    words = ["--data", "gel.mat", "--time-unit", "s", "--radius-unit", "m"]
+    done = call("init", *words, "--time-column", "expts.t", "--radius-column", "expts.Roft")
+    assert done.exit_code == 0, done.output
+    problems = build(load_config("gel.yaml"))
+    assert [problem.fixed["R_eq"] for problem in problems] == pytest.approx([20e-6, 22e-6])
 
 
 def rescaled(path: Path, factor: float) -> Path:

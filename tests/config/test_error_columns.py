@@ -39,6 +39,14 @@ def test_each_reading_has_its_own_error_in_the_unit_of_its_column(tmp_path):
     np.testing.assert_allclose(noise.time_std, [2e-10, 3e-10, 1e-10])
 
 
+def test_what_the_model_misses_is_added_in_squares(tmp_path):
+    noise = problem(tmp_path, "{radius_std: {column: s}, model_std: 5 % of maximum}").observations.noise
+    np.testing.assert_allclose(noise.std, np.hypot([1e-6, 4e-6, 3e-6], 0.05 * 80e-6))
+    for wrong in ("{radius_std: 1 um, model_std: {column: s}}", "{radius_std: 1 um, model_std: -1 um}"):
+        with pytest.raises(ConfigError, match=r"c.yaml:8:.*error.model_std"):
+            problem(tmp_path, wrong)
+
+
 @pytest.mark.parametrize(("value", "words"), [("", "is blank"), (0, "is 0, not positive"), (-1, "is -1, not positive")])
 def test_an_error_that_is_none_is_refused(tmp_path, value, words):
     with pytest.raises(DataError, match=f"reading 5 in column 's' {words}"):

@@ -12,7 +12,10 @@ from toy_config import write_toy
 
 from en4dvar.config.document import read_document
 from en4dvar.errors import ConfigError, DataError
-from en4dvar.inputs.readers import Column, Matrix, read_contents, read_covariance, read_series
+from en4dvar.inputs.asked import Column, Matrix
+from en4dvar.inputs.contents import read_contents
+from en4dvar.inputs.readers import read_series
+from en4dvar.inputs.square import read_covariance
 
 TIME, RADIUS = Column("t", "us", "s"), Column("R", "um", "m")
 

@@ -17,7 +17,10 @@ from en4dvar.config.synthetic import resolve_campaign
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.errors import ConfigError, DataError, En4dvarError
 from en4dvar.executor import SerialExecutor
-from en4dvar.inputs.readers import Column, Matrix, TimeStep, read_contents, read_covariance, read_series
+from en4dvar.inputs.asked import Column, Matrix, TimeStep
+from en4dvar.inputs.contents import read_contents
+from en4dvar.inputs.readers import read_series
+from en4dvar.inputs.square import read_covariance
 from en4dvar.report.result import load_result
 from en4dvar.runs.checks import validate
 from en4dvar.units import UnitError, parse_quantity

@@ -9,7 +9,9 @@ import pytest
 from scipy.io import savemat
 
 from en4dvar.errors import DataError
-from en4dvar.inputs.readers import Column, Layout, Readings, TimeStep, read_series
+from en4dvar.inputs.asked import Column, Layout, TimeStep
+from en4dvar.inputs.contents import read_contents
+from en4dvar.inputs.readers import Readings, read_series
 
 TIME, RADIUS = Column("t", "us", "s"), Column("R", "um", "m")
 
@@ -126,6 +128,14 @@ def test_mat_layouts(tmp_path: Path, shape: tuple[int, int]) -> None:
     assert series.times.tolist() == [3e-6, 5e-6, 6e-6]
     assert series.values.tolist() == [5e-6, 6e-6, 7e-6]
     assert series.scalars == {"Req": 21.0}
+
+
+def test_scalars_in_the_comments_of_a_table(tmp_path):
+    head = "# Req = 21.79\n# en4dvar track = x\n# a = b: 3\n# deltat=-1.5e-6 \n# e = .\nt,R\n# late = 3\n"
+    (tmp_path / "a.csv").write_text(head + "1,2\n2,3\n3,1\n")
+    series = read_series(tmp_path / "a.csv", Column("t", "us", "s"), Column("R", "um", "m"))
+    assert series.scalars == {"Req": 21.79, "deltat": -1.5e-6, "late": 3}
+    assert read_contents(tmp_path / "a.csv").scalars == series.scalars
 
 
 def test_mat_time_step(tmp_path: Path) -> None:

@@ -16,8 +16,11 @@ from scipy.io import savemat
 
 from en4dvar.errors import DataError
 from en4dvar.inputs import sheets
+from en4dvar.inputs.asked import Column, Layout
+from en4dvar.inputs.contents import read_contents
 from en4dvar.inputs.matfile import mat_variables
-from en4dvar.inputs.readers import Column, Layout, Readings, parts_of, read_contents, read_series
+from en4dvar.inputs.parts import parts_of
+from en4dvar.inputs.readers import Readings, read_series
 from en4dvar.inputs.steps import step_doubts
 
 TIME, RADIUS = Column("t", "us", "us"), Column("R", "um", "um")

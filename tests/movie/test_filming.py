@@ -143,7 +143,7 @@ def test_the_movie_of_a_laser_bubble_and_back(tmp_path, monkeypatch):
     assert outcome.exit_code == 0, outcome.output
     assert "31 of 34 frames read" in outcome.output
     truth = np.genfromtxt("gel_true.csv", delimiter=",", skip_header=4)[:, 1]
-    told = np.genfromtxt("gel.csv", delimiter=",", skip_header=4, usecols=(2, 3))[3:]
+    told = np.genfromtxt("gel.csv", delimiter=",", skip_header=5, usecols=(2, 3))[3:]
     off = np.abs(told[:, 0] - truth)
     assert np.median(off) < 0.3
     assert np.mean(off < 3 * told[:, 1]) > 0.9

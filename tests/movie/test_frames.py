@@ -10,6 +10,7 @@ from PIL import Image
 from en4dvar.errors import DataError
 from en4dvar_movie.corrections import read_corrections
 from en4dvar_movie.frames import open_movie, with_scale
+from en4dvar_movie.writing import write_movie
 
 FRAMES = np.random.default_rng(2).integers(0, 256, (4, 32, 48), dtype=np.uint8)
 
@@ -90,7 +91,7 @@ def damaged(folder, kind):
     [
         ("empty", "the file is empty"),
         ("cut", "cannot be read"),
-        ("half", "damaged or cut off: of 4 frames not all are there"),
+        ("half", "damaged or cut off: not all of its frames are there"),
         ("video", "cannot be read as a movie"),
         ("kind", "not a movie by its suffix"),
         ("folder", "holds no frame"),
@@ -118,6 +119,21 @@ def test_a_stack_of_one_page_that_announces_many(tmp_path):
     found = read(tmp_path / "m.tif")
     assert np.array_equal(found, deep)
     assert found.dtype.isnative
+
+
+def test_a_video_that_is_cut_off_says_what_is_missing_and_which_frame_is_damaged(tmp_path):
+    write_movie(tmp_path / "m.avi", iter(np.tile(FRAMES, (5, 1, 1))), 20, 1e-6, 1e5)
+    whole = (tmp_path / "m.avi").read_bytes()
+    (tmp_path / "cut.avi").write_bytes(whole[: len(whole) // 2])
+    movie = open_movie(tmp_path / "cut.avi")
+    for _ in range(2):  # a tracker runs through a movie twice
+        there = len(list(movie.frames()))
+    assert 5 < there < 15
+    assert movie.damaged == {there - 1}
+    assert movie.notes == [
+        f"{tmp_path / 'cut.avi'}: the file is cut off: it says that it holds 20 frames, {there} are there"
+    ]
+    assert not open_movie(tmp_path / "m.avi").damaged
 
 
 def test_an_interlaced_movie(tmp_path):

@@ -45,8 +45,12 @@ def test_from_the_movie_to_observations(tmp_path, monkeypatch):
     readings = np.genfromtxt(lines[len(comment) + 1 :], delimiter=",", usecols=(2, 3))[3:] * 1e-6
     count = len(problem.observations.times)
     np.testing.assert_allclose(problem.observations.values, readings[:count, 0])
-    np.testing.assert_allclose(problem.observations.noise.std, readings[:count, 1])
+    model = 0.01 * problem.observations.values.max()
+    np.testing.assert_allclose(problem.observations.noise.std, np.hypot(readings[:count, 1], model))
     np.testing.assert_allclose(problem.observations.noise.time_std, 0.05 / RATE)
+    (offset,) = (term for term in problem.prior.terms if term.parameter.name == "reading_offset")
+    edge = 0.05 * np.sqrt(2 * np.pi) * 1.25  # px: 5 % of the contrast at the edge of this movie, 1.2 px and the pixel's
+    np.testing.assert_allclose([offset.mean, offset.std], [0, 1e-6 * PIXEL * edge], atol=1e-8)
 
 
 @pytest.mark.slow
@@ -63,10 +67,33 @@ def test_from_the_movie_to_the_configuration_in_one_step(tmp_path, monkeypatch):
     mute = CliRunner().invoke(main, ["init", "--movie", "gel.tif", "--out", "mute.yaml"])
     assert mute.exit_code == 2
     assert "never guessed" in mute.output
-    for wrong, words in ((["--data", "gel.csv", "--movie", "gel.tif"], "not together"), (scale, "are of a --movie")):
+    for wrong, words in ((["--data", "gel.csv", "--movie", "gel.tif"], "not together"), (scale, "is of a --movie")):
         refused = CliRunner().invoke(main, ["init", *wrong])
         assert refused.exit_code == 2
         assert words in refused.output
+
+
+@pytest.mark.slow
+def test_flashes_raw_frames_and_corrections_go_through_that_step_too(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    times = np.add.outer(np.arange(12) * 2.5, [0.0, 1.0])  # us
+    radii = 9 + 35 * np.abs(np.cos(np.pi * (times - 4) / 32))
+    np.array(list(render(radii, Scene(), np.random.default_rng(3)))).tofile("gel.raw")
+    (tmp_path / "by_hand.txt").write_text("5 out  two bubbles\n")
+    scale = ["--pixel", f"{PIXEL} um", "--frame-rate", "400 kHz", "--flashes", "0 us, 1 us", "--exposure", "50 ns"]
+    words = ["init", "--movie", "gel.raw", "--raw", "128x128x8", "--corrections", "by_hand.txt", *scale]
+    outcome = CliRunner().invoke(main, [*words, "--start", "laser", "--out", "gel.yaml"])
+    assert outcome.exit_code == 0, outcome.output
+    table = np.genfromtxt(tmp_path / "gel.csv", delimiter=",", skip_header=5, usecols=(0, 1, 2))
+    t, read = table[np.isfinite(table[:, 2]) & (table[:, 0] != 5)].T[1:]
+    truth = dict(zip(np.round(times.ravel() + 7.5, 6), PIXEL * radii.ravel(), strict=True))  # after three empty frames
+    assert len(t) == 22
+    np.testing.assert_allclose(read, [truth[instant] for instant in t], atol=PIXEL)
+    (problem,) = build(load_config(tmp_path / "gel.yaml"))
+    assert len(problem.observations.times) > 10
+    refused = CliRunner().invoke(main, ["init", "--flashes", "0 us, 1 us"])
+    assert refused.exit_code == 2
+    assert "--flashes is of a --movie" in refused.output
 
 
 def test_nothing_is_replaced_and_the_scale_is_asked_for(tmp_path, monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from movies import CLASSES, SHARED, against_a_person, movie_of, rendered
@@ -64,6 +66,12 @@ def test_a_flash_is_named_and_left_out():
     found = track(movie_of(shown))
     assert not found.readings[4].used
     assert "flash" in found.readings[4].reason
+    assert sum(r.used for r in found.readings) == 5
+
+
+def test_a_frame_that_the_file_holds_damaged_is_named_and_left_out():
+    found = track(replace(movie_of(frames()), damaged={4}))
+    assert [r.found.frame for r in found.readings if r.reason == "the file is damaged here"] == [4]
     assert sum(r.used for r in found.readings) == 5
 
 

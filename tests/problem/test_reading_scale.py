@@ -88,6 +88,26 @@ def test_one_factor_for_several_series_is_refused():
         check_problem(scaled(problem_of(all_series())))
 
 
+def test_an_offset_is_told_in_the_unit_of_what_is_read(tmp_path: Path) -> None:
+    entry = "  c: 0.02 N s/m\n"
+    offset = "  reading_offset: {prior: normal, mean: 0 um, std: 5 um}\n"
+    config = write_toy(tmp_path, ("{prior: normal, mean: maximum, std: 1 %}", "100 um"), (entry, entry + offset))
+    lines = [line.split(",") for line in csv_text().splitlines()[2:]]
+    (tmp_path / "toy.csv").write_text("t_ms,x_um\n" + "".join(f"{t},{3 + float(x):.6g}\n" for t, x in lines))
+    outcome = CliRunner().invoke(main, ["run", str(config), "--out", str(tmp_path / "run"), "--no-report"])
+    assert outcome.exit_code == 0, outcome.output
+    row = {row.name: row for row in load_result(tmp_path / "run" / "posterior.nc").summary()}["reading_offset"]
+    assert row.unit == "um"
+    assert abs(row.mean - 3) < 3 * row.std < 2
+    shown = []
+    for value in ("0 um", "7 um"):
+        truth, out = ["--set", "parameters.k=2 N/m", "--set", f"parameters.reading_offset={value}"], tmp_path / "s.csv"
+        words = ["simulate", str(config), *truth, "--out", str(out), "--force"]
+        assert CliRunner().invoke(main, words).exit_code == 0
+        shown.append(np.loadtxt(out.read_text().splitlines()[-31:], delimiter=",")[:, 1])
+    np.testing.assert_allclose(shown[1], 7 + shown[0], rtol=1e-4, atol=1e-3)
+
+
 def test_from_yaml_to_the_result_and_the_simulation(tmp_path: Path) -> None:
     entry = "  c: 0.02 N s/m\n"
     config = write_toy(

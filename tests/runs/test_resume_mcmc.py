@@ -10,7 +10,7 @@ import pytest
 from run_files import assert_same_results, configuration, kill_after_writes, make_campaign, resumed_until_done, run_cli
 
 from en4dvar.assimilate import LoopState
-from en4dvar.inputs.readers import DataFile
+from en4dvar.inputs.asked import DataFile
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.runner import run_campaign
 from en4dvar.sampling import mcmc

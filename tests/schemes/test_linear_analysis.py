@@ -13,7 +13,7 @@ from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.schemes.base import Evaluation, Runs, Weights, gauss_newton
 from en4dvar.schemes.en4dvar import En4DVar
-from en4dvar.state import TIME_SHIFT, Parameter
+from en4dvar.state import READING_OFFSET, TIME_SHIFT, Parameter
 
 NAMES = ("a", "b", "c")
 TRUTH = np.array([1.0, -0.5, 0.7])
@@ -210,6 +210,20 @@ def test_time_shift_reads_each_member_at_its_own_time():
     path = 0.3 + 2.0 * (analysis.trajectory_times + analysis.posterior)
     close(analysis.posterior_trajectories, path, 1e-12)
     assert analysis.fixed_parameters == (Parameter("a", "m"),)
+
+
+def test_an_offset_of_the_readings_is_an_error_that_they_share():
+    """Estimated beside a model, it leaves the posterior of R + c² 11ᵀ; as a fixed number it is subtracted."""
+    problem, c, ones = make_problem(Linear(NAMES), TRUTH), 0.3, np.ones((9, 9))
+    widened = replace(problem, prior=Prior((*problem.prior.terms, PriorTerm.normal(READING_OFFSET, 0.0, c))))
+    analysis, h = run(widened, sampling="exact"), jacobian(problem.model, problem.observations.times)
+    mean, cov, _ = kalman(analysis.prior[:, :3], h, problem.observations.values, 0.01 * np.eye(9) + c**2 * ones)
+    close(analysis.centre[:3], mean, 1e-9)
+    close(np.cov(analysis.posterior[:, :3].T), cov, 1e-9)
+    fixed = run(replace(problem, fixed={"reading_offset": c, "reading_scale": 2.0}))
+    mean, cov, _ = kalman(fixed.prior, 2 * h, problem.observations.values - c, 0.01 * np.eye(9))
+    close(fixed.centre, mean, 1e-12)
+    close(np.cov(fixed.posterior.T), cov, 1e-12)
 
 
 def test_minimum_norm_start_has_the_background_of_the_member():

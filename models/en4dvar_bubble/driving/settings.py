@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, Union, get_type_hints
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, create_model, field_validator, model_validator
 
 from en4dvar.errors import En4dvarError
-from en4dvar.inputs.readers import Format
+from en4dvar.inputs.asked import Format
 from en4dvar.units import Quantity, convert
 from en4dvar_bubble.driving.base import Driving
 from en4dvar_bubble.driving.pulses import PULSES

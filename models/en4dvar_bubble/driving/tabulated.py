@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from en4dvar.inputs.readers import Column, Format, Layout, read_series
+from en4dvar.inputs.asked import Column, Format, Layout
+from en4dvar.inputs.readers import read_series
 from en4dvar.state import Array, Parameter
 from en4dvar_bubble.driving.base import Driving, PulseNumber
 

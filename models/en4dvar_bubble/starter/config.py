@@ -14,11 +14,13 @@ from en4dvar.config.document import parse_document
 from en4dvar.config.find_files import find_files, with_parts
 from en4dvar.errors import ConfigError, DataError
 from en4dvar.files import expanded
-from en4dvar.inputs.readers import ANY, Column, DataFile, Layout, Readings, TimeStep, read_series
+from en4dvar.inputs.asked import ANY, Column, DataFile, Layout, TimeStep
+from en4dvar.inputs.readers import Readings, read_series
 from en4dvar.inputs.steps import step_doubts
+from en4dvar.inputs.variables import indexed
 from en4dvar.units import UnitError, convert, parse_quantity, parse_unit
 from en4dvar_bubble.starter.look import Start
-from en4dvar_bubble.starter.page import Source, quoted, yaml_text
+from en4dvar_bubble.starter.page import TRACKED_COMMON, Source, quoted, yaml_text
 from en4dvar_bubble.starter.proposal import Entry, Proposal, propose, with_columns
 
 _NAMED_UNIT = re.compile(r"[_ \[(/]([a-zA-Zµμ]+)[\])]?$")
@@ -84,7 +86,8 @@ def propose_config(
     proposal = propose({name: (series.times, series.values) for name, series in found.items()}, start, law)
     proposal = _with_rest(proposal, found, source.radius[1])
     if errors:
-        proposal = with_columns(proposal, errors)
+        common = max(series.scalars.get(TRACKED_COMMON, 0.0) for series in found.values())
+        proposal = with_columns(proposal, errors, f"{common:g} {source.radius[1]}" if common > 0 else "")
     proposal = replace(proposal, warnings=(*proposal.warnings, *doubts(source), *_steps(found, source), *unusable))
     text = yaml_text(name or run_name(str(data)), source, proposal, command)
     config = resolve(parse_document(text), Path(folder).absolute())
@@ -139,6 +142,7 @@ def _steps(found: Mapping[str, Readings], source: Source) -> list[str]:
 def _with_rest(proposal: Proposal, found: Mapping[str, Readings], unit: str) -> Proposal:
     """The radius at rest of the files, where every one has such a scalar that suits its radii in their unit."""
     names = {name for series in found.values() for name in series.scalars if _REST.fullmatch(name)}
+    names = {name for name in names if not indexed(name)[1]} or names  # of expts(1).Req, … one that means each its own
     if len(names) != 1:
         return proposal
     (name,) = names
@@ -161,7 +165,7 @@ def doubts(source: Source) -> list[str]:
         if column is None:
             continue
         name, unit = column
-        if _PIXELS.search(name):
+        if _PIXELS.search(name) and "*" not in unit:
             found.append(f"{name!r} seems to hold pixels; then give --radius-unit as the size of one, such as 2.76*um")
         if what == "times" and _FRAMES.match(name):
             found.append(f"{name!r} seems to count frames; then give --time-step with the time between two of them")

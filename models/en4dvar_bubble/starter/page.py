@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from en4dvar.inputs.readers import ANY, Layout
+from en4dvar.inputs.asked import ANY, Layout
 from en4dvar_bubble.starter.proposal import Entry, Proposal
 
 SCHEMA_FILE = "en4dvar.schema.json"
@@ -56,6 +56,7 @@ class Source:
 
 # the table that 'en4dvar track' writes: its columns say their units
 TRACKED = Source("", ("t_us", "us"), None, ("R_um", "um"), errors=("R_std_um", "t_std_us"))
+TRACKED_COMMON = "R_common_um"  # the scalar that holds the std of what moves all radii alike
 TRACKED_COLUMNS = ("t_us", "R_um", "R_std_um", "t_std_us")
 
 

@@ -118,14 +118,20 @@ def starter(start: Start, law: str | None) -> Proposal:
     return Proposal(tuple(data), _model(law_name, start, None), tuple(lines))
 
 
-def with_columns(proposal: Proposal, errors: Sequence[str]) -> Proposal:
-    """The proposal with the errors that the data file states: columns of the std of radii and of times."""
+def with_columns(proposal: Proposal, errors: Sequence[str], common: str) -> Proposal:
+    """The proposal with the errors that the data file states: columns of the std of radii and of times, and the
+    ``common`` std of what moves all radii alike, "" where the file states none."""
     kept = [entry for entry in proposal.data if entry.key not in ("  radius_std", "  time_std", "  # time_std")]
     told = [
-        Entry("  radius_std", f"{{column: {errors[0]}}}", "each reading's own; a model is rarely better than 1 %"),
+        Entry("  radius_std", f"{{column: {errors[0]}}}", "each reading's own"),
+        Entry("  model_std", "1 % of maximum", "a model is rarely better; added to it in squares"),
         Entry("  time_std", f"{{column: {errors[1]}}}", "of the exposure"),
     ]
-    return replace(proposal, data=(*kept, *told))
+    alike = [
+        Entry("reading_offset", f"{{prior: normal, mean: 0 um, std: {common}}}", "the level of the edge, of all alike"),
+        Entry("# reading_scale", "{prior: lognormal, median: 1, log_std: 0.01}", "how well is the pixel's size known?"),
+    ]
+    return replace(proposal, data=(*kept, *told), parameters=(*proposal.parameters, *alike * bool(common)))
 
 
 def _built(start: Start, law: str | None) -> tuple[BubbleModel, str]:

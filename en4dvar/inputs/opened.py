@@ -1,0 +1,46 @@
+"""A data file that is there, of a known format, and whatever goes wrong in reading it as one kind of error."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import get_args
+
+from en4dvar.errors import DataError
+from en4dvar.hints import no_such_file
+from en4dvar.inputs.asked import SUFFIXES, Format, Layout
+
+SHEETS = (".xls", ".xlsb", ".ods")
+
+
+@contextmanager
+def opened(path: Path, layout: Layout) -> Iterator[Format]:
+    """The format of a file that is there. Raises :class:`DataError`, also where reading inside fails."""
+    require_file(path)
+    kind = layout.format or SUFFIXES.get(path.suffix.lower())
+    if kind is None:
+        hint = (
+            "save the sheet as CSV"
+            if path.suffix.lower() in SHEETS
+            else f"write format: {' or '.join(get_args(Format))}"
+        )
+        raise DataError(f"{path}: the format cannot be told from the suffix {path.suffix!r}; {hint}")
+    with readable(path):
+        yield kind
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Whatever goes wrong in the system or in the csv module as :class:`DataError`."""
+    try:
+        yield
+    except (OSError, csv.Error) as error:
+        raise DataError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+
+
+def require_file(path: Path) -> None:
+    if not os.path.isfile(path):  # Path.is_file raises for a name that is too long, or in a closed folder
+        raise DataError(f"{path}: is a directory" if os.path.isdir(path) else no_such_file(path))

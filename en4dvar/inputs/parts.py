@@ -1,0 +1,111 @@
+"""The parts of a data file that each hold a data set, and the columns of one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from en4dvar.errors import DataError
+from en4dvar.hints import listed
+from en4dvar.inputs.asked import ANY, Column, Format, Layout
+from en4dvar.inputs.matfile import mat_variables
+from en4dvar.inputs.opened import opened
+from en4dvar.inputs.sheets import sheet_lines
+from en4dvar.inputs.text_table import Table, matches, scalars_in
+from en4dvar.inputs.variables import Variables, indexed
+from en4dvar.state import Array
+
+
+def columns_of(
+    path: Path, layout: Layout, wanted: Sequence[str], part: str
+) -> tuple[dict[str, Array], Mapping[str, float], list[int]]:
+    """The columns wanted of a part, the file's scalars, and the numbers of the lines, none where it has no lines."""
+    with opened(path, layout) as kind:
+        if kind != "mat":
+            table = table_of(path, kind, layout, [*wanted, *([layout.by] if layout.by is not None else [])])
+            if layout.by is not None:
+                if part not in _groups(table, layout.by):
+                    raise DataError(f"{path}: no row belongs to {part!r} by column {layout.by!r}")
+                at = table.position(layout.by)
+                table.rows = [(line, row) for line, row in table.rows if _cell(row, at) == part]
+            scalars = scalars_in(path) if kind == "csv" else {}
+            return _of_table(table, wanted), scalars, [line for line, _ in table.rows]
+        _refuse_by(path, layout)
+        found = mat_variables(path).of(part)
+        return {name: _of_mat(found, name, path) for name in wanted}, found.scalars, []
+
+
+def parts_of(path: Path, value: Column, layout: Layout = ANY, time: str | None = None) -> tuple[str, ...]:
+    """The parts of a file that each hold a data set; () where the file is one data set.
+
+    They are the columns that a name with ``*`` stands for, but not that of the ``time``; the elements of a struct array
+    or a cell array, as ``1``, ``2``, …, for the column ``expts.R`` of what MATLAB calls ``expts(1).R``,
+    ``expts(2).R``, …; or what the column ``by`` of a table says. Raises :class:`DataError`.
+    """
+    several = "*" in value.name
+    with opened(path, layout) as kind:
+        if kind != "mat":
+            table = table_of(path, kind, layout, [value.name, *(one for one in (time, layout.by) if one is not None)])
+            if layout.by is not None:
+                return _groups(table, layout.by)
+            if not several or value.name in table.names:
+                return ()
+            return tuple(name for name in table.names if matches(name, value.name) and name != time)
+        _refuse_by(path, layout)
+        found = mat_variables(path)
+    if several:
+        return tuple(name for name in found.matching(value.name) if name != time)
+    if found.vector(value.name) is not None:
+        return ()
+    return tuple(i for name, i in map(indexed, found.vectors) if i and name == value.name)
+
+
+def table_of(path: Path, kind: Format, layout: Layout, wanted: Sequence[str] = ()) -> Table:
+    if kind == "csv":
+        return Table(path, layout.decimal, wanted)
+    return Table(path, layout.decimal, wanted, sheet_lines(path, layout.sheet))
+
+
+def _refuse_by(path: Path, layout: Layout) -> None:
+    if layout.by is not None:
+        raise DataError(f"{path}: data.by is for tables; elements of a struct array are data sets without it")
+
+
+def _groups(table: Table, by: str) -> tuple[str, ...]:
+    """What the column ``by`` says, in the order of the rows. Raises :class:`DataError`."""
+    cells = [_cell(row, table.position(by)) for _, row in table.rows]
+    if "" in cells:
+        line = table.rows[cells.index("")][0]
+        raise DataError(f"{table.path}:{line}: column {by!r} does not say which data set this is")
+    return tuple(dict.fromkeys(cells))
+
+
+def _cell(row: Sequence[str], i: int) -> str:
+    return row[i] if i < len(row) else ""
+
+
+def _of_table(table: Table, wanted: Sequence[str]) -> dict[str, Array]:
+    where = {name: table.position(name) for name in wanted}
+    if not table.rows:
+        raise DataError(f"{table.path}: no data: no line follows the header")
+    columns = {name: table.numbers(i, name) for name, i in where.items()}
+    for line, cells in table.rows:
+        if any(cells[len(table.names) :]):
+            raise DataError(f"{table.path}:{line}: {len(cells)} cells, but the header names {len(table.names)} columns")
+    return columns
+
+
+def _of_mat(found: Variables, name: str, path: Path) -> Array:
+    """A vector by its name. Raises :class:`DataError`."""
+    vector = found.vector(name)
+    if vector is not None:
+        return np.asarray(vector, dtype=float)
+    kind = found.others.get(name)
+    fault = f"is {kind}, not a row or column of real numbers" if kind else "is not in the file"
+    rest = [f"{k} ({what})" for k, what in found.others.items() if k != name]
+    there = f"{listed(sorted(found.vectors)) or 'none'}{'; no vectors: ' * bool(rest)}{listed(rest)}"
+    matrix = name if name in found.matrices else next(iter(found.matrices), None)
+    hint = f"; columns of a matrix are {matrix}(:,1), {matrix}(:,2), …" if matrix else ""
+    raise DataError(f"{path}: field {name!r} {fault}; the vectors are: {there}{hint}")

@@ -1,0 +1,55 @@
+"""Square tables without header: covariances and correlations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from en4dvar.errors import DataError
+from en4dvar.inputs.asked import Matrix
+from en4dvar.inputs.opened import readable, require_file
+from en4dvar.inputs.text_table import cells_of, check_width, delimiter_of, number_in, numbered_lines
+from en4dvar.state import Array
+from en4dvar.units import convert
+
+
+def read_covariance(matrix: Matrix) -> Array:
+    """The covariance (K, K) of a CSV file: symmetric, positive variances. Raises :class:`DataError`."""
+    path, values = matrix.path, read_square(matrix.path, "covariance")
+    if not np.all(np.isfinite(values)) or not np.all(np.diag(values) > 0):
+        raise DataError(f"{path}: the variances must be positive and every covariance finite")
+    scale = np.sqrt(np.outer(np.diag(values), np.diag(values)))
+    unequal = np.argwhere(np.abs(values - values.T) > 1e-9 * scale)
+    if len(unequal):
+        i, j = unequal[0]
+        raise DataError(
+            f"{path}: not symmetric: {values[i, j]:g} in row {i + 1}, column {j + 1}, {values[j, i]:g} across"
+        )
+    return np.asarray(convert(0.5 * (values + values.T), matrix.unit, matrix.target))
+
+
+def read_square(path: Path, what: str = "correlation matrix") -> Array:
+    """The numbers (K, K) of a CSV file without header. Raises :class:`DataError`."""
+    require_file(path)
+    with readable(path):
+        rows = _rows_of_numbers(path)
+    if not rows or len(rows) != len(rows[0]):
+        raise DataError(f"{path}: a {what} is square, but this has {len(rows)} rows of {len(rows[0]) if rows else 0}")
+    return np.array(rows)
+
+
+def _rows_of_numbers(path: Path) -> list[list[float]]:
+    """Rows of equally many numbers."""
+    rows: list[list[float]] = []
+    delimiter = None
+    for number, line in numbered_lines(path):
+        if delimiter is None:
+            delimiter = delimiter_of(line)
+            check_width(line, delimiter, path)
+        rows.append(
+            [number_in(cell, str(i), path, number, None) for i, cell in enumerate(cells_of(line, delimiter), 1)]
+        )
+        if len(rows[-1]) != len(rows[0]):
+            raise DataError(f"{path}:{number}: {len(rows[-1])} numbers, but {len(rows[0])} in the first row")
+    return rows
