@@ -21,6 +21,7 @@ from en4dvar.commands.results import compare, export, report, rerun
 from en4dvar.commands.run import run
 from en4dvar.commands.simulate import simulate
 from en4dvar.commands.validate import validate
+from en4dvar.commands.warm_up import warm_up
 from en4dvar.errors import En4dvarError
 
 OF_THE_DEVICE = (
@@ -95,7 +96,7 @@ def main() -> None:
     """
 
 
-for command in (compare, export, joint, models, report, rerun, run, schema, simulate, validate):
+for command in (compare, export, joint, models, report, rerun, run, schema, simulate, validate, warm_up):
     main.add_command(command)
 
 if __name__ == "__main__":

@@ -15,7 +15,8 @@ ROOT = Path(__file__).resolve().parents[2]
 # The modules of one line are a layer together; a package is a layer by itself.
 LAYERS = (
     ("errors",),
-    ("state", "hints", "files", "tables", "caution", "compiled", "user_code", "user_file"),
+    ("state", "hints", "files", "tables", "caution", "kernel_cache", "user_code", "user_file"),
+    ("compiled",),
     ("dependence", "parameter_map"),
     ("units", "prior", "forward", "noise"),
     ("batch", "series", "observations", "function_model"),
