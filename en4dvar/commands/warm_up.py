@@ -21,7 +21,7 @@ def warm_up() -> None:
 
     \b
     Example:
-      en4dvar warm-up
+      en4dvar warm-up  # in an image, or before a batch of jobs
     """
     from en4dvar.compiled import KERNELS, compilations
 

@@ -18,16 +18,13 @@ OTHER = max(UNROLLED) + 1  # a number of nodes whose loops are not unrolled
 def examples() -> dict[str, Callable[[], object]]:
     """What is compiled, in words, and a call that does; for ``en4dvar warm-up``."""
     standard = preset("standard", "acoustic")
-    heat = {m: BubbleModel(accuracy=replace(standard, nodes=m)) for m in (*filter(None, UNROLLED), OTHER)}
     models = {"polytropic or isothermal gas": BubbleModel(gas="polytropic")}
-    models |= {f"heat, {m} nodes": model for m, model in heat.items() if m != OTHER}
-    models |= {"heat, another number of nodes": heat[OTHER]}
-    models |= {"general equations (vapour, conducting medium, memory, Gilmore)": BubbleModel(get_law("zener-neo-hookean"), radial="gilmore")}
-    fung = BubbleModel(get_law("fung-kelvin-voigt"), "polytropic")
-    calls: dict[str, Callable[[], object]] = {
-        f"bubble, {what}": partial(_integrate, model) for what, model in models.items()
-    }
-    return calls | {"bubble, laws given as a strain energy": partial(_integrate, fung)}
+    for nodes, words in ((4, "4 nodes"), (8, "8 nodes"), (OTHER, "another number of nodes")):
+        models[f"heat, {words}"] = BubbleModel(accuracy=replace(standard, nodes=nodes))
+    zener, fung = get_law("zener-neo-hookean"), get_law("fung-kelvin-voigt")
+    models["general equations (vapour, conducting medium, memory, Gilmore)"] = BubbleModel(zener, radial="gilmore")
+    models["laws given as a strain energy"] = BubbleModel(fung, "polytropic")
+    return {f"bubble, {what}": partial(_integrate, model) for what, model in models.items()}
 
 
 def _integrate(model: BubbleModel) -> None:

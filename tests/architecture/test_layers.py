@@ -50,13 +50,14 @@ FLOOR = {name: floor for floor, layer in enumerate(LAYERS) for name in layer}
 BUBBLE = (
     "tables", "medium", "collapse", "numbers", "gas", "driving", "laws", "solver", "dynamics", "alternatives",
     "packing", "paths", "settings", "model", "api", "battery", "starter", "examples", "commands", "commands_init",
+    "warm_up",
 )  # fmt: skip
 
 
 # and inside the reader of movies
 MOVIE = (
     "frames", "kernels", "outline", "fitting", "locate", "background", "corrections", "uncertainty", "flashes",
-    "tracking", "table", "outlined", "page", "scene", "writing", "filming", "commands",
+    "tracking", "table", "outlined", "page", "scene", "writing", "filming", "commands", "warm_up",
 )  # fmt: skip
 
 
