@@ -127,12 +127,12 @@ def note_beginning(run_dir: Path, resume: bool) -> None:
 @contextmanager
 def continuable() -> Iterator[None]:
     """Within, an interrupt says what is kept of the run and what to type next."""
-    from en4dvar.runs.interrupt import Interrupted
+    from en4dvar.runs.interrupt import begun
 
     try:
         yield
-    except Interrupted as interrupt:
-        again = command_line(without=("--force", "--resume"), also=("--resume",))
-        raise Failed(f"{interrupt}\nto continue: {again}", 130) from None
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
+        if told := begun(interrupt):
+            again = command_line(without=("--force", "--resume"), also=("--resume",))
+            raise Failed(f"{told}\nto continue: {again}", 130) from None
         raise Failed(f"interrupted before the run began\nto run it: {command_line()}", 130) from None

@@ -9,7 +9,6 @@ The cost grows with the number of blocks, not with its square.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -92,8 +91,3 @@ class Arrow:
     def _factors(self) -> list[tuple[Array, bool]]:
         """Upper Cholesky factors of the blocks."""
         return [cho_factor(block) if len(block) else (block, False) for block in self.blocks]
-
-
-def log_two_pi(count: int) -> float:
-    """(count/2) ln 2π."""
-    return 0.5 * count * math.log(2 * math.pi)

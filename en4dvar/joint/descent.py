@@ -68,23 +68,33 @@ def linearise(
         if local is None:
             return None
         found.append(local)
-    slope, border = place.border.copy(), np.eye(len(place.border))
-    edges, blocks, slopes = [], [], []
-    for e, local in enumerate(found):
-        shared, rest = joint.columns(e)
-        at = joint.of_border(e)
-        np.add.at(slope, at, local.gradient[shared])
-        np.add.at(border, np.ix_(at, at), local.hessian[np.ix_(shared, shared)])
-        edge = np.zeros((len(border), len(rest)))
-        edge[at] = local.hessian[np.ix_(shared, rest)]
-        edges.append(edge)
-        blocks.append(np.eye(len(rest)) + local.hessian[np.ix_(rest, rest)])
-        slopes.append(place.own[e] + local.gradient[rest])
-    arrow = Arrow(border, edges, blocks)
+    arrow, slope, slopes = assembled(joint, [local.hessian for local in found], [local.gradient for local in found])
+    slope = place.border + slope
+    slopes = [v + b for v, b in zip(place.own, slopes, strict=True)]
     x, y = arrow.solve(-slope, [-b for b in slopes])
     decrease = -float(slope @ x + sum(b @ v for b, v in zip(slopes, y, strict=True)))
     cost = place.background + sum(local.cost for local in found)
     return Joined(place, cost, tuple(found), arrow, (x, y), float(np.sqrt(max(0.0, decrease))))
+
+
+def assembled(
+    joint: JointProblem, hessians: Sequence[Array], gradients: Sequence[Array]
+) -> tuple[Arrow, Array, list[Array]]:
+    """The arrow of the prior and the experiments' Hessians (n, n) of J_o; their gradients (n,) summed over what is
+    shared, and what is each experiment's own.
+    """
+    border, slope = np.eye(len(joint.shared)), np.zeros(len(joint.shared))
+    edges, blocks, slopes = [], [], []
+    for e, (hessian, gradient) in enumerate(zip(hessians, gradients, strict=True)):
+        (shared, rest), at = joint.columns(e), joint.of_border(e)
+        np.add.at(slope, at, gradient[shared])
+        np.add.at(border, np.ix_(at, at), hessian[np.ix_(shared, shared)])
+        edge = np.zeros((len(border), len(rest)))
+        edge[at] = hessian[np.ix_(shared, rest)]
+        edges.append(edge)
+        blocks.append(np.eye(len(rest)) + hessian[np.ix_(rest, rest)])
+        slopes.append(gradient[rest])
+    return Arrow(border, edges, blocks), slope, slopes
 
 
 def cost(joint: JointProblem, experiments: Sequence[Experiment], place: Place) -> float:

@@ -12,17 +12,15 @@ from en4dvar.caution import Caution, caution
 from en4dvar.ensemble.forecast import Forecast, plotting_times
 from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
-from en4dvar.joint.arrow import Arrow
-from en4dvar.joint.descent import JointDescent, Place, cost, descend
+from en4dvar.joint.descent import JointDescent, Place, assembled, cost, descend
 from en4dvar.joint.members import JointMembers, gaussian, sampled
 from en4dvar.joint.problem import JointProblem
 from en4dvar.joint.tangent import Experiment
-from en4dvar.prior import own_seed
+from en4dvar.prior import Prior, own_seed
 from en4dvar.problem import AssimilationSettings
 from en4dvar.state import Array
 
 TOLD = 0.5  # of J, by which descents differ that ended in different minima
-LEAST = 1e-3  # of the prior's precision: what a single estimate that learned nothing is taken to know
 TRIED = 6  # experiments whose own estimate of what is shared is tried as a start
 
 
@@ -34,9 +32,10 @@ class Single:
     precision: Array
 
     @classmethod
-    def of_members(cls, members: Array, mode: Array) -> Single:
-        """From an ensemble (N, n) and its mode (n,), in units of the prior."""
-        return cls(mode, np.linalg.inv(np.atleast_2d(np.cov(members.T))))
+    def of_physical(cls, prior: Prior, members: Array, mode: Array) -> Single:
+        """From the members (N, n) alive and the mode (n,) of a posterior. Raises ValueError outside a map's range."""
+        z = (prior.from_physical(np.vstack([members, mode])) - prior.mean) / prior.std
+        return cls(z[-1], np.linalg.inv(np.atleast_2d(np.cov(z[:-1].T))))
 
 
 @dataclass(frozen=True)
@@ -72,9 +71,7 @@ class JointEstimate:
 
     def control(self, e: int) -> Array:
         """(N + 1, n) physical members of experiment e and, last, the mode."""
-        z = self.joint.standard(
-            e, np.vstack([self.members.border, self.mode.border]), np.vstack([self.members.own[e], self.mode.own[e]])
-        )
+        z = _points(self.joint, self.members, self.mode, e)
         return self.joint.experiments[e].prior.to_physical(self.joint.control(e, z))
 
 
@@ -120,16 +117,7 @@ class _Estimate:
         self.tell(f"J {lowest.at.cost:.4g} after {len(lowest.costs) - 1} iterations, {lowest.stop}")
         members, cautions = self._members(lowest)
         grids = tuple(plotting_times(one) for one in joint.experiments)
-        forecasts = tuple(
-            one.run(
-                joint.standard(
-                    one.e, np.vstack([members.border, lowest.at.place.border]),
-                    np.vstack([members.own[one.e], lowest.at.place.own[one.e]]),
-                ),
-                grids[one.e],
-            )
-            for one in experiments
-        )  # fmt: skip
+        forecasts = tuple(one.run(_points(joint, members, lowest.at.place, one.e), grids[one.e]) for one in experiments)
         self._require(forecasts)
         if not lowest.converged:
             cautions.append(caution("not-converged", f"the joint estimate has not converged: {lowest.stop}"))
@@ -166,31 +154,15 @@ class _Estimate:
             analysis = assimilate(one, settings, own_seed(self.seed, one.observations.name), self.executor)
             self.runs_of_singles += analysis.forward_runs
             alive = np.isfinite(analysis.posterior).all(axis=1)
-            members = (one.prior.from_physical(analysis.posterior[alive]) - one.prior.mean) / one.prior.std
-            mode = (one.prior.from_physical(analysis.centre[None])[0] - one.prior.mean) / one.prior.std
-            found.append(Single.of_members(members, mode))
+            found.append(Single.of_physical(one.prior, analysis.posterior[alive], analysis.centre))
         return found
 
     def _starts(self, singles: Sequence[Single]) -> list[Place]:
         """Where the quadratic forms of the single estimates meet, and where what is shared is as in one of them."""
         joint = self.joint
-        border, slope = np.eye(len(joint.shared)), np.zeros(len(joint.shared))
-        edges, blocks, slopes = [], [], []
-        for e, single in enumerate(singles):
-            shared, rest = joint.columns(e)
-            at = joint.of_border(e)
-            n = len(single.mode)
-            likelihood = single.precision - (1 - LEAST) * np.eye(n)
-            pull = single.precision @ single.mode
-            np.add.at(border, np.ix_(at, at), likelihood[np.ix_(shared, shared)])
-            np.add.at(slope, at, pull[shared])
-            edge = np.zeros((len(border), len(rest)))
-            edge[at] = single.precision[np.ix_(shared, rest)]
-            edges.append(edge)
-            blocks.append(single.precision[np.ix_(rest, rest)])
-            slopes.append(pull[rest])
-        arrow = Arrow(border, edges, blocks)
-        x, y = arrow.solve(slope, slopes)
+        likelihoods = [one.precision - np.eye(len(one.mode)) for one in singles]
+        arrow, shared_pull, own_pulls = assembled(joint, likelihoods, [one.precision @ one.mode for one in singles])
+        x, y = arrow.solve(shared_pull, own_pulls)
         starts = [Place(x, tuple(y))]
         for e in np.linspace(0, len(singles) - 1, min(TRIED, len(singles))).astype(int).tolist():
             shared, _ = joint.columns(e)
@@ -239,6 +211,11 @@ def _agreeing(descents: Sequence[JointDescent]) -> int:
     """How many descents ended in the lowest minimum."""
     lowest = min((one.at.cost for one in descents), default=np.inf)
     return sum(one.at.cost - lowest < TOLD for one in descents)
+
+
+def _points(joint: JointProblem, members: JointMembers, mode: Place, e: int) -> Array:
+    """(N + 1, n) members of experiment e and, last, the mode, in units of its prior."""
+    return joint.standard(e, np.vstack([members.border, mode.border]), np.vstack([members.own[e], mode.own[e]]))
 
 
 def _physical(joint: JointProblem, z: Array) -> Array:

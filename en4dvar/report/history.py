@@ -20,6 +20,24 @@ FEW = 150  # readings whose marks are large
 
 
 @dataclass(frozen=True)
+class Band:
+    """Between two quantiles of the members of a group, and how that is drawn."""
+
+    group: str
+    levels: tuple[float, float]
+    colour: str
+    alpha: float
+    label: str
+
+
+BANDS = (
+    Band("prior_predictive", (0.05, 0.95), "prior", 0.28, "prior 90 %"),
+    Band("posterior_predictive", (0.05, 0.95), "posterior", 0.3, "posterior 90 %"),
+    Band("posterior_predictive", (0.25, 0.75), "posterior", 0.6, "posterior 50 %"),
+)
+
+
+@dataclass(frozen=True)
 class SeriesShown:
     """One series in display units: ``x`` (K,) times or places, ``data``, ``std`` and ``centre`` (K,)."""
 
@@ -75,15 +93,13 @@ def _legend(top: Axes) -> None:
 def _pair(top: Axes, bottom: Axes, result: StoredResult, one: SeriesShown) -> None:
     """Data and predictions above, residuals below."""
     curve = f"{one.axis.name}_path" in result.dataset("prior_predictive")
-    draw = _band if curve else _bars
-    draw(top, result, one, "prior_predictive", (0.05, 0.95), "prior", 0.28, "prior 90 %")
-    draw(top, result, one, "posterior_predictive", (0.05, 0.95), "posterior", 0.3, "posterior 90 %")
-    draw(top, result, one, "posterior_predictive", (0.25, 0.75), "posterior", 0.6, "posterior 50 %")
+    for band in BANDS:
+        (_along if curve else _bars)(top, result, one, band)
     size, many = 2.2 if len(one.x) <= FEW else 1.2, len(one.x) > MANY
     if many:  # one path instead of a bar for each, and pixels below the centre
         edges = one.data - one.std, one.data + one.std
-        band = top.fill_between(one.x, *edges, color=LIGHT["ink"], alpha=0.3, lw=0, label="data ± std")
-        band.set_rasterized(True)
+        filled = top.fill_between(one.x, *edges, color=LIGHT["ink"], alpha=0.3, lw=0, label="data ± std")
+        filled.set_rasterized(True)
         top.plot(one.x, one.data, ",", alpha=0.3, color=LIGHT["ink"], zorder=1.5, rasterized=True)
     else:
         top.errorbar(
@@ -115,44 +131,27 @@ def _residuals(ax: Axes, one: SeriesShown, size: float, many: bool) -> None:
     ax.set_xlabel(one.x_label)
 
 
-def _band(
-    ax: Axes,
-    result: StoredResult,
-    one: SeriesShown,
-    group: str,
-    levels: tuple[float, float],
-    colour: str,
-    alpha: float,
-    label: str,
-) -> None:
+def _along(ax: Axes, result: StoredResult, one: SeriesShown, band: Band) -> None:
     """Quantiles of the members along the path."""
-    values = shown(result.dataset(group)[f"{one.axis.name}_path"][0])
+    held = result.dataset(band.group)
+    values = shown(held[f"{one.axis.name}_path"][0])
     seen = np.isfinite(values).any(axis=0)
     if not seen.any():
         return
-    low, high = np.nanquantile(values[:, seen], levels, axis=0)
-    time = shown(result.dataset(group)["path_time"])[seen]
-    ax.fill_between(time, low, high, color=LIGHT[colour], alpha=alpha, lw=0, label=label)
+    low, high = np.nanquantile(values[:, seen], band.levels, axis=0)
+    time = shown(held["path_time"])[seen]
+    ax.fill_between(time, low, high, color=LIGHT[band.colour], alpha=band.alpha, lw=0, label=band.label)
 
 
-def _bars(
-    ax: Axes,
-    result: StoredResult,
-    one: SeriesShown,
-    group: str,
-    levels: tuple[float, float],
-    colour: str,
-    alpha: float,
-    label: str,
-) -> None:
+def _bars(ax: Axes, result: StoredResult, one: SeriesShown, band: Band) -> None:
     """Quantiles of the members at each reading of a field."""
-    values = shown(result.dataset(group)[one.axis.name][0])
+    values = shown(result.dataset(band.group)[one.axis.name][0])
     alive = np.isfinite(values).all(axis=1)
     if not alive.any():
         return
-    low, high = np.quantile(values[alive], levels, axis=0)
+    low, high = np.quantile(values[alive], band.levels, axis=0)
     width = 4 if len(one.x) <= FEW else 2
-    ax.vlines(one.x, low, high, color=LIGHT[colour], alpha=alpha, lw=width, label=label)
+    ax.vlines(one.x, low, high, color=LIGHT[band.colour], alpha=band.alpha, lw=width, label=band.label)
 
 
 def _data_range(data: Array, std: Array) -> tuple[float, float]:

@@ -44,3 +44,10 @@ def tell_interrupt(kept: Callable[[], str]) -> Iterator[None]:
         raise
     except KeyboardInterrupt:
         raise Interrupted(f"interrupted; {kept()}") from None
+
+
+def begun(error: BaseException | None) -> Interrupted | None:
+    """The interrupt of a run that has begun, itself or below a second Ctrl-C that came while it was being answered."""
+    while error is not None and not isinstance(error, Interrupted):
+        error = error.__context__
+    return error

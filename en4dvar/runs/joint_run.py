@@ -115,12 +115,10 @@ def _members(result: StoredResult, problem: InverseProblem) -> np.ndarray:
 
 
 def _single(problem: InverseProblem, members: np.ndarray, centre: np.ndarray) -> Single:
-    prior = problem.prior
     try:
-        z = (prior.from_physical(np.vstack([members, centre])) - prior.mean) / prior.std
+        return Single.of_physical(problem.prior, members, centre)
     except ValueError as error:
         raise OutputError(f"{problem.observations.name}: {error}") from None
-    return Single.of_members(z[:-1], z[-1])
 
 
 def _named_apart(problems: Sequence[InverseProblem], run_dirs: Sequence[Path]) -> Iterator[InverseProblem]:

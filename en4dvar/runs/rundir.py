@@ -16,7 +16,7 @@ from typing import Literal
 
 from en4dvar.errors import OutputError
 from en4dvar.files import inside, make_folder, write_text
-from en4dvar.runs.interrupt import Interrupted
+from en4dvar.runs.interrupt import begun
 from en4dvar.runs.lock import LOCK, locked
 from en4dvar.runs.replacement import (
     LISTING,
@@ -56,7 +56,7 @@ class RunDirectory:
         """Lock ``path`` for a new run, one that replaces an earlier run, the rest of one, or its report.
 
         ``resume`` of what is missing or empty is a new run: that of a batch job which was killed before it began. A new
-        run that fails before it has claimed a file leaves nothing behind, unless it can be resumed (``Interrupted``).
+        run that fails before it has claimed a file leaves nothing behind, unless it was interrupted and can be resumed.
 
         Raises
         ------
@@ -81,7 +81,7 @@ class RunDirectory:
             try:
                 yield directory
             except BaseException as error:
-                if not isinstance(error, Interrupted):
+                if not begun(error):
                     directory._withdraw()
                 raise
 

@@ -17,8 +17,7 @@ from en4dvar.errors import OutputError
 from en4dvar.files import write_bytes
 from en4dvar.joint.estimate import JointEstimate
 from en4dvar.state import Array, Parameter
-from en4dvar.storage.netcdf import Group, Groups, Variable, to_bytes, variable
-from en4dvar.storage.seal import check_seal
+from en4dvar.storage.netcdf import Group, Groups, Variable, read_groups, to_bytes, variable
 from en4dvar.units import convert
 
 FILE = "joint.nc"
@@ -185,12 +184,7 @@ class StoredJoint:
 
 def load_joint(path: Path) -> StoredJoint:
     """Read the file into memory. Raises :class:`OutputError`: it is none, cut short or altered."""
-    check_seal(path)
-    try:
-        with xr.open_datatree(path, engine="netcdf4", decode_timedelta=False) as tree:
-            nodes = {node.path: node.to_dataset(inherit=False).load() for node in tree.subtree}
-    except OSError as error:
-        raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
+    nodes = read_groups(path)
     if {"/posterior", "/prior", "/alone", "/fit"} - set(nodes):
         raise OutputError(f"{path}: not a joint estimate")
     return StoredJoint(xr.DataTree.from_dict(nodes))

@@ -23,7 +23,7 @@ import xarray as xr
 
 from en4dvar.errors import OutputError
 from en4dvar.files import atomic_path
-from en4dvar.storage.seal import seal_file, sealed
+from en4dvar.storage.seal import check_seal, seal_file, sealed
 
 _LOCK = threading.Lock()  # the netCDF library is not safe to use from several threads
 _MORE = 1 << 18  # bytes; more than the library had left to write
@@ -107,6 +107,21 @@ def to_bytes(groups: Groups) -> bytes:
             raise
         memory = file.close()
     return sealed(bytes(memory))
+
+
+def read_groups(path: Path) -> dict[str, xr.Dataset]:
+    """The groups of a sealed file by their paths, in memory; the file can be replaced while they are in use.
+
+    Raises
+    ------
+    OutputError: it is none of ours, cut short or altered (see :mod:`en4dvar.storage.seal`).
+    """
+    check_seal(path)
+    try:
+        with xr.open_datatree(path, engine="netcdf4", decode_timedelta=False) as tree:
+            return {node.path: node.to_dataset(inherit=False).load() for node in tree.subtree}
+    except OSError as error:
+        raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
 
 
 @contextmanager

@@ -20,9 +20,8 @@ from en4dvar.state import Array, Parameter
 from en4dvar.storage.axes import Axis, axes_of
 from en4dvar.storage.complete import check_complete, of_members
 from en4dvar.storage.groups import build_groups
-from en4dvar.storage.netcdf import netcdf_file, tree_of
+from en4dvar.storage.netcdf import netcdf_file, read_groups, tree_of
 from en4dvar.storage.record import observations_of
-from en4dvar.storage.seal import check_seal
 from en4dvar.summary import ParameterSummary, living, results_table
 
 if TYPE_CHECKING:
@@ -197,12 +196,6 @@ def load_stored(path: str | Path) -> StoredResult:
     OutputError: it is not one, of another version, cut short or altered (see :mod:`en4dvar.storage.seal`).
     """
     path = Path(path)
-    check_seal(path)
-    try:
-        with xr.open_datatree(path, engine="netcdf4", decode_timedelta=False) as tree:
-            # a plain copy: the file can be replaced (or deleted) while the result is in use
-            nodes = {node.path: node.to_dataset(inherit=False).load() for node in tree.subtree}
-    except OSError as error:
-        raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
+    nodes = read_groups(path)
     check_complete(path, nodes)
     return StoredResult(xr.DataTree.from_dict(nodes))

@@ -36,8 +36,10 @@ def interrupt(*_: object, **__: object) -> None:
     raise KeyboardInterrupt
 
 
-def told_at(step: str, before: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[str, list[str], list[str]]:
-    """What is kept and what to type, as told after an interrupt at ``step``, and what was typed before."""
+def told_at(
+    step: str, before: str, folder: Path, monkeypatch: pytest.MonkeyPatch, *later: str
+) -> tuple[str, list[str], list[str]]:
+    """What is kept and what to type, as told after interrupts at ``step`` and ``later``, and what was typed."""
     if ".twin_run." in step:
         path = folder / "twin.yaml"
         path.write_text(TWIN)
@@ -48,7 +50,8 @@ def told_at(step: str, before: str, folder: Path, monkeypatch: pytest.MonkeyPatc
         assert call(*words).exit_code == 0
         words.append(before)
     monkeypatch.setattr("sys.argv", ["en4dvar", *words])
-    monkeypatch.setattr(step, interrupt)
+    for each in (step, *later):
+        monkeypatch.setattr(each, interrupt)
     outcome = call(*words)
     monkeypatch.undo()
     assert outcome.exit_code == 130
@@ -71,5 +74,14 @@ def test_a_run_that_has_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, s
     kept, advice, words = told_at(step, before, tmp_path, monkeypatch)
     assert kept.startswith("interrupted; ")
     assert "kept" in kept
+    assert advice == [*(w for w in words if w != before), "--resume"]
+    assert call(*advice).exit_code == 0
+
+
+@pytest.mark.fault("interrupt")
+def test_a_second_one_while_the_first_is_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str) -> None:
+    steps = "en4dvar.runs.runner.summary_csv", "en4dvar.executor.local.SerialExecutor.__exit__"
+    kept, advice, words = told_at(steps[0], before, tmp_path, monkeypatch, steps[1])
+    assert kept.startswith("interrupted; ")
     assert advice == [*(w for w in words if w != before), "--resume"]
     assert call(*advice).exit_code == 0
