@@ -6,7 +6,6 @@ Source: Lorenz (1996), Predictability: a problem partly solved, Proc. ECMWF Semi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -15,8 +14,6 @@ from pydantic import BaseModel, ConfigDict
 from pydantic import Field as Setting
 
 from en4dvar import Field
-from en4dvar.compiled import kernel
-from en4dvar.kernel_cache import stamp_with_sources
 from en4dvar_lorenz.autonomous import Autonomous, dimensionless
 from en4dvar_lorenz.rk4 import rk4
 
@@ -42,12 +39,9 @@ def tendency(x: np.ndarray, dx: np.ndarray) -> None:
     dx[n] = 0.0
 
 
-@kernel
+@njit(nogil=True)
 def integrate(start: np.ndarray, times: np.ndarray, longest: float) -> np.ndarray:
     return rk4(tendency, start, times, longest)
-
-
-stamp_with_sources(integrate, Path(__file__).parent)
 
 
 class Lorenz96(Autonomous):

@@ -6,7 +6,6 @@ Sources: Lotka (1925), Elements of Physical Biology; Volterra (1926), Nature 118
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -15,8 +14,6 @@ from pydantic import BaseModel, ConfigDict
 from pydantic import Field as Setting
 
 from en4dvar import Field, Observable, Parameter, StateField, StateLayout
-from en4dvar.compiled import kernel
-from en4dvar.kernel_cache import stamp_with_sources
 from en4dvar_lorenz.autonomous import Autonomous
 from en4dvar_lorenz.logarithm import Logarithm
 from en4dvar_lorenz.rk4 import rk4
@@ -40,12 +37,9 @@ def tendency(x: np.ndarray, dx: np.ndarray) -> None:
     dx[2] = dx[3] = dx[4] = dx[5] = 0.0
 
 
-@kernel
+@njit(nogil=True)
 def integrate(start: np.ndarray, times: np.ndarray, longest: float) -> np.ndarray:
     return rk4(tendency, start, times, longest)
-
-
-stamp_with_sources(integrate, Path(__file__).parent)
 
 
 def _positive(name: str, label: str, symbol: str) -> Parameter:

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(inline="always")
+@njit(nogil=True)
 def rk4(
     tendency: Callable[[np.ndarray, np.ndarray], None], start: np.ndarray, times: np.ndarray, longest: float
 ) -> np.ndarray:
