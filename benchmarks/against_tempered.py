@@ -6,6 +6,10 @@ polyacrylamide where their files are there. For each parameter, transformed: how
 in its standard deviations, and the ratio of standard deviations; the largest are shown.
 
     python benchmarks/against_tempered.py [--find 60] [--data FOLDER] [--minutes 5]
+    python benchmarks/against_tempered.py --sets laser:54        this one alone
+
+Both sides are draws. The error of ours is that of so many independent ones, 1/√n of the mean and 1/√(2n) of the spread
+in standard deviations; that of the reference is how far one of its two populations is from both together.
 """
 
 from __future__ import annotations
@@ -44,8 +48,9 @@ MEASURED = {
 }
 
 
-def reference(problem: InverseProblem, seed: int) -> tuple[Tempered, float]:
-    """Two populations together, and by how much the mean of one differs from that of both, in standard deviations."""
+def reference(problem: InverseProblem, seed: int) -> tuple[Tempered, list[float]]:
+    """Two populations together; by how much the mean of one differs from that of both, in standard deviations, and
+    ln of the ratio of these."""
     prior = problem.prior
 
     def log_likelihood(x: np.ndarray) -> np.ndarray:
@@ -53,7 +58,8 @@ def reference(problem: InverseProblem, seed: int) -> tuple[Tempered, float]:
 
     a, b = (tempered(log_likelihood, prior.mean, prior.std, s, PARTICLES, WALK) for s in (seed, seed + 10_000))
     both = Tempered(np.concatenate([a.draws, b.draws]), a.runs + b.runs)
-    return both, float(np.max(np.abs(a.mean - both.mean) / both.std))
+    spread = float(np.max(np.abs(np.log(a.std / both.std))))
+    return both, [float(np.max(np.abs(a.mean - both.mean) / both.std)), spread]
 
 
 def compared(problem: InverseProblem, settings: AssimilationSettings, seed: int) -> Record:
@@ -65,6 +71,7 @@ def compared(problem: InverseProblem, settings: AssimilationSettings, seed: int)
         "ratio": x.std(axis=0, ddof=1) / population.std,
         "error": error,
         "runs": [analysis.forward_runs, population.runs],
+        "draws": max(analysis.refinement.get(f"{by}_effective_sample_size", 0) for by in ("importance", "mcmc")),
         "modes": [float(mode.weight) for mode in analysis.modes],
         "how": how(analysis),
         "warned": [c.code for c in analysis.cautions if c.severity != "note"],
@@ -101,15 +108,17 @@ def with_two_modes(path: Path, count: int, minutes: float) -> list[int]:
 
 
 def table(records: dict[str, Record]) -> None:
-    print("| set | by | modes | mean off by | std ratio | populations differ by | runs (populations) | warns |")
-    print("|---|---|---|---|---|---|---|---|")
+    print("| set | by | draws that count | modes | mean off by | std ratio | reference ± | runs (its) | warns |")
+    print("|---|---|---|---|---|---|---|---|---|")
     for key, r in records.items():
         shift = float(np.max(np.abs(r["shift"])))
         ratio = float(np.exp(np.max(np.abs(np.log(r["ratio"])))))
         modes = ", ".join(f"{w:.2f}" for w in r["modes"])
         runs = "{} ({})".format(*r["runs"])
         codes = ", ".join(r["warned"])
-        print(f"| {key} | {r['how']} | {modes} | {shift:.3f} | {ratio:.3f} | {r['error']:.3f} | {runs} | {codes} |")
+        error = ", ".join(f"{e:.3f}" for e in r["error"])
+        cells = [key, r["how"], f"{r['draws']:.0f}", modes, f"{shift:.3f}", f"{ratio:.3f}", error, runs, codes]
+        print(f"| {' | '.join(cells)} |")
     within = sum(
         max(np.abs(r["shift"])) < TOLERANCE and max(np.abs(np.log(r["ratio"]))) < TOLERANCE for r in records.values()
     )
@@ -122,7 +131,11 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="the measured bubbles")
     parser.add_argument("--minutes", type=float, default=1e9)
     parser.add_argument("--records", type=Path, default=Path("runs/against_tempered"))
+    parser.add_argument("--sets", nargs="*", help="the sets, instead of those that --find says")
     given = parser.parse_args()
+    if given.sets:
+        table(fill(given.records / "sets.jsonl", given.sets, lambda key: run(key, given.data), given.minutes))
+        return
     seeds = with_two_modes(given.records / "modes.jsonl", given.find, given.minutes)
     measured = [key for key, (_, file, _) in MEASURED.items() if (given.data / file).is_file()]
     for key in MEASURED.keys() - measured:

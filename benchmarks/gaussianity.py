@@ -2,7 +2,7 @@
 
     python benchmarks/gaussianity.py --set wide --n 500               runs of ``calibration.py b``, before refinement
     python benchmarks/gaussianity.py --set wide --n 500 --linearisation transform    the plain smoother, which is off
-    python benchmarks/gaussianity.py --set mixed --n 20               20 experiments of each of the designs below
+    python benchmarks/gaussianity.py --set mixed --n 20               20 experiments of each of the 25 designs below
     python benchmarks/gaussianity.py --set mixed --start 100 --n 20   others, for validation
 
 A run is off where the mean of a parameter lies more than 0.5 standard deviations of a long Markov chain from the
@@ -14,6 +14,7 @@ off no longer, told where it warns (graver than a note), else silent. Chains are
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -58,15 +59,12 @@ def thinned(problem: InverseProblem, few: int | None) -> InverseProblem:
     return replace(problem, observations=few_of_them)
 
 
-DESIGNS: dict[str, Callable[[int], InverseProblem]] = {
-    "30 % priors": narrow,
-    "wide priors": wide(1.0),
-    "1.5 x wide": wide(1.5),
-    "2 x wide": wide(2.0),
-    "3 x wide": wide(3.0),
-    "2 x wide, 5 readings": wide(2.0, few=5),
-    "2 x wide, 4.2 um": wide(2.0, std=4.2e-6),
-    "1.5 x wide, 0.3 us": wide(1.5, time_std=0.3e-6),
+WIDENED = {"wide priors": 1.0, "1.5 x wide": 1.5, "2 x wide": 2.0, "3 x wide": 3.0}
+FEW: dict[str, int | None] = {"": None, ", 5 readings": 5}
+ERRORS: dict[str, dict[str, float]] = {"": {}, ", 4.2 um": {"std": 4.2e-6}, ", 0.3 us": {"time_std": 0.3e-6}}
+DESIGNS: dict[str, Callable[[int], InverseProblem]] = {"30 % priors": narrow} | {
+    f"{width}{count}{kind}": wide(WIDENED[width], FEW[count], **ERRORS[kind])
+    for width, count, kind in itertools.product(WIDENED, FEW, ERRORS)
 }
 
 

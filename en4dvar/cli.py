@@ -14,6 +14,7 @@ from typing import Any
 import click
 
 from en4dvar.commands.common import Failed, give_up_output
+from en4dvar.commands.design import design
 from en4dvar.commands.joint import joint
 from en4dvar.commands.listings import models, schema
 from en4dvar.commands.plugin_commands import PluginCommand, plugin_commands
@@ -96,7 +97,7 @@ def main() -> None:
     """
 
 
-for command in (compare, export, joint, models, report, rerun, run, schema, simulate, validate, warm_up):
+for command in (compare, design, export, joint, models, report, rerun, run, schema, simulate, validate, warm_up):
     main.add_command(command)
 
 if __name__ == "__main__":

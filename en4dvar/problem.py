@@ -12,7 +12,7 @@ from en4dvar.forward import ForwardModel, Observable
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior
 from en4dvar.series import Part
-from en4dvar.state import DISCREPANCY, NOISE_SCALE, Parameter
+from en4dvar.state import DISCREPANCY, NOISE_SCALE, READING_SCALE, Parameter
 from en4dvar.varying import PiecewiseModel, RandomWalk, Varying
 
 
@@ -43,10 +43,10 @@ class InverseProblem:
     """Everything that defines a posterior: F, H, y, R, the prior, and the values held fixed.
 
     The control vector holds ``prior.parameters`` in transformed space. A parameter named ``t_s`` shifts the observation
-    times: member i is observed at t_k + t_s,i; one named ``sigma`` multiplies the std of every observation error, where
-    the model has no parameter of that name. ``discrepancy_amplitude`` and ``discrepancy_length`` are those of the
-    discrepancy that the observations allow for. ``perturbations`` act on the initial state, ``tied`` follow what is
-    estimated. ``fixed`` are physical SI values of the other parameters.
+    times: member i is observed at t_k + t_s,i; one named ``sigma`` multiplies the std of every observation error, one
+    named ``reading_scale`` the predictions, where the model has no parameter of that name. ``discrepancy_amplitude``
+    and ``discrepancy_length`` are those of the discrepancy that the observations allow for. ``perturbations`` act on
+    the initial state, ``tied`` follow what is estimated. ``fixed`` are physical SI values of the other parameters.
 
     Where the observations have parts, these say what was observed, and ``observable`` is that of the first.
     """
@@ -68,8 +68,16 @@ class InverseProblem:
     @property
     def has_noise_scale(self) -> bool:
         """Whether ``sigma`` is given and scales the observation errors (rather than being the model's own)."""
-        given = NOISE_SCALE.name in self.prior.names or NOISE_SCALE.name in self.fixed
-        return given and all(p.name != NOISE_SCALE.name for p in self.model.parameters)
+        return self._has(NOISE_SCALE)
+
+    @property
+    def has_reading_scale(self) -> bool:
+        """Whether ``reading_scale`` is given and scales the predictions (rather than being the model's own)."""
+        return self._has(READING_SCALE)
+
+    def _has(self, parameter: Parameter) -> bool:
+        given = parameter.name in self.prior.names or parameter.name in self.fixed
+        return given and all(p.name != parameter.name for p in self.model.parameters)
 
     @property
     def discrepancy(self) -> tuple[Parameter, ...]:
@@ -90,7 +98,7 @@ class InverseProblem:
 
     def varied(self, varying: Sequence[Varying]) -> InverseProblem:
         """The same with what varies; the changes join the control vector at its end."""
-        changes = (change for one in varying for change in one.changes)
+        changes = (term for one in varying for term in one.terms)
         return replace(
             self, model=PiecewiseModel(self.model, varying), prior=self.prior.of((*self.prior.terms, *changes))
         )
@@ -100,7 +108,7 @@ class InverseProblem:
         """The same with every parameter constant, and a model without error."""
         if not isinstance(self.model, PiecewiseModel):
             return self
-        changes = {change.parameter.name for one in self.varying for change in one.changes}
+        changes = {term.parameter.name for one in self.varying for term in one.terms}
         terms = tuple(term for term in self.prior.terms if term.parameter.name not in changes)
         return replace(self, model=self.model.model, prior=self.prior.of(terms))
 

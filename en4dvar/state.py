@@ -69,6 +69,20 @@ NOISE_SCALE = Parameter(
 )
 
 
+READING_SCALE = Parameter(
+    name="reading_scale",
+    unit="1",
+    transform="lognormal",
+    bounds=(0.0, np.inf),
+    label="scale of the readings",
+    symbol="$b$",
+    source="the model is observed times this factor; a model's own parameter of this name goes before it",
+)
+
+
+OF_READINGS = TIME_SHIFT, NOISE_SCALE, READING_SCALE  # what any model may be given beside its own parameters
+
+
 DISCREPANCY = (
     Parameter(
         name="discrepancy_amplitude",

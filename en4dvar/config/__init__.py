@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from en4dvar.config.document import Document, document_from, override
-from en4dvar.config.load import Config, load_config, resolve, time_grid
+from en4dvar.config.load import Config, load_config, resolve
+from en4dvar.config.times import time_grid
 from en4dvar.config.twin import TwinConfig, resolve_twin
 from en4dvar.errors import ConfigError, Fault
 

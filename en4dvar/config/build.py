@@ -66,7 +66,7 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
     )
     perturbations = tuple(perturbed.perturbation for perturbed in config.initial_state)
     varying = _varying(config, observations, terms)
-    asked, count = config.assimilation, len(terms) + sum(len(one.changes) for one in varying)
+    asked, count = config.assimilation, len(terms) + sum(len(one.terms) for one in varying)
     if asked.sampling == "exact" and asked.members <= count:
         message = f"{asked.members} are too few for {count} parameters; at least {count + 1}"
         raise ConfigError([config.document.fault(("assimilation", "members"), message)])

@@ -22,7 +22,7 @@ from en4dvar.config.series import SeriesData
 from en4dvar.config.synthetic import CampaignFile
 from en4dvar.config.twin import TwinFile
 from en4dvar.errors import En4dvarError
-from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Parameter
+from en4dvar.state import OF_READINGS, Parameter
 
 Json = dict[str, Any]
 KINDS = "en4dvar.schemas"
@@ -145,7 +145,7 @@ def _possible_parameters(kind: Any) -> tuple[Parameter, ...]:
 
 def _parameters(known: tuple[Parameter, ...]) -> Json:
     """The ``parameters`` section: names that an editor can offer; others are a matter of the model's settings."""
-    named = {p.name: p for p in (*known, TIME_SHIFT, NOISE_SCALE)}
+    named = {p.name: p for p in (*known, *OF_READINGS)}
     entry = {"$ref": "#/$defs/parameter"}
     return {
         "type": "object",

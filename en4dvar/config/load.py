@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
-import numpy as np
 import yaml
-from pydantic import Field
 
-from en4dvar.config.context import Context, Made, time_unit
+from en4dvar.config.context import Context, Made
 from en4dvar.config.data import Data
 from en4dvar.config.dependence import PriorCorrelation, PriorFile, resolved
+from en4dvar.config.design import Design
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.initial_state import PERTURBED, Perturbed
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, entries
-from en4dvar.config.schema import Assimilation, Execution, File, Output, QuantityText, Section
+from en4dvar.config.schema import Assimilation, Execution, File, Output, Section
 from en4dvar.config.series import DATA, DataPlan
+from en4dvar.config.times import Times, read_times
 from en4dvar.config.validate import check
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
 from en4dvar.dependence import Dependence
@@ -27,40 +27,12 @@ from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.problem import AssimilationSettings
 from en4dvar.state import NOISE_SCALE, Array
-from en4dvar.units import UnitError, parse_quantity
-
-
-def time_grid(start: str | float, end: str | float, step: str | float, unit: str) -> Array:
-    """Instants (K,) from ``start`` to ``end``, both included. Raises :class:`UnitError`."""
-    first = 0.0 if start == "start" else parse_quantity(start, unit)
-    last, width = parse_quantity(end, unit), parse_quantity(step, unit)
-    if not width > 0 or not last > first:
-        raise UnitError(f"no instants from {first:g} to {last:g} {unit} in steps of {width:g} {unit}")
-    steps = (last - first) / width * (1 + 1e-9)
-    if not 2 <= steps < 1_000_000:
-        raise UnitError(f"{steps:.6g} steps; give between 2 and a million")
-    return np.asarray(first + width * np.arange(int(np.floor(steps)) + 1), dtype=float)
-
-
-class Times(Section):
-    """A uniform grid of instants, both ends included."""
-
-    start: Annotated[QuantityText, Field(alias="from")] = "start"
-    """First instant with its unit; start is time zero."""
-    end: Annotated[QuantityText, Field(alias="to")]
-    """Last instant with its unit."""
-    step: QuantityText
-    """Time step with its unit."""
-
-
-def _grid(times: Times, context: Context) -> Array:
-    return time_grid(times.start, times.end, times.step, time_unit(context))
 
 
 class Simulate(Section):
     """Settings of ``en4dvar simulate``: when the synthetic observations are taken."""
 
-    times: Annotated[Array, Made(_grid, Times)]
+    times: Annotated[Array, Made(read_times, Times)]
     """Instants of the synthetic observations."""
 
 
@@ -87,6 +59,8 @@ class Estimation(File):
     """Where results go."""
     simulate: Simulate | None = None
     """Settings of ``en4dvar simulate``."""
+    design: Design | None = None
+    """Which experiments ``en4dvar design`` compares, and about what."""
 
     def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """As given, with absolute paths."""
@@ -118,6 +92,7 @@ class Config:
     initial_state: tuple[Perturbed, ...] = ()
     model_error: tuple[ErrorOf, ...] = ()
     dependence: tuple[Dependence, ...] = ()
+    design: Design = field(default_factory=Design)
 
     @property
     def text(self) -> str:
@@ -172,6 +147,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
         initial_state=file.initial_state or (),
         model_error=file.model_error or (),
         dependence=blocks,
+        design=file.design or Design(),
     )
 
 

@@ -25,7 +25,7 @@ from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel
 from en4dvar.hints import brief, shown, suggest
 from en4dvar.prior import PriorTerm
-from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Array, Parameter
+from en4dvar.state import OF_READINGS, READING_SCALE, TIME_SHIFT, Array, Parameter
 from en4dvar.units import parse_quantity
 from en4dvar.varying import RandomWalk
 from en4dvar.varying.model import can_vary
@@ -252,7 +252,8 @@ class Uncertain:
             message = f"relative to the mean, which is zero; give it in {self.parameter.unit}"
             raise ConfigError([Fault(message, "varies.std")])
         try:
-            return RandomWalk.of(model, term, varies.knots(times), varies.std.absolute(centre) / term.slope(term.mean))
+            std = varies.std.absolute(centre) / term.slope(term.mean)
+            return RandomWalk.of(model, term, varies.knots(times), std, varies.estimated)
         except ConfigError as error:
             raise ConfigError(
                 [replace(f, path=f"varies.{f.path}" if f.path else "varies") for f in error.problems]
@@ -317,7 +318,7 @@ def _missing(parameter: Parameter) -> str:
 
 
 def entries(kind: str = "") -> Made:
-    """One entry for every parameter of the model, in its order, then t_s and sigma if given.
+    """One entry for every parameter of the model, in its order, then those of the readings if given.
 
     ``kind``: what the file is, where it names no data from which a value could come.
     """
@@ -326,7 +327,9 @@ def entries(kind: str = "") -> Made:
         model = context.model
         shift = replace(TIME_SHIFT, unit=model.time_unit, display_unit=model.time_display_unit)
         known = {p.name: p for p in model.parameters}  # a model's own sigma goes before
-        known |= {p.name: p for p in (shift, NOISE_SCALE) if p.name not in known}
+        # what makes its own readings makes them to scale
+        offered = (p for p in (*OF_READINGS, shift) if not (kind and p is READING_SCALE))
+        known |= {p.name: p for p in offered if p.name not in known}
         defaults: Mapping[str, float] = getattr(model, "defaults", {})
 
         def unknown(name: str) -> str:

@@ -63,7 +63,7 @@ def read_one(plan: SeriesPlan, file: DataFile, fewest: int = 3) -> Series:
 
     try:
         stated = {key: beside(column) for key, column in _errors(data).items()}
-        noise = _noise(data, times, values, np.arange(len(read.times))[window], stated)
+        noise = errors_of(data, times, values, np.arange(len(read.times))[window], stated)
         weights, places = data.weights, data.places
         return Series(
             observable=plan.observable,
@@ -139,7 +139,7 @@ def _span(times: Array, data: Data) -> str:
     return f"; the readings go from {first:g} to {last:g} {column.unit}"
 
 
-def _noise(
+def errors_of(
     data: Data, times: Array, values: Array, samples: npt.NDArray[np.intp], stated: Mapping[str, Array | None]
 ) -> Noise:
     """The observation errors; ``samples`` (K,) are the places of the observations in the series.

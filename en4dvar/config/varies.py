@@ -21,6 +21,10 @@ from en4dvar.varying import StateChanges
 MOST_KNOTS = 1000
 
 
+class Estimated(Spread):
+    """A standard deviation that is estimated, by that of its half-normal prior."""
+
+
 class Knots(Section):
     """When something changes: at regular knots, or at given ones."""
 
@@ -58,12 +62,23 @@ class Knots(Section):
         return found
 
 
+def _change_std(text: Any, context: Context) -> Spread:
+    if text == "estimated":
+        return Estimated(0.5, relative=True)
+    return parse_spread(text, subject_unit(context))
+
+
 class VariesSection(Knots):
     """A parameter that varies in time: constant pieces, and at each knot between two a random change."""
 
-    std: Annotated[Spread, Made(lambda text, context: parse_spread(text, subject_unit(context)))]
+    std: Annotated[Spread, Made(_change_std)]
     """Standard deviation of each change: in % of the value (lognormal: of its logarithm), or in the parameter's
-    unit, which holds at the centre of the prior."""
+    unit, which holds at the centre of the prior; or ``estimated``, with a half-normal prior of 50 %."""
+
+    @property
+    def estimated(self) -> bool:
+        """Whether ``std`` is that of the prior of the changes' standard deviation."""
+        return isinstance(self.std, Estimated)
 
 
 class ModelErrorSection(Knots):

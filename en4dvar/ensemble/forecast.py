@@ -15,7 +15,7 @@ from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.noise import Predicted
 from en4dvar.problem import InverseProblem
-from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Array, Parameter
+from en4dvar.state import NOISE_SCALE, OF_READINGS, READING_SCALE, TIME_SHIFT, Array, Parameter
 
 NO_TIMES: Array = np.empty(0)
 GRID_POINTS = 200  # of a plot
@@ -78,20 +78,22 @@ class Composite:
         self._operators = _operators(problem)
         self._batched = batched(problem)
         self._scaled, self._discrepancy = problem.has_noise_scale, problem.discrepancy
+        self._reading_scaled = problem.has_reading_scale
 
     def __call__(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
         """Run control vectors ``x`` (B, n; transformed) through F and H.
 
-        Member i is observed at t_k + t_s,i. ``extra_times`` (M,), on the clock of the observations, are read from the
-        same run. A member fails, without disturbing the others, where a parameter leaves its bounds, ``initial_state``
-        raises, the model returns a :class:`Failure`, or H gives anything but finite numbers.
+        Member i is observed at t_k + t_s,i, times its ``reading_scale``. ``extra_times`` (M,), on the clock of the
+        observations, are read from the same run. A member fails, without disturbing the others, where a parameter
+        leaves its bounds, ``initial_state`` raises, the model returns a :class:`Failure`, or H gives anything but
+        finite numbers.
         """
         problem = self.problem
         times, reading, size, at_observations, at_extra = self._reading(extra_times)
         physical = problem.prior.to_physical(x)
         failures = out_of_bounds(problem.prior, physical)
         alive, states = self._initial_states(physical, failures)
-        shift = _of_framework(problem, physical, TIME_SHIFT, 0.0)
+        shift = time_shift(problem, physical)
         shifted = times + shift[alive, None]
         outcomes = self.executor.trajectories(problem.model, states, shifted) if len(states) else ()
         observed, limits, reasons = reading.observe(outcomes, size)
@@ -104,6 +106,8 @@ class Composite:
             observed[:, alive], limits[alive] = read
             for i, reason in zip(np.arange(len(x))[alive], reasons, strict=True):
                 failures[i] = reason
+        if self._reading_scaled:
+            observed = observed * reading_scale(problem, physical)[:, None]
         predicted = Predicted(
             observed[0][:, at_observations],
             observed[1][:, at_observations] if len(observed) > 1 else None,
@@ -181,7 +185,7 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
     """
     perturbed = [p.parameter for p in problem.perturbations]
     discrepancy = problem.discrepancy
-    known = {p.name: p for p in (TIME_SHIFT, NOISE_SCALE, *discrepancy, *perturbed, *problem.model.parameters)}
+    known = {p.name: p for p in (*OF_READINGS, *discrepancy, *perturbed, *problem.model.parameters)}
     estimated, fixed = set(problem.prior.names), set(problem.fixed)
     if unknown := {p.field for p in problem.perturbations} - set(problem.model.layout.names):
         raise ConfigError(f"initial_state: {', '.join(sorted(unknown))}: not a field of the model's state")
@@ -196,6 +200,8 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
     ):
         if names:
             raise ConfigError(f"{', '.join(sorted(names))}: {message}")
+    if problem.has_reading_scale and problem.observations.parts:
+        raise ConfigError("reading_scale: several series, or places, have no common scale; leave it out")
     _operators(problem)
     return tuple(known[name] for name in problem.fixed)
 
@@ -207,8 +213,20 @@ def _operators(problem: InverseProblem) -> list[tuple[Callable[[Any], Array], ..
     return [operators_of(parts), *([operators_of(parts, True, what)] if noise.needs_rates else [])]
 
 
+def time_shift(problem: InverseProblem, physical: Array) -> Array:
+    """t_s (B,) of physical control vectors (B, n)."""
+    return _of_framework(problem, physical, TIME_SHIFT, 0.0)
+
+
+def reading_scale(problem: InverseProblem, physical: Array) -> Array:
+    """What the predictions of physical control vectors (B, n) are multiplied by, (B,)."""
+    if not problem.has_reading_scale:
+        return np.ones(len(physical))
+    return _of_framework(problem, physical, READING_SCALE, 1.0)
+
+
 def _of_framework(problem: InverseProblem, physical: Array, parameter: Parameter, default: float) -> Array:
-    """Values (B,) of a parameter that the framework itself uses, t_s or σ."""
+    """Values (B,) of a parameter that the framework itself uses."""
     if parameter.name in problem.prior.names:
         return np.asarray(physical[:, problem.prior.names.index(parameter.name)])
     return np.full(len(physical), problem.fixed.get(parameter.name, default))

@@ -83,7 +83,7 @@ def examine(
 
 def _changes(a: Analysis) -> set[str]:
     """Names of the changes of parameters that vary, of which data may say little."""
-    return {change.parameter.name for one in a.problem.varying for change in one.changes}
+    return {term.parameter.name for one in a.problem.varying for term in one.terms}
 
 
 def doubts(problem: InverseProblem, members: Array, predicted: Array) -> Sequence[str]:

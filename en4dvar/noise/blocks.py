@@ -60,7 +60,7 @@ class BlockNoise(Noise):
 
     def _blocks(self) -> Iterator[Block]:
         alone = np.ones(len(self.std), dtype=bool)
-        for where in self._correlated():
+        for where in self._groups():
             alone[where] = False
             matrix = Correlation(self._matrix[np.ix_(where, where)])
             yield Block(where, CorrelatedNoise(self.std[where], self.time_std[where], matrix))
@@ -73,7 +73,7 @@ class BlockNoise(Noise):
     def _matrix(self) -> Array:
         return np.eye(len(self.std)) if self.correlation is None else self.correlation.matrix
 
-    def _correlated(self) -> Iterator[Indices]:
+    def _groups(self) -> Iterator[Indices]:
         """Sets of readings that are correlated with each other and with no other."""
         if self.correlation is None:
             return
@@ -101,6 +101,9 @@ class BlockNoise(Noise):
 
     def whitened_residual(self, values: Array, predicted: Predicted) -> Array:
         return self._each(predicted, lambda n, y, p: n.whitened_residual(y, p), values)
+
+    def drawn(self, predicted: Predicted, stream: np.random.Generator) -> Array:
+        return self._each(predicted, lambda n, y, p: n.drawn(p, stream), predicted.values)
 
     def influence(self, residual: Array) -> Array:
         return np.asarray(self.thresholds / np.maximum(np.abs(residual), self.thresholds), dtype=float)
@@ -162,7 +165,7 @@ class BlockNoise(Noise):
         """(…, K) of what each block gives of its readings (…, K')."""
         found = np.empty(np.broadcast_shapes(predicted.values.shape, values.shape))
         for block in self.blocks:
-            found[..., block.where] = of(block.noise, values[block.where], part(predicted, block.where))
+            found[..., block.where] = of(block.noise, values[..., block.where], part(predicted, block.where))
         return found
 
 

@@ -89,6 +89,9 @@ class CorrelatedNoise(Noise):
     def matrices(self) -> dict[str, tuple[Array, str]]:
         return {"correlation": (self.correlation.matrix, "correlation of the observation errors")}
 
+    def _correlated(self, v: Array) -> Array:
+        return self.correlation.correlated(v)
+
     def _decorrelated(self, z: Array) -> Array:
         return np.asarray(z @ self.correlation.whitening.T)
 

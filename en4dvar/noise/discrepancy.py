@@ -104,6 +104,11 @@ class DiscrepancyNoise(Noise):
         """Gaussian errors that count each reading as these do at a prediction."""
         return self
 
+    def drawn(self, predicted: Predicted, stream: np.random.Generator) -> Array:
+        root = np.linalg.cholesky(self.covariance_of_discrepancy(predicted))
+        missed = np.einsum("...ij,...j->...i", root, stream.standard_normal(predicted.values.shape))
+        return super().drawn(predicted, stream) + missed
+
     def explained(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
         """Mean and std (K,) of δ given the residual at one prediction."""
         covariance = self.covariance_of_discrepancy(predicted)
@@ -155,6 +160,9 @@ class DiscrepancyNoise(Noise):
     def precision_times(self, values: Array, weights: Array, at: Predicted, vectors: Array) -> Array:
         root = np.linalg.cholesky(self.covariance(at))
         return np.asarray(weights[0] * cho_solve((root, True), vectors.T).T)
+
+    def _correlated(self, v: Array) -> Array:
+        return v if self.correlation is None else self.correlation.correlated(v)
 
     def _amplitude_and_length(self, predicted: Predicted) -> tuple[Array, Array]:
         if predicted.discrepancy is None:

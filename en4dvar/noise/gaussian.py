@@ -81,6 +81,11 @@ class Noise:
         """v = R^{-1/2}(y − m) (…, K); with correlated errors v_k holds what is new in y_k."""
         return self._decorrelated((values - predicted.values) / self.error_std(predicted))
 
+    def drawn(self, predicted: Predicted, stream: np.random.Generator) -> Array:
+        """Readings (…, K) as they may come of predictions."""
+        errors = self._correlated(self._white(stream, predicted.values.shape))
+        return np.asarray(predicted.values + self.error_std(predicted) * errors)
+
     def influence(self, residual: Array) -> Array:
         """ρ'(v)/v (…, K) of whitened residuals, at most 1: how much of a Gaussian observation one counts."""
         return np.ones_like(residual)
@@ -159,6 +164,14 @@ class Noise:
     def matrices(self) -> dict[str, tuple[Array, str]]:
         """Matrices (K, K) that belong to the kind, for the record: name → values and what they are."""
         return {}
+
+    def _white(self, stream: np.random.Generator, shape: tuple[int, ...]) -> Array:
+        """Draws of v."""
+        return stream.standard_normal(shape)
+
+    def _correlated(self, v: Array) -> Array:
+        """Lv (…, K)."""
+        return np.asarray(v)
 
     def _decorrelated(self, z: Array) -> Array:
         """L⁻¹z (…, K)."""

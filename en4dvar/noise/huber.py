@@ -66,6 +66,16 @@ class HuberNoise(Noise):
             (2 * slope - c * at_edge) / weight, (1 + 3 * square - c**3 * at_edge) / information, information
         )
 
+    def _white(self, stream: np.random.Generator, shape: tuple[int, ...]) -> Array:
+        """Within the threshold of a Gaussian cut there, beyond it exponential."""
+        from scipy.special import ndtr, ndtri
+
+        c, (which, where) = self.threshold, stream.uniform(size=(2, *shape))
+        inside = self._inside / (self._inside + 2 / c * self._edge)
+        within = ndtri(ndtr(-c) + where * (1 - 2 * ndtr(-c)))
+        beyond = np.sign(which - (1 + inside) / 2) * (c - np.log(where) / c)
+        return np.asarray(np.where(which < inside, within, beyond))
+
     def _loss(self, v: Array) -> Array:
         inner = np.minimum(np.abs(v), self.threshold)
         return np.asarray(inner * (np.abs(v) - 0.5 * inner))

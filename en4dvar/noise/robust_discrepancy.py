@@ -111,6 +111,9 @@ class RobustDiscrepancyNoise(DiscrepancyNoise):
         """κ."""
         return self.huber.expected_curvature
 
+    def _white(self, stream: np.random.Generator, shape: tuple[int, ...]) -> Array:
+        return self.huber._white(stream, shape)
+
     def _log_norm(self) -> float:
         return self.huber._log_norm()
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from en4dvar.ensemble.forecast import reading_scale, time_shift
 from en4dvar.ensemble.members import EVERYONE, InitialStates, Reading
 from en4dvar.ensemble.readout import Readout, batched, operators_of
 from en4dvar.executor.chunks import without_warnings
@@ -27,7 +28,7 @@ from en4dvar.forward import Failure, PathQuantity, Trajectory
 from en4dvar.noise import Linearisation
 from en4dvar.problem import InverseProblem
 from en4dvar.response.linear import LinearResponse
-from en4dvar.state import TIME_SHIFT, Array
+from en4dvar.state import Array
 from en4dvar.user_code import reason_of
 
 CELLS = 32  # M, of the path in time; narrow where its quantities change
@@ -94,9 +95,7 @@ def _ledger(problem: InverseProblem, response: LinearResponse, std: Array, names
     physical = prior.to_physical(response.at)
     reasons = [""]
     alive, start = InitialStates(problem)(physical[None], reasons)
-    shift = problem.fixed.get(TIME_SHIFT.name, 0.0)
-    if TIME_SHIFT.name in prior.names:
-        shift = float(physical[prior.names.index(TIME_SHIFT.name)])
+    shift, scale = (float(of(problem, physical[None])[0]) for of in (time_shift, reading_scale))
     times = problem.observations.times + shift
     path = None if alive is not EVERYONE else _path(problem, start, float(times.max()))
     if path is None:
@@ -107,7 +106,8 @@ def _ledger(problem: InverseProblem, response: LinearResponse, std: Array, names
     changes = [
         (model.layout[name].start, prior.to_physical(x)[j]) for name, j, x in zip(names, columns, moved, strict=True)
     ]
-    local = _localised(problem, states[:-1], edges[:-1], shift, changes) / (CHANGE * std[columns])[:, None, None]
+    local = _localised(problem, states[:-1], edges[:-1], shift, changes)
+    local = scale * local / (CHANGE * std[columns])[:, None, None]
     kernel = np.stack(
         [gain @ _whitened(response, one) for gain, one in zip(response.gain[columns], local, strict=True)]
     )

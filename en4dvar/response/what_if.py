@@ -63,11 +63,13 @@ def what_if(
 ) -> tuple[Shift, ...]:
     """The shifts of all alternatives of the problem's model: the largest first, then those unknown, then small ones.
 
-    ``std`` (n,) of the posterior, transformed; ``cost`` J at ``response.at``.
+    ``std`` (n,) of the posterior, transformed; ``cost`` J at ``response.at``. A scale that is estimated has an
+    uncertainty of its own.
     """
     if not response.defined or not np.all(std > 0):
         return ()
-    shifts = [_shift(problem, response, std, cost, executor, one) for one in problem.model.alternatives]
+    offered = [one for one in problem.model.alternatives if one.values == 1.0 or not problem.has_reading_scale]
+    shifts = [_shift(problem, response, std, cost, executor, one) for one in offered]
     return tuple(sorted(shifts, key=lambda shift: -shift.largest))
 
 

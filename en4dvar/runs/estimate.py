@@ -68,7 +68,7 @@ def estimate(
         name is that of its observable, and ``error`` is then a dict name → error. A function is asked for all times
         together, the union of those of the series, and returns a dict of arrays.
     priors: name → prior, as in a file: ``{"prior": "lognormal", "median": 4, "log_std": 0.5}``; a number fixes a
-        parameter. ``t_s`` is a time shift, ``sigma`` the noise scale.
+        parameter. ``t_s`` is a time shift, ``sigma`` the noise scale, ``reading_scale`` that of the predictions.
     error: std of the readings: a number, one a reading, text such as ``"1 % of maximum"``, or a dict as ``data.error``
         of a file, in which an array is one number a reading.
     units: of a function's parameters, values (by name) and of ``"time"``; by default none has one.

@@ -18,7 +18,7 @@ from en4dvar.function_model import FunctionModel, digest_of, name_of
 from en4dvar.hints import listed, suggest
 from en4dvar.inputs.arrays import TIME, VALUE, columns_of, csv_of, require_columns, stacked, tables_of
 from en4dvar.runs.rundir import GIVEN
-from en4dvar.state import NOISE_SCALE, TIME_SHIFT, Array, Parameter
+from en4dvar.state import OF_READINGS, Array, Parameter
 from en4dvar.storage.checkpoint import digest
 
 MODELS = "give f(parameters, times), a ForwardModel, or a dict such as {'name': 'bubble'}"
@@ -181,7 +181,7 @@ class Given:
         return self._function(model), section
 
     def _function(self, function: Any) -> FunctionModel:
-        names = [name for name in self.priors if name not in (TIME_SHIFT.name, NOISE_SCALE.name)]
+        names = [name for name in self.priors if name not in {p.name for p in OF_READINGS}]
         if wrong := [name for name in names if not str(name).isidentifier()]:
             raise ConfigError(f"priors: {wrong[0]!r} is no name of a parameter; write letters, digits and _")
         columns = {name for one in self.series for name in one.columns}

@@ -186,6 +186,13 @@ def shown(bar: Any) -> Iterator[Any]:
 @contextmanager
 def cycle_progress(cycles: int) -> Iterator[Callable[[int], None] | None]:
     """A bar of assimilation cycles on the terminal (standard error), or None where there is no terminal."""
+    with counted("cycles") as tell:
+        yield (lambda cycle: tell(cycle + 1, cycles)) if tell else None
+
+
+@contextmanager
+def counted(what: str) -> Iterator[Callable[[int, int], None] | None]:
+    """A bar on the terminal (standard error) that is told how many of how many are done, or None without a terminal."""
     from rich.console import Console
     from rich.progress import Progress as Bar
 
@@ -194,8 +201,8 @@ def cycle_progress(cycles: int) -> Iterator[Callable[[int], None] | None]:
         yield None
         return
     with shown(Bar(console=console, transient=True)) as bar:
-        task = bar.add_task("cycles", total=cycles)
-        yield lambda cycle: bar.update(task, completed=cycle + 1)
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def _short(name: str, record: Record) -> str:

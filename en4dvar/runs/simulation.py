@@ -18,7 +18,7 @@ from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import run_chunk
 from en4dvar.forward import Failure
 from en4dvar.inputs.readers import Column
-from en4dvar.state import TIME_SHIFT, Array
+from en4dvar.state import READING_SCALE, TIME_SHIFT, Array
 from en4dvar.units import UnitError, convert
 from en4dvar.user_code import reason_of
 
@@ -89,9 +89,10 @@ def noise_level(text: str, config: Config, simulation: Simulation) -> float:
 
 def _forward(config: Config, theta: Mapping[str, float], times: Array) -> Array:
     model = config.model
-    shift = theta.get(TIME_SHIFT.name, 0.0)
+    shift, names = theta.get(TIME_SHIFT.name, 0.0), {p.name for p in model.parameters}
+    scale = 1.0 if READING_SCALE.name in names else theta.get(READING_SCALE.name, 1.0)
     try:
-        own = {name: value for name, value in theta.items() if name in {p.name for p in model.parameters}}
+        own = {name: value for name, value in theta.items() if name in names}
         state = np.asarray(model.initial_state(own), dtype=float)
     except BaseException as error:
         reason = error if isinstance(error, ValueError) else reason_of(error)
@@ -100,7 +101,7 @@ def _forward(config: Config, theta: Mapping[str, float], times: Array) -> Array:
     if isinstance(path, Failure):
         raise En4dvarError(f"the model failed: {path.reason}")
     try:
-        return np.asarray(config.observable.operator(path), dtype=float)
+        return np.asarray(config.observable.operator(path), dtype=float) * scale
     except BaseException as error:
         raise En4dvarError(f"{config.observable.name} cannot be read from the run: {reason_of(error)}") from None
 

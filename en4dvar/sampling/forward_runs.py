@@ -8,11 +8,12 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.ensemble.forecast import reading_scale, time_shift
 from en4dvar.ensemble.members import InitialStates, Reading, out_of_bounds
 from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.problem import InverseProblem
-from en4dvar.state import TIME_SHIFT, Array
+from en4dvar.state import Array
 
 Sets = npt.NDArray[np.intp] | None  # numbers of the data sets meant; all of them by default
 
@@ -44,14 +45,11 @@ class Predictor:
         if len(states):
             outcomes = self.executor.trajectories(self.problem.model, states, times[alive])
             observed[alive] = self._reading.observe(outcomes, times.shape[1])[0][0]
-        return observed
+        return observed * reading_scale(self.problem, physical)[:, None]
 
     def time_shifts(self, x: Array) -> Array:
         """t_s (B,) of control vectors (B, n)."""
-        prior = self.problem.prior
-        if TIME_SHIFT.name in prior.names:
-            return np.asarray(prior.to_physical(x)[:, prior.names.index(TIME_SHIFT.name)])
-        return np.full(len(x), self.problem.fixed.get(TIME_SHIFT.name, 0.0))
+        return time_shift(self.problem, self.problem.prior.to_physical(x))
 
 
 class ForwardRuns:

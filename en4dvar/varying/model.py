@@ -45,7 +45,7 @@ class PiecewiseModel(ForwardModel):
         self.model, self.varying = model, tuple(varying)
         self.walks = tuple(one for one in self.varying if isinstance(one, RandomWalk))
         self.state_changes = tuple(one for one in self.varying if isinstance(one, StateChanges))
-        self.parameters = (*model.parameters, *(c.parameter for one in self.varying for c in one.changes))
+        self.parameters = (*model.parameters, *(term.parameter for one in self.varying for term in one.terms))
         self.layout = StateLayout((*model.layout.fields, *(one.own for one in self.varying)))
         varied = {walk.name for walk in self.walks}
         self.path_parameters = tuple(name for name in model.path_parameters if name not in varied)

@@ -4,13 +4,15 @@
 
 in the transformed space of the parameter, whose prior is that of x_0. The changes c_k are parameters of the control
 vector like any other, independent of each other and of x_0, so that J, its minimisation, the ensemble and the evidence
-are what they are without; the values of the pieces are their sums.
+are what they are without; the values of the pieces are their sums. Where q is estimated it is a parameter as well, with
+a half-normal prior, and the c_k / q ~ N(0, 1) take the place of the c_k, so that all are still independent.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,21 +28,37 @@ SCALE = {"normal": "", "lognormal": "ln", "logit": "logit"}  # what a change is 
 class RandomWalk:
     """``first`` is the prior of the first piece, ``changes`` (m) are those of the changes at the ``knots`` (m,).
 
-    The knots are in the model's time, increasing and positive.
+    The knots are in the model's time, increasing and positive. ``spread`` is the prior of the changes' standard
+    deviation where that is estimated; they then count it.
     """
 
     first: PriorTerm
     knots: tuple[float, ...]
     changes: tuple[PriorTerm, ...]
+    spread: PriorTerm | None = None
 
     @classmethod
-    def of(cls, model: ForwardModel, first: PriorTerm, knots: Sequence[float], std: float) -> RandomWalk:
-        """With changes N(0, std²) in the transformed space of ``first``. Raises :class:`ConfigError`."""
+    def of(
+        cls, model: ForwardModel, first: PriorTerm, knots: Sequence[float], std: float, estimated: bool = False
+    ) -> RandomWalk:
+        """With changes N(0, std²) in the transformed space of ``first``. Raises :class:`ConfigError`.
+
+        ``estimated``: ``std`` is that of the half-normal prior of their standard deviation.
+        """
 
         def change(k: int, knot: float) -> PriorTerm:
-            return PriorTerm.normal(_change(model, first, k, knot), 0.0, std)
+            p = _change(model, first, k, knot)
+            if estimated:
+                p = replace(p, unit="1", display_unit="1", label=f"{p.label}, in its standard deviations")
+            return PriorTerm.normal(p, 0.0, 1.0 if estimated else std)
 
-        return cls(first, tuple(knots), tuple(change(k, knot) for k, knot in enumerate(knots, 1)))
+        spread = PriorTerm.half_normal(_spread(first), std) if estimated else None
+        return cls(first, tuple(knots), tuple(change(k, knot) for k, knot in enumerate(knots, 1)), spread)
+
+    @property
+    def terms(self) -> tuple[PriorTerm, ...]:
+        """What joins the control vector."""
+        return (*([self.spread] if self.spread else []), *self.changes)
 
     @property
     def parameter(self) -> Parameter:
@@ -84,7 +102,8 @@ class RandomWalk:
         inside = (value > low) & (value < high)
         centre = term.to_physical(np.array(term.mean))
         first = np.where(inside, term.from_physical(np.where(inside, value, centre)), np.nan)
-        changes = [theta[term.parameter.name] for term in self.changes]
+        std = theta[self.spread.parameter.name] if self.spread else 1.0
+        changes = [std * theta[term.parameter.name] for term in self.changes]
         return self.first.to_physical(np.cumsum(np.stack([first, *changes], axis=-1), axis=-1))
 
 
@@ -96,8 +115,7 @@ def clock(model: ForwardModel, knot: float) -> str:
 
 def _change(model: ForwardModel, first: PriorTerm, k: int, knot: float) -> Parameter:
     """The change at the k-th knot, counted from one."""
-    p, scale = first.parameter, SCALE.get(first.transform, "score")
-    unit, shown = (p.unit, p.display_unit) if first.transform == "normal" else ("1", "1")
+    p, scale, (unit, shown) = first.parameter, SCALE.get(first.transform, "score"), _units(first)
     if len(p.symbol) > 2 and p.symbol[0] == p.symbol[-1] == "$":
         function = rf"\mathrm{{{scale}}} " if scale else ""
         symbol = rf"$\Delta_{{{k}}}({function}{p.symbol[1:-1]})$"
@@ -111,3 +129,21 @@ def _change(model: ForwardModel, first: PriorTerm, k: int, knot: float) -> Param
         display_unit=shown,
         source="random walk of a parameter that varies in time",
     )
+
+
+def _spread(first: PriorTerm) -> Parameter:
+    """The standard deviation of the changes."""
+    p, (unit, shown) = first.parameter, _units(first)
+    return Parameter(
+        f"{p.name}_change_std",
+        unit,
+        bounds=(0.0, math.inf),
+        label=f"std of the changes of {SCALE.get(first.transform, 'score')} {p.label}".replace("  ", " "),
+        display_unit=shown,
+        source="random walk of a parameter that varies in time",
+    )
+
+
+def _units(first: PriorTerm) -> tuple[str, str]:
+    """Unit and display unit of a change."""
+    return (first.parameter.unit, first.parameter.display_unit) if first.transform == "normal" else ("1", "1")

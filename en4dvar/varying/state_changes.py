@@ -53,6 +53,11 @@ class StateChanges:
         return f"{self.name} of the state"
 
     @property
+    def terms(self) -> tuple[PriorTerm, ...]:
+        """What joins the control vector."""
+        return self.changes
+
+    @property
     def own(self) -> Field:
         """Where the state of a run keeps the changes."""
         return Field(f"{self.name}_changes", len(self.knots))

@@ -88,6 +88,11 @@ def test_faults_are_located():
     assert "campaign.groups.agarose_03.parameters.mu" in told
 
 
+def test_a_campaign_makes_its_readings_to_scale():
+    with pytest.raises(ConfigError, match=r"agarose_03\.parameters\.reading_scale: unknown parameter"):
+        plan(**{"campaign.groups.agarose_03.parameters.reading_scale": "1.03"})
+
+
 def test_an_existing_campaign_is_not_overwritten(tmp_path):
     (tmp_path / "truth.csv").write_text("mine")
     result = CliRunner().invoke(main, ["simulate", str(CONFIGS / "agarose_twin.yaml"), "--out", str(tmp_path)])

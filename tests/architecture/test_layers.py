@@ -36,6 +36,7 @@ LAYERS = (
     ("assimilate",),
     ("joint",),
     ("population",),
+    ("design",),
     ("inputs",),
     ("config",),
     ("storage",),

@@ -56,6 +56,21 @@ def test_knots_and_standard_deviations(tmp_path):
     assert walk.changes[0].std * slope == pytest.approx(0.2)
 
 
+def test_a_standard_deviation_that_is_estimated(tmp_path):
+    path = varying(tmp_path, "{at: [40 ms, 80 ms], std: estimated}", data=halved())
+    problem, walk = walk_of(path, **{"assimilation.members": 24})
+    assert problem.prior.names == ("A", "k", "k_change_std", "k_change_1", "k_change_2")
+    assert [(t.transform, t.shape) for t in walk.terms[:1]] == [("half-normal", (0.5,))]
+    assert [(t.std, t.parameter.unit) for t in walk.changes] == [(1.0, "1")] * 2
+    assert problem.constant.prior.names == ("A", "k")
+    prior = "k: {prior: normal, mean: 3 N/m, std: 1 N/m}"
+    _, of_normal = walk_of(varying(tmp_path, "{at: [40 ms], std: estimated}", prior))
+    assert (of_normal.spread.shape, of_normal.spread.parameter.unit) == ((1.5,), "N/m")
+    theta = {"k": np.array([2.0]), "k_change_std": np.array([0.5]), "k_change_1": np.array([1.0]),
+             "k_change_2": np.array([-2.0])}  # fmt: skip
+    np.testing.assert_allclose(walk.pieces(theta), [[2.0, 2.0 * np.exp(0.5), 2.0 * np.exp(-0.5)]], rtol=1e-14)
+
+
 @pytest.mark.parametrize(
     ("varies", "words"),
     [

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from same_bits import assert_same_bits
 from toys import make_observations
-from varying_models import KNOTS, Ramp
+from varying_models import KNOTS, Batched, Ramp
 
 from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.executor import ProcessesExecutor, ThreadsExecutor
@@ -101,6 +103,38 @@ def test_the_state_may_change_as_well(walks):
     assert end.mean() == pytest.approx(expected[-1][0][0], abs=1e-10)
     assert end.var(ddof=1) == pytest.approx(expected[-1][1][0, 0], abs=1e-10)
     assert a.posterior_predictions[:, -1] == pytest.approx(end, abs=1e-10)
+
+
+def over_widths(values, scale):
+    """What the smoother says, over a half-normal prior of the width of the walk: quadrature with 400 of them."""
+    widths = (np.arange(400) + 0.5) / 400 * 4 * scale
+    both = [smoother(values, q) for q in widths]
+    log_joint = np.array([log for _, log in both]) - 0.5 * (widths / scale) ** 2
+    top, means = log_joint.max(), np.array([[m[1] for m, _ in found[1:]] for found, _ in both])
+    weights = np.exp(log_joint - top)
+    log_evidence = top + np.log(weights.mean() * 4 * np.sqrt(2 / np.pi))
+    weights /= weights.sum()
+    variances = np.array([[c[1, 1] for _, c in found[1:]] for found, _ in both])
+    mean, width = weights @ means, weights @ widths
+    std = np.sqrt(weights @ (variances + (means - mean) ** 2))
+    return mean, std, width, np.sqrt(weights @ (widths - width) ** 2), log_evidence
+
+
+@pytest.mark.parametrize("truth", [(1.2, 1.2, 0.6, 0.6), (1.0,) * 4])
+def test_an_estimated_width_of_the_walk_is_sampled(truth):
+    """A cheap model: ``refine: auto`` draws some 13 000 by importance; about 2000 of them count."""
+    constant, model = problem(truth, knots=()), Batched()
+    model.compiled = True
+    walk = RandomWalk.of(model, constant.prior.terms[0], KNOTS, 0.5, estimated=True)
+    p = replace(constant, model=model).varied([walk])
+    a = assimilate(p, AssimilationSettings(members=48), 1)
+    mean, std, width, width_std, log_evidence = over_widths(p.observations.values, 0.5)
+    pieces, own = a.pieces(walk, a.posterior), a.posterior[:, p.prior.names.index("r_change_std")]
+    assert np.max(np.abs(pieces.mean(axis=0) - mean) / std) < 0.25
+    assert (own.mean(), own.std()) == pytest.approx((width, width_std), rel=0.2)
+    assert a.log_evidence == pytest.approx(log_evidence, abs=0.3)
+    assert a.log_evidence_constant == pytest.approx(smoother(p.observations.values, 0.0)[1], abs=1e-8)
+    assert p.constant.prior == constant.prior
 
 
 def test_evidence_of_constant_values_is_that_of_a_run_without():

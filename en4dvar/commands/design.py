@@ -1,0 +1,39 @@
+"""``en4dvar design``: what experiments would tell, before they are made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from en4dvar.commands.common import Source, command_line, config_options, continuable
+
+
+@click.command()
+@config_options
+@click.option("--out", type=click.Path(path_type=Path), help="Directory of the result; default runs/<name>_design.")
+@click.option("--force", is_flag=True, help="Replace an earlier result in the directory.")
+@click.option("--resume", is_flag=True, help="Go on with an interrupted comparison, to the same numbers.")
+def design(source: Source, out: Path | None, force: bool, resume: bool) -> None:
+    """Compare planned experiments by the information they are expected to give.
+
+    The configuration is that of 'run'; its data file need not exist. A 'design:' section says when readings are
+    taken, what can be turned, and about which parameters is asked. Writes design.nc, designs.csv and a page.
+
+    \b
+    Example:
+      en4dvar design configs/lotka_volterra_design.yaml
+    """
+    from en4dvar.report.design import design_table, remarks
+    from en4dvar.runs.design_run import run_design
+    from en4dvar.runs.progress import counted
+
+    with continuable(), counted("designs") as on_design:
+        found, directory = run_design(
+            source.path, overrides=source.overrides(), out=out, force=force, resume=resume, on_design=on_design,
+            command=command_line(),
+        )  # fmt: skip
+    click.echo(design_table(found))
+    for remark in remarks(found):
+        click.echo(f"note: {remark}", err=True)
+    click.echo(f"report: {directory / 'design.html'}")

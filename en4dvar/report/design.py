@@ -1,0 +1,221 @@
+"""The page of compared designs: information against each knob and price, what would be known, what would be seen."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from en4dvar.files import write_text
+from en4dvar.report.html import render
+from en4dvar.report.style import LIGHT, PAGE, inline_svg, panels, styled
+from en4dvar.report.text import figure_text, rough_number, with_unit
+from en4dvar.state import Array
+from en4dvar.storage.design_file import DesignRow, Designs
+from en4dvar.tables import csv_text, table
+from en4dvar.units import convert
+
+TOLD, DRAWN = 12, 6  # designs on the terminal, in the figure of what is seen
+NOTHING = 0.9  # of the prior's std: a posterior that is wider has learned nothing to speak of
+COARSE = 1.0  # relative std beyond which a percentage says nothing
+GAINS = "Expected information against what can be turned, each mark a design; bars: Monte Carlo standard errors."
+FRONT = "Expected information against price; joined: the designs that no other beats in both."
+FANS = "What would be seen: median, 50 % and 90 % of the prior; marks below: the readings that are taken."
+
+
+def ranked(found: Designs) -> list[DesignRow]:
+    """Those that could be evaluated, the most informative first."""
+    return sorted((row for row in found.rows if row.found), key=lambda row: -_worth(row))
+
+
+def front(found: Designs) -> list[DesignRow]:
+    """The designs that no other beats in both price and information (Pareto), the cheapest first."""
+    kept: list[DesignRow] = []
+    for row in sorted(ranked(found), key=lambda row: (row.price, -_worth(row))):
+        if not kept or _worth(row) > _worth(kept[-1]):
+            kept.append(row)
+    return kept
+
+
+def settings_text(row: DesignRow) -> str:
+    """What the knobs are set to."""
+    return ", ".join(f"{name} {value}" for name, value in row.settings.items()) or "as in the file"
+
+
+def words(found: Designs, row: DesignRow) -> str:
+    """What would be known: "G to ± 12 %, alpha hardly at all"."""
+    return ", ".join(_known(found, row, a) for a in range(len(found.asked.parameters)))
+
+
+def _known(found: Designs, row: DesignRow, a: int) -> str:
+    name, one = found.asked.parameters[a], row.found
+    assert one is not None
+    if one.ratio[a] > NOTHING:
+        return f"{name} hardly at all"
+    if one.relative[a] < COARSE:
+        return f"{name} to ± {rough_number(100 * float(one.relative[a]))} %"
+    unit, shown = found.asked.units[a]
+    value = rough_number(float(convert(np.array(one.std[a]), unit, shown)))
+    return f"{name} to ± {value}{'' if shown == '1' else f' {shown}'}"
+
+
+def design_table(found: Designs) -> str:
+    """The best designs and the file's own, for the terminal."""
+    rows, own = ranked(found), [row for row in found.rows if not row.settings and row.found]
+    told = list({id(row): row for row in (*rows[:TOLD], *own)}.values())
+    several = any(row.found.alike > 1 for row in rows if row.found)
+    head = ("design", *(["experiments"] if several else []), "readings", "price", "gain [nats]", "by", "what is known")
+    cells = [
+        (
+            settings_text(row),
+            *([str(row.found.alike)] if several else []),
+            str(len(row.found.readings)),
+            f"{row.price:g}",
+            f"{row.found.gain:.2f} ± {row.found.error:.2f}",
+            row.found.method,
+            words(found, row),
+        )
+        for row in told
+        if row.found
+    ]
+    return table([head, *cells])
+
+
+def remarks(found: Designs) -> list[str]:
+    """What to know of the designs beside their worth."""
+    failed = [row for row in found.rows if row.failure]
+    beyond = [row for row in ranked(found)[:TOLD] if row.found and row.found.beyond > 0.1]
+    told = [f"{settings_text(row)}: {row.failure}" for row in failed]
+    told += [
+        f"{settings_text(row)}: {100 * row.found.beyond:.0f} % of the prior leaves what the model is valid for"
+        for row in beyond
+        if row.found
+    ]
+    return told
+
+
+@styled
+def gains(found: Designs) -> Figure:
+    """Information against each knob."""
+    names = [*found.asked.knobs, *(["experiments"] if len({_alike(row) for row in ranked(found)}) > 1 else [])]
+    figure, axes = panels(len(names), PAGE, 2.2)
+    for ax, name in zip(axes, names, strict=True):
+        rows = [row for row in ranked(found) if name in row.settings or name == "experiments"]
+        values = [row.settings.get(name, _alike(row)) for row in rows]
+        x, labels = _positions(values)
+        worth = np.array([_worth(row) for row in rows])
+        errors = np.array([row.found.error for row in rows if row.found])
+        ax.errorbar(x, worth, errors, fmt="o", ms=3, lw=0.6, color=LIGHT["posterior"], alpha=0.7)
+        if labels:
+            ax.set_xticks(sorted(set(x)), labels)
+        ax.set(xlabel=figure_text(name) + ("" if labels else _unit_of(values)), ylabel="information [nats]")
+    return figure
+
+
+@styled
+def prices(found: Designs) -> Figure:
+    """Information against price, with the front."""
+    figure, (ax,) = panels(1, PAGE, 2.2)
+    rows, best = ranked(found), front(found)
+    ax.plot([row.price for row in rows], [_worth(row) for row in rows], "o", ms=3, color=LIGHT["prior"])
+    ax.plot([row.price for row in best], [_worth(row) for row in best], "o-", ms=4, color=LIGHT["posterior"])
+    ax.set(xlabel="price", ylabel="information [nats]")
+    return figure
+
+
+@styled
+def fans(found: Designs) -> Figure:
+    """What would be seen with the best designs, and the file's own."""
+    rows = {row.number: row for row in reversed([*ranked(found)[:DRAWN], *(r for r in found.rows if r.number == 0)])}
+    shown = [row for row in reversed(list(rows.values())) if row.found]
+    figure, axes = panels(len(shown), PAGE, 1.6)
+    time, value = found.asked.axes
+    for ax, row in zip(axes, shown, strict=True):
+        one = row.found
+        assert one is not None
+        t, taken = convert(one.grid, *time), convert(one.times, *time)
+        low, lower, middle, upper, high = convert(one.fan, *value)
+        ax.fill_between(t, low, high, color=LIGHT["posterior"], alpha=0.18, lw=0)
+        ax.fill_between(t, lower, upper, color=LIGHT["posterior"], alpha=0.3, lw=0)
+        ax.plot(t, middle, color=LIGHT["posterior"])
+        ax.plot(taken, np.full(len(taken), 0.03), "|", color=LIGHT["centre"], transform=ax.get_xaxis_transform())
+        told = ", ".join(figure_text(f"{name} {value}") for name, value in row.settings.items()) or "as in the file"
+        ax.set(title=f"{told}: {_worth(row):.2f} nats")
+        ax.set(xlabel=with_unit("time", time[1]), ylabel=with_unit(found.asked.seen, value[1]))
+    return figure
+
+
+def write_design(found: Designs, folder: Path) -> Path:
+    """Write ``design.html`` and ``designs.csv``. Returns the path of the page. Raises :class:`OutputError`."""
+    write_text(folder / "designs.csv", csv_text(_cells(found)))
+    rows, best = ranked(found), {id(row) for row in front(found)}
+    drawings = [("fans", FANS, inline_svg(fans(found), "fans", FANS))]
+    if len(rows) > 1:
+        drawings.insert(0, ("prices", FRONT, inline_svg(prices(found), "prices", FRONT)))
+    if found.asked.knobs or len({_alike(row) for row in rows}) > 1:
+        drawings.insert(0, ("gains", GAINS, inline_svg(gains(found), "gains", GAINS)))
+    page = render(
+        "design.html.j2",
+        title="Designs compared",
+        sortable=True,
+        name=found.attributes.get("name", ""),
+        asked=", ".join(found.asked.parameters),
+        rows=[(settings_text(row), row, words(found, row), id(row) in best) for row in rows],
+        remarks=remarks(found),
+        drawings=drawings,
+        attributes=found.attributes,
+    )
+    return write_text(folder / "design.html", page)
+
+
+def _cells(found: Designs) -> list[list[Any]]:
+    """The table as CSV, parameters in their display units."""
+    shown = [unit for _, unit in found.asked.units]
+    stds = [
+        f"{name}_std" + ("" if u == "1" else f" [{u}]") for name, u in zip(found.asked.parameters, shown, strict=True)
+    ]
+    head = [*found.asked.knobs, "experiments", "readings", "price", "gain_nats", "gain_error", "method", *stds]
+    ratios = [f"{name}_std_ratio" for name in found.asked.parameters]
+    cells = []
+    for row in ranked(found):
+        one = row.found
+        assert one is not None
+        units = zip(one.std, found.asked.units, strict=True)
+        std = [float(convert(np.array(value), *unit)) for value, unit in units]
+        knobs = [row.settings.get(name, "") for name in found.asked.knobs]
+        worth = [one.alike, len(one.readings), row.price, one.gain, one.error, one.method]
+        cells.append([*knobs, *worth, *std, *map(float, one.ratio), one.lost, one.beyond])
+    return [[*head, *ratios, "lost", "beyond_validity"], *cells]
+
+
+def _worth(row: DesignRow) -> float:
+    return row.found.gain if row.found else math.nan
+
+
+def _alike(row: DesignRow) -> int:
+    return row.found.alike if row.found else 1
+
+
+def _positions(values: Sequence[Any]) -> tuple[Array, list[str]]:
+    """Where values of a knob lie on an axis: at their numbers, or one beside the other with labels."""
+    numbers = [_number(value) for value in values]
+    units = {_unit_of([value]) for value in values}
+    if len(units) == 1 and None not in numbers:
+        return np.array(numbers, dtype=float), []
+    names = list(dict.fromkeys(map(str, values)))
+    return np.array([names.index(str(value)) for value in values], dtype=float), names
+
+
+def _number(value: Any) -> float | None:
+    found = re.match(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)", str(value))
+    return float(found.group(1)) if found and not isinstance(value, bool) else None
+
+
+def _unit_of(values: Sequence[Any]) -> str:
+    rest = re.sub(r"^\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?\s*", "", str(values[0])) if values else ""
+    return f" [{rest}]" if rest else ""

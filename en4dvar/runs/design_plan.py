@@ -1,0 +1,123 @@
+"""From a configuration to the experiments it plans: every combination of its knobs, as problems without readings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from en4dvar.config import Config, resolve
+from en4dvar.config.build import data_files, inverse_plan, problem_of
+from en4dvar.config.design import Value
+from en4dvar.config.document import Document, override
+from en4dvar.config.reading import errors_of, read_observations
+from en4dvar.config.series import SeriesPlan
+from en4dvar.ensemble.forecast import forecast
+from en4dvar.errors import ConfigError, En4dvarError
+from en4dvar.noise import Noise, noise_of
+from en4dvar.observations import Observations
+from en4dvar.problem import InverseProblem
+from en4dvar.series import Series
+from en4dvar.state import Array
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A design: what its knobs are set to, and the configuration that this makes. Without settings: as in the file."""
+
+    settings: Mapping[str, Value]
+    config: Config
+
+    @property
+    def readings(self) -> tuple[int, float] | None:
+        """How many readings are to be chosen, and how far apart."""
+        chosen = self.config.design.choose
+        return (chosen.readings, chosen.apart) if chosen else None
+
+
+def candidates(document: Document, base: Path) -> Iterator[Candidate]:
+    """The file's own design, then every combination of its knobs. Raises :class:`ConfigError`."""
+    config = resolve(document, base)
+    yield Candidate({}, config)
+    if config.design.knobs:
+        for settings in config.design.settings():
+            overrides = {config.design.knobs[name].key: value for name, value in settings.items()}
+            yield Candidate(settings, resolve(override(document, overrides), base))
+
+
+def planned_problem(config: Config) -> InverseProblem:
+    """The inverse problem of an experiment that is yet to be made.
+
+    Its readings are those of the model at the centre of the prior, of which errors may be a share.
+
+    Raises
+    ------
+    ConfigError: no times, or something that only readings can say. DataError: a data file that is needed cannot be
+        used. En4dvarError: the model fails at the centre of the prior.
+    """
+    plan, design = inverse_plan(config), config.design
+    times = design.times if design.times is not None else config.simulate_times
+    measured = None
+    if times is None or any(entry.needs_data for entry in config.parameters):
+        name, file = next(iter(data_files(plan).items()))
+        measured = read_observations(plan, file, name, config.weights)
+    if config.weights != "sum":
+        raise ConfigError([config.document.fault(("assimilation", "weights"), "only weights of sum are Bayesian")])
+    if times is None and measured is not None:
+        return problem_of(config, measured)
+    assert times is not None
+    for one in plan.series:
+        _require_plannable(one)
+    blank = _observations(config, [np.full(len(times), _scale(measured))] * len(plan.series), times, measured)
+    problem = problem_of(config, blank)
+    run = forecast(problem, problem.prior.mean[None])
+    if run.failures[0]:
+        raise En4dvarError(f"the model fails at the centre of the prior: {run.failures[0]}")
+    values = np.split(run.predictions[0], len(plan.series))
+    return replace(problem, observations=_observations(config, values, times, measured, stated=True))
+
+
+def _scale(measured: Observations | None) -> float:
+    """The largest reading, for priors that refer to it."""
+    return 1.0 if measured is None else float(measured.values.max())
+
+
+def _observations(
+    config: Config, values: list[Array], times: Array, measured: Observations | None, stated: bool = False
+) -> Observations:
+    """Readings of all series at ``times``, with the errors that the file has ``stated``."""
+    plan = inverse_plan(config)
+    series = [
+        Series(
+            observable=one.observable,
+            times=times,
+            values=own,
+            noise=_noise(one, times, own) if stated else noise_of(np.ones(len(times)), np.zeros(len(times))),
+            name=one.name,
+            group=one.group,
+            scalars=measured.scalars if measured else {},
+            source=measured.source if measured else "",
+        )
+        for one, own in zip(plan.series, values, strict=True)
+    ]
+    return Observations.of_series(series, plan.correlation if stated else {}, config.name)
+
+
+def _noise(one: SeriesPlan, times: Array, values: Array) -> Noise:
+    return errors_of(one.data, times, values, np.arange(len(times)), {})
+
+
+def _require_plannable(one: SeriesPlan) -> None:
+    """Raise :class:`ConfigError` for what a planned series cannot have."""
+    error = one.data.error
+    in_columns = error.column("std", ""), error.column("time_std", "")
+    for present, what in (
+        (any(in_columns), "errors in a column of the file"),
+        (error.covariance is not None, "a covariance of readings"),
+        (one.data.weights is not None, "weights of readings"),
+        (one.data.places is not None, "places on a field"),
+    ):
+        if present:
+            raise ConfigError(f"data: {what} cannot be planned at design.times; leave design.times out, or state a std")

@@ -1,0 +1,190 @@
+"""``en4dvar design``: every design of a file evaluated, kept as it ends, and reported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from en4dvar.config import Config
+from en4dvar.config.document import document_from, override
+from en4dvar.design.evaluate import Evaluated, Method, evaluate
+from en4dvar.errors import ConfigError, En4dvarError
+from en4dvar.executor import Executor, choose_executor, one_blas_thread
+from en4dvar.report.design import write_design
+from en4dvar.runs.design_plan import Candidate, candidates, planned_problem
+from en4dvar.runs.interrupt import terminate_as_interrupt
+from en4dvar.runs.rundir import RunDirectory
+from en4dvar.runs.session import Session, directory_mode, session
+from en4dvar.storage.checkpoint import FOLDER, Keeper, digest
+from en4dvar.storage.design_file import Asked, DesignRow, Designs, load_designs, save_designs
+from en4dvar.user_code import reason_of
+
+STATE = f"{FOLDER}/designs"
+CHECKED = 3  # best designs whose linearised information is checked
+AGREE = 0.1  # nats
+
+
+@dataclass(frozen=True)
+class Done:
+    """What came of a candidate: its number, ``method``, one evaluation for each number of experiments, or why none."""
+
+    number: int
+    method: str
+    found: tuple[Evaluated, ...]
+    failure: str = ""
+
+
+@dataclass(frozen=True)
+class DesignState:
+    """The candidates that are done, in the order in which they ended."""
+
+    done: tuple[Done, ...] = ()
+
+
+def run_design(
+    source: str | Path | Mapping[str, Any],
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    out: Path | None = None,
+    force: bool = False,
+    resume: bool = False,
+    on_design: Callable[[int, int], None] | None = None,
+    command: str = "",
+) -> tuple[Designs, Path]:
+    """Evaluate the designs of a configuration. Returns what was found and the directory it lies in.
+
+    ``on_design`` is called with how many designs are done, and of how many.
+
+    Raises
+    ------
+    ConfigError, DataError: the file cannot be used, or none of its designs. OutputError: the directory cannot.
+    """
+    document, base = document_from(source)
+    document = override(document, overrides or {})
+    every = list(candidates(document, base))
+    config = every[0].config
+    config = replace(config, directory=out or config.directory.with_name(f"{config.directory.name}_design"))
+    kept = f"the designs that are done are kept in {config.directory}"
+    with (
+        one_blas_thread(),
+        terminate_as_interrupt(),
+        RunDirectory.open(config.directory, directory_mode(force, resume)) as directory,
+        session(config, {}, directory, command, lambda: kept) as run,
+    ):
+        run.begin("design.nc", "designs.csv", "design.html", STATE)
+        work = _Work(config, every, run, on_design)
+        asked = config.execution
+        with choose_executor(config.model, asked.executor, asked.workers, asked.address, asked.limits) as executor:
+            work.everything(executor)
+        file = directory.at("design.nc")
+        save_designs(file, work.rows(), _asked(config), {**run.attributes, "name": config.name})
+        found = load_designs(file)
+        if config.report:
+            write_design(found, directory.work)
+    return found, config.directory
+
+
+def _asked(config: Config) -> Asked:
+    problem = planned_problem(config)
+    terms = {term.parameter.name: term.parameter for term in problem.prior.terms}
+    about = [terms[name] for name in config.design.about or terms]
+    model, seen = config.model, problem.observable
+    return Asked(
+        parameters=tuple(p.name for p in about),
+        symbols=tuple(p.symbol for p in about),
+        labels=tuple(p.label for p in about),
+        units=tuple((p.unit, p.display_unit) for p in about),
+        knobs=tuple(config.design.knobs),
+        seen=seen.label,
+        axes=((model.time_unit, model.time_display_unit), (seen.unit, seen.display_unit)),
+    )
+
+
+class _Work:
+    """The candidates, what is done of them, and how the rest is decided."""
+
+    def __init__(
+        self, config: Config, every: Sequence[Candidate], run: Session, tell: Callable[[int, int], None] | None
+    ):
+        self.config, self.every, self.run, self.tell = config, every, run, tell
+        fingerprint = digest(run.identity.settings.encode())
+        self.state = DesignState()
+        if run.resumed:
+            again = "all designs are evaluated again"
+            self.state = run.restore(STATE, fingerprint, DesignState, again) or DesignState()
+        self.keeper = Keeper(run.directory.at(STATE), fingerprint, config.execution.checkpoint_every)
+
+    def everything(self, executor: Executor) -> None:
+        """Evaluate by the method asked for; ``auto`` checks the linearised information and replaces it if it is off."""
+        method = self.config.design.method
+        if method != "auto":
+            self._evaluate(executor, range(len(self.every)), method)
+            return
+        self._evaluate(executor, range(len(self.every)), "laplace")
+        gains = {d.number: d.found[0].gain for d in self._latest() if d.found}
+        best = sorted(gains, key=lambda number: -gains[number])[:CHECKED]
+        checked = [number for number in dict.fromkeys([0, *best]) if number in gains]
+        self._evaluate(executor, checked, "nested")
+        if self._off(gains, checked):
+            self._evaluate(executor, list(gains), "nested")
+
+    def _off(self, gains: Mapping[int, float], checked: Sequence[int]) -> bool:
+        exact = {d.number: d.found[0] for d in self._latest() if d.method == "nested" and d.found}
+        return any(abs(exact[n].gain - gains[n]) > AGREE + 2 * exact[n].error for n in checked if n in exact)
+
+    def rows(self) -> list[DesignRow]:
+        """Every candidate, or number of experiments alike, in the order of the file."""
+        found = []
+        for done in sorted(self._latest(), key=lambda d: d.number):
+            candidate = self.every[done.number]
+            price = candidate.config.design.price
+            for one in done.found:
+                cost = one.alike * (price.experiment + price.reading * len(one.readings))
+                found.append(DesignRow(done.number, dict(candidate.settings), one, cost))
+            if done.failure:
+                found.append(DesignRow(done.number, dict(candidate.settings), None, float("nan"), done.failure))
+        return found
+
+    def _latest(self) -> list[Done]:
+        """Of each candidate what came last: nested after laplace."""
+        return list({d.number: d for d in self.state.done}.values())
+
+    def _evaluate(self, executor: Executor, numbers: Sequence[int], method: Method) -> None:
+        done = {d.number for d in self.state.done if d.method == method}
+        left = [n for n in numbers if n not in done]
+        calls = ((self.every[n], method, self.config.seed) for n in left)
+        for i, outcome in executor.map(_one, calls):
+            if isinstance(outcome, Exception):
+                ended = Done(left[i], method, (), reason_of(outcome))
+            else:
+                ended = (
+                    Done(left[i], method, outcome) if isinstance(outcome, tuple) else Done(left[i], method, (), outcome)
+                )
+            self.state = DesignState((*self.state.done, ended))
+            self.run.log.write(_line(ended))
+            self.keeper.keep(lambda: self.state)
+            if self.tell:
+                self.tell(len(numbers) - len(left) + i + 1, len(numbers))
+        self.keeper.write(self.state)
+        if not any(d.found for d in self.state.done):
+            raise ConfigError(f"none of the designs can be evaluated: {self.state.done[0].failure}")
+
+
+def _one(candidate: Candidate, method: Method, seed: int) -> tuple[Evaluated, ...] | str:
+    """Evaluate a candidate in a worker; text says why it cannot be."""
+    config = candidate.config
+    design = config.design
+    try:
+        problem = planned_problem(config)
+        return evaluate(problem, design.about, design.sizes, method, seed, design.experiments, candidate.readings)
+    except En4dvarError as error:
+        return str(error)
+
+
+def _line(done: Done) -> str:
+    if done.failure:
+        return f"design {done.number}: {done.failure}"
+    one = done.found[0]
+    return f"design {done.number}: {one.gain:.4g} nats ± {one.error:.2g} ({one.method}), {one.forward_runs} runs"

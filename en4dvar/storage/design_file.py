@@ -1,0 +1,156 @@
+"""Designs and what they are worth ⇄ ``design.nc``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from en4dvar.design.evaluate import FAN, Evaluated
+from en4dvar.errors import OutputError
+from en4dvar.files import write_bytes
+from en4dvar.state import Array
+from en4dvar.storage.netcdf import Group, read_groups, to_bytes, variable
+
+FILE = "design.nc"
+
+
+@dataclass(frozen=True)
+class DesignRow:
+    """A design: its ``number`` in the file, what its knobs are set to (nothing: as in the file), what it is worth, or
+    the reason why that is not known; ``price`` in the unit of the file.
+    """
+
+    number: int
+    settings: Mapping[str, Any]
+    found: Evaluated | None
+    price: float
+    failure: str = ""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What was asked: parameters with their ``units`` (stored, shown), symbols and labels, and the knobs; the label and
+    the ``axes`` of what is seen, time and observable, each with its units (stored, shown).
+    """
+
+    parameters: tuple[str, ...]
+    symbols: tuple[str, ...]
+    labels: tuple[str, ...]
+    units: tuple[tuple[str, str], ...]
+    knobs: tuple[str, ...]
+    seen: str
+    axes: tuple[tuple[str, str], tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Designs:
+    """A file of :func:`save_designs`."""
+
+    asked: Asked
+    rows: tuple[DesignRow, ...]
+    attributes: Mapping[str, Any]
+
+
+def save_designs(path: Path, rows: Sequence[DesignRow], asked: Asked, attributes: Mapping[str, Any]) -> Path:
+    """Write the file; it appears complete or not at all. Raises :class:`OutputError`."""
+    return write_bytes(path, to_bytes({"/": _group(rows, asked, attributes)}))
+
+
+def _group(rows: Sequence[DesignRow], asked: Asked, attributes: Mapping[str, Any]) -> Group:
+    worth = [row.found for row in rows]
+
+    def each(name: str) -> Array:
+        return np.array([np.nan if one is None else getattr(one, name) for one in worth], dtype=float)
+
+    def padded(name: str, length: int) -> Array:
+        table = np.full((len(rows), length), np.nan)
+        for i, one in enumerate(worth):
+            if one is not None:
+                values = getattr(one, name)
+                table[i, : len(values)] = values
+        return table
+
+    def text(values: Sequence[str]) -> np.ndarray[Any, Any]:
+        return np.array(values, dtype=object)
+
+    readings = max((len(one.times) for one in worth if one), default=1)
+    points = max((len(one.grid) for one in worth if one), default=1)
+    a, (time, _), (value, _) = len(asked.parameters), *asked.axes
+    variables = {
+        "number": variable("design", np.array([row.number for row in rows]), "1", "number of the design in the file"),
+        "settings": variable("design", text([json.dumps(dict(row.settings)) for row in rows]), "", "knobs, as JSON"),
+        "failure": variable("design", text([row.failure for row in rows]), "", "why a design could not be evaluated"),
+        "price": variable("design", np.array([row.price for row in rows]), "1", "price"),
+        "gain": variable("design", each("gain"), "1", "expected information gain, nats"),
+        "gain_error": variable("design", each("error"), "1", "Monte Carlo standard error of gain"),
+        "method": variable("design", text([one.method if one else "" for one in worth]), "", "method of gain"),
+        "experiments": variable("design", each("alike"), "1", "experiments alike"),
+        "lost": variable("design", each("lost"), "1", "share of the prior where the model fails"),
+        "beyond": variable("design", each("beyond"), "1", "share of the prior that leaves the model's validity"),
+        "forward_runs": variable("design", each("forward_runs"), "1", "forward runs"),
+        "std": variable(("design", "parameter"), padded("std", a), "", "expected posterior std, units of parameters"),
+        "relative_std": variable(("design", "parameter"), padded("relative", a), "1", "the same relative to the value"),
+        "std_ratio": variable(("design", "parameter"), padded("ratio", a), "1", "posterior over prior std"),
+        "reading": variable(("design", "taken"), padded("readings", readings), "1", "numbers of the readings taken"),
+        "time": variable(("design", "taken"), padded("times", readings), time, "times of the readings taken"),
+        "grid": variable(("design", "point"), padded("grid", points), time, "times of the fan"),
+        "fan": variable(("design", "level", "point"), _fans(worth, points), value, asked.seen),
+    }
+    root = {**attributes, "asked": json.dumps(asked.__dict__)}
+    return Group(variables, {"parameter": variable("parameter", text(asked.parameters), "", "asked for")}, root)
+
+
+def _fans(worth: Sequence[Evaluated | None], points: int) -> Array:
+    """(designs, levels, points), NaN behind the points of a design."""
+    found = np.full((len(worth), len(FAN), points), np.nan)
+    for i, one in enumerate(worth):
+        if one is not None:
+            found[i, :, : len(one.grid)] = one.fan
+    return found
+
+
+def load_designs(path: Path) -> Designs:
+    """Read the file. Raises :class:`OutputError`: it is none, cut short or altered."""
+    root = read_groups(path)["/"]
+    if "asked" not in root.attrs:
+        raise OutputError(f"{path}: no result of en4dvar design")
+    asked = Asked(**json.loads(root.attrs["asked"]))
+    rows = [_row(root.isel(design=i)) for i in range(root.sizes["design"])]
+    return Designs(asked, tuple(rows), root.attrs)
+
+
+def _row(one: xr.Dataset) -> DesignRow:
+    def number(name: str) -> float:
+        return float(one[name])
+
+    def known(name: str) -> Array:
+        values = one[name].values
+        return np.asarray(values[np.isfinite(values)], dtype=float)
+
+    settings, failure = json.loads(str(one["settings"].item())), str(one["failure"].item())
+    if failure:
+        return DesignRow(int(one["number"]), settings, None, number("price"), failure)
+    grid = known("grid")
+    found = Evaluated(
+        gain=number("gain"),
+        error=number("gain_error"),
+        method=str(one["method"].item()),
+        std=one["std"].values,
+        relative=one["relative_std"].values,
+        ratio=one["std_ratio"].values,
+        lost=number("lost"),
+        beyond=number("beyond"),
+        readings=known("reading"),
+        times=known("time"),
+        grid=grid,
+        fan=one["fan"].values[:, : len(grid)],
+        alike=int(one["experiments"]),
+        forward_runs=int(one["forward_runs"]),
+    )
+    return DesignRow(int(one["number"]), settings, found, number("price"))

@@ -1,0 +1,161 @@
+"""``en4dvar design`` from a file: bits, files, resume, words."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from en4dvar.cli import main
+from en4dvar.errors import ConfigError, En4dvarError, OutputError
+from en4dvar.report.design import front
+from en4dvar.runs import design_run
+from en4dvar.runs.design_run import run_design
+
+
+def _plan(**design):
+    return {
+        "name": "plan",
+        "seed": 3,
+        "model": {"name": "toys:Vectorised"},
+        "data": {
+            "path": "not yet measured.csv",
+            "columns": {"time": {"name": "t", "unit": "s"}, "y": {"name": "y", "unit": "m"}},
+            "error": {"y_std": "0.3 m"},
+        },
+        "parameters": {
+            "a": {"prior": "lognormal", "median": "1 m", "log_std": 0.5},
+            "b": {"prior": "normal", "mean": "0.2 m", "std": "1 m"},
+        },
+        "design": {
+            "times": {"from": "0.1 s", "to": "2.5 s", "step": "0.4 s"},
+            "knobs": {
+                "error": {"key": "data.error.y_std", "values": ["0.1 m", "1 m"]},
+                "every": {"key": "design.times.step", "values": ["0.2 s", "0.4 s", "0.8 s"]},
+            },
+            "draws": 20,
+            "simulated": 20,
+            "inner": 50,
+            **design,
+        },
+    }
+
+
+def _same(one, other):
+    assert [row.settings for row in one.rows] == [row.settings for row in other.rows]
+    for a, b in zip(one.rows, other.rows, strict=True):
+        assert (a.found.gain, a.found.error, a.found.method) == (b.found.gain, b.found.error, b.found.method)
+        np.testing.assert_array_equal(a.found.std, b.found.std)
+        np.testing.assert_array_equal(a.found.fan, b.found.fan)
+
+
+def test_every_combination_and_the_file_itself(tmp_path):
+    found, directory = run_design(_plan(), out=tmp_path / "out")
+    assert [row.settings for row in found.rows][:3] == [
+        {},
+        {"error": "0.1 m", "every": "0.2 s"},
+        {"error": "0.1 m", "every": "0.4 s"},
+    ]
+    gains = {tuple(row.settings.values()): row.found.gain for row in found.rows}
+    assert gains["0.1 m", "0.2 s"] > gains["0.1 m", "0.4 s"] > gains["1 m", "0.4 s"] > gains["1 m", "0.8 s"]
+    assert gains["0.1 m", "0.2 s"] - gains["1 m", "0.2 s"] == pytest.approx(2 * np.log(10), abs=0.6)  # two parameters
+    rows = list(csv.DictReader((directory / "designs.csv").read_text().splitlines()))
+    assert len(rows) == 7
+    assert float(rows[0]["gain_nats"]) == max(gains.values())
+    assert [len(row.found.times) for row in front(found)] == [4, 7, 13]
+    page = (directory / "design.html").read_text()
+    assert page.count("<svg") == 3
+    assert "a to ±" in page
+
+
+@pytest.mark.parametrize("executor", ["threads", pytest.param("processes", marks=pytest.mark.slow)])
+def test_the_same_bits_on_any_workers(tmp_path, executor):
+    one, _ = run_design(_plan(method="nested"), out=tmp_path / "one", overrides={"execution.executor": "serial"})
+    settings = {"execution.executor": executor, "execution.workers": 2}
+    other, _ = run_design(_plan(method="nested"), out=tmp_path / "other", overrides=settings)
+    _same(one, other)
+
+
+def test_resumed(tmp_path, monkeypatch):
+    """Stopped after three designs, it goes on with the fourth, to the same bits."""
+    whole, _ = run_design(_plan(), out=tmp_path / "whole")
+    settings, done = {"execution.executor": "serial", "execution.checkpoint_every": 0}, []
+
+    def stop(count, total):
+        done.append(count)
+        if len(done) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_design(_plan(), out=tmp_path / "out", overrides=settings, on_design=stop)
+    calls, evaluate = [], design_run.evaluate
+    monkeypatch.setattr(design_run, "evaluate", lambda *args: calls.append(1) or evaluate(*args))
+    again, _ = run_design(_plan(), out=tmp_path / "out", overrides=settings, resume=True)
+    _same(whole, again)
+    assert len(calls) == 7 - 3 + 4  # the checks of auto follow
+    with pytest.raises(OutputError, match="force"):
+        run_design(_plan(), out=tmp_path / "out")
+
+
+def test_chosen_readings_tell_more_than_as_many_at_a_fixed_rate(tmp_path):
+    chosen = {"times": {"from": "0.1 s", "to": "2.5 s", "step": "0.1 s"}, "knobs": {}, "choose": {"readings": 6}}
+    found, _ = run_design(_plan(**chosen), out=tmp_path / "chosen")
+    fixed, _ = run_design(_plan(knobs={}, times={"from": "0.1 s", "to": "2.5 s", "step": "0.48 s"}), out=tmp_path / "f")
+    assert len(found.rows[0].found.times) == len(fixed.rows[0].found.times) == 6
+    assert found.rows[0].found.gain > fixed.rows[0].found.gain + 0.2
+
+
+def test_experiments_alike(tmp_path):
+    found, _ = run_design(_plan(knobs={}, about=["a"], experiments=[1, 4], method="laplace"), out=tmp_path / "out")
+    one, four = (row.found for row in found.rows)
+    assert (one.alike, four.alike) == (1, 4)
+    assert four.gain > one.gain
+    assert [row.price for row in found.rows] == [7, 28]
+
+
+def test_a_design_that_cannot_be_made(tmp_path):
+    """It is named, and the others are compared."""
+    knobs = {"start": {"key": "design.times.to", "values": ["2.5 s", "1e9 s"]}}
+    with pytest.raises(ConfigError, match="steps; give between 2 and a million"):
+        run_design(_plan(knobs=knobs), out=tmp_path / "out")
+    choose = {"n": {"key": "design.choose.readings", "values": [3, 50]}}
+    found, _ = run_design(_plan(knobs=choose, choose={"readings": 3}), out=tmp_path / "out")
+    assert [bool(row.failure) for row in found.rows] == [False, False, True]
+    assert "no 50 of 7 readings" in found.rows[2].failure
+
+
+def test_as_a_command(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plan.yaml").write_text(json.dumps(_plan()))
+    outcome = CliRunner().invoke(main, ["design", "plan.yaml"])
+    assert outcome.exit_code == 0, outcome.output
+    assert "what is known" in outcome.output
+    assert (tmp_path / "runs/plan_design/design.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"about": ["c"]}, "c: not estimated; estimated are a, b"),
+        ({"times": "often"}, "design.times: expected 'key: value' lines"),
+        ({"knobs": {"x": {"key": "no such", "values": [1]}}}, "design.knobs.x.key"),
+        ({"knobs": {"x": {"key": "parameters.zz", "values": [1]}}}, "zz"),
+        ({"draws": 3}, "design.draws"),
+        ({"method": "guess"}, "design.method"),
+        ({"experiments": []}, "design.experiments"),
+        ({"knobs": {k: {"key": "seed", "values": list(range(100))} for k in "ab"}}, "10000 combinations; at most 2000"),
+    ],
+)
+def test_bad_input(tmp_path, change, message):
+    with pytest.raises(En4dvarError, match=message):
+        run_design(_plan(**change), out=tmp_path / "out")
+
+
+def test_times_or_a_file_of_them(tmp_path):
+    plan = _plan(knobs={})
+    del plan["design"]["times"]
+    with pytest.raises(ConfigError, match=r"none of the designs .*not yet measured\.csv: no such file"):
+        run_design(plan, out=tmp_path / "out")
