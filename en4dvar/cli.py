@@ -24,6 +24,7 @@ from en4dvar.commands.run import run
 from en4dvar.commands.simulate import simulate
 from en4dvar.commands.sweep_twin import sweep_twin
 from en4dvar.commands.validate import validate
+from en4dvar.commands.warm_up import warm_up
 from en4dvar.errors import En4dvarError
 
 OF_THE_DEVICE = (
@@ -100,6 +101,7 @@ def main() -> None:
 
 for command in (
     compare, design, export, joint, models, population, report, rerun, run, schema, simulate, sweep_twin, validate,
+    warm_up,
 ):  # fmt: skip
     main.add_command(command)
 

@@ -19,9 +19,12 @@ from typing import Any, TypeVar
 import numba
 
 from en4dvar.errors import OutputError
+from en4dvar.kernel_cache import compile_once
 
 F = TypeVar("F", bound=Callable[..., Any])
 CACHE = "NUMBA_CACHE_DIR"
+KERNELS: list[Any] = []
+"""Every kernel that has been declared so far in this process."""
 
 
 def kernel(function: F) -> F:
@@ -45,7 +48,14 @@ def _compiled(function: F, compile_: Callable[[F], Any]) -> F:
     except RuntimeError:  # numba found no folder
         _keep_in_a_temporary_folder()
         compiled = compile_(function)
+    compile_once(compiled)
+    KERNELS.append(compiled)
     return compiled
+
+
+def compilations() -> int:
+    """How often a kernel was compiled in this process, because nothing kept on disk served its arguments."""
+    return sum(sum(kernel.stats.cache_misses.values()) for kernel in KERNELS)
 
 
 def _keep_in_a_temporary_folder() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from en4dvar import report
 from en4dvar.analysis import Analysis, Descents, IterationRecord, Mode
@@ -20,6 +21,10 @@ from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.report.figures import all_figures
 from en4dvar.state import TIME_SHIFT, Array, Field, Parameter, StateLayout
+
+# Of several test processes on the same cores, each with as many threads of BLAS, these wait for each other, spinning:
+# one solution of an oracle took four times the CPU time. What tests start has the number that it would have anyway.
+threadpool_limits(1, user_api="blas")
 
 FAILED = 3
 

@@ -15,7 +15,8 @@ ROOT = Path(__file__).resolve().parents[2]
 # The modules of one line are a layer together; a package is a layer by itself.
 LAYERS = (
     ("errors",),
-    ("state", "hints", "files", "tables", "caution", "compiled", "user_code", "user_file"),
+    ("state", "hints", "files", "tables", "caution", "kernel_cache", "user_code", "user_file"),
+    ("compiled",),
     ("dependence", "parameter_map"),
     ("units", "prior", "forward", "noise"),
     ("batch", "series", "observations", "function_model", "field_prior"),
@@ -50,14 +51,14 @@ FLOOR = {name: floor for floor, layer in enumerate(LAYERS) for name in layer}
 BUBBLE = (
     "tables", "medium", "collapse", "gas", "driving", "numbers", "laws", "solver", "dynamics", "alternatives",
     "packing", "paths", "events", "settings", "model", "api", "battery", "starter", "examples", "commands",
-    "commands_init",
+    "commands_init", "warm_up",
 )  # fmt: skip
 
 
 # and inside the reader of movies
 MOVIE = (
     "frames", "kernels", "outline", "fitting", "locate", "background", "corrections", "uncertainty", "flashes",
-    "tracking", "table", "outlined", "page", "scene", "writing", "filming", "commands",
+    "tracking", "table", "outlined", "page", "scene", "writing", "filming", "commands", "warm_up",
 )  # fmt: skip
 
 

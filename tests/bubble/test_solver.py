@@ -12,9 +12,9 @@ import pytest
 
 import en4dvar_bubble.solver
 from en4dvar.forward import Failure
+from en4dvar.kernel_cache import _digest
 from en4dvar_bubble import Accuracy, BubbleModel, get_law, simulate
 from en4dvar_bubble.solver import integrate, lanes, rodas5p
-from en4dvar_bubble.solver.caching import _digest
 from en4dvar_bubble.solver.collocation import ball
 
 TIMES = np.linspace(4e-6, 80e-6, 60)

@@ -13,24 +13,32 @@ pathlib.Path(__file__).with_name("numbers").write_text(locale.str(1.5))
 """
 
 
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A configuration and its run where nobody has set a locale."""
+    folder = tmp_path_factory.mktemp("plain")
+    path = make_campaign(folder, 2)
+    done = run_cli("run", path, "--out", folder / "run", LC_ALL="C.UTF-8")
+    assert done.returncode == 0, done.stderr
+    return path, folder / "run"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "number"), [("tr_TR", "1,5"), ("de_DE", "1,5")])
 @pytest.mark.fault("locale")
-def test_a_run_in_another_locale(tmp_path, name, number):
+def test_a_run_in_another_locale(plain, tmp_path, name, number):
     localedef = shutil.which("localedef")
     made = localedef and subprocess.run([localedef, "-i", name, "-f", "UTF-8", tmp_path / f"{name}.UTF-8"], check=False)
     if not (tmp_path / f"{name}.UTF-8").exists():
         pytest.skip(f"the locale {name} cannot be made here ({made})")
     (tmp_path / "sitecustomize.py").write_text(SET_AT_START)
-    path = make_campaign(tmp_path, 2)
+    path, undisturbed = plain
     there = {"LC_ALL": f"{name}.UTF-8", "LOCPATH": tmp_path}
-    done = run_cli("run", path, "--out", tmp_path / "plain", LC_ALL="C.UTF-8")
-    assert done.returncode == 0, done.stderr
     done = run_cli("run", path, "--out", tmp_path / "run", **there, PYTHONPATH=f"{tmp_path}:{TESTS}")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "numbers").read_text() == number
-    assert_same_results(tmp_path / "run", tmp_path / "plain")
+    assert_same_results(tmp_path / "run", undisturbed)
     assert (tmp_path / "run" / "report.html").exists()
-    assert (tmp_path / "run" / "summary.csv").read_bytes() == (tmp_path / "plain" / "summary.csv").read_bytes()
+    assert (tmp_path / "run" / "summary.csv").read_bytes() == (undisturbed / "summary.csv").read_bytes()
     again = run_cli("report", tmp_path / "run", **there, PYTHONPATH=f"{tmp_path}:{TESTS}")
     assert again.returncode == 0, again.stderr

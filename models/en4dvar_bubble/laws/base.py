@@ -167,7 +167,7 @@ class ConstitutiveLaw:
         """Memory variables (N, M) in Pa of members at rest at ``stretch`` (N,): s = b(λ)."""
         b = self.memory_tables(values).equilibrium
         x = np.log(stretch)[:, None]
-        return np.concatenate([evaluate(b[:, i], GRID.span, x) for i in range(b.shape[1])] or [x[:, :0]], axis=1)
+        return np.concatenate([evaluate(b[:, i].copy(), GRID.span, x) for i in range(b.shape[1])] or [x[:, :0]], axis=1)
 
 
 class Liquid(ConstitutiveLaw):

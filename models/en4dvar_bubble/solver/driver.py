@@ -10,13 +10,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from en4dvar.kernel_cache import stamp_with_sources
 from en4dvar.state import Array
 from en4dvar_bubble import tables as tables_module
 from en4dvar_bubble.driving import Driving, Reading
 from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import integrate, rows
 from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output
-from en4dvar_bubble.solver.caching import stamp_with_sources
 from en4dvar_bubble.solver.collocation import ball, exterior
 
 stamp_with_sources(integrate.integrate, Path(__file__).parent, Path(tables_module.__file__))

@@ -1,0 +1,45 @@
+"""``en4dvar warm-up``."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from importlib.metadata import entry_points
+
+import click
+
+GROUP = "en4dvar.warm_up"
+"""Entry points whose value is a function without arguments: what is compiled, in words → a small call that does."""
+
+
+@click.command("warm-up")
+def warm_up() -> None:
+    """Compile now what is compiled at its first use, and keep it: for images, clusters and first runs.
+
+    Each kind of equations and each method that has compiled loops is used once, on very little.
+
+    \b
+    Example:
+      en4dvar warm-up  # in an image, or before a batch of jobs
+    """
+    from en4dvar.compiled import KERNELS, compilations
+
+    for what, call in examples():
+        before, start = compilations(), time.perf_counter()
+        call()
+        took = f"compiled in {time.perf_counter() - start:.1f} s" if compilations() > before else "there already"
+        click.echo(f"{what}: {took}")
+    click.echo(f"compiled code is kept below {os.path.commonpath([kernel.stats.cache_path for kernel in KERNELS])}")
+
+
+def examples() -> Iterator[tuple[str, Callable[[], object]]]:
+    """What is compiled, in words, and a call that does. Raises :class:`En4dvarError` for a package at fault."""
+    from en4dvar.errors import En4dvarError
+
+    for entry in sorted(entry_points(group=GROUP)):
+        try:
+            found = entry.load()()
+        except (ImportError, AttributeError) as error:
+            raise En4dvarError(f"warm-up of {entry.name!r} ({entry.value}) cannot be loaded: {error}") from error
+        yield from found.items()

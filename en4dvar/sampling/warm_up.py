@@ -1,0 +1,28 @@
+"""The compiled loops of this package, each used once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from en4dvar.noise import noise_of
+from en4dvar.observations import Observations
+from en4dvar.sampling.mixture import fit_gaussians
+from en4dvar.sampling.nearest import best_over_shifts, targets
+
+
+def examples() -> dict[str, Callable[[], object]]:
+    """What is compiled, in words, and a call that does; for ``en4dvar warm-up``."""
+    return {"sampling, mixtures": _mixture, "sweep, nearest neighbours": _nearest}
+
+
+def _mixture() -> None:
+    rng = np.random.default_rng(0)
+    fit_gaussians(rng.standard_normal((20, 2)), rng, components=2, rounds=1)
+
+
+def _nearest() -> None:
+    times = np.linspace(0.0, 1.0, 5)
+    aims = targets([Observations(times, times, noise_of(np.ones(5)), np.ones(5))], shift=0.1, step=0.05)
+    best_over_shifts(np.zeros((1, len(aims.grid))), aims)
