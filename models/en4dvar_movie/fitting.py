@@ -114,6 +114,7 @@ def _descend(
     """Levenberg–Marquardt; None where it leaves what an outline can be."""
     damping, cutoff = 1e-3, CUTOFF * noise
     centre, precision = _known(p, p[SHAPE + 2 * (modes - 1) :], ring, noise, optics)
+    nested = len(p) > SHAPE + 2 * (modes - 1)
     bright = 0.0, -optics.contrast  # what the centre can be between
     darkest = (1 + DARKER * optics.spread) * optics.contrast
     A, g, _, total, cost = normal_equations(image, p, modes, ring, cutoff)
@@ -132,10 +133,11 @@ def _descend(
         trial[CONTRAST] = max(trial[CONTRAST], darkest)
         inner = _innermost(trial, trial[SHAPE + 2 * (modes - 1) :])
         trial[RIM] = np.clip(trial[RIM], 0.1 * inner, 0.75 * inner)
-        if not np.all(np.isfinite(trial)) or inner < 1 or trial[R] > 3 * max(image.shape):
+        gone = not np.all(np.isfinite(trial)) or inner < 1 or trial[R] > 3 * max(image.shape)
+        if gone and (not nested or damping > 1e6):  # a single circle that shrinks to nothing is a speck of dirt
+            return None
+        if gone:
             damping *= 10
-            if damping > 1e6:
-                return None
             continue
         found = normal_equations(image, trial, modes, ring, cutoff)
         better = found[4] + 0.5 * float(precision @ (trial - centre) ** 2)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from movies import CLASSES, SHARED, against_a_person, movie_of, rendered
+from movies import CLASSES, SHARED, against_a_person, film, movie_of, rendered
 
 from en4dvar.errors import DataError
 from en4dvar_movie.background import find_background
@@ -106,6 +106,17 @@ def test_dirt_is_no_bubble():
     assert [r.found.frame for r in found.readings if r.used] == [3, 4, 5, 6, 7, 8]
     assert "background" in found.readings[1].reason
     assert "elsewhere" in found.readings[9].reason
+
+
+def test_specks_of_dirt_do_not_tell_how_sharp_an_edge_is():
+    _, shown = film("dirt", 7000)
+    assert find_background(movie_of(shown))[1].width == pytest.approx(1.2, abs=0.15)
+
+
+def test_nested_circles_of_a_faint_frame_are_found():
+    """A first step would shrink the innermost one to nothing."""
+    scores, _ = rendered("three flashes, 3 to 8 px apart", 5003)
+    assert np.isfinite(scores).all()
 
 
 def test_corrections_by_hand():
