@@ -37,7 +37,7 @@ class InitialEnsemble:
         return self.drawn([member_stream(seed, "initial state", i) for i in range(n_members)], exact)
 
     def drawn(self, streams: Sequence[np.random.Generator], exact: bool = False) -> Array:
-        """As :meth:`members`, from random numbers of ``streams`` (N). Raises :class:`En4dvarError`."""
+        """(N, n_state), as :meth:`members`, from random numbers of ``streams`` (N). Raises :class:`En4dvarError`."""
         model, prior, n = self.model, self.prior, len(streams)
         std = np.concatenate([np.full(f.size, self.initial_std.get(f.name, 0.0)) for f in model.layout])
         of_prior = np.array([stream.standard_normal(len(prior.terms)) for stream in streams]) if prior else None

@@ -38,6 +38,8 @@ def run_sequence(
     """Assimilate a series of data and write its run directory; arguments and errors as of :func:`en4dvar.run`.
 
     ``on_cycle`` is called with the index of the last observation time of each cycle, from 0.
+
+    Raises :class:`ConfigError` for ``overrides`` of a configuration that is loaded already.
     """
     if not isinstance(config, SequenceConfig):
         config = load_sequence(config, overrides)

@@ -36,10 +36,12 @@ class Simulation:
         """(K,) of the first series."""
         return next(iter(self.series.values()))
 
-    def with_noise(self, stds: Mapping[str, float], seed: int) -> Simulation:
-        """Independent Gaussian noise added, its standard deviation by the name of the series, in the observable's
-        unit."""
+    def with_noise(self, std: float | Mapping[str, float], seed: int) -> Simulation:
+        """Independent Gaussian noise added, of a standard deviation in the observable's unit: one for all series, or
+        by their names.
+        """
         stream = np.random.Generator(np.random.Philox(seed))
+        stds = std if isinstance(std, Mapping) else dict.fromkeys(self.series, std)
         noisy = {name: v + stds[name] * stream.standard_normal(len(v)) for name, v in self.series.items()}
         return replace(self, series=noisy)
 

@@ -41,7 +41,7 @@ def call(command):
 
 def test_every_block_is_used():
     assert set(FILES) == {"duffing.py", "duffing.yaml", "fast_duffing.py", "from_python.py", "twin.yaml", "sequence.py"}
-    assert [command.split()[0] for command in COMMANDS] == ["simulate", "validate", "run", "run"]
+    assert [command.split()[0] for command in COMMANDS] == ["simulate", "validate", "run", "run", "sweep-twin"]
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -40,8 +41,13 @@ simulate: {times: {from: 0 us, to: 100 us, step: 1 us}}
 """  # every section, every kind of prior, on SERIES
 
 
-def of(target: str) -> Iterator[bytes]:
-    """Inputs of a target that its reader accepts."""
+@cache
+def of(target: str) -> tuple[bytes, ...]:
+    """Inputs of a target that its reader accepts; the same each time, though some formats hold the time of day."""
+    return tuple(_made(target))
+
+
+def _made(target: str) -> Iterator[bytes]:
     match target:
         case "configuration":
             yield from (p.read_bytes() for p in sorted(CONFIGS.glob("*.yaml")) if not _of_a_command(p))
@@ -83,4 +89,4 @@ def of(target: str) -> Iterator[bytes]:
 
 def _of_a_command(path: Path) -> bool:
     """Study and campaign files belong to commands of their own."""
-    return path.stem in ("agarose_study", "agarose_twin")
+    return path.stem == "agarose_study" or path.stem.endswith("_twin")

@@ -43,6 +43,8 @@ def _ready(path: Path) -> None:
     if not isinstance(config, Config) or config.assimilation.members > MOST:
         return
     for problem in build(config)[:1]:
+        if problem.fields:  # the ensemble of which is another one
+            return
         WeightSpace(problem, config.assimilation, config.seed, SerialExecutor())
 
 

@@ -89,5 +89,5 @@ def test_a_run_is_repeated_to_the_bit(tmp_path: Path):
     assert not again.sets[0].data
     (tmp_path / "f.csv").write_text("changed", encoding="utf-8")
     assert "has changed since" in rerun(tmp_path / "out").sets[0].data
-    with pytest.raises(ConfigError, match=r"out: .* has several series; it cannot be estimated jointly"):
+    with pytest.raises(ConfigError, match=r"out: .* has several series; it cannot be estimated with others"):
         join([tmp_path / "out"], ["a"], tmp_path / "joint")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -66,7 +66,7 @@ class Driving:
     cells: int = 512
     stops: tuple[float, ...] = ()
     numbers: tuple[PulseNumber, ...] = ()
-    remade: Callable[..., Driving] | None = None
+    remade: Callable[..., Driving] | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         if not self.end > self.begin:
