@@ -51,8 +51,8 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 def test_help_lists_commands_without_importing_them(package: str) -> None:
     listing = CliRunner().invoke(main, ["--help"]).output
     told = dict(re.findall(r"^  (\S+) +(\S.*)$", listing, re.M))
-    assert told["shout"] == "Say it aloud."
-    assert told["gone"] == "From no_such_package."
+    assert told["shout"].startswith("Say it aloud.")
+    assert told["gone"].startswith("From no_such_package.")
     assert told["run"].startswith("Estimate the parameters")  # a package cannot replace a command of ours
     assert package not in sys.modules
 
