@@ -23,14 +23,10 @@ FEWEST = 0.5  # of the draws must be alive
 
 
 @dataclass(frozen=True)
-class Expected:
-    """``gains`` (R,) of the draws, nats, and posterior ``std`` (R, a) of what is asked, in transformed space, relative
-    to the prior's; ``lost``: share of the draws at which the model fails.
-    """
+class Gains:
+    """``gains`` (R,) of the draws, nats."""
 
     gains: Array
-    std: Array
-    lost: float
 
     @property
     def gain(self) -> float:
@@ -41,6 +37,16 @@ class Expected:
     def error(self) -> float:
         """Monte Carlo standard error of :attr:`gain`."""
         return standard_error(self.gains)
+
+
+@dataclass(frozen=True)
+class Expected(Gains):
+    """By linearisation; posterior ``std`` (R, a) of what is asked, in transformed space, relative to the prior's;
+    ``lost``: share of the draws at which the model fails.
+    """
+
+    std: Array
+    lost: float
 
 
 def standard_error(values: Array) -> float:

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.design.laplace import about, precision, require_alive, standard_error
+from en4dvar.design.laplace import Gains, about, precision, require_alive, standard_error
 from en4dvar.design.planned import Planned, Tangents
 from en4dvar.prior import member_stream
 from en4dvar.sampling.importance import Importance
@@ -38,24 +38,13 @@ WIDER = 1.2  # than the Gaussian that it is made of
 
 
 @dataclass(frozen=True)
-class Nested:
-    """``gains`` (R,) of simulated readings less their control variate, nats; ``linearised`` (R,) at the same draws;
-    ``effective`` (R,) importance draws behind each.
+class Nested(Gains):
+    """Of simulated readings, less their control variate; ``linearised`` (R,) gains at the same draws, ``effective``
+    (R,) importance draws behind each.
     """
 
-    gains: Array
     linearised: Array
     effective: Array
-
-    @property
-    def gain(self) -> float:
-        """Expected information, nats."""
-        return float(self.gains.mean())
-
-    @property
-    def error(self) -> float:
-        """Monte Carlo standard error of :attr:`gain`."""
-        return standard_error(self.gains)
 
     @property
     def correction(self) -> tuple[float, float]:
