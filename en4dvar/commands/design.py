@@ -11,10 +11,13 @@ from en4dvar.commands.common import Source, command_line, config_options, contin
 
 @click.command()
 @config_options
+@click.option(
+    "--after", metavar="RUN_DIR", type=click.Path(path_type=Path), help="Finished run: start from what it knows."
+)
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the result; default runs/<name>_design.")
 @click.option("--force", is_flag=True, help="Replace an earlier result in the directory.")
 @click.option("--resume", is_flag=True, help="Go on with an interrupted comparison, to the same numbers.")
-def design(source: Source, out: Path | None, force: bool, resume: bool) -> None:
+def design(source: Source, after: Path | None, out: Path | None, force: bool, resume: bool) -> None:
     """Compare planned experiments by the information they are expected to give.
 
     The configuration is that of 'run'; its data file need not exist. A 'design:' section says when readings are
@@ -30,8 +33,8 @@ def design(source: Source, out: Path | None, force: bool, resume: bool) -> None:
 
     with continuable(), counted("designs") as on_design:
         found, directory = run_design(
-            source.path, overrides=source.overrides(), out=out, force=force, resume=resume, on_design=on_design,
-            command=command_line(),
+            source.path, overrides=source.overrides(), after=after, out=out, force=force, resume=resume,
+            on_design=on_design, command=command_line(),
         )  # fmt: skip
     click.echo(design_table(found))
     for remark in remarks(found):

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from en4dvar.config import Config
-from en4dvar.config.document import document_from, override
+from en4dvar.config import Config, resolve
+from en4dvar.config.document import Document, document_from, override
+from en4dvar.config.parameters import Uncertain
 from en4dvar.design.evaluate import Evaluated, Method, evaluate
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import Executor, choose_executor, one_blas_thread
@@ -47,6 +48,7 @@ def run_design(
     source: str | Path | Mapping[str, Any],
     *,
     overrides: Mapping[str, Any] | None = None,
+    after: Path | None = None,
     out: Path | None = None,
     force: bool = False,
     resume: bool = False,
@@ -55,6 +57,7 @@ def run_design(
 ) -> tuple[Designs, Path]:
     """Evaluate the designs of a configuration. Returns what was found and the directory it lies in.
 
+    ``after``: a finished run (or a file of members), whose posterior is the prior of what is asked: what is next?
     ``on_design`` is called with how many designs are done, and of how many.
 
     Raises
@@ -63,6 +66,8 @@ def run_design(
     """
     document, base = document_from(source)
     document = override(document, overrides or {})
+    if after is not None:
+        document = override(document, _known(document, base, after))
     every = list(candidates(document, base))
     config = every[0].config
     config = replace(config, directory=out or config.directory.with_name(f"{config.directory.name}_design"))
@@ -84,6 +89,15 @@ def run_design(
         if config.report:
             write_design(found, directory.work)
     return found, config.directory
+
+
+def _known(document: Document, base: Path, after: Path) -> dict[str, Any]:
+    """What makes the posterior of a finished run the prior of what is asked; the rest belongs to each experiment."""
+    config = resolve(document, base)
+    estimated = [entry.parameter.name for entry in config.parameters if isinstance(entry, Uncertain)]
+    names = config.design.about or estimated
+    file = after / "posterior.nc" if after.is_dir() else after
+    return {"prior.ensemble": str(file.absolute()), **{f"parameters.{name}": {"prior": "ensemble"} for name in names}}
 
 
 def _asked(config: Config) -> Asked:

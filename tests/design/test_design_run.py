@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import en4dvar
 from en4dvar.cli import main
 from en4dvar.errors import ConfigError, En4dvarError, OutputError
 from en4dvar.report.design import front
@@ -159,3 +160,23 @@ def test_times_or_a_file_of_them(tmp_path):
     del plan["design"]["times"]
     with pytest.raises(ConfigError, match=r"none of the designs .*not yet measured\.csv: no such file"):
         run_design(plan, out=tmp_path / "out")
+
+
+def test_after_a_run_there_is_less_to_learn(tmp_path):
+    """The gain of two experiments is that of the first, and that of the second after it (a linear model)."""
+    plan = _plan(knobs={}, about=["b"], method="linear")
+    plan["parameters"]["a"] = {"prior": "normal", "mean": "1 m", "std": "0.001 m"}  # known, so that b is all there is
+    times = np.arange(0.1, 2.6, 0.4)
+    rows = [f"{t:.3f},{1 + 0.2 * np.cos(t + 1 / 3):.6f}" for t in times]
+    (tmp_path / "measured.csv").write_text("\n".join(["t,y", *rows]))
+    measured = {**plan, "data": {**plan["data"], "path": str(tmp_path / "measured.csv")}}
+    en4dvar.run({**measured, "output": {"directory": str(tmp_path / "run"), "report": False}})
+    before, _ = run_design(plan, out=tmp_path / "before")
+    next_one, _ = run_design(plan, out=tmp_path / "next", after=tmp_path / "run")
+    plan["design"] |= {"method": "laplace", "experiments": [2]}
+    twice, _ = run_design(plan, out=tmp_path / "twice")
+    one, other, both = (found.rows[0].found.gain for found in (before, next_one, twice))
+    assert other < 0.5 < 1.5 < one
+    assert one + other == pytest.approx(both, abs=0.02)
+    with pytest.raises(En4dvarError, match="nowhere"):
+        run_design(plan, out=tmp_path / "bad", after=tmp_path / "nowhere")
