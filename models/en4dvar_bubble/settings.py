@@ -32,6 +32,7 @@ from en4dvar_bubble.solver.driver import Accuracy, AccuracyName, Radial, preset
 
 SetName = Literal["water-25C", "imr-v1", "imr-v2"]
 
+UNUSED = {"A_v", "B_v"}  # recorded by earlier versions, in no equation
 _GIVEN = "given in the configuration"
 _VAPOUR_PRESSURE = {"anyOf": [{"const": "saturated"}, {"const": 0}, {"type": "string", "pattern": r"^\s*[\d.]"}]}
 
@@ -54,12 +55,14 @@ class _NamedSet(Section):
         given = {"set": value} if isinstance(value, str) else value
         if not isinstance(given, dict):
             return given
+        given = {name: value for name, value in given.items() if name not in UNUSED}
         chosen = CONSTANT_SETS.get(str(given.get("set", "water-25C")))
         if chosen is None:
             return {"set": given["set"]}  # the only fault worth telling
         sources = given.get("sources", {})
         if not isinstance(sources, dict):
             return given
+        sources = {name: words for name, words in sources.items() if name not in UNUSED}
         inherited = {
             name: f"{number!r} {UNITS[name]}" if UNITS[name] != "1" else number
             for name, number in chosen.constants.items()

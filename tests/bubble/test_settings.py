@@ -173,3 +173,9 @@ class TestConstants:
     def test_vapour_pressure_follows_the_temperature(self):
         warm = {"vapour_pressure": "saturated", "constants": {"T_inf": "310 K"}}
         assert BubbleSettings.model_validate(warm).medium.p_v == pytest.approx(1.17e11 * np.exp(-5200 / 310))
+
+
+def test_constants_of_earlier_versions_are_left_out():
+    """They stood in no equation; the resolved configurations of earlier runs record them."""
+    old = {"set": "imr-v2", "A_v": "3.3e-05 W/(m K^2)", "B_v": "0.01742 W/(m K)", "sources": {"A_v": "a paper"}}
+    assert ConstantsSettings.model_validate(old) == ConstantsSettings.model_validate("imr-v2")
