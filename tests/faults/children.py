@@ -149,15 +149,15 @@ def _import_everything() -> None:
     import matplotlib.backends.backend_svg
     import matplotlib.pyplot  # noqa: F401
 
+    import en4dvar.report.cycles
     import en4dvar.report.overlay
-    import en4dvar.report.twin
     import en4dvar.runs.runner
     import en4dvar_agarose.commands  # noqa: F401
     import en4dvar_bubble  # noqa: F401
     from en4dvar.storage.fingerprint import source_digest
 
     source_digest("en4dvar")
-    for module in (en4dvar.report, en4dvar.report.twin):
+    for module in (en4dvar.report, en4dvar.report.cycles):
         module.draw = _of_few(module.draw)  # type: ignore[attr-defined]
 
 
