@@ -14,7 +14,6 @@ from en4dvar.design.nested import nested
 from en4dvar.design.planned import Planned
 from en4dvar.design.readings import choose
 from en4dvar.ensemble.forecast import plotting_times
-from en4dvar.executor import Executor
 from en4dvar.prior import own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.state import Array
@@ -67,7 +66,6 @@ def evaluate(
     seed: int,
     alike: Sequence[int] = (1,),
     choice: tuple[int, float] | None = None,
-    executor: Executor | None = None,
 ) -> tuple[Evaluated, ...]:
     """Evaluate a design, for every number of experiments ``alike``.
 
@@ -78,14 +76,14 @@ def evaluate(
     ------
     ConfigError: a name that is not estimated; a choice that is not possible. TooFewMembersError: the model fails.
     """
-    planned = Planned(problem, about, executor)
+    planned = Planned(problem, about)
     before = 0
     if choice is not None:
         chosen = choose(planned, planned.draws(sizes.draws, own_seed(seed, "choice of readings")), *choice)
         weights = np.zeros(len(problem.observations))
         weights[chosen] = 1
         problem = replace(problem, observations=replace(problem.observations, weights=weights))
-        before, planned = planned.forward_runs, Planned(problem, about, executor)
+        before, planned = planned.forward_runs, Planned(problem, about)
     u = planned.draws(sizes.draws, seed)
     grid = plotting_times(problem)
     run = planned.run(u, grid)
