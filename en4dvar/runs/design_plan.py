@@ -16,6 +16,7 @@ from en4dvar.config.reading import errors_of, read_observations
 from en4dvar.config.series import SeriesPlan
 from en4dvar.ensemble.forecast import forecast
 from en4dvar.errors import ConfigError, En4dvarError
+from en4dvar.inputs.asked import DataFile
 from en4dvar.noise import Noise, noise_of
 from en4dvar.observations import Observations
 from en4dvar.problem import InverseProblem
@@ -57,11 +58,9 @@ def planned_problem(config: Config) -> InverseProblem:
     ConfigError: no times, or something that only readings can say. DataError: a data file that is needed cannot be
         used. En4dvarError: the model fails at the centre of the prior.
     """
-    plan, design = inverse_plan(config), config.design
-    times = design.times if design.times is not None else config.simulate_times
+    plan, times = inverse_plan(config), _planned_times(config)
     measured = None
-    if times is None or any(entry.needs_data for entry in config.parameters):
-        name, file = next(iter(data_files(plan).items()))
+    for name, file in files_needed(config).items():
         measured = read_observations(plan, file, name, config.weights)
     if config.weights != "sum":
         raise ConfigError([config.document.fault(("assimilation", "weights"), "only weights of sum are Bayesian")])
@@ -77,6 +76,20 @@ def planned_problem(config: Config) -> InverseProblem:
         raise En4dvarError(f"the model fails at the centre of the prior: {run.failures[0]}")
     values = np.split(run.predictions[0], len(plan.series))
     return replace(problem, observations=_observations(config, values, times, measured, stated=True))
+
+
+def _planned_times(config: Config) -> Array | None:
+    return config.design.times if config.design.times is not None else config.simulate_times
+
+
+def files_needed(config: Config) -> dict[str, DataFile]:
+    """The data file, by its name, that a plan takes its times or a prior's ``maximum`` from, if it needs one.
+
+    Raises :class:`ConfigError`, :class:`DataError`: there is none.
+    """
+    if _planned_times(config) is not None and not any(entry.needs_data for entry in config.parameters):
+        return {}
+    return dict([next(iter(data_files(inverse_plan(config)).items()))])
 
 
 def _scale(measured: Observations | None) -> float:

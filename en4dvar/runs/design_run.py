@@ -11,10 +11,11 @@ from en4dvar.config import Config, resolve
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.parameters import Uncertain
 from en4dvar.design.evaluate import Evaluated, Method, evaluate
+from en4dvar.design.planned import Planned
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import Executor, choose_executor, one_blas_thread
 from en4dvar.report.design import write_design
-from en4dvar.runs.design_plan import Candidate, candidates, planned_problem
+from en4dvar.runs.design_plan import Candidate, candidates, files_needed, planned_problem
 from en4dvar.runs.interrupt import terminate_as_interrupt
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.runs.session import Session, directory_mode, session
@@ -71,12 +72,13 @@ def run_design(
     every = list(candidates(document, base))
     config = every[0].config
     config = replace(config, directory=out or config.directory.with_name(f"{config.directory.name}_design"))
+    about = _asked(config)
     kept = f"the designs that are done are kept in {config.directory}"
     with (
         one_blas_thread(),
         terminate_as_interrupt(),
         RunDirectory.open(config.directory, directory_mode(force, resume)) as directory,
-        session(config, {}, directory, command, lambda: kept) as run,
+        session(config, files_needed(config), directory, command, lambda: kept) as run,
     ):
         run.begin("design.nc", "designs.csv", "design.html", STATE)
         work = _Work(config, every, run, on_design)
@@ -84,7 +86,7 @@ def run_design(
         with choose_executor(config.model, asked.executor, asked.workers, asked.address, asked.limits) as executor:
             work.everything(executor)
         file = directory.at("design.nc")
-        save_designs(file, work.rows(), _asked(config), {**run.attributes, "name": config.name})
+        save_designs(file, work.rows(), about, {**run.attributes, "name": config.name})
         found = load_designs(file)
         if config.report:
             write_design(found, directory.work)
@@ -103,7 +105,7 @@ def _known(document: Document, base: Path, after: Path) -> dict[str, Any]:
 def _asked(config: Config) -> Asked:
     problem = planned_problem(config)
     terms = {term.parameter.name: term.parameter for term in problem.prior.terms}
-    about = [terms[name] for name in config.design.about or terms]
+    about = [terms[name] for name in Planned(problem, config.design.about).about]
     model, seen = config.model, problem.observable
     return Asked(
         parameters=tuple(p.name for p in about),

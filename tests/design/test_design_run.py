@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 import en4dvar
 from en4dvar.cli import main
-from en4dvar.errors import ConfigError, En4dvarError, OutputError
+from en4dvar.errors import ConfigError, DataError, En4dvarError, OutputError
 from en4dvar.report.design import front
 from en4dvar.runs import design_run
 from en4dvar.runs.design_run import run_design
@@ -158,8 +158,16 @@ def test_bad_input(tmp_path, change, message):
 def test_times_or_a_file_of_them(tmp_path):
     plan = _plan(knobs={})
     del plan["design"]["times"]
-    with pytest.raises(ConfigError, match=r"none of the designs .*not yet measured\.csv: no such file"):
+    with pytest.raises(DataError, match=r"not yet measured\.csv: no such file"):
         run_design(plan, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    plan["data"]["path"], plan["design"]["method"] = str(tmp_path / "measured.csv"), "linear"
+    (tmp_path / "measured.csv").write_text("t,y\n0.1,1\n0.5,1\n0.9,1\n")
+    three, _ = run_design(plan, out=tmp_path / "out")
+    assert len(three.rows[0].found.times) == 3
+    (tmp_path / "measured.csv").write_text("t,y\n0.1,1\n0.5,1\n0.9,1\n1.3,1\n")
+    with pytest.raises(OutputError, match="cannot be resumed to the same result"):
+        run_design(plan, out=tmp_path / "out", resume=True)
 
 
 def test_after_a_run_there_is_less_to_learn(tmp_path):
