@@ -19,6 +19,7 @@ from en4dvar.state import Array
 
 MOST = 2000  # designs
 Value = QuantityText | bool
+OF_A_LAW = ("model", "parameters", "prior", "prior_correlation")
 
 
 class Knob(Section):
@@ -66,12 +67,19 @@ class Design(_SampleSizes):
     """How many experiments alike are made, e.g. bubbles of one gel: they share what is asked for."""
     price: Price = Price()
     """What an experiment costs: information is compared with it."""
+    laws: dict[str, dict[str, Any]] = Field({})
+    """Which law holds? Name → keys of this file and values, e.g. ``{model.law: ...}``; ``{}`` is the file itself."""
     method: Literal["auto", "linear", "laplace", "nested"] = "auto"
     """linear: at the prior mean; laplace: linearised over the prior; nested: simulated readings, each explained anew;
     auto: laplace, checked by nested on the first and the best designs and replaced by it where they disagree."""
 
     @classmethod
     def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        laws = given.get("laws")
+        if isinstance(laws, dict) and laws:
+            _check_laws(laws, faults)
+            if given.get("experiments", [1]) != [1]:
+                faults.add(("experiments",), "not with laws: which law holds is asked of one experiment", at_key=True)
         knobs = given.get("knobs")
         if not isinstance(knobs, dict):
             return
@@ -88,3 +96,13 @@ class Design(_SampleSizes):
         """Name of the knob → value, of every combination."""
         for values in product(*(knob.values for knob in self.knobs.values())):
             yield dict(zip(self.knobs, values, strict=True))
+
+
+def _check_laws(laws: Mapping[str, Any], faults: Faults) -> None:
+    if len(laws) < 2:
+        faults.add(("laws",), "one law has nothing to be told from; give two or more", at_key=True)
+    for name, keys in laws.items():
+        for key in keys if isinstance(keys, dict) else ():
+            if str(key).split(".")[0] not in OF_A_LAW:
+                message = f"laws share the experiment; they differ in keys of {', '.join(OF_A_LAW)}"
+                faults.add(("laws", name, key), message, at_key=True)

@@ -11,18 +11,22 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from en4dvar.design.evaluate import Evaluated
+from en4dvar.design.laws import Decision
 from en4dvar.files import write_text
 from en4dvar.report.html import render
 from en4dvar.report.style import LIGHT, PAGE, inline_svg, panels, styled
 from en4dvar.report.text import figure_text, rough_number, with_unit
 from en4dvar.state import Array
-from en4dvar.storage.design_file import DesignRow, Designs
+from en4dvar.storage.design_file import DECISION, DesignRow, Designs
 from en4dvar.tables import csv_text, table
 from en4dvar.units import convert
 
 TOLD, DRAWN = 12, 6  # designs on the terminal, in the figure of what is seen
 NOTHING = 0.9  # of the prior's std: a posterior that is wider has learned nothing to speak of
+RARELY = 0.1  # share of experiments that decide which law holds, below which none is promised
 COARSE = 1.0  # relative std beyond which a percentage says nothing
+THIN = 0.1  # share of evidences with few effective draws that is told
 GAINS = "Expected information against what can be turned, each mark a design; bars: Monte Carlo standard errors."
 FRONT = "Expected information against price; joined: the designs that no other beats in both."
 FANS = "What would be seen: median, 50 % and 90 % of the prior; marks below: the readings that are taken."
@@ -49,7 +53,15 @@ def settings_text(row: DesignRow) -> str:
 
 def words(found: Designs, row: DesignRow) -> str:
     """What would be known: "G to ± 12 %, alpha hardly at all"."""
-    return ", ".join(_known(found, row, a) for a in range(len(found.asked.parameters)))
+    known = [_known(found, row, a) for a in range(len(found.asked.parameters))]
+    return ", ".join([*([_law(row.found.decision)] if row.found and row.found.decision else []), *known])
+
+
+def _law(decision: Decision) -> str:
+    """How surely the law will be known."""
+    if decision.decided < RARELY:
+        return f"the law hardly (probability {decision.probability:.2f})"
+    return f"the law in {100 * decision.decided:.0f} ± {100 * decision.decided_error:.0f} % of experiments"
 
 
 def _known(found: Designs, row: DesignRow, a: int) -> str:
@@ -64,20 +76,29 @@ def _known(found: Designs, row: DesignRow, a: int) -> str:
     return f"{name} to ± {value}{'' if shown == '1' else f' {shown}'}"
 
 
+def by(one: Evaluated) -> str:
+    """What the information that designs are ranked by was found by."""
+    return "nested" if one.decision else one.method
+
+
+def _gain(found: Designs) -> str:
+    return "law [nats]" if found.asked.laws else "gain [nats]"
+
+
 def design_table(found: Designs) -> str:
     """The best designs and the file's own, for the terminal."""
     rows, own = ranked(found), [row for row in found.rows if not row.settings and row.found]
     told = list({id(row): row for row in (*rows[:TOLD], *own)}.values())
     several = any(row.found.alike > 1 for row in rows if row.found)
-    head = ("design", *(["experiments"] if several else []), "readings", "price", "gain [nats]", "by", "what is known")
+    head = ("design", *(["experiments"] if several else []), "readings", "price", _gain(found), "by", "what is known")
     cells = [
         (
             settings_text(row),
             *([str(row.found.alike)] if several else []),
             str(len(row.found.readings)),
             f"{row.price:g}",
-            f"{row.found.gain:.2f} ± {row.found.error:.2f}",
-            row.found.method,
+            f"{row.found.worth:.2f} ± {row.found.worth_error:.2f}",
+            by(row.found),
             words(found, row),
         )
         for row in told
@@ -91,6 +112,8 @@ def remarks(found: Designs) -> list[str]:
     failed = [row for row in found.rows if row.failure]
     beyond = [row for row in ranked(found)[:TOLD] if row.found and row.found.beyond > 0.1]
     told = [f"{settings_text(row)}: {row.failure}" for row in failed]
+    thin = sum(bool(row.found and row.found.decision and row.found.decision.thin > THIN) for row in found.rows)
+    told += [f"of {thin} designs the evidences of many readings are rough; raise design.inner"] if thin else []
     told += [
         f"{settings_text(row)}: {100 * row.found.beyond:.0f} % of the prior leaves what the model is valid for"
         for row in beyond
@@ -109,7 +132,7 @@ def gains(found: Designs) -> Figure:
         values = [row.settings.get(name, _alike(row)) for row in rows]
         x, labels = _positions(values)
         worth = np.array([_worth(row) for row in rows])
-        errors = np.array([row.found.error for row in rows if row.found])
+        errors = np.array([row.found.worth_error for row in rows if row.found])
         ax.errorbar(x, worth, errors, fmt="o", ms=3, lw=0.6, color=LIGHT["posterior"], alpha=0.7)
         if labels:
             ax.set_xticks(sorted(set(x)), labels)
@@ -165,6 +188,8 @@ def write_design(found: Designs, folder: Path) -> Path:
         sortable=True,
         name=found.attributes.get("name", ""),
         asked=", ".join(found.asked.parameters),
+        laws=found.asked.laws,
+        by=by,
         rows=[(settings_text(row), row, words(found, row), id(row) in best) for row in rows],
         remarks=remarks(found),
         drawings=drawings,
@@ -179,7 +204,8 @@ def _cells(found: Designs) -> list[list[Any]]:
     stds = [
         f"{name}_std" + ("" if u == "1" else f" [{u}]") for name, u in zip(found.asked.parameters, shown, strict=True)
     ]
-    head = [*found.asked.knobs, "experiments", "readings", "price", "gain_nats", "gain_error", "method", *stds]
+    head = [*found.asked.knobs, "experiments", "readings", "price", "gain_nats", "gain_error", "method"]
+    head += [*([name for name, _ in DECISION.values()] if found.asked.laws else []), *stds]
     ratios = [f"{name}_std_ratio" for name in found.asked.parameters]
     cells = []
     for row in ranked(found):
@@ -189,12 +215,13 @@ def _cells(found: Designs) -> list[list[Any]]:
         std = [float(convert(np.array(value), *unit)) for value, unit in units]
         knobs = [row.settings.get(name, "") for name in found.asked.knobs]
         worth = [one.alike, len(one.readings), row.price, one.gain, one.error, one.method]
+        worth += [getattr(one.decision, field) for field in DECISION] if one.decision else []
         cells.append([*knobs, *worth, *std, *map(float, one.ratio), one.lost, one.beyond])
     return [[*head, *ratios, "lost", "beyond_validity"], *cells]
 
 
 def _worth(row: DesignRow) -> float:
-    return row.found.gain if row.found else math.nan
+    return row.found.worth if row.found else math.nan
 
 
 def _alike(row: DesignRow) -> int:

@@ -26,10 +26,21 @@ from en4dvar.state import Array
 
 @dataclass(frozen=True)
 class Candidate:
-    """A design: what its knobs are set to, and the configuration that this makes. Without settings: as in the file."""
+    """A design: what its knobs are set to, and the configuration that this makes. Without settings: as in the file.
+
+    ``laws``: the same configuration with each of the laws that are to be told apart.
+    """
 
     settings: Mapping[str, Value]
     config: Config
+    laws: tuple[Config, ...] = ()
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Value], document: Document, base: Path) -> Candidate:
+        """From the document that the settings make. Raises :class:`ConfigError`."""
+        config = resolve(document, base)
+        laws = (resolve(override(document, keys), base) for keys in config.design.laws.values())
+        return cls(settings, config, tuple(laws))
 
     @property
     def readings(self) -> tuple[int, float] | None:
@@ -40,12 +51,13 @@ class Candidate:
 
 def candidates(document: Document, base: Path) -> Iterator[Candidate]:
     """The file's own design, then every combination of its knobs. Raises :class:`ConfigError`."""
-    config = resolve(document, base)
-    yield Candidate({}, config)
-    if config.design.knobs:
-        for settings in config.design.settings():
-            overrides = {config.design.knobs[name].key: value for name, value in settings.items()}
-            yield Candidate(settings, resolve(override(document, overrides), base))
+    first = Candidate.of({}, document, base)
+    yield first
+    design = first.config.design
+    if design.knobs:
+        for settings in design.settings():
+            overrides = {design.knobs[name].key: value for name, value in settings.items()}
+            yield Candidate.of(settings, override(document, overrides), base)
 
 
 def planned_problem(config: Config) -> InverseProblem:

@@ -113,6 +113,7 @@ def _asked(config: Config) -> Asked:
         labels=tuple(p.label for p in about),
         units=tuple((p.unit, p.display_unit) for p in about),
         knobs=tuple(config.design.knobs),
+        laws=tuple(config.design.laws),
         seen=seen.label,
         axes=((model.time_unit, model.time_display_unit), (seen.unit, seen.display_unit)),
     )
@@ -135,6 +136,8 @@ class _Work:
     def everything(self, executor: Executor) -> None:
         """Evaluate by the method asked for; ``auto`` checks the linearised information and replaces it if it is off."""
         method = self.config.design.method
+        if method == "auto" and self.config.design.laws:
+            method = "laplace"  # the designs are ranked by what they tell of the law, which is exact
         if method != "auto":
             self._evaluate(executor, range(len(self.every)), method)
             return
@@ -193,8 +196,8 @@ def _one(candidate: Candidate, method: Method, seed: int) -> tuple[Evaluated, ..
     config = candidate.config
     design = config.design
     try:
-        problem = planned_problem(config)
-        return evaluate(problem, design.about, design.sizes, method, seed, design.experiments, candidate.readings)
+        problem, laws = planned_problem(config), [planned_problem(law) for law in candidate.laws]
+        return evaluate(problem, design.about, design.sizes, method, seed, design.experiments, candidate.readings, laws)
     except En4dvarError as error:
         return str(error)
 
@@ -203,4 +206,5 @@ def _line(done: Done) -> str:
     if done.failure:
         return f"design {done.number}: {done.failure}"
     one = done.found[0]
-    return f"design {done.number}: {one.gain:.4g} nats ± {one.error:.2g} ({one.method}), {one.forward_runs} runs"
+    worth = f"{one.worth:.4g} nats ± {one.worth_error:.2g}{' of the law' if one.decision else f' ({one.method})'}"
+    return f"design {done.number}: {worth}, {one.forward_runs} runs"
