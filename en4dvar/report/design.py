@@ -23,6 +23,7 @@ from en4dvar.tables import csv_text, table
 from en4dvar.units import convert
 
 TOLD, DRAWN = 12, 6  # designs on the terminal, in the figure of what is seen
+NAMED = 4  # of the designs that cannot be had for the same reason
 NOTHING = 0.9  # of the prior's std: a posterior that is wider has learned nothing to speak of
 RARELY = 0.1  # share of experiments that decide which law holds, below which none is promised
 COARSE = 1.0  # relative std beyond which a percentage says nothing
@@ -111,7 +112,16 @@ def remarks(found: Designs) -> list[str]:
     """What to know of the designs beside their worth."""
     failed = [row for row in found.rows if row.failure]
     beyond = [row for row in ranked(found)[:TOLD] if row.found and row.found.beyond > 0.1]
-    told = [f"{settings_text(row)}: {row.failure}" for row in failed]
+    told = []
+    if (rows := ranked(found)) and _worth(rows[0]) < found.asked.enough:
+        told.append(
+            f"the best design is expected to tell {_worth(rows[0]):.2f} nats, less than design.enough = "
+            f"{found.asked.enough:g}: no experiment among these is worth making"
+        )
+    for reason in dict.fromkeys(row.failure for row in failed):
+        names = [settings_text(row) for row in failed if row.failure == reason]
+        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+        told.append(f"{'; '.join(names[:NAMED])}{more}: {reason}")
     thin = sum(bool(row.found and row.found.decision and row.found.decision.thin > THIN) for row in found.rows)
     told += [f"of {thin} designs the evidences of many readings are rough; raise design.inner"] if thin else []
     told += [
@@ -191,11 +201,23 @@ def write_design(found: Designs, folder: Path) -> Path:
         laws=found.asked.laws,
         by=by,
         rows=[(settings_text(row), row, words(found, row), id(row) in best) for row in rows],
+        lab=[(settings_text(row), readings_text(found, row), row, words(found, row)) for row in front(found)],
         remarks=remarks(found),
         drawings=drawings,
         attributes=found.attributes,
     )
     return write_text(folder / "design.html", page)
+
+
+def readings_text(found: Designs, row: DesignRow) -> str:
+    """When readings are taken: "43 from 0.7 to 59.5 µs, every 1.4 µs", or each where they are not evenly spaced."""
+    assert row.found is not None
+    stored, shown = found.asked.axes[0]
+    t, unit = convert(row.found.times, stored, shown), "" if shown == "1" else f" {shown}"
+    gaps = np.diff(t)
+    if len(t) > 2 and np.ptp(gaps) < 1e-6 * gaps.mean():
+        return f"{len(t)} from {t[0]:.4g} to {t[-1]:.4g}{unit}, every {gaps.mean():.4g}{unit}"
+    return f"{len(t)}, at {', '.join(f'{one:.4g}' for one in t)}{unit}"
 
 
 def _cells(found: Designs) -> list[list[Any]]:

@@ -114,6 +114,7 @@ def _asked(config: Config) -> Asked:
         units=tuple((p.unit, p.display_unit) for p in about),
         knobs=tuple(config.design.knobs),
         laws=tuple(config.design.laws),
+        enough=config.design.enough,
         seen=seen.label,
         axes=((model.time_unit, model.time_display_unit), (seen.unit, seen.display_unit)),
     )
@@ -158,9 +159,8 @@ class _Work:
         found = []
         for done in sorted(self._latest(), key=lambda d: d.number):
             candidate = self.every[done.number]
-            price = candidate.config.design.price
             for one in done.found:
-                cost = one.alike * (price.experiment + price.reading * len(one.readings))
+                cost = candidate.config.design.price.of(one.alike, len(one.readings))
                 found.append(DesignRow(done.number, dict(candidate.settings), one, cost))
             if done.failure:
                 found.append(DesignRow(done.number, dict(candidate.settings), None, float("nan"), done.failure))
@@ -197,7 +197,12 @@ def _one(candidate: Candidate, method: Method, seed: int) -> tuple[Evaluated, ..
     design = config.design
     try:
         problem, laws = planned_problem(config), [planned_problem(law) for law in candidate.laws]
-        return evaluate(problem, design.about, design.sizes, method, seed, design.experiments, candidate.readings, laws)
+        sizes, alike = design.sizes, design.experiments
+        every = evaluate(problem, design.about, sizes, method, seed, alike, candidate.readings, laws)
+        costs = (design.price.of(one.alike, len(one.readings)) for one in every)
+        broken = [design.within.broken(len(o.readings), cost, o.beyond) for o, cost in zip(every, costs, strict=True)]
+        kept = tuple(one for one, reason in zip(every, broken, strict=True) if not reason)
+        return kept or broken[0]
     except En4dvarError as error:
         return str(error)
 

@@ -45,7 +45,8 @@ class DesignRow:
 @dataclass(frozen=True)
 class Asked:
     """What was asked: parameters with their ``units`` (stored, shown), symbols and labels, the knobs and the laws; the
-    label and the ``axes`` of what is seen, time and observable, each with its units (stored, shown).
+    label and the ``axes`` of what is seen, time and observable, each with its units (stored, shown); what is
+    ``enough``, nats.
     """
 
     parameters: tuple[str, ...]
@@ -55,7 +56,8 @@ class Asked:
     knobs: tuple[str, ...]
     seen: str
     axes: tuple[tuple[str, str], tuple[str, str]]
-    laws: tuple[str, ...] = ()
+    laws: tuple[str, ...]
+    enough: float
 
 
 @dataclass(frozen=True)
