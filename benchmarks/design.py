@@ -7,10 +7,10 @@
 
 ``laser`` (neo-Hookean Kelvin-Voigt, priors of benchmarks/laser_twin.py) or ``acoustic`` (quadratic law, narrow priors
 of benchmarks/acoustic_twin.py). Design ``i`` of ``exact`` has seed ``i``: step and end of the readings, their error
-and, of a laser bubble, the largest radius. Brute force takes ln p(y) of each of 2000 simulated sets of readings from 10⁵
-draws of the prior, none of which a set came from; errors are four times as large as a camera's, so that enough draws
-explain a set: fewest and median effective numbers of them are told. All are synthetic. Records are kept and the next
-call goes on (``--minutes``).
+and, of a laser bubble, the largest radius. Brute force takes ln p(y) of each of 2000 simulated sets of readings from
+10⁵ draws of the prior, none of which a set came from; errors are four times as large as a camera's, so that enough
+draws explain a set: fewest and median effective numbers of them are told. All are synthetic. Records are kept and the
+next call goes on (``--minutes``).
 """
 
 from __future__ import annotations
@@ -48,6 +48,8 @@ CAMERA = {
     "laser": (0.7e-6, 60e-6, 0.2e-6, 1e-6, 1.5e-6, 16),
     "acoustic": (5.6e-6, 25e-6, 0.2e-6, 1e-6, 1.4e-6, 14),
 }
+# a fixed rate that ends with its frames, and until when half as many may be chosen: s
+RATE = {"laser": (laser_twin.TIMES, 60e-6), "acoustic": (5.6e-6 + 1.5e-6 * np.arange(14), 40e-6)}
 
 
 def planned(kind: str, times: Array, std: float, largest: float = laser_twin.LARGEST) -> InverseProblem:
@@ -130,22 +132,34 @@ def tell_exact(records: Mapping[str, Record]) -> None:
         )
 
 
+def chosen(kind: str, count: int, last: float) -> InverseProblem:
+    """So many readings until ``last`` (s) that tell most about G and mu."""
+    first, _, fine, apart, std, _ = CAMERA[kind]
+    times = np.arange(first, last, fine)
+    whole = Planned(planned(kind, times, std), ABOUT)
+    return planned(kind, times[choose(whole, whole.draws(SIZES.draws, 1), count, apart)], std)
+
+
 def settings_of(kind: str) -> dict[str, InverseProblem]:
-    """The customary readings, at a fixed rate; as many that are chosen; half as many that are chosen."""
-    first, last, fine, apart, std, count = CAMERA[kind]
-    candidates = planned(kind, np.arange(first, last, fine), std)
-    whole = Planned(candidates, ABOUT)
-    found = {"customary": planned(kind, np.linspace(first, last, count), std)}
-    for name, few in (("designed", count), ("half", count // 2)):
-        taken = choose(whole, whole.draws(SIZES.draws, 1), few, apart)
-        found[name] = planned(kind, candidates.observations.times[taken], std)
-    return found
+    """The customary readings, at a fixed rate, and as many that are chosen in the same window."""
+    first, last, _, _, std, count = CAMERA[kind]
+    return {"customary": planned(kind, np.linspace(first, last, count), std), "designed": chosen(kind, count, last)}
 
 
 def frames(kind: str) -> None:
-    """Information of the three settings."""
-    sizes = replace(SIZES, simulated=400, inner=400)
-    for name, problem in settings_of(kind).items():
+    """All readings at a fixed rate against half as many that are chosen, in a longer window and in the same one."""
+    sizes, (rate, longest), (_, last, *_, std, count) = (
+        replace(SIZES, simulated=400, inner=400),
+        RATE[kind],
+        CAMERA[kind],
+    )
+    compared = {
+        "rate of the twin": planned(kind, rate, std),
+        "half, until later": chosen(kind, len(rate) // 2, longest),
+        "customary": settings_of(kind)["customary"],
+        "half, same window": chosen(kind, count // 2, last),
+    }
+    for name, problem in compared.items():
         cheap, nested = (evaluate(problem, ABOUT, sizes, method, 0)[0] for method in ("laplace", "nested"))
         print(
             f"{kind}, {name}: {len(problem.observations)} readings, linearised {cheap.gain:.3f} ± {cheap.error:.3f}, "
