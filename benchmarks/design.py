@@ -8,9 +8,9 @@
 ``laser`` (neo-Hookean Kelvin-Voigt, priors of benchmarks/laser_twin.py) or ``acoustic`` (quadratic law, narrow priors
 of benchmarks/acoustic_twin.py). Design ``i`` of ``exact`` has seed ``i``: step and end of the readings, their error
 and, of a laser bubble, the largest radius. Brute force takes ln p(y) of each of 2000 simulated sets of readings from
-10⁵ draws of the prior, none of which a set came from; errors are four times as large as a camera's, so that enough
-draws explain a set: fewest and median effective numbers of them are told. All are synthetic. Records are kept and the
-next call goes on (``--minutes``).
+10⁵ draws of the prior, none of which a set came from; errors are eight (laser) or four times as large as a
+camera's, so that enough draws explain a set: fewest and median effective numbers of them are told. All are synthetic.
+Records are kept and the next call goes on (``--minutes``).
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ from en4dvar_bubble import BubbleModel
 
 ABOUT = ("G", "mu")
 SIZES = SampleSizes()
-COARSE, INNER, OUTER = 4.0, 100_000, 2000
+MORE = SampleSizes(simulated=400, draws=400)
+COARSE, INNER, OUTER = {"laser": 8.0, "acoustic": 4.0}, 100_000, 2000
 # first and last instant, spacing of candidates, least distance of two that are chosen, s; error, m; frames
 CAMERA = {
     "laser": (0.7e-6, 60e-6, 0.2e-6, 1e-6, 1.5e-6, 16),
@@ -82,8 +83,8 @@ def speed(count: int) -> None:
 
 def exact(kind: str, seed: int) -> Record:
     """Information about everything: linearised, nested, and by brute force, with standard errors."""
-    problem = random_design(kind, seed, COARSE)
-    cheap, nested = (evaluate(problem, (), SIZES, method, seed)[0] for method in ("laplace", "nested"))
+    problem = random_design(kind, seed, COARSE[kind])
+    cheap, nested = (evaluate(problem, (), MORE, method, seed)[0] for method in ("laplace", "nested"))
     whole, std, rng = Planned(problem), problem.observations.std, np.random.default_rng([7, seed])
     others, truths = (_predictions(whole, count, k, seed) / std for count, k in ((INNER, 11), (OUTER, 12)))
     gains, effective = [], []
@@ -148,11 +149,7 @@ def settings_of(kind: str) -> dict[str, InverseProblem]:
 
 def frames(kind: str) -> None:
     """All readings at a fixed rate against half as many that are chosen, in a longer window and in the same one."""
-    sizes, (rate, longest), (_, last, *_, std, count) = (
-        replace(SIZES, simulated=400, inner=400),
-        RATE[kind],
-        CAMERA[kind],
-    )
+    (rate, longest), (_, last, *_, std, count) = RATE[kind], CAMERA[kind]
     compared = {
         "rate of the twin": planned(kind, rate, std),
         "half, until later": chosen(kind, len(rate) // 2, longest),
@@ -160,7 +157,7 @@ def frames(kind: str) -> None:
         "half, same window": chosen(kind, count // 2, last),
     }
     for name, problem in compared.items():
-        cheap, nested = (evaluate(problem, ABOUT, sizes, method, 0)[0] for method in ("laplace", "nested"))
+        cheap, nested = (evaluate(problem, ABOUT, MORE, method, 0)[0] for method in ("laplace", "nested"))
         print(
             f"{kind}, {name}: {len(problem.observations)} readings, linearised {cheap.gain:.3f} ± {cheap.error:.3f}, "
             f"nested {nested.gain:.3f} ± {nested.error:.3f} nats; µs {np.round(1e6 * problem.observations.times, 1)}",
@@ -231,7 +228,7 @@ def main() -> None:
         found = fill(folder / f"promise_{kind}.jsonl", keys, one, given.minutes)
         for name in ("customary", "designed"):
             print(f"{kind}, {name}: ", end="")
-            worth = evaluate(settings[name], ABOUT, replace(SIZES, simulated=400, inner=400), "nested", 0)[0]
+            worth = evaluate(settings[name], ABOUT, MORE, "nested", 0)[0]
             tell_promise((worth.gain, worth.error), {k: r for k, r in found.items() if k.endswith(name)})
 
 
