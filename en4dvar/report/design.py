@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from en4dvar.tables import csv_text, table
 from en4dvar.units import convert
 
 TOLD, DRAWN = 12, 6  # designs on the terminal, in the figure of what is seen
+WIDE = 46  # letters of a line above a figure
 NAMED = 4  # of the designs that cannot be had for the same reason
 NOTHING = 0.9  # of the prior's std: a posterior that is wider has learned nothing to speak of
 RARELY = 0.1  # share of experiments that decide which law holds, below which none is promised
@@ -178,7 +180,7 @@ def fans(found: Designs) -> Figure:
         ax.plot(t, middle, color=LIGHT["posterior"])
         ax.plot(taken, np.full(len(taken), 0.03), "|", color=LIGHT["centre"], transform=ax.get_xaxis_transform())
         told = ", ".join(figure_text(f"{name} {value}") for name, value in row.settings.items()) or "as in the file"
-        ax.set(title=f"{told}: {_worth(row):.2f} nats")
+        ax.set_title(fill(f"{told}: {_worth(row):.2f} nats", WIDE), fontsize="small")
         ax.set(xlabel=with_unit("time", time[1]), ylabel=with_unit(found.asked.seen, value[1]))
     return figure
 
@@ -188,7 +190,7 @@ def write_design(found: Designs, folder: Path) -> Path:
     write_text(folder / "designs.csv", csv_text(_cells(found)))
     rows, best = ranked(found), {id(row) for row in front(found)}
     drawings = [("fans", FANS, inline_svg(fans(found), "fans", FANS))]
-    if len(rows) > 1:
+    if len({row.price for row in rows}) > 1:
         drawings.insert(0, ("prices", FRONT, inline_svg(prices(found), "prices", FRONT)))
     if found.asked.knobs or len({_alike(row) for row in rows}) > 1:
         drawings.insert(0, ("gains", GAINS, inline_svg(gains(found), "gains", GAINS)))
