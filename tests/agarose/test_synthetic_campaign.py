@@ -88,7 +88,7 @@ def test_faults_are_located():
     assert "campaign.groups.agarose_03.parameters.mu" in told
 
 
-@pytest.mark.parametrize("name, value", [("reading_scale", "1.03"), ("sigma", "1.5"), ("t_s", "1 us")])
+@pytest.mark.parametrize(("name", "value"), [("reading_scale", "1.03"), ("sigma", "1.5"), ("t_s", "1 us")])
 def test_a_campaign_makes_its_own_readings(name, value):
     """What only a fit has is refused, where it would be ignored."""
     with pytest.raises(ConfigError, match=rf"agarose_03\.parameters\.{name}: a campaign makes its own readings"):
