@@ -58,7 +58,9 @@ def emitted(paths: Paths) -> Array:
 
 
 def _driving(run: Paths) -> Array:
-    """p_f (N, K) in Pa at the bubble, as the equation of motion reads it."""
+    """p_f in Pa at the bubble, (N, K), as the equation of motion reads it; 0 where there is none."""
     model: Any = run.model
+    if model.driving.silent:
+        return np.zeros(1)
     when = run.times + (0.0 if model.reading == "instantaneous" else run["R"] / run.medium(1).c)
     return np.asarray(model.driving.of_each(when, model.parameter_values(run.initial)))

@@ -145,8 +145,8 @@ class Driving:
         shift, rate, offset = (np.reshape(of, (-1, 1)) for of in clocks[:3])
         read = (t * 1e6 - shift) * rate
         inside = (read >= self.span[0]) & (read <= self.span[1])
-        tables = clocks.table.reshape(-1, self.cells, 8)[np.asarray(offset[:, 0] / (8 * self.cells), dtype=int)]
-        shape = evaluate(np.broadcast_to(tables, (len(t), *tables.shape[1:])), self.span, read)
+        table = np.broadcast_to(offset[:, 0].astype(int) // (8 * self.cells), len(t))
+        shape = evaluate(clocks.table.reshape(-1, self.cells, 8)[table], self.span, read)
         amplitude = np.reshape(values.get("p_A", self.amplitude), (-1, 1))
         return np.where(inside, amplitude * shape, 0.0)
 
