@@ -20,6 +20,8 @@ RELEASED = BubbleModel(law=NeoHookeanKelvinVoigt(), start="laser", gas="polytrop
 DRIVEN = BubbleModel(law=NeoHookeanKelvinVoigt(), gas="polytropic", accuracy=Accuracy(rtol=1e-10))
 THETA = {"G": np.array([1e4, 3e3]), "mu": np.array([0.08, 0.1]), "R_max": np.full(2, 2e-4), "R_eq": np.full(2, 4e-5)}
 HELD = {"G": np.full(2, 5e4), "mu": np.full(2, 0.08), "R0": np.full(2, 1.5e-6), "p_A": np.array([-2e7, -1.5e7])}
+HELD |= {"pulse_frequency": np.array([1e6, 1.1e6]), "pulse_exponent": np.array([3.7, 3.2])}
+HELD |= {"pulse_delay": np.array([5e-6, 5.3e-6])}
 C, R = RELEASED.medium.c, 0.03
 
 
