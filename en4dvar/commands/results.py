@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 
 import click
 
-from en4dvar.commands.common import Failed, deliver, folder_of, refuse_to_replace
+from en4dvar.commands.common import (
+    Failed,
+    ask,
+    deliver,
+    folder_of,
+    refuse_to_replace,
+    tell,
+    trust_option,
+    workers_option,
+)
 
 MOST_ROWS = 60  # of estimates on the terminal
 
@@ -37,8 +45,8 @@ def report(run_dir: Path, datasets: tuple[str, ...]) -> None:
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of figure and page; default compare_... beside.")
 @click.option("--no-report", is_flag=True, help="Print the tables only.")
 @click.option("--stored", is_flag=True, help="Evidences as the results have them: nothing is run.")
-@click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
-@click.option("--trust", is_flag=True, help="Run code that the files name, wherever it lies: read it before.")
+@workers_option
+@trust_option
 def compare(
     run_dirs: tuple[Path, ...], out: Path | None, no_report: bool, stored: bool, workers: int | None, trust: bool
 ) -> None:
@@ -58,9 +66,6 @@ def compare(
     comparison = compare_runs(run_dirs)
     if not (stored or comparison.incomparable):
         from en4dvar.runs.evidence_run import sampled_evidences
-
-        def tell(words: str) -> None:
-            click.echo(words, err=True)
 
         evidences = [sampled_evidences(run_dir, workers, trust, None, tell) for run_dir in run_dirs]
         comparison = compare_runs(run_dirs, evidences)
@@ -104,8 +109,8 @@ def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
 
 @click.command()
 @click.argument("run_dir", type=click.Path(path_type=Path))
-@click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
-@click.option("--trust", is_flag=True, help="Run code that the files name, wherever it lies: read it before.")
+@workers_option
+@trust_option
 def rerun(run_dir: Path, workers: int | None, trust: bool) -> None:
     """Repeat a run from what its result files record, and compare to the last bit. Nothing is written.
 
@@ -119,7 +124,6 @@ def rerun(run_dir: Path, workers: int | None, trust: bool) -> None:
     """
     from en4dvar.runs.rerun import rerun as repeat
 
-    ask = (lambda question: click.confirm(question, err=True)) if sys.stdin.isatty() else None
     found = repeat(run_dir, workers, trust=trust, ask=ask)
     click.echo(str(found))
     if not found.same:

@@ -130,6 +130,8 @@ class BubbleSettings(Section):
     """Constant vapour pressure in the bubble: a pressure, or saturated at the far-field temperature."""
     constants: ConstantsSettings = ConstantsSettings()
     """Constants of medium and gas: the name of a set, or a section that replaces some of them."""
+    hydrophone: Annotated[float, Quantity("m"), Field(gt=0)] = 1.0
+    """How far from the bubble acoustic_pressure is read."""
     accuracy: AccuracyName = "standard"
     """Nodes and tolerance together; errors of each in docs/solver.md."""
     nodes: Annotated[int, Field(ge=1, le=128)] | None = None
