@@ -107,7 +107,10 @@ CASES = [
 
 @dataclass(frozen=True)
 class AsDapper(ETKF):
-    """EnKF-N with the hyperprior of DAPPER, whose mode is moved, and a transform without the radial term."""
+    """EnKF-N with the hyperprior of DAPPER, whose mode is moved, a transform without the radial term, and its rotation.
+
+    Rotations of Haar's law: ours, which walk towards it, give this variant an RMSE that is 1.9 % larger.
+    """
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step:
         from dapper.da_methods.ensemble import hyperprior_coeffs
@@ -125,7 +128,11 @@ class AsDapper(ETKF):
         zeta = np.exp(brentq(slope, -10.0, np.log((n_members - 1) * c / epsilon) + 1e-9))
         root = (vt.T * (1 / np.sqrt(s**2 + zeta) - 1 / np.sqrt(zeta))) @ vt + np.eye(n_members) / np.sqrt(zeta)
         w = vt.T @ (s * along / (s**2 + zeta))
-        return Step(Weights(w, np.sqrt(n_members - 1) * root), np.nan)
+        ones = np.full((n_members, 1), n_members**-0.5)
+        q = np.linalg.qr(np.hstack([ones, draw("rotation", n_members - 1)])).Q  # the first column is ± ones
+        mixed = np.linalg.qr(draw("mixture", n_members)[1:, 1:])
+        turn = ones @ ones.T + q[:, 1:] @ (mixed.Q * np.sign(np.diag(mixed.R))) @ q[:, 1:].T
+        return Step(Weights(w, np.sqrt(n_members - 1) * turn @ root), np.nan)
 
 
 def draw(case: Case, cycles: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -164,7 +171,13 @@ def settings_of(case: Case, size: int, n: int) -> SequentialSettings:
         local = Localisation.on_line(places, np.arange(0.0, n, case.seen), radius, float(n), block_size=2)
     if case.noise:
         error = ModelError(np.where(moves, case.noise, 0.0), case.form)
-    return SequentialSettings(scheme, Inflation(case.inflation), rotation=True, localisation=local, model_error=error)
+    return SequentialSettings(
+        scheme,
+        Inflation(case.inflation),
+        rotation=not isinstance(scheme, AsDapper),
+        localisation=local,
+        model_error=error,
+    )
 
 
 def ours(case: Case, truth: np.ndarray, y: np.ndarray, mean: np.ndarray, seed: int) -> tuple[np.ndarray, float]:
