@@ -49,6 +49,10 @@ class Work(Generic[R]):
     dataset: Callable[[R, Mapping[str, Any]], xr.Dataset]
     summary: Callable[[R], str]
 
+    def again(self, executor: Executor) -> xr.Dataset:
+        """What its file holds, without attributes of the making."""
+        return self.dataset(self.conduct(executor, None, None), {})
+
 
 def run_cycles(config: TwinConfig | SequenceConfig, work: Work[R], force: bool, resume: bool, command: str) -> R:
     """Do the work in its run directory; arguments and errors as of :func:`en4dvar.run`."""
