@@ -80,6 +80,8 @@ def _sequence(run_dir: Path) -> xr.Dataset:
         raise OutputError(f"{run_dir}: written by an earlier version, without an evidence; run it again")
     if why := str(data.attrs["without_evidence"]):
         raise OutputError(f"{run_dir}: has no evidence to compare: {why}")
+    if not np.isfinite(data.attrs["log_evidence"]):
+        raise OutputError(f"{run_dir}: has no evidence to compare: its ensemble has lost the readings")
     return data
 
 

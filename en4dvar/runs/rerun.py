@@ -114,7 +114,8 @@ def _of_cycles(file: Path, workers: int | None, trust: bool, ask: Ask | None) ->
     recorded = read_cycles(file)
     config = _configuration(file, recorded.attrs, trust, ask)
     assert not isinstance(config, Config)
-    work = twin_work(config) if isinstance(config, TwinConfig) else sequence_work(config)
+    with of_strangers(file.parent, ask, trust):  # data may have weights by a function
+        work = twin_work(config) if isinstance(config, TwinConfig) else sequence_work(config)
     with make_executor(work.model, workers or 1) as executor:
         again = work.again(executor)
     variables, differ = differences({"": recorded}, {"": again})
