@@ -138,9 +138,11 @@ def log_evidence(gaps: Array, std: Array, correlation: Correlation | None) -> Ar
     ``gaps`` (B, N, p): (y − predictions) / ``std`` (B, p), NaN where nothing was observed.
     """
     _, n_members, p = gaps.shape
-    there = np.isfinite(gaps[:, 0])
-    mean = gaps.mean(axis=1)
-    d, s = np.where(there, mean, 0.0), np.where(there[:, None], gaps - mean[:, None], 0.0) / np.sqrt(n_members - 1)
+    there, d = np.isfinite(gaps[:, 0]), gaps.mean(axis=1)
+    s = gaps - d[:, None]
+    s /= np.sqrt(n_members - 1)
+    if not there.all():
+        d, s = np.where(there, d, 0.0), np.where(there[:, None], s, 0.0)
     log_norm = np.sum(np.where(there, np.log(std) + 0.5 * np.log(2 * np.pi), 0.0), axis=1)
     if correlation is not None:
         for k, among in enumerate(there):
