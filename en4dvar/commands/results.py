@@ -56,13 +56,20 @@ def compare(
     installed packages is run with --trust alone.
 
     The runs may be laws on the same data or different gels. Writes compare.html, a figure (PNG, PDF) and CSV tables.
+    Of sequences a table of their evidences is printed.
 
     \b
     Example:
       en4dvar compare runs/neo_hookean runs/quadratic
     """
     from en4dvar.report.compare import compare_runs, comparison_table, estimates_table
+    from en4dvar.storage.cycles_file import cycles_file
 
+    if any(map(cycles_file, run_dirs)):
+        from en4dvar.report.compare_cycles import compare_sequences, sequences_table
+
+        click.echo(sequences_table(compare_sequences(run_dirs)))
+        return
     comparison = compare_runs(run_dirs)
     if not (stored or comparison.incomparable):
         from en4dvar.runs.evidence_run import sampled_evidences
@@ -92,17 +99,29 @@ def compare(
 def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
     """Write a table of a run as CSV or LaTeX, in display units.
 
+    Of a sequence or a twin experiment --csv has the state in time, --latex the last analysis.
+
     \b
     Example:
       en4dvar export runs/quickstart --latex --out table.tex
     """
     from en4dvar.report.export import export_table, posterior_file
+    from en4dvar.storage.cycles_file import cycles_file
 
+    cycles = cycles_file(run_dir)
+    if kind == "netcdf" and cycles:
+        click.echo(f"{cycles} is netCDF as it is: xarray.open_dataset({str(cycles)!r}); nothing to export")
+        return
     if kind == "netcdf":
         path = posterior_file(run_dir)
         click.echo(f"{path} follows the ArviZ schema as it is: arviz.from_netcdf({str(path)!r}); nothing to export")
         return
-    text = export_table(run_dir, kind)  # type: ignore[arg-type]
+    if cycles:
+        from en4dvar.report.export_cycles import cycles_table
+
+        text = cycles_table(cycles, kind)  # type: ignore[arg-type]
+    else:
+        text = export_table(run_dir, kind)  # type: ignore[arg-type]
     refuse_to_replace(out, force)
     deliver(text, out, "table")
 
@@ -114,8 +133,9 @@ def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
 def rerun(run_dir: Path, workers: int | None, trust: bool) -> None:
     """Repeat a run from what its result files record, and compare to the last bit. Nothing is written.
 
-    Configuration, seed and observations are those in the files. Where a bit differs, or anything that decides them has
-    changed since (versions, sources, processor, data files), it is told; the exit code is 1 where a bit differs.
+    Configuration, seed and observations are those in the files; the data of a sequence are read again. Where a bit
+    differs, or anything that decides them has changed since (versions, sources, processor, data files), it is told;
+    the exit code is 1 where a bit differs.
     A law or model outside of the current folder and of installed packages is run after a question, or with --trust.
 
     \b

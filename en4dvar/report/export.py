@@ -127,7 +127,7 @@ def _one_set(rows: tuple[ParameterSummary, ...], notes: Notes) -> list[str]:
             (
                 latex_symbol(row),
                 latex_unit(row.unit) or "--",
-                _plus_minus(row.prior_mean, row.prior_std),
+                plus_minus(row.prior_mean, row.prior_std),
                 _estimate(row, notes),
                 _interval(row),
             )
@@ -135,7 +135,7 @@ def _one_set(rows: tuple[ParameterSummary, ...], notes: Notes) -> list[str]:
         for row in rows
     ]
     head = "parameter & unit & prior & posterior & 5--95\\,\\%"
-    return _tabular("llrrr", head, lines, notes)
+    return tabular("llrrr", head, lines, notes)
 
 
 def _many_sets(found: Sequence[Found], notes: Notes) -> list[str]:
@@ -150,10 +150,11 @@ def _many_sets(found: Sequence[Found], notes: Notes) -> list[str]:
         own = {row.name: row for row in rows}
         cells = [_estimate(own[n], notes) if n in own else "--" for n in names]
         lines.append(" & ".join([escaped(dataset), *cells]))
-    return _tabular("l" + "r" * len(names), head, lines, notes)
+    return tabular("l" + "r" * len(names), head, lines, notes)
 
 
-def _tabular(columns: str, head: str, lines: list[str], notes: Notes) -> list[str]:
+def tabular(columns: str, head: str, lines: list[str], notes: Notes) -> list[str]:
+    """The lines of a table and of the notes below it."""
     body = [f"  {line} \\\\" for line in lines]
     return [
         f"\\begin{{tabular}}{{{columns}}}", "  \\toprule", f"  {head} \\\\", "  \\midrule", *body,
@@ -163,7 +164,7 @@ def _tabular(columns: str, head: str, lines: list[str], notes: Notes) -> list[st
 
 def _estimate(row: ParameterSummary, notes: Notes) -> str:
     """Mean ± std, or the mean alone, or the interval of several modes, with the mark of its footnote."""
-    value = f"${_tex(plain_number(row.mean, 3))}$" if row.untrusted else _plus_minus(row.mean, row.std)
+    value = f"${_tex(plain_number(row.mean, 3))}$" if row.untrusted else plus_minus(row.mean, row.std)
     if row.modal:
         value = _interval(row)
     return f"{value}{notes.mark(row)}"
@@ -180,7 +181,8 @@ def _one_line(comment: str) -> str:
     return "".join(c if c.isprintable() else " " for c in comment)
 
 
-def _plus_minus(mean: float, std: float) -> str:
+def plus_minus(mean: float, std: float) -> str:
+    """In math mode, with the digits that the std calls for."""
     return f"${_tex(number_like(mean, std))} \\pm {_tex(number_like(std, std))}$"
 
 

@@ -119,16 +119,10 @@ def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 
 
     Raises :class:`OutputError`.
     """
+    from en4dvar.runs.cycles import report_cycles
+
     with RunDirectory.open(path, "report") as directory:
-        if (directory.work / "twin.nc").exists():
-            from en4dvar.runs.twin_run import report_twin
-
-            return report_twin(directory)
-        if (directory.work / "sequence.nc").exists():
-            from en4dvar.runs.sequence_run import report_sequence
-
-            return report_sequence(directory)
-        return _report(directory, datasets, workers)
+        return report_cycles(directory) or _report(directory, datasets, workers)
 
 
 def _require_one_usable(config: Config, files: Mapping[str, DataFile]) -> None:
