@@ -335,11 +335,11 @@ def entries(kind: str = "") -> Made:
         # what makes its own readings makes them to scale
         made = {READING_SCALE.name, READING_OFFSET.name} if kind else set()
         known |= {p.name: p for p in (*OF_READINGS, shift, offset) if p.name not in known.keys() | made}
-        possible = [p.name for p in model.optional_parameters if p.name not in known]
+        labels = {p.name: p.label for p in (*known.values(), *model.optional_parameters)}
         defaults: Mapping[str, float] = getattr(model, "defaults", {})
 
         def unknown(name: str) -> str:
-            return f"unknown parameter {shown(name)}{suggest(name, [*known, *possible])}"
+            return f"unknown parameter {shown(name)}{suggest(name, labels)}"
 
         found: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in defaults.items()}
         with Faults() as faults:

@@ -7,10 +7,13 @@ next run there finishes it, and commands that read say so and read nothing.
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Iterable, Iterator
+import shlex
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
@@ -34,6 +37,7 @@ FIXED = (
     "config.yaml", "config.resolved.yaml", "posterior.nc", "twin.nc", "run.log", "report.html", "summary.csv",
     "what_if.csv", "ledger.csv", "varying.csv", "joint.nc", "joint.csv", "joint.html",
 )  # fmt: skip
+ENDED = ("posterior.nc", "twin.nc", "sequence.nc", "joint.nc")  # the result, written as a run ends
 GIVEN = "data.csv"  # readings that a script handed over, written before its run begins
 Mode = Literal["new", "force", "resume", "report"]
 
@@ -168,9 +172,7 @@ def _prepare(path: Path, mode: Mode) -> Path:
     if mode == "resume" and others:
         raise OutputError(f"{path}: holds no run")
     if mode == "new" and (listed or others - {LISTING}):  # an empty list is of a run that was killed before it began
-        raise OutputError(
-            f"{path}: not empty; give --resume to continue its run, --force to replace it, or another --out"
-        )
+        raise OutputError(_occupied(path, listed))
     foreign = [name for name in FIXED if os.path.lexists(path / name) and name not in listed]
     if foreign:
         raise OutputError(f"{path}: {foreign[0]} was not written by a run and would be replaced; move it away")
@@ -183,6 +185,21 @@ def _prepare(path: Path, mode: Mode) -> Path:
         work.mkdir()
     write_list(work, ())
     return work
+
+
+def _occupied(path: Path, listed: Sequence[str]) -> str:
+    """What is in the directory, and what can be typed."""
+    beside = next(p for i in itertools.count(2) if not (p := path.with_name(f"{path.name}_{i}")).exists())
+    another = f"--out {shlex.quote(str(beside))} keeps both"
+    if not listed:
+        return f"{path}: not empty, and not of a run; {another}"
+    ended = next((path / name for name in ENDED if (path / name).is_file()), None)
+    if ended is None:
+        return f"{path}: not empty: an unfinished run; --resume continues it, --force replaces it, {another}"
+    when = datetime.fromtimestamp(ended.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
+    page = path / "report.html"
+    to_read = f", see {page}" if page.is_file() else ""
+    return f"{path}: not empty: a finished run of {when}{to_read}; --force replaces it, {another}"
 
 
 def _remove_if_empty(folder: Path) -> None:

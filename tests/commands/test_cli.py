@@ -156,6 +156,11 @@ def full_directory(folder: Path) -> list[str | Path]:
     return ["run", write_toy(folder), "--out", folder / "out"]
 
 
+def damaged(path: Path) -> Path:
+    path.write_bytes(b"MATLAB\x80\xff")
+    return path
+
+
 HEAD = "t_ms,x_um\n"
 BAD: dict[str, tuple[Callable[[Path], list[str | Path]], str]] = {
     "no configuration": (lambda f: ["run", f / "toi.yaml"], "toi.yaml: no such file"),
@@ -174,7 +179,10 @@ BAD: dict[str, tuple[Callable[[Path], list[str | Path]], str]] = {
     "few observations": (with_data(HEAD + "0,1\n1,1\n"), "toy.csv: 2 usable observations; at least 3"),
     "unknown law": (replaced("mass: 2 g", "law: cubik"), "toy.yaml:11:8: model.law: 'cubik' is not one of"),
     "no prior": (replaced("  A: {prior: normal, mean: maximum, std: 1 %}\n", ""), "toy.yaml:12:1: parameters.A: "),
-    "not empty": (full_directory, "out: not empty; give --resume to continue its run, --force to"),
+    "not empty": (full_directory, "out: not empty, and not of a run; --out "),
+    "data as configuration": (lambda f: ["run", damaged(f / "A.mat")], "A.mat' looks at the readings and proposes one"),
+    "readings as configuration": (lambda f: ["run", write_toy(f).with_suffix(".csv")], "toy.csv: a data file, not a"),
+    "a folder as configuration": (lambda f: ["run", f], "a folder, not a configuration; 'en4dvar init --data "),
     "unwritable": (lambda f: ["run", write_toy(f), "--out", f / "toy.csv" / "out"], "cannot be used as run directory"),
     "a file as directory": (lambda f: ["run", write_toy(f), "--out", f / "toy.csv"], "cannot be used as run directory"),
     "bad --set": (lambda f: ["run", write_toy(f), "--set", "members"], "'members' is not KEY=VALUE"),
