@@ -99,7 +99,7 @@ def cost(result: StoredResult) -> Figure:
 
 @styled
 def traces(result: StoredResult) -> Figure:
-    """Each parameter over the iterations: mean and middle 68 % of the ensemble the iterate describes, and its centre."""
+    """Each parameter over the iterations: mean and middle 68 % of the ensemble of the iterate, and its centre."""
     rows = result.summary()
     steps = result.iterations["iteration"].values
     figure, axes = panels(len(rows), COLUMN, 3.4 / 2.54)
