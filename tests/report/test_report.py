@@ -351,9 +351,12 @@ def test_unwritable_run_directory_is_one_clear_error(run_dir):
 
 def test_no_band_of_a_positive_quantity_is_negative(analysis):
     result = Result.from_analysis(analysis, {})
-    spread = np.random.default_rng(1).lognormal(sigma=3, size=result.iterations["G"].shape)
-    result.tree["iterations"]["G"] = ("iteration", "draw"), spread, result.iterations["G"].attrs
+    members = result.iterations["G"]
+    spread = np.random.default_rng(1).lognormal(sigma=3, size=members.shape)
+    result.tree["iterations"]["G"] = members.copy(data=spread)
     (band,) = traces(result).axes[0].collections
     assert (spread.mean(axis=1) < spread.std(axis=1)).all()
     assert band.get_paths()[0].vertices[:, 1].min() > 0
+    readings = result.observed_data["R"]
+    result.tree["observed_data"]["R"] = readings.copy(data=readings.values - 0.99 * readings.values.min())
     assert history(result).axes[0].get_ylim()[0] == 0
