@@ -37,7 +37,6 @@ FIXED = (
     "config.yaml", "config.resolved.yaml", "posterior.nc", "twin.nc", "run.log", "report.html", "summary.csv",
     "what_if.csv", "ledger.csv", "varying.csv", "joint.nc", "joint.csv", "joint.html",
 )  # fmt: skip
-ENDED = ("posterior.nc", "twin.nc", "sequence.nc", "joint.nc")  # the result, written as a run ends
 GIVEN = "data.csv"  # readings that a script handed over, written before its run begins
 Mode = Literal["new", "force", "resume", "report"]
 
@@ -193,10 +192,11 @@ def _occupied(path: Path, listed: Sequence[str]) -> str:
     another = f"--out {shlex.quote(str(beside))} keeps both"
     if not listed:
         return f"{path}: not empty, and not of a run; {another}"
-    ended = next((path / name for name in ENDED if (path / name).is_file()), None)
-    if ended is None:
-        return f"{path}: not empty: an unfinished run; --resume continues it, --force replaces it, {another}"
-    when = datetime.fromtimestamp(ended.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
+    results = [path / name for name in listed if "/" not in name and name.endswith(".nc")]  # written as a run ends
+    ended = [file.stat().st_mtime for file in results if file.is_file()]
+    if not ended or (path / NEXT / LISTING).exists():
+        return f"{path}: not empty: a run; --resume continues it if it has not ended, --force replaces it, {another}"
+    when = datetime.fromtimestamp(max(ended)).strftime("%Y-%m-%d %H:%M")
     page = path / "report.html"
     to_read = f", see {page}" if page.is_file() else ""
     return f"{path}: not empty: a finished run of {when}{to_read}; --force replaces it, {another}"

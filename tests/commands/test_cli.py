@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -261,3 +262,14 @@ def test_many_warnings_are_told_before_notes(tmp_path: Path, capsys: pytest.Capt
     assert lines[-1] == "and 50 more warnings and notes; see run.log"
     _tell(Campaign(tmp_path, outcomes[:1]), with_report=False)
     assert [line.split(":")[0] for line in capsys.readouterr().err.splitlines()] == ["warning", "note"]
+
+
+def test_a_run_that_is_there_is_named_with_what_to_type(tmp_path: Path) -> None:
+    arguments = ["run", write_toy(tmp_path), "--out", tmp_path / "out", "--no-report"]
+    assert call(*arguments).exit_code == 0
+    again = call(*arguments)
+    assert again.exit_code == 2
+    assert f"a finished run of {datetime.now():%Y-}" in again.stderr
+    assert f"--force replaces it, --out {tmp_path / 'out_2'} keeps both" in again.stderr
+    (tmp_path / "out" / "posterior.nc").unlink()
+    assert "a run; --resume continues it if it has not ended" in call(*arguments).stderr
