@@ -334,13 +334,13 @@ def entries(kind: str = "") -> Made:
         known = {p.name: p for p in model.parameters}
         of_readings = {p.name: p for p in (*OF_READINGS, shift, offset) if p.name not in known}  # a model's own first
         known |= {} if kind else of_readings
-        possible = [p.name for p in model.optional_parameters if p.name not in known]
+        labels = {p.name: p.label for p in (*known.values(), *model.optional_parameters)}
         defaults: Mapping[str, float] = getattr(model, "defaults", {})
 
         def unknown(name: str) -> str:
             if kind and name in of_readings:
                 return f"{kind} makes its own readings: keys of their own say when and with which errors"
-            return f"unknown parameter {shown(name)}{suggest(name, [*known, *possible])}"
+            return f"unknown parameter {shown(name)}{suggest(name, labels)}"
 
         found: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in defaults.items()}
         with Faults() as faults:

@@ -142,8 +142,8 @@ def unfinished(analysis: Analysis) -> checks.Findings:
     """Iterations that stopped before their own criterion; a note where the next step would have been short, or members
     were drawn from the posterior itself afterwards, and nothing where no user would see it.
 
-    Draws and chains warn of themselves where they are too few, or find a lower J. A gradient regressed over the ensemble
-    need not vanish where J is smallest, so that variant often ends like this.
+    Draws and chains warn of themselves where they are too few, or find a lower J. A gradient regressed over the
+    ensemble need not vanish where J is smallest, so that variant often ends like this.
     """
     step_norm = analysis.iterations[-1].step_norm  # of the next step, had there been one
     if analysis.converged or step_norm <= UNSEEN:
