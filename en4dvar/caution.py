@@ -71,8 +71,8 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
 }
 TRIGGERS = {
     "not-converged": (
-        "the iterations stopped before their criterion was met; a note where the next step would have been at most"
-        " half a posterior standard deviation"
+        "the iterations stopped before their criterion was met; a note where the next step would have been at most "
+        "half a posterior standard deviation, or the members were drawn from the posterior itself afterwards"
     ),
     "chain-not-converged": "the Markov chains disagree, or have too few independent samples",
     "prior-conflict": "the minimum of J lies further from the prior mean than one prior in two thousand would",
