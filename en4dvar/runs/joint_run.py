@@ -15,7 +15,6 @@ from en4dvar.executor import Executor, choose_executor
 from en4dvar.files import make_folder
 from en4dvar.joint.estimate import Single, estimate_jointly
 from en4dvar.joint.problem import JointProblem, sharing
-from en4dvar.report.joint import write_joint
 from en4dvar.runs.finished import Finished, carried, finished, finished_set
 from en4dvar.runs.trust import Ask
 from en4dvar.runs.worklist import Worklist
@@ -56,6 +55,8 @@ def join(
     with choose_executor(first.model, None, workers) as executor:
         path = _save(joint, sets, first, executor, attributes, make_folder(out) / FILE, tell)
     stored = load_joint(path)
+    from en4dvar.report.joint import write_joint  # with matplotlib, which a run without a page does not need
+
     return stored, write_joint(stored, out)
 
 

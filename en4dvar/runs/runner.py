@@ -14,8 +14,7 @@ from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.executor import Executor, choose_executor, one_blas_thread
 from en4dvar.files import write_text
 from en4dvar.inputs.asked import DataFile
-from en4dvar.report import TABLES, write_pages
-from en4dvar.report.joint import PAGE_FILES, write_joint
+from en4dvar.report import JOINT_FILES, TABLES, write_pages
 from en4dvar.report.result import Result
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
 from en4dvar.runs.interrupt import terminate_as_interrupt
@@ -112,10 +111,10 @@ def run_campaign(
     return Campaign(config.directory, work.outcomes(), tuple(run.notices))
 
 
-def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 1) -> Path:
+def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
     """Write (again) the report of a run from its netCDF; ``datasets`` of a campaign get a page in any case.
 
-    ``workers``: processes that draw it.
+    ``workers``: processes that draw it. ``figures``: also keep those of ``datasets``, or of all pages, as PDF and PNG.
 
     Raises :class:`OutputError`.
     """
@@ -123,12 +122,12 @@ def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 
         if (directory.work / "twin.nc").exists():
             from en4dvar.runs.twin_run import report_twin
 
-            return report_twin(directory)
+            return report_twin(directory, figures)
         if (directory.work / "sequence.nc").exists():
             from en4dvar.runs.sequence_run import report_sequence
 
-            return report_sequence(directory)
-        return _report(directory, datasets, workers)
+            return report_sequence(directory, figures)
+        return _report(directory, datasets, workers, figures)
 
 
 def _require_one_usable(config: Config, files: Mapping[str, DataFile]) -> None:
@@ -180,19 +179,21 @@ def _finish(work: Worklist, report_workers: int) -> None:
         attributes = {**work.run.attributes, "identity": work.run.identity.settings}
         save_campaign(directory.at("posterior.nc"), good, longest, attributes, failures)
     if good and work.config.report:
-        _report(directory, workers=report_workers)
+        _report(directory, workers=report_workers, figures=work.config.figures)
     else:
         rows = ((name, work.ended[name].summary, work.ended[name].warnings) for name in good)
         write_text(directory.claim("summary.csv"), summary_csv(rows, failures))
 
 
-def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int = 1) -> Path:
+def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
     directory.claim("report.html", "summary.csv", *TABLES)
     if (directory.work / FILE).exists():
-        directory.claim(*PAGE_FILES)
+        from en4dvar.report.joint import write_joint  # with matplotlib, whose import takes longer than a page
+
+        directory.claim(*JOINT_FILES)
         write_joint(load_joint(directory.work / FILE), directory.work)
     with directory.claiming("figures", "pages"):
-        return write_pages(directory.work, datasets, workers)
+        return write_pages(directory.work, datasets, workers, figures)
 
 
 def _loaded(config: Config | str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None) -> Config:

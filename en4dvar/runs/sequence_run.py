@@ -65,17 +65,17 @@ def run_sequence(
             dataset(result, attributes).to_netcdf(partial, engine="netcdf4", format="NETCDF4")
         write_text(directory.at("summary.csv"), summary_csv(result))
         if config.report:
-            report_sequence(directory)
+            report_sequence(directory, config.figures)
     return result
 
 
-def report_sequence(directory: RunDirectory) -> Path:
-    """Write the figures and the page of a finished sequence. Raises :class:`OutputError`."""
+def report_sequence(directory: RunDirectory, figures: bool = False) -> Path:
+    """Write the page of a finished sequence, on demand its figures as files too. Raises :class:`OutputError`."""
     from en4dvar.report.sequence import write_sequence_report
 
     directory.claim("report.html")
     with directory.claiming("figures"):
-        return write_sequence_report(directory.work)
+        return write_sequence_report(directory.work, figures)
 
 
 def estimates_table(result: SeriesResult) -> str:

@@ -51,17 +51,17 @@ def run_twin(
             dataset(result, attributes).to_netcdf(partial, engine="netcdf4", format="NETCDF4")
         write_text(directory.at("summary.csv"), summary_csv(result))
         if config.report:
-            report_twin(directory)
+            report_twin(directory, config.figures)
     return result
 
 
-def report_twin(directory: RunDirectory) -> Path:
-    """Write the figures and the page of a finished twin experiment. Raises :class:`OutputError`."""
+def report_twin(directory: RunDirectory, figures: bool = False) -> Path:
+    """Write the page of a finished twin experiment, on demand its figures as files too. Raises :class:`OutputError`."""
     from en4dvar.report.twin import write_twin_report
 
     directory.claim("report.html")
     with directory.claiming("figures"):
-        return write_twin_report(directory.work)
+        return write_twin_report(directory.work, figures)
 
 
 def _conduct(config: TwinConfig, run: Session, on_cycle: Callable[[int], None] | None) -> TwinResult:
