@@ -42,6 +42,11 @@ class Mark:
     label: str = ""
 
     @property
+    def stroke(self) -> float:
+        """Width of the pen: of rings and ticks it is thin, whatever their ``size``."""
+        return {"rings": 0.9, "ticks": 0.5, "dashes": 1.0}.get(self.kind, self.size)
+
+    @property
     def heights(self) -> Array:
         """What the panel must be high enough for."""
         return np.concatenate([self.y, self.top])

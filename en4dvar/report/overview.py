@@ -19,6 +19,7 @@ from en4dvar.storage.store import StoredResult
 from en4dvar.summary import ParameterSummary
 
 NAMED = 40  # data sets whose names fit below a figure
+LISTED = 2000  # data sets in the table: a browser shows as many at once
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ def render_overview(
     ``joint``: address of the page of a joint estimate. ``pages``: stem of a data set → address of its page, for those
     that have one; ``failures``: name of a data set without a posterior → reason.
     """
+    listed = set(map(id, sorted(sets, key=lambda s: -s.gravity)[:LISTED]))
     return render(
         "campaign.html.j2",
         sortable=True,
@@ -79,6 +81,7 @@ def render_overview(
         parameters=[_parameter(name, sets) for name in _parameters(sets)],
         failures=failures,
         sets=sets,
+        listed=[one for one in sets if id(one) in listed],
         pages=pages,
         joint=joint,
         without_page=sum(1 for one in sets if one.stem not in pages),

@@ -78,6 +78,6 @@ def _mark(ax: Axes, mark: Mark) -> None:
     elif mark.kind == "span":
         ax.axhspan(mark.y[0], mark.top[0], lw=0, **how)
     else:
-        edge = {"rings": 0.9, "ticks": 0.5, "dashes": 1.0}.get(mark.kind, 0.0)
+        edge = 0.0 if mark.kind == "dots" else mark.stroke
         look: dict[str, Any] = {"mew": edge, "mfc": "none"} if mark.kind == "rings" else {"mew": edge}
         ax.plot(mark.x, mark.y, MARKERS[mark.kind], ms=mark.size, rasterized=many, **look, **how)

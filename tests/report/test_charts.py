@@ -11,7 +11,9 @@ import pytest
 
 from en4dvar.report.chart import Chart, Panel, Row, steps
 from en4dvar.report.paper import on_paper
-from en4dvar.report.svg import SHOWN, numbers, powers, svg, ticks
+from en4dvar.report.paths import SHOWN
+from en4dvar.report.svg import svg
+from en4dvar.report.ticks import numbers, powers, ticks
 
 
 def drawn(panel, height=100.0):

@@ -26,7 +26,7 @@ from en4dvar.prior import Prior
 from en4dvar.report import write_pages
 from en4dvar.report.drawing import draw
 from en4dvar.report.figures import all_figures
-from en4dvar.report.overview import SetSummary, overview_figures, render_overview
+from en4dvar.report.overview import LISTED, SetSummary, overview_figures, render_overview
 from en4dvar.report.page import judge_chi2
 from en4dvar.report.result import Result
 from en4dvar.storage.provenance import provenance
@@ -280,10 +280,13 @@ def test_the_page_of_a_process_that_dies_is_drawn_here(campaign_dir, tmp_path, m
 
 def test_overview_of_many_data_sets_stays_small(analysis):
     one = SetSummary.of(Result.from_analysis(analysis, provenance("name: test\n")), "set")
-    sets = [replace(one, name=f"set {i:04d}", stem=f"set_{i:04d}") for i in range(2000)]
+    sets = [replace(one, name=f"set {i:04d}", stem=f"set_{i:04d}", cautions=()) for i in range(20_000)]
+    sets[7_777] = replace(sets[7_777], cautions=one.cautions)
     html = render_overview(sets, {}, {}, draw(overview_figures(sets)))
     assert len(html.encode()) < 3e6
-    assert html.count("<tr>") == 2001
+    assert html.count("<tr>") == LISTED + 1
+    assert "<td>set 7777</td>" in html
+    assert "Of 20000 data sets the 2000 with the gravest warnings are listed" in html
 
 
 @pytest.mark.slow
