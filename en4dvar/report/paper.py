@@ -26,6 +26,8 @@ def on_paper(chart: Chart) -> Figure:
     for i, row in enumerate(chart.rows):
         each = columns // len(row.panels)
         for j, panel in enumerate(row.panels):
+            if panel.bare and not panel.words:
+                continue
             _panel(figure.add_subplot(grid[i, j * each : (j + 1) * each]), panel)
     figure.align_labels()
     return figure

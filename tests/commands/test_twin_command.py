@@ -95,6 +95,7 @@ def test_report_again_from_the_file(finished):
     again = call("report", directory, "--figures")
     assert again.exit_code == 0, again.output
     assert (directory / "figures" / "scores.png").stat().st_size > 10_000
+    assert call("report", directory).exit_code == 0
     damaged = (directory / "twin.nc").read_bytes()
     (directory / "twin.nc").write_bytes(damaged.replace(b"analysis", b"analisys", 1))
     refused = call("report", directory)
