@@ -28,7 +28,7 @@ from en4dvar.summary import summary_csv
 from en4dvar.tables import csv_text
 
 PAGES = 40  # data sets of a campaign with a page from the start
-SHARE = 4  # pages that are worth the start of a process
+SHARE = 20  # pages that are worth the start of a process
 TABLES = {"what_if.csv": SHIFT_COLUMNS, "ledger.csv": ENTRY_COLUMNS, "varying.csv": PIECE_COLUMNS}
 JOINT_FILES = ("joint.html", "joint.csv")  # of a joint estimate
 
@@ -55,15 +55,17 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
         _write_tables(run_dir, [_lines(result)])
         figures = draw(all_figures(result), IDENTIFIERS, inside(run_dir, "figures") if files else None)
         return write_text(run_dir / "report.html", render_set(result, figures, copies=files))
-    sets, lines = [], []
+    sets, lines, held = [], [], {}
     for path in stored:
         result = load_stored(path)
         sets.append(SetSummary.of(result, path.stem))
+        if len(stored) <= PAGES:  # to read one takes as long as to draw it
+            held[path.stem] = result
         lines.append(_lines(result))
     _write_tables(run_dir, lines)
     failures = failed_datasets(whole)
     write_text(run_dir / "summary.csv", summary_csv(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
-    return _write_campaign(run_dir, sets, failures, _asked(run_dir, sets, datasets), workers, files)
+    return _write_campaign(run_dir, sets, failures, _asked(run_dir, sets, datasets), workers, files, held)
 
 
 def _lines(result: StoredResult) -> tuple[Lines, ...]:
@@ -90,19 +92,19 @@ def _asked(run_dir: Path, sets: Sequence[SetSummary], names: Sequence[str]) -> f
 
 def _write_campaign(
     run_dir: Path, sets: Sequence[SetSummary], failures: Mapping[str, str], asked: frozenset[str], workers: int,
-    files: bool,
+    files: bool, held: Mapping[str, StoredResult],
 ) -> Path:  # fmt: skip
     folder = make_folder(inside(run_dir, "pages"))
     first = {s.stem for s in sorted(sets, key=lambda s: -s.gravity)[:PAGES]}
     paged = [s for s in sets if s.stem in asked | first or (folder / f"{s.stem}.html").is_file()]
-    calls: list[tuple[Path, str, str | None, list[tuple[str, str]]]] = []
+    workers = min(workers, len(paged) // SHARE)
+    calls: list[tuple[Path, str, str | None, list[tuple[str, str]], StoredResult | None]] = []
     for before, one, after in zip([None, *paged[:-1]], paged, [*paged[1:], None], strict=True):
         neighbours = (("← ", before), ("→ ", after))
         trail = [("All data sets", "../report.html")]
         trail += [(f"{arrow}{s.name}", quote(f"{s.stem}.html")) for arrow, s in neighbours if s is not None]
         copies = f"{one.stem}_" if files and (one.stem in asked or not asked) else None
-        calls.append((run_dir, one.stem, copies, trail))
-    workers = min(workers, len(calls) // SHARE)
+        calls.append((run_dir, one.stem, copies, trail, held.get(one.stem) if workers <= 1 else None))
     with ProcessesExecutor(workers) if workers > 1 else SerialExecutor() as executor:
         for i, value in executor.map(_write_page, calls):
             if isinstance(value, WorkerLostError):
@@ -115,9 +117,13 @@ def _write_campaign(
     return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures, joint))
 
 
-def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:
-    """The page of one data set of a campaign; ``copies``: prefix of its figures as PDF and PNG, None for none."""
-    result = load_stored(run_dir / "datasets" / f"{stem}.nc")
+def _write_page(
+    run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]], held: StoredResult | None
+) -> None:
+    """The page of one data set of a campaign; ``copies``: prefix of its figures as PDF and PNG, None for none;
+    ``held``: what is stored, where it has been read.
+    """
+    result = held or load_stored(run_dir / "datasets" / f"{stem}.nc")
     folder = None if copies is None else inside(run_dir, "figures")
     figures = draw(all_figures(result), IDENTIFIERS, folder, copies or "")
     write_text(inside(run_dir, f"pages/{stem}.html"), render_set(result, figures, trail, copies is not None))
