@@ -8,7 +8,7 @@ from itertools import product
 from math import prod
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from en4dvar.config.context import Context, Made, quantity, time_unit
 from en4dvar.config.schema import QuantityText, Section, section_of
@@ -53,6 +53,8 @@ _SampleSizes: Any = section_of(SampleSizes)
 
 class Design(_SampleSizes):
     """Which experiments ``en4dvar design`` compares, and about what."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
     about: tuple[str, ...] = ()
     """Parameters that are asked for; the others are uncertain all the same. Default: all that have a prior."""

@@ -47,6 +47,8 @@ def join(
     RefusedError: code of a stranger, see :func:`~en4dvar.runs.rerun.rerun`. OutputError: there is no result, or it is
         damaged. ConfigError: the data sets cannot share these parameters. TooFewMembersError: the ensemble is lost.
     """
+    from en4dvar.report.joint import write_joint  # what draws pages is slow to import
+
     first, sets = finished(run_dirs, trust, ask)
     if not names and not any(one.groups for one in sets):
         raise ConfigError("nothing is shared: give --share NAME, or 'shared:' in the configurations of the runs")
@@ -55,8 +57,6 @@ def join(
     with choose_executor(first.model, None, workers) as executor:
         path = _save(joint, sets, first, executor, attributes, make_folder(out) / FILE, tell)
     stored = load_joint(path)
-    from en4dvar.report.joint import write_joint  # with matplotlib, which a run without a page does not need
-
     return stored, write_joint(stored, out)
 
 

@@ -129,7 +129,7 @@ def test_a_page_imports_no_matplotlib(analysis, tmp_path):
     from en4dvar.storage.store import save
 
     save(Result.from_analysis(analysis, provenance("name: test\n")), tmp_path / "posterior.nc")
-    script = "import sys; from en4dvar.runs.runner import write_pages; write_pages(sys.argv[1]); "
+    script = "import sys; from en4dvar.report import write_pages; write_pages(sys.argv[1]); "
     script += "sys.exit('matplotlib' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", script, tmp_path], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
