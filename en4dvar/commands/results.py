@@ -23,21 +23,22 @@ MOST_ROWS = 60  # of estimates on the terminal
 
 @click.command()
 @click.argument("run_dir", type=click.Path(path_type=Path))
-@click.option("--dataset", "datasets", multiple=True, metavar="NAME", help="A page and figures for this data set, too.")
-def report(run_dir: Path, datasets: tuple[str, ...]) -> None:
-    """Write the report and figures of a finished run again, from its netCDF files.
+@click.option("--dataset", "datasets", multiple=True, metavar="NAME", help="A page for this data set, too.")
+@click.option("--figures", is_flag=True, help="Also keep figures as PDF and PNG: of these data sets, or of all pages.")
+def report(run_dir: Path, datasets: tuple[str, ...], figures: bool) -> None:
+    """Write the report of a finished run again, from its netCDF files.
 
     In a campaign of many data sets only those with the gravest warnings have a page of their own; --dataset (any
-    number of times) adds one, with its figures as PDF and PNG.
+    number of times) adds one.
 
     \b
     Example:
-      en4dvar report runs/quickstart
+      en4dvar report runs/quickstart --figures
     """
     from en4dvar.executor import available_cores
     from en4dvar.runs.runner import write_report
 
-    click.echo(f"report: {write_report(run_dir, datasets, available_cores())}")
+    click.echo(f"report: {write_report(run_dir, datasets, available_cores(), figures)}")
 
 
 @click.command()

@@ -93,6 +93,7 @@ class Config:
     weights: Literal["sum", "mean", "balanced"]
     execution: Execution
     report: bool
+    figures: bool
     directory: Path
     simulate_times: Array | None
     resolved: str
@@ -150,6 +151,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
         weights=file.assimilation.weights,
         execution=file.execution,
         report=file.output.report,
+        figures=file.output.figures,
         directory=file.output.directory or Path("runs") / file.name,
         simulate_times=file.simulate.times if file.simulate else None,
         resolved=read.resolved(file.parameters),

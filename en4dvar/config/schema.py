@@ -107,7 +107,9 @@ class Output(Section):
     directory: Path | None = None
     """Run directory; default runs/<name>, relative to the current directory."""
     report: bool = True
-    """Write the figures and report.html."""
+    """Write report.html."""
+    figures: bool = False
+    """Also keep the figures of the report as PDF and PNG, in figures/."""
 
 
 class File(Section):

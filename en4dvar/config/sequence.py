@@ -108,6 +108,7 @@ class SequenceConfig:
     execution: Workers
     directory: Path
     report: bool
+    figures: bool
     resolved: str
 
     @property
@@ -149,6 +150,7 @@ def resolve_sequence(document: Document, base: Path, model: ForwardModel | None 
         execution=file.execution,
         directory=file.output.directory or Path("runs") / file.name,
         report=file.output.report,
+        figures=file.output.figures,
         resolved=read.resolved(file.parameters),
     )
 

@@ -12,10 +12,11 @@ from en4dvar.state import Parameter
 
 GREEK = (
     "alpha|beta|gamma|delta|epsilon|varepsilon|zeta|eta|theta|vartheta|iota|kappa|lambda|mu|nu|xi|pi|rho|sigma|tau|"
-    "upsilon|phi|varphi|chi|psi|omega|Gamma|Delta|Theta|Lambda|Xi|Pi|Sigma|Phi|Psi|Omega"
+    "upsilon|phi|varphi|chi|psi|omega|Gamma|Delta|Theta|Lambda|Xi|Pi|Sigma|Phi|Psi|Omega|infty|ell"
 )
 _LETTER = rf"(?:[A-Za-z0-9]|\\(?:{GREEK})(?![A-Za-z]))"
-_SIMPLE = re.compile(rf"[^$\\]*|\${_LETTER}(?:[_^](?:{_LETTER}|\{{[\w, ]+\}}))?\$", re.ASCII)
+_ATOM = rf"(?:{_LETTER}(?:[_^](?:{_LETTER}|\{{[\w, ]+\}}|\{{\\mathrm\{{\w+\}}\}}))?|\\dot\{{[A-Za-z]\}}|[|/()+=,-])"
+_SIMPLE = re.compile(rf"[^$\\]*|\${_ATOM}+\$", re.ASCII)
 
 
 def check_symbols(things: Iterable[Parameter | Observable]) -> None:

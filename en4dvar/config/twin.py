@@ -114,6 +114,7 @@ class TwinConfig:
     execution: Workers
     directory: Path
     report: bool
+    figures: bool
     resolved: str
 
     @property
@@ -163,5 +164,6 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
         execution=file.execution,
         directory=file.output.directory or Path("runs") / file.name,
         report=file.output.report,
+        figures=file.output.figures,
         resolved=read.resolved(()),
     )

@@ -1,4 +1,4 @@
-"""A run directory's netCDF → figures (PDF and PNG), ``summary.csv`` and self-contained HTML pages.
+"""A run directory's netCDF → ``summary.csv``, self-contained HTML pages and, on demand, figures as PDF and PNG.
 
 Nothing is recomputed: whatever is shown was stored by the run. One data set is one page, ``report.html``. A campaign's
 ``report.html`` is its table, with a page for each data set beside it in ``pages/``; of more than :data:`PAGES` sets
@@ -15,12 +15,11 @@ from en4dvar.errors import OutputError
 from en4dvar.executor import ProcessesExecutor, SerialExecutor, WorkerLostError
 from en4dvar.files import inside, make_folder, write_text
 from en4dvar.hints import suggest
+from en4dvar.report.drawing import draw
 from en4dvar.report.figures import all_figures
-from en4dvar.report.joint import PAGE_FILES
 from en4dvar.report.overview import SetSummary, overview_figures, render_overview
 from en4dvar.report.page import IDENTIFIERS, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, Lines, response_lines
-from en4dvar.report.style import draw
 from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
 from en4dvar.storage.campaign_file import failed_datasets
 from en4dvar.storage.joint_file import FILE
@@ -29,17 +28,18 @@ from en4dvar.summary import summary_csv
 from en4dvar.tables import csv_text
 
 PAGES = 40  # data sets of a campaign with a page from the start
-SHARE = 4  # pages that are worth the start of a process
+SHARE = 20  # pages that are worth the start of a process
 TABLES = {"what_if.csv": SHIFT_COLUMNS, "ledger.csv": ENTRY_COLUMNS, "varying.csv": PIECE_COLUMNS}
-COPIES = 12  # data sets of a campaign up to which figures are also kept as PDF and PNG
+JOINT_FILES = ("joint.html", "joint.csv")  # of a joint estimate
 
 
-def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int = 1) -> Path:
+def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int = 1, files: bool = False) -> Path:
     """Write the report of a run and return the path of ``report.html``.
 
     Reads ``datasets/*.nc`` where the run has several data sets, else ``posterior.nc``. ``datasets`` are names of data
-    sets of a campaign: their pages, with figures as PDF and PNG, are written and the overview links to them. Pages of a
-    campaign are drawn by up to ``workers`` processes, each with its share of :data:`SHARE` or more.
+    sets of a campaign: their pages are written and the overview links to them. ``files``: figures are also kept as PDF
+    and PNG, in a campaign of ``datasets`` or, where none is named, of all that have a page. Pages of a campaign are
+    drawn by up to ``workers`` processes, each with its share of :data:`SHARE` or more.
 
     Raises
     ------
@@ -48,22 +48,24 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     run_dir = Path(run_dir)
     if not run_dir.is_dir():
         raise OutputError(f"{run_dir}: no such run directory")
-    files, whole = result_files(run_dir), run_dir / "posterior.nc"
-    if files == [whole]:
+    stored, whole = result_files(run_dir), run_dir / "posterior.nc"
+    if stored == [whole]:
         result = load_stored(whole)
         write_text(run_dir / "summary.csv", summary_csv([(result.name, result.summary(), result.cautions)], {}))
         _write_tables(run_dir, [_lines(result)])
-        figures = draw(all_figures(result), inside(run_dir, "figures"), identifiers=IDENTIFIERS)
-        return write_text(run_dir / "report.html", render_set(result, figures))
-    sets, lines = [], []
-    for path in files:
+        figures = draw(all_figures(result), IDENTIFIERS, inside(run_dir, "figures") if files else None)
+        return write_text(run_dir / "report.html", render_set(result, figures, copies=files))
+    sets, lines, held = [], [], {}
+    for path in stored:
         result = load_stored(path)
         sets.append(SetSummary.of(result, path.stem))
+        if len(stored) <= PAGES:  # to read one takes as long as to draw it
+            held[path.stem] = result
         lines.append(_lines(result))
     _write_tables(run_dir, lines)
     failures = failed_datasets(whole)
     write_text(run_dir / "summary.csv", summary_csv(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
-    return _write_campaign(run_dir, sets, failures, _asked(run_dir, sets, datasets), workers)
+    return _write_campaign(run_dir, sets, failures, _asked(run_dir, sets, datasets), workers, files, held)
 
 
 def _lines(result: StoredResult) -> tuple[Lines, ...]:
@@ -89,34 +91,39 @@ def _asked(run_dir: Path, sets: Sequence[SetSummary], names: Sequence[str]) -> f
 
 
 def _write_campaign(
-    run_dir: Path, sets: Sequence[SetSummary], failures: Mapping[str, str], asked: frozenset[str], workers: int
-) -> Path:
+    run_dir: Path, sets: Sequence[SetSummary], failures: Mapping[str, str], asked: frozenset[str], workers: int,
+    files: bool, held: Mapping[str, StoredResult],
+) -> Path:  # fmt: skip
     folder = make_folder(inside(run_dir, "pages"))
     first = {s.stem for s in sorted(sets, key=lambda s: -s.gravity)[:PAGES]}
     paged = [s for s in sets if s.stem in asked | first or (folder / f"{s.stem}.html").is_file()]
-    calls: list[tuple[Path, str, str | None, list[tuple[str, str]]]] = []
+    workers = min(workers, len(paged) // SHARE)
+    calls: list[tuple[Path, str, str | None, list[tuple[str, str]], StoredResult | None]] = []
     for before, one, after in zip([None, *paged[:-1]], paged, [*paged[1:], None], strict=True):
         neighbours = (("← ", before), ("→ ", after))
         trail = [("All data sets", "../report.html")]
         trail += [(f"{arrow}{s.name}", quote(f"{s.stem}.html")) for arrow, s in neighbours if s is not None]
-        copies = f"{one.stem}_" if len(sets) <= COPIES or one.stem in asked else None
-        calls.append((run_dir, one.stem, copies, trail))
-    workers = min(workers, len(calls) // SHARE)
+        copies = f"{one.stem}_" if files and (one.stem in asked or not asked) else None
+        calls.append((run_dir, one.stem, copies, trail, held.get(one.stem) if workers <= 1 else None))
     with ProcessesExecutor(workers) if workers > 1 else SerialExecutor() as executor:
         for i, value in executor.map(_write_page, calls):
             if isinstance(value, WorkerLostError):
                 _write_page(*calls[i])
             elif isinstance(value, Exception):
                 raise value
-    figures = draw(overview_figures(sets), inside(run_dir, "figures"))
-    joint = PAGE_FILES[0] if (run_dir / FILE).exists() else ""
+    figures = draw(overview_figures(sets), folder=inside(run_dir, "figures") if files else None)
+    joint = JOINT_FILES[0] if (run_dir / FILE).exists() else ""
     pages = {s.stem: quote(f"pages/{s.stem}.html") for s in paged}
     return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures, joint))
 
 
-def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:
-    """The page of one data set of a campaign; ``copies``: prefix of its figures as PDF and PNG, None for none."""
-    result = load_stored(run_dir / "datasets" / f"{stem}.nc")
+def _write_page(
+    run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]], held: StoredResult | None
+) -> None:
+    """The page of one data set of a campaign; ``copies``: prefix of its figures as PDF and PNG, None for none;
+    ``held``: what is stored, where it has been read.
+    """
+    result = held or load_stored(run_dir / "datasets" / f"{stem}.nc")
     folder = None if copies is None else inside(run_dir, "figures")
-    figures = draw(all_figures(result), folder, copies or "", IDENTIFIERS)
+    figures = draw(all_figures(result), IDENTIFIERS, folder, copies or "")
     write_text(inside(run_dir, f"pages/{stem}.html"), render_set(result, figures, trail, copies is not None))

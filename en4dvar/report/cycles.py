@@ -12,9 +12,10 @@ from matplotlib.figure import Figure
 from scipy.stats import binom
 
 from en4dvar.files import inside, write_text
+from en4dvar.report.drawing import Captioned, draw
 from en4dvar.report.html import render
 from en4dvar.report.page import provenance_rows
-from en4dvar.report.style import COLUMN, LIGHT, Captioned, draw, styled
+from en4dvar.report.style import COLUMN, LIGHT, styled
 from en4dvar.report.text import with_unit
 
 Table = tuple[str, Sequence[str], Sequence[Sequence[str]], str]  # heading, columns, rows, words below it
@@ -34,8 +35,9 @@ def write_cycles_page(
     facts: Sequence[tuple[str, str, str]],
     tables: Sequence[Table],
     figures: Iterable[Captioned],
+    files: bool,
 ) -> Path:
-    """Write figures (PDF and PNG) and ``report.html``; returns the path of the page."""
+    """Write ``report.html``, with ``files`` also figures as PDF and PNG; returns the path of the page."""
     a = data.attrs
     page = render(
         "cycles.html.j2",
@@ -45,7 +47,8 @@ def write_cycles_page(
         what=what,
         facts=facts,
         tables=tables,
-        figures=draw(figures, inside(run_dir, "figures")),
+        figures=draw(figures, folder=inside(run_dir, "figures") if files else None),
+        copies=files,
         warnings=_lines(a.get("warnings", "")),
         lost=_lines(a["members_lost_why"]),
         provenance=provenance_rows(a),

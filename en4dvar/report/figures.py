@@ -1,17 +1,16 @@
-"""The figures of a report: pure functions from a stored result to a figure in display units, 8.5 cm wide."""
+"""The figures of a report: pure functions from a stored result to a chart in display units, 8.5 cm wide."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
-from en4dvar.report import fields, readings, varying
-from en4dvar.report.history import MANY, history
-from en4dvar.report.style import COLUMN, LIGHT, PAGE, Captioned, panels, scaled_histogram, styled
+from en4dvar.report import readings, varying
+from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row, in_columns
+from en4dvar.report.drawing import Captioned
+from en4dvar.report.history import history
 from en4dvar.report.text import estimate, pretty_unit, shown, with_unit
 from en4dvar.state import Array
 from en4dvar.storage.store import StoredResult
@@ -19,123 +18,101 @@ from en4dvar.storage.store import StoredResult
 MAX_PAIRS = 6
 
 
-@styled
-def histograms(result: StoredResult) -> Figure:
+def histograms(result: StoredResult) -> Chart:
     """Posterior over prior, one panel a parameter scaled to its peak. Bar: 5–95 %, ticks: members, line: centre."""
-    rows = result.summary()
-    figure, axes = panels(len(rows), COLUMN, 3.6 / 2.54)
-    for ax, row in zip(axes, rows, strict=True):
+    panels = []
+    for row in result.summary():
         prior, posterior = result.members("prior", row.name), result.members("posterior", row.name)
-        scaled_histogram(ax, prior, LIGHT["prior"], alpha=0.35)
-        scaled_histogram(ax, posterior, LIGHT["posterior"], alpha=0.6)
-        marks = ax.plot(posterior, np.full(posterior.shape, -0.06), "|", color=LIGHT["posterior"], ms=3, mew=0.5)
-        marks[0].set_rasterized(len(posterior) > MANY)
-        if not row.untrusted:
-            ax.plot([row.q05, row.q95], [1.07, 1.07], color=LIGHT["posterior"], lw=2, solid_capstyle="butt")
-        ax.axvline(row.centre, ymax=0.85, color=LIGHT["centre"], lw=0.9, ls="--")
-        ax.set(yticks=[], ylim=(-0.14, 1.2), xlabel=with_unit(row.symbol, row.unit), xlim=_reach(prior, posterior))
         value, doubt = f"{estimate(row, '')} {pretty_unit(row.unit)}".rstrip(), " (?)" if row.untrusted else ""
-        ax.set_title(f"{value}{doubt}", color=LIGHT["posterior"])
-        ax.spines["left"].set_visible(False)
-        ax.xaxis.set_major_locator(MaxNLocator(4))
-    return figure
+        panel = Panel(
+            with_unit(row.symbol, row.unit), title=f"{value}{doubt}", title_colour="posterior", xticks=4, yticks=(),
+            left=False, xlim=_reach(prior, posterior), ylim=(-0.14, 1.2),
+        )  # fmt: skip
+        panel.histogram(prior, "prior", alpha=0.35)
+        panel.histogram(posterior, "posterior", alpha=0.6)
+        panel.dots(posterior, np.full(posterior.shape, -0.06), "posterior", 3.0, kind="ticks")
+        if not row.untrusted:
+            panel.line([row.q05, row.q95], [1.07, 1.07], "posterior", 2.0)
+        panel.upright(row.centre, "centre", dash="--")
+        panels.append(panel)
+    return in_columns(panels, 3.6 * POINTS)
 
 
-@styled
-def residuals(result: StoredResult) -> Figure:
+def residuals(result: StoredResult) -> Chart:
     """Whitened residuals in time, their autocorrelation, normal quantiles, leverages; the discrepancy if any."""
-    name, stats = result.observable, result.sample_stats
     time, label = readings.times(result), readings.time_label(result)
     white, studentised, leverage = (
         result.of_readings("sample_stats", key) for key in ("whitened_residual", "studentised", "leverage")
     )
     counts = np.isfinite(white)
-    discrepant = f"{name}_discrepancy" in stats
-    figure = Figure(figsize=(COLUMN, (13.0 if discrepant else 10.0) / 2.54), layout="constrained")
-    grid = figure.add_gridspec(3 if discrepant else 2, 3)
-    top, below = figure.add_subplot(grid[0, :]), grid.nrows - 1
-    top.axhline(0, color=LIGHT["muted"], lw=0.6)
+    top = Panel(label, "whitened residual", legend=len(result.axes) > 1)
+    top.rule(0)
     for axis, (series, colour) in zip(result.axes, readings.each_series(result), strict=True):
         chosen = series[counts[series]]
         if f"{axis.name}_place" not in result.observed_data:
-            top.plot(time[chosen], white[chosen], "-", color=LIGHT["muted"], lw=0.5)
-        top.plot(time[chosen], white[chosen], "o", ms=2.2, color=colour)
-    top.set(xlabel=label, ylabel="whitened residual")
-    readings.name_series(top, result)
-    if discrepant:
-        _discrepancy(figure.add_subplot(grid[1, :]), result, time, label)
-    _autocorrelation(figure.add_subplot(grid[below, 0]), white[counts])
-    _quantiles(figure.add_subplot(grid[below, 1]), studentised[counts])
-    ax = figure.add_subplot(grid[below, 2])
+            top.line(time[chosen], white[chosen], "muted", 0.5)
+        top.dots(time[chosen], white[chosen], colour, label=axis.name)
+    rows = [Row(5.0 * POINTS, [top])]
+    if f"{result.observable}_discrepancy" in result.sample_stats:
+        rows.append(Row(4.4 * POINTS, [_discrepancy(result, time, label)]))
+    levers = Panel(label, "leverage", xticks=3, ylim=(0.0, 1.05 * float(np.nanmax(leverage, initial=1e-3))))
     for series, colour in readings.each_series(result, "posterior"):
         chosen = series[counts[series]]
-        ax.vlines(time[chosen], 0, leverage[chosen], color=colour, lw=0.9)
-    ax.set(xlabel=label, ylabel="leverage", ylim=(0, None))
-    return figure
+        levers.bars(time[chosen], 0, leverage[chosen], colour, 0.9)
+    below = [_autocorrelation(white[counts]), _quantiles(studentised[counts]), levers]
+    return Chart([*rows, Row(5.0 * POINTS, below)])
 
 
-@styled
-def cost(result: StoredResult) -> Figure:
+def cost(result: StoredResult) -> Chart:
     """J and its two terms over the iterations; logarithmic where J falls by more than a factor of 20."""
     steps = result.iterations["iteration"].values
-    figure = Figure(figsize=(COLUMN, 5.4 / 2.54), layout="constrained")
-    ax = figure.subplots()
-    lines = (
-        ("J", "$J$", "ink", "o-"),
-        ("J_observation", "$J_o$ observations", "posterior", "s--"),
-        ("J_background", "$J_b$ background", "background", "^:"),
-    )
-    for key, label, colour, marker in lines:
-        ax.plot(steps, result.iterations[key].values, marker, ms=3, color=LIGHT[colour], label=label)
     total = result.iterations["J"].values
-    if total.min() > 0 and total.max() > 20 * total.min():
-        ax.set_yscale("log", nonpositive="mask")
-    ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-    ax.set(xlabel="iteration", ylabel="cost")
-    ax.grid(axis="y", lw=0.5)
-    ax.legend()
-    return figure
+    steep = bool(total.min() > 0 and total.max() > 20 * total.min())
+    panel = Panel("iteration", "cost", xticks=6, whole=True, logarithmic=steep, grid=True, legend=True)
+    lines = (
+        ("J", "$J$", "ink", ""),
+        ("J_observation", "$J_o$ observations", "posterior", "--"),
+        ("J_background", "$J_b$ background", "background", ":"),
+    )
+    for key, label, colour, dash in lines:
+        panel.line(steps, result.iterations[key].values, colour, dash=dash, label=label)
+        panel.dots(steps, result.iterations[key].values, colour, 3.0, label=label)
+    return Chart([Row(5.4 * POINTS, [panel])])
 
 
-@styled
-def traces(result: StoredResult) -> Figure:
+def traces(result: StoredResult) -> Chart:
     """Each parameter over the iterations: mean and middle 68 % of the ensemble of the iterate, and its centre."""
-    rows = result.summary()
     steps = result.iterations["iteration"].values
-    figure, axes = panels(len(rows), COLUMN, 3.4 / 2.54)
-    for ax, row in zip(axes, rows, strict=True):
+    panels = []
+    for row in result.summary():
+        panel = Panel("iteration", with_unit(row.symbol, row.unit), whole=True, yticks=4)
         members, centre = (shown(result.iterations[key]) for key in (row.name, f"{row.name}_centre"))
         alive = np.isfinite(members).all(axis=0)
         if alive.sum() > 1:
             low, high = np.quantile(members[:, alive], (0.16, 0.84), axis=1)  # of what is positive, positive
-            ax.fill_between(steps, low, high, color=LIGHT["posterior"], alpha=0.3, lw=0)
-            ax.plot(steps, members[:, alive].mean(axis=1), color=LIGHT["posterior"])
-        ax.plot(steps, centre, "--", color=LIGHT["centre"], lw=0.9)
-        ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-        ax.yaxis.set_major_locator(MaxNLocator(4))
-        ax.set(xlabel="iteration", ylabel=with_unit(row.symbol, row.unit))
-    return figure
+            panel.band(steps, low, high, "posterior", 0.3)
+            panel.line(steps, members[:, alive].mean(axis=1), "posterior")
+        panel.line(steps, centre, "centre", 0.9, "--")
+        panels.append(panel)
+    return in_columns(panels, 3.4 * POINTS)
 
 
-@styled
-def pairs(result: StoredResult) -> Figure:
+def pairs(result: StoredResult) -> Chart:
     """Posterior members of every pair of parameters; above the diagonal their correlation."""
     rows = result.summary()
-    n = len(rows)
+    side = max(COLUMN, min(PAGE, len(rows) * 2.7 * POINTS))
     values = {row.name: result.members("posterior", row.name) for row in rows}
-    side = max(COLUMN, min(PAGE, n * 2.7 / 2.54))
-    figure = Figure(figsize=(side, side), layout="constrained")
-    grid = figure.subplots(n, n, squeeze=False)
+    lines = []
     for i, row in enumerate(rows):
-        for j, column in enumerate(rows):
-            _pair(grid[i, j], i, j, values[column.name], values[row.name])
-            if i == n - 1:
-                grid[i, j].set_xlabel(with_unit(column.symbol, column.unit))
-            if j == 0 and i > 0:
-                grid[i, j].set_ylabel(with_unit(row.symbol, row.unit))
-            grid[i, j].tick_params(labelbottom=i == n - 1, labelleft=j == 0 and i > 0)
-    figure.align_labels()
-    return figure
+        panels = [_pair(i, j, values[column.name], values[row.name]) for j, column in enumerate(rows)]
+        panels[0].ylabel = with_unit(row.symbol, row.unit) if i else ""
+        for panel, column in zip(panels, rows, strict=True):
+            panel.x_numbers, panel.xlabel = i == len(rows) - 1, with_unit(column.symbol, column.unit)
+            panel.xlabel = panel.xlabel if panel.x_numbers else ""
+        for panel in panels[1:]:
+            panel.y_numbers = False
+        lines.append(Row(side / len(rows), panels))
+    return Chart(lines, side)
 
 
 def all_figures(result: StoredResult) -> Iterator[Captioned]:
@@ -148,7 +125,9 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
             "where it is not to be trusted; ticks: members; dashed: the centre, where J is smallest.",
             histograms(result),
         )
-    if fields.stored_fields(result)[1]:
+    if "fields" in result.tree.children:
+        from en4dvar.report import fields  # with matplotlib, whose import takes longer than all charts
+
         yield "fields", fields.CAPTION, fields.maps(result)
     yield (
         "history",
@@ -185,59 +164,59 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
         yield "pairs", "Posterior members in pairs of parameters; above the diagonal the correlation.", pairs(result)
 
 
-def _discrepancy(ax: Axes, result: StoredResult, time: Array, label: str) -> None:
+def _discrepancy(result: StoredResult, time: Array, label: str) -> Panel:
     """Data less the centre, and mean ± std of what the model misses."""
     name, stats = result.observable, result.sample_stats
     residual = shown(result.observed_data[name]) - shown(stats[f"{name}_centre"])
     mean, std = shown(stats[f"{name}_discrepancy"]), shown(stats[f"{name}_discrepancy_std"])
-    ax.axhline(0, color=LIGHT["muted"], lw=0.6)
-    ax.fill_between(time, mean - std, mean + std, color=LIGHT["posterior"], alpha=0.35, lw=0, label="discrepancy ± std")
-    ax.plot(time, residual, "o", ms=2.2, color=LIGHT["ink"], label="data − centre")
-    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
-    ax.set(xlabel=label, ylabel=with_unit("residual", str(stats[f"{name}_discrepancy"].attrs["display_units"])))
+    unit = str(stats[f"{name}_discrepancy"].attrs["display_units"])
+    panel = Panel(label, with_unit("residual", unit), legend=True)
+    panel.rule(0)
+    panel.band(time, mean - std, mean + std, "posterior", 0.35, "discrepancy ± std")
+    panel.dots(time, residual, "ink", label="data − centre")
+    return panel
 
 
-def _autocorrelation(ax: Axes, white: Array) -> None:
+def _autocorrelation(white: Array) -> Panel:
     lags = max(1, min(15, len(white) // 3))
     correlation = [float(white[lag:] @ white[:-lag]) / float(white @ white) for lag in range(1, lags + 1)]
-    limit = 1.96 / np.sqrt(len(white))
-    ax.axhspan(-limit, limit, color=LIGHT["posterior"], alpha=0.16, lw=0)
-    ax.axhline(0, color=LIGHT["muted"], lw=0.6)
-    ax.vlines(np.arange(1, lags + 1), 0, correlation, color=LIGHT["ink"], lw=1.2)
-    ax.xaxis.set_major_locator(MaxNLocator(4, integer=True))
-    ax.set(xlabel="lag", ylabel="autocorrelation", ylim=(min(-0.6, *correlation), max(1.0, *correlation)))
+    limit = 1.96 / math.sqrt(len(white))
+    ylim = min(-0.6, *correlation), max(1.0, *correlation)
+    panel = Panel("lag", "autocorrelation", xticks=4, whole=True, ylim=ylim)
+    panel.span(-limit, limit, "posterior", 0.16)
+    panel.rule(0)
+    panel.bars(np.arange(1, lags + 1), 0, correlation, "ink", 1.2)
+    return panel
 
 
-def _quantiles(ax: Axes, values: Array) -> None:
+def _quantiles(values: Array) -> Panel:
     from scipy.special import ndtri
 
     expected = ndtri((np.arange(len(values)) + 0.5) / len(values))
     reach = float(np.max(np.abs(expected))) * 1.1
-    ax.plot([-reach, reach], [-reach, reach], color=LIGHT["muted"], lw=0.6)
-    ax.plot(expected, np.sort(values), "o", ms=2, color=LIGHT["ink"])
-    ax.set(xlabel="normal quantile", ylabel="residual / std")
+    panel = Panel("normal quantile", "residual / std", xticks=4)
+    panel.line([-reach, reach], [-reach, reach], "muted", 0.6)
+    panel.dots(expected, np.sort(values), "ink", 2.0)
+    return panel
 
 
-def _reach(prior: Array, posterior: Array) -> tuple[float | None, float | None]:
+def _reach(prior: Array, posterior: Array) -> tuple[float, float] | None:
     """Limits that hold the posterior and 90 % of the prior: a long tail of the prior does not flatten the picture."""
     ends = [*np.quantile(prior, (0.05, 0.95)), *posterior] if prior.size else list(posterior)
-    low, high = (min(ends), max(ends)) if ends else (0.0, 0.0)
+    low, high = (float(min(ends)), float(max(ends))) if ends else (0.0, 0.0)
     margin = 0.05 * (high - low)
-    return (low - margin, high + margin) if margin > 0 else (None, None)
+    return (low - margin, high + margin) if margin > 0 else None
 
 
-def _pair(ax: Axes, i: int, j: int, x: Array, y: Array) -> None:
-    ax.xaxis.set_major_locator(MaxNLocator(2))
-    ax.yaxis.set_major_locator(MaxNLocator(3))
+def _pair(i: int, j: int, x: Array, y: Array) -> Panel:
+    panel = Panel(xticks=2, yticks=3)
     if i == j:
-        scaled_histogram(ax, x, LIGHT["posterior"], alpha=0.6)
-        ax.set_yticks([])
-        ax.spines["left"].set_visible(False)
+        panel.histogram(x, "posterior", alpha=0.6)
+        panel.yticks, panel.left = (), False
     elif i > j:
-        ax.plot(x, y, "o", ms=2, color=LIGHT["posterior"], alpha=0.7, mew=0, rasterized=len(x) > MANY)
+        panel.dots(x, y, "posterior", 2.0, alpha=0.7)
     else:
-        ax.set_axis_off()
         known = np.ptp(x) > 0 and np.ptp(y) > 0
-        correlation = float(np.corrcoef(x, y)[0, 1]) if known else float("nan")
-        text = f"{correlation:+.2f}".replace("-", "−") if known else "–"
-        ax.text(0.5, 0.5, text, ha="center", va="center", transform=ax.transAxes)
+        correlation = float(np.corrcoef(x, y)[0, 1]) if known else math.nan
+        panel.bare, panel.words = True, f"{correlation:+.2f}".replace("-", "−") if known else "–"
+    return panel

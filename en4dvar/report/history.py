@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
-from en4dvar.report.style import COLUMN, LIGHT, styled
+from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.text import shown, with_unit
 from en4dvar.state import Array
 from en4dvar.storage.axes import Axis
 from en4dvar.storage.store import StoredResult
 
-MANY = 5000  # marks: beyond, they are drawn as pixels, for a vector each would make a page of many megabytes
+MANY = 5000  # readings: beyond, their bars are one band
 FEW = 150  # readings whose marks are large
 
 
@@ -64,74 +61,64 @@ class SeriesShown:
         label = with_unit(label, attrs["display_units"])
         return cls(axis, x, x_label, data, std, shown(result.sample_stats[f"{name}_centre"]), label)
 
+    @property
+    def size(self) -> float:
+        """Of a dot."""
+        return 2.2 if len(self.x) <= FEW else 1.2
 
-@styled
-def history(result: StoredResult) -> Figure:
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Limits along x."""
+        first, last = float(self.x.min()), float(self.x.max())
+        span = (last - first) or max(abs(first), 1.0)
+        return first - 0.03 * span, last + 0.03 * span
+
+
+def history(result: StoredResult) -> Chart:
     """Data ± std, prior and posterior predictive bands (50 and 90 %), the centre; below, residuals over their std."""
-    axes = result.axes
-    height = 9.5 if len(axes) == 1 else 7.0 * len(axes)
-    figure = Figure(figsize=(COLUMN, height / 2.54), layout="constrained")
-    if len(axes) == 1:
-        top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
-        _pair(top, bottom, result, SeriesShown.of(result, axes[0]))
-        _legend(top)
-        return figure
-    for i, (part, axis) in enumerate(zip(figure.subfigures(len(axes), 1, squeeze=False).ravel(), axes, strict=True)):
-        top, bottom = part.subplots(2, 1, sharex=True, height_ratios=[3, 1])
-        _pair(top, bottom, result, SeriesShown.of(result, axis))
-        top.set_title(axis.name, loc="left", fontsize=8)
-        if i == 0:
-            handles, labels = top.get_legend_handles_labels()
-            figure.legend(handles, labels, loc="outside upper center", ncols=3, columnspacing=1.2, handlelength=1.4)
-    return figure
+    several = len(result.axes) > 1
+    high, low = (5.0, 2.3) if several else (6.8, 2.7)
+    rows = []
+    for i, axis in enumerate(result.axes):
+        one = SeriesShown.of(result, axis)
+        top = Panel(
+            ylabel=one.label, title=axis.name if several else "", xlim=one.reach, ylim=_data_range(one.data, one.std),
+            x_numbers=False, legend=i == 0,
+        )  # fmt: skip
+        _data(top, result, one)
+        rows += [Row(high * POINTS, [top]), Row(low * POINTS, [_residuals(one)])]
+    return Chart(rows)
 
 
-def _legend(top: Axes) -> None:
-    top.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, columnspacing=1.2, handlelength=1.4)
-
-
-def _pair(top: Axes, bottom: Axes, result: StoredResult, one: SeriesShown) -> None:
-    """Data and predictions above, residuals below."""
+def _data(panel: Panel, result: StoredResult, one: SeriesShown) -> None:
+    """Data and predictions."""
     curve = f"{one.axis.name}_path" in result.dataset("prior_predictive")
     for band in BANDS:
-        (_along if curve else _bars)(top, result, one, band)
-    size, many = 2.2 if len(one.x) <= FEW else 1.2, len(one.x) > MANY
-    if many:  # one path instead of a bar for each, and pixels below the centre
-        edges = one.data - one.std, one.data + one.std
-        filled = top.fill_between(one.x, *edges, color=LIGHT["ink"], alpha=0.3, lw=0, label="data ± std")
-        filled.set_rasterized(True)
-        top.plot(one.x, one.data, ",", alpha=0.3, color=LIGHT["ink"], zorder=1.5, rasterized=True)
-    else:
-        top.errorbar(
-            one.x, one.data, one.std, fmt="o", ms=size, lw=0.6, color=LIGHT["ink"], label="data ± std", zorder=4
-        )
+        (_along if curve else _bars)(panel, result, one, band)
     if curve:
-        top.plot(one.x, one.centre, lw=0.9, color=LIGHT["centre"], label="centre", zorder=3, rasterized=many)
+        panel.line(one.x, one.centre, "centre", 0.9, label="centre")
     else:
-        top.plot(one.x, one.centre, "_", ms=5, color=LIGHT["centre"], label="centre", zorder=5)
-    top.set_ylabel(one.label)
-    top.set_ylim(_data_range(one.data, one.std))
-    _residuals(bottom, one, size, many)
+        panel.dots(one.x, one.centre, "centre", 5.0, label="centre", kind="dashes")
+    if len(one.x) > MANY:  # one outline instead of a bar for each
+        panel.band(one.x, one.data - one.std, one.data + one.std, "ink", 0.3, "data ± std")
+    else:
+        panel.bars(one.x, one.data - one.std, one.data + one.std, "ink", 0.6, label="data ± std")
+    panel.dots(one.x, one.data, "ink", one.size, label="data ± std")
 
 
-def _residuals(ax: Axes, one: SeriesShown, size: float, many: bool) -> None:
+def _residuals(one: SeriesShown) -> Panel:
     residual = (one.data - one.centre) / one.std
-    for limit, alpha in ((2, 0.12), (1, 0.16)):
-        ax.axhspan(-limit, limit, color=LIGHT["posterior"], alpha=alpha, lw=0)
-    ax.axhline(0, color=LIGHT["muted"], lw=0.6)
-    ax.plot(one.x, residual, "," if many else "o", ms=size, color=LIGHT["ink"], rasterized=many)
     reach = 1.15 * max(3.0, float(np.max(np.abs(residual))))
-    first, last = float(one.x.min()), float(one.x.max())
-    span = (last - first) or max(abs(first), 1.0)
-    ax.set(ylim=(-reach, reach), ylabel="residual / std", xlim=(first - 0.03 * span, last + 0.03 * span))
-    if reach < 8:
-        ax.set_yticks([-2, 0, 2])
-    else:
-        ax.yaxis.set_major_locator(MaxNLocator(4))
-    ax.set_xlabel(one.x_label)
+    panel = Panel(one.x_label, "residual / std", xlim=one.reach, ylim=(-reach, reach))
+    panel.yticks = (-2, 0, 2) if reach < 8 else 4
+    for limit, alpha in ((2, 0.12), (1, 0.16)):
+        panel.span(-limit, limit, "posterior", alpha)
+    panel.rule(0)
+    panel.dots(one.x, residual, "ink", one.size)
+    return panel
 
 
-def _along(ax: Axes, result: StoredResult, one: SeriesShown, band: Band) -> None:
+def _along(panel: Panel, result: StoredResult, one: SeriesShown, band: Band) -> None:
     """Quantiles of the members along the path."""
     held = result.dataset(band.group)
     values = shown(held[f"{one.axis.name}_path"][0])
@@ -139,19 +126,17 @@ def _along(ax: Axes, result: StoredResult, one: SeriesShown, band: Band) -> None
     if not seen.any():
         return
     low, high = np.nanquantile(values[:, seen], band.levels, axis=0)
-    time = shown(held["path_time"])[seen]
-    ax.fill_between(time, low, high, color=LIGHT[band.colour], alpha=band.alpha, lw=0, label=band.label)
+    panel.band(shown(held["path_time"])[seen], low, high, band.colour, band.alpha, band.label)
 
 
-def _bars(ax: Axes, result: StoredResult, one: SeriesShown, band: Band) -> None:
+def _bars(panel: Panel, result: StoredResult, one: SeriesShown, band: Band) -> None:
     """Quantiles of the members at each reading of a field."""
     values = shown(result.dataset(band.group)[one.axis.name][0])
     alive = np.isfinite(values).all(axis=1)
     if not alive.any():
         return
     low, high = np.quantile(values[alive], band.levels, axis=0)
-    width = 4 if len(one.x) <= FEW else 2
-    ax.vlines(one.x, low, high, color=LIGHT[band.colour], alpha=band.alpha, lw=width, label=band.label)
+    panel.bars(one.x, low, high, band.colour, 4.0 if len(one.x) <= FEW else 2.0, band.alpha, band.label)
 
 
 def _data_range(data: Array, std: Array) -> tuple[float, float]:

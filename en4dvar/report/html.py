@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from en4dvar.report import responses, text
-from en4dvar.report.style import DARK, LIGHT, css_variables
+from en4dvar.report.palette import DARK, LIGHT, css_variables
 
 WRITERS = (  # what templates call
     text.estimate, text.fixed, text.number_like, text.percent, text.plain_number, text.plus_minus,
@@ -21,13 +21,13 @@ WRITERS = (  # what templates call
 )  # fmt: skip
 
 
-def render(template: str, *, sortable: bool = False, **content: Any) -> str:
-    """The page of a template as text. ``sortable``: with the script that sorts tables.
+def render(template: str, *, sortable: bool = False, charts: bool = False, **content: Any) -> str:
+    """The page of a template as text. ``sortable``: with the script that sorts tables; ``charts``: that of charts.
 
-    A content security policy forbids the page every address and every script but that one: what escaping might miss
+    A content security policy forbids the page every address and every script but these: what escaping might miss
     would still not run.
     """
-    script = _text("table.js") if sortable else ""
+    script = "".join(_text(name) for name, asked in (("table.js", sortable), ("chart.js", charts)) if asked)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
     return _environment().get_template(template).render(policy=policy, style=_style(), script=Markup(script), **content)

@@ -19,7 +19,6 @@ from en4dvar.storage.joint_file import QUANTILES, StoredGroups, StoredJoint
 from en4dvar.tables import csv_text, table
 from en4dvar.units import convert
 
-PAGE_FILES = ("joint.html", "joint.csv")
 MOST_FITS = 12  # panels of the figure
 CAPTION = "Median and 5–95 % of what is shared, as each data set has it alone (grey) and as all have it together."
 FITS = "Observations and 5–95 % of the joint posterior's predictions."

@@ -9,16 +9,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from en4dvar.caution import Caution, codes, gravity, worst_first
+from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row
+from en4dvar.report.drawing import Captioned, Drawing
 from en4dvar.report.html import render
-from en4dvar.report.style import COLUMN, LIGHT, PAGE, Captioned, Drawing, styled
 from en4dvar.report.text import figure_text, number_like, pretty_unit, symbol_html, with_unit
 from en4dvar.storage.store import StoredResult
 from en4dvar.summary import ParameterSummary
 
 NAMED = 40  # data sets whose names fit below a figure
+LISTED = 2000  # data sets in the table: a browser shows as many at once
 
 
 @dataclass(frozen=True)
@@ -69,15 +70,18 @@ def render_overview(
     ``joint``: address of the page of a joint estimate. ``pages``: stem of a data set → address of its page, for those
     that have one; ``failures``: name of a data set without a posterior → reason.
     """
+    listed = set(map(id, sorted(sets, key=lambda s: -s.gravity)[:LISTED]))
     return render(
         "campaign.html.j2",
         sortable=True,
+        charts=True,
         title=f"{len(sets)} data sets",
         created=sets[0].about.get("date_created", ""),
         configuration=sets[0].about.get("configuration", ""),
         parameters=[_parameter(name, sets) for name in _parameters(sets)],
         failures=failures,
         sets=sets,
+        listed=[one for one in sets if id(one) in listed],
         pages=pages,
         joint=joint,
         without_page=sum(1 for one in sets if one.stem not in pages),
@@ -87,41 +91,41 @@ def render_overview(
     )
 
 
-@styled
-def estimates(sets: Sequence[SetSummary]) -> Figure:
+def estimates(sets: Sequence[SetSummary]) -> Chart:
     """Mean and 5–95 % of every data set, one panel a parameter; with many data sets sorted by the mean, as a band."""
-    names = _parameters(sets)
-    few = len(sets) <= NAMED
-    width = PAGE if few else COLUMN
-    figure = Figure(figsize=(width, len(names) * 3.0 / 2.54 + (2.0 / 2.54 if few else 0)), layout="constrained")
-    panels = figure.subplots(len(names), 1, squeeze=False, sharex=few).ravel()
-    for ax, name in zip(panels, names, strict=True):
-        x = np.array([i for i, one in enumerate(sets) if name in one.rows])
-        rows = [sets[i].rows[name] for i in x]
-        mean, low, high = (np.array([getattr(row, key) for row in rows]) for key in ("middle", "q05", "q95"))
-        trusted = np.array([not row.untrusted for row in rows], dtype=bool)
-        low, high = (np.where(trusted, bound, np.nan) for bound in (low, high))
-        prior = rows[0].prior_mean + np.array([-1.0, 1.0]) * rows[0].prior_std
-        ax.axhspan(*prior, color=LIGHT["prior"], alpha=0.2, lw=0)
-        if few:
-            ax.vlines(x, low, high, color=LIGHT["posterior"], lw=1.4, alpha=0.6)
-            ax.plot(x, mean, "o", ms=3, color=LIGHT["posterior"])
-            ax.plot(x[~trusted], mean[~trusted], "o", ms=5.5, mfc="none", mew=0.9, color=LIGHT["centre"])
-        else:
-            order = np.argsort(mean)
-            ax.fill_between(np.arange(len(order)), low[order], high[order], color=LIGHT["posterior"], alpha=0.3, lw=0)
-            ax.plot(np.arange(len(order)), mean[order], color=LIGHT["posterior"], lw=0.9)
-            ax.set_xticks([])
-            ax.set_xlabel(f"{len(order)} data sets, sorted")
-        reach = [v for values in (mean, low, high) for v in values[np.isfinite(values)]]
-        if reach and max(reach) > min(reach):
-            margin = 0.08 * (max(reach) - min(reach))
-            ax.set_ylim(min(reach) - margin, max(reach) + margin)
-        ax.set_ylabel(with_unit(rows[0].symbol, rows[0].unit))
+    names, few = _parameters(sets), len(sets) <= NAMED
+    panels = [_estimates(name, sets, few) for name in names]
+    rows = [Row(3.0 * POINTS, [panel]) for panel in panels]
     if few:
-        panels[-1].set_xlim(-0.6, len(sets) - 0.4)
-        panels[-1].set_xticks(range(len(sets)), [figure_text(one.name) for one in sets], rotation=90)
-    return figure
+        labels = [figure_text(one.name) for one in sets]
+        panels[-1].x_numbers, panels[-1].names = True, labels
+        rows[-1] = Row((3.0 + 0.14 * max(map(len, labels))) * POINTS, [panels[-1]])
+    return Chart(rows, PAGE if few else COLUMN)
+
+
+def _estimates(name: str, sets: Sequence[SetSummary], few: bool) -> Panel:
+    x = np.array([i for i, one in enumerate(sets) if name in one.rows])
+    rows = [sets[i].rows[name] for i in x]
+    mean, low, high = (np.array([getattr(row, key) for row in rows]) for key in ("middle", "q05", "q95"))
+    trusted = np.array([not row.untrusted for row in rows], dtype=bool)
+    low, high = (np.where(trusted, bound, np.nan) for bound in (low, high))
+    panel = Panel(ylabel=with_unit(rows[0].symbol, rows[0].unit), yticks=4, x_numbers=False)
+    panel.span(rows[0].prior_mean - rows[0].prior_std, rows[0].prior_mean + rows[0].prior_std, "prior", 0.2)
+    if few:
+        panel.xlim, panel.xticks = (-0.6, len(sets) - 0.4), range(len(sets))
+        panel.bars(x, low, high, "posterior", 1.4, 0.6)
+        panel.dots(x, mean, "posterior", 3.0)
+        panel.dots(x[~trusted], mean[~trusted], "centre", 5.5, kind="rings")
+    else:
+        order, ranks = np.argsort(mean), np.arange(len(mean))
+        panel.xlabel, panel.xticks = f"{len(order)} data sets, sorted", ()
+        panel.band(ranks, low[order], high[order], "posterior", 0.3)
+        panel.line(ranks, mean[order], "posterior", 0.9)
+    reach = [v for values in (mean, low, high) for v in values[np.isfinite(values)]]
+    if reach and max(reach) > min(reach):
+        margin = 0.08 * (max(reach) - min(reach))
+        panel.ylim = float(min(reach) - margin), float(max(reach) + margin)
+    return panel
 
 
 def overview_figures(sets: Sequence[SetSummary]) -> list[Captioned]:

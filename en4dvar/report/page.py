@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from en4dvar.diagnostics import chi2_interval
+from en4dvar.report.drawing import Drawing
 from en4dvar.report.html import render
 from en4dvar.report.readings import reading_words
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
-from en4dvar.report.style import Drawing
 from en4dvar.report.text import number_like, plain_number
 from en4dvar.report.varying import stored_walks, verdict
 from en4dvar.storage.groups import ITERATION_SCALARS, SHARES
@@ -39,6 +39,7 @@ def render_set(
     attributes, reasons = result.attributes, result.sample_stats["failure_reason"].values.ravel()
     return render(
         "set.html.j2",
+        charts=True,
         title=result.name,
         trail=trail,
         copies=copies,

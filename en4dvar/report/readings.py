@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from en4dvar.influence import UNKNOWN
-from en4dvar.report.style import COLUMN, LIGHT, styled
+from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.text import fixed, plain_number, pretty_unit, shown, signed, symbol_html, with_unit
 from en4dvar.state import Array
 from en4dvar.storage.store import StoredResult
@@ -46,46 +44,37 @@ def each_series(result: StoredResult, alone: str = "ink") -> list[tuple[npt.NDAr
     sizes = [len(result.observed_data[axis.name]) for axis in result.axes]
     parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
     names = [alone] if len(parts) == 1 else [COLOURS[i % len(COLOURS)] for i in range(len(parts))]
-    return [(part, LIGHT[name]) for part, name in zip(parts, names, strict=True)]
+    return list(zip(parts, names, strict=True))
 
 
-def name_series(ax: Axes, result: StoredResult) -> None:
-    """A legend with the colours of several series; nothing for a single one."""
-    if len(result.axes) > 1:
-        for axis, (_, colour) in zip(result.axes, each_series(result), strict=True):
-            ax.plot([], [], "o", ms=3, color=colour, label=axis.name)
-        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(result.axes), handletextpad=0.2)
-
-
-@styled
-def influence(result: StoredResult) -> Figure:
+def influence(result: StoredResult) -> Chart:
     """Change of each parameter without each reading, and the distance of the readings from the prior, over time."""
     rows = result.summary() if has_influence(result) else ()
-    time = times(result)
     in_std = result.of_readings("sample_stats", "influence_in_std", shared=True) if rows else np.empty(0)
-    figure = Figure(figsize=(COLUMN, (3.6 + 1.7 * len(rows)) / 2.54), layout="constrained")
-    axes = figure.subplots(len(rows) + 1, 1, sharex=True, squeeze=False).ravel()
-    for ax, row, change in zip(axes, rows, in_std, strict=False):
-        _stems(ax, time, change, each_series(result, "posterior"))
-        ax.set_ylabel(row.symbol)
+    panels = []
+    for row, change in zip(rows, in_std, strict=False):
         reach = 1.15 * max(0.1, float(np.nanmax(np.abs(change), initial=0.0)))
-        ax.set_ylim(-reach, reach)
-    distance = result.of_readings("sample_stats", "prior_distance")
-    last = axes[-1]
-    last.axhspan(-FAR, FAR, color=LIGHT["prior"], alpha=0.16, lw=0)
-    _stems(last, time, distance, each_series(result))
-    last.set(xlabel=time_label(result), ylabel="prior distance")
-    name_series(axes[0], result)
-    return figure
+        panel = Panel(ylabel=row.symbol, ylim=(-reach, reach), yticks=3, x_numbers=False)
+        _stems(panel, result, change, "posterior")
+        panels.append(panel)
+    last = Panel(time_label(result), "prior distance", yticks=4)
+    last.span(-FAR, FAR, "prior", 0.16)
+    _stems(last, result, result.of_readings("sample_stats", "prior_distance"), "ink")
+    panels.append(last)
+    panels[0].legend = len(result.axes) > 1
+    heights = [1.7] * len(rows) + [3.0]
+    heights[0] += 0.5 if panels[0].legend else 0.0
+    return Chart([Row(height * POINTS, [panel]) for height, panel in zip(heights, panels, strict=True)])
 
 
-def _stems(ax: Axes, time: Array, values: Array, series: list[tuple[npt.NDArray[np.intp], str]]) -> None:
+def _stems(panel: Panel, result: StoredResult, values: Array, alone: str) -> None:
+    time = times(result)
     many = len(time) > 500
-    ax.axhline(0, color=LIGHT["muted"], lw=0.6)
-    for own, colour in series:
+    panel.rule(0)
+    for axis, (own, colour) in zip(result.axes, each_series(result, alone), strict=True):
         if not many:
-            ax.vlines(time[own], 0, values[own], color=colour, lw=0.8)
-        ax.plot(time[own], values[own], "o", ms=1.2 if many else 2.6, color=colour, rasterized=many)
+            panel.bars(time[own], 0, values[own], colour, label=axis.name)
+        panel.dots(time[own], values[own], colour, 1.2 if many else 2.6, label=axis.name)
 
 
 def reading_words(result: StoredResult) -> list[Markup]:

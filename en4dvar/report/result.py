@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from en4dvar.errors import OutputError
 from en4dvar.files import write_text
 from en4dvar.report import figures
+from en4dvar.report.drawing import draw
 from en4dvar.report.notebook import cell_html
 from en4dvar.report.page import IDENTIFIERS, render_set
-from en4dvar.report.style import draw
 from en4dvar.storage.store import StoredResult, load_stored, save
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from en4dvar.report.chart import Chart
 
 
 class Result(StoredResult):
@@ -21,15 +24,15 @@ class Result(StoredResult):
 
     def plot_histograms(self) -> Figure:
         """Posterior over prior, one panel a parameter."""
-        return figures.histograms(self)
+        return _on_paper(figures.histograms(self))
 
     def plot_history(self) -> Figure:
         """Data, prior and posterior predictive bands and the residuals of the centre."""
-        return figures.history(self)
+        return _on_paper(figures.history(self))
 
     def plot_pairs(self) -> Figure:
         """Posterior members of every pair of parameters with their correlation."""
-        return figures.pairs(self)
+        return _on_paper(figures.pairs(self))
 
     def save(self, path: str | Path) -> Path:
         """Write one netCDF file, which :func:`load_result` reads again. Raises :class:`OutputError`."""
@@ -41,7 +44,7 @@ class Result(StoredResult):
         """Write the page of the result as one HTML file. Raises :class:`OutputError`."""
         if Path(path).suffix != ".html":
             raise OutputError(f"{path}: name a file that ends in .html")
-        drawn = draw(figures.all_figures(self), None, identifiers=IDENTIFIERS)
+        drawn = draw(figures.all_figures(self), IDENTIFIERS)
         return write_text(Path(path), render_set(self, drawn, copies=False))
 
     def to_inference_data(self) -> Any:
@@ -59,6 +62,12 @@ class Result(StoredResult):
 
     def _repr_html_(self) -> str:
         return cell_html(self)
+
+
+def _on_paper(chart: Chart) -> Figure:
+    from en4dvar.report.paper import on_paper  # matplotlib takes time to import
+
+    return on_paper(chart)
 
 
 def load_result(path: str | Path) -> Result:

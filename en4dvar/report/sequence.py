@@ -11,7 +11,8 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from en4dvar.report.cycles import RANKS, labelled, ranks, stacked_axes, write_cycles_page
-from en4dvar.report.style import LIGHT, PAGE, Captioned, styled
+from en4dvar.report.drawing import Captioned
+from en4dvar.report.style import LIGHT, PAGE, styled
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
 from en4dvar.state import Array
 from en4dvar.storage.cycles_file import read_cycles
@@ -21,8 +22,8 @@ SHOWN = 5  # variables or observations in a figure
 CERTAIN = 1e-9  # of its size: the spread of what is known
 
 
-def write_sequence_report(run_dir: Path) -> Path:
-    """Write figures (PDF and PNG) and ``report.html`` from ``sequence.nc``; returns the path of the page.
+def write_sequence_report(run_dir: Path, files: bool = False) -> Path:
+    """Write ``report.html`` from ``sequence.nc``, with ``files`` also its figures as PDF and PNG; returns its path.
 
     Raises :class:`~en4dvar.errors.OutputError` where there is nothing to read or the directory cannot be written.
     """
@@ -44,6 +45,7 @@ def write_sequence_report(run_dir: Path) -> Path:
             ("Innovations", columns, _innovations(data), words),
         ],
         figures=sequence_figures(data),
+        files=files,
     )
 
 

@@ -1,14 +1,14 @@
-"""How figures look and how they are written: PDF and PNG on white, inline SVG that follows light and dark schemes.
+"""How matplotlib's figures look and are written: PDF and PNG on white, inline SVG that follows light and dark schemes.
 
 Figures are drawn with the object interface in the light palette. In the page each colour of the palette becomes a CSS
-variable, so one drawing serves both schemes. The palette is Okabe & Ito's (safe for colour-blind readers).
+variable, so one drawing serves both schemes.
 """
 
 from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -21,34 +21,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 
-from en4dvar.files import make_folder, write_bytes
+from en4dvar.files import write_bytes
+from en4dvar.report.palette import LIGHT as LIGHT  # for those who draw with matplotlib
 from en4dvar.state import Array
 
 P = ParamSpec("P")
 T = TypeVar("T")
-Captioned = tuple[str, str, Figure]  # name, caption
-Drawing = tuple[str, str, Markup]  # name, caption, SVG
-
-LIGHT = {
-    "paper": "#ffffff",
-    "ink": "#1b1b1f",
-    "muted": "#63636c",
-    "grid": "#dcdce2",
-    "prior": "#85858f",
-    "posterior": "#0072b2",
-    "centre": "#d55e00",
-    "background": "#009e73",
-}
-DARK = {
-    "paper": "#16161a",
-    "ink": "#ececf0",
-    "muted": "#a9a9b4",
-    "grid": "#3b3b44",
-    "prior": "#9c9ca8",
-    "posterior": "#56b4e9",
-    "centre": "#ff9f5a",
-    "background": "#2fd0a2",
-}
 COLUMN = 8.5 / 2.54  # inches: one journal column
 PAGE = 17.5 / 2.54
 
@@ -155,21 +133,3 @@ def inline_svg(figure: Figure, name: str, description: str) -> Markup:
     label = description.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     head = f'<svg role="img" aria-label="{label}" viewBox="0 0 {width * 72:g} {height * 72:g}"'
     return Markup(re.sub(r"^<svg[^>]*", head, svg, count=1))
-
-
-def draw(figures: Iterable[Captioned], folder: Path | None, copies: str = "", identifiers: str = "") -> list[Drawing]:
-    """Figures as a page shows them; ``folder`` is where PDF and PNG are kept, if anywhere.
-
-    ``copies`` begins the names of these files, ``identifiers`` those of the elements of the drawings.
-    """
-    drawings = []
-    for name, caption, figure in figures:
-        if folder is not None:
-            save_figure(figure, make_folder(folder), f"{copies}{name}")
-        drawings.append((name, caption, inline_svg(figure, f"{identifiers}{name}", caption)))
-    return drawings
-
-
-def css_variables(palette: dict[str, str]) -> str:
-    """Declarations of the palette for a CSS rule."""
-    return " ".join(f"--{name}: {code};" for name, code in palette.items())

@@ -138,11 +138,20 @@ def symbol_html(symbol: str) -> Markup:
     """
     if not (len(symbol) > 2 and symbol.startswith("$") and symbol.endswith("$")):
         return escape(symbol)
-    body = re.sub(r"(?<![_^])\\(?:mathrm|text|mathit)\s*\{([^{}]*)\}", r"\1", symbol[1:-1])
+    tags = {"_": "sub", "^": "sup", "": "i"}
+    return Markup("").join(
+        Markup(f"<{tags[mark]}>{{}}</{tags[mark]}>").format(piece) for mark, piece in math_pieces(symbol[1:-1])
+    )
+
+
+def math_pieces(body: str) -> list[tuple[str, str]]:
+    r"""What stands between two dollar signs: ("", base), ("_", index) and ("^", exponent) in order.
+
+    >>> math_pieces(r"R_{\mathrm{eq}}")
+    [('', 'R'), ('_', 'eq')]
+    """
+    body = re.sub(r"(?<![_^])\\(?:mathrm|text|mathit)\s*\{([^{}]*)\}", r"\1", body)
     body = re.sub(r"\\(?:mathrm|text|rm|mathit)\b\s*", "", body)
     body = re.sub(r"\\([A-Za-z]+)\s?", lambda m: _GREEK.get(m[1], m[1]), body)
     pieces = re.findall(r"([_^])(\{[^{}]*\}|.)|([^_^]+)", body)
-    tags = {"_": "sub", "^": "sup", "": "i"}
-    return Markup("").join(
-        Markup(f"<{tags[mark]}>{{}}</{tags[mark]}>").format((index or base).strip("{}")) for mark, index, base in pieces
-    )
+    return [(mark, (index or base).strip("{}")) for mark, index, base in pieces]

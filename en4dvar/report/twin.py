@@ -13,7 +13,8 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from en4dvar.report.cycles import RANKS, labelled, ranks, stacked_axes, write_cycles_page
-from en4dvar.report.style import COLUMN, LIGHT, Captioned, styled
+from en4dvar.report.drawing import Captioned
+from en4dvar.report.style import COLUMN, LIGHT, styled
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
 from en4dvar.storage.cycles_file import read_cycles
 from en4dvar.storage.twin_file import MEAN
@@ -25,8 +26,8 @@ MOST_BARS = 21  # of the histogram of the truth's rank
 GROUPS = 12  # of spreads
 
 
-def write_twin_report(run_dir: Path) -> Path:
-    """Write figures (PDF and PNG) and ``report.html`` from ``twin.nc``; returns the path of the page.
+def write_twin_report(run_dir: Path, files: bool = False) -> Path:
+    """Write ``report.html`` from ``twin.nc``, with ``files`` also its figures as PDF and PNG; returns its path.
 
     Raises :class:`~en4dvar.errors.OutputError` where there is nothing to read or the directory cannot be written.
     """
@@ -41,6 +42,7 @@ def write_twin_report(run_dir: Path) -> Path:
         facts=_facts(data),
         tables=[("Scores", columns, _scores(data), words)],
         figures=twin_figures(data),
+        files=files,
     )
 
 

@@ -6,11 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from en4dvar.caution import untrusted
 from en4dvar.diagnostics import change_words
-from en4dvar.report.style import COLUMN, LIGHT, styled
+from en4dvar.report.chart import POINTS, Chart, Panel, Row, steps
 from en4dvar.report.text import with_unit
 from en4dvar.state import Array
 from en4dvar.storage.store import StoredResult
@@ -93,23 +92,18 @@ def verdict(result: StoredResult) -> str:
     return change_words(str(stats["varying"]), float(stats["log_evidence_change"]))
 
 
-@styled
-def bands(result: StoredResult) -> Figure:
+def bands(result: StoredResult) -> Chart:
     """Median and 5–95 % of each parameter that varies, over the prior's."""
-    walks = stored_walks(result)
-    figure = Figure(figsize=(COLUMN, len(walks) * 5.0 / 2.54), layout="constrained")
-    for ax, walk in zip(figure.subplots(len(walks), 1, squeeze=False).flat, walks, strict=True):
-        for quantiles, colour, alpha, words in (
-            (walk.prior, "prior", 0.3, "prior"),
-            (walk.posterior, "posterior", 0.35, "posterior"),
-        ):
-            low, median, high = np.column_stack([quantiles, quantiles[:, -1]])  # a step ends at its right edge
-            ax.fill_between(walk.edges, low, high, step="post", color=LIGHT[colour], alpha=alpha, lw=0, label=words)
-            if words == "posterior":
-                ax.step(walk.edges, median, where="post", color=LIGHT[colour], label="median")
+    rows = []
+    for walk in stored_walks(result):
         least, most = float(np.nanmin(walk.posterior)), float(np.nanmax(walk.prior))
-        if least > 0 and math.isfinite(most) and most > 5 * least:
-            ax.set_yscale("log")
-        ax.set(xlabel=with_unit("time", walk.time_unit), ylabel=with_unit(walk.symbol, walk.unit))
-        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
-    return figure
+        steep = least > 0 and math.isfinite(most) and most > 5 * least
+        panel = Panel(
+            with_unit("time", walk.time_unit), with_unit(walk.symbol, walk.unit), logarithmic=steep, legend=True
+        )
+        for quantiles, colour, alpha in ((walk.prior, "prior", 0.3), (walk.posterior, "posterior", 0.35)):
+            (x, low), (_, high) = (steps(walk.edges, quantiles[i]) for i in (0, 2))
+            panel.band(x, low, high, colour, alpha, colour)
+        panel.line(*steps(walk.edges, walk.posterior[1]), "posterior", label="median")
+        rows.append(Row(5.0 * POINTS, [panel]))
+    return Chart(rows)

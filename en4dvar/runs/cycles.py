@@ -75,12 +75,12 @@ def run_cycles(config: TwinConfig | SequenceConfig, work: Work[R], force: bool, 
             work.dataset(result, attributes).to_netcdf(partial, engine="netcdf4", format="NETCDF4")
         write_text(directory.at("summary.csv"), work.summary(result))
         if config.report:
-            report_cycles(directory)
+            report_cycles(directory, config.figures)
     return result
 
 
-def report_cycles(directory: RunDirectory) -> Path | None:
-    """Write the figures and the page of a finished run of cycles; None where there is none.
+def report_cycles(directory: RunDirectory, figures: bool = False) -> Path | None:
+    """Write the page of a finished run of cycles, on demand its figures as files too; None where there is none.
 
     Raises :class:`OutputError`.
     """
@@ -92,7 +92,7 @@ def report_cycles(directory: RunDirectory) -> Path | None:
         return None
     directory.claim("report.html")
     with directory.claiming("figures"):
-        return (write_twin_report if file.stem == "twin" else write_sequence_report)(directory.work)
+        return (write_twin_report if file.stem == "twin" else write_sequence_report)(directory.work, figures)
 
 
 @contextmanager

@@ -112,17 +112,17 @@ def run_campaign(
     return Campaign(config.directory, work.outcomes(), tuple(run.notices))
 
 
-def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 1) -> Path:
+def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
     """Write (again) the report of a run from its netCDF; ``datasets`` of a campaign get a page in any case.
 
-    ``workers``: processes that draw it.
+    ``workers``: processes that draw it. ``figures``: also keep those of ``datasets``, or of all pages, as PDF and PNG.
 
     Raises :class:`OutputError`.
     """
     from en4dvar.runs.cycles import report_cycles
 
     with RunDirectory.open(path, "report") as directory:
-        return report_cycles(directory) or _report(directory, datasets, workers)
+        return report_cycles(directory, figures) or _report(directory, datasets, workers, figures)
 
 
 def _require_one_usable(config: Config, files: Mapping[str, DataFile]) -> None:
@@ -174,22 +174,23 @@ def _finish(work: Worklist, report_workers: int) -> None:
         attributes = {**work.run.attributes, "identity": work.run.identity.settings}
         save_campaign(directory.at("posterior.nc"), good, longest, attributes, failures)
     if good and work.config.report:
-        _report(directory, workers=report_workers)
+        _report(directory, workers=report_workers, figures=work.config.figures)
     else:
         rows = ((name, work.ended[name].summary, work.ended[name].warnings) for name in good)
         write_text(directory.claim("summary.csv"), summary_csv(rows, failures))
 
 
-def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int = 1) -> Path:
-    from en4dvar.report import TABLES, write_pages  # half a second, for who wants pages
-    from en4dvar.report.joint import PAGE_FILES, write_joint
+def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
+    from en4dvar.report import JOINT_FILES, TABLES, write_pages  # what draws pages is slow to import
 
     directory.claim("report.html", "summary.csv", *TABLES)
     if (directory.work / FILE).exists():
-        directory.claim(*PAGE_FILES)
+        from en4dvar.report.joint import write_joint  # with matplotlib, whose import takes longer than a page
+
+        directory.claim(*JOINT_FILES)
         write_joint(load_joint(directory.work / FILE), directory.work)
     with directory.claiming("figures", "pages"):
-        return write_pages(directory.work, datasets, workers)
+        return write_pages(directory.work, datasets, workers, figures)
 
 
 def _loaded(config: Config | str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None) -> Config:

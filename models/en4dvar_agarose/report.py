@@ -11,7 +11,8 @@ from markupsafe import Markup
 
 from en4dvar.files import inside, make_folder, write_bytes, write_text
 from en4dvar.population import HyperPrior
-from en4dvar.report.style import COLUMN, DARK, LIGHT, css_variables, inline_svg, save_figure
+from en4dvar.report.palette import DARK, LIGHT, css_variables
+from en4dvar.report.style import COLUMN, inline_svg, save_figure
 from en4dvar_agarose import measured, tables
 from en4dvar_agarose.evidence import DECISIVE, MISFIT, probability, verdict
 from en4dvar_agarose.figures import all_figures

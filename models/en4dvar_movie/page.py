@@ -11,7 +11,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from en4dvar.report.style import DARK, LIGHT, css_variables, inline_svg, styled
+from en4dvar.report.palette import DARK, LIGHT, css_variables
+from en4dvar.report.style import inline_svg, styled
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.outline import MODES
 from en4dvar_movie.outlined import brightest, by_frame, grey

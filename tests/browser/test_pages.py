@@ -79,6 +79,28 @@ def test_table_sorts_by_click_and_by_key(opened, pages):
     assert column(page, 1) == ["", "serious", "serious"]
 
 
+def test_a_legend_switches_its_marks_by_click_and_by_key(opened, pages):
+    page = opened(pages["single"]).page
+    entry = page.locator('.entry[data-label="posterior 90 %"]')
+    band = page.locator('g[clip-path] path[data-label="posterior 90 %"]')
+    assert entry.get_attribute("aria-pressed") == "true"
+    entry.click()
+    assert (band.is_visible(), entry.get_attribute("aria-pressed")) == (False, "false")
+    entry.press("Enter")
+    assert (band.is_visible(), entry.get_attribute("aria-pressed")) == (True, "true")
+    assert page.get_by_role("button", name="posterior 90 %").count() == 1
+
+
+def test_a_panel_says_where_the_pointer_is(opened, pages):
+    page = opened(pages["single"]).page
+    panel = page.locator("#d0-history rect.read").first
+    (low, high), (bottom, top) = (map(float, panel.get_attribute(f"data-{axis}").split()) for axis in "xy")
+    panel.hover()  # its middle
+    across, up = page.locator("#d0-history .reading").text_content().replace("−", "-").split(", ")
+    assert float(across) == pytest.approx((low + high) / 2, abs=0.01 * (high - low))
+    assert float(up) == pytest.approx((bottom + top) / 2, abs=0.01 * (top - bottom))
+
+
 def test_data_sets_are_reached_and_left_by_links(opened, pages):
     page = opened(pages["campaign"]).page
     page.get_by_role("link", name="alpha").click()

@@ -29,7 +29,7 @@ def call(*arguments: str | Path) -> Result:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
     """A run of the toy configuration: its directory and what the command said."""
     folder = tmp_path_factory.mktemp("finished")
-    outcome = call("run", write_toy(folder), "--out", folder / "run")
+    outcome = call("run", write_toy(folder), "--out", folder / "run", "--set", "output.figures=true")
     return folder / "run", outcome
 
 
@@ -235,7 +235,7 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("one_figure")
 def test_force_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None:
     path, out = write_toy(tmp_path), tmp_path / "out"
-    assert call("run", path, "--out", out).exit_code == 0
+    assert call("run", path, "--out", out, "--set", "output.figures=true").exit_code == 0
     (out / "notes.txt").write_text("mine")
     (out / "figures" / "mine.png").write_text("mine")
     (tmp_path / "other.csv").write_text(csv_text())

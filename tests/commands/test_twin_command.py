@@ -90,11 +90,12 @@ def test_report_again_from_the_file(finished):
     for words in ("Twin experiment", "ienks", '<td class="words">smoothed</td>', "lag: 2", "10 of them do not count"):
         assert words in page
     assert "://" not in re.sub(r'<(pre|table class="pairs")>.*?</(pre|table)>', "", page, flags=re.DOTALL)
-    for file in ("report.html", "figures/scores.png"):
-        (directory / file).unlink()
-    again = call("report", directory)
+    (directory / "report.html").unlink()
+    assert not (directory / "figures").exists()
+    again = call("report", directory, "--figures")
     assert again.exit_code == 0, again.output
     assert (directory / "figures" / "scores.png").stat().st_size > 10_000
+    assert call("report", directory).exit_code == 0
     damaged = (directory / "twin.nc").read_bytes()
     (directory / "twin.nc").write_bytes(damaged.replace(b"analysis", b"analisys", 1))
     refused = call("report", directory)

@@ -229,15 +229,15 @@ def test_page_names_the_reading_that_decides(tmp_path, analysis):
     assert f"by {size:.2g} Pa·s".replace("-", "−") in moving
     assert moving.endswith("For 10 of 40 readings only another fit tells.")
     assert "from what the prior predicts" in far
-    figure = influence(result)
-    assert len(figure.axes) == 5
-    assert [ax.get_ylabel() for ax in figure.axes][:2] == ["$G$", r"$\mu$"]
-    drawn = figure.axes[1].lines[-1]
-    assert drawn.get_xdata()[7] == pytest.approx(16.0)
-    assert list(drawn.get_ydata()) == list(marked.influence.in_std[1])
+    panels = [panel for row in influence(result).rows for panel in row.panels]
+    assert [panel.ylabel for panel in panels[:2]] == ["$G$", r"$\mu$"]
+    assert len(panels) == 5
+    drawn = panels[1].marks[-1]
+    assert drawn.x[7] == pytest.approx(16.0)
+    assert list(drawn.y) == list(marked.influence.in_std[1])
 
 
 def test_page_says_why_influence_is_not_told(analysis):
     result = Result.from_analysis(analysis, provenance("name: test\n"))
     assert str(reading_words(result)[0]).startswith("What leaving out a reading would change is not told: too few")
-    assert len(influence(result).axes) == 1
+    assert len(influence(result).rows) == 1

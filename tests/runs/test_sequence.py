@@ -235,7 +235,7 @@ def test_other_commands_say_what_it_is(folder):
 
 def test_report_of_a_sequence(folder):
     result = run_sequence(written(folder, assimilation={"scheme": "ienks", "members": 20, "lag": 2},
-                                  output={"report": True}))  # fmt: skip
+                                  output={"report": True, "figures": True}))  # fmt: skip
     page = Path("runs/drift/report.html").read_text()
     assert {file.stem for file in Path("runs/drift/figures").glob("*.png")} == {
         "state", "parameters", "innovations", "ranks",

@@ -74,9 +74,8 @@ def test_arviz_reads_it(analysis, result, tmp_path):
 
 def test_a_panel_for_each_series(result):
     figures = {name: figure for name, _, figure in all_figures(result)}
-    titles = [ax.get_title(loc="left") for ax in figures["history"].axes]
-    assert [title for title in titles if title] == ["p", "q", "f"]
-    assert len(figures["history"].axes) == 6
+    titles = [panel.title for row in figures["history"].rows for panel in row.panels]
+    assert titles == ["p", "", "q", "", "f", ""]
     page = render_set(result, [])
     assert "18 observations, weights sum to 16" not in page
     assert "16 observations, weights sum to 16" in page

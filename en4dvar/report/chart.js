@@ -1,0 +1,40 @@
+// Figures answer: a panel says where the pointer is, an entry of a legend switches its marks off and on.
+for (const svg of document.querySelectorAll("figure svg")) {
+  const text = document.createElementNS(svg.namespaceURI, "text");
+  text.setAttribute("class", "reading");
+  text.setAttribute("aria-hidden", "true");
+  svg.append(text);
+  for (const panel of svg.querySelectorAll("rect.read")) {
+    const [[x0, x1], [y0, y1]] = [panel.dataset.x, panel.dataset.y].map((two) => two.split(" ").map(Number));
+    const short = (value, span) => value.toFixed(Math.min(12, Math.max(0, 2 - Math.floor(Math.log10(Math.abs(span))))));
+    panel.addEventListener("pointermove", (event) => {
+      const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
+      const box = panel.getBBox();
+      const [across, up] = [(at.x - box.x) / box.width, 1 - (at.y - box.y) / box.height];
+      const y = "log" in panel.dataset ? (y0 * (y1 / y0) ** up).toPrecision(3) : short(y0 + (y1 - y0) * up, y1 - y0);
+      text.textContent = `${short(x0 + (x1 - x0) * across, x1 - x0)}, ${y}`;
+      text.setAttribute("text-anchor", across > 0.5 ? "end" : "start");
+      text.setAttribute("x", at.x + (across > 0.5 ? -3 : 3));
+      text.setAttribute("y", at.y - 3);
+    });
+    panel.addEventListener("pointerleave", () => (text.textContent = ""));
+  }
+  for (const entry of svg.querySelectorAll(".entry")) {
+    svg.setAttribute("role", "group"); // within an image nothing can be pressed
+    const label = entry.dataset.label;
+    const marks = [...svg.querySelectorAll("path[data-label]")].filter((p) => p.dataset.label === label);
+    const press = () => {
+      const off = entry.getAttribute("aria-pressed") === "true";
+      entry.setAttribute("aria-pressed", String(!off));
+      marks.forEach((mark) => mark.toggleAttribute("hidden", off));
+    };
+    for (const [key, value] of [["role", "button"], ["tabindex", "0"], ["aria-pressed", "true"], ["aria-label", entry.textContent]])
+      entry.setAttribute(key, value);
+    entry.addEventListener("click", press);
+    entry.addEventListener("keydown", (event) => {
+      if (event.key !== "Enter" && event.key !== " ") return;
+      event.preventDefault();
+      press();
+    });
+  }
+}

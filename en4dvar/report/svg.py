@@ -1,0 +1,165 @@
+"""A chart as an ``<svg>`` element of a page: words as words, colours as CSS variables, no addresses.
+
+The entries of a legend carry the label of their marks: with the page's script they are switched on and off, and a panel
+says where the pointer is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from markupsafe import Markup, escape
+
+from en4dvar.report.chart import Chart, Mark, Panel, Row
+from en4dvar.report.paths import Frame, path_of
+from en4dvar.report.text import plain_number
+from en4dvar.report.ticks import numbers, powers, ticks
+from en4dvar.report.words import EM, FONT, SMALL, width_of, written
+
+GAP = 6.0  # between panels
+
+
+def svg(chart: Chart, name: str, description: str) -> Markup:
+    """The drawing; its identifiers begin with ``name``, ``description`` is what a screen reader says."""
+    parts, top = [], 0.0
+    margins = _left_margins(chart)
+    for i, row in enumerate(chart.rows):
+        for j, (panel, x, width) in enumerate(_columns(row, margins, chart.width)):
+            parts += _panel(panel, row, top, x, width, f"{name}-{i}-{j}")
+        top += row.height
+    head = (
+        f'<svg role="img" aria-label="{escape(description)}" viewBox="0 0 {chart.width:.5g} {chart.height:.5g}" '
+        f'font-size="{SMALL:g}" color="var(--ink)" fill="currentColor" stroke-linejoin="round">'
+    )
+    return Markup(f"{head}{''.join(parts)}</svg>")
+
+
+def _y_ticks(panel: Panel) -> list[float]:
+    low, high = panel.limits()[1]
+    wanted = panel.yticks
+    found = powers(low, high) if panel.logarithmic and isinstance(wanted, int) else ticks(low, high, wanted)
+    return [t for t in found if low <= t <= high or math.isclose(t, low) or math.isclose(t, high)]
+
+
+def _y_labels(panel: Panel) -> list[str]:
+    found = _y_ticks(panel)
+    return [plain_number(t, 3) for t in found] if panel.logarithmic else numbers(found)
+
+
+def _left(panel: Panel) -> float:
+    """Points that the labels on the left need."""
+    if panel.bare or not panel.left:
+        return 8.0 if panel.x_numbers and not panel.bare else 2.0  # half a number below the corner
+    labels = _y_labels(panel) if panel.y_numbers else []
+    widest = max((len(t) for t in labels), default=0) * EM * SMALL
+    return widest + 4.5 + (FONT + 5 if panel.ylabel else 0)
+
+
+def _left_margins(chart: Chart) -> dict[tuple[int, int], float]:
+    """(panels of the row, place in it) → margin; the first places of all rows have one."""
+    found: dict[tuple[int, int], float] = {}
+    for row in chart.rows:
+        for j, panel in enumerate(row.panels):
+            key = (len(row.panels) if j else 0, j)
+            found[key] = max(found.get(key, 0.0), _left(panel))
+    return found
+
+
+def _columns(row: Row, margins: dict[tuple[int, int], float], width: float) -> Iterator[tuple[Panel, float, float]]:
+    """Each panel, where its frame begins and how wide it is."""
+    n = len(row.panels)
+    lefts = [margins[n if j else 0, j] for j in range(n)]
+    each, x = (width - sum(lefts) - n * GAP) / n, 0.0
+    for panel, left in zip(row.panels, lefts, strict=True):
+        yield panel, x + left, each
+        x += left + each + GAP
+
+
+def _panel(panel: Panel, row: Row, top: float, x: float, width: float, name: str) -> list[str]:
+    legend, above = _legend(panel, x, top, width)
+    above += FONT + 4 if any(p.title for p in row.panels) else 4
+    below = max((_below(p) for p in row.panels), default=0.0)
+    place = Frame(x, top + above, width, row.height - above - below, *panel.limits(), panel.logarithmic)
+    if panel.bare:
+        return [written(panel.words, x + width / 2, place.y + place.height / 2 + 3, size=FONT)] if panel.words else []
+    box = f'x="{place.x:.1f}" y="{place.y:.1f}" width="{place.width:.1f}" height="{place.height:.1f}"'
+    drawn = "".join(path_of(mark, place) for mark in panel.marks)
+    (x0, x1), (y0, y1) = place.xlim, place.ylim
+    reading = f'data-x="{x0:.7g} {x1:.7g}" data-y="{y0:.7g} {y1:.7g}"{" data-log" if panel.logarithmic else ""}'
+    return [
+        *legend,
+        f'<clipPath id="{name}"><rect {box}/></clipPath>',
+        *(_grid(panel, place) if panel.grid else ()),
+        f'<g clip-path="url(#{name})" fill="none">{drawn}</g>',
+        *_axes(panel, place, below),
+        written(panel.title, x + width / 2, place.y - 4, size=FONT, colour=panel.title_colour),
+        f'<rect class="read" {box} fill="none" pointer-events="all" {reading}/>',
+    ]
+
+
+def _below(panel: Panel) -> float:
+    """Points that the labels below need."""
+    if panel.bare:
+        return 2.0
+    under = max((len(t) for t in panel.names), default=0) * EM * SMALL + 4 if panel.names else SMALL + 4
+    return (under if panel.x_numbers and panel.xticks != () else 3.0) + (FONT + 4 if panel.xlabel else 0)
+
+
+def _axes(panel: Panel, place: Frame, below: float) -> Iterator[str]:
+    """Lines, ticks, numbers and labels."""
+    base, left, far = place.y + place.height, place.x, place.x + place.width
+    low, high = place.xlim
+    along = [t for t in ticks(low, high, panel.xticks, panel.whole) if low <= t <= high]
+    lines, words = [f"M{left:.1f} {base:.1f}H{far:.1f}"], []
+    texts = panel.names or numbers(along)
+    for x, text in zip(place.across(np.array(along)), texts, strict=True):
+        lines.append(f"M{x:.1f} {base:.1f}v2.5")
+        if panel.names:
+            words.append(written(text, 0, 0, "end", turned=(x + 2.3, base + 4)))
+        elif panel.x_numbers:
+            words.append(written(text, x, base + SMALL + 3))
+    if panel.left:
+        lines.append(f"M{left:.1f} {place.y:.1f}V{base:.1f}")
+        for y, text in zip(place.up(np.array(_y_ticks(panel))), _y_labels(panel), strict=True):
+            lines.append(f"M{left:.1f} {y:.1f}h-2.5")
+            words.append(written(text, left - 4, y + 2.5, "end") if panel.y_numbers else "")
+    yield f'<path d="{"".join(lines)}" stroke="var(--muted)" stroke-width="0.6" fill="none"/>'
+    yield from words
+    yield written(panel.xlabel, place.x + place.width / 2, base + below - 3, size=FONT)
+    across = left - _left(panel) + FONT - 1
+    yield written(panel.ylabel, 0, 0, size=FONT, turned=(across, place.y + place.height / 2))
+
+
+def _grid(panel: Panel, place: Frame) -> Iterator[str]:
+    lines = "".join(f"M{place.x:.1f} {y:.1f}h{place.width:.1f}" for y in place.up(np.array(_y_ticks(panel))))
+    yield f'<path d="{lines}" stroke="var(--grid)" stroke-width="0.5"/>'
+
+
+def _legend(panel: Panel, x: float, top: float, width: float) -> tuple[list[str], float]:
+    """The entries above a panel, and the height they take."""
+    parts, at, line = [], x, top
+    for label in panel.entries():
+        marks = [m for m in panel.marks if m.label == label]
+        length = 15 + width_of(label)
+        if at > x and at + length > x + width:
+            at, line = x, line + SMALL + 4
+        sample = Frame(at, line + 2, 11, SMALL, (0, 1), (0, 1), False)
+        drawn = "".join(path_of(_sample(m), sample) for m in marks)
+        parts.append(
+            f'<g class="entry" data-label="{escape(label)}"><g fill="none">{drawn}</g>'
+            f"{written(label, at + 14, line + SMALL + 1, 'start')}</g>"
+        )
+        at += length + 5
+    return parts, line - top + SMALL + 6 if parts else 0.0
+
+
+def _sample(mark: Mark) -> Mark:
+    """The mark as its legend shows it, in a unit square."""
+    ends, middle = np.array([0.0, 1.0]), np.array([0.5])
+    none = np.empty(0)
+    x, y, top = {"line": (ends, middle.repeat(2), none), "band": (ends, ends * 0, ends * 0 + 1)}.get(
+        mark.kind, (middle, middle * 0, middle * 2) if mark.top.size else (middle, middle, none)
+    )
+    return Mark(mark.kind, x, y, top, mark.colour, mark.size, mark.alpha, mark.dash)

@@ -1,0 +1,136 @@
+"""Charts: what a page shows lies where the numbers are, the same on paper, and costs no matplotlib."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from en4dvar.report.chart import Chart, Panel, Row, steps
+from en4dvar.report.paper import on_paper
+from en4dvar.report.paths import SHOWN
+from en4dvar.report.svg import svg
+from en4dvar.report.ticks import numbers, powers, ticks
+
+
+def drawn(panel, height=100.0):
+    """The drawing of one panel, the frame of its marks (x, y, width, height), and the paths of its marks."""
+    text = str(svg(Chart([Row(height, [panel])], 200.0), "a", "about"))
+    box = re.search(r'<rect x="([\d.]+)" y="([\d.]+)" width="([\d.]+)" height="([\d.]+)"/>', text)
+    marks = re.search(r"<g clip-path[^>]*>(.*?)</g>", text, re.S)[1]
+    return text, [float(v) for v in box.groups()], re.findall(r'd="([^"]*)"', marks)
+
+
+def points(path):
+    return np.array([[float(v) for v in pair] for pair in re.findall(r"[ML]([-\d.]+) ([-\d.]+)", path)])
+
+
+@pytest.mark.parametrize("logarithmic", [False, True])
+def test_marks_lie_where_the_axes_say(logarithmic):
+    panel = Panel(xlim=(0.0, 10.0), ylim=(1.0, 100.0), logarithmic=logarithmic)
+    panel.line([0, 5, 10], [1, 10, 100], "ink")
+    _, (x, y, width, height), (path,) = drawn(panel)
+    share = np.array([0, 0.5, 1]) if logarithmic else np.array([0, 9 / 99, 1])
+    expected = np.column_stack([x + width * np.array([0, 0.5, 1]), y + height * (1 - share)])
+    assert points(path) == pytest.approx(expected, abs=0.11)
+
+
+def test_numbers_stand_at_their_ticks():
+    panel = Panel(xlim=(0.0, 10.0), ylim=(-2.0, 2.0), yticks=(-2, 0, 2))
+    text, (x, _, width, height), _ = drawn(panel)
+    found = {v: (float(a), float(b)) for a, b, v in re.findall(r'<text x="([\d.]+)" y="([\d.]+)"[^>]*>([^<]+)<', text)}
+    assert found["−2"][1] - found["2"][1] == pytest.approx(height, abs=0.2)
+    assert found["10"][0] - found["4"][0] == pytest.approx(0.6 * width, abs=0.2)
+    assert found["4"][0] == pytest.approx(x + 0.4 * width, abs=0.2)
+
+
+def test_gaps_stay_gaps_and_what_is_not_finite_is_not_drawn():
+    panel = Panel(xlim=(0.0, 4.0), ylim=(0.0, 4.0))
+    panel.line([0, 1, 2, 3], [0, 1, np.nan, 3], "ink")
+    panel.dots([1, 2], [np.nan, np.inf], "ink")
+    panel.bars([1.0, 2.0], [np.nan, 0.0], [1.0, 2.0], "ink")
+    _, _, paths = drawn(panel)
+    assert [path.count("M") for path in paths] == [2, 1]
+    assert not any(word in "".join(paths) for word in ("nan", "inf"))
+
+
+def test_many_readings_stay_small_and_keep_their_extremes():
+    x = np.arange(100_000.0)
+    y = np.sin(x / 50)
+    y[77_777] = 40.0
+    panel = Panel()
+    panel.line(x, y, "ink")
+    panel.dots(x, y, "ink")
+    text, (_, top, _, height), (line, dots) = drawn(panel)
+    low, high = panel.limits()[1]
+    assert len(points(line)) <= SHOWN
+    peak = top + height * (1 - (40 - low) / (high - low))
+    assert points(line)[:, 1].min() == pytest.approx(peak, abs=0.11)
+    assert points(dots)[:, 1].min() == pytest.approx(peak, abs=0.11)
+    assert len(text) < 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "wanted", "expected"),
+    [
+        (0.0, 1.0, 5, [0, 0.2, 0.4, 0.6, 0.8, 1.0]),
+        (-0.24, 0.31, 4, [-0.2, 0, 0.2]),
+        (3.1e-6, 9.2e-6, 4, [4e-6, 6e-6, 8e-6]),
+        (7.0, 7.0, 4, [7.0]),
+        (0.0, 9.0, (1, 2), [1, 2]),
+    ],
+)
+def test_ticks_are_round(low, high, wanted, expected):
+    assert ticks(low, high, wanted) == pytest.approx(expected)
+
+
+def test_ticks_of_counts_are_whole_and_of_decades_are_powers():
+    assert ticks(-0.1, 2.1, 5, whole=True) == [0, 1, 2]
+    assert powers(0.5, 2e4) == pytest.approx([1, 10, 100, 1e3, 1e4])
+    assert powers(2.0, 9.0) == pytest.approx([2, 5])
+    assert numbers([-0.5, 0.0, 0.5]) == ["−0.5", "0", "0.5"]
+    assert numbers([2e6, 4e6]) == ["2×10⁶", "4×10⁶"]
+
+
+def test_words_are_escaped_and_symbols_set():
+    panel = Panel(r"$R_0$ (µm)", '<b>"&', title=r"\$5")
+    text, _, _ = drawn(panel)
+    assert "&lt;b&gt;&#34;&amp;" in text
+    assert ">$5<" in text
+    assert re.search(r'font-style="italic">R</tspan><tspan dy="[\d.]+" font-size="[\d.]+">0</tspan><tspan dy="-', text)
+
+
+def test_legend_names_the_marks_it_switches():
+    panel = Panel(legend=True)
+    panel.band([0, 1], [0, 0], [1, 1], "posterior", 0.3, "90 % & more")
+    text, _, _ = drawn(panel)
+    assert text.count('data-label="90 % &amp; more"') == 2
+
+
+def test_paper_shows_the_same():
+    panel = Panel("x", "y", xlim=(0.0, 3.0), ylim=(0.0, 9.0), title="T", title_colour="posterior")
+    edges, values = np.array([0.0, 1.0, 3.0]), np.array([4.0, 8.0])
+    panel.line(*steps(edges, values), "posterior", 2.0)
+    bare = Panel(bare=True, words="+0.5")
+    (ax, empty) = on_paper(Chart([Row(90.0, [panel, bare])], 200.0)).axes
+    assert (ax.get_xlim(), ax.get_ylim(), ax.get_title()) == ((0.0, 3.0), (0.0, 9.0), "T")
+    assert ax.lines[0].get_xydata().tolist() == [[0, 4], [1, 4], [1, 8], [3, 8]]
+    assert ax.lines[0].get_linewidth() == 2.0
+    assert [text.get_text() for text in empty.texts] == ["+0.5"]
+
+
+def test_a_page_imports_no_matplotlib(analysis, tmp_path):
+    """Its import takes longer than the whole page."""
+    from en4dvar.report.result import Result
+    from en4dvar.storage.provenance import provenance
+    from en4dvar.storage.store import save
+
+    save(Result.from_analysis(analysis, provenance("name: test\n")), tmp_path / "posterior.nc")
+    script = "import sys; from en4dvar.report import write_pages; write_pages(sys.argv[1]); "
+    script += "sys.exit('matplotlib' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script, tmp_path], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "report.html").read_text(encoding="utf-8").count("<svg") > 4
