@@ -23,7 +23,7 @@ EARLY = ("en4dvar.config.build.data_files", "en4dvar.runs.runner.build_one", "en
 BEGUN = (
     *(f"en4dvar.runs.session.{step}" for step in ("identity", "provenance", "RunLog.write", "write_checkpoint")),
     *(f"en4dvar.runs.runner.{step}" for step in ("datasets", "summary_csv", "RunDirectory.publish")),
-    *(f"en4dvar.runs.twin_run.{step}" for step in ("dataset", "conduct", "RunDirectory.publish")),
+    *(f"en4dvar.runs.{step}" for step in ("twin_run.dataset", "twin_run.conduct", "cycles.RunDirectory.publish")),
 )
 pytestmark = pytest.mark.parametrize("before", ["", "--force", "--resume"])  # a first run, or one after another
 
@@ -40,7 +40,7 @@ def told_at(
     step: str, before: str, folder: Path, monkeypatch: pytest.MonkeyPatch, *later: str
 ) -> tuple[str, list[str], list[str]]:
     """What is kept and what to type, as told after interrupts at ``step`` and ``later``, and what was typed."""
-    if ".twin_run." in step:
+    if ".twin_run." in step or ".cycles." in step:
         path = folder / "twin.yaml"
         path.write_text(TWIN)
     else:
