@@ -69,6 +69,56 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
     ),
     "start-moved": ("note", "no action is needed where the iterations converged"),
 }
+TRIGGERS = {
+    "not-converged": (
+        "the iterations stopped before their criterion was met; a note where the next step would have been at most"
+        " half a posterior standard deviation"
+    ),
+    "chain-not-converged": "the Markov chains disagree, or have too few independent samples",
+    "prior-conflict": "the minimum of J lies further from the prior mean than one prior in two thousand would",
+    "implausible-data": (
+        "times, radii or frames contradict each other or the physics, as a collapse faster than any gel allows"
+    ),
+    "misfit": "χ² lies above what the errors allow once in two thousand times; K − DFS is expected of K readings",
+    "residual-structure": (
+        "neighbouring residuals resemble each other, as they would once in a thousand times by chance; a caution "
+        "where that cannot move an estimate by its standard deviation"
+    ),
+    "model-validity": (
+        "a tenth of the posterior members leave what the equations assume; a note where the readings from then on "
+        "inform by less than 0.1 DFS"
+    ),
+    "ensemble-collapse": "the spread of the members is below a third of what J allows, or zero in a parameter",
+    "rank-deficient": (
+        "the prior members differ in fewer directions than there are parameters, or too few members are left"
+    ),
+    "non-gaussian": (
+        "mean or spread of the members differ from those of the posterior by more than 0.5 standard deviations or "
+        "30 %; serious beyond one standard deviation or a factor of two"
+    ),
+    "several-modes": (
+        "J has several minima that hold some of the probability; a note where they overlap in every parameter"
+    ),
+    "starts-disagree": (
+        "one descent alone ended in the lowest minimum, or a draw of the posterior has a J lower than any minimum found"
+    ),
+    "members-lost": "members failed in a forecast; serious where more than a tenth did",
+    "at-bound": (
+        "a fifth of the posterior members lie within 5 % of the interval's width from a bound, three times the "
+        "prior's share"
+    ),
+    "odd-residuals": (
+        "residuals grow where the observable changes fast, or one is an outlier, as they would once in a thousand "
+        "times by chance"
+    ),
+    "not-bayesian": "readings count with weights other than 0 and 1",
+    "overstated-error": "χ² lies below what the errors allow once in two thousand times",
+    "not-informed": "neither the mean nor the spread of a parameter changed much: its DFS is below 0.1",
+    "down-weighted": "readings lie beyond the threshold of a robust cost",
+    "one-descent": "one descent alone led to the minimum, so that another minimum is not excluded",
+    "start-moved": "the prior mean could not be used as the start of the iterations",
+}
+"""When each is given, for the reference."""
 SPOILS = {"non-gaussian", "at-bound"}  # mean ± std, though they are not serious; what is serious does in any case
 _LINE = re.compile(r"(serious|caution|note) \[([a-z-]+)(?:: ([\w ]+))?\] (.*?)(?: — ([^—]*))?")
 

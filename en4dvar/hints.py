@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from reprlib import Repr
@@ -10,6 +11,7 @@ from reprlib import Repr
 _SHORT = Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, 80, 80
 LONGEST = 2000  # characters of one message
+FEW = 8  # names that are suggested at most
 
 
 def shown(value: object) -> str:
@@ -27,13 +29,44 @@ def brief(text: str, longest: int = LONGEST) -> str:
     return text if len(text) <= longest else f"{text[:half]} … ({len(text) - 2 * half} characters) … {text[-half:]}"
 
 
-def suggest(word: object, known: Iterable[str]) -> str:
-    """``"; did you mean 'x'?"``, or else the list of what is known, or nothing."""
-    names = list(known)
-    close = get_close_matches(str(word), names, 1, 0.6) if len(str(word)) < LONGEST else []  # quadratic in the length
-    if close:
-        return f"; did you mean {close[0]!r}?"
+def suggest(word: object, known: Iterable[str] | Mapping[str, object]) -> str:
+    """``"; did you mean 'x'?"``, or else the list of what is known, or nothing.
+
+    ``known``: the names, or each with what it means in words. A part of a name counts before a misspelt name.
+
+    >>> suggest("neohookean", ["zener-neo-hookean", "neo-hookean-kelvin-voigt"])
+    "; did you mean 'neo-hookean-kelvin-voigt'?"
+    >>> suggest("viscosity", {"G": "shear modulus", "mu": "viscosity"}), suggest("mue", {"G": "", "mu": ""})
+    ("; did you mean 'mu'?", "; did you mean 'mu'?")
+    """
+    names, text = list(known), str(word)
+    words = {name: known[name] if isinstance(known, Mapping) else "" for name in names}
+    meant = _meant(_letters(text), {name: one if isinstance(one, str) else "" for name, one in words.items()})
+    close = get_close_matches(text, names, 1, 0.6) if len(text) < LONGEST else []  # quadratic in the length
+    if found := meant or close:
+        return f"; did you mean {' or '.join(map(repr, found))}?"
     return f"; known: {', '.join(names)}" if names else ""
+
+
+def _meant(letters: str, known: Mapping[str, str]) -> list[str]:
+    """The few names that begin with ``letters``, else those that hold them, else those whose meaning does."""
+    if not 2 < len(letters) < LONGEST:
+        return []
+    begin = [name for name in known if _letters(name).startswith(letters)]
+    within = [name for name in known if letters in _letters(name)]
+    of_meaning = [name for name, words in known.items() if letters in _letters(words)]
+    found = begin or within or of_meaning
+    return found if len(found) <= FEW else []
+
+
+def _letters(text: str) -> str:
+    return "".join(filter(str.isalnum, text.lower()))
+
+
+def natural(path: Path) -> tuple[list[list[str | int]], Path]:
+    """Key to sort by: numbers in a path by their size, so that ``bubble10`` comes after ``bubble2``."""
+    parts = (re.split(r"([0-9]{1,40})", part) for part in path.with_suffix("").parts)
+    return [[int(s) if i % 2 else s for i, s in enumerate(part)] for part in parts], path
 
 
 def short(text: str, most: int = 60) -> str:

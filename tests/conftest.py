@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
@@ -25,6 +26,10 @@ from en4dvar.state import TIME_SHIFT, Array, Field, Parameter, StateLayout
 # Of several test processes on the same cores, each with as many threads of BLAS, these wait for each other, spinning:
 # one solution of an oracle took four times the CPU time. What tests start has the number that it would have anyway.
 threadpool_limits(1, user_api="blas")
+
+# A file is one worker's (``--dist loadfile``). Where xdist keeps the order (``--no-loadscope-reorder``, as in .ci/run),
+# the files that take longest start first, or one worker would be left with them at the end.
+LONGEST = ("test_commands", "test_study", "test_examples", "test_imr_suite", "test_terminal", "test_generated_input")
 
 FAILED = 3
 
@@ -128,6 +133,13 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
         cautions=(caution("members-lost", "1 of 24 members failed in the posterior forecast: collapse too violent"),),
     )
     return replace(analysis, **changes)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The :data:`LONGEST` files first, then those with the most tests."""
+    tests = Counter(item.path for item in items)
+    ranks = {path: LONGEST.index(path.stem) if path.stem in LONGEST else len(LONGEST) for path in tests}
+    items.sort(key=lambda item: (ranks[item.path], -tests[item.path]))
 
 
 @pytest.fixture(scope="session")

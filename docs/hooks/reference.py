@@ -204,7 +204,7 @@ def _loaded(command: click.Command) -> click.Command:
 
 def warnings_page() -> str:
     """Every code a result can warn with."""
-    from en4dvar.caution import CATALOGUE, SEVERITIES
+    from en4dvar.caution import CATALOGUE, SEVERITIES, TRIGGERS
 
     meaning = {
         "serious": "do not trust the posterior before this is settled",
@@ -213,6 +213,8 @@ def warnings_page() -> str:
     }
     parts = [
         "# Warnings",
+        "DFS are degrees of freedom for signal: how many numbers the data determine, or of one parameter 1 − posterior "
+        "variance / prior variance. J is the cost that is minimised, χ² its part that compares model and readings.",
         "Generated. A result says what should keep you from trusting it: in the report, in `run.log`, "
         "on the terminal and in `posterior.nc` (`warnings`, `warning_codes`), each with a code that does not change. "
         "They stand in the order of what they do to the numbers, the worst first. No interval is printed of the "
@@ -220,8 +222,12 @@ def warnings_page() -> str:
         "What is behind them: [What a posterior means](trusting_a_posterior.md#when-not-to-trust-it).",
     ]
     for severity in SEVERITIES:
-        rows = [[f"`{code}`", _prose(advice)] for code, (kind, advice) in CATALOGUE.items() if kind == severity]
-        parts += [f"## {severity.capitalize()}: {meaning[severity]}", _rows(["code", "what to do"], rows)]
+        rows = [
+            [f"`{code}`", _prose(TRIGGERS[code]), _prose(advice)]
+            for code, (kind, advice) in CATALOGUE.items()
+            if kind == severity
+        ]
+        parts += [f"## {severity.capitalize()}: {meaning[severity]}", _rows(["code", "when", "what to do"], rows)]
     return "\n\n".join(parts) + "\n"
 
 

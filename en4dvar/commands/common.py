@@ -16,8 +16,8 @@ from typing import IO, TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
+    from en4dvar.caution import Caution
     from en4dvar.config import Config
-
 
 LONGEST = 120  # name of a folder
 
@@ -112,6 +112,67 @@ def config_options(command: Callable[..., Any]) -> Callable[..., Any]:
         return command(Source(config, data, settings), **options)
 
     return with_source
+
+
+workers_option = click.option(
+    "--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it."
+)
+trust_option = click.option(
+    "--trust", is_flag=True, help="Run code that the files name, wherever it lies: read it before."
+)
+
+
+def ask(question: str) -> bool:
+    """Whether the user says yes; nobody does where there is no terminal."""
+    return sys.stdin.isatty() and click.confirm(question, err=True)
+
+
+def tell(words: str) -> None:
+    """What is being done, on standard error."""
+    click.echo(words, err=True)
+
+
+@dataclass(frozen=True)
+class Together:
+    """Finished runs that one estimate is made of, the folder of its result, and how it is computed."""
+
+    run_dirs: tuple[Path, ...]
+    out: Path
+    told: bool
+    """Whether the user named the folder."""
+    options: dict[str, Any]
+    """Keywords of what computes it."""
+
+    def conclude(self, table: str, cautions: Iterable[Caution], page: Path) -> None:
+        """Print what was found; warnings go to standard error."""
+        click.echo(table)
+        for caution in cautions:
+            click.echo(f"{caution.kind}: {caution}", err=True)
+        click.echo(f"report: {page if self.told else os.path.relpath(page)}")
+
+
+def several_runs(kind: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """The arguments RUN_DIR with --out, --workers and --trust, which the command gets as one :class:`Together`."""
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        @click.argument(
+            "run_dirs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN_DIR [RUN_DIR...]"
+        )
+        @click.option(
+            "--out", type=click.Path(path_type=Path), help=f"Folder of the result; default {kind}_... beside."
+        )
+        @workers_option
+        @trust_option
+        @functools.wraps(command)
+        def with_runs(
+            run_dirs: tuple[Path, ...], out: Path | None, workers: int | None, trust: bool, **options: Any
+        ) -> Any:
+            how = {"workers": workers, "trust": trust, "ask": ask, "tell": tell}
+            return command(Together(run_dirs, out or folder_of(kind, run_dirs), out is not None, how), **options)
+
+        return with_runs
+
+    return decorate
 
 
 def refuse_to_replace(out: Path | None, force: bool) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -30,23 +30,41 @@ def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
         f"{settings.scheme}, {settings.members} members, weights {config.weights}, seed {config.seed}",
         table([("data set", "observations", "window", "maximum", "error std"), *rows]),
     ]
-    for problem in problems if any(e.needs_data for e in config.parameters) else problems[:1]:
-        title = f"estimated ({problem.observations.name})" if len(problems) > 1 else "estimated"
-        parts.append(table([(title, "unit", "prior", "median", "5 %", "95 %"), *_prior_rows(problem)]))
-        if problem.fields:
-            fields = [_field_row(one) for one in problem.fields]
-            parts.append(table([("field", "cells", "std", "correlation"), *fields]))
-        if correlated := _correlation_rows(problem):
-            parts.append(table([("correlated in the prior", "correlation"), *correlated]))
-        if problem.tied:
-            rows = [(tie.parameter.name, tie.to, f"{tie.factor:g}") for tie in problem.tied]
-            parts.append(table([("tied", "to", "times"), *rows]))
-        if problem.fixed:
-            known = {p.parameter.name: p.parameter for p in config.parameters}
-            fixed = [(name, *_shown(known[name], value)) for name, value in problem.fixed.items()]
-            parts.append(table([("fixed", "value", "unit"), *fixed]))
+    parts.append(_together(problems, ("estimated", "unit", "prior", "median", "5 %", "95 %"), _prior_rows))
+    if first.fields:
+        parts.append(table([("field", "cells", "std", "correlation"), *map(_field_row, first.fields)]))
+    if correlated := _correlation_rows(first):
+        parts.append(table([("correlated in the prior", "correlation"), *correlated]))
+    if first.tied:
+        rows = [(tie.parameter.name, tie.to, f"{tie.factor:g}") for tie in first.tied]
+        parts.append(table([("tied", "to", "times"), *rows]))
+    if first.fixed:
+        known = {p.parameter.name: p.parameter for p in config.parameters}
+
+        def fixed(problem: InverseProblem) -> list[tuple[str, ...]]:
+            return [(name, *_shown(known[name], value)) for name, value in problem.fixed.items()]
+
+        parts.append(_together(problems, ("fixed", "value", "unit"), fixed))
     parts.append(f"run directory: {config.directory}")
     return "\n\n".join(parts)
+
+
+def _together(
+    problems: Sequence[InverseProblem], header: tuple[str, ...], rows: Callable[[InverseProblem], list[tuple[str, ...]]]
+) -> str:
+    """One table for all data sets: a row a parameter, or a row each where a value comes from the data."""
+    found: dict[str, dict[str, tuple[str, ...]]] = {}
+    for problem in problems:
+        for name, *row in rows(problem):
+            found.setdefault(name, {})[problem.observations.name] = tuple(row)
+    if len(problems) == 1:
+        return table([header, *rows(problems[0])])
+    lines: list[tuple[str, ...]] = []
+    for name, each in found.items():
+        same = len(each) == len(problems) and len(set(each.values())) == 1
+        shown = {"all": next(iter(each.values()))} if same else each
+        lines += [(name, dataset, *row) for dataset, row in shown.items()]
+    return table([(header[0], "data set", *header[1:]), *lines])
 
 
 def _field_row(one: FieldPrior) -> tuple[str, ...]:

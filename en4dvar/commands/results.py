@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 
 import click
 
-from en4dvar.commands.common import Failed, deliver, folder_of, refuse_to_replace
+from en4dvar.commands.common import (
+    Failed,
+    ask,
+    deliver,
+    folder_of,
+    refuse_to_replace,
+    tell,
+    trust_option,
+    workers_option,
+)
 
 MOST_ROWS = 60  # of estimates on the terminal
 
@@ -37,8 +45,8 @@ def report(run_dir: Path, datasets: tuple[str, ...]) -> None:
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of figure and page; default compare_... beside.")
 @click.option("--no-report", is_flag=True, help="Print the tables only.")
 @click.option("--stored", is_flag=True, help="Evidences as the results have them: nothing is run.")
-@click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
-@click.option("--trust", is_flag=True, help="Run code that the files name, wherever it lies: read it before.")
+@workers_option
+@trust_option
 def compare(
     run_dirs: tuple[Path, ...], out: Path | None, no_report: bool, stored: bool, workers: int | None, trust: bool
 ) -> None:
@@ -48,19 +56,23 @@ def compare(
     installed packages is run with --trust alone.
 
     The runs may be laws on the same data or different gels. Writes compare.html, a figure (PNG, PDF) and CSV tables.
+    Of sequences a table of their evidences is printed.
 
     \b
     Example:
       en4dvar compare runs/neo_hookean runs/quadratic
     """
     from en4dvar.report.compare import compare_runs, comparison_table, estimates_table
+    from en4dvar.storage.cycles_file import cycles_file
 
+    if any(map(cycles_file, run_dirs)):
+        from en4dvar.report.compare_cycles import compare_sequences, sequences_table
+
+        click.echo(sequences_table(compare_sequences(run_dirs)))
+        return
     comparison = compare_runs(run_dirs)
     if not (stored or comparison.incomparable):
         from en4dvar.runs.evidence_run import sampled_evidences
-
-        def tell(words: str) -> None:
-            click.echo(words, err=True)
 
         evidences = [sampled_evidences(run_dir, workers, trust, None, tell) for run_dir in run_dirs]
         comparison = compare_runs(run_dirs, evidences)
@@ -87,30 +99,43 @@ def compare(
 def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
     """Write a table of a run as CSV or LaTeX, in display units.
 
+    Of a sequence or a twin experiment --csv has the state in time, --latex the last analysis.
+
     \b
     Example:
       en4dvar export runs/quickstart --latex --out table.tex
     """
     from en4dvar.report.export import export_table, posterior_file
+    from en4dvar.storage.cycles_file import cycles_file
 
+    cycles = cycles_file(run_dir)
+    if kind == "netcdf" and cycles:
+        click.echo(f"{cycles} is netCDF as it is: xarray.open_dataset({str(cycles)!r}); nothing to export")
+        return
     if kind == "netcdf":
         path = posterior_file(run_dir)
         click.echo(f"{path} follows the ArviZ schema as it is: arviz.from_netcdf({str(path)!r}); nothing to export")
         return
-    text = export_table(run_dir, kind)  # type: ignore[arg-type]
+    if cycles:
+        from en4dvar.report.export_cycles import cycles_table
+
+        text = cycles_table(cycles, kind)  # type: ignore[arg-type]
+    else:
+        text = export_table(run_dir, kind)  # type: ignore[arg-type]
     refuse_to_replace(out, force)
     deliver(text, out, "table")
 
 
 @click.command()
 @click.argument("run_dir", type=click.Path(path_type=Path))
-@click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
-@click.option("--trust", is_flag=True, help="Run code that the files name, wherever it lies: read it before.")
+@workers_option
+@trust_option
 def rerun(run_dir: Path, workers: int | None, trust: bool) -> None:
     """Repeat a run from what its result files record, and compare to the last bit. Nothing is written.
 
-    Configuration, seed and observations are those in the files. Where a bit differs, or anything that decides them has
-    changed since (versions, sources, processor, data files), it is told; the exit code is 1 where a bit differs.
+    Configuration, seed and observations are those in the files; the data of a sequence are read again. Where a bit
+    differs, or anything that decides them has changed since (versions, sources, processor, data files), it is told;
+    the exit code is 1 where a bit differs.
     A law or model outside of the current folder and of installed packages is run after a question, or with --trust.
 
     \b
@@ -119,7 +144,6 @@ def rerun(run_dir: Path, workers: int | None, trust: bool) -> None:
     """
     from en4dvar.runs.rerun import rerun as repeat
 
-    ask = (lambda question: click.confirm(question, err=True)) if sys.stdin.isatty() else None
     found = repeat(run_dir, workers, trust=trust, ask=ask)
     click.echo(str(found))
     if not found.same:

@@ -87,7 +87,6 @@ def _estimate(config: Config, force: bool, resume: bool) -> None:
 
 def _tell(campaign: Campaign, with_report: bool) -> None:
     """The posterior on standard output, warnings on standard error. Raises :class:`Failed` where a data set has."""
-    from en4dvar.report.joint import joint_table
     from en4dvar.storage.joint_file import FILE, load_joint
     from en4dvar.summary import results_table
 
@@ -98,6 +97,8 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
             click.echo(f"{outcome.name}: {remark}")
     together = load_joint(campaign.directory / FILE) if (campaign.directory / FILE).exists() else None
     if together:
+        from en4dvar.report.joint import joint_table
+
         click.echo(f"\n{joint_table(together)}")
     for notice in campaign.notices:
         click.echo(f"warning: {notice}", err=True)

@@ -8,7 +8,7 @@ from itertools import product
 from math import prod
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from en4dvar.config.context import Context, Made, quantity, time_unit
 from en4dvar.config.schema import QuantityText, Section, section_of
@@ -19,6 +19,7 @@ from en4dvar.state import Array
 
 MOST = 2000  # designs
 Value = QuantityText | bool
+OF_A_LAW = ("model", "parameters", "prior", "prior_correlation")
 
 
 class Knob(Section):
@@ -47,12 +48,40 @@ class Price(Section):
     experiment: Annotated[float, Field(ge=0)] = 0.0
     """Of an experiment, beside its readings."""
 
+    def of(self, experiments: int, readings: int) -> float:
+        """Of so many experiments of so many readings each."""
+        return experiments * (self.experiment + self.reading * readings)
+
+
+class Within(Section):
+    """What a design must keep to; one that does not is left out, and named."""
+
+    readings: Annotated[int, Field(ge=1)] | None = None
+    """Most readings of an experiment: the frames that the camera holds."""
+    price: Annotated[float, Field(ge=0)] | None = None
+    """Most that a design may cost."""
+    beyond: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Largest share of the prior that may leave what the model is valid for (of a bubble: its wall Mach number)."""
+
+    def broken(self, readings: int, price: float, beyond: float) -> str:
+        """What a design does not keep to; nothing: it does."""
+        told = (
+            ("readings", readings, f"{readings} readings"),
+            ("price", price, f"a price of {price:g}"),
+            ("beyond", beyond, f"{100 * beyond:.0f} % of the prior leaves what the model is valid for"),
+        )
+        limits = ((key, getattr(self, key), value, text) for key, value, text in told)
+        over = ((key, most, text) for key, most, value, text in limits if most is not None and value > most)
+        return "; ".join(f"{text}: more than design.within.{key} = {most:g}" for key, most, text in over)
+
 
 _SampleSizes: Any = section_of(SampleSizes)
 
 
 class Design(_SampleSizes):
     """Which experiments ``en4dvar design`` compares, and about what."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
     about: tuple[str, ...] = ()
     """Parameters that are asked for; the others are uncertain all the same. Default: all that have a prior."""
@@ -66,12 +95,23 @@ class Design(_SampleSizes):
     """How many experiments alike are made, e.g. bubbles of one gel: they share what is asked for."""
     price: Price = Price()
     """What an experiment costs: information is compared with it."""
+    within: Within = Within()
+    """What a design must keep to."""
+    enough: Annotated[float, Field(ge=0)] = 0.1
+    """Information, nats, below which no experiment is worth making; where the best design tells less, it is said."""
+    laws: dict[str, dict[str, Any]] = Field({})
+    """Which law holds? Name → keys of this file and values, e.g. ``{model.law: ...}``; ``{}`` is the file itself."""
     method: Literal["auto", "linear", "laplace", "nested"] = "auto"
     """linear: at the prior mean; laplace: linearised over the prior; nested: simulated readings, each explained anew;
     auto: laplace, checked by nested on the first and the best designs and replaced by it where they disagree."""
 
     @classmethod
     def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        laws = given.get("laws")
+        if isinstance(laws, dict) and laws:
+            _check_laws(laws, faults)
+            if given.get("experiments", [1]) != [1]:
+                faults.add(("experiments",), "not with laws: which law holds is asked of one experiment", at_key=True)
         knobs = given.get("knobs")
         if not isinstance(knobs, dict):
             return
@@ -88,3 +128,13 @@ class Design(_SampleSizes):
         """Name of the knob → value, of every combination."""
         for values in product(*(knob.values for knob in self.knobs.values())):
             yield dict(zip(self.knobs, values, strict=True))
+
+
+def _check_laws(laws: Mapping[str, Any], faults: Faults) -> None:
+    if len(laws) < 2:
+        faults.add(("laws",), "one law has nothing to be told from; give two or more", at_key=True)
+    for name, keys in laws.items():
+        for key in keys if isinstance(keys, dict) else ():
+            if str(key).split(".")[0] not in OF_A_LAW:
+                message = f"laws share the experiment; they differ in keys of {', '.join(OF_A_LAW)}"
+                faults.add(("laws", name, key), message, at_key=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ import yaml
 
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.hints import brief, no_such_file, shown
+from en4dvar.inputs.asked import SUFFIXES
 
 Key = tuple[str | int, ...]
 Mark = tuple[int, int]  # line and column, from 1
@@ -82,11 +84,16 @@ def read_document(path: Path) -> Document:
             words = f"longer than {LONGEST / 1e6:g} MB, which no configuration is; numbers belong into data files"
             raise ConfigError([Fault(words, file=str(path))])
         text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ConfigError([Fault(f"not UTF-8 text ({error.reason} at byte {error.start})", file=str(path))]) from None
+        return parse_document(text, str(path))
     except OSError as error:
         raise ConfigError([Fault(_unreadable(path, error))]) from None
-    return parse_document(text, str(path))
+    except UnicodeDecodeError as error:
+        fault = ConfigError([Fault(f"not UTF-8 text ({error.reason} at byte {error.start})", file=str(path))])
+    except ConfigError as error:
+        fault = error
+    if path.suffix.lower() in SUFFIXES:
+        raise ConfigError([Fault(_propose("a data file", path))]) from None
+    raise fault from None
 
 
 def document_of(given: Mapping[Any, Any]) -> Document:
@@ -171,8 +178,13 @@ def override(document: Document, overrides: Mapping[str, Any]) -> Document:
 
 def _unreadable(path: Path, error: OSError) -> str:
     if path.is_dir():
-        return f"{path}: is a directory, not a YAML file"
+        return _propose("a folder", path)
     return no_such_file(path) if isinstance(error, FileNotFoundError) else f"{path}: {error.strerror}"
+
+
+def _propose(what: str, path: Path) -> str:
+    given = shlex.quote(str(path))
+    return f"{path}: {what}, not a configuration; 'en4dvar init --data {given}' looks at the readings and proposes one"
 
 
 def _copy(node: Any) -> Any:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from en4dvar.errors import DataError
 from en4dvar.files import PathError, expanded, readable
+from en4dvar.hints import natural
 from en4dvar.inputs.asked import ANY, SUFFIXES, Column, DataFile, Layout
 from en4dvar.inputs.parts import parts_of
 
@@ -42,15 +43,15 @@ def find_files(base: Path, texts: Sequence[str]) -> dict[str, Path]:
         except PathError as error:
             raise DataError(str(error)) from None
         if glob.has_magic(text) and not os.path.exists(path):
-            found = sorted(Path(p) for p in glob.glob(str(path), recursive=True))
+            found = sorted(map(Path, glob.glob(str(path), recursive=True)), key=natural)
             if not found:
                 raise DataError(f"{path}: no file matches")
             paths += found
         elif os.path.isdir(path):
-            held = sorted(p for p in _beside(path) if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+            held = [p for p in _beside(path) if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
             if not held:
                 raise DataError(f"{path}: the folder holds no data file ({', '.join(SUFFIXES)})")
-            paths += held
+            paths += sorted(held, key=natural)
         else:
             paths.append(path)
     again = [path for path, count in Counter(os.path.abspath(p) for p in paths).items() if count > 1]

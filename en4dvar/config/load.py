@@ -153,12 +153,16 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
         directory=file.output.directory or Path("runs") / file.name,
         simulate_times=file.simulate.times if file.simulate else None,
         resolved=read.resolved(file.parameters),
-        sharing=sharing_of(parameters, file.groups or {}, bool(blocks), document),
+        sharing=sharing_of(parameters, file.groups or {}, bool(blocks), _of_several_series(file.data), document),
         initial_state=file.initial_state or (),
         model_error=file.model_error or (),
         dependence=blocks,
         design=file.design or Design(),
     )
+
+
+def _of_several_series(data: Data | DataPlan | None) -> bool:
+    return isinstance(data, DataPlan) and not data.alone
 
 
 def observed_in(data: Data | DataPlan | None, read: Read[Any]) -> Observable:

@@ -25,7 +25,7 @@ from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel
 from en4dvar.hints import brief, shown, suggest
 from en4dvar.prior import PriorTerm
-from en4dvar.state import OF_READINGS, READING_OFFSET, READING_SCALE, TIME_SHIFT, Array, Parameter
+from en4dvar.state import OF_READINGS, READING_OFFSET, TIME_SHIFT, Array, Parameter
 from en4dvar.units import parse_quantity
 from en4dvar.varying import RandomWalk
 from en4dvar.varying.model import can_vary
@@ -331,15 +331,16 @@ def entries(kind: str = "") -> Made:
         shift = replace(TIME_SHIFT, unit=model.time_unit, display_unit=model.time_display_unit)
         seen = context.observed
         offset = replace(READING_OFFSET, unit=seen.unit, display_unit=seen.display_unit) if seen else READING_OFFSET
-        known = {p.name: p for p in model.parameters}  # a model's own sigma goes before
-        # what makes its own readings makes them to scale
-        made = {READING_SCALE.name, READING_OFFSET.name} if kind else set()
-        known |= {p.name: p for p in (*OF_READINGS, shift, offset) if p.name not in known.keys() | made}
-        possible = [p.name for p in model.optional_parameters if p.name not in known]
+        known = {p.name: p for p in model.parameters}
+        of_readings = {p.name: p for p in (*OF_READINGS, shift, offset) if p.name not in known}  # a model's own first
+        known |= {} if kind else of_readings
+        labels = {p.name: p.label for p in (*known.values(), *model.optional_parameters)}
         defaults: Mapping[str, float] = getattr(model, "defaults", {})
 
         def unknown(name: str) -> str:
-            return f"unknown parameter {shown(name)}{suggest(name, [*known, *possible])}"
+            if kind and name in of_readings:
+                return f"{kind} makes its own readings: keys of their own say when and with which errors"
+            return f"unknown parameter {shown(name)}{suggest(name, labels)}"
 
         found: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in defaults.items()}
         with Faults() as faults:

@@ -32,6 +32,8 @@ from en4dvar.schemes import ON_A_WINDOW
 from en4dvar.units import Quantity, parse_quantity
 
 QuantityText = str | int | float
+# For a class that stands in no file: pydantic would search all of them for its text.
+IN_NO_FILE = {"use_attribute_docstrings": False}
 Name = Annotated[str, Field(pattern=r"^\w[\w.+ -]*$", max_length=100)]
 
 
@@ -81,14 +83,17 @@ def _plain(value: Any) -> Any:
 
 
 def section_of(*kinds: Any, base: type[Section] = Section) -> Any:
-    """``base`` with the fields of dataclasses, declared there as ``members: Annotated[int, Ge(3), "Size."] = 48``."""
+    """``base`` with the fields of dataclasses, declared there as ``members: Annotated[int, Ge(3), "Size."] = 48``.
+
+    A section below it with more keys, and texts below them, turns ``use_attribute_docstrings`` on again.
+    """
     declared: dict[str, Any] = {}
     for kind in kinds:
         hints = get_type_hints(kind, include_extras=True)
         for field in fields(kind):
             words = [text for text in getattr(hints[field.name], "__metadata__", ()) if isinstance(text, str)]
             declared[field.name] = (hints[field.name], Field(field.default, description=" ".join(words) or None))
-    return create_model(f"{base.__name__}Of", __base__=base, **declared)
+    return create_model(f"{base.__name__}Of", __base__=base, __cls_kwargs__=IN_NO_FILE, **declared)
 
 
 def _size(text: str) -> str:
@@ -197,6 +202,8 @@ else:
 
 class Assimilation(_Settings):
     """The settings of the scheme, declared at :class:`AssimilationSettings`, and how observations count."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
     scheme: OnAWindow = AssimilationSettings.scheme
     """en4dvar (iterative ensemble smoother), es-mda (multiple data assimilation), or the one analysis of a filter:

@@ -123,7 +123,8 @@ def _plan(section: DataOfSeries, context: Context) -> DataPlan:
             with faults.at(schema=SeriesData, place=place):
                 plans[name] = _series(name, _merged(common, own), context)
                 if plans[name].data.error is not None and plans[name].data.error.discrepancy is not None:
-                    raise ConfigError([Fault("a discrepancy is that of a single series", "error.discrepancy")])
+                    words = "a discrepancy is that of a single series; leave it out, or estimate this series by itself"
+                    raise ConfigError([Fault(words, "error.discrepancy")])
         for name, others in (section.correlation or {}).items():
             for other in others:
                 _check_pair(name, other, section, faults)

@@ -48,7 +48,11 @@ class Sharing:
 
 
 def sharing_of(
-    entries: Sequence[Entry], groups: Mapping[str, Mapping[str, Patterns]], correlated: bool, document: Document
+    entries: Sequence[Entry],
+    groups: Mapping[str, Mapping[str, Patterns]],
+    correlated: bool,
+    several_series: bool,
+    document: Document,
 ) -> Sharing:
     """What a file asks to be shared. Raises :class:`ConfigError`: every entry that cannot be."""
     asked = {e.parameter.name: e for e in entries if isinstance(e, Uncertain) and e.spec.shared is not None}
@@ -62,6 +66,9 @@ def sharing_of(
         ]
     if kinds and correlated:
         faults.append(document.fault(("parameters", next(iter(kinds)), "shared"), "not with correlated priors"))
+    if kinds and several_series:
+        words = "not where a data set has several series: a joint estimate takes one series of each"
+        faults.append(document.fault(("parameters", next(iter(kinds)), "shared"), words))
     if faults:
         raise ConfigError(faults)
     return Sharing(kinds, groups, document)

@@ -23,6 +23,7 @@ _MESSAGES = {
     "dict_type": _SECTION,
     "model_type": _SECTION,
     "model_attributes_type": _SECTION,
+    "tuple_type": "expected a list, e.g. [1, 2]",
     "string_type": "expected text; put it in quotes",
     "path_type": "expected the path of a file or folder",
     "int_parsing_size": "too large for a whole number",

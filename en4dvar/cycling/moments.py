@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from en4dvar.cycling.series import CycleSeries
+from en4dvar.noise import Correlation
+from en4dvar.noise.discrepancy import whitened
 from en4dvar.state import Array
 
 BLOCK = 64  # ensembles kept until their moments are taken, at most
@@ -85,18 +88,22 @@ class MomentsRecorder:
 
 
 class InnovationRecorder(MomentsRecorder):
-    """Moments of predictions (N, p), and the ranks (K, p) of observations (K, p) with errors ``std``, (p,) or (K, p).
+    """Moments of predictions (N, p) of a series; and of its observations (K, p) ranks and, ``of_data``, evidence (K,).
 
     A rank is the probability that the mixture of the members' Gaussians gives to what lies below the observation: the
     share of members below it, errors of the observations added, without the chance of a draw. NaN where there is none.
     """
 
-    def __init__(self, values: Array, std: Array, before: Moments | None = None, ranks: Array | None = None):
-        super().__init__(values.shape[0], values.shape[1], before)
-        self._values, self._std = values, np.broadcast_to(std, values.shape)
-        self._ranks = np.full(values.shape, np.nan)
-        if ranks is not None:
-            self._ranks[: len(ranks)] = ranks
+    def __init__(self, series: CycleSeries, of_data: bool, before: Moments | None = None):
+        cycles, size = series.values.shape
+        super().__init__(cycles, size, before)
+        self._series, self._of_data = series, of_data
+        self._std = np.broadcast_to(series.std, series.values.shape)
+        self._ranks, self._evidence = np.full(series.values.shape, np.nan), np.full(len(series.times), np.nan)
+
+    def resume(self, ranks: Array, evidence: Array) -> None:
+        """Take over what was recorded before."""
+        self._ranks[: len(ranks)], self._evidence[: len(evidence)] = ranks, evidence
 
     @property
     def ranks(self) -> Array:
@@ -104,12 +111,48 @@ class InnovationRecorder(MomentsRecorder):
         self._flush()
         return self._ranks
 
+    @property
+    def evidence(self) -> Array:
+        """Of everything recorded so far."""
+        self._flush()
+        return self._evidence
+
     def _flush(self) -> None:
         if not self._cycles:
             return
         from scipy.special import ndtr
 
-        at = self._cycles
-        gaps = (self._values[at][:, None] - self._ensembles[: len(at)]) / self._std[at][:, None]
-        self._ranks[at] = ndtr(gaps).mean(axis=1)
+        at = list(self._cycles)
         super()._flush()
+        gaps = self._ensembles[: len(at)]  # the members are not needed any more: memory is not asked for again
+        np.subtract(self._series.values[at][:, None], gaps, out=gaps)
+        gaps /= self._std[at][:, None]
+        if self._of_data:
+            self._evidence[at] = log_evidence(gaps, self._std[at], self._series.correlation)
+        self._ranks[at] = ndtr(gaps, out=gaps).mean(axis=1)
+
+
+def log_evidence(gaps: Array, std: Array, correlation: Correlation | None) -> Array:
+    """ln N(y; ȳ, P + R) (B,) of observations before they are assimilated, ȳ and P of the members' predictions.
+
+    ``gaps`` (B, N, p): (y − predictions) / ``std`` (B, p), NaN where nothing was observed.
+    """
+    _, n_members, p = gaps.shape
+    there, d = np.isfinite(gaps[:, 0]), gaps.mean(axis=1)
+    s = gaps - d[:, None]
+    s /= np.sqrt(n_members - 1)
+    if not there.all():
+        d, s = np.where(there, d, 0.0), np.where(there[:, None], s, 0.0)
+    log_norm = np.sum(np.where(there, np.log(std) + 0.5 * np.log(2 * np.pi), 0.0), axis=1)
+    if correlation is not None:
+        for k, among in enumerate(there):
+            part = Correlation(correlation.matrix[np.ix_(among, among)])
+            d[k, among], s[k][:, among] = part.decorrelated(d[k, among]), part.decorrelated(s[k][:, among].T).T
+            log_norm[k] += np.sum(np.log(np.diag(part.root)))
+    if p <= n_members:
+        v, roots = whitened(d, np.eye(p) + np.swapaxes(s, 1, 2) @ s)
+        square = np.sum(v**2, axis=1)
+    else:  # (I + SᵀS)⁻¹ = I − Sᵀ (I + SSᵀ)⁻¹ S
+        v, roots = whitened(np.einsum("kij,kj->ki", s, d), np.eye(n_members) + s @ np.swapaxes(s, 1, 2))
+        square = np.sum(d**2, axis=1) - np.sum(v**2, axis=1)
+    return np.asarray(-0.5 * square - np.sum(np.log(roots), axis=1) - log_norm)

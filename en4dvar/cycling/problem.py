@@ -14,6 +14,7 @@ from en4dvar.cycling.start import InitialEnsemble
 from en4dvar.executor import Executor
 from en4dvar.forward import Observable
 from en4dvar.observations import Observations
+from en4dvar.schemes.bootstrap_filter import BootstrapFilter
 from en4dvar.series import Part, Series
 from en4dvar.state import Array
 
@@ -58,6 +59,18 @@ class SeriesProblem:
         settings = replace(settings, to_end=True, innovations=True, coordinates=start.coordinates)
         return cls(start, observables, series, settings, members, data.name)
 
+    @property
+    def without_evidence(self) -> str:
+        """Why the densities of the observations do not multiply to an evidence; "" where they do."""
+        scheme = self.settings.scheme
+        if self.settings.localisation is not None:
+            return "its analyses are localised, the covariance of its forecasts is not"
+        if scheme.shift > 1:
+            return "it assimilates the observations of several times at once"
+        if not scheme.cycled or isinstance(scheme, BootstrapFilter):
+            return "its scheme knows no Gaussian forecast"
+        return ""
+
 
 @dataclass(frozen=True)
 class SeriesResult:
@@ -71,6 +84,11 @@ class SeriesResult:
     def normalised(self) -> Array:
         """(K, p) innovations over their expected standard deviations, √(forecast + observation variance)."""
         return normalised_innovations(self.problem.series, self.run)
+
+    @property
+    def log_evidence(self) -> float:
+        """ln p(y) by the forecasts' Gaussians, of one observation time after the other; NaN where there is none."""
+        return float("nan") if self.problem.without_evidence else float(np.sum(self.run.evidence))
 
     @property
     def warnings(self) -> tuple[str, ...]:

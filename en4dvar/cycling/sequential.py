@@ -106,6 +106,7 @@ class SequentialState:
     smoothed: Moments
     predicted: Moments
     ranks: Array
+    evidence: Array
     iterations: Array
     effective: Array
     kept: tuple[tuple[int, Array], ...]
@@ -120,10 +121,11 @@ class SequentialResult:
 
     The last L smoothed rows of the IEnKS, unless ``to_end``, and all of a filter without a smoother are NaN.
     ``predicted``: moments (K, p) of the forecast where it was observed. ``ranks`` (K, p): share of the members, with
-    the errors of the observations, that lie below the observation, NaN where there was none. ``iterations`` (K,)
-    forecasts of the window. ``effective`` (K,): members that the weights of a particle filter leave, NaN: all.
-    ``members`` (N', n) the final ensemble at the start of the last window; ``kept``: index of a time → analysis members
-    (N', n), physical; ``failures`` the reasons of the members lost.
+    the errors of the observations, that lie below the observation, NaN where there was none. ``evidence`` (K,): log
+    density of the observations of a time given those before, of the Gaussian of the forecast; NaN in a twin experiment.
+    ``iterations`` (K,) forecasts of the window. ``effective`` (K,): members that the weights of a particle filter
+    leave, NaN: all. ``members`` (N', n) the final ensemble at the start of the last window; ``kept``: index of a time →
+    analysis members (N', n), physical; ``failures`` the reasons of the members lost.
     """
 
     forecast: Moments
@@ -131,6 +133,7 @@ class SequentialResult:
     smoothed: Moments
     predicted: Moments
     ranks: Array
+    evidence: Array
     iterations: Array
     effective: Array
     members: Array
@@ -225,15 +228,17 @@ class _Run:
             self.trail = list(resume.trail)
             earlier = resume.forecast, resume.analysis, resume.smoothed
         self.before, self.after, self.smooth = (MomentsRecorder(cycles, size, moments, truth) for moments in earlier)
-        found = (resume.predicted, resume.ranks) if resume else (None, None)
-        self.predicted = InnovationRecorder(series.values, series.std, *found)
+        self.predicted = InnovationRecorder(series, truth is None, resume.predicted if resume else None)
+        if resume is not None:
+            self.predicted.resume(resume.ranks, resume.evidence)
 
     def state(self) -> SequentialState:
         done = self.done  # the next forecast may be there already
         before, predicted = (recorder.moments().until(done + 1) for recorder in (self.before, self.predicted))
         after, smooth = (recorder.moments().until(done) for recorder in (self.after, self.smooth))
+        ranks, evidence = (found[: done + 1].copy() for found in (self.predicted.ranks, self.predicted.evidence))
         return SequentialState(
-            done, self.start, self.ensemble, before, after, smooth, predicted, self.predicted.ranks[: done + 1].copy(),
+            done, self.start, self.ensemble, before, after, smooth, predicted, ranks, evidence,
             self.iterations[:done].copy(), self.effective[:done].copy(), tuple(self.kept), self.flow.runs,
             tuple(self.failures), tuple(self.trail),
         )  # fmt: skip
@@ -243,8 +248,8 @@ class _Run:
             self.settings.smoother.ended(self.trail, len(self.iterations) - 1, self.put_smoothed)
         before, after, smooth = (recorder.moments() for recorder in (self.before, self.after, self.smooth))
         return SequentialResult(
-            before, after, smooth, self.predicted.moments(), self.predicted.ranks, self.iterations, self.effective,
-            self.ensemble, tuple(self.kept), tuple(self.failures), self.flow.runs,
+            before, after, smooth, self.predicted.moments(), self.predicted.ranks, self.predicted.evidence,
+            self.iterations, self.effective, self.ensemble, tuple(self.kept), tuple(self.failures), self.flow.runs,
         )  # fmt: skip
 
     def cycle(self) -> None:

@@ -10,11 +10,11 @@ import numpy as np
 from annotated_types import Ge
 
 from en4dvar.design.laplace import Expected, expected, require_alive
+from en4dvar.design.laws import Decision, deciding
 from en4dvar.design.nested import nested
 from en4dvar.design.planned import Planned
 from en4dvar.design.readings import choose
 from en4dvar.ensemble.forecast import plotting_times
-from en4dvar.executor import Executor
 from en4dvar.prior import own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.state import Array
@@ -40,7 +40,7 @@ class Evaluated:
     that is asked for in its unit, ``relative`` (a,) to the value, ``ratio`` (a,) of posterior to prior std in
     transformed space. ``lost``: share of the draws at which the model fails; ``beyond``: share that leaves what the
     model is valid for. ``readings`` (k,) are taken, at ``times`` (k,). ``fan`` (5, M) are quantiles of what will be
-    seen at ``grid`` (M,). ``forward_runs`` it took.
+    seen at ``grid`` (M,). ``forward_runs`` it took. ``decision``: what it tells of which of several laws holds.
     """
 
     gain: float
@@ -57,6 +57,17 @@ class Evaluated:
     fan: Array
     alike: int = 1
     forward_runs: int = 0
+    decision: Decision | None = None
+
+    @property
+    def worth(self) -> float:
+        """What designs are ranked by, nats: information about the law where that is asked, else :attr:`gain`."""
+        return self.decision.information if self.decision else self.gain
+
+    @property
+    def worth_error(self) -> float:
+        """Its Monte Carlo standard error."""
+        return self.decision.information_error if self.decision else self.error
 
 
 def evaluate(
@@ -67,25 +78,20 @@ def evaluate(
     seed: int,
     alike: Sequence[int] = (1,),
     choice: tuple[int, float] | None = None,
-    executor: Executor | None = None,
+    laws: Sequence[InverseProblem] = (),
 ) -> tuple[Evaluated, ...]:
     """Evaluate a design, for every number of experiments ``alike``.
 
     ``choice``: how many of the readings are to be chosen, and how far apart in time. Several alike are evaluated by
-    linearisation.
+    linearisation. ``laws``: the same experiment explained by each of several laws, read as ``problem`` is; which
+    of them holds is asked as well.
 
     Raises
     ------
     ConfigError: a name that is not estimated; a choice that is not possible. TooFewMembersError: the model fails.
     """
-    planned = Planned(problem, about, executor)
-    before = 0
-    if choice is not None:
-        chosen = choose(planned, planned.draws(sizes.draws, own_seed(seed, "choice of readings")), *choice)
-        weights = np.zeros(len(problem.observations))
-        weights[chosen] = 1
-        problem = replace(problem, observations=replace(problem.observations, weights=weights))
-        before, planned = planned.forward_runs, Planned(problem, about, executor)
+    problem, before = (problem, 0) if choice is None else _chosen(problem, about, sizes, seed, choice)
+    planned = Planned(problem, about)
     u = planned.draws(sizes.draws, seed)
     grid = plotting_times(problem)
     run = planned.run(u, grid)
@@ -94,7 +100,11 @@ def evaluate(
     tried = 1 if method == "linear" else len(u)
     exceeds = np.isfinite(run.beyond[run.active]).any(axis=1)
     used = problem.observations.used
-    found = []
+    found, decision = [], None
+    if laws:
+        own = [Planned(replace(law, observations=problem.observations)) for law in laws]
+        decision = deciding(own, sizes.simulated, sizes.inner, seed)
+        before += sum(law.forward_runs for law in own)
     for n in alike:
         values = expected(planned, tangents, tried, n)
         gain, error, by = values.gain, values.error, str("laplace" if method == "nested" else method)
@@ -118,9 +128,19 @@ def evaluate(
                 fan=np.quantile(run.path[run.active][:, : len(grid)], FAN, axis=0),
                 alike=n,
                 forward_runs=before + planned.forward_runs,
+                decision=decision,
             )
         )
     return tuple(found)
+
+
+def _chosen(
+    problem: InverseProblem, about: Sequence[str], sizes: SampleSizes, seed: int, choice: tuple[int, float]
+) -> tuple[InverseProblem, int]:
+    """The problem with the readings of the ``choice`` alone, and the runs it took; on draws of their own."""
+    planned, weights = Planned(problem, about), np.zeros(len(problem.observations))
+    weights[choose(planned, planned.draws(sizes.draws, own_seed(seed, "choice of readings")), *choice)] = 1
+    return replace(problem, observations=replace(problem.observations, weights=weights)), planned.forward_runs
 
 
 def _in_units(planned: Planned, values: Expected, u: Array) -> tuple[Array, Array]:

@@ -54,16 +54,6 @@ def standard_error(values: Array) -> float:
     return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
 
 
-def linear(planned: Planned) -> Expected:
-    """By the tangent at the prior mean alone. Raises :class:`TooFewMembersError` where the model fails there."""
-    return expected(planned, planned.tangents(np.zeros((1, len(planned.names)))), 1)
-
-
-def laplace(planned: Planned, u: Array) -> Expected:
-    """By the tangents at draws (R, n) of the prior. Raises :class:`TooFewMembersError` where the model mostly fails."""
-    return expected(planned, planned.tangents(u), len(u))
-
-
 def expected(planned: Planned, tangents: Tangents, count: int, alike: int = 1) -> Expected:
     """Of ``alike`` experiments, from tangents at those of ``count`` draws where the model lives."""
     require_alive(len(tangents.at), count)

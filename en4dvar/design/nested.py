@@ -65,9 +65,9 @@ def nested(planned: Planned, u: Array, inner: int, seed: int) -> Nested:
     values = np.stack([noise.drawn(one.prediction, s) for one, s in zip(truths.at, streams, strict=True)])
     plain, effective = np.empty(len(values)), np.empty(len(values))
     for i, (y, stream) in enumerate(zip(values, streams, strict=True)):
-        near = _near(planned, truths, y, i)
-        known, of_known = _log_integral(planned, y, truths.u[i, : planned.asked], near, inner, stream)
-        log, of_all = _log_integral(planned, y, truths.u[i, :0], near, inner, stream)
+        near = explaining(planned, truths, y, i)
+        known, of_known = log_integral(planned, y, truths.u[i, : planned.asked], near, inner, stream)
+        log, of_all = log_integral(planned, y, truths.u[i, :0], near, inner, stream)
         plain[i], effective[i] = known - log, min(of_known, of_all)
     alive = np.isfinite(plain)
     require_alive(int(alive.sum()), len(u))
@@ -77,28 +77,39 @@ def nested(planned: Planned, u: Array, inner: int, seed: int) -> Nested:
     return Nested(gains[alive], linearised[alive], effective[alive])
 
 
-def _near(planned: Planned, truths: Tangents, values: Array, i: int) -> tuple[Array, Array]:
-    """Gaussians where readings (K,) of draw i have a posterior: centres (M, n) and precisions (M, n, n).
+def explaining(planned: Planned, truths: Tangents, values: Array, own: int | None) -> tuple[Array, Array]:
+    """Gaussians where readings (K,) have a posterior: centres (M, n) and precisions (M, n, n).
 
-    Each is one step of Gauss and Newton away from the draw itself, or from another one that explains the readings.
+    Each is one step of Gauss and Newton away from the draw that the readings are of, its ``own``, or from one that
+    explains them.
     """
     observations = replace(planned.problem.observations, values=values)
     costs = [float(observations.cost(one.prediction)) for one in truths.at] + 0.5 * np.sum(truths.u**2, axis=1)
-    others = [k for k in np.argsort(costs)[:OTHERS].tolist() if k != i]
-    found = truths.some([i, *others])
+    chosen = list(dict.fromkeys([*([] if own is None else [own]), *np.argsort(costs)[:OTHERS].tolist()]))
+    found = truths.some(chosen)
     d, rows = found.whitened(planned, np.tile(values, (len(found.at), 1)))
     matrices = precision(rows)
     step = np.linalg.solve(matrices, (np.einsum("rki,rk->ri", rows, d) - found.u)[..., None])[..., 0]
-    lowest = costs[[i, *others]] - 0.5 * np.einsum("ri,rij,rj->r", step, matrices, step)
+    lowest = np.array(costs)[chosen] - 0.5 * np.einsum("ri,rij,rj->r", step, matrices, step)
     plausible = lowest < lowest.min() + PLAUSIBLE
     plausible[0] = True
     return (found.u + step)[plausible], matrices[plausible]
 
 
-def _log_integral(
-    planned: Planned, values: Array, known: Array, near: tuple[Array, Array], inner: int, stream: np.random.Generator
+def log_integral(
+    planned: Planned,
+    values: Array,
+    known: Array,
+    near: tuple[Array, Array],
+    inner: int,
+    stream: np.random.Generator,
+    enough: float = ENOUGH,
+    rounds: int = ROUNDS,
 ) -> tuple[float, float]:
-    """ln ∫ e^{−J_o} N(·; 0, I) over the coordinates behind the ``known`` ones, and the effective draws behind it."""
+    """ln ∫ e^{−J_o} N(·; 0, I) over the coordinates behind the ``known`` ones, and the effective draws behind it.
+
+    In at most so many ``rounds`` of ``inner`` runs, until there are ``enough`` effective draws.
+    """
     (centres, matrices), k = near, len(known)
     if k == len(planned.names):
         return -float(planned.cost(values, planned.run(known[None]))[0]), np.inf
@@ -111,10 +122,10 @@ def _log_integral(
         shares, np.vstack([centres[:, k:] - shift, np.zeros(n)]), np.vstack([roots, np.eye(n)[None]])
     )
     draws = Importance(first, stream, inner, WIDER)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         z = draws.draw()
         draws.add(z, -planned.cost(values, planned.run(np.hstack([np.tile(known, (inner, 1)), z]))))
-        if draws.effective >= ENOUGH:
+        if draws.effective >= enough:
             break
     if not np.isfinite(draws.log):
         return -np.inf, 0.0

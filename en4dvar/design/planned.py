@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
 from en4dvar.errors import ConfigError
-from en4dvar.executor import Executor
 from en4dvar.noise import Linearisation
 from en4dvar.prior import standard_normal
 from en4dvar.problem import InverseProblem
@@ -31,7 +30,7 @@ class Planned:
     ConfigError: a name that is not estimated, or twice; weights other than 0 and 1, which are not Bayesian.
     """
 
-    def __init__(self, problem: InverseProblem, about: Sequence[str] = (), executor: Executor | None = None):
+    def __init__(self, problem: InverseProblem, about: Sequence[str] = ()):
         names = problem.prior.names
         about = tuple(about) or names
         if unknown := [name for name in about if name not in names]:
@@ -41,7 +40,7 @@ class Planned:
         if not np.isin(problem.observations.weights, (0, 1)).all():
             raise ConfigError("weights other than 0 and 1 are not Bayesian: there is no expected information of them")
         self.problem, self.about, self.asked = problem, about, len(about)
-        self.composite = Composite(problem, executor)
+        self.composite = Composite(problem)
         order = [names.index(name) for name in (*about, *(name for name in names if name not in about))]
         half = problem.prior.from_white_change(np.eye(len(names)))
         covariance = (half.T @ half)[np.ix_(order, order)]

@@ -139,16 +139,20 @@ def _fit(a: Analysis, odd: Sequence[Caution]) -> checks.Findings:
 
 
 def unfinished(analysis: Analysis) -> checks.Findings:
-    """Iterations that stopped before their own criterion; a note where the next step would have been short, and nothing
-    where no user would see it.
+    """Iterations that stopped before their own criterion; a note where the next step would have been short, or members
+    were drawn from the posterior itself afterwards, and nothing where no user would see it.
 
-    A gradient regressed over the ensemble need not vanish where J is smallest, so that variant often ends like this.
+    Draws and chains warn of themselves where they are too few, or find a lower J. A gradient regressed over the
+    ensemble need not vanish where J is smallest, so that variant often ends like this.
     """
     step_norm = analysis.iterations[-1].step_norm  # of the next step, had there been one
     if analysis.converged or step_norm <= UNSEEN:
         return
     words = f"not converged: {analysis.stop_reason}"
-    if step_norm <= SHORT_STEP:
+    if analysis.refinement:
+        words = f"the search for the minimum has {words}; members are drawn from the posterior itself, wherever that is"
+        yield replace(caution("not-converged", words, "note"), advice="no action is needed")
+    elif step_norm <= SHORT_STEP:
         words = f"{words}; the next step would be {step_norm:.2g} posterior standard deviations"
         advice = "no action is needed where this is little to you; else start again from another seed"
         yield replace(caution("not-converged", words, "note"), advice=advice)

@@ -11,13 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import binom
 
-from en4dvar.errors import OutputError
 from en4dvar.files import inside, write_text
 from en4dvar.report.html import render
 from en4dvar.report.page import provenance_rows
 from en4dvar.report.style import COLUMN, LIGHT, Captioned, draw, styled
 from en4dvar.report.text import with_unit
-from en4dvar.storage.seal import check_seal
 
 Table = tuple[str, Sequence[str], Sequence[Sequence[str]], str]  # heading, columns, rows, words below it
 BINS = 10
@@ -25,16 +23,6 @@ RANKS = (
     "Rank histogram: where each observation fell among the forecast members, errors of the observations added. A "
     "reliable ensemble has flat bars, 95 % of them inside the band; a valley is too little spread, a hill too much."
 )
-
-
-def read_cycles(path: Path) -> xr.Dataset:
-    """A result file. Raises :class:`OutputError` where there is nothing to read."""
-    check_seal(path)
-    try:
-        with xr.open_dataset(path) as file:
-            return file.load()
-    except (OSError, ValueError) as error:
-        raise OutputError(f"{path}: not a readable result: {error}") from None
 
 
 def write_cycles_page(

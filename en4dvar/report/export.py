@@ -37,9 +37,10 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
     Parameters
     ----------
     kind: ``csv``: a line for each data set and parameter (prior, mean, std, 5/50/95 %, centre, DFS), every digit kept;
-        ``members``: a line for each data set and living posterior member, a column a parameter; ``latex``: mean ± std
-        for a paper (package booktabs), a row a parameter, or with several data sets a row a data set.
-        Warnings come along: in a column of the CSV, as footnotes and comments in LaTeX. A number that is not to be
+        ``members``: a line for each data set and living posterior member, a column a parameter; ``latex``: for a paper
+        (package booktabs) mean ± std, or of a skewed posterior the median with its 5 and 95 %, a row a parameter, or
+        with several data sets a row a data set. Warnings come along: in a column of the CSV, as footnotes in LaTeX,
+        where notes are comments. A number that is not to be
         trusted stands without an interval.
 
     Raises
@@ -85,15 +86,17 @@ def _members_csv(results: Iterable[StoredResult]) -> str:
 
 Found = tuple[str, tuple[ParameterSummary, ...], tuple[Caution, ...]]
 LITTLE_NOTE = "the data say little about it: its posterior is close to its prior"
+SKEWED_NOTE = "median and 5 to 95 %: the posterior is skewed"
+SKEWED = 2.0  # the sides of 48 Gaussian members rarely differ as much
 MODAL_NOTE = "5 to 95 % of a posterior of several modes, by their weights"
 
 
 def latex_table(found: Sequence[Found]) -> str:
     """Mean ± std for a paper (package booktabs): a row a parameter, or of several ``found`` a row each."""
     header = "% en4dvar export: posterior mean and standard deviation; needs \\usepackage{booktabs}"
-    warned = [f"% {c.severity}: {name}: {c}" for name, _, cautions in found for c in cautions]
+    warned = [f"% {c.severity}: {name}: {c}" for name, _, cautions in found for c in cautions if c.kind == "note"]
     notes = Notes()
-    table = _one_set(found[0][1], notes) if len(found) == 1 else _many_sets(found, notes)
+    table = _one_set(found[0], notes) if len(found) == 1 else _many_sets(found, notes)
     return "\n".join([header, *(_one_line(line) for line in warned), *table]) + "\n"
 
 
@@ -103,39 +106,48 @@ class Notes:
     def __init__(self) -> None:
         self._letters: dict[str, str] = {}
 
-    def mark(self, row: ParameterSummary) -> str:
-        """What follows a number: the letter of its footnote, or nothing."""
-        words = {LITTLE: LITTLE_NOTE, MODAL: MODAL_NOTE}.get(row.informed, "")
+    def mark(self, row: ParameterSummary, cautions: Sequence[Caution]) -> str:
+        """What follows a number: the letters of its footnotes, or nothing."""
+        words = [{LITTLE: LITTLE_NOTE, MODAL: MODAL_NOTE}.get(row.informed, "")]
         if row.untrusted:
-            words = f"not to be trusted: {untrusted_words(row)}"
-        if not words:
-            return ""
-        letter = self._letters.setdefault(words, string.ascii_lowercase[len(self._letters) % 26])
-        return f"\\textsuperscript{{{letter}}}"
+            words = [f"not to be trusted: {untrusted_words(row)}"]
+        elif skewed(row) and not row.modal:
+            words.append(SKEWED_NOTE)
+        return self._marks([*words, *(c.words for c in cautions if row.name in c.parameters and c.kind == "warning")])
+
+    def warn(self, cautions: Sequence[Caution]) -> str:
+        """What follows the name of a data set: the letters of the warnings about all of its parameters."""
+        return self._marks([c.words for c in cautions if not c.parameters and c.kind == "warning"])
+
+    def _marks(self, each: Sequence[str]) -> str:
+        known = self._letters
+        letters = [known.setdefault(words, string.ascii_lowercase[len(known) % 26]) for words in each if words]
+        return f"\\textsuperscript{{{','.join(letters)}}}" if letters else ""
 
     def lines(self, columns: int) -> list[str]:
         """Rows below the table."""
-        start = f"  \\multicolumn{{{columns}}}{{l}}{{\\footnotesize "
+        start = f"  \\multicolumn{{{columns}}}{{p{{0.9\\linewidth}}}}{{\\footnotesize "
         return [
             f"{start}\\textsuperscript{{{letter}}} {escaped(words)}}} \\\\" for words, letter in self._letters.items()
         ]
 
 
-def _one_set(rows: tuple[ParameterSummary, ...], notes: Notes) -> list[str]:
+def _one_set(found: Found, notes: Notes) -> list[str]:
+    _, rows, cautions = found
+    head = f"parameter & unit & prior & posterior{notes.warn(cautions)} & 5--95\\,\\%"
     lines = [
         " & ".join(
             (
                 latex_symbol(row),
                 latex_unit(row.unit) or "--",
-                _plus_minus(row.prior_mean, row.prior_std),
-                _estimate(row, notes),
+                plus_minus(row.prior_mean, row.prior_std),
+                _estimate(row, cautions, notes),
                 _interval(row),
             )
         )
         for row in rows
     ]
-    head = "parameter & unit & prior & posterior & 5--95\\,\\%"
-    return _tabular("llrrr", head, lines, notes)
+    return tabular("llrrr", head, lines, notes)
 
 
 def _many_sets(found: Sequence[Found], notes: Notes) -> list[str]:
@@ -146,14 +158,14 @@ def _many_sets(found: Sequence[Found], notes: Notes) -> list[str]:
         ["data set", *(f"{latex_symbol(first[n])}" + (f" ({units[n]})" if units[n] else "") for n in names)]
     )
     lines = []
-    for dataset, rows, _ in found:
-        own = {row.name: row for row in rows}
-        cells = [_estimate(own[n], notes) if n in own else "--" for n in names]
-        lines.append(" & ".join([escaped(dataset), *cells]))
-    return _tabular("l" + "r" * len(names), head, lines, notes)
+    for dataset, rows, cautions in found:
+        own, named = {row.name: row for row in rows}, f"{escaped(dataset)}{notes.warn(cautions)}"
+        lines.append(" & ".join([named, *(_estimate(own[n], cautions, notes) if n in own else "--" for n in names)]))
+    return tabular("l" + "r" * len(names), head, lines, notes)
 
 
-def _tabular(columns: str, head: str, lines: list[str], notes: Notes) -> list[str]:
+def tabular(columns: str, head: str, lines: list[str], notes: Notes) -> list[str]:
+    """The lines of a table and of the notes below it."""
     body = [f"  {line} \\\\" for line in lines]
     return [
         f"\\begin{{tabular}}{{{columns}}}", "  \\toprule", f"  {head} \\\\", "  \\midrule", *body,
@@ -161,12 +173,28 @@ def _tabular(columns: str, head: str, lines: list[str], notes: Notes) -> list[st
     ]  # fmt: skip
 
 
-def _estimate(row: ParameterSummary, notes: Notes) -> str:
-    """Mean ± std, or the mean alone, or the interval of several modes, with the mark of its footnote."""
-    value = f"${_tex(plain_number(row.mean, 3))}$" if row.untrusted else _plus_minus(row.mean, row.std)
+def _estimate(row: ParameterSummary, cautions: Sequence[Caution], notes: Notes) -> str:
+    """Mean ± std; of a skewed posterior the median with the distances to its 5 and 95 %; of several modes the interval;
+    of what is not to be trusted the mean alone. With the marks of its footnotes."""
     if row.modal:
         value = _interval(row)
-    return f"{value}{notes.mark(row)}"
+    elif row.untrusted:
+        value = f"${_tex(plain_number(row.mean, 3))}$"
+    else:
+        value = _asymmetric(row) if skewed(row) else plus_minus(row.mean, row.std)
+    return f"{value}{notes.mark(row, cautions)}"
+
+
+def skewed(row: ParameterSummary) -> bool:
+    """Whether one side of the 90 % interval is more than twice the other: mean ± std would mislead."""
+    below, above = row.q50 - row.q05, row.q95 - row.q50
+    return max(below, above) > SKEWED * min(below, above)
+
+
+def _asymmetric(row: ParameterSummary) -> str:
+    """The median with its distances to the 5 and 95 % quantiles."""
+    above, below = (_tex(number_like(side, row.std)) for side in (row.q95 - row.q50, row.q50 - row.q05))
+    return f"${_tex(number_like(row.q50, row.std))}^{{+{above}}}_{{-{below}}}$"
 
 
 def _interval(row: ParameterSummary) -> str:
@@ -180,7 +208,8 @@ def _one_line(comment: str) -> str:
     return "".join(c if c.isprintable() else " " for c in comment)
 
 
-def _plus_minus(mean: float, std: float) -> str:
+def plus_minus(mean: float, std: float) -> str:
+    """In math mode, with the digits that the std calls for."""
     return f"${_tex(number_like(mean, std))} \\pm {_tex(number_like(std, std))}$"
 
 

@@ -99,7 +99,7 @@ def cost(result: StoredResult) -> Figure:
 
 @styled
 def traces(result: StoredResult) -> Figure:
-    """Each parameter over the iterations: mean ± std of the ensemble the iterate describes, and its centre."""
+    """Each parameter over the iterations: mean and middle 68 % of the ensemble of the iterate, and its centre."""
     rows = result.summary()
     steps = result.iterations["iteration"].values
     figure, axes = panels(len(rows), COLUMN, 3.4 / 2.54)
@@ -107,9 +107,9 @@ def traces(result: StoredResult) -> Figure:
         members, centre = (shown(result.iterations[key]) for key in (row.name, f"{row.name}_centre"))
         alive = np.isfinite(members).all(axis=0)
         if alive.sum() > 1:
-            mean, std = members[:, alive].mean(axis=1), members[:, alive].std(axis=1, ddof=1)
-            ax.fill_between(steps, mean - std, mean + std, color=LIGHT["posterior"], alpha=0.3, lw=0)
-            ax.plot(steps, mean, color=LIGHT["posterior"])
+            low, high = np.quantile(members[:, alive], (0.16, 0.84), axis=1)  # of what is positive, positive
+            ax.fill_between(steps, low, high, color=LIGHT["posterior"], alpha=0.3, lw=0)
+            ax.plot(steps, members[:, alive].mean(axis=1), color=LIGHT["posterior"])
         ax.plot(steps, centre, "--", color=LIGHT["centre"], lw=0.9)
         ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
         ax.yaxis.set_major_locator(MaxNLocator(4))
@@ -178,7 +178,7 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
     if named:
         yield (
             "iterations",
-            "Parameters over the iterations: ensemble mean ± std (blue), centre (dashed).",
+            "Parameters over the iterations: ensemble mean and middle 68 % (blue), centre (dashed).",
             traces(result),
         )
     if 2 <= len(result.posterior.data_vars) <= MAX_PAIRS and result.alive.sum() > 2:

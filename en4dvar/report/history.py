@@ -157,4 +157,5 @@ def _bars(ax: Axes, result: StoredResult, one: SeriesShown, band: Band) -> None:
 def _data_range(data: Array, std: Array) -> tuple[float, float]:
     """Limits of the data with room around: a wide prior must not shrink them to a line."""
     low, high = float((data - std).min()), float((data + std).max())
-    return low - 0.12 * (high - low), high + 0.25 * (high - low)
+    below = low - 0.12 * (high - low)
+    return max(0.0, below) if data.min() >= 0 else below, high + 0.25 * (high - low)

@@ -10,10 +10,11 @@ import numpy.typing as npt
 import xarray as xr
 from matplotlib.figure import Figure
 
-from en4dvar.report.cycles import RANKS, labelled, ranks, read_cycles, stacked_axes, write_cycles_page
+from en4dvar.report.cycles import RANKS, labelled, ranks, stacked_axes, write_cycles_page
 from en4dvar.report.style import LIGHT, PAGE, Captioned, styled
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
 from en4dvar.state import Array
+from en4dvar.storage.cycles_file import read_cycles
 from en4dvar.units import convert
 
 SHOWN = 5  # variables or observations in a figure

@@ -12,9 +12,10 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from en4dvar.report.cycles import RANKS, labelled, ranks, read_cycles, stacked_axes, write_cycles_page
+from en4dvar.report.cycles import RANKS, labelled, ranks, stacked_axes, write_cycles_page
 from en4dvar.report.style import COLUMN, LIGHT, Captioned, styled
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
+from en4dvar.storage.cycles_file import read_cycles
 from en4dvar.storage.twin_file import MEAN
 
 COLOURS = {"forecast": "prior", "analysis": "posterior", "smoothed": "background"}

@@ -7,11 +7,14 @@ import unicodedata
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from en4dvar.caution import Caution
 from en4dvar.errors import TooFewMembersError
-from en4dvar.report.result import Result, load_result
 from en4dvar.summary import ParameterSummary
+
+if TYPE_CHECKING:
+    from en4dvar.report.result import Result
 
 _RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")  # names of devices on Windows
 _LONGEST = 120  # bytes; file systems allow 255, and temporary names are longer
@@ -64,10 +67,14 @@ class Campaign:
 
     def __iter__(self) -> Iterator[Result]:
         """Posteriors, one after the other; none is kept."""
+        from en4dvar.report.result import load_result  # what draws pages is slow to import
+
         return (load_result(o.file) for o in self.outcomes if o.file is not None)
 
     def __getitem__(self, name: str) -> Result:
         """The posterior of a data set. Raises :class:`KeyError` where it is unknown or has failed."""
+        from en4dvar.report.result import load_result
+
         for outcome in self.outcomes:
             if outcome.name == name and outcome.file is not None:
                 return load_result(outcome.file)

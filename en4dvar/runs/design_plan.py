@@ -16,6 +16,7 @@ from en4dvar.config.reading import errors_of, read_observations
 from en4dvar.config.series import SeriesPlan
 from en4dvar.ensemble.forecast import forecast
 from en4dvar.errors import ConfigError, En4dvarError
+from en4dvar.inputs.asked import DataFile
 from en4dvar.noise import Noise, noise_of
 from en4dvar.observations import Observations
 from en4dvar.problem import InverseProblem
@@ -25,10 +26,21 @@ from en4dvar.state import Array
 
 @dataclass(frozen=True)
 class Candidate:
-    """A design: what its knobs are set to, and the configuration that this makes. Without settings: as in the file."""
+    """A design: what its knobs are set to, and the configuration that this makes. Without settings: as in the file.
+
+    ``laws``: the same configuration with each of the laws that are to be told apart.
+    """
 
     settings: Mapping[str, Value]
     config: Config
+    laws: tuple[Config, ...] = ()
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Value], document: Document, base: Path) -> Candidate:
+        """From the document that the settings make. Raises :class:`ConfigError`."""
+        config = resolve(document, base)
+        laws = (resolve(override(document, keys), base) for keys in config.design.laws.values())
+        return cls(settings, config, tuple(laws))
 
     @property
     def readings(self) -> tuple[int, float] | None:
@@ -39,12 +51,13 @@ class Candidate:
 
 def candidates(document: Document, base: Path) -> Iterator[Candidate]:
     """The file's own design, then every combination of its knobs. Raises :class:`ConfigError`."""
-    config = resolve(document, base)
-    yield Candidate({}, config)
-    if config.design.knobs:
-        for settings in config.design.settings():
-            overrides = {config.design.knobs[name].key: value for name, value in settings.items()}
-            yield Candidate(settings, resolve(override(document, overrides), base))
+    first = Candidate.of({}, document, base)
+    yield first
+    design = first.config.design
+    if design.knobs:
+        for settings in design.settings():
+            overrides = {design.knobs[name].key: value for name, value in settings.items()}
+            yield Candidate.of(settings, override(document, overrides), base)
 
 
 def planned_problem(config: Config) -> InverseProblem:
@@ -57,11 +70,9 @@ def planned_problem(config: Config) -> InverseProblem:
     ConfigError: no times, or something that only readings can say. DataError: a data file that is needed cannot be
         used. En4dvarError: the model fails at the centre of the prior.
     """
-    plan, design = inverse_plan(config), config.design
-    times = design.times if design.times is not None else config.simulate_times
+    plan, times = inverse_plan(config), _planned_times(config)
     measured = None
-    if times is None or any(entry.needs_data for entry in config.parameters):
-        name, file = next(iter(data_files(plan).items()))
+    for name, file in files_needed(config).items():
         measured = read_observations(plan, file, name, config.weights)
     if config.weights != "sum":
         raise ConfigError([config.document.fault(("assimilation", "weights"), "only weights of sum are Bayesian")])
@@ -77,6 +88,20 @@ def planned_problem(config: Config) -> InverseProblem:
         raise En4dvarError(f"the model fails at the centre of the prior: {run.failures[0]}")
     values = np.split(run.predictions[0], len(plan.series))
     return replace(problem, observations=_observations(config, values, times, measured, stated=True))
+
+
+def _planned_times(config: Config) -> Array | None:
+    return config.design.times if config.design.times is not None else config.simulate_times
+
+
+def files_needed(config: Config) -> dict[str, DataFile]:
+    """The data file, by its name, that a plan takes its times or a prior's ``maximum`` from, if it needs one.
+
+    Raises :class:`ConfigError`, :class:`DataError`: there is none.
+    """
+    if _planned_times(config) is not None and not any(entry.needs_data for entry in config.parameters):
+        return {}
+    return dict([next(iter(data_files(inverse_plan(config)).items()))])
 
 
 def _scale(measured: Observations | None) -> float:

@@ -11,10 +11,11 @@ from en4dvar.config import Config, resolve
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.parameters import Uncertain
 from en4dvar.design.evaluate import Evaluated, Method, evaluate
+from en4dvar.design.planned import Planned
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import Executor, choose_executor, one_blas_thread
 from en4dvar.report.design import write_design
-from en4dvar.runs.design_plan import Candidate, candidates, planned_problem
+from en4dvar.runs.design_plan import Candidate, candidates, files_needed, planned_problem
 from en4dvar.runs.interrupt import terminate_as_interrupt
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.runs.session import Session, directory_mode, session
@@ -71,12 +72,13 @@ def run_design(
     every = list(candidates(document, base))
     config = every[0].config
     config = replace(config, directory=out or config.directory.with_name(f"{config.directory.name}_design"))
+    about = _asked(config)
     kept = f"the designs that are done are kept in {config.directory}"
     with (
         one_blas_thread(),
         terminate_as_interrupt(),
         RunDirectory.open(config.directory, directory_mode(force, resume)) as directory,
-        session(config, {}, directory, command, lambda: kept) as run,
+        session(config, files_needed(config), directory, command, lambda: kept) as run,
     ):
         run.begin("design.nc", "designs.csv", "design.html", STATE)
         work = _Work(config, every, run, on_design)
@@ -84,7 +86,7 @@ def run_design(
         with choose_executor(config.model, asked.executor, asked.workers, asked.address, asked.limits) as executor:
             work.everything(executor)
         file = directory.at("design.nc")
-        save_designs(file, work.rows(), _asked(config), {**run.attributes, "name": config.name})
+        save_designs(file, work.rows(), about, {**run.attributes, "name": config.name})
         found = load_designs(file)
         if config.report:
             write_design(found, directory.work)
@@ -103,7 +105,7 @@ def _known(document: Document, base: Path, after: Path) -> dict[str, Any]:
 def _asked(config: Config) -> Asked:
     problem = planned_problem(config)
     terms = {term.parameter.name: term.parameter for term in problem.prior.terms}
-    about = [terms[name] for name in config.design.about or terms]
+    about = [terms[name] for name in Planned(problem, config.design.about).about]
     model, seen = config.model, problem.observable
     return Asked(
         parameters=tuple(p.name for p in about),
@@ -111,6 +113,8 @@ def _asked(config: Config) -> Asked:
         labels=tuple(p.label for p in about),
         units=tuple((p.unit, p.display_unit) for p in about),
         knobs=tuple(config.design.knobs),
+        laws=tuple(config.design.laws),
+        enough=config.design.enough,
         seen=seen.label,
         axes=((model.time_unit, model.time_display_unit), (seen.unit, seen.display_unit)),
     )
@@ -133,6 +137,8 @@ class _Work:
     def everything(self, executor: Executor) -> None:
         """Evaluate by the method asked for; ``auto`` checks the linearised information and replaces it if it is off."""
         method = self.config.design.method
+        if method == "auto" and self.config.design.laws:
+            method = "laplace"  # the designs are ranked by what they tell of the law, which is exact
         if method != "auto":
             self._evaluate(executor, range(len(self.every)), method)
             return
@@ -153,9 +159,8 @@ class _Work:
         found = []
         for done in sorted(self._latest(), key=lambda d: d.number):
             candidate = self.every[done.number]
-            price = candidate.config.design.price
             for one in done.found:
-                cost = one.alike * (price.experiment + price.reading * len(one.readings))
+                cost = candidate.config.design.price.of(one.alike, len(one.readings))
                 found.append(DesignRow(done.number, dict(candidate.settings), one, cost))
             if done.failure:
                 found.append(DesignRow(done.number, dict(candidate.settings), None, float("nan"), done.failure))
@@ -191,8 +196,13 @@ def _one(candidate: Candidate, method: Method, seed: int) -> tuple[Evaluated, ..
     config = candidate.config
     design = config.design
     try:
-        problem = planned_problem(config)
-        return evaluate(problem, design.about, design.sizes, method, seed, design.experiments, candidate.readings)
+        problem, laws = planned_problem(config), [planned_problem(law) for law in candidate.laws]
+        sizes, alike = design.sizes, design.experiments
+        every = evaluate(problem, design.about, sizes, method, seed, alike, candidate.readings, laws)
+        costs = (design.price.of(one.alike, len(one.readings)) for one in every)
+        broken = [design.within.broken(len(o.readings), cost, o.beyond) for o, cost in zip(every, costs, strict=True)]
+        kept = tuple(one for one, reason in zip(every, broken, strict=True) if not reason)
+        return kept or broken[0]
     except En4dvarError as error:
         return str(error)
 
@@ -201,4 +211,5 @@ def _line(done: Done) -> str:
     if done.failure:
         return f"design {done.number}: {done.failure}"
     one = done.found[0]
-    return f"design {done.number}: {one.gain:.4g} nats ± {one.error:.2g} ({one.method}), {one.forward_runs} runs"
+    worth = f"{one.worth:.4g} nats ± {one.worth_error:.2g}{' of the law' if one.decision else f' ({one.method})'}"
+    return f"design {done.number}: {worth}, {one.forward_runs} runs"

@@ -15,7 +15,6 @@ from en4dvar.executor import Executor, choose_executor
 from en4dvar.files import make_folder
 from en4dvar.joint.estimate import Single, estimate_jointly
 from en4dvar.joint.problem import JointProblem, sharing
-from en4dvar.report.joint import write_joint
 from en4dvar.runs.finished import Finished, carried, finished, finished_set
 from en4dvar.runs.trust import Ask
 from en4dvar.runs.worklist import Worklist
@@ -48,6 +47,8 @@ def join(
     RefusedError: code of a stranger, see :func:`~en4dvar.runs.rerun.rerun`. OutputError: there is no result, or it is
         damaged. ConfigError: the data sets cannot share these parameters. TooFewMembersError: the ensemble is lost.
     """
+    from en4dvar.report.joint import write_joint  # what draws pages is slow to import
+
     first, sets = finished(run_dirs, trust, ask)
     if not names and not any(one.groups for one in sets):
         raise ConfigError("nothing is shared: give --share NAME, or 'shared:' in the configurations of the runs")

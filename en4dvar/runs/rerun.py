@@ -1,27 +1,33 @@
 """``en4dvar rerun``: a run repeated from what its result files record, and compared with them to the last bit.
 
-Configuration, seed and observations are those in the files, so that the data need not be there any more.
+Configuration, seed and observations are those in the files, so that the data need not be there any more; the data of a
+sequence are read again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from en4dvar.assimilate import assimilate
+from en4dvar.config import AnyConfig, Config, TwinConfig, resolve_any
 from en4dvar.config.build import inverse_plan, problem_of
 from en4dvar.config.document import parse_document
-from en4dvar.config.load import resolve
 from en4dvar.errors import OutputError
-from en4dvar.executor import choose_executor, one_blas_thread
+from en4dvar.executor import choose_executor, make_executor, one_blas_thread
+from en4dvar.forward import ForwardModel
 from en4dvar.observations import SEVERAL
 from en4dvar.report.result import Result, load_result
+from en4dvar.runs.sequence_run import sequence_work
 from en4dvar.runs.trust import Ask, of_strangers
+from en4dvar.runs.twin_run import twin_work
 from en4dvar.storage.campaign_file import failed_datasets
+from en4dvar.storage.cycles_file import cycles_file, read_cycles
 from en4dvar.storage.fingerprint import Identity, digest_of, identity
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.store import result_files
@@ -82,16 +88,13 @@ def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = Fals
         for instance because the file of a user's own model is gone. TooFewMembersError: the ensemble is lost.
     """
     run_dir = Path(run_dir)
+    if cycles := cycles_file(run_dir):
+        return _of_cycles(cycles, workers, trust, ask)
     campaign = run_dir / "posterior.nc"
     files = result_files(run_dir)
     first = load_result(files[0])
-    if "identity" not in first.attributes:
-        raise OutputError(f"{files[0]}: does not record all that a run is made of; it was written by a program")
-    document = parse_document(str(first.attributes["configuration_resolved"]), f"{files[0]}: configuration_resolved")
-    with of_strangers(run_dir, ask, trust):
-        config = resolve(document, run_dir.absolute())
-    now = provenance("", None)
-    was = {key: str(first.attributes[key]) for key in SURROUNDINGS}
+    config = _configuration(files[0], first.attributes, trust, ask)
+    assert isinstance(config, Config)
     repeated = []
     with one_blas_thread(), choose_executor(config.model, None, workers) as executor:
         for file in files:
@@ -100,30 +103,64 @@ def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = Fals
             problem = problem_of(config, recorded.observations(observables))
             analysis = assimilate(problem, config.assimilation, int(recorded.attributes["seed"]), executor)
             again = Result.from_analysis(analysis, {})
-            variables, differ = differences(recorded, again)
+            variables, differ = differences(_groups(recorded), _groups(again))
             repeated.append(Repeated(recorded.name, variables, differ, _data_file(recorded)))
-    return Rerun(
-        tuple(repeated),
-        identity(config.resolved, config.model, {}).difference(
-            Identity(str(first.attributes["identity"]), ()), frozenset()
-        ),
-        tuple(f"{key.replace('_', ' ')}: {was[key]} → {now[key]}" for key in SURROUNDINGS if was[key] != now[key]),
-        failed_datasets(campaign) if files != [campaign] else {},
-    )
+    failures = failed_datasets(campaign) if files != [campaign] else {}
+    return _found(repeated, config.resolved, config.model, first.attributes, failures)
 
 
-def differences(recorded: Result, again: Result) -> tuple[int, tuple[str, ...]]:
-    """Number of variables compared, and the words for each that is not the same to the bit."""
+def _of_cycles(file: Path, workers: int | None, trust: bool, ask: Ask | None) -> Rerun:
+    """Of a twin experiment or a sequence, whose data are read again. Raises as :func:`rerun`, :class:`DataError`."""
+    recorded = read_cycles(file)
+    config = _configuration(file, recorded.attrs, trust, ask)
+    assert not isinstance(config, Config)
+    with of_strangers(file.parent, ask, trust):  # data may have weights by a function
+        work = twin_work(config) if isinstance(config, TwinConfig) else sequence_work(config)
+    with make_executor(work.model, workers or 1) as executor:
+        again = work.again(executor)
+    variables, differ = differences({"": recorded}, {"": again})
+    repeated = Repeated(config.name, variables, differ, "")
+    return _found([repeated], config.resolved, work.model, recorded.attrs, {})
+
+
+def _configuration(file: Path, attributes: Mapping[Any, Any], trust: bool, ask: Ask | None) -> AnyConfig:
+    """What a result file was made of."""
+    if "identity" not in attributes:
+        raise OutputError(f"{file}: does not record all that a run is made of; it was written by a program")
+    document = parse_document(str(attributes["configuration_resolved"]), f"{file}: configuration_resolved")
+    with of_strangers(file.parent, ask, trust):
+        return resolve_any(document, file.parent.absolute())
+
+
+def _found(
+    sets: Sequence[Repeated],
+    resolved: str,
+    model: ForwardModel,
+    attributes: Mapping[Any, Any],
+    failures: Mapping[str, str],
+) -> Rerun:
+    now, was = provenance("", None), Identity(str(attributes["identity"]), ())
+    changed = identity(resolved, model, {}).difference(was, frozenset())
+    told = [(key, str(attributes[key]), now[key]) for key in SURROUNDINGS]
+    surroundings = tuple(f"{key.replace('_', ' ')}: {old} → {new}" for key, old, new in told if old != new)
+    return Rerun(tuple(sets), changed, surroundings, failures)
+
+
+def _groups(result: Result) -> dict[str, xr.Dataset]:
+    return {f"/{name}": node.to_dataset() for name, node in result.tree.children.items()}
+
+
+def differences(recorded: Mapping[str, xr.Dataset], again: Mapping[str, xr.Dataset]) -> tuple[int, tuple[str, ...]]:
+    """Number of variables compared, by group, and the words for each that is not the same to the bit."""
     count, told = 0, []
-    for path, node in recorded.tree.to_dict().items():
-        other = again.tree.children.get(path.strip("/"))
-        variables = other.to_dataset() if other is not None else xr.Dataset()
+    for group, node in recorded.items():
+        variables = again.get(group, xr.Dataset()).variables
         for name, variable in node.variables.items():
             count += 1
-            if name not in variables.variables:
-                told.append(f"{path}/{name} is missing")
+            if name not in variables:
+                told.append(f"{group}/{name} is missing")
             elif not _same_bits(variable.values, variables[name].values):
-                told.append(f"{path}/{name} differs{_by_how_much(variable.values, variables[name].values)}")
+                told.append(f"{group}/{name} differs{_by_how_much(variable.values, variables[name].values)}")
     return count, tuple(told)
 
 

@@ -7,10 +7,13 @@ next run there finishes it, and commands that read say so and read nothing.
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Iterable, Iterator
+import shlex
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
@@ -168,9 +171,7 @@ def _prepare(path: Path, mode: Mode) -> Path:
     if mode == "resume" and others:
         raise OutputError(f"{path}: holds no run")
     if mode == "new" and (listed or others - {LISTING}):  # an empty list is of a run that was killed before it began
-        raise OutputError(
-            f"{path}: not empty; give --resume to continue its run, --force to replace it, or another --out"
-        )
+        raise OutputError(_occupied(path, listed))
     foreign = [name for name in FIXED if os.path.lexists(path / name) and name not in listed]
     if foreign:
         raise OutputError(f"{path}: {foreign[0]} was not written by a run and would be replaced; move it away")
@@ -183,6 +184,22 @@ def _prepare(path: Path, mode: Mode) -> Path:
         work.mkdir()
     write_list(work, ())
     return work
+
+
+def _occupied(path: Path, listed: Sequence[str]) -> str:
+    """What is in the directory, and what can be typed."""
+    beside = next(p for i in itertools.count(2) if not (p := path.with_name(f"{path.name}_{i}")).exists())
+    another = f"--out {shlex.quote(str(beside))} keeps both"
+    if not listed:
+        return f"{path}: not empty, and not of a run; {another}"
+    results = [path / name for name in listed if "/" not in name and name.endswith(".nc")]  # written as a run ends
+    ended = [file.stat().st_mtime for file in results if file.is_file()]
+    if not ended or (path / NEXT / LISTING).exists():
+        return f"{path}: not empty: a run; --resume continues it if it has not ended, --force replaces it, {another}"
+    when = datetime.fromtimestamp(max(ended)).strftime("%Y-%m-%d %H:%M")
+    page = path / "report.html"
+    to_read = f", see {page}" if page.is_file() else ""
+    return f"{path}: not empty: a finished run of {when}{to_read}; --force replaces it, {another}"
 
 
 def _remove_if_empty(folder: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from en4dvar.analysis import Progress
 from en4dvar.config import Config, load_config
@@ -14,9 +14,6 @@ from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.executor import Executor, choose_executor, one_blas_thread
 from en4dvar.files import write_text
 from en4dvar.inputs.asked import DataFile
-from en4dvar.report import TABLES, write_pages
-from en4dvar.report.joint import PAGE_FILES, write_joint
-from en4dvar.report.result import Result
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
 from en4dvar.runs.interrupt import terminate_as_interrupt
 from en4dvar.runs.joint_run import JOINED, join_within
@@ -26,6 +23,9 @@ from en4dvar.runs.worklist import Worklist, datasets
 from en4dvar.storage.campaign_file import save_campaign
 from en4dvar.storage.joint_file import FILE, load_joint
 from en4dvar.summary import summary_csv
+
+if TYPE_CHECKING:
+    from en4dvar.report.result import Result
 
 
 def run(
@@ -119,16 +119,10 @@ def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 
 
     Raises :class:`OutputError`.
     """
+    from en4dvar.runs.cycles import report_cycles
+
     with RunDirectory.open(path, "report") as directory:
-        if (directory.work / "twin.nc").exists():
-            from en4dvar.runs.twin_run import report_twin
-
-            return report_twin(directory)
-        if (directory.work / "sequence.nc").exists():
-            from en4dvar.runs.sequence_run import report_sequence
-
-            return report_sequence(directory)
-        return _report(directory, datasets, workers)
+        return report_cycles(directory) or _report(directory, datasets, workers)
 
 
 def _require_one_usable(config: Config, files: Mapping[str, DataFile]) -> None:
@@ -187,6 +181,9 @@ def _finish(work: Worklist, report_workers: int) -> None:
 
 
 def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int = 1) -> Path:
+    from en4dvar.report import TABLES, write_pages  # half a second, for who wants pages
+    from en4dvar.report.joint import PAGE_FILES, write_joint
+
     directory.claim("report.html", "summary.csv", *TABLES)
     if (directory.work / FILE).exists():
         directory.claim(*PAGE_FILES)

@@ -1,4 +1,4 @@
-"""A sequence from YAML to a run directory: ``sequence.nc``, ``summary.csv``, report. Resumable at any moment."""
+"""A sequence from YAML to a run directory: ``sequence.nc``, ``summary.csv``, report."""
 
 from __future__ import annotations
 
@@ -11,19 +11,12 @@ import numpy as np
 from en4dvar.config import SequenceConfig, load_sequence
 from en4dvar.config.build_sequence import build_sequence, sequence_data
 from en4dvar.cycling.problem import SeriesProblem, SeriesResult, assimilate_series
+from en4dvar.cycling.sequential import SequentialState
 from en4dvar.errors import ConfigError
-from en4dvar.executor import make_executor
-from en4dvar.files import write_text
-from en4dvar.runs.cycles import kept_cycles
-from en4dvar.runs.interrupt import terminate_as_interrupt
-from en4dvar.runs.rundir import RunDirectory
-from en4dvar.runs.session import directory_mode, session
-from en4dvar.storage.checkpoint import FOLDER
-from en4dvar.storage.netcdf import netcdf_file
+from en4dvar.executor import Executor
+from en4dvar.runs.cycles import Keep, Work, run_cycles
 from en4dvar.storage.sequence_file import dataset, estimates, summary_csv
 from en4dvar.tables import table
-
-STATE = f"{FOLDER}/sequence.cycle"
 
 
 def run_sequence(
@@ -45,37 +38,18 @@ def run_sequence(
         config = load_sequence(config, overrides)
     elif overrides:
         raise ConfigError("overrides apply to a file or dict; give them to load_sequence instead")
-    problem, files = build_sequence(config), sequence_data(config)
-    kept = f"the cycles up to the last checkpoint are kept in {config.directory}"
-    with (
-        terminate_as_interrupt(),
-        RunDirectory.open(config.directory, directory_mode(force, resume)) as directory,
-        session(config, files, directory, command, lambda: kept) as run,
-    ):
-        run.begin("sequence.nc", "summary.csv", STATE)
-        cycles = len(problem.series.times)
-        with (
-            make_executor(config.model, config.execution.workers) as executor,
-            kept_cycles(run, STATE, config.execution.checkpoint_every, cycles) as (before, keep),
-        ):
-            result = assimilate_series(problem, config.seed, executor, on_cycle, before, keep)
-        run.log.write("\n".join(f"member lost: {reason}" for reason in result.run.failures))
-        attributes = {**run.attributes, "name": config.name, "scheme": config.assimilation.scheme}
-        with netcdf_file(directory.at("sequence.nc")) as partial:
-            dataset(result, attributes).to_netcdf(partial, engine="netcdf4", format="NETCDF4")
-        write_text(directory.at("summary.csv"), summary_csv(result))
-        if config.report:
-            report_sequence(directory)
-    return result
+    return run_cycles(config, sequence_work(config, on_cycle), force, resume, command)
 
 
-def report_sequence(directory: RunDirectory) -> Path:
-    """Write the figures and the page of a finished sequence. Raises :class:`OutputError`."""
-    from en4dvar.report.sequence import write_sequence_report
+def sequence_work(config: SequenceConfig, on_cycle: Callable[[int], None] | None = None) -> Work[SeriesResult]:
+    """The work of a sequence; its data are read. Raises :class:`ConfigError`, :class:`DataError`."""
+    problem = build_sequence(config)
 
-    directory.claim("report.html")
-    with directory.claiming("figures"):
-        return write_sequence_report(directory.work)
+    def conduct(executor: Executor, resume: SequentialState | None, keep: Keep | None) -> SeriesResult:
+        return assimilate_series(problem, config.seed, executor, on_cycle, resume, keep)
+
+    cycles, scheme = len(problem.series.times), config.assimilation.scheme
+    return Work("sequence", config.model, scheme, cycles, sequence_data(config), conduct, dataset, summary_csv)
 
 
 def estimates_table(result: SeriesResult) -> str:

@@ -1,4 +1,4 @@
-"""A twin experiment from YAML to a run directory: ``twin.nc``, ``summary.csv``, report. Resumable at any moment."""
+"""A twin experiment from YAML to a run directory: ``twin.nc``, ``summary.csv``, report."""
 
 from __future__ import annotations
 
@@ -7,19 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from en4dvar.config import TwinConfig, load_twin
+from en4dvar.cycling.sequential import SequentialState
 from en4dvar.cycling.twin import TwinResult, conduct
-from en4dvar.executor import make_executor
-from en4dvar.files import write_text
-from en4dvar.runs.cycles import kept_cycles
-from en4dvar.runs.interrupt import terminate_as_interrupt
-from en4dvar.runs.rundir import RunDirectory
-from en4dvar.runs.session import Session, directory_mode, session
-from en4dvar.storage.checkpoint import FOLDER
-from en4dvar.storage.netcdf import netcdf_file
+from en4dvar.executor import Executor
+from en4dvar.runs.cycles import Keep, Work, run_cycles
 from en4dvar.storage.twin_file import dataset, summary_csv
 from en4dvar.tables import table
-
-STATE = f"{FOLDER}/twin.cycle"
 
 
 def run_twin(
@@ -37,40 +30,17 @@ def run_twin(
     """
     if not isinstance(config, TwinConfig):
         config = load_twin(config, overrides)
-    kept = f"the cycles up to the last checkpoint are kept in {config.directory}"
-    with (
-        terminate_as_interrupt(),
-        RunDirectory.open(config.directory, directory_mode(force, resume)) as directory,
-        session(config, {}, directory, command, lambda: kept) as run,
-    ):
-        run.begin("twin.nc", "summary.csv", STATE)
-        result = _conduct(config, run, on_cycle)
-        run.log.write("\n".join(f"member lost: {reason}" for reason in result.run.failures))
-        attributes = {**run.attributes, "name": config.name, "scheme": config.scheme}
-        with netcdf_file(directory.at("twin.nc")) as partial:
-            dataset(result, attributes).to_netcdf(partial, engine="netcdf4", format="NETCDF4")
-        write_text(directory.at("summary.csv"), summary_csv(result))
-        if config.report:
-            report_twin(directory)
-    return result
+    return run_cycles(config, twin_work(config, on_cycle), force, resume, command)
 
 
-def report_twin(directory: RunDirectory) -> Path:
-    """Write the figures and the page of a finished twin experiment. Raises :class:`OutputError`."""
-    from en4dvar.report.twin import write_twin_report
-
-    directory.claim("report.html")
-    with directory.claiming("figures"):
-        return write_twin_report(directory.work)
-
-
-def _conduct(config: TwinConfig, run: Session, on_cycle: Callable[[int], None] | None) -> TwinResult:
+def twin_work(config: TwinConfig, on_cycle: Callable[[int], None] | None = None) -> Work[TwinResult]:
+    """The work of a twin experiment."""
     experiment = config.experiment
-    with (
-        make_executor(experiment.model, config.execution.workers) as executor,
-        kept_cycles(run, STATE, config.execution.checkpoint_every, experiment.cycles) as (resume, keep),
-    ):
+
+    def conducted(executor: Executor, resume: SequentialState | None, keep: Keep | None) -> TwinResult:
         return conduct(experiment, config.seed, executor, on_cycle, resume, keep)
+
+    return Work("twin", experiment.model, config.scheme, experiment.cycles, {}, conducted, dataset, summary_csv)
 
 
 def scores_table(result: TwinResult) -> str:

@@ -71,12 +71,13 @@ class Importance:
             self.effective = effective_number(weights)
 
     def next_proposal(self) -> StudentMixture:
-        """Fitted to the draws so far; the first one while none of them has a weight."""
-        if not np.isfinite(self.log):
+        """Fitted to the draws so far; the first one while hardly any of them has a weight."""
+        if np.isfinite(self.log_weights).sum() <= 2 * (self.z.shape[1] + 1):
             return self.proposals[0]
         logs, power = self.log_weights - self.log_weights.max(), 1.0
         weights = np.exp(logs)
-        while effective_number(weights) < FEWEST and power > 1e-4:
+        singular = 2.0 * (self.z.shape[1] + 1)  # draws behind a covariance, however little power is left to the weights
+        while (found := effective_number(weights)) < singular or (found < FEWEST and power > 1e-4):
             power *= 0.8
             weights = np.exp(power * logs)
         where = resampled(weights / weights.sum(), self.count, self.stream)

@@ -60,7 +60,7 @@ def transform(hessian: Hessian, zeta: float, w: Array) -> Array:
     z = inverse_root @ w
     square = float(z @ z)
     c = 2 * zeta**2 / (len(w) + 1)
-    kept = math.sqrt(1 - c * square)
+    kept = math.sqrt(max(1 - c * square, np.finfo(float).eps))  # positive at a minimum but for rounding
     stretch = c / (kept * (1 + kept))  # (1/kept − 1) / |z|²
     found = inverse_root + np.outer(stretch * z, z @ inverse_root)
     return np.asarray(math.sqrt(hessian.prior_precision) * found)

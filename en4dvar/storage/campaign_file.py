@@ -21,8 +21,8 @@ from en4dvar.storage.netcdf import netcdf_file
 from en4dvar.storage.seal import check_seal
 
 GROUPS = (
-    "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "constant_data", "sample_stats",
-    "log_likelihood",
+    "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "observation_errors",
+    "constant_data", "sample_stats", "log_likelihood",
 )  # fmt: skip
 LEFT_OUT = {"path_time", "iteration", "mode", "descent"}
 RENAMED = {"time": "observation", "time_column": "observation_column"}  # padded to the longest data set

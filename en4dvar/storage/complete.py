@@ -10,6 +10,7 @@ import xarray as xr
 from en4dvar.config.symbols import symbol_fault
 from en4dvar.errors import OutputError
 from en4dvar.storage.axes import Axis, axes_of
+from en4dvar.storage.beside import BESIDE, joined
 from en4dvar.storage.readings import MEMBER
 from en4dvar.units import UnitError, convert
 
@@ -42,7 +43,8 @@ _NAMED = ("/prior", "/posterior", "/constant_data")  # groups whose variables go
 
 def check_complete(path: Path, nodes: Mapping[str, xr.Dataset]) -> None:
     """Check the groups of a file, by their path in it. Raises :class:`OutputError`, which names what is missing."""
-    for fault in _faults(nodes):
+    together = {path: joined(node, nodes.get(f"/{BESIDE.get(path[1:])}")) for path, node in nodes.items()}
+    for fault in _faults(together):
         raise OutputError(f"{path}: not a result of en4dvar: {fault}")
 
 

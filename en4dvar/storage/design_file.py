@@ -12,12 +12,21 @@ import numpy as np
 import xarray as xr
 
 from en4dvar.design.evaluate import FAN, Evaluated
+from en4dvar.design.laws import Decision
 from en4dvar.errors import OutputError
 from en4dvar.files import write_bytes
 from en4dvar.state import Array
 from en4dvar.storage.netcdf import Group, read_groups, to_bytes, variable
 
-FILE = "design.nc"
+DECISION = {  # field → variable, description
+    "information": ("law_information", "mutual information of law and data, nats"),
+    "information_error": ("law_information_error", "its Monte Carlo standard error"),
+    "probability": ("law_probability", "expected probability of the law that holds"),
+    "probability_error": ("law_probability_error", "its Monte Carlo standard error"),
+    "decided": ("law_decided", "share of experiments in which that is 0.95 or more"),
+    "decided_error": ("law_decided_error", "its Monte Carlo standard error"),
+    "thin": ("law_thin", "share of evidences with few effective draws"),
+}
 
 
 @dataclass(frozen=True)
@@ -35,8 +44,9 @@ class DesignRow:
 
 @dataclass(frozen=True)
 class Asked:
-    """What was asked: parameters with their ``units`` (stored, shown), symbols and labels, and the knobs; the label and
-    the ``axes`` of what is seen, time and observable, each with its units (stored, shown).
+    """What was asked: parameters with their ``units`` (stored, shown), symbols and labels, the knobs and the laws; the
+    label and the ``axes`` of what is seen, time and observable, each with its units (stored, shown); what is
+    ``enough``, nats.
     """
 
     parameters: tuple[str, ...]
@@ -46,6 +56,8 @@ class Asked:
     knobs: tuple[str, ...]
     seen: str
     axes: tuple[tuple[str, str], tuple[str, str]]
+    laws: tuple[str, ...]
+    enough: float
 
 
 @dataclass(frozen=True)
@@ -102,8 +114,18 @@ def _group(rows: Sequence[DesignRow], asked: Asked, attributes: Mapping[str, Any
         "grid": variable(("design", "point"), padded("grid", points), time, "times of the fan"),
         "fan": variable(("design", "level", "point"), _fans(worth, points), value, asked.seen),
     }
+    if asked.laws:
+        decisions = [one.decision if one else None for one in worth]
+        variables |= {
+            name: variable("design", _of_decisions(decisions, field), "1", label)
+            for field, (name, label) in DECISION.items()
+        }
     root = {**attributes, "asked": json.dumps(asked.__dict__)}
     return Group(variables, {"parameter": variable("parameter", text(asked.parameters), "", "asked for")}, root)
+
+
+def _of_decisions(decisions: Sequence[Decision | None], field: str) -> Array:
+    return np.array([np.nan if one is None else getattr(one, field) for one in decisions], dtype=float)
 
 
 def _fans(worth: Sequence[Evaluated | None], points: int) -> Array:
@@ -152,5 +174,10 @@ def _row(one: xr.Dataset) -> DesignRow:
         fan=one["fan"].values[:, : len(grid)],
         alike=int(one["experiments"]),
         forward_runs=int(one["forward_runs"]),
+        decision=_decision(one) if "law_information" in one else None,
     )
     return DesignRow(int(one["number"]), settings, found, number("price"))
+
+
+def _decision(one: xr.Dataset) -> Decision:
+    return Decision(**{field: float(one[name]) for field, (name, _) in DECISION.items()})

@@ -27,7 +27,8 @@ from en4dvar.storage.seal import check_seal, seal_file, sealed
 
 _LOCK = threading.Lock()  # the netCDF library is not safe to use from several threads
 _MORE = 1 << 18  # bytes; more than the library had left to write
-_INITIAL_SIZE = 1 << 19  # bytes; grows as needed
+_INITIAL_SIZE = 1 << 19  # bytes beside those of large variables; grows as needed
+_LARGE = 1 << 24  # bytes of a variable
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,10 @@ def tree_of(groups: Groups) -> xr.DataTree:
 
 def to_bytes(groups: Groups) -> bytes:
     """The file of the groups; its last line seals it."""
+    sizes = [v.values.nbytes for group in groups.values() for v in group.variables.values()]
+    memory = _INITIAL_SIZE + sum(size for size in sizes if size > _LARGE)  # growing takes it twice
     with _LOCK:
-        file = netCDF4.Dataset("in-memory.nc", "w", format="NETCDF4", memory=_INITIAL_SIZE)
+        file = netCDF4.Dataset("in-memory.nc", "w", format="NETCDF4", memory=memory)
         try:
             data = [item for path, group in groups.items() for item in _define(file, path, group)]
             for variable, values in data:
@@ -105,8 +108,8 @@ def to_bytes(groups: Groups) -> bytes:
         except BaseException:
             file.close()
             raise
-        memory = file.close()
-    return sealed(bytes(memory))
+        content = file.close()
+    return sealed(content)
 
 
 def read_groups(path: Path) -> dict[str, xr.Dataset]:

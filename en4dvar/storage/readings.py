@@ -40,18 +40,24 @@ def observable_variable(part: Part, dims: tuple[str, ...], values: Array, what: 
     return _variable(dims, values, o.unit, f"{o.label}, {what}", display_units=o.display_unit, symbol=o.symbol)
 
 
-def predictive(a: Analysis, predictions: Array, paths: Array) -> Variables:
-    found: Variables = {}
-    width, curves = len(a.trajectory_times), iter(range(len(a.problem.parts)))
-    for axis, part in series_of(a):
-        words = "noise-free prediction at the observations"
-        found[part.name] = observable_variable(part, (*MEMBER, axis.time), predictions[None, :, part.where], words)
-        if part.has_path:
-            first = width * next(curves)
-            along = paths[None, :, first : first + width]
-            words = "noise-free prediction along the path"
-            found[f"{part.name}_path"] = observable_variable(part, (*MEMBER, "path_time"), along, words)
-    return found
+def predictive(a: Analysis, predictions: Array) -> Variables:
+    words = "noise-free prediction at the observations"
+    return {
+        part.name: observable_variable(part, (*MEMBER, axis.time), predictions[None, :, part.where], words)
+        for axis, part in series_of(a)
+    }
+
+
+def paths(a: Analysis, members: Array) -> Variables:
+    """Of each series that has one; they stand side by side in ``members``."""
+    width, words = len(a.trajectory_times), "noise-free prediction along the path"
+    parts = [part for _, part in series_of(a) if part.has_path]
+    return {
+        f"{part.name}_path": observable_variable(
+            part, (*MEMBER, "path_time"), members[None, :, i * width : (i + 1) * width], words
+        )
+        for i, part in enumerate(parts)
+    }
 
 
 def log_likelihood(a: Analysis) -> Variables:
@@ -67,28 +73,37 @@ def log_likelihood(a: Analysis) -> Variables:
 
 
 def observed(a: Analysis) -> tuple[Variables, dict[str, Any]]:
-    """Variables and attributes of the data and of what is stated about their errors."""
-    stated = a.observations
+    """The readings, and attributes of the data and of what is stated about their errors.
+
+    Nothing else: tools take every variable of this group for one that the model predicts.
+    """
+    given = a.observations
+    variables = {
+        part.name: observable_variable(part, (axis.time,), given.values[part.where], "observed")
+        for axis, part in series_of(a)
+    }
+    scalars = {f"{SCALAR}{key}": value for key, value in given.scalars.items()}
+    numbers = _thresholds(given) if given.parts else given.noise.attributes()
+    return variables, {"name": given.name, "data_source": given.source, **scalars, **numbers}
+
+
+def stated(a: Analysis) -> Variables:
+    """What is stated about the readings: their errors, weights and places."""
+    given = a.observations
     variables: Variables = {}
     for axis, part in series_of(a):
-        variables |= _observed_series(a, axis, part)
-    scalars = {f"{SCALAR}{key}": value for key, value in stated.scalars.items()}
-    if not stated.parts:
-        matrices, dims, numbers = stated.noise.matrices(), ("time", "time_column"), stated.noise.attributes()
-        names = {key: f"{a.problem.observable.name}_{key}" for key in matrices}
-    else:
-        matrices, dims, numbers = stated.noise.matrices(), ("reading", "reading_column"), _thresholds(stated)
-        names = {key: key for key in matrices}
-    for key, (matrix, words) in matrices.items():
-        variables[names[key]] = _variable(dims if matrix.ndim == 2 else "correlated_pair", matrix, "1", words)
-    return variables, {"name": stated.name, "data_source": stated.source, **scalars, **numbers}
+        variables |= _stated_of_series(a, axis, part)
+    dims = ("reading", "reading_column") if given.parts else ("time", "time_column")
+    for key, (matrix, words) in given.noise.matrices().items():
+        name = key if given.parts else f"{a.problem.observable.name}_{key}"
+        variables[name] = _variable(dims if matrix.ndim == 2 else "correlated_pair", matrix, "1", words)
+    return variables
 
 
-def _observed_series(a: Analysis, axis: Axis, part: Part) -> Variables:
+def _stated_of_series(a: Analysis, axis: Axis, part: Part) -> Variables:
     name, stated, own = part.name, a.observations, part.where
     dims = (axis.time,)
     variables = {
-        name: observable_variable(part, dims, stated.values[own], "observed"),
         f"{name}_std": observable_variable(
             part, dims, a.error_std[own], "observation-error std, timing error included"
         ),

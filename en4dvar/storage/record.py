@@ -21,7 +21,7 @@ from en4dvar.storage.readings import SCALAR
 def observations_of(
     data: xr.Dataset, axes: Sequence[Axis], name: str, observables: Mapping[str, Observable]
 ) -> Observations:
-    """From the group ``observed_data``; see :meth:`en4dvar.storage.store.StoredResult.observations`."""
+    """From ``observed_data`` and what is beside it: :meth:`en4dvar.storage.store.StoredResult.observations`."""
     attributes = {str(key): value for key, value in data.attrs.items()}
 
     def each(suffix: str) -> Array:

@@ -19,9 +19,9 @@ VERSION = "1"
 _LENGTH = len(f"\n{FORMAT} {VERSION} sha256 {'0' * 64}\n")
 
 
-def sealed(content: bytes) -> bytes:
+def sealed(content: bytes | memoryview) -> bytes:
     """``content`` with its last line."""
-    return content + _line(hashlib.sha256(content).hexdigest())
+    return b"".join((content, _line(hashlib.sha256(content).hexdigest())))
 
 
 def seal_file(path: Path) -> None:

@@ -93,6 +93,7 @@ def dataset(result: SeriesResult, attributes: Mapping[str, Any]) -> xr.Dataset:
         **moment_variables(kinds),
         **innovation_variables(series, run),
         **run_variables(run),
+        "evidence": ("time", run.evidence, {"long_name": "log density of the observations given those before"}),
         "members": (of_members, _members(run, problem.members), {"long_name": "analysis ensemble"}),
     }
     of_columns = {observable.name: observable for observable in problem.observables}
@@ -128,6 +129,8 @@ def dataset(result: SeriesResult, attributes: Mapping[str, Any]) -> xr.Dataset:
         "parameters": ", ".join(problem.start.prior.names if problem.start.prior else ()),
         "seed": result.seed,
         "members": problem.members,
+        "log_evidence": result.log_evidence,
+        "without_evidence": problem.without_evidence,
         "warnings": "\n".join(result.warnings),
         **run_attributes(run),
         **attributes,

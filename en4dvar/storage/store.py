@@ -18,6 +18,7 @@ from en4dvar.forward import Observable
 from en4dvar.observations import Observations
 from en4dvar.state import Array, Parameter
 from en4dvar.storage.axes import Axis, axes_of
+from en4dvar.storage.beside import BESIDE, joined
 from en4dvar.storage.complete import check_complete, of_members
 from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import netcdf_file, read_groups, tree_of
@@ -108,8 +109,11 @@ class StoredResult:
         return tuple(c.words for c in self.cautions)
 
     def dataset(self, group: str) -> xr.Dataset:
-        """A group of the file, e.g. ``"prior_predictive"``."""
-        return self.tree.children[group].to_dataset()
+        """A group of the file, e.g. ``"prior_predictive"``, with the variables of the group beside it."""
+        found = {
+            name: node.to_dataset() for name, node in self.tree.children.items() if name in (group, BESIDE.get(group))
+        }
+        return joined(found[group], found.get(BESIDE.get(group, "")))
 
     def observations(self, observables: Mapping[str, Observable] | None = None) -> Observations:
         """The observations (y, t, R) that the result was estimated from, to the bit.

@@ -61,7 +61,7 @@ def describe(check: Check) -> str:
 
 
 def documented(law: ConstitutiveLaw) -> None:
-    """Title, formula, and for every parameter unit, bounds and source."""
+    """Title, formula, and for every parameter unit and bounds."""
     missing = [] if law.title else ["a title"]
     if "$" not in (type(law).__doc__ or ""):
         missing.append("a formula in LaTeX ($…$) in the docstring")
@@ -70,8 +70,6 @@ def documented(law: ConstitutiveLaw) -> None:
             parse_unit(p.unit)
         except En4dvarError as error:
             missing.append(f"a unit of {p.name} ({error})")
-        if not p.source:
-            missing.append(f"a source of {p.name}")
         if p.bounds == (-np.inf, np.inf):
             missing.append(f"bounds of {p.name}")
     assert not missing, "the class lacks " + "; ".join(missing)

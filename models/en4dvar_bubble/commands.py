@@ -18,8 +18,15 @@ class CheckFailed(En4dvarError):
     """A law does not pass the battery."""
 
 
+def _completed(context: click.Context, parameter: click.Parameter, typed: str) -> list[str]:
+    """Names of laws that the shell offers."""
+    from en4dvar_bubble.laws.loading import available
+
+    return [name for name in available() if name.startswith(typed)]
+
+
 @click.command()
-@click.argument("names", nargs=-1, metavar="[LAW]...")
+@click.argument("names", nargs=-1, metavar="[LAW]...", shell_complete=_completed)
 @click.option("--check", is_flag=True, help="Run the battery on the laws: what every law must satisfy.")
 def laws(names: tuple[str, ...], check: bool) -> None:
     """List constitutive laws with parameters and units, or check them.

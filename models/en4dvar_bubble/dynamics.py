@@ -73,6 +73,8 @@ class Dynamics:
     radial: Radial = "keller-miksis"
     vapour: Vapour = "none"
     medium_heat: Heat = "cold"
+    hydrophone: float = 1.0
+    """Its distance from the bubble, m (:mod:`emission`)."""
     named: tuple[str, ...] = ()
     """Those of the :attr:`optional_parameters` that are parameters."""
 

@@ -24,6 +24,7 @@ from en4dvar.state import Array
 from en4dvar_bubble.alternatives import alternatives
 from en4dvar_bubble.collapse import doubts
 from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics
+from en4dvar_bubble.emission import OBSERVABLE
 from en4dvar_bubble.events import OBSERVABLES
 from en4dvar_bubble.packing import pack
 from en4dvar_bubble.paths import Paths
@@ -50,6 +51,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
             positive=True,
         ),
         *OBSERVABLES,
+        OBSERVABLE,
     )
 
     path_quantities = (
@@ -71,6 +73,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
             radial=settings.radial,
             vapour=settings.vapour,
             medium_heat=settings.medium_heat,
+            hydrophone=settings.hydrophone,
         )
 
     def with_parameters(self, names: Collection[str]) -> BubbleModel:

@@ -21,7 +21,7 @@ from en4dvar.hints import suggest
 from en4dvar.state import Parameter
 from en4dvar.units import Quantity, parse_quantity
 from en4dvar_bubble.driving import Reading
-from en4dvar_bubble.driving.settings import PULSE_SECTIONS, DrivingSettings, Section, with_kind
+from en4dvar_bubble.driving.settings import IN_NO_FILE, PULSE_SECTIONS, DrivingSettings, Section, with_kind
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX, Gas, Heat, Start, Vapour
 from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, get_law
@@ -100,6 +100,7 @@ _SOURCES = Field(
 ConstantsSettings = create_model(
     "ConstantsSettings",
     __base__=_NamedSet,
+    __cls_kwargs__=IN_NO_FILE,
     __doc__=_NamedSet.__doc__,
     **{f.name: _key(f) for f in CONSTANTS},  # type: ignore[call-overload]
     sources=(dict[str, str], _SOURCES),
@@ -129,6 +130,8 @@ class BubbleSettings(Section):
     """Constant vapour pressure in the bubble: a pressure, or saturated at the far-field temperature."""
     constants: ConstantsSettings = ConstantsSettings()
     """Constants of medium and gas: the name of a set, or a section that replaces some of them."""
+    hydrophone: Annotated[float, Quantity("m"), Field(gt=0)] = 1.0
+    """How far from the bubble acoustic_pressure is read."""
     accuracy: AccuracyName = "standard"
     """Nodes and tolerance together; errors of each in docs/solver.md."""
     nodes: Annotated[int, Field(ge=1, le=128)] | None = None

@@ -15,7 +15,7 @@ from pydantic import Field as Setting
 
 from en4dvar import Field
 from en4dvar_lorenz.autonomous import Autonomous, dimensionless
-from en4dvar_lorenz.rk4 import rk4
+from en4dvar_lorenz.rk4 import kept, rk4
 
 SOURCE = "Lorenz (1963)"
 
@@ -38,7 +38,7 @@ def tendency(x: np.ndarray, dx: np.ndarray) -> None:
     dx[3] = dx[4] = dx[5] = 0.0
 
 
-@njit(nogil=True)
+@kept
 def integrate(start: np.ndarray, times: np.ndarray, longest: float) -> np.ndarray:
     return rk4(tendency, start, times, longest)
 

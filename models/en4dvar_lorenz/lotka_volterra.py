@@ -16,7 +16,7 @@ from pydantic import Field as Setting
 from en4dvar import Field, Observable, Parameter, StateField, StateLayout
 from en4dvar_lorenz.autonomous import Autonomous
 from en4dvar_lorenz.logarithm import Logarithm
-from en4dvar_lorenz.rk4 import rk4
+from en4dvar_lorenz.rk4 import kept, rk4
 
 SOURCE = "Lotka (1925), Volterra (1926)"
 
@@ -37,7 +37,7 @@ def tendency(x: np.ndarray, dx: np.ndarray) -> None:
     dx[2] = dx[3] = dx[4] = dx[5] = 0.0
 
 
-@njit(nogil=True)
+@kept
 def integrate(start: np.ndarray, times: np.ndarray, longest: float) -> np.ndarray:
     return rk4(tendency, start, times, longest)
 

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from numba import njit
 
+from en4dvar.compiled import F, kernel
+from en4dvar.kernel_cache import stamp_with_sources
 
-@njit(nogil=True)
+
+def kept(function: F) -> F:
+    """``function``, which may call :func:`rk4`, compiled and kept on disk until a file of this folder changes."""
+    compiled = kernel(function)
+    stamp_with_sources(compiled, Path(__file__).parent)
+    return compiled
+
+
+@njit(inline="always")  # a function that hands another one on, compiled for itself, numba does not keep on disk
 def rk4(
     tendency: Callable[[np.ndarray, np.ndarray], None], start: np.ndarray, times: np.ndarray, longest: float
 ) -> np.ndarray:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.errors import DataError
+from en4dvar.errors import DataError, En4dvarError
 from en4dvar.hints import no_such_file
 
 Frame = npt.NDArray[Any]
@@ -59,7 +59,9 @@ class Movie:
                 if frame.shape != shape:
                     raise DataError(f"{self.path}: frame {number} is {_size(frame.shape)}, the first {_size(shape)}")
                 yield frame
-        except (OSError, ValueError, RuntimeError, SyntaxError, EOFError, KeyError, IndexError) as error:
+        except En4dvarError:
+            raise
+        except Exception as error:  # whatever the libraries stumble over in a damaged file
             words = " ".join(str(error).split()) or type(error).__name__
             raise DataError(f"{self.path}: frame {number + 1} cannot be read: {words}") from None
         if number < 0:
@@ -159,22 +161,19 @@ def _tiff(path: Path) -> Movie:
             pixel = _tiff_pixel(about, first.tags.get("XResolution"))
             start, frame, plain = first.dataoffsets[0], first.nbytes, first.compression == 1
             kind, shape = np.dtype(first.dtype).newbyteorder(file.byteorder), first.shape
-    except (OSError, ValueError, IndexError, KeyError, tifffile.TiffFileError) as error:
-        raise DataError(f"{path}: cannot be read as TIFF: {error}") from None
-    count = int(about.get("images", pages))
-    rate = 1 / float(about["finterval"]) if about.get("finterval") else float("nan")
+        count = int(about.get("images", pages))
+        rate = 1 / float(about["finterval"]) if about.get("finterval") else float("nan")
+    except Exception as error:  # tifffile believes what a damaged file says of itself
+        raise DataError(f"{path}: cannot be read as TIFF, it is damaged: {error}") from None
     if pages == 1 < count and plain and path.stat().st_size >= start + count * frame:  # ImageJ's way beyond 4 GB
         return Movie(path, lambda: _blocks(path, start, count, kind, shape), count, pixel, rate)
     if pages < count or any("invalid page offset" in fault for fault in faults):
         raise DataError(f"{path}: the file is damaged or cut off: not all of its frames are there")
 
     def read() -> Iterator[Frame]:
-        with tifffile.TiffFile(path) as file:
+        with overheard("tifffile"), tifffile.TiffFile(path) as file:
             for page in file.pages:
-                try:
-                    yield page.asarray()
-                except tifffile.TiffFileError as error:
-                    raise ValueError(error) from None
+                yield page.asarray()
 
     return Movie(path, read, pages, pixel, rate)
 

@@ -88,9 +88,11 @@ def test_faults_are_located():
     assert "campaign.groups.agarose_03.parameters.mu" in told
 
 
-def test_a_campaign_makes_its_readings_to_scale():
-    with pytest.raises(ConfigError, match=r"agarose_03\.parameters\.reading_scale: unknown parameter"):
-        plan(**{"campaign.groups.agarose_03.parameters.reading_scale": "1.03"})
+@pytest.mark.parametrize(("name", "value"), [("reading_scale", "1.03"), ("sigma", "1.5"), ("t_s", "1 us")])
+def test_a_campaign_makes_its_own_readings(name, value):
+    """What only a fit has is refused, where it would be ignored."""
+    with pytest.raises(ConfigError, match=rf"agarose_03\.parameters\.{name}: a campaign makes its own readings"):
+        plan(**{f"campaign.groups.agarose_03.parameters.{name}": value})
 
 
 def test_an_existing_campaign_is_not_overwritten(tmp_path):

@@ -50,7 +50,7 @@ FLOOR = {name: floor for floor, layer in enumerate(LAYERS) for name in layer}
 # the same inside the bubble, as the docstring of its package states
 BUBBLE = (
     "tables", "medium", "collapse", "gas", "driving", "numbers", "laws", "solver", "dynamics", "alternatives",
-    "packing", "paths", "events", "settings", "model", "api", "battery", "starter", "examples", "commands",
+    "packing", "paths", "events", "emission", "settings", "model", "api", "battery", "starter", "examples", "commands",
     "commands_init", "warm_up",
 )  # fmt: skip
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow  # a browser takes half a minute of the processor
 LOOK = (Path(__file__).parent / "look.js").read_text(encoding="utf-8")
 KINDS = ("single", "campaign", "set", "compare")
 FIGURES = {"single": 6, "campaign": 1, "set": 2, "compare": 1}

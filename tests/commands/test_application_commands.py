@@ -40,3 +40,18 @@ def test_an_interrupted_sweep_says_how_to_continue(tmp_path: Path, monkeypatch: 
     ]
     monkeypatch.undo()
     assert CliRunner().invoke(main, [*call[:-1], "--resume"]).exit_code == 0
+
+
+def test_the_shell_completes_commands_options_and_laws() -> None:
+    def offered(words: str) -> list[str]:
+        typed = {
+            "COMP_WORDS": words,
+            "COMP_CWORD": str(len(words.split(" ")) - 1),
+            "_EN4DVAR_COMPLETE": "bash_complete",
+        }
+        return CliRunner().invoke(main, env=typed, prog_name="en4dvar").output.split()
+
+    assert "plain,rerun" in offered("en4dvar r")
+    assert offered("en4dvar run --wo") == ["plain,--workers"]
+    assert offered("en4dvar laws neo") == ["plain,neo-hookean-kelvin-voigt"]
+    assert offered("en4dvar run ") == ["file,"]

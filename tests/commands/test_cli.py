@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -156,6 +157,11 @@ def full_directory(folder: Path) -> list[str | Path]:
     return ["run", write_toy(folder), "--out", folder / "out"]
 
 
+def damaged(path: Path) -> Path:
+    path.write_bytes(b"MATLAB\x80\xff")
+    return path
+
+
 HEAD = "t_ms,x_um\n"
 BAD: dict[str, tuple[Callable[[Path], list[str | Path]], str]] = {
     "no configuration": (lambda f: ["run", f / "toi.yaml"], "toi.yaml: no such file"),
@@ -174,7 +180,10 @@ BAD: dict[str, tuple[Callable[[Path], list[str | Path]], str]] = {
     "few observations": (with_data(HEAD + "0,1\n1,1\n"), "toy.csv: 2 usable observations; at least 3"),
     "unknown law": (replaced("mass: 2 g", "law: cubik"), "toy.yaml:11:8: model.law: 'cubik' is not one of"),
     "no prior": (replaced("  A: {prior: normal, mean: maximum, std: 1 %}\n", ""), "toy.yaml:12:1: parameters.A: "),
-    "not empty": (full_directory, "out: not empty; give --resume to continue its run, --force to"),
+    "not empty": (full_directory, "out: not empty, and not of a run; --out "),
+    "data as configuration": (lambda f: ["run", damaged(f / "A.mat")], "A.mat' looks at the readings and proposes one"),
+    "readings as configuration": (lambda f: ["run", write_toy(f).with_suffix(".csv")], "toy.csv: a data file, not a"),
+    "a folder as configuration": (lambda f: ["run", f], "a folder, not a configuration; 'en4dvar init --data "),
     "unwritable": (lambda f: ["run", write_toy(f), "--out", f / "toy.csv" / "out"], "cannot be used as run directory"),
     "a file as directory": (lambda f: ["run", write_toy(f), "--out", f / "toy.csv"], "cannot be used as run directory"),
     "bad --set": (lambda f: ["run", write_toy(f), "--set", "members"], "'members' is not KEY=VALUE"),
@@ -253,3 +262,14 @@ def test_many_warnings_are_told_before_notes(tmp_path: Path, capsys: pytest.Capt
     assert lines[-1] == "and 50 more warnings and notes; see run.log"
     _tell(Campaign(tmp_path, outcomes[:1]), with_report=False)
     assert [line.split(":")[0] for line in capsys.readouterr().err.splitlines()] == ["warning", "note"]
+
+
+def test_a_run_that_is_there_is_named_with_what_to_type(tmp_path: Path) -> None:
+    arguments = ["run", write_toy(tmp_path), "--out", tmp_path / "out", "--no-report"]
+    assert call(*arguments).exit_code == 0
+    again = call(*arguments)
+    assert again.exit_code == 2
+    assert f"a finished run of {datetime.now():%Y-}" in again.stderr
+    assert f"--force replaces it, --out {tmp_path / 'out_2'} keeps both" in again.stderr
+    (tmp_path / "out" / "posterior.nc").unlink()
+    assert "a run; --resume continues it if it has not ended" in call(*arguments).stderr

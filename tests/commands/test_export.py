@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from en4dvar.analysis import Analysis
+from en4dvar.caution import caution
 from en4dvar.cli import main
-from en4dvar.report.export import escaped, export_table, latex_unit
+from en4dvar.report.export import escaped, export_table, latex_table, latex_unit
 from en4dvar.report.result import Result as Posterior
 from en4dvar.report.result import load_result
 from en4dvar.storage.store import save
@@ -77,27 +79,47 @@ def test_latex_of_one_data_set(one: Path) -> None:
     assert lines[1:4] == [
         r"\begin{tabular}{llrrr}",
         r"  \toprule",
-        r"  parameter & unit & prior & posterior & 5--95\,\% \\",
+        r"  parameter & unit & prior & posterior\textsuperscript{a} & 5--95\,\% \\",
     ]
-    assert lines[-2:] == [r"  \bottomrule", r"\end{tabular}"]
+    *lines, bottom, note, skew, end = lines
+    assert skew.endswith(r"\textsuperscript{b} median and 5 to 95 \%: the posterior is skewed} \\")
+    assert (bottom, end) == (r"  \bottomrule", r"\end{tabular}")
+    assert r"\textsuperscript{a} 1 of 24 members failed in the posterior forecast" in note
     summaries = load_result(one / "posterior.nc").summary()
     for line, summary, head in zip(
-        lines[5:-2], summaries, (r"$G$ & kPa", r"$\mu$ & Pa\,s", r"$R_0$ & $\mu$m", r"$t_s$ & $\mu$s"), strict=True
+        lines[5:], summaries, (r"$G$ & kPa", r"$\mu$ & Pa\,s", r"$R_0$ & $\mu$m", r"$t_s$ & $\mu$s"), strict=True
     ):
         assert line.startswith(f"  {head} & $")
         assert line.endswith(r" \\")
         cells = line.removesuffix(r" \\").split(" & ")
         assert len(cells) == 5
-        mean, std = numbers(cells[3])
-        assert mean == pytest.approx(summary.mean, abs=0.06 * summary.std)
-        assert std == pytest.approx(summary.std, rel=0.05)
+        middle, *sides = numbers(cells[3].removesuffix(r"\textsuperscript{b}"))
+        if len(sides) == 2:
+            quantiles = [summary.q50, summary.q95 - summary.q50, summary.q05 - summary.q50]
+            assert [middle, *sides] == pytest.approx(quantiles, abs=0.06 * summary.std)
+        else:
+            assert middle == pytest.approx(summary.mean, abs=0.06 * summary.std)
+            assert sides == pytest.approx([summary.std], rel=0.05)
 
 
 def test_latex_of_a_campaign(two: Path) -> None:
     lines = lines_of_table(two)
     assert lines[3] == r"  data set & $G$ (kPa) & $\mu$ (Pa\,s) & $R_0$ ($\mu$m) & $t_s$ ($\mu$s) \\"
-    assert [line.split(" & ")[0] for line in lines[5:-2]] == [r"  a\_1", r"  b\&2"]
-    assert {line.count(" & ") for line in lines[3:-2] if "rule" not in line} == {4}
+    mark = r"\textsuperscript{a}"
+    assert [line.split(" & ")[0] for line in lines[5:-4]] == [rf"  a\_1{mark}", rf"  b\&2{mark}"]
+    assert {line.count(" & ") for line in lines[3:-4] if "rule" not in line} == {4}
+
+
+def test_a_skewed_posterior_stands_as_its_median_with_unequal_sides(analysis: Analysis) -> None:
+    row = Posterior.from_analysis(analysis, {}).summary()[0]
+    even = replace(row, q05=0.9, q50=1.0, q95=1.1, mean=1.0, std=0.1)
+    skew = replace(even, q95=1.5, mean=1.1)
+    assert r"$1.00 \pm 0.10$" in latex_table([("x", (even,), ())])
+    table = latex_table([("x", (skew,), ())])
+    assert r"$1.00^{+0.50}_{-0.10}$\textsuperscript{a}" in table
+    assert "the posterior is skewed" in table
+    about = caution("not-informed", "it is the prior's", "caution", (row.name,))
+    assert r"\textsuperscript{a} it is the prior's" in latex_table([("x", (even,), (about,))])
 
 
 def test_what_latex_would_not_print_is_escaped() -> None:

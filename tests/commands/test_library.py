@@ -13,6 +13,7 @@ from doc_pages import ROOT, blocks
 
 import en4dvar
 
+pytestmark = pytest.mark.slow  # as the examples of the other pages
 PAGE = ROOT / "docs" / "tutorial_library.md"
 
 

@@ -7,6 +7,8 @@ import sys
 import types
 from importlib import import_module
 
+from pydantic import BaseModel
+
 import en4dvar
 from en4dvar.cli import main
 
@@ -27,6 +29,26 @@ def test_cli_and_package_import_nothing_heavy() -> None:
 
 def test_units_and_errors_need_no_pydantic() -> None:
     assert not loaded("import en4dvar.units, en4dvar.errors").intersection({"pydantic", "numba", "scipy"})
+
+
+def test_a_run_without_a_report_imports_nothing_that_draws() -> None:
+    """Half a second of every start, and of every worker's."""
+    assert not loaded("import en4dvar.runs.runner, en4dvar.commands.run").intersection({"matplotlib", "jinja2"})
+
+
+def test_pydantic_searches_no_file_for_classes_made_in_memory() -> None:
+    """It would go through every loaded module for each: 0.3 s of every start."""
+    import_module("en4dvar.config")
+    import_module("en4dvar_bubble.model")
+
+    def below(kind: type[BaseModel]) -> set[type[BaseModel]]:
+        return {kind}.union(*map(below, kind.__subclasses__()))
+
+    settings = [k for k in below(BaseModel) if k.__module__.startswith("en4dvar")]
+    assert len(settings) > 50
+    for kind in settings:
+        if kind.model_config.get("use_attribute_docstrings"):
+            assert f"class {kind.__name__}" in inspect.getsource(kind)  # raises where it stands in no file
 
 
 def test_public_names() -> None:

@@ -42,6 +42,17 @@ def test_every_fault_is_told_at_once_and_in_place(tmp_path: Path) -> None:
     assert done.stdout == ""
 
 
+def test_priors_of_many_files_are_one_table(tmp_path: Path) -> None:
+    """A row a data set only where a value comes from the data; ``A`` is the maximum of each."""
+    path = write_toy(tmp_path, ("toy.csv", "'*.csv'"))
+    (tmp_path / "toy2.csv").write_text("t_ms,x_um\n" + "\n".join(f"{5 * i},{300 - 2 * i}" for i in range(25)))
+    printed = call("validate", path).stdout
+    assert printed.count("estimated  data set") == 1
+    rows = [line.split()[:2] for line in printed.partition("estimated  ")[2].partition("\n\n")[0].splitlines()[1:]]
+    assert [row for row in rows if row[0] == "A"] == [["A", "toy"], ["A", "toy2"]]
+    assert [row for row in rows if row[0] == "k"] == [["k", "all"]]
+
+
 def test_a_fault_of_the_model_does_not_hide_those_of_the_data(tmp_path: Path) -> None:
     path = write_toy(tmp_path, ("mass: 2 g", "law: cubik"), ("unit: um", "unit: Pa"))
     done = call("validate", path)

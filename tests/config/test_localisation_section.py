@@ -67,6 +67,7 @@ def test_a_run_shows_a_field_as_a_field(tmp_path: Path, scheme: str) -> None:
     assert not (tmp_path / "run" / "figures" / "posterior.png").exists()
 
 
+@pytest.mark.slow
 def test_a_campaign_of_fields(tmp_path: Path) -> None:
     path = write_line(tmp_path, ("path: line.csv", "path: [line.csv, other.csv]"))
     (tmp_path / "other.csv").write_text((tmp_path / "line.csv").read_text(encoding="utf-8"), encoding="utf-8")

@@ -8,11 +8,13 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from toys import Vectorised
 
 import en4dvar
 from en4dvar.cli import main
-from en4dvar.errors import ConfigError, En4dvarError, OutputError
-from en4dvar.report.design import front
+from en4dvar.errors import ConfigError, DataError, En4dvarError, OutputError
+from en4dvar.forward import ValidityLimit
+from en4dvar.report.design import front, readings_text, remarks
 from en4dvar.runs import design_run
 from en4dvar.runs.design_run import run_design
 
@@ -128,6 +130,52 @@ def test_a_design_that_cannot_be_made(tmp_path):
     assert "no 50 of 7 readings" in found.rows[2].failure
 
 
+class Bounded(Vectorised):
+    """Valid where |y| is below 2 m."""
+
+    validity = (ValidityLimit("y", 2.0),)
+
+
+def test_what_a_design_must_keep_to(tmp_path):
+    """More readings than the camera holds, a price too high: left out before the best is looked for, and named."""
+    within = {"readings": 7, "price": 12}
+    found, _ = run_design(_plan(within=within, experiments=[1, 2], method="laplace"), out=tmp_path / "out")
+    assert {(len(row.found.times), row.found.alike) for row in found.rows if row.found} == {(7, 1), (4, 1), (4, 2)}
+    told = "\n".join(remarks(found))
+    assert "error 0.1 m, every 0.2 s; error 1 m, every 0.2 s: 13 readings: more than design.within.readings = 7" in told
+    assert "a price of 13: more than design.within.price = 12" in told
+
+
+@pytest.mark.parametrize(("most", "kept"), [(0.9, True), (0.05, False)])
+def test_designs_that_leave_what_the_model_is_valid_for(tmp_path, most, kept):
+    plan = {**_plan(knobs={}, within={"beyond": most}, method="laplace"), "model": {"name": f"{__name__}:Bounded"}}
+    if kept:
+        assert 0.1 < run_design(plan, out=tmp_path / "out")[0].rows[0].found.beyond < 0.9
+    else:
+        with pytest.raises(ConfigError, match=r"leaves what the model is valid for: more than design\.within\.beyond"):
+            run_design(plan, out=tmp_path / "out")
+
+
+def test_when_to_stop(tmp_path):
+    """Readings that tell nothing to speak of: it is said."""
+    found, directory = run_design(
+        _plan(knobs={}), out=tmp_path / "out", overrides={"data.error.y_std": "40 m", "design.method": "linear"}
+    )
+    assert "less than design.enough = 0.1: no experiment among these is worth making" in remarks(found)[0]
+    assert "is worth making" in (directory / "design.html").read_text()
+
+
+def test_what_is_taken_to_the_lab(tmp_path):
+    """When to read: a rate, or each chosen instant."""
+    found, _ = run_design(_plan(knobs={}, method="laplace"), out=tmp_path / "out")
+    assert readings_text(found, found.rows[0]) == "7 from 0.1 to 2.5 s, every 0.4 s"
+    assert not remarks(found)
+    found, directory = run_design(_plan(knobs={}, choose={"readings": 3}, method="laplace"), out=tmp_path / "three")
+    taken = ", ".join(f"{t:.4g}" for t in found.rows[0].found.times)
+    assert readings_text(found, found.rows[0]) == f"3, at {taken} s"
+    assert f"3, at {taken} s" in (directory / "design.html").read_text()
+
+
 def test_as_a_command(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "plan.yaml").write_text(json.dumps(_plan()))
@@ -158,8 +206,16 @@ def test_bad_input(tmp_path, change, message):
 def test_times_or_a_file_of_them(tmp_path):
     plan = _plan(knobs={})
     del plan["design"]["times"]
-    with pytest.raises(ConfigError, match=r"none of the designs .*not yet measured\.csv: no such file"):
+    with pytest.raises(DataError, match=r"not yet measured\.csv: no such file"):
         run_design(plan, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    plan["data"]["path"], plan["design"]["method"] = str(tmp_path / "measured.csv"), "linear"
+    (tmp_path / "measured.csv").write_text("t,y\n0.1,1\n0.5,1\n0.9,1\n")
+    three, _ = run_design(plan, out=tmp_path / "out")
+    assert len(three.rows[0].found.times) == 3
+    (tmp_path / "measured.csv").write_text("t,y\n0.1,1\n0.5,1\n0.9,1\n1.3,1\n")
+    with pytest.raises(OutputError, match="cannot be resumed to the same result"):
+        run_design(plan, out=tmp_path / "out", resume=True)
 
 
 def test_after_a_run_there_is_less_to_learn(tmp_path):

@@ -50,7 +50,7 @@ def test_members_on_workers_where_data_sets_are_few(few, tmp_path, kind):
 @pytest.mark.parametrize(
     ("campaign", "workers", "kind"),
     [
-        pytest.param("quiet", 2, "processes", id="data sets-processes"),
+        pytest.param("quiet", 2, "processes", id="data sets-processes", marks=pytest.mark.slow),
         pytest.param("few", 3, "processes", id="members-processes"),
         pytest.param("quiet", 2, "dask", id="data sets-dask", marks=pytest.mark.slow),
         pytest.param("few", 3, "dask", id="members-dask", marks=pytest.mark.slow),
@@ -68,7 +68,8 @@ def test_death_of_a_worker_changes_nothing(request, tmp_path, monkeypatch, kind,
     assert_same_results(tmp_path / "run", run)
 
 
-@pytest.mark.parametrize("kind", ["processes", pytest.param("dask", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["processes", "dask"])
 @pytest.mark.fault("worker-always")
 def test_a_data_set_that_kills_every_worker_is_named_and_the_others_are_not_disturbed(quiet, tmp_path, kind):
     _, run = quiet

@@ -119,7 +119,7 @@ def test_a_call_that_fails(quiet, children, tmp_path, fault):
         assert row("disk-failing").told(found.told) or "cannot be used as run directory" in found.told
 
 
-@pytest.mark.parametrize("limit", [0, 300, 9000])
+@pytest.mark.parametrize("limit", [0, pytest.param(300, marks=pytest.mark.long), 9000])
 @pytest.mark.fault("disk-failing")
 def test_no_room(quiet, children, tmp_path, limit):
     """The kernel refuses bytes beyond a size, also those of libraries (HDF5, PDF)."""

@@ -13,6 +13,7 @@ from faulty_models import STIFF
 from rows import row
 from run_files import assert_same_results, configuration, environment, make_campaign, run_cli
 from toy_config import write_toy
+from worker_calls import exits
 
 from en4dvar.cli import main
 from en4dvar.config import load_any, load_config
@@ -70,6 +71,7 @@ def test_a_member_that_ends_the_program_is_lost(raising, tmp_path, monkeypatch, 
     check_losses(run(config), raising, reason)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("executor", EXECUTORS[2:], ids=IDS[2:])
 @pytest.mark.fault("model-os-exit")
 def test_a_member_that_ends_its_worker_is_lost(raising, tmp_path, monkeypatch, executor):
@@ -92,10 +94,6 @@ def check_losses(result, raising, reason):
     assert not any(reasons[~stiff])
     for key in ("A", "k"):
         assert np.array_equal(result.posterior[key], raising.posterior[key])
-
-
-def exits(number):
-    return sys.exit(number)
 
 
 @pytest.mark.parametrize(

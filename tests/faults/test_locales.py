@@ -24,7 +24,7 @@ def plain(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "number"), [("tr_TR", "1,5"), ("de_DE", "1,5")])
+@pytest.mark.parametrize(("name", "number"), [("tr_TR", "1,5"), pytest.param("de_DE", "1,5", marks=pytest.mark.long)])
 @pytest.mark.fault("locale")
 def test_a_run_in_another_locale(plain, tmp_path, name, number):
     localedef = shutil.which("localedef")

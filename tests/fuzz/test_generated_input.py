@@ -69,13 +69,12 @@ def _one_place(folder, places):
             raise AssertionError(f"{'.'.join(map(str, path))}: {text[:2000]}") from error
 
 
-def test_one_odd_value_here_and_there(folder):
-    _one_place(folder, itertools.islice(mutations.one_changed(yaml.safe_load(seeds.FULL)), 0, None, 97))
-
-
-@pytest.mark.slow
-def test_every_odd_value_in_every_place(folder):
-    _one_place(folder, mutations.one_changed(yaml.safe_load(seeds.FULL)))
+@pytest.mark.parametrize(
+    "step", [97, pytest.param(5, marks=pytest.mark.slow), pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])]
+)
+def test_odd_values_in_every_place(folder, step):
+    """Every ``step``-th: prime to the numbers of values, so that every place and every value has its turn."""
+    _one_place(folder, itertools.islice(mutations.one_changed(yaml.safe_load(seeds.FULL)), 0, None, step))
 
 
 @given(st.binary(max_size=200) | st.text(max_size=200).map(lambda s: s.encode("utf-8", "surrogatepass")))

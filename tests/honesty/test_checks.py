@@ -170,3 +170,12 @@ def test_iterations_that_end_next_to_their_criterion_are_a_note_without_alarm():
     assert near.advice.startswith("no action is needed")
     assert (far.severity, unknown.severity) == ("serious", "serious")
     assert far.advice == unknown.advice == CATALOGUE["not-converged"][1]
+
+
+def test_where_members_are_drawn_from_the_posterior_itself_the_search_matters_no_more():
+    analysis, control = gaussian()
+    last = replace(analysis.iterations[-1], step_norm=2.0)
+    drawn = {"importance_effective_sample_size": 1500.0}
+    ended = replace(analysis, converged=False, iterations=(last,), refinement=drawn)
+    (told,) = examine(ended, control)
+    assert (told.code, told.severity, told.advice) == ("not-converged", "note", "no action is needed")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from honesty.provoked import PROVOKED, chain_not_converged
 
-from en4dvar.caution import CATALOGUE, SEVERITIES, Caution, caution
+from en4dvar.caution import CATALOGUE, SEVERITIES, TRIGGERS, Caution, caution
 from en4dvar.sampling import mcmc
 
 
@@ -26,7 +26,7 @@ def test_chain_that_has_not_mixed(monkeypatch):
 
 
 def test_every_code_has_its_test():
-    assert set(CATALOGUE) == {*PROVOKED, "chain-not-converged"}
+    assert set(CATALOGUE) == set(TRIGGERS) == {*PROVOKED, "chain-not-converged"}
 
 
 @pytest.mark.parametrize("words", ["plain", "ends — like advice", "two\nlines [misfit] — of it", "<b> & 'quotes' …"])

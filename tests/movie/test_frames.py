@@ -106,6 +106,23 @@ def test_what_cannot_be_read_is_told_in_one_message(tmp_path, kind, words):
     assert "\n" not in str(error.value)
 
 
+def test_a_scribbled_stack_is_read_or_refused_in_one_message(tmp_path):
+    tifffile.imwrite(tmp_path / "whole.tif", FRAMES[:4], imagej=True, metadata={"unit": "um", "finterval": 1e-6})
+    whole = np.frombuffer((tmp_path / "whole.tif").read_bytes(), np.uint8)
+    refused = []
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        scribbled = whole.copy()
+        scribbled[rng.integers(0, 400, rng.integers(1, 20))] = rng.integers(0, 256)
+        (tmp_path / "m.tif").write_bytes(scribbled.tobytes())
+        try:
+            assert len(read(tmp_path / "m.tif"))
+        except DataError as error:
+            refused.append(str(error))
+    assert len(refused) > 50
+    assert not any("\n" in words for words in refused)
+
+
 def test_a_stack_of_one_page_that_announces_many(tmp_path):
     """ImageJ's way beyond 4 GB, here with the high byte first."""
     deep = (FRAMES.astype(np.uint16) * 16).astype(">u2")

@@ -65,10 +65,10 @@ def test_the_next_spring_is_less_certain_than_the_mean(found):
 def test_the_command_and_a_damaged_file(campaign, tmp_path, monkeypatch):
     monkeypatch.setattr("en4dvar.population.estimate.Effort", lambda: SMALL)
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(main, ["population", str(campaign), "--of", "k", "--out", str(tmp_path)])
+    result = CliRunner().invoke(main, ["population", str(campaign), "--of", "k"])
     assert result.exit_code == 0, result.output
     assert "mean of the population" in result.output
-    path = tmp_path / "population.nc"
+    path = campaign.parent / "population_run" / "population.nc"
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(OutputError, match=r"population\.nc"):
         load_population(path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import arviz
 import numpy as np
 import pytest
 from toys import Decay, Vectorised, make_problem, with_noise
@@ -31,6 +30,8 @@ CORRELATION = np.exp(-np.abs(np.subtract.outer(TIMES, TIMES)) / 0.5)
 
 @pytest.mark.parametrize(("draws", "heavy"), [(48, 0.1), (48, 0.6), (48, 1.5), (500, 0.3), (500, 0.9), (30, 0.5)])
 def test_smoothed_weights_are_those_of_arviz(draws, heavy):
+    import arviz  # takes seconds, which every worker would spend where it stands above
+
     ratios = heavy * np.random.default_rng(draws).standard_exponential((draws, 6))
     log_weights, shape = pareto_smoothed(ratios)
     expected, k = arviz.psislw(ratios.T)

@@ -24,7 +24,8 @@ from en4dvar.errors import OutputError
 from en4dvar.executor import SerialExecutor, WorkerLostError
 from en4dvar.prior import Prior
 from en4dvar.report import write_pages
-from en4dvar.report.figures import all_figures
+from en4dvar.report.figures import all_figures, traces
+from en4dvar.report.history import history
 from en4dvar.report.overview import SetSummary, overview_figures, render_overview
 from en4dvar.report.page import judge_chi2
 from en4dvar.report.result import Result
@@ -346,3 +347,16 @@ def test_unwritable_run_directory_is_one_clear_error(run_dir):
     (run_dir / "figures").write_text("in the way")
     with pytest.raises(OutputError, match="figures: cannot be created"):
         write_pages(run_dir)
+
+
+def test_no_band_of_a_positive_quantity_is_negative(analysis):
+    result = Result.from_analysis(analysis, {})
+    members = result.iterations["G"]
+    spread = np.random.default_rng(1).lognormal(sigma=3, size=members.shape)
+    result.tree["iterations"]["G"] = members.copy(data=spread)
+    (band,) = traces(result).axes[0].collections
+    assert (spread.mean(axis=1) < spread.std(axis=1)).all()
+    assert band.get_paths()[0].vertices[:, 1].min() > 0
+    readings = result.observed_data["R"]
+    result.tree["observed_data"]["R"] = readings.copy(data=readings.values - 0.99 * readings.values.min())
+    assert history(result).axes[0].get_ylim()[0] == 0

@@ -95,7 +95,7 @@ def test_correlated_errors_are_kept_beside_one_another(tmp_path):
     path.write_text(path.read_text().replace("position_std: 2 um", "position_std: 2 um, correlation_time: 20 ms"))
     done = run_campaign(configuration(path, tmp_path / "run"))
     with xr.open_datatree(done.directory / "posterior.nc") as tree:
-        together = tree["observed_data"]["position_correlation"]
+        together = tree["observation_errors"]["position_correlation"]
         assert together.dims == ("dataset", "observation", "observation_column")
         assert together.shape == (2, 31, 31)
         for result in done:

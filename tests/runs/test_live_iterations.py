@@ -4,6 +4,7 @@ import re
 
 import pytest
 from run_files import assert_same_results, configuration, make_campaign
+from worker_calls import counts
 
 from en4dvar.analysis import Descents, StartRecord
 from en4dvar.executor import choose_executor
@@ -71,7 +72,8 @@ def test_an_iteration_is_told_before_its_data_set_ends(quiet, tmp_path, monkeypa
         assert iterations(log(out), result.name) == list(range(n))
 
 
-@pytest.mark.parametrize("kind", ["processes", pytest.param("dask", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["processes", "dask"])
 @pytest.mark.fault("worker-killed")
 def test_iterations_of_a_killed_worker_are_told_again(tmp_path, monkeypatch, kind):
     """It dies as soon as four of them have been heard here: by then none of them is on its way."""
@@ -103,11 +105,3 @@ def test_what_calls_tell_comes_in_order_and_before_their_end(kind):
     assert [m for i, m in seen if i == 0] == [0, 1, 2, "3"]
     assert [m for i, m in seen if i == 1] == ["ValueError('nothing to count')"]
     assert [m for i, m in seen if i == 2] == [0, 1, 2, 3, 4, "5"]
-
-
-def counts(n, tell):
-    for i in range(n):
-        tell(i)
-    if not n:
-        raise ValueError("nothing to count")
-    return n

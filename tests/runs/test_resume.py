@@ -24,7 +24,7 @@ def quiet(tmp_path_factory):
     return path, folder / "run", Stops.calls
 
 
-@pytest.mark.parametrize("step", [4, pytest.param(1, marks=pytest.mark.slow)], ids=["some", "all"])
+@pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.slow)], ids=["some", "all"])
 def test_interrupted_at_any_forecast(quiet, tmp_path, step):
     path, run, n_calls = quiet
     told = []
@@ -165,8 +165,18 @@ REASONS = {
 }
 
 
-@pytest.mark.parametrize("damage", REASONS)
-@pytest.mark.parametrize("file", ["checkpoints/set1.iteration", "checkpoints/set0.done"])
+@pytest.mark.parametrize(
+    ("file", "damage"),
+    [
+        *(("checkpoints/set1.iteration", damage) for damage in REASONS),
+        ("checkpoints/set0.done", altered),
+        *(
+            pytest.param("checkpoints/set0.done", damage, marks=pytest.mark.slow)  # the same reader
+            for damage in REASONS
+            if damage is not altered
+        ),
+    ],
+)
 def test_a_bad_checkpoint_is_named_and_not_used(quiet, tmp_path, damage, file):
     path, run, n_calls = quiet
     out = tmp_path / "run"

@@ -195,6 +195,7 @@ SCHEME = BASE["assimilation"]
         ({"assimilation": {**SCHEME, "scheme": "ienks", "lag": 3, "mda_weights": [1, 1]}}, "assimilation", "are 3"),
         ({"assimilation": {**SCHEME, "scheme": "ienks", "mda_weights": [0]}}, "assimilation.mda_weights", "than 0"),
         ({"assimilation": {**SCHEME, "mda_weights": [1, 1]}}, "assimilation", "only with scheme ienks"),
+        ({"sequence": {"initial_std": {"x": 0.5}, "positive": "x"}}, "sequence.positive", "expected a list"),
         ({"assimilation": {**SCHEME, "localisation": {"radius": 2}}}, "assimilation.localisation", "data.places"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
@@ -267,7 +268,7 @@ def test_model_error_in_a_twin():
 
 @pytest.mark.slow
 def test_a_field_read_at_places_is_localised(folder):
-    """Lorenz-96, every second variable, 15 members: with a taper it is followed, without it is lost."""
+    """Lorenz-96, every second variable, 15 members: with a taper filter and smoother follow it, without it is lost."""
     model = Lorenz96.from_settings(Lorenz96Settings())
     start = model.trajectories(model.initial_state({"F": 8.0})[None], np.array([20.0]))[0].states
     times, noise = 0.1 * np.arange(1, 81), np.random.default_rng(0)
@@ -276,14 +277,18 @@ def test_a_field_read_at_places_is_localised(folder):
     Path("field.csv").write_text("t,cell,x\n" + "".join(f"{t:.3f},{c},{x:.4f}\n" for t, c, x in rows))
     data = {**BASE["data"], "path": "field.csv", "places": {"column": "cell"}, "error": {"x_std": 1}}
     errors = []
-    for local in ({"radius": 4, "periodic": True}, None):
-        scheme = {"scheme": "etkf", "members": 15, "inflation": 1.04, "localisation": local}
+    local = {"radius": 4, "periodic": True}
+    for scheme in ({"scheme": "etkf"}, {"scheme": "ienks", "lag": 2}, {"scheme": "etkf", "localisation": None}):
+        asked = {"members": 15, "inflation": 1.04, "localisation": local, **scheme}
         changes = {"model": {"name": "lorenz96"}, "parameters": None, "model_error": None, "data": data}
-        path = written(folder, **changes, assimilation=scheme, sequence={"initial_std": {"x": 4}})
+        path = written(folder, **changes, assimilation=asked, sequence={"initial_std": {"x": 4}})
         run = assimilate_series(build_sequence(load_sequence(path)), 0).run
-        errors.append(np.sqrt(np.mean((run.analysis.mean[50:, :40] - truth[50:]) ** 2)))
-    assert errors[0] < 0.75
-    assert errors[1] > 2
+        for moments in (run.analysis, run.smoothed) if "lag" in scheme else (run.analysis,):
+            errors.append(np.sqrt(np.mean((moments.mean[50:, :40] - truth[50:]) ** 2)))
+    filtered, analysed, smoothed, lost = errors
+    assert smoothed < min(filtered, analysed)
+    assert max(filtered, analysed) < 0.75
+    assert lost > 2
 
 
 @pytest.mark.slow

@@ -71,6 +71,14 @@ def test_enkf_n_minimises_its_cost(seed, k):
     assert np.abs(found.T.sum(axis=0) - found.T.sum() / n).max() < 1e-12
 
 
+def test_enkf_n_of_an_ensemble_that_is_lost_stays_finite():
+    """Predictions of 1e10 standard deviations: to rounding the Hessian is not positive, which was a domain error."""
+    rng = np.random.default_rng(0)
+    s = 1e10 * rng.standard_normal((8, 6)) * np.logspace(0, -16, 8)[:, None]
+    step = analysed(EnKFN(), Evaluation(1e10 * rng.standard_normal(8), s - s.mean(axis=1, keepdims=True)))
+    assert np.isfinite(step.w).all()
+
+
 def test_without_information_enkf_n_keeps_the_mean():
     e = Evaluation(np.ones(3), np.zeros((3, 6)))
     assert analysed(EnKFN(), e).w == pytest.approx(np.zeros(6), abs=1e-12)

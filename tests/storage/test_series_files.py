@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import arviz as az
 import numpy as np
 import pytest
 from config.test_series_section import write
@@ -64,6 +63,8 @@ def test_the_observations_come_back_to_the_bit(analysis, result):
 
 @pytest.mark.filterwarnings("ignore:Estimated shape parameter")  # of twelve members
 def test_arviz_reads_it(analysis, result, tmp_path):
+    import arviz as az  # takes seconds
+
     save(result, tmp_path / "posterior.nc")
     data = az.from_netcdf(tmp_path / "posterior.nc")
     assert set(data.log_likelihood.data_vars) == {"p", "q", "f"}

@@ -12,14 +12,15 @@ import xarray as xr
 
 from en4dvar.errors import OutputError
 from en4dvar.report.result import Result, load_result
+from en4dvar.storage.beside import BESIDE
 from en4dvar.storage.provenance import git_commit, provenance
 from en4dvar.storage.seal import sealed
 from en4dvar.storage.store import save
 
 FAILED = 3
 GROUPS = {
-    "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "constant_data",
-    "sample_stats", "log_likelihood", "iterations",
+    "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "observation_errors",
+    "prior_paths", "posterior_paths", "constant_data", "sample_stats", "log_likelihood", "iterations",
 }  # fmt: skip
 
 
@@ -42,7 +43,7 @@ def test_file_has_every_group_with_units_and_names(path):
                 assert variable.attrs["long_name"], f"{node.path}/{name}"
         assert tree["posterior/G"].dims == ("chain", "draw")
         assert tree["posterior_predictive/R"].dims == ("chain", "draw", "time")
-        assert tree["posterior_predictive/R_path"].dims == ("chain", "draw", "path_time")
+        assert tree["posterior_paths/R_path"].dims == ("chain", "draw", "path_time")
         assert tree["log_likelihood/R"].dims == ("chain", "draw", "time")
         assert tree["iterations/G"].dims == ("iteration", "draw")
         assert tree["constant_data/p_inf"].item() == 101325.0
@@ -121,6 +122,7 @@ def test_arviz_reads_it(path):
     assert posterior["G"].dims == ("chain", "draw")
     assert bool(data["sample_stats"]["active"].values[0, 0])
     assert data["observed_data"]["R"].shape == (40,)
+    assert list(data["observed_data"].data_vars) == list(data["log_likelihood"].data_vars) == ["R"]
     if not az.__version__.startswith("0."):
         return  # the statistics below have other names from 1.0 on; reading is what the file answers for
     table = az.summary(posterior.dropna("draw"), kind="stats", round_to="none")
@@ -129,6 +131,31 @@ def test_arviz_reads_it(path):
     alive = posterior["G"].values[np.isfinite(posterior["G"].values)]
     low, high = az.hdi(alive, hdi_prob=0.9)
     assert alive.min() <= low < alive.mean() < high <= alive.max()
+
+
+def test_a_file_of_an_earlier_version_has_errors_and_paths_in_the_same_groups(result, path, tmp_path):
+    tree = result.tree.copy()
+    for group, beside in BESIDE.items():
+        tree[group] = xr.DataTree(result.dataset(group))
+        del tree[beside]
+    earlier = load_result(save(Result(tree), tmp_path / "earlier.nc"))
+    for group in BESIDE:
+        xr.testing.assert_identical(earlier.dataset(group), load_result(path).dataset(group))
+    ours, theirs = load_result(path).observations(), earlier.observations()
+    np.testing.assert_array_equal(theirs.std, ours.std)
+    np.testing.assert_array_equal(theirs.weights, ours.weights)
+
+
+@pytest.mark.filterwarnings("ignore")  # of ArviZ, about what it will be and the few members
+def test_arviz_draws_it_without_arguments(result, tmp_path):
+    """Wherever every member lives; ``plot_loo_pit`` of ArviZ 0 wants the name of the observable, and that is all."""
+    az = pytest.importorskip("arviz")
+    living = result.tree.isel(draw=slice(FAILED + 1, None), missing_dims="ignore")
+    data = az.from_netcdf(str(save(Result(living), tmp_path / "posterior.nc")))
+    earlier = az.__version__.startswith("0.")
+    (az.plot_ppc if earlier else az.plot_ppc_dist)(data)
+    az.plot_loo_pit(data, **({"y": "R"} if earlier else {}))
+    assert list(az.summary(data).index) == ["G", "mu", "R0", "t_s"]
 
 
 def test_root_attributes(path):

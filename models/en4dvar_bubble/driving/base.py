@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from en4dvar.state import Array, Parameter
-from en4dvar_bubble.tables import Grid
+from en4dvar_bubble.tables import Grid, evaluate
 
 Reading = Literal["instantaneous", "retarded", "as-printed"]
 Role = Literal["delay", "rate", "stretch", "shape"]
@@ -138,6 +138,17 @@ class Driving:
         inside = [1e6 * t for t in sorted(set(self.stops)) if self.begin < t < self.end]
         first, last, _, _ = self.grid.span
         return np.array([first, *(t for t in inside if first < t < last), last])
+
+    def of_each(self, t: Array, values: Mapping[str, Array]) -> Array:
+        """p_f (N, K) in Pa of members at their times (N, K) in s; ``values``: name → (N,) of parameters, as above."""
+        clocks = self.of_members(values)
+        shift, rate, offset = (np.reshape(of, (-1, 1)) for of in clocks[:3])
+        read = (t * 1e6 - shift) * rate
+        inside = (read >= self.span[0]) & (read <= self.span[1])
+        table = np.broadcast_to(offset[:, 0].astype(int) // (8 * self.cells), len(t))
+        shape = evaluate(clocks.table.reshape(-1, self.cells, 8)[table], self.span, read)
+        amplitude = np.reshape(values.get("p_A", self.amplitude), (-1, 1))
+        return np.where(inside, amplitude * shape, 0.0)
 
     def pressure(self, t: Array) -> Array:
         """p_f in Pa at times (K,) in s, of any shape."""

@@ -16,6 +16,9 @@ from en4dvar_bubble.driving.base import Driving
 from en4dvar_bubble.driving.pulses import PULSES
 from en4dvar_bubble.driving.tabulated import from_file
 
+# For a class that stands in no file: pydantic would search all of them for its text.
+IN_NO_FILE = {"use_attribute_docstrings": False}
+
 
 class Section(BaseModel):
     """A section of a YAML file: unknown keys are errors, the texts under its keys are their descriptions."""
@@ -51,7 +54,7 @@ def _section(kind: str, function: Callable[..., Driving]) -> type[_Kind]:
         described = " ".join(text for text in hints[name].__metadata__ if isinstance(text, str))
         default = ... if argument.default is argument.empty else argument.default
         keys[name] = (hints[name], Field(default, description=described))
-    section = create_model(kind.capitalize(), __base__=_Kind, __doc__=words, **keys)
+    section = create_model(kind.capitalize(), __base__=_Kind, __doc__=words, __cls_kwargs__=IN_NO_FILE, **keys)
     section.pulse = staticmethod(function)
     return section
 

@@ -15,7 +15,7 @@ class NeoHookeanKelvinVoigt(ConstitutiveLaw):
     r"""$J = -4\mu\dot R/R - \tfrac G2\left[5 - 4\lambda^{-1} - \lambda^{-4}\right]$ (Gaudron et al. 2015)."""
 
     name = "neo-hookean-kelvin-voigt"
-    title = "neo-Hookean Kelvin–Voigt"
+    title = "neo-Hookean Kelvin–Voigt (NHKV)"
     parameters: ClassVar[tuple[Parameter, ...]] = (G, MU)
 
     def stress(self, stretch: Array, p: Any) -> Array:

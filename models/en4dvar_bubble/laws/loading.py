@@ -64,7 +64,7 @@ def _from_module(where: str, attribute: str) -> Any:
 def _from_entry_point(name: str) -> Any:
     registered = {entry.name: entry for entry in entry_points(group=GROUP)}
     if name not in registered:
-        known = sorted({*REGISTRY, *registered})
+        known = {law: REGISTRY[law].title if law in REGISTRY else "" for law in sorted({*REGISTRY, *registered})}
         own = "; a class of your own is my_law.py:ClassName" if name.endswith(".py") else ""
         raise ConfigError(f"unknown law {name!r}{own or suggest(name, known)}")
     with loading(f"law {name!r}: entry point {registered[name].value!r} cannot be loaded"):

@@ -1,0 +1,102 @@
+"""Sequences of the same readings side by side: evidence by the forecasts of their observations.
+
+ln p(y) = Σ_k ln p(y_k | y_1 … y_{k−1}), each the density of N(H x̄, P + R) of the forecast: exact for a linear model and
+an ensemble of enough members, as in a Kalman filter. Source: Schweppe (1965), IEEE Trans. Inf. Theory 11, 61; for
+model selection by ensembles: Carrassi, Bocquet, Hannart & Ghil (2017), Q. J. R. Meteorol. Soc. 143, 866.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from en4dvar.errors import OutputError
+from en4dvar.report.compare import UNDECIDABLE, model_probabilities
+from en4dvar.storage.cycles_file import cycles_file, read_cycles
+from en4dvar.tables import table
+
+READINGS = ("time", "observation", "observations", "observation_std", "observation_correlation")
+
+
+@dataclass(frozen=True)
+class SequenceScore:
+    """``innovation``: root mean square of normalised innovations; ``difference`` to the largest log-evidence."""
+
+    run: str
+    scheme: str
+    log_evidence: float
+    difference: float
+    probability: float
+    innovation: float
+
+
+def compare_sequences(run_dirs: Sequence[Path]) -> tuple[SequenceScore, ...]:
+    """Score sequences, in the order given.
+
+    Raises
+    ------
+    OutputError: fewer than two, one of them no sequence, without an evidence, or of other readings.
+    """
+    if len(run_dirs) < 2:
+        raise OutputError("compare needs at least two run directories")
+    runs = {str(run_dir): _sequence(run_dir) for run_dir in run_dirs}
+    if len(runs) < len(run_dirs):
+        raise OutputError("compare: a run directory is given twice")
+    _require_same_readings(runs)
+    evidence = np.array([float(data.attrs["log_evidence"]) for data in runs.values()])
+    each = zip(runs.items(), evidence, model_probabilities(evidence), strict=True)
+    return tuple(
+        SequenceScore(run, str(data.attrs["scheme"]), float(log), float(log - evidence.max()), float(p), _size(data))
+        for (run, data), log, p in each
+    )
+
+
+def sequences_table(scores: Sequence[SequenceScore]) -> str:
+    """What the terminal shows: a row a run, and which is preferred."""
+    header = ("run", "scheme", "log-evidence", "difference", "probability", "innovations / expected")
+    rows = [
+        (s.run, s.scheme, f"{s.log_evidence:.2f}", f"{s.difference:.2f}", f"{s.probability:.3f}", f"{s.innovation:.3g}")
+        for s in scores
+    ]
+    best, second = sorted(scores, key=lambda score: -score.log_evidence)[:2]
+    words = f"{best.run} is preferred: log-evidence {-second.difference:.2f} above {second.run}"
+    if -second.difference < UNDECIDABLE:
+        words = f"undecidable: {best.run} and {second.run} differ by {-second.difference:.2f} in log-evidence"
+    return f"{table([header, *rows])}\n\n{words}"
+
+
+def _sequence(run_dir: Path) -> xr.Dataset:
+    file = cycles_file(run_dir)
+    if file is None:
+        raise OutputError(f"{run_dir}: no sequence; sequences are compared with sequences of the same readings")
+    if file.stem == "twin":
+        raise OutputError(f"{run_dir}: a twin experiment has no evidence; RMSE and spread are in its summary.csv")
+    data = read_cycles(file)
+    if "log_evidence" not in data.attrs:
+        raise OutputError(f"{run_dir}: written by an earlier version, without an evidence; run it again")
+    if why := str(data.attrs["without_evidence"]):
+        raise OutputError(f"{run_dir}: has no evidence to compare: {why}")
+    if not np.isfinite(data.attrs["log_evidence"]):
+        raise OutputError(f"{run_dir}: has no evidence to compare: its ensemble has lost the readings")
+    return data
+
+
+def _require_same_readings(runs: Mapping[str, xr.Dataset]) -> None:
+    (first, one), *others = runs.items()
+    for name, other in others:
+        if not all(_same(one, other, key) for key in READINGS):
+            raise OutputError(f"{name} and {first} hold other readings or errors: their evidences do not compare")
+
+
+def _same(one: xr.Dataset, other: xr.Dataset, key: str) -> bool:
+    if key not in one or key not in other:
+        return key not in one and key not in other
+    return one[key].variable.equals(other[key].variable)
+
+
+def _size(data: xr.Dataset) -> float:
+    return float(np.sqrt(np.nanmean(data["normalised_innovation"].values ** 2)))

@@ -1,0 +1,84 @@
+"""Tables of runs of cycles, twin experiments and sequences, for other programs: CSV in time or of members, LaTeX."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+
+from en4dvar.errors import OutputError
+from en4dvar.report.export import Notes, escaped, latex_unit, plus_minus, tabular
+from en4dvar.state import Array
+from en4dvar.storage.cycles_file import read_cycles
+from en4dvar.tables import csv_text
+from en4dvar.units import convert
+
+KINDS = ("forecast", "analysis", "smoothed")
+CERTAIN = 1e-9  # of its size: the spread of what is known
+
+
+def cycles_table(file: Path, kind: Literal["csv", "latex", "members"]) -> str:
+    """A table of a result file as text, in display units.
+
+    Parameters
+    ----------
+    kind: ``csv``: a line for each time and variable of the state, mean and std of each estimate (and the truth of a
+        twin experiment); ``members``: a line for each member and time that is kept; ``latex``: rows of a table
+        (package booktabs), mean and std of the last analysis.
+
+    Raises
+    ------
+    OutputError: there is no result, it is damaged, or it holds no members (a twin experiment).
+    """
+    data = read_cycles(file)
+    if kind == "members" and "members" not in data:
+        raise OutputError(
+            f"{file}: a twin experiment keeps no members; --csv has mean and std of each variable in time"
+        )
+    if kind == "latex":
+        return _latex(data)
+    return csv_text(_members(data) if kind == "members" else _in_time(data))
+
+
+def _shown(data: xr.Dataset) -> tuple[list[str], list[str], Array]:
+    """Names of the variables, the units they are shown in, and the factors (n,) to these."""
+    units = [str(unit) for unit in data["units"].values]
+    shown = [str(unit) for unit in data["display_units"].values] if "display_units" in data else units
+    factors = [float(convert(1.0, unit, to)) for unit, to in zip(units, shown, strict=True)]
+    return [str(name) for name in data["state"].values], shown, np.array(factors)
+
+
+def _in_time(data: xr.Dataset) -> Iterator[list[str]]:
+    names, units, factors = _shown(data)
+    columns = [f"{kind}_{what}" for kind in KINDS for what in ("mean", "std") if f"{kind}_{what}" in data]
+    columns += ["truth"] * ("truth" in data)
+    yield ["time", "variable", "unit", *columns]
+    values = np.stack([data[column].values * factors for column in columns], axis=-1)
+    for time, at in zip(data["time"].values, values, strict=True):
+        for name, unit, row in zip(names, units, at, strict=True):
+            yield [repr(float(time)), name, unit, *(f"{x:.10g}" if np.isfinite(x) else "" for x in row)]
+
+
+def _members(data: xr.Dataset) -> Iterator[list[str]]:
+    names, units, factors = _shown(data)
+    header = [f"{name} ({unit})" if unit != "1" else name for name, unit in zip(names, units, strict=True)]
+    yield ["time", "member", *header]
+    for time, members in zip(data["member_time"].values, data["members"].values * factors, strict=True):
+        for i, member in enumerate(members):
+            if np.isfinite(member).all():  # the others were lost
+                yield [repr(float(time)), str(i), *(f"{x:.10g}" for x in member)]
+
+
+def _latex(data: xr.Dataset) -> str:
+    names, units, factors = _shown(data)
+    last = zip(data["analysis_mean"].values[-1] * factors, data["analysis_std"].values[-1] * factors, strict=True)
+    lines = [
+        f"{escaped(name)} & {latex_unit(unit) or '--'} & {plus_minus(float(mean), float(std))}"
+        for name, unit, (mean, std) in zip(names, units, last, strict=True)
+        if std > CERTAIN * abs(mean)
+    ]
+    head = "% en4dvar export: mean and standard deviation of the last analysis; needs \\usepackage{booktabs}"
+    return "\n".join([head, *tabular("llr", "variable & unit & analysis", lines, Notes())]) + "\n"

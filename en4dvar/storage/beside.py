@@ -1,0 +1,22 @@
+"""Groups of a file that stand beside those of ArviZ.
+
+Tools take every variable of the observed data for one that is predicted, and every dimension of the predictions for one
+of the readings. So the errors of the readings and the paths between them have groups of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import xarray as xr
+
+BESIDE: Mapping[str, str] = {
+    "observed_data": "observation_errors",
+    "prior_predictive": "prior_paths",
+    "posterior_predictive": "posterior_paths",
+}
+
+
+def joined(group: xr.Dataset, beside: xr.Dataset | None) -> xr.Dataset:
+    """A group with the variables of the one beside it; files of earlier versions have all in one."""
+    return group if beside is None else group.assign({name: beside[name] for name in beside.data_vars})

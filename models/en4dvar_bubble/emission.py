@@ -1,0 +1,66 @@
+r"""What a hydrophone far from the bubble reads: the pressure of the wave that the bubble itself sends out.
+
+Near the bubble the liquid is incompressible, far from it the wave is φ = −F(t − r/c)/r (Keller & Miksis 1980, J.
+Acoust. Soc. Am. 68, 628). Bernoulli's equation at the wall then gives
+
+    r p(r, t + r/c) = ρ F′ = R (p_L − p_∞ − p_f + ρ Ṙ²/2),        p_L = p_b − 2S/R + J − 4μ Ṙ/R,
+
+with the stress integral J of the medium: what the path knows, without a derivative of it. In an incompressible liquid
+this is ρ (R² R̈ + 2 R Ṙ²), the second derivative of the volume times ρ/4π. The pulse itself, which the hydrophone meets
+too, is not in it, nor are steepening and absorption on the way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from en4dvar.forward import Observable
+from en4dvar.state import Array
+from en4dvar_bubble.paths import BubbleTrajectory, Paths
+
+
+@dataclass(frozen=True)
+class Emission:
+    """H: the pressure (Pa) at the model's ``hydrophone``, at the instants at which it arrives there."""
+
+    batched: ClassVar[bool] = True
+
+    def __call__(self, trajectory: Any) -> Array:
+        """(K,) of a path, (N, K) of many. Raises ValueError: the path does not start where the model does."""
+        if isinstance(trajectory, BubbleTrajectory):
+            return np.asarray(emitted(trajectory.paths)[trajectory.member])
+        return emitted(trajectory)
+
+
+OBSERVABLE = Observable(
+    "acoustic_pressure", "Pa", Emission(), r"$p_\mathrm{ac}$", "kPa", "pressure that the bubble sends out"
+)
+
+
+def emitted(paths: Paths) -> Array:
+    """(N, K) Pa at the model's hydrophone; the paths are run again, at the instants (s) when it was sent."""
+    if np.any(paths.start):
+        raise ValueError("what the bubble sent out before is read from whole paths, which a resumed one is not")
+    model: Any = paths.model
+    if "emitted" not in paths.found:
+        sent = paths.times - model.hydrophone / paths.medium(1).c
+        if model.start == "acoustic":  # at rest before time zero
+            sent = np.maximum(sent, 0.0)
+        run = model.integrate(paths.initial, sent)
+        medium, R, Rdot = run.medium(1), run["R"], run["Rdot"]
+        excess = run["p_b"] - 2 * medium.S / R + run["S"] - medium.p_inf - _driving(run)
+        lost = (run.solution.status != 0)[:, None]
+        paths.found["emitted"] = np.where(lost, np.nan, R * (excess + 0.5 * medium.rho * Rdot**2) / model.hydrophone)
+    return np.asarray(paths.found["emitted"])
+
+
+def _driving(run: Paths) -> Array:
+    """p_f in Pa at the bubble, (N, K), as the equation of motion reads it; 0 where there is none."""
+    model: Any = run.model
+    if model.driving.silent:
+        return np.zeros(1)
+    when = run.times + (0.0 if model.reading == "instantaneous" else run["R"] / run.medium(1).c)
+    return np.asarray(model.driving.of_each(when, model.parameter_values(run.initial)))
