@@ -55,8 +55,8 @@ def test_order_of_the_method(gas, nodes, reading):
     ("vapour", "medium_heat"), [("none", "conducting"), ("transport", "cold"), ("transport", "conducting")]
 )
 def test_order_with_every_field(vapour, medium_heat):
-    """The order of a Rosenbrock method is lost with any wrong entry of the Jacobian. That of p_sat is a difference, right
-    to 1e-6, which is 1e-12 of R: of 480 steps it would be seen.
+    """The order of a Rosenbrock method is lost with any wrong entry of the Jacobian. That of p_sat is a difference,
+    right to 1e-6, which is 1e-12 of R: of 480 steps it would be seen.
     """
     medium = replace(WATER_25C, D_p=1.0, D_T=1.75)
     found = order((120, 240), nodes=5, vapour=vapour, medium_heat=medium_heat, medium=medium)
