@@ -18,6 +18,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -26,11 +27,20 @@ import numpy as np
 from scalar_bubble import Array, Integrator, Problem, constants, cvode, lsoda, run
 
 from en4dvar.executor import Executor, SerialExecutor, ThreadsExecutor
-from en4dvar_bubble import Accuracy, BubbleModel, simulate
-from en4dvar_bubble.solver.driver import ACCURACIES
+from en4dvar_bubble import Accuracy, BubbleModel, get_law, simulate
+from en4dvar_bubble.solver.driver import ACCURACIES, preset
+from en4dvar_bubble.solver.integrate import STEPS
 
 CENTRE = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}  # the paper's 1 % gel
 SPREAD = 0.3
+RELEASED = {"G": 2770.0, "mu": 0.186, "R_max": 230e-6, "R_eq": 230e-6 / 7}  # polyacrylamide
+PHYSICS: dict[str, dict[str, Any]] = {
+    "polytropic": {"gas": "polytropic"},
+    "heat": {},
+    "heat, conducting medium": {"medium_heat": "conducting"},
+    "heat, vapour transport": {"vapour": "transport"},
+    "heat, vapour transport, conducting medium": {"vapour": "transport", "medium_heat": "conducting"},
+}
 TIMES = np.linspace(6e-6, 80e-6, 60)
 BASELINE_MEMBERS = 12  # of the 48, for the slow integrators
 _FORECASTS = 10  # in a row between two runs of a slow integrator, which empties the caches
@@ -200,6 +210,32 @@ def accuracies() -> list[str]:
     return lines
 
 
+def by_physics() -> list[str]:
+    """A laser bubble with each physics: steps, cost, error in time (same nodes, 1e-10) and in all (finer grids)."""
+    rng = np.random.default_rng(0)
+    theta = {name: value * np.exp(0.1 * rng.standard_normal(48)) for name, value in RELEASED.items()}
+    times, lines, cheapest = np.linspace(1e-6, 60e-6, 60), [], 0.0
+
+    def radii(accuracy: Accuracy, options: dict[str, Any]) -> tuple[Any, Callable[[], Any]]:
+        model = BubbleModel(law=get_law("neo-hookean-kelvin-voigt"), start="laser", accuracy=accuracy, **options)
+        x, t = model.initial_states(theta), np.broadcast_to(times, (48, len(times)))
+        return model.integrate(x, t), lambda: model.integrate(x, t)["R"]
+
+    standard = preset("standard", "laser")
+    for name, options in PHYSICS.items():
+        paths, call = radii(standard, options)
+        seconds = median_time(call, 5) / 48
+        cheapest = cheapest or seconds
+        in_time = rms(paths["R"], radii(replace(standard, rtol=1e-10), options)[0]["R"])
+        in_all = rms(paths["R"], radii(Accuracy(nodes=32, rtol=1e-9, medium_nodes=48), options)[0]["R"])
+        errors = " | ".join(f"{np.nanmedian(e):.0e}" for e in (in_time, in_all))
+        steps, size = paths.solution.record[:, STEPS].mean(), paths.model.system.size
+        lines.append(
+            f"| {name} | {size} | {steps:.0f} | {errors} | {seconds * 1e3:.3f} | **{seconds / cheapest:.1f}** |"
+        )
+    return lines
+
+
 def _start(accuracy: Accuracy, theta: dict[str, Array], gas: str = "heat") -> tuple[BubbleModel, Array]:
     model = BubbleModel(accuracy=accuracy, gas=gas)  # type: ignore[arg-type]
     return model, model.initial_states(theta)
@@ -253,6 +289,11 @@ TABLES: dict[str, tuple[str, Callable[[], list[str]]]] = {
     "threads": ("| members | one thread, ms | two threads, ms | ratio |\n|---|---|---|---|", threads),
     "members": ("| members | ms | ms per member |\n|---|---|---|", by_members),
     "nodes": ("| nodes | ms per trajectory | rms error / R_max |\n|---|---|---|", by_nodes),
+    "physics": (
+        "| laser bubble, `standard` | unknowns | steps | error in time | everything | ms per trajectory | ratio |\n"
+        "|---|---|---|---|---|---|---|",
+        by_physics,
+    ),
     "random": (
         "| random members | s on two threads | failures | most steps | largest wall Mach |\n|---|---|---|---|---|",
         random_members,

@@ -118,7 +118,9 @@ class _Output:
 
 
 def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> _Output:
-    """Integrate chunk by chunk; a chunk writes its rows and is forgotten (law tables alone are 32 kB per member)."""
+    """Integrate chunk by chunk, each by all threads together; a chunk writes its rows and is forgotten (law tables
+    alone are 32 kB per member).
+    """
     n = len(x)
     out = _Output(
         {name: np.empty((n, len(t))) for name in _FIELDS},
@@ -126,12 +128,17 @@ def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> _Output:
         np.empty(n, dtype=object),
         np.empty((n, RECORD)),
     )
-    share = -(-n // (workers * WIDTH)) * WIDTH
-    chunk = min(_CHUNK, max(WIDTH, share))
+    chunk = _CHUNK * workers
 
-    def run(begin: int) -> None:
+    def run(begin: int, pool: ThreadPoolExecutor) -> None:
         rows = slice(begin, min(begin + chunk, n))
-        paths = model.integrate(x[rows], np.broadcast_to(t, (rows.stop - rows.start, len(t))))
+        size = rows.stop - rows.start
+        work, finish = model.prepared(x[rows], np.broadcast_to(t, (size, len(t))))
+        others = [pool.submit(work) for _ in range(min(workers, -(-size // WIDTH)) - 1)]
+        work()
+        for other in others:
+            other.result()
+        paths = finish()
         solution = paths.solution
         failed = solution.status != 0
         for name, values in out.fields.items():
@@ -140,13 +147,9 @@ def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> _Output:
         out.status[rows], out.record[rows] = solution.status, solution.record
         out.reasons[rows] = [solution.reason(i) for i in range(len(failed))]
 
-    if workers == 1:
+    with ThreadPoolExecutor(workers) as pool:  # its threads begin with the first work for them
         for begin in range(0, n, chunk):
-            run(begin)
-    else:
-        with ThreadPoolExecutor(workers) as pool:
-            for _ in pool.map(run, range(0, n, chunk)):
-                pass
+            run(begin, pool)
     return out
 
 

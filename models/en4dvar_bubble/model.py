@@ -82,7 +82,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
 
     @property
     def cheap(self) -> bool:
-        """All but the equations of vapour and of the medium's temperature, a run of which takes some 10 ms."""
+        """All but the equations of vapour and of the medium's temperature, a run of which takes ten times as long."""
         return not (self.system.vapour or self.system.medium)
 
     @property

@@ -47,22 +47,23 @@ class Dims(NamedTuple):
 class Equations(NamedTuple):
     """What the equations read that is the same for all members.
 
-    ``nodes`` is None for the equations with every option; for the paper's, with their analytic Jacobian, a zero per
-    temperature node, and ``size`` a zero per unknown. Only their lengths count. That of a tuple belongs to its type:
-    the compiler knows it and unrolls; arrays serve any length.
+    ``nodes`` and ``size`` are None for the equations with every option; for the paper's, a zero per temperature node
+    and a zero per unknown. Only their lengths count. That of a tuple belongs to its type: the compiler knows it and
+    unrolls; arrays serve any length.
     """
 
     nodes: Any
     size: Any
     dims: Dims
     gas: Array  # collocation: gas+1 rows of d/dy (the last is the wall), gas of the Laplacian, radii, averaging weights
-    medium: Array  # likewise: medium+1 rows of d/dx, medium of the Laplacian, nodes
+    medium: Array  # likewise: medium+1 rows of d/dx, medium of the Laplacian, x − x⁻², x⁻⁶
     elastic_span: Array  # of the tables against ln λ: first, last, cells per unit, cells
     memory: Array  # tables of the memory variables
     viscous: Array  # tables of ν against ln |V|
     viscous_span: Array
     driving: Array  # table of the far-field pressure over its amplitude; of members of their own shape, one each
     driving_span: Array
+    spans: IntArray  # of the general equations: where their matrix is not zero, see :mod:`arrow`
     reading: int  # when the driving is read, see :mod:`rows`
 
 
@@ -114,7 +115,7 @@ class Lanes(NamedTuple):
 
 class Workspace(NamedTuple):
     """Scratch of a step, and what it leaves: the stages ``k``, ``y_new``; ``norm`` (3, WIDTH) of the error, its fifth
-    root, wall Mach number.
+    root, wall Mach number. From ``border`` on it is that of the general equations.
     """
 
     work: Array
@@ -127,3 +128,9 @@ class Workspace(NamedTuple):
     t_stage: Array
     norm: Array
     dense: Array
+    border: Array  # unknowns of the border and their rates; what the fields read of it
+    border_f: Array
+    shared: Array
+    moved_f: Array  # the last two where an unknown of the border is moved
+    moved: Array
+    extended: Array  # a right-hand side and its solution

@@ -17,6 +17,7 @@ from en4dvar_bubble.driving import Driving, Reading
 from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import integrate, rows
 from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output
+from en4dvar_bubble.solver.arrow import spans
 from en4dvar_bubble.solver.collocation import ball, exterior
 
 stamp_with_sources(integrate.integrate, Path(__file__).parent, Path(tables_module.__file__))
@@ -36,8 +37,6 @@ RADIALS: dict[Radial, int] = {
     "gilmore": rows.GILMORE,
 }
 
-MEDIUM_LENGTH = 0.5
-"""Length of the medium's grid map in radii: half of the nodes lie within it of the wall."""
 UNROLLED = (0, 4, 8)
 """Numbers of temperature nodes for which the paper's equations are compiled with all loops unrolled."""
 _FIRST_STEP = 1e-3  # µs
@@ -70,12 +69,17 @@ ACCURACIES: dict[AccuracyName, Accuracy] = {
 }
 # A released bubble is full of gas that is hot in its core when it bounces; the acoustic one has hardly any.
 _NODES_RELEASED: dict[AccuracyName, int] = {"fast": 8, "standard": 16, "reference": 32}
+# It is so large that heat comes a few percent of its radius into the medium, where its grid is dense.
+_MEDIUM_RELEASED: dict[AccuracyName, int] = {"fast": 8, "standard": 12, "reference": 32}
+MEDIUM_LENGTHS = {"acoustic": 0.5, "laser": 0.05}
 
 
 def preset(name: AccuracyName, start: str) -> Accuracy:
     """The accuracy called ``name`` for a start, ``acoustic`` or ``laser``."""
     base = ACCURACIES[name]
-    return base if start == "acoustic" else replace(base, nodes=_NODES_RELEASED[name])
+    if start == "acoustic":
+        return base
+    return replace(base, nodes=_NODES_RELEASED[name], medium_nodes=_MEDIUM_RELEASED[name])
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,8 @@ class System:
     """Which unknowns there are, in the order of the kernel's rows, and which equations.
 
     ``gas`` temperature nodes, ``vapour`` mole-fraction nodes (0 or ``gas``), ``medium`` temperature nodes, ``memory``
-    variables; ``shear``: a viscosity that depends on the shear rate.
+    variables; ``shear``: a viscosity that depends on the shear rate. ``medium_length``: of the medium's grid map in
+    radii; half of its nodes lie within it of the wall.
     """
 
     gas: int
@@ -92,6 +97,7 @@ class System:
     memory: int = 0
     radial: Radial = "keller-miksis"
     shear: bool = False
+    medium_length: float = 0.5
 
     @property
     def wall(self) -> int:
@@ -138,6 +144,7 @@ class System:
 
 
 _ELASTIC_SPAN, _VISCOUS_SPAN = GRID.span, VISCOUS_GRID.span
+_NO_SPANS = np.zeros((0, 16), dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -184,12 +191,13 @@ def _gas_operators(m: int) -> Array:
 
 
 @cache
-def _medium_operators(m: int) -> Array:
+def _medium_operators(m: int, length: float) -> Array:
     """The same for the medium."""
-    ops = np.zeros((2 * m + 2, m + 1))
+    ops = np.zeros((2 * m + 3, m + 1))
     if m:
-        e = exterior(m, MEDIUM_LENGTH)
-        ops[: m + 1], ops[m + 1 : 2 * m + 1], ops[2 * m + 1] = e.derivative, e.laplacian[:m], e.x
+        e = exterior(m, length)
+        ops[: m + 1], ops[m + 1 : 2 * m + 1] = e.derivative, e.laplacian[:m]
+        ops[2 * m + 1], ops[2 * m + 2] = e.x - e.x**-2, e.x**-6.0
     return ops
 
 
@@ -214,7 +222,7 @@ class Solver:
         """
         system = self.system
         if system.general:
-            return None, np.zeros(system.size)
+            return None, None
         if system.gas in UNROLLED:
             return (0,) * system.gas, (0,) * system.size
         return np.zeros(system.gas), np.zeros(system.size)
@@ -222,9 +230,10 @@ class Solver:
     def equations(self, memory: Array, viscous: Array, pulse: Array) -> Equations:
         """What the compiled equations read beside the members' parameters; tables of laws and pulses (…, cells, 8)."""
         system, driving = self.system, self.driving
-        gas, medium = _gas_operators(system.gas), _medium_operators(system.medium)
-        laws = (_ELASTIC_SPAN, memory, viscous, _VISCOUS_SPAN)
-        return Equations(*self.lengths, system.dims, gas, medium, *laws, pulse, driving.span, READINGS[self.reading])
+        gas, medium = _gas_operators(system.gas), _medium_operators(system.medium, system.medium_length)
+        tables = (_ELASTIC_SPAN, memory, viscous, _VISCOUS_SPAN, pulse, driving.span)
+        nonzero = spans(system.dims) if system.general else _NO_SPANS
+        return Equations(*self.lengths, system.dims, gas, medium, *tables, nonzero, READINGS[self.reading])
 
     @cached_property
     def control(self) -> Control:

@@ -13,6 +13,8 @@ from numba.core import types
 from en4dvar.compiled import kernel
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.arrays import Lanes, Loaded, Workspace
+from en4dvar_bubble.solver.fields import scratch
+from en4dvar_bubble.solver.general import SHARED
 from en4dvar_bubble.solver.lanes import WIDTH, peek, take
 from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, TABLE
 from en4dvar_bubble.solver.step import LEAST_ERROR, attempt, interpolant
@@ -43,9 +45,13 @@ def _rows(count):
 
 
 @nb.njit
-def _workspace(m, n):
-    work, f, jac, dt, k = _rows(6 * m + 2), _rows(n), _rows(n * n), _rows(1), _rows(rodas5p.STAGES * n)
-    return Workspace(work, f, jac, dt, k, _rows(n), _rows(n), _rows(1), _rows(3), _rows(3 * n))
+def _workspace(eq, n):
+    dims, size = eq.dims, max(n, len(eq.spans))
+    work = _rows(scratch(dims))
+    f, jac, dt, k = _rows(n), _rows(size * size), _rows(1), _rows(rodas5p.STAGES * n)
+    own = size - dims.gas - dims.vapour - dims.medium
+    general = _rows(own), _rows(own), _rows(SHARED), _rows(own), _rows(SHARED), _rows(size)
+    return Workspace(work, f, jac, dt, k, _rows(n), _rows(n), _rows(1), _rows(3), _rows(3 * n), *general)
 
 
 @nb.njit
@@ -260,7 +266,7 @@ def _march(members, lanes, eq, control, w, out):
 @kernel
 def integrate(members, eq, control, out):
     """Integrate all members and write their states at the output times; the arguments are those of :mod:`arrays`."""
-    w = _workspace(eq.dims.gas, members.initial.shape[1])
+    w = _workspace(eq, members.initial.shape[1])
     cells = int(eq.elastic_span[3])
     lanes = _idle_lanes(members.initial.shape[1], members.parameters.shape[1], cells, control.first_step)
     _march(members, lanes, eq, control, w, out)

@@ -244,23 +244,41 @@ def _split(typingctx, x):
 
 
 @intrinsic
-def gather(typingctx, table, index, column):
-    """``table.ravel()[index + column]`` per lane; ``index`` holds integral numbers, ``table`` is C-contiguous
-    float64.
+def gather_rows(typingctx, table, index):
+    """The first six of the eight numbers from ``table.ravel()[index]`` on, per lane, as six lanes; ``index`` holds
+    integral numbers, ``table`` is C-contiguous float64.
+
+    Eight loads of a whole row and a transposition: pairs, then fours, then eights of lanes are brought together.
     """
 
     def codegen(context, builder, sig, args):
         data = cgutils.create_struct_proxy(sig.args[0])(context, builder, value=args[0]).data
         offsets = builder.fptosi(args[1], _IVEC)
-        result = ir.Constant(_VEC, ir.Undefined)
+        found = []
         for lane in range(WIDTH):
-            position = ir.Constant(ir.IntType(32), lane)
-            where = builder.add(builder.extract_element(offsets, position), args[2])
-            value = builder.load(builder.gep(data, [where]))
-            result = builder.insert_element(result, value, position)
-        return result
+            where = builder.extract_element(offsets, ir.Constant(ir.IntType(32), lane))
+            row = builder.bitcast(builder.gep(data, [where]), _VEC.as_pointer())
+            found.append(builder.load(row, align=8))
 
-    return lanes(table, lanes, types.int64), codegen
+        def merged(vectors: list[Any], run: int, half: int) -> list[Any]:
+            """Of each two vectors, the runs of ``run`` numbers that are in their even (0) or odd (1) places."""
+            first = [i + half * run for i in range(WIDTH) if (i // run) % 2 == 0]
+            places = [
+                at + other * WIDTH for k in range(0, WIDTH // 2, run) for other in (0, 1) for at in first[k : k + run]
+            ]
+            chosen = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), places)
+            pairs = zip(vectors[::2], vectors[1::2], strict=True)
+            return [builder.shuffle_vector(a, b, chosen) for a, b in pairs]
+
+        columns = []
+        for column in range(6):
+            vectors = found
+            for bit in range(3):
+                vectors = merged(vectors, 1 << bit, (column >> bit) & 1)
+            columns.append(vectors[0])
+        return context.make_tuple(builder, sig.return_type, columns)
+
+    return types.UniTuple(lanes, 6)(table, lanes), codegen
 
 
 _LOG2E = 1.4426950408889634

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numba as nb
 
-from en4dvar_bubble.solver.lanes import any_lane, floor, gather, load, maximum, minimum, select, splat
+from en4dvar_bubble.solver.lanes import any_lane, floor, gather_rows, load, maximum, minimum, select, splat
 from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, PULSE_TABLE
 
 
@@ -15,9 +15,7 @@ def lookup(table, offset, span, x):
     position = (x - origin) * per_unit
     cell = minimum(maximum(floor(position), 0.0), intervals - 1.0)
     s = position - cell
-    at = offset + cell * 8.0
-    c0, c1, c2 = gather(table, at, 0), gather(table, at, 1), gather(table, at, 2)
-    c3, c4, c5 = gather(table, at, 3), gather(table, at, 4), gather(table, at, 5)
+    c0, c1, c2, c3, c4, c5 = gather_rows(table, offset + cell * 8.0)
     value = ((((c5 * s + c4) * s + c3) * s + c2) * s + c1) * s + c0
     first = (((c5 * 5.0 * s + c4 * 4.0) * s + c3 * 3.0) * s + c2 * 2.0) * s + c1
     second = ((c5 * 20.0 * s + c4 * 12.0) * s + c3 * 6.0) * s + c2 * 2.0

@@ -11,8 +11,9 @@ from numba.core.types import NoneType
 from numba.extending import overload
 
 from en4dvar_bubble.solver import rodas5p
+from en4dvar_bubble.solver.arrow import arrow_factors, arrow_solve
 from en4dvar_bubble.solver.equations import jacobian, rhs
-from en4dvar_bubble.solver.general import general_jacobian, general_rhs
+from en4dvar_bubble.solver.fields import general_jacobian, general_rhs
 from en4dvar_bubble.solver.lanes import absolute, exp, load, log, maximum, splat, sqrt, store
 from en4dvar_bubble.solver.rows import INVERSE_C
 
@@ -60,15 +61,48 @@ def _is_general(eq):
     return isinstance(eq.types[eq.fields.index("nodes")], NoneType)
 
 
-def _jacobian(y, t, eq, loaded, w):
-    """The right-hand side and its Jacobian, of the equations that the compiler chooses by the type of ``eq``."""
+@nb.njit(forceinline=True)
+def _dense(lanes, eq, w):
+    """:func:`_linearise` of the paper's equations."""
+    jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
+    n = len(w.f)
+    inverse_h = 1.0 / load(lanes.h, 0)
+    for i in range(n * n):
+        store(w.jac, i, -load(w.jac, i))
+    for i in range(n):
+        store(w.jac, i * n + i, load(w.jac, i * n + i) + inverse_h * (1.0 / _GAMMA))
+    _factorise(w.jac, eq.size)
 
 
-@overload(_jacobian, jit_options={"forceinline": True})
-def _choose_jacobian(y, t, eq, loaded, w):
+@nb.njit
+def _general(lanes, eq, w):
+    """:func:`_linearise` of the equations with every option."""
+    general_jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
+    arrow_factors(lanes.h, eq, w)
+
+
+def _linearise(lanes, eq, w):
+    """dy/dt to ``f``, ∂f_V/∂t to ``dt``, and 1/(hγ) − ∂f/∂y, without 1/(hγ) in the algebraic row, as its factors to
+    ``jac``, of the equations that the compiler chooses by the type of ``eq``.
+    """
+
+
+@overload(_linearise, jit_options={"forceinline": True})
+def _choose_matrix(lanes, eq, w):
     if _is_general(eq):
-        return lambda y, t, eq, loaded, w: general_jacobian(y, t, eq, loaded, w)
-    return lambda y, t, eq, loaded, w: jacobian(y, t, eq, loaded, w)
+        return lambda lanes, eq, w: _general(lanes, eq, w)
+    return lambda lanes, eq, w: _dense(lanes, eq, w)
+
+
+def _substitute(eq, w, row):
+    """Solve for the stage in rows ``row … row+n−1`` of ``k``."""
+
+
+@overload(_substitute, jit_options={"forceinline": True})
+def _choose_solve(eq, w, row):
+    if _is_general(eq):
+        return lambda eq, w, row: arrow_solve(eq, w, row)
+    return lambda eq, w, row: _solve(w.jac, eq.size, w.k, row)
 
 
 def _rhs(y, t, eq, loaded, w):
@@ -78,7 +112,7 @@ def _rhs(y, t, eq, loaded, w):
 @overload(_rhs, jit_options={"forceinline": True})
 def _choose_rhs(y, t, eq, loaded, w):
     if _is_general(eq):
-        return lambda y, t, eq, loaded, w: general_rhs(y, t, eq, loaded, w.f)
+        return lambda y, t, eq, loaded, w: general_rhs(y, t, eq, loaded, w)
     return lambda y, t, eq, loaded, w: rhs(y, t, eq, loaded, w.work, w.f)
 
 
@@ -91,22 +125,6 @@ def _choose_row(eq):
     if _is_general(eq):
         return lambda eq: eq.dims.gas + eq.dims.vapour + eq.dims.medium if eq.dims.wall else -1
     return lambda eq: -1
-
-
-@nb.njit(inline="always")
-def _linearise(lanes, eq, algebraic, w):
-    """dy/dt to ``f``, ∂f_V/∂t to ``dt``, and 1/(hγ) − ∂f/∂y, without 1/(hγ) in the algebraic row, as its factors to
-    ``jac``.
-    """
-    _jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
-    n = len(w.f)
-    inverse_h = 1.0 / load(lanes.h, 0)
-    for i in range(n * n):
-        store(w.jac, i, -load(w.jac, i))
-    for i in range(n):
-        if i != algebraic:
-            store(w.jac, i * n + i, load(w.jac, i * n + i) + inverse_h * (1.0 / _GAMMA))
-    _factorise(w.jac, eq.size)
 
 
 @nb.njit(inline="always")
@@ -134,7 +152,7 @@ def _stages(lanes, eq, algebraic, w):
                     value = value + load(w.k, r * n + i) * _C[s, r]
             store(w.k, s * n + i, load(w.f, i) + value * inverse_h)
         store(w.k, s * n + fast_row, load(w.k, s * n + fast_row) + slope_t * _D[s])
-        _solve(w.jac, eq.size, w.k, s * n)
+        _substitute(eq, w, s * n)
 
 
 @nb.njit(inline="always")
@@ -166,7 +184,7 @@ def _judge(lanes, shear, tolerances, w):
 def attempt(lanes, eq, tolerances, w):
     """One step of all lanes: see :class:`arrays.Workspace` for what it leaves."""
     algebraic = _algebraic_row(eq)
-    _linearise(lanes, eq, algebraic, w)
+    _linearise(lanes, eq, w)
     _stages(lanes, eq, algebraic, w)
     _judge(lanes, eq.dims.shear, tolerances, w)
 

@@ -1,0 +1,277 @@
+"""Temperatures of the gas, fractions of vapour and temperatures of the medium at the nodes: rates and Jacobian.
+
+The equations are those of :mod:`general`. With τ' and ∇²τ from the collocation matrices every rate is a function of
+the node's own values and of what the fields read of the border, so that each block of the Jacobian is a sum of
+collocation matrices with scaled rows, and its columns of the border are derivatives with respect to ten numbers.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+
+from en4dvar_bubble.solver import rows
+from en4dvar_bubble.solver.general import (
+    CONDUCT,
+    CONTENT_SUM,
+    DIFFUSE,
+    DRIFT,
+    FLOW,
+    GAS_WALL,
+    HEAT,
+    HOT,
+    RATE,
+    SHARED,
+    SLOPE_SUM,
+    SPREAD,
+    TAU_WALL,
+    VAPOUR_SUM,
+    border_rates,
+    sums,
+)
+from en4dvar_bubble.solver.lanes import absolute, any_lane, exp, load, log, maximum, splat, sqrt, store
+
+_DELTA = 1e-7  # relative, of differences with respect to the border
+# Rows of the scratch: k, θ, θ^b; τ' (and at the wall), ∇²τ; Y' (likewise), ∇²Y; θ_m' (likewise), ∇²θ_m.
+
+
+@nb.njit
+def scratch(dims):
+    """How many rows of scratch the fields need."""
+    return _of_medium(dims.gas) + 2 * dims.medium + 1
+
+
+@nb.njit
+def _of_medium(mT):
+    """The first row of the scratch that is the medium's."""
+    return 7 * mT + 2
+
+
+@nb.njit
+def _products(y, first, count, matrix, work, at):
+    """d/dy at the nodes and at the wall, then the Laplacian, of the unknowns ``first … first+count−1`` to ``work``,
+    without what the wall adds. Returns d/dy at the wall.
+    """
+    number = 2 * count + 1
+    for i in range(
+        0, number, 4
+    ):  # four sums at a time, which do not wait for each other; the last ones may be repeated
+        b, c, d = min(i + 1, number - 1), min(i + 2, number - 1), min(i + 3, number - 1)
+        sum_a, sum_b, sum_c, sum_d = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
+        for j in range(count):
+            value = load(y, first + j)
+            sum_a = sum_a + value * matrix[i, j]
+            sum_b = sum_b + value * matrix[b, j]
+            sum_c = sum_c + value * matrix[c, j]
+            sum_d = sum_d + value * matrix[d, j]
+        store(work, at + i, sum_a)
+        store(work, at + b, sum_b)
+        store(work, at + c, sum_c)
+        store(work, at + d, sum_d)
+    return load(work, at + count)
+
+
+@nb.njit
+def _add_wall(value, count, matrix, work, at):
+    """What the value at the wall adds to the derivatives in ``work``."""
+    for i in range(2 * count + 1):
+        store(work, at + i, load(work, at + i) + value * matrix[i, count])
+
+
+@nb.njit
+def _sum_up(y, eq, par, work, border):
+    """The interior's share in the derivatives, to ``work``, and in the sums of the border; returns θ_m' at the wall."""
+    mT, mY, mM, _, _, _, _ = eq.dims
+    if mT == 0:
+        return splat(0.0)
+    a, power = load(par, rows.SLOPE), load(par, rows.DIFFUSION_T)
+    content = splat(0.0)
+    for i in range(mT):
+        tau = load(y, i)
+        k = sqrt(maximum(a * tau * 2.0 + 1.0, 1e-12))
+        theta = tau * 2.0 / (k + 1.0) + 1.0
+        store(work, i, k)
+        store(work, mT + i, theta)
+        share = eq.gas[2 * mT + 2, i] / theta
+        if mY:
+            share = share * load(y, mT + i)
+            store(work, 2 * mT + i, splat(1.0))
+            if any_lane(power > 0.0):
+                store(work, 2 * mT + i, exp(power * log(maximum(theta, 1e-12))))
+        content = content + share
+    store(border, CONTENT_SUM, content)
+    store(border, SLOPE_SUM, _products(y, 0, mT, eq.gas, work, 3 * mT))
+    if mY:
+        store(border, VAPOUR_SUM, _products(y, mT, mY, eq.gas, work, 5 * mT + 1))
+    return _products(y, mT + mY, mM, eq.medium, work, _of_medium(mT))
+
+
+@nb.njit
+def _rates(eq, par, shared, work, out):
+    """Rates of the fields to ``out``; the derivatives in ``work`` are completed."""
+    mT, mY, mM, _, _, _, _ = eq.dims
+    gas, medium = eq.gas, eq.medium
+    if mT == 0:
+        return
+    kappa, power = load(par, rows.KAPPA), load(par, rows.DIFFUSION_T)
+    k1 = (kappa - 1.0) / kappa
+    E, rate, drift_V = load(shared, CONDUCT), load(shared, RATE), load(shared, DRIFT)
+    _add_wall(load(shared, TAU_WALL), mT, gas, work, 3 * mT)
+    if mY:
+        _add_wall(load(shared, GAS_WALL), mY, gas, work, 5 * mT + 1)
+    for i in range(mT):
+        conduct = load(work, i) * load(work, mT + i)
+        slope, bend = load(work, 3 * mT + i), load(work, 4 * mT + 1 + i)
+        drift = k1 * E * slope - drift_V * gas[2 * mT + 1, i]
+        store(out, i, k1 * conduct * (rate + E * bend) - drift * slope)
+        if mY:
+            slope_y, bend_y = load(work, 5 * mT + 1 + i), load(work, 6 * mT + 2 + i)
+            spread = load(shared, DIFFUSE) * load(work, 2 * mT + i)
+            store(out, mT + i, spread * (bend_y + (power - 1.0) * slope / conduct * slope_y) - drift * slope_y)
+    if mM:
+        at = _of_medium(mT)
+        _add_wall(load(shared, HOT), mM, medium, work, at)
+        for j in range(mM):
+            flow = load(shared, FLOW) * medium[2 * mM + 1, j] * load(work, at + j)
+            heating = load(shared, HEAT) * medium[2 * mM + 2, j]
+            store(out, mT + mY + j, flow + load(shared, SPREAD) * load(work, at + mM + 1 + j) + heating)
+
+
+@nb.njit
+def general_rhs(y, t, eq, loaded, w):
+    """Write dy/dt (n, 8) to ``f``; the wall's row holds the residual of its algebraic equation. ``w`` leaves what the
+    Jacobian needs; returns θ_m' at the wall but for the wall's own share.
+    """
+    fields, kept = eq.dims.gas + eq.dims.vapour + eq.dims.medium, sums(eq.dims)
+    own = len(y) - fields
+    outward = _sum_up(y, eq, loaded.par, w.work, w.border)
+    for i in range(own):
+        store(w.border, kept + i, load(y, fields + i))
+    border_rates(w.border, t, outward, eq, loaded, w.shared, w.border_f)
+    for i in range(own):
+        store(w.f, fields + i, load(w.border_f, kept + i))
+    _rates(eq, loaded.par, w.shared, w.work, w.f)
+    return outward
+
+
+@nb.njit
+def _gas_blocks(y, eq, par, shared, work, matrix, size):
+    """Minus the derivatives of the gas's rates and of the sums with respect to τ and Y, to ``matrix``."""
+    mT, mY, mM, _, _, _, _ = eq.dims
+    ops, border = eq.gas, mT + mY + mM
+    a, kappa, power = load(par, rows.SLOPE), load(par, rows.KAPPA), load(par, rows.DIFFUSION_T)
+    k1 = (kappa - 1.0) / kappa
+    E, rate, drift_V = load(shared, CONDUCT), load(shared, RATE), load(shared, DRIFT)
+    for i in range(mT):
+        k, theta = load(work, i), load(work, mT + i)
+        slope, bend = load(work, 3 * mT + i), load(work, 4 * mT + 1 + i)
+        conduct, y_V = k * theta, drift_V * ops[2 * mT + 1, i]
+        own = a * theta / k + 1.0  # of kθ
+        on_slope, on_bend = y_V - k1 * E * slope * 2.0, k1 * conduct * E
+        for j in range(mT):
+            store(matrix, i * size + j, -(on_slope * ops[i, j] + on_bend * ops[mT + 1 + i, j]))
+        store(matrix, i * size + i, load(matrix, i * size + i) - k1 * own * (rate + E * bend))
+        share = ops[2 * mT + 2, i] / theta
+        store(matrix, (border + SLOPE_SUM) * size + i, splat(-ops[mT, i]))
+        if mY == 0:
+            store(matrix, (border + CONTENT_SUM) * size + i, share / conduct)
+            continue
+        slope_y, bend_y = load(work, 5 * mT + 1 + i), load(work, 6 * mT + 2 + i)
+        store(matrix, (border + CONTENT_SUM) * size + i, share / conduct * load(y, mT + i))
+        store(matrix, (border + CONTENT_SUM) * size + mT + i, -share)
+        store(matrix, (border + VAPOUR_SUM) * size + mT + i, splat(-ops[mT, i]))
+        spread = load(shared, DIFFUSE) * load(work, 2 * mT + i)
+        mix = spread * (power - 1.0) / conduct
+        row = (mT + i) * size
+        on_slope, on_slope_y = (mix - k1 * E) * slope_y, mix * slope + y_V - k1 * E * slope
+        for j in range(mT):
+            store(matrix, row + j, -(on_slope * ops[i, j]))
+            store(matrix, row + mT + j, -(on_slope_y * ops[i, j] + spread * ops[mT + 1 + i, j]))
+        curved = power * (spread * bend_y + mix * slope * slope_y) - mix * own * slope * slope_y
+        store(matrix, row + i, load(matrix, row + i) - curved / conduct)
+
+
+@nb.njit
+def _medium_block(eq, par, shared, matrix, size):
+    """The same of the medium's, and of the residual of the wall."""
+    mT, mY, mM, _, _, _, _ = eq.dims
+    medium, first = eq.medium, mT + mY
+    wall = first + mM + sums(eq.dims)
+    for i in range(mM):
+        flow = load(shared, FLOW) * medium[2 * mM + 1, i]
+        row = (first + i) * size + first
+        for j in range(mM):
+            store(matrix, row + j, -(flow * medium[i, j] + load(shared, SPREAD) * medium[mM + 1 + i, j]))
+        store(matrix, wall * size + first + i, -(load(par, rows.MEDIUM_K) * medium[mM, i]))
+
+
+@nb.njit
+def _border_column(column, eq, par, shared, change, work, matrix, size):
+    """Minus the derivatives of the fields' rates with respect to an unknown of the border, from those of ``shared``."""
+    mT, mY, mM, _, _, _, _ = eq.dims
+    gas, medium = eq.gas, eq.medium
+    kappa, power = load(par, rows.KAPPA), load(par, rows.DIFFUSION_T)
+    k1 = (kappa - 1.0) / kappa
+    E, drift_V = load(shared, CONDUCT), load(shared, DRIFT)
+    for i in range(mT):
+        conduct = load(work, i) * load(work, mT + i)
+        slope, bend = load(work, 3 * mT + i), load(work, 4 * mT + 1 + i)
+        radius = gas[2 * mT + 1, i]
+        drift = load(change, DRIFT) * radius - k1 * slope * load(change, CONDUCT)
+        wall_slope = load(change, TAU_WALL) * gas[i, mT]
+        wall_bend = load(change, TAU_WALL) * gas[mT + 1 + i, mT]
+        heat = load(change, RATE) + load(change, CONDUCT) * bend + E * wall_bend
+        carried = drift_V * radius - k1 * E * slope
+        total = k1 * conduct * heat + drift * slope + (carried - k1 * E * slope) * wall_slope
+        store(matrix, i * size + column, -total)
+        if mY:
+            slope_y, bend_y, at_T = load(work, 5 * mT + 1 + i), load(work, 6 * mT + 2 + i), load(work, 2 * mT + i)
+            spread, mix = load(shared, DIFFUSE) * at_T, (power - 1.0) / conduct
+            wall_slope_y = load(change, GAS_WALL) * gas[i, mT]
+            total = load(change, DIFFUSE) * at_T * (bend_y + mix * slope * slope_y)
+            total = total + spread * (load(change, GAS_WALL) * gas[mT + 1 + i, mT] + mix * slope * wall_slope_y)
+            total = total + (spread * mix - k1 * E) * wall_slope * slope_y + drift * slope_y + carried * wall_slope_y
+            store(matrix, (mT + i) * size + column, -total)
+    for i in range(mM):
+        flow, at, hot = medium[2 * mM + 1, i], _of_medium(mT) + i, load(change, HOT)
+        total = load(change, FLOW) * flow * load(work, at) + load(change, SPREAD) * load(work, at + mM + 1)
+        total = total + load(change, HEAT) * medium[2 * mM + 2, i] + load(shared, SPREAD) * hot * medium[mM + 1 + i, mM]
+        total = total + load(shared, FLOW) * flow * hot * medium[i, mM]
+        store(matrix, (mT + mY + i) * size + column, -total)
+
+
+@nb.njit
+def general_jacobian(y, t, eq, loaded, w):
+    """Write dy/dt to ``f`` of the workspace, minus its derivatives in the extended form of :mod:`arrow` to ``jac`` and
+    ∂f_V/∂t to ``dt``. Those with respect to the border are one-sided differences.
+    """
+    kept, par = sums(eq.dims), loaded.par
+    fields = len(y) - len(w.border) + kept
+    own = len(w.border)
+    size = fields + own
+    outward = general_rhs(y, t, eq, loaded, w)
+    _gas_blocks(y, eq, par, w.shared, w.work, w.jac, size)
+    if eq.dims.wall:
+        _medium_block(eq, par, w.shared, w.jac, size)
+    moved, changed, now = w.moved, w.moved_f, load(t, 0)
+    store(t, 0, now + _DELTA)
+    late = load(t, 0)
+    for b in range(-1, own):  # time comes first
+        value = load(w.border, max(b, 0))
+        inverse = 1.0 / (late - now)
+        if b >= 0:
+            floor_b = 0.01 if b == own - 2 else 0.0 if b == CONTENT_SUM and kept else 1.0
+            store(w.border, b, value + maximum(absolute(value), floor_b) * _DELTA)
+            inverse = 1.0 / (load(w.border, b) - value)
+        border_rates(w.border, t, outward, eq, loaded, moved, changed)
+        store(t, 0, now)
+        if b < 0:
+            store(w.dt, 0, (load(changed, own - 2) - load(w.border_f, own - 2)) * inverse)
+            continue
+        store(w.border, b, value)
+        for i in range(SHARED):
+            store(moved, i, (load(moved, i) - load(w.shared, i)) * inverse)
+        _border_column(fields + b, eq, par, w.shared, moved, w.work, w.jac, size)
+        for i in range(kept):
+            store(w.jac, (fields + i) * size + fields + b, splat(0.0))
+        for i in range(kept, own):
+            store(w.jac, (fields + i) * size + fields + b, (load(w.border_f, i) - load(changed, i)) * inverse)
