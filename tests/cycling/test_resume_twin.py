@@ -189,7 +189,9 @@ def test_a_damaged_checkpoint_is_named_and_not_used(interrupted):
 
 def test_workers_and_report_may_change(interrupted):
     path, out, quiet = interrupted
-    run_twin(load_twin(path, {"output.directory": str(out), "output.report": True}), resume=True)
+    run_twin(
+        load_twin(path, {"output.directory": str(out), "output.report": True, "output.figures": True}), resume=True
+    )
     assert_same_files(out, quiet)
     assert "spread / RMSE" in (out / "report.html").read_text()
     names = {p.name for p in (out / "figures").iterdir()}

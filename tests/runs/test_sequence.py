@@ -241,7 +241,7 @@ def test_report_of_a_sequence(folder):
         "state", "parameters", "innovations", "ranks",
     }  # fmt: skip
     assert f"{result.run.forward_runs}</strong>" in page
-    en4dvar.write_report("runs/drift")
+    en4dvar.write_report("runs/drift", figures=True)
     assert Path("runs/drift/report.html").read_text() == page
 
 
