@@ -12,6 +12,7 @@ from en4dvar.caution import Caution, caution
 from en4dvar.ensemble.forecast import Forecast, plotting_times
 from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
+from en4dvar.joint.challenge import challenger
 from en4dvar.joint.descent import JointDescent, Place, assembled, cost, descend
 from en4dvar.joint.members import JointMembers, gaussian, sampled
 from en4dvar.joint.problem import JointProblem
@@ -21,6 +22,7 @@ from en4dvar.problem import AssimilationSettings
 from en4dvar.state import Array
 
 TOLD = 0.5  # of J, by which descents differ that ended in different minima
+CHALLENGES = 3  # rounds of looking for lower minima of single experiments
 TRIED = 6  # experiments whose own estimate of what is shared is tried as a start
 
 
@@ -113,7 +115,7 @@ class _Estimate:
     def result(self, singles: Sequence[Single]) -> JointEstimate:
         joint, experiments = self.joint, self.experiments
         descents = self._descents(self._starts(singles or self._singles()))
-        lowest = min(descents, key=lambda one: one.at.cost)
+        lowest = self._challenged(min(descents, key=lambda one: one.at.cost))
         self.tell(f"J {lowest.at.cost:.4g} after {len(lowest.costs) - 1} iterations, {lowest.stop}")
         members, cautions = self._members(lowest)
         grids = tuple(plotting_times(one) for one in joint.experiments)
@@ -175,18 +177,31 @@ class _Estimate:
     def _descents(self, starts: Sequence[Place]) -> list[JointDescent]:
         """From one start after the other, that of lowest J first, until two have ended in the lowest minimum."""
         costs = np.array([cost(self.joint, self.experiments, start) for start in starts])
-        s, found = self.settings, list[JointDescent]()
+        found = list[JointDescent]()
         for i in np.argsort(costs, kind="stable"):
             if np.isfinite(costs[i]):
-                one = descend(
-                    self.joint, self.experiments, starts[i], s.max_iterations, s.step_tolerance, s.cost_tolerance
-                )
-                found += [one] if one else []
+                found += self._descended(starts[i])
             if _agreeing(found) >= 2:
                 break
         if not found:
             raise TooFewMembersError("the joint estimate: some experiment cannot be run wherever it starts")
         return found
+
+    def _descended(self, start: Place) -> list[JointDescent]:
+        """One descent; none where the start cannot be run."""
+        s = self.settings
+        one = descend(self.joint, self.experiments, start, s.max_iterations, s.step_tolerance, s.cost_tolerance)
+        return [one] if one else []
+
+    def _challenged(self, lowest: JointDescent) -> JointDescent:
+        """Or the descent from a lower minimum that single experiments have, looked for where runs are cheap."""
+        for _ in range(CHALLENGES if all(one.model.cheap for one in self.joint.experiments) else 0):
+            place = challenger(self.experiments, lowest.at, self.seed)
+            lower = self._descended(place) if place else []
+            if not lower or lower[0].at.cost >= lowest.at.cost:
+                break
+            lowest = lower[0]
+        return lowest
 
     def _members(self, lowest: JointDescent) -> tuple[JointMembers, list[Caution]]:
         laplace = gaussian(lowest.at, self.seed, self.settings.members)

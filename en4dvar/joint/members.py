@@ -125,22 +125,12 @@ def _given(joint: JointProblem, experiment: Experiment, at: Joined, border: Arra
     alone than what is shared, as a time shift, is off the arrow's straight line by many of its standard deviations.
     """
     e, arrow = experiment.e, at.arrow
-    middle, own = at.place.own[e], joint.columns(e)[1]
     block = arrow.blocks[e]
     precision = np.broadcast_to(block, (len(border), *block.shape))
-    if not own:
+    if not joint.columns(e)[1]:
         return np.zeros((len(border), 0)), precision
-    mean = middle - np.linalg.solve(block, arrow.edges[e].T @ (border - at.place.border).T).T
-    lowest = np.full(len(border), np.inf)
-    there = mean
-    for _ in range(STEPS):
-        cost, gradient, hessian = experiment.linearise_own(joint.standard(e, border, there), own)
-        cost = cost + 0.5 * np.sum(there**2, axis=1)
-        lower = (cost < lowest) & np.isfinite(gradient).all(axis=1)
-        lowest, mean = np.where(lower, cost, lowest), np.where(lower[:, None], there, mean)
-        precision = np.where(lower[:, None, None], np.eye(len(own)) + hessian, precision)
-        step = np.linalg.solve(precision, (mean + gradient)[..., None])[..., 0]
-        there = np.where(lower[:, None], mean - step, mean)
+    mean = at.place.own[e] - np.linalg.solve(block, arrow.edges[e].T @ (border - at.place.border).T).T
+    mean, precision, _ = experiment.settled(border, mean, precision, STEPS)
     return mean, precision
 
 

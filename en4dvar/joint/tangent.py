@@ -78,3 +78,22 @@ class Experiment:
             d, S = observations.whiten(Linearisation.of_stacked(run.predicted[i * (k + 1)], stacked[i, 0], change))
             gradient[i], hessian[i] = -S.T @ d, S.T @ S
         return observations.cost(run.predicted)[:: k + 1], gradient, hessian
+
+    def settled(self, border: Array, start: Array, precision: Array, steps: int) -> tuple[Array, Array, Array]:
+        """The own quantities that J is low at, given what is shared (M, c): Gauss–Newton from ``start`` (M, n_e).
+
+        Where J has not fallen the step is halved. Returns the lowest places (M, n_e), their precision (M, n_e, n_e), or
+        the one given where no run lives, and J_o + J_b of the own quantities (M,) there, +inf where no run lives.
+        """
+        columns = self.joint.columns(self.e)[1]
+        lowest, mean, there, step = np.full(len(start), np.inf), start, start, np.zeros_like(start)
+        for _ in range(steps):
+            cost, gradient, hessian = self.linearise_own(self.joint.standard(self.e, border, there), columns)
+            cost = cost + 0.5 * np.sum(there**2, axis=1)
+            lower = (cost < lowest) & np.isfinite(gradient).all(axis=1)
+            lowest, mean = np.where(lower, cost, lowest), np.where(lower[:, None], there, mean)
+            precision = np.where(lower[:, None, None], np.eye(len(columns)) + hessian, precision)
+            newton = np.linalg.solve(precision, (mean + gradient)[..., None])[..., 0]
+            step = np.where(lower[:, None], newton, 0.5 * step)
+            there = mean - step
+        return mean, precision, lowest

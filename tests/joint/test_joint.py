@@ -160,6 +160,35 @@ def test_own_quantities_that_follow_what_is_shared_on_a_bent_line():
     assert 0.85 < found.shared.std() / std < 1.15
 
 
+class Folded(Vectorised):
+    """y = a t + c² + 0.1 c t: both signs of c are minima, one of them the lower."""
+
+    def trajectories(self, x, times):
+        own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+        a, c = x[:, 2, None], x[:, 3, None]
+        y = a * own + c**2 + 0.1 * c * own
+        theta = np.broadcast_to(x[:, None, 2:], (*own.shape, 2))
+        states = np.concatenate([y[..., None], np.zeros((*own.shape, 1)), theta], axis=-1)
+        return [Trajectory(t, s, self.layout) for t, s in zip(own, states, strict=True)]
+
+
+def test_an_experiment_in_the_wrong_minimum_of_its_own_is_found():
+    """All singles say c = −1; of the first experiment it is +1, which the shared a of the others decides."""
+    model = Folded(names=("a", "c"), compiled=True)
+    prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
+    t, truths = np.array([1.0, 2.0, 3.0]), (1.0, *[-1.0] * 7)
+    problems = [
+        InverseProblem(
+            model, model.observables[0], make_observations(t, 0.5 * t + 1 + 0.1 * c * t, std=0.02, name=f"{e}"), prior
+        )
+        for e, c in enumerate(truths)
+    ]
+    singles = [estimate.Single(np.array([0.5, -1.0]), np.diag([100.0, 100.0])) for _ in problems]
+    found = estimate.estimate_jointly(sharing(problems, ("a",)), SETTINGS, seed=3, singles=singles)
+    np.testing.assert_allclose([found.control(e)[-1, 1] for e in range(8)], truths, atol=0.1)
+    assert found.chi2.max() < 1
+
+
 def test_a_member_of_any_experiment_may_fail():
     problems = _experiments()
     limit = estimate.estimate_jointly(_joint(problems), SETTINGS, seed=3).shared[:, 0]
