@@ -1,0 +1,18 @@
+"""The compiled test-beds, each integrated over one interval."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from en4dvar_lorenz import lorenz63, lorenz96, lotka_volterra
+
+MODULES = {"Lorenz-63": lorenz63, "Lorenz-96": lorenz96, "Lotka–Volterra": lotka_volterra}
+
+
+def examples() -> dict[str, Callable[[], object]]:
+    """What is compiled, in words, and a call that does; for ``en4dvar warm-up``."""
+    start, times = np.ones((1, 6)), np.array([[0.01]])
+    return {f"test-bed, {name}": partial(module.integrate, start, times, 0.01) for name, module in MODULES.items()}
