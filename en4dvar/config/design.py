@@ -8,11 +8,12 @@ from itertools import product
 from math import prod
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import ConfigDict, Field
 
 from en4dvar.config.context import Context, Made, quantity, time_unit
 from en4dvar.config.schema import QuantityText, Section, section_of
-from en4dvar.config.times import Times, read_times
+from en4dvar.config.times import Times, read_times, time_grid
 from en4dvar.config.validate import Faults
 from en4dvar.design.evaluate import SampleSizes
 from en4dvar.state import Array
@@ -29,6 +30,30 @@ class Knob(Section):
     """The key, its sections before it: ``model.pulse.amplitude``, ``design.times.step``, ``data.error.radius_std``."""
     values: Annotated[tuple[Value, ...], Field(min_length=1)]
     """The values, as they would stand in the file."""
+
+
+class Later(Section):
+    """The rate from there on."""
+
+    end: Annotated[QuantityText, Field(alias="to")]
+    """Last instant with its unit."""
+    step: QuantityText
+    """Time step with its unit."""
+
+
+class Rates(Times):
+    """Instants at one rate or at two, one after the other."""
+
+    then: Later | None = None
+    """Another rate, of a camera that changes it: after ``to``."""
+
+
+def _read_rates(times: Rates, context: Context) -> Array:
+    first = read_times(times, context)
+    if times.then is None:
+        return first
+    later = time_grid(times.end, times.then.end, times.then.step, time_unit(context))
+    return np.concatenate([first, later[later > first[-1] + 0.5 * (later[1] - later[0])]])
 
 
 class Choice(Section):
@@ -85,7 +110,7 @@ class Design(_SampleSizes):
 
     about: tuple[str, ...] = ()
     """Parameters that are asked for; the others are uncertain all the same. Default: all that have a prior."""
-    times: Annotated[Array | None, Made(read_times, Times)] = None
+    times: Annotated[Array | None, Made(_read_rates, Rates)] = None
     """When readings are taken, on the model's clock; default: ``simulate.times``, else those of the data file."""
     knobs: dict[str, Knob] = Field({})
     """Name → a key of this file and the values that are tried; every combination is a design."""

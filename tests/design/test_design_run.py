@@ -203,6 +203,17 @@ def test_bad_input(tmp_path, change, message):
         run_design(_plan(**change), out=tmp_path / "out")
 
 
+def test_two_rates_one_after_the_other(tmp_path):
+    times = {"from": "0.5 s", "to": "1 s", "step": "0.1 s", "then": {"to": "2 s", "step": "0.5 s"}}
+    knobs = {"late": {"key": "design.times.then.step", "values": ["0.25 s"]}}
+    found, _ = run_design(_plan(knobs=knobs, times=times), out=tmp_path / "two")
+    own, finer = (row.found.times for row in found.rows)
+    np.testing.assert_allclose(own, [0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.5, 2.0])
+    np.testing.assert_allclose(finer, [0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.25, 1.5, 1.75, 2.0])
+    with pytest.raises(ConfigError, match=r"design\.times"):
+        run_design(_plan(knobs={}, times={**times, "then": {"to": "0.7 s", "step": "0.5 s"}}), out=tmp_path / "no")
+
+
 def test_times_or_a_file_of_them(tmp_path):
     plan = _plan(knobs={})
     del plan["design"]["times"]
