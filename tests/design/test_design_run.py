@@ -8,6 +8,7 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from run_files import TESTS
 from toys import Vectorised
 
 import en4dvar
@@ -201,6 +202,18 @@ def test_as_a_command(tmp_path, monkeypatch):
 def test_bad_input(tmp_path, change, message):
     with pytest.raises(En4dvarError, match=message):
         run_design(_plan(**change), out=tmp_path / "out")
+
+
+def test_the_shipped_linear_plan_is_the_closed_form(tmp_path):
+    found, _ = run_design(
+        TESTS.parent / "configs" / "linear_design.yaml", overrides={"design.method": "laplace"}, out=tmp_path / "line"
+    )
+    for row in found.rows:
+        H = np.column_stack([np.ones_like(row.found.times), row.found.times])
+        posterior = np.linalg.inv(np.diag([0.25, 1.0]) + H.T @ H / 0.25)
+        assert row.found.gain == pytest.approx(-0.5 * np.log(posterior[1, 1]), abs=1e-8)
+        assert row.found.std[0] == pytest.approx(np.sqrt(posterior[1, 1]), rel=1e-8)
+    assert len(found.rows) == 7
 
 
 def test_two_rates_one_after_the_other(tmp_path):
