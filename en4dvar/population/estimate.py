@@ -215,9 +215,12 @@ class _Estimate:
         return walk(self.hyper, mixtures, stream, self.effort.hyper_walkers, self.effort.hyper_rounds)
 
     def _weighed(self, sets: Sequence[SetPosterior], h: Array) -> Weighed:
-        """Draws of a proposal fitted to ``h``, with emulators; where few are left, of one fitted to those."""
+        """Draws of a proposal fitted to ``h``, with emulators; where few are left, of one fitted to those.
+
+        Where they are fewer than a covariance needs, nothing can be fitted; that few are left is then told.
+        """
         found = self._proposed(sets, h, 2 * self.tries)
-        if found.effective < self.effort.effective:
+        if 2 * (h.shape[1] + 1) <= found.effective < self.effort.effective:
             stream = member_stream(self.seed, "second fit", self.tries)
             found = self._proposed(sets, found.h[found.resampled(len(h), stream)], 2 * self.tries + 1)
         return found
