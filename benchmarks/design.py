@@ -231,6 +231,12 @@ def main() -> None:
             print(f"{kind}, {name}: ", end="")
             worth = evaluate(settings[name], ABOUT, MORE, "nested", 0)[0]
             tell_promise((worth.gain, worth.error), {k: r for k, r in found.items() if k.endswith(name)})
+        pairs = [
+            [found.get(f"{i} {name}", {}).get("gain") for name in ("designed", "customary")] for i in range(len(found))
+        ]
+        more = np.array([a - b for a, b in pairs if a is not None and b is not None])
+        error = more.std(ddof=1) / np.sqrt(len(more))
+        print(f"designed over customary, of the same truths: {more.mean():+.3f} ± {error:.3f} ({len(more)} pairs)")
 
 
 if __name__ == "__main__":

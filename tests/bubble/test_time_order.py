@@ -55,8 +55,11 @@ def test_order_of_the_method(gas, nodes, reading):
     ("vapour", "medium_heat"), [("none", "conducting"), ("transport", "cold"), ("transport", "conducting")]
 )
 def test_order_with_every_field(vapour, medium_heat):
-    """The order of a Rosenbrock method is lost with any wrong entry of the Jacobian. That of p_sat is a difference,
-    right to 1e-6, which is 1e-12 of R: of 480 steps it would be seen.
+    """The order of a Rosenbrock method is lost with any wrong entry of the Jacobian.
+
+    The border's entries are one-sided differences of 1e-7, right to about as much: with differences of 1e-6 the order
+    of full physics is 4.90 here instead of 4.95, and between 240 and 480 steps 4.55 instead of 4.87 (4.90 with 1e-8),
+    where the error of 1e-11 of R is partly theirs. Hence fewer steps than above.
     """
     medium = replace(WATER_25C, D_p=1.0, D_T=1.75)
     found = order((120, 240), nodes=5, vapour=vapour, medium_heat=medium_heat, medium=medium)
