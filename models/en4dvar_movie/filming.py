@@ -32,7 +32,7 @@ class Camera:
 
     pixel: Annotated[float, "m", "size of a pixel"] = 2e-6
     exposure: Annotated[float, "s", "how long light falls on a frame, or how long a flash is"] = 0.0
-    jitter: Annotated[float, "s", "std of the instants of the frames, each by itself"] = 0.0
+    jitter: Annotated[float, "s", "std of the error of each frame's instant"] = 0.0
     flashes: Annotated[tuple[float, ...], "flashes of a frame after its instant, such as 0 us, 2 us"] = (0.0,)
 
 

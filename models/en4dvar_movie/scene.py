@@ -34,7 +34,7 @@ class Scene:
     shot: Annotated[float, "share of the noise's variance that is shot noise, growing with the light"] = 0.5
     uneven: Annotated[float, "share by which the background's light varies over a frame"] = 0.1
     centre: Annotated[float, "radius of the bright centre over that of the bubble; 0: none"] = 0.0
-    drift: Annotated[float, "way of the bubble's centre from frame to frame"] = 0.0
+    drift: Annotated[float, "distance the bubble's centre moves from frame to frame"] = 0.0
     ellipticity: Annotated[float, "std of a random ellipsoid's surface over its radius"] = 0.0
     dirt: Annotated[int, "number of specks, a quarter of which moves from frame to frame"] = 0
     bubble: Annotated[tuple[float, float] | None, "x and y of the bubble's centre; default the frame's middle"] = None
