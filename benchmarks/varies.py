@@ -1,4 +1,4 @@
-"""A viscosity that varies in time, as a campaign of twins: do the bands cover it, and how often is a change told?
+"""A viscosity that varies in time, as a campaign of twins: do the bands cover it, and how often is a change reported?
 
     python benchmarks/varies.py                  60 twins of each kind of truth, about four minutes on one core
     python benchmarks/varies.py --minutes 2      a piece of it: records are kept, the next call goes on
@@ -108,7 +108,7 @@ def main() -> None:
         return
     keys = [f"{truth} {seed}" for seed in range(options.n) for truth in TRUTHS]
     found = fill(options.records / "twins.jsonl", keys, experiment, options.minutes)
-    print("| truth | twins | pieces covered by 5–95 % | by piece | z mean, std | change told | constant told |")
+    print("| truth | twins | pieces covered by 5–95 % | by piece | z mean, std | change reported | constant reported |")
     print("|---|---|---|---|---|---|---|")
     for truth in TRUTHS:
         records = [record for key, record in found.items() if key.startswith(truth)]
