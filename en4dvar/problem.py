@@ -214,7 +214,7 @@ class AssimilationSettings:
     ] = "auto"
     what_if: Annotated[
         bool,
-        "Tell what the result would be under the alternatives that the model offers, and what on the path informed it.",
+        "Say what the result would be under the model's alternatives, and which part of the path informed it.",
     ] = True
     stochastic_model: Annotated[
         bool,

@@ -118,7 +118,7 @@ workers_option = click.option(
     "--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it."
 )
 trust_option = click.option(
-    "--trust", is_flag=True, help="Run code that the files name, wherever it lies: read it before."
+    "--trust", is_flag=True, help="Run code that the files name, wherever it lies; read it first."
 )
 
 
@@ -159,7 +159,7 @@ def several_runs(kind: str) -> Callable[[Callable[..., Any]], Callable[..., Any]
             "run_dirs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN_DIR [RUN_DIR...]"
         )
         @click.option(
-            "--out", type=click.Path(path_type=Path), help=f"Folder of the result; default {kind}_... beside."
+            "--out", type=click.Path(path_type=Path), help=f"Folder of the result; default {kind}_... beside the first."
         )
         @workers_option
         @trust_option

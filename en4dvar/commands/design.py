@@ -12,16 +12,17 @@ from en4dvar.commands.common import Source, command_line, config_options, contin
 @click.command()
 @config_options
 @click.option(
-    "--after", metavar="RUN_DIR", type=click.Path(path_type=Path), help="Finished run: start from what it knows."
+    "--after", metavar="RUN_DIR", type=click.Path(path_type=Path), help="Finished run whose posterior is the prior."
 )
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the result; default runs/<name>_design.")
 @click.option("--force", is_flag=True, help="Replace an earlier result in the directory.")
-@click.option("--resume", is_flag=True, help="Go on with an interrupted comparison, to the same numbers.")
+@click.option("--resume", is_flag=True, help="Go on with an interrupted comparison; the numbers are the same.")
 def design(source: Source, after: Path | None, out: Path | None, force: bool, resume: bool) -> None:
     """Compare planned experiments by the information they are expected to give.
 
     The configuration is that of 'run'; its data file need not exist. A 'design:' section says when readings are
-    taken, what can be turned, and about which parameters is asked. Writes design.nc, designs.csv and a page.
+    taken, which settings can be changed, and which parameters are asked about. Writes design.nc, designs.csv and a
+    page.
 
     \b
     Example:

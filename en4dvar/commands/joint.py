@@ -17,7 +17,8 @@ def joint(runs: Together, names: tuple[str, ...]) -> None:
     """Estimate data sets together that share parameters: the bubbles of one gel, the experiments of one pulse.
 
     Takes finished runs, any of which may be a campaign; their models, windows and errors may differ (laser and
-    acoustic bubbles of one gel). What is not shared stays each data set's own. Writes joint.nc, joint.csv and a page.
+    acoustic bubbles of one gel). Each data set has its own values of what is not shared. Writes joint.nc, joint.csv and
+    a page.
 
     \b
     Example:

@@ -14,11 +14,11 @@ from en4dvar.commands.common import Together, several_runs
 )  # fmt: skip
 @click.option(
     "--mean-std", type=click.FloatRange(min=0, min_open=True), default=1.0, show_default=True,
-    help="Hyperprior of the mean: normal about the prior's, with so many of its standard deviations.",
+    help="Hyperprior of the mean: normal about that of the prior; its std as a multiple of the prior's.",
 )  # fmt: skip
 @click.option(
     "--spread", type=click.FloatRange(min=0, min_open=True), default=0.5, show_default=True,
-    help="Hyperprior of the spread: half-normal, with so many of the prior's standard deviations.",
+    help="Hyperprior of the spread: half-normal; its std as a multiple of the prior's.",
 )  # fmt: skip
 @several_runs("population")
 def population(runs: Together, names: tuple[str, ...], mean_std: float, spread: float) -> None:

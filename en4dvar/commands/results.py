@@ -24,7 +24,9 @@ MOST_ROWS = 60  # of estimates on the terminal
 @click.command()
 @click.argument("run_dir", type=click.Path(path_type=Path))
 @click.option("--dataset", "datasets", multiple=True, metavar="NAME", help="A page for this data set, too.")
-@click.option("--figures", is_flag=True, help="Also keep figures as PDF and PNG: of these data sets, or of all pages.")
+@click.option(
+    "--figures", is_flag=True, help="Also keep the figures as PDF and PNG: of these data sets, or of all pages."
+)
 def report(run_dir: Path, datasets: tuple[str, ...], figures: bool) -> None:
     """Write the report of a finished run again, from its netCDF files.
 
@@ -43,21 +45,23 @@ def report(run_dir: Path, datasets: tuple[str, ...], figures: bool) -> None:
 
 @click.command()
 @click.argument("run_dirs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN_DIR RUN_DIR...")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder of figure and page; default compare_... beside.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="Folder of the results; default compare_... beside the first."
+)
 @click.option("--no-report", is_flag=True, help="Print the tables only.")
-@click.option("--stored", is_flag=True, help="Evidences as the results have them: nothing is run.")
+@click.option("--stored", is_flag=True, help="Take the evidences stored in the results; run nothing.")
 @workers_option
 @trust_option
 def compare(
     run_dirs: tuple[Path, ...], out: Path | None, no_report: bool, stored: bool, workers: int | None, trust: bool
 ) -> None:
-    """Compare runs: posteriors over each other; on the same data also evidence and model probabilities.
+    """Compare runs: posteriors over each other and, on the same data, evidence and model probabilities.
 
-    Evidences are sampled with forward runs where the model is cheap. Code outside of the current folder and of
-    installed packages is run with --trust alone.
+    Evidences are sampled with forward runs if the model is cheap. Code outside the current folder and installed
+    packages is run only with --trust.
 
     The runs may be laws on the same data or different gels. Writes compare.html, a figure (PNG, PDF) and CSV tables.
-    Of sequences a table of their evidences is printed.
+    For sequences, a table of their evidences is printed.
 
     \b
     Example:
@@ -90,17 +94,17 @@ def compare(
 @click.command()
 @click.argument("run_dir", type=click.Path(path_type=Path))
 @click.option(
-    "--csv", "kind", flag_value="csv", default="csv", help="Summary: a line a data set and parameter (default)."
+    "--csv", "kind", flag_value="csv", default="csv", help="Summary: one line per data set and parameter (default)."
 )
 @click.option("--members", "kind", flag_value="members", help="CSV of the posterior members.")
-@click.option("--latex", "kind", flag_value="latex", help="Table for a paper: mean ± std (package booktabs).")
-@click.option("--netcdf", "kind", flag_value="netcdf", help="Say where posterior.nc is: it needs no export.")
+@click.option("--latex", "kind", flag_value="latex", help="Table for a paper (package booktabs).")
+@click.option("--netcdf", "kind", flag_value="netcdf", help="Say where posterior.nc is, which needs no export.")
 @click.option("--out", type=click.Path(path_type=Path), help="File to write; default standard output.")
 @click.option("--force", is_flag=True, help="Replace that file.")
 def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
     """Write a table of a run as CSV or LaTeX, in display units.
 
-    Of a sequence or a twin experiment --csv has the state in time, --latex the last analysis.
+    For a sequence or a twin experiment, --csv holds the state in time and --latex the last analysis.
 
     \b
     Example:
@@ -134,10 +138,10 @@ def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
 def rerun(run_dir: Path, workers: int | None, trust: bool) -> None:
     """Repeat a run from what its result files record, and compare to the last bit. Nothing is written.
 
-    Configuration, seed and observations are those in the files; the data of a sequence are read again. Where a bit
-    differs, or anything that decides them has changed since (versions, sources, processor, data files), it is told;
-    the exit code is 1 where a bit differs.
-    A law or model outside of the current folder and of installed packages is run after a question, or with --trust.
+    Configuration, seed and observations are those in the files; the data of a sequence are read again. It says if a bit
+    differs, or if anything that decides the bits has changed since (versions, sources, processor, data files); the
+    exit code is 1 if a bit differs. A law or model outside the current folder and installed packages is run only if
+    you agree when asked, or with --trust.
 
     \b
     Example:

@@ -26,9 +26,9 @@ MOST_TOLD = 30  # data sets, warnings and failures on the terminal; all of them 
 @click.option(
     "--resume",
     is_flag=True,
-    help="Continue the interrupted run in the run directory, to the same bits; begin where there is none.",
+    help="Continue the interrupted run in the run directory, to the same bits; if there is none, begin.",
 )
-@click.option("--no-report", is_flag=True, help="Leave figures and page to 'en4dvar report'.")
+@click.option("--no-report", is_flag=True, help="Write no page; 'en4dvar report' writes it later.")
 @click.option("--workers", type=click.IntRange(min=1), help="Parallel workers; the numbers do not depend on it.")
 @click.option("--scheduler", metavar="ADDRESS", help="Work on a dask cluster, e.g. tcp://10.0.0.1:8786.")
 def run(
@@ -42,7 +42,7 @@ def run(
 ) -> None:
     """Estimate the parameters; write posterior and report to the run directory.
 
-    Several data files (a list, a pattern or a folder) are a campaign; one that cannot be used does not end it.
+    Several data files (a list, a pattern or a folder) are a campaign; a file that cannot be used does not stop it.
     A configuration with a 'twin:' section is a twin experiment: RMSE and spread against its truth. One with a
     'sequence:' section is followed in time by a filter or a sliding-window smoother.
 

@@ -13,15 +13,19 @@ from en4dvar.commands.common import Source, command_line, config_options, contin
 @config_options
 @click.option(
     "--vary", "varied", multiple=True, required=True, metavar="KEY=[VALUE, …]",
-    help="A key and its values; any number of times, for all combinations.",
+    help="A key and its values; any number of times, for all combinations."
 )  # fmt: skip
 @click.option(
-    "--seeds", type=click.IntRange(min=1), default=5, show_default=True, help="Runs of each, from the file's seed on."
+    "--seeds",
+    type=click.IntRange(min=1),
+    default=5,
+    show_default=True,
+    help="Number of seeds per combination, from the file's on.",
 )
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the table; default runs/<name>_sweep.")
 @click.option("--force", is_flag=True, help="Replace an earlier sweep, once this one is complete.")
 @click.option("--resume", is_flag=True, help="Take over finished runs; seeds and values may be added at the end.")
-@click.option("--workers", type=click.IntRange(min=1), help="Processes, default one a core; the numbers are the same.")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes, by default one per core; the same numbers.")
 def sweep_twin(
     source: Source, varied: tuple[str, ...], seeds: int, out: Path | None, force: bool, resume: bool,
     workers: int | None,

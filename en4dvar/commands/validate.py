@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 @config_options
 @click.option("--plot", is_flag=True, help="Draw the prior predictive over the data (PNG and PDF).")
 def validate(source: Source, plot: bool) -> None:
-    """Check a configuration and its data; tell what would be estimated and what it costs.
+    """Check a configuration and its data; say what would be estimated and what it costs.
 
-    Every fault is told at once, with file, line and column. The cost comes from running prior members for a moment.
+    All mistakes are listed at once, with file, line and column. The cost is estimated by running a few prior members.
 
     \b
     Example:

@@ -15,9 +15,9 @@ GROUP = "en4dvar.warm_up"
 
 @click.command("warm-up")
 def warm_up() -> None:
-    """Compile now what is compiled at its first use, and keep it: for images, clusters and first runs.
+    """Compile now what is otherwise compiled at first use: for images, clusters and first runs.
 
-    Each kind of equations and each method that has compiled loops is used once, on very little.
+    Each kind of equations, and each method with compiled loops, is used once on a tiny problem.
 
     \b
     Example:

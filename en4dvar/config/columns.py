@@ -35,7 +35,7 @@ class ValueColumn(Section):
     """A column of a CSV file or a field of a ``.mat`` file; the unit is required, never guessed."""
 
     name: Annotated[str, Field(min_length=1)]
-    """Header of the column (CSV) or name of the field (.mat); ``R_*`` is a data set a column."""
+    """Header of the column (CSV) or name of the field (.mat); ``R_*`` makes each column a data set."""
     unit: Annotated[str, unit_of(observable_unit), BeforeValidator(_unit_text, json_schema_input_type=str | Pixel)]
     """Unit of the numbers in the file, e.g. um, or ``{pixel: 2.76 um}``; required, never guessed."""
 

@@ -57,9 +57,9 @@ class Data(Section):
     sheet: str = ""
     """Sheet of an Excel workbook, a range of it, or both: ``Film 3``, ``A3:D40``, ``Film 3!A3:D40``."""
     unsorted: Disorder = "refuse"
-    """Rows whose times do not increase: refuse the file, or sort them."""
+    """What to do with rows whose times do not increase: refuse the file, or sort them."""
     repeated: Repeated = "refuse"
-    """Several readings of one time, without ``places``: refuse the file, or average them."""
+    """What to do with several readings of one time, without ``places``: refuse the file, or average them."""
     columns: Annotated[Columns, OfObservable("column role")]
     """Which columns hold the time and the observable, each with its unit: ``time: {name: t, unit: us}``."""
     window: WindowSection = Field({}, validate_default=True)

@@ -50,7 +50,7 @@ class PriorCorrelation(Section):
     kernel: KernelName | None = None
     """PriorCorrelation as a function of distance, for parameters with places: needs ``at`` and ``length``."""
     at: tuple[Position, ...] | None = None
-    """Place of each parameter, a number or a list of coordinates."""
+    """Place of each parameter: a number, or a list of coordinates."""
     length: Annotated[float, Field(gt=0)] | None = None
     """PriorCorrelation length of the kernel, in the unit of the places."""
 

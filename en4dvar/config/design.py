@@ -62,7 +62,7 @@ class Choice(Section):
     readings: Annotated[int, Field(ge=1)]
     """How many readings are taken."""
     apart: Annotated[float, quantity(time_unit, "not negative")] = 0.0
-    """Least time between two of them, e.g. 2 us."""
+    """Least time between two chosen readings, e.g. 2 us."""
 
 
 class Price(Section):
@@ -82,11 +82,11 @@ class Within(Section):
     """What a design must keep to; one that does not is left out, and named."""
 
     readings: Annotated[int, Field(ge=1)] | None = None
-    """Most readings of an experiment: the frames that the camera holds."""
+    """Largest number of readings of an experiment: the frames that the camera can hold."""
     price: Annotated[float, Field(ge=0)] | None = None
-    """Most that a design may cost."""
+    """Largest price of a design."""
     beyond: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Largest share of the prior that may leave what the model is valid for (of a bubble: its wall Mach number)."""
+    """Largest share of the prior for which the model may leave its validity (for a bubble: its wall Mach number)."""
 
     def broken(self, readings: int, price: float, beyond: float) -> str:
         """What a design does not keep to; nothing: it does."""
@@ -109,7 +109,7 @@ class Design(_SampleSizes):
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     about: tuple[str, ...] = ()
-    """Parameters that are asked for; the others are uncertain all the same. Default: all that have a prior."""
+    """Parameters that are asked for; the others stay uncertain. Default: all that have a prior."""
     times: Annotated[Array | None, Made(_read_rates, Rates)] = None
     """When readings are taken, on the model's clock; default: ``simulate.times``, else those of the data file."""
     knobs: dict[str, Knob] = Field({})
@@ -117,13 +117,13 @@ class Design(_SampleSizes):
     choose: Choice | None = None
     """Take only the most informative readings."""
     experiments: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] = (1,)
-    """How many experiments alike are made, e.g. bubbles of one gel: they share what is asked for."""
+    """How many equal experiments are made, e.g. bubbles of one gel; they share the parameters asked for."""
     price: Price = Price()
     """What an experiment costs: information is compared with it."""
     within: Within = Within()
     """What a design must keep to."""
     enough: Annotated[float, Field(ge=0)] = 0.1
-    """Information, nats, below which no experiment is worth making; where the best design tells less, it is said."""
+    """Information in nats below which no experiment is worth making; a message says if the best design tells less."""
     laws: dict[str, dict[str, Any]] = Field({})
     """Which law holds? Name → keys of this file and values, e.g. ``{model.law: ...}``; ``{}`` is the file itself."""
     method: Literal["auto", "linear", "laplace", "nested"] = "auto"

@@ -25,10 +25,10 @@ def _square(context: Context) -> str:
 
 
 class CovarianceFile(Section):
-    """A CSV file of the full matrix R, without header; its unit (e.g. ``um^2``) is required, never guessed."""
+    """A CSV file with the full matrix R, without header; its unit (e.g. ``um^2``) is required, never guessed."""
 
     path: Annotated[str, Field(min_length=1)]
-    """CSV file, relative to the configuration's folder; one row an observation of the window or of the series."""
+    """CSV file, relative to the configuration's folder; one row per observation of the window or of the series."""
     unit: Annotated[str, unit_of(_square)]
     """Unit of the covariances, the observable's squared, e.g. um^2."""
 
@@ -44,11 +44,11 @@ class Error(Section):
     std: Annotated[Spread | Column | None, Made(read_error_std, json=QUANTITY_OR_COLUMN)] = Field(
         None, alias=f"{PLACEHOLDER}_std"
     )
-    """Std of the observation error: a quantity, e.g. '1 % of maximum', or ``{column: NAME}``, one a reading."""
+    """Std of the observation error: a quantity, e.g. '1 % of maximum', or ``{column: NAME}``, one per reading."""
     time_std: Annotated[float | Column, Made(read_time_std, json=QUANTITY_OR_COLUMN)] = 0.0
     """Std of the observation times, a quantity or ``{column: NAME}``: adds (rate × time_std)²."""
     model_std: Annotated[Spread | None, Made(read_spread)] = None
-    """Std of what the model misses from reading to reading, e.g. '1 % of maximum': added to the other in squares."""
+    """Std of what the model misses from reading to reading, e.g. '1 % of maximum'; its square is added."""
     correlation_time: Annotated[float | None, quantity(time_unit, "positive")] = None
     """Errors are correlated as exp(−|Δt|/τ)."""
     covariance: Annotated[Matrix | None, Made(_matrix, CovarianceFile)] = None

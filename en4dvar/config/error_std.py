@@ -30,7 +30,7 @@ def parse_error_std(text: Any, unit: str) -> Spread:
 
 
 class ErrorColumn(Section):
-    """A column of standard deviations, one a reading."""
+    """A column of standard deviations, one per reading."""
 
     column: Annotated[str, Field(min_length=1)]
     """Header of the column (CSV) or name of the field (.mat)."""

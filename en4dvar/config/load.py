@@ -57,7 +57,7 @@ class Estimation(File):
     """Fields of the initial state that are uncertain, each with its ``std``; with a ``kernel`` and a ``length`` cell by
     cell."""
     model_error: Annotated[tuple[ErrorOf, ...], MODEL_ERROR] | None = None
-    """Fields of the state that change at knots by what the model does not know, each with its ``std``."""
+    """Fields of the state that change at knots, by something the model does not know, each with its ``std``."""
     assimilation: Assimilation = Assimilation()
     """Scheme, ensemble size and stopping rules; the defaults are the recommended ones."""
     execution: Execution = Execution()

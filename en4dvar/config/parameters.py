@@ -88,9 +88,9 @@ class PriorSection(Section):
     beta: Annotated[float, Field(gt=0)] | None = None
     """Second exponent of a beta."""
     map: Literal["normal", "lognormal", "logit"] | None = None
-    """Of an ensemble: in which coordinate its members are taken as Gaussian; by default the parameter's own."""
+    """For ``prior: ensemble``: the coordinate in which its members count as Gaussian; default: the parameter's own."""
     unit: Annotated[str | None, unit_of(subject_unit)] = None
-    """Of an ensemble: unit of the numbers in the file, where that does not tell it."""
+    """For ``prior: ensemble``: unit of the numbers in the file, if the file does not say it."""
     varies: VariesSection | None = None
     """The parameter varies in time; the prior is that of its first piece."""
     shared: Annotated[str | None, Field(min_length=1)] = None

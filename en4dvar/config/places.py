@@ -21,7 +21,7 @@ from en4dvar.units import UnitError, convert, parse_quantity
 
 
 class PlaceColumn(Section):
-    """A column of places, one a reading."""
+    """A column of places, one per reading."""
 
     column: Annotated[str, Field(min_length=1)]
     """Header of the column (CSV) or name of the field (.mat)."""

@@ -176,7 +176,7 @@ class Localise(Section):
     at: dict[str, QuantityText | tuple[QuantityText, ...]] | None = None
     """Places of parameters, and of series that are no part of a field: ``{k_1: [0, 50], well: [10, 20]}``."""
     threshold: Annotated[float, Field(gt=0, lt=1)] | None = None
-    """Size of correlations below which they are taken for chance; default 3/√N."""
+    """Correlations below this size are taken for chance; default 3/√N."""
 
     @classmethod
     def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:

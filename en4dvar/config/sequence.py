@@ -47,7 +47,7 @@ class Sequence(Section):
     positive: Annotated[tuple[str, ...], Made(_known_fields, tuple[str, ...])] = ()
     """Further fields that are estimated by their logarithm, of what exceeds their lower bound: none falls below it."""
     members_every: Annotated[int, Field(ge=0)] = 0
-    """Ensembles are stored after every so many observation times, and the last; 0: the last alone."""
+    """The ensemble is stored after each so many observation times, and at the end; 0: at the end only."""
 
 
 class SequenceFile(File):

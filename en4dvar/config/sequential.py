@@ -99,7 +99,7 @@ else:
 
 class _Scheme(Section):
     scheme: OnASeries
-    """A filter (one analysis a cycle), ienks (sliding-window smoother), or a baseline to judge them by."""
+    """A filter (one analysis per cycle), ienks (sliding-window smoother), or a baseline to judge them by."""
     members: Annotated[int, Field(ge=3)]
     """Ensemble size N."""
 

@@ -25,9 +25,9 @@ class SeriesData(Data):
     """One series: where its readings are, and what they are of."""
 
     observable: str | None = None
-    """Name of what was read; default: the name of the series."""
+    """Name of the observable that was read; default: the name of the series."""
     group: Annotated[str | None, Field(min_length=1)] = None
-    """Series of one group are balanced as one (``assimilation.weights: balanced``); default: each by itself."""
+    """Series of one group count as one when weights are ``balanced``; default: each by itself."""
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ class CampaignSection(Section):
     most: Annotated[int, Field(ge=3, le=100_000)] = 60
     """Largest number of readings."""
     fewest: Annotated[int, Field(ge=3)] = 5
-    """Data sets with fewer readings are drawn again."""
+    """A data set with fewer readings is drawn again."""
     noise: Annotated[float, quantity(lambda context: context.units.observables[0].unit, "positive")]
     """Std of the error of a reading, in the observable's unit."""
     time_shift: Interval = (0.0, 0.0)

@@ -48,7 +48,7 @@ class Twin(Section):
     cycles: Annotated[int, Field(ge=1)]
     """Number of analyses."""
     burn_in: Annotated[int, Field(ge=0)] = 0
-    """Cycles at the beginning that no score counts."""
+    """Cycles at the beginning that are left out of the scores."""
     interval: Annotated[float, quantity(time_unit, "positive")]
     """Time between two observations, in the model's unit of time."""
     error: Annotated[dict[str, float], stds(_errors)]

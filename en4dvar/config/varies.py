@@ -82,7 +82,7 @@ class VariesSection(Knots):
 
 
 class ModelErrorSection(Knots):
-    """A field of the state that changes at knots by what the model does not know."""
+    """A field of the state that changes at knots, by something the model does not know."""
 
     std: Annotated[Spread, Made(lambda text, context: parse_spread(text, subject_unit(context)))]
     """Standard deviation of each change: in the field's unit (added to it), or in % (a factor)."""

@@ -25,7 +25,7 @@ Number = Annotated[float, Field(ge=0)]
 
 
 class WeightColumn(Section):
-    """A column of weights, one a reading."""
+    """A column of weights, one per reading."""
 
     column: Annotated[str, Field(min_length=1)]
     """Header of the column (CSV) or name of the field (.mat); the numbers have no unit."""
@@ -42,7 +42,7 @@ class AwayFromMinima(Section):
     """Zero near the minima of the observations, 1 elsewhere."""
 
     zero_near_minima: Annotated[float, quantity(time_unit, "positive")]
-    """Readings that lie no farther than this from a local minimum do not count, e.g. 2 us."""
+    """Readings within this time of a local minimum do not count, e.g. 2 us."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 
 @click.command()
 @click.option("--data", metavar="PATH", help="CSV, Excel, .mat file, folder or pattern; without it, an empty starter.")
-@click.option("--movie", type=click.Path(path_type=Path), help="Movie, read first as by 'en4dvar track'.")
+@click.option("--movie", type=click.Path(path_type=Path), help="Movie to read first, as 'en4dvar track' does.")
 @click.option("--pixel", metavar="LENGTH", help="Size of a pixel of the movie, e.g. '2.76 um'.")
 @click.option("--frame-rate", metavar="RATE", help="Frame rate of the movie, or of the data's, e.g. '270 kHz'.")
 @click.option("--exposure", metavar="TIME", help="Exposure of a frame of the movie, e.g. '500 ns'.")
@@ -35,14 +35,16 @@ _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 @click.option("--example", type=click.Choice(["quickstart"]), help="An example and its synthetic data instead.")
 @click.option("--time-unit", metavar="UNIT", help="Unit of the times in the file, e.g. us.")
 @click.option("--radius-unit", metavar="UNIT", help="Unit of the radii in the file, e.g. um.")
-@click.option("--time-column", metavar="NAME", help="Column of times, where its name does not tell.")
-@click.option("--radius-column", metavar="NAME", help="Column of radii, where its name does not tell.")
+@click.option("--time-column", metavar="NAME", help="Column of times, if its name does not tell.")
+@click.option("--radius-column", metavar="NAME", help="Column of radii, if its name does not tell.")
 @click.option("--time-step", metavar="TIME", help="Constant time step instead of a column, e.g. '3.7 us'.")
 @click.option("--by", metavar="NAME", help="Column that says which bubble a row belongs to.")
 @click.option("--sheet", metavar="SHEET", help="Sheet of a workbook or a range of it, e.g. 'Film 3!A3:D40'.")
-@click.option("--unsorted", type=click.Choice(["refuse", "sort"]), help="Rows whose times do not increase.")
-@click.option("--repeated", type=click.Choice(["refuse", "average"]), help="Several readings of one time.")
-@click.option("--start", type=click.Choice(["acoustic", "laser"]), help="Start of the bubble; default: what it shows.")
+@click.option("--unsorted", type=click.Choice(["refuse", "sort"]), help="What to do if times do not increase.")
+@click.option(
+    "--repeated", type=click.Choice(["refuse", "average"]), help="What to do with several readings of a time."
+)
+@click.option("--start", type=click.Choice(["acoustic", "laser"]), help="Start; default: what the data suggest.")
 @click.option("--law", metavar="LAW", help="Constitutive law, see 'en4dvar laws'.")
 @click.option("--out", type=click.Path(path_type=Path), help="YAML file to write; default <name of the data>.yaml.")
 @click.option("--force", is_flag=True, help="Replace that file.")
@@ -68,7 +70,7 @@ def init(
 ) -> None:
     """Write a commented starter configuration for bubble radius data, proposed from what they show.
 
-    Units are asked for on a terminal, else given; they are never guessed.
+    Units are never guessed: give them, or answer the questions on a terminal.
 
     \b
     Example:

@@ -150,7 +150,7 @@ class BubbleSettings(Section):
     @model_validator(mode="before")
     @classmethod
     def _driving_of_the_start(cls, value: Any) -> Any:
-        """The acoustic start is driven by the histotripsy pulse unless told otherwise, the laser start by nothing."""
+        """By default the acoustic start is driven by the histotripsy pulse, the laser start by nothing."""
         if isinstance(value, dict):
             default = {"kind": "none" if value.get("start") == "laser" else "histotripsy"}
             return {**value, "driving": with_kind(value.get("driving", default))}

@@ -16,10 +16,8 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("movie", type=click.Path(path_type=Path))
-@click.option("--pixel", metavar="LENGTH", help="Size of a pixel, e.g. '2.76 um'; needed where the file does not tell.")
-@click.option(
-    "--frame-rate", metavar="RATE", help="Frames per time, e.g. '270 kHz'; needed where the file does not tell."
-)
+@click.option("--pixel", metavar="LENGTH", help="Size of a pixel, e.g. '2.76 um'; needed if the file does not tell.")
+@click.option("--frame-rate", metavar="RATE", help="Frame rate, e.g. '270 kHz'; needed if the file does not tell.")
 @click.option("--exposure", metavar="TIME", help="Exposure of a frame or length of a flash, e.g. '500 ns'.")
 @click.option("--flashes", metavar="TIMES", help="Flashes of one exposure, as '0 us, 2 us, 4 us': nested circles.")
 @click.option("--raw", metavar="WxHxBITS", help="Shape of the frames of a file without header, e.g. 512x128x8.")
@@ -28,7 +26,7 @@ if TYPE_CHECKING:
 )
 @click.option("--out", type=click.Path(path_type=Path), help="CSV file to write; default <name of the movie>.csv.")
 @click.option("--page", type=click.Path(path_type=Path), help="HTML page to write; default beside the CSV file.")
-@click.option("--outlined", type=click.Path(path_type=Path), help="Movie to write too, with the outlines drawn.")
+@click.option("--outlined", type=click.Path(path_type=Path), help="Also write the movie with the outlines drawn in.")
 @click.option("--force", is_flag=True, help="Replace these files.")
 @click.option("--workers", type=click.IntRange(min=1), help="Threads; the numbers do not depend on it.")
 def track(

@@ -37,7 +37,7 @@ class Camera:
 
 
 def film(config: Config, times: Array | None, out: Path, settings: Mapping[str, str], seed: int) -> str:
-    """Write a movie of the bubble too, a frame an instant: .tif, .mp4 or .avi.
+    """Also write a movie of the bubble (.tif, .mp4 or .avi) with one frame per instant.
 
     Parameters
     ----------
