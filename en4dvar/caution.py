@@ -71,51 +71,56 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
 }
 TRIGGERS = {
     "not-converged": (
-        "the iterations stopped before their criterion was met; a note where the next step would have been at most "
-        "half a posterior standard deviation, or the members were drawn from the posterior itself afterwards"
+        "the iterations stopped before their criterion was met, and the next step would have been longer than 0.1 "
+        "posterior standard deviations; a note up to 0.5, or if members were drawn from the posterior afterwards"
     ),
     "chain-not-converged": "the Markov chains disagree, or have too few independent samples",
     "prior-conflict": "the minimum of J lies further from the prior mean than one prior in two thousand would",
     "implausible-data": (
-        "times, radii or frames contradict each other or the physics, as a collapse faster than any gel allows"
+        "times, radii or frames contradict each other or the physics, e.g. a collapse faster than any gel allows"
     ),
-    "misfit": "χ² lies above what the errors allow once in two thousand times; K − DFS is expected of K readings",
+    "misfit": (
+        "χ² is larger than the errors explain, except once in two thousand times; K − DFS is expected for K readings"
+    ),
     "residual-structure": (
         "neighbouring residuals resemble each other, as they would once in a thousand times by chance; a caution "
-        "where that cannot move an estimate by its standard deviation"
+        "if that cannot move any estimate by its standard deviation"
     ),
     "model-validity": (
-        "a tenth of the posterior members leave what the equations assume; a note where the readings from then on "
-        "inform by less than 0.1 DFS"
+        "more than a tenth of the posterior members leave the range in which the equations hold; a note if the "
+        "readings from then on contribute at most 0.1 DFS"
     ),
     "ensemble-collapse": "the spread of the members is below a third of what J allows, or zero in a parameter",
     "rank-deficient": (
         "the prior members differ in fewer directions than there are parameters, or too few members are left"
     ),
     "non-gaussian": (
-        "mean or spread of the members differ from those of the posterior by more than 0.5 standard deviations or "
-        "30 %; serious beyond one standard deviation or a factor of two"
+        "mean or spread of the members differ from those that an emulator of the model finds for the posterior, by "
+        "more than 0.5 standard deviations or 30 %; serious beyond one standard deviation or a factor of two; without "
+        "an emulator, the members' own J do not look like those of a Gaussian"
     ),
     "several-modes": (
-        "J has several minima that hold some of the probability; a note where they overlap in every parameter"
+        "J has several minima that hold some of the probability; serious if they were not sampled, a note if they were "
+        "and overlap in every parameter"
     ),
     "starts-disagree": (
-        "one descent alone ended in the lowest minimum, or a draw of the posterior has a J lower than any minimum found"
+        "only one of several descents ended in the lowest minimum and the posterior was not sampled, or a draw of the "
+        "posterior has a J lower than any minimum found"
     ),
-    "members-lost": "members failed in a forecast; serious where more than a tenth did",
+    "members-lost": "members failed in a forecast; serious if more than a tenth did",
     "at-bound": (
-        "a fifth of the posterior members lie within 5 % of the interval's width from a bound, three times the "
-        "prior's share"
+        "at least a fifth of the posterior members lie within 5 % of the interval's width from a bound, and more than "
+        "three times the prior's share"
     ),
     "odd-residuals": (
-        "residuals grow where the observable changes fast, or one is an outlier, as they would once in a thousand "
-        "times by chance"
+        "residuals are larger where the observable changes fast, or one is an outlier; by chance this would happen "
+        "once in a thousand times"
     ),
     "not-bayesian": "readings count with weights other than 0 and 1",
-    "overstated-error": "χ² lies below what the errors allow once in two thousand times",
-    "not-informed": "neither the mean nor the spread of a parameter changed much: its DFS is below 0.1",
+    "overstated-error": "χ² is smaller than the errors explain, except once in two thousand times",
+    "not-informed": "a parameter's DFS is below 0.1 and its mean within 0.3 prior standard deviations of the prior's",
     "down-weighted": "readings lie beyond the threshold of a robust cost",
-    "one-descent": "one descent alone led to the minimum, so that another minimum is not excluded",
+    "one-descent": "only one descent was made, so that another minimum is not excluded",
     "start-moved": "the prior mean could not be used as the start of the iterations",
 }
 """When each is given, for the reference."""

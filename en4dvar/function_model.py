@@ -97,7 +97,7 @@ def _values(columns: Mapping[str, Any], name: str, count: int) -> Array:
         raise ValueError(f"the function returned {', '.join(map(str, columns)) or 'nothing'}, but no {name!r}")
     values = np.asarray(columns[name], dtype=float)
     if values.shape != (count,):
-        raise ValueError(f"the function returned shape {values.shape} for {name}, expected ({count},), one a time")
+        raise ValueError(f"the function returned shape {values.shape} for {name}, expected ({count},), one per time")
     return values
 
 

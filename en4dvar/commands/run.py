@@ -64,7 +64,9 @@ def run(
     if isinstance(config, Config):
         _estimate(config, force, resume)
     elif scheduler:
-        raise click.UsageError("a series takes no --scheduler: its cycles are too short to be sent away")
+        raise click.UsageError(
+            "--scheduler cannot be used for a series: its cycles are too short to be sent to other machines"
+        )
     elif isinstance(config, TwinConfig):
         _conduct(config, force, resume)
     else:

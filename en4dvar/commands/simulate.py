@@ -44,7 +44,7 @@ def simulate(
 
     others = asked(forms)
     if others and noise and out is None:
-        raise click.UsageError("--noise is that of the table: give its file with --out")
+        raise click.UsageError("--noise applies to the table: name its file with --out")
     if "campaign" in read_document(source.path).data:
         if source.data or times or noise or others:
             words = ", ".join(["--data", "--times", *(f"--{name}" for name in others)])

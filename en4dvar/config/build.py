@@ -48,7 +48,7 @@ def build(config: Config) -> tuple[InverseProblem, ...]:
 def inverse_plan(config: Config) -> DataPlan:
     """How the observations are read. Raises :class:`ConfigError` without data or without anything to estimate."""
     if config.data is None:
-        raise ConfigError([Fault("required: where the observations are", "data", config.document.file)])
+        raise ConfigError([Fault("required: it says where the observations are", "data", config.document.file)])
     if not config.initial_state and not any(isinstance(entry, Uncertain) for entry in config.parameters):
         raise ConfigError([config.document.fault(("parameters",), "no parameter has a prior; nothing to estimate")])
     return DataPlan.of(config.data, config.observable)
@@ -210,5 +210,5 @@ def _maximum(entry: Uncertain, config: Config | SequenceConfig, observations: Ob
         return None
     if observations.parts:
         key = "mean" if entry.spec.mean == "maximum" else "median"
-        raise ConfigError([Fault("'maximum' is that of a single series without places; give a value", key)])
+        raise ConfigError([Fault("'maximum' is defined only for a single series without places; give a value", key)])
     return convert(float(observations.values.max()), config.observable.unit, entry.parameter.unit)

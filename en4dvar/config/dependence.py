@@ -84,7 +84,9 @@ class PriorCorrelation(Section):
     def _of_distance(self) -> Array:
         places = [np.atleast_1d(np.asarray(place, dtype=float)) for place in self.at or ()]
         if len(places) != len(self.between) or len({len(place) for place in places}) != 1:
-            raise ConfigError(f"at: give {len(self.between)} places, one a parameter, all with as many coordinates")
+            raise ConfigError(
+                f"at: give {len(self.between)} places, one per parameter, all with the same number of coordinates"
+            )
         return correlation_of_places(self.kernel or "", np.stack(places), self.length or 1.0)
 
 
@@ -182,7 +184,7 @@ def _check_names(names: Sequence[str], estimated: Sequence[str], apart: Mapping[
         if name in apart:
             raise ConfigError(f"{name} cannot be correlated: {apart[name]}")
         if name not in estimated:
-            raise ConfigError(f"{name!r} is no parameter with a prior{suggest(name, estimated)}")
+            raise ConfigError(f"{name!r} is not a parameter with a prior{suggest(name, estimated)}")
 
 
 def _of_ensemble(

@@ -129,16 +129,18 @@ class Tied:
         """Raise :class:`ConfigError` where it cannot follow; ``own`` are the names of the model's parameters."""
         name, other = self.parameter.name, found.get(self.to)
         if name not in own:
-            raise ConfigError(f"{name} is no parameter of the model and cannot be tied")
+            raise ConfigError(f"{name} is not a parameter of the model and cannot be tied")
         if other is None or self.to not in own or self.to == name:
             names = [one for one in found if one in own and one != name]
             raise ConfigError(
-                [Fault(f"{self.to!r} is no other parameter of the model{suggest(self.to, names)}", "tied")]
+                [Fault(f"{self.to!r} is not another parameter of the model{suggest(self.to, names)}", "tied")]
             )
         if isinstance(other, Tied):
             raise ConfigError([Fault(f"{self.to} is tied itself; tie {name} to {other.to}", "tied")])
         if isinstance(other, Uncertain) and other.spec.varies is not None:
-            raise ConfigError([Fault(f"{self.to} varies in time, and nothing can follow that", "tied")])
+            raise ConfigError(
+                [Fault(f"{self.to} varies in time, and another parameter cannot be tied to that", "tied")]
+            )
         if other.parameter.unit != self.parameter.unit:
             units = f"{other.parameter.unit}, {name} in {self.parameter.unit}"
             raise ConfigError([Fault(f"{self.to} is in {units}", "tied")])

@@ -153,10 +153,10 @@ class Execution(Section):
     def _belongs_to_the_executor(self) -> Self:
         if self.limits and self.executor in ("serial", "threads"):
             raise ValueError(
-                f"a time or memory limit can end a process only; write executor: processes, not {self.executor}"
+                f"only a process can be ended at its limit; write executor: processes, not {self.executor}"
             )
         if self.address is not None and self.executor not in (None, "dask"):
-            raise ValueError(f"address is that of a dask scheduler; write executor: dask, not {self.executor}")
+            raise ValueError(f"address is for a dask scheduler only; write executor: dask, not {self.executor}")
         return self
 
 

@@ -209,7 +209,9 @@ def error_rates(model: ForwardModel, errors: Sequence[ErrorOf], positive: Collec
 def per_time(spec: Knots, std: float, path: str) -> float:
     """Variance per unit of time. Raises :class:`ConfigError`."""
     if spec.every is None:
-        raise ConfigError([Fault("give every, the time after which it is std: in a series it grows all along", path)])
+        raise ConfigError(
+            [Fault("give every, the time in which the model error reaches std: in a series it grows with time", path)]
+        )
     return std**2 / spec.every
 
 

@@ -105,7 +105,7 @@ def away_from_minima(times: Array, values: Array, reach: float, prominence: floa
 
 def _of_function(name: str, base: Path) -> Weighing:
     if not user_file.is_file_reference(name):
-        raise ConfigError([Fault(f"{shown(name)} names no function of a file; write ./weights.py:name", "function")])
+        raise ConfigError([Fault(f"{shown(name)} is not a function in a file; write ./weights.py:name", "function")])
     try:
         reference = user_file.absolute(name, base)
         with loading(f"{shown(name)} cannot be loaded"):
@@ -114,7 +114,7 @@ def _of_function(name: str, base: Path) -> Weighing:
     except (ConfigError, PathError, ValueError) as error:
         raise ConfigError([Fault(str(error), "function")]) from None
     if not callable(function):
-        raise ConfigError([Fault(f"{shown(name)} is no function", "function")])
+        raise ConfigError([Fault(f"{shown(name)} is not a function", "function")])
 
     def of(times: Array, values: Array, prominence: float) -> Array:
         try:

@@ -64,7 +64,7 @@ def _places(problem: InverseProblem, asked: Localising, dimensions: int) -> Arra
     known = {*problem.prior.names, *(part.name for part in problem.parts)}
     for name, where in asked.at.items():
         if name not in known:
-            raise ConfigError(f"at: {name!r} is no parameter with a prior and no series")
+            raise ConfigError(f"at: {name!r} is not a parameter with a prior and no series")
         if len(where) != dimensions:
             raise ConfigError(f"at: {name} has {len(where)} coordinates, the readings have {dimensions}")
     unknown = (math.nan,) * dimensions

@@ -203,7 +203,7 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
             raise ConfigError(f"{', '.join(sorted(names))}: {message}")
     for given, parameter in ((problem.has_reading_scale, READING_SCALE), (problem.has_reading_offset, READING_OFFSET)):
         if given and problem.observations.parts:
-            raise ConfigError(f"{parameter.name}: one number for several series or for places means nothing")
+            raise ConfigError(f"{parameter.name}: cannot be one number for several series or for readings at places")
     _operators(problem)
     return tuple(known[name] for name in problem.fixed)
 

@@ -127,7 +127,7 @@ class ProcessesExecutor(PoolExecutor):
         while True:
             with self._changing:
                 if given_up != self._given_up:
-                    raise WorkerLostError("the call was given up")
+                    raise WorkerLostError("the call was cancelled")
                 starts = not self._idle
                 worker = _Worker(self.limits) if starts else self._idle.pop()
                 self._busy.append(worker)

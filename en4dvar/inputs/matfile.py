@@ -202,7 +202,7 @@ def _numbers(elements: _Elements, order: str, name: str, count: int) -> Array:
         return np.empty(0)
     kind, content = elements.next()
     if kind not in NUMBERS:
-        raise _Damaged(f"{name} is stored as elements of kind {kind}, which are no numbers")
+        raise _Damaged(f"{name} is stored as elements of kind {kind}, which are not numbers")
     stored = np.dtype(f"{order}{NUMBERS[kind]}")
     if len(content) != count * stored.itemsize:
         raise _Damaged(f"{name} should hold {count} numbers, but there are {len(content) // stored.itemsize}")

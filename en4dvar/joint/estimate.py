@@ -184,7 +184,7 @@ class _Estimate:
             if _agreeing(found) >= 2:
                 break
         if not found:
-            raise TooFewMembersError("the joint estimate: some experiment cannot be run wherever it starts")
+            raise TooFewMembersError("the joint estimate: one of the experiments cannot be run from any start")
         return found
 
     def _descended(self, start: Place) -> list[JointDescent]:

@@ -37,7 +37,7 @@ class JointProblem:
     def __post_init__(self) -> None:
         names = [one.observations.name for one in self.experiments]
         if again := sorted({name for name in names if names.count(name) > 1}):
-            raise ConfigError(f"data sets of a joint estimate need names of their own: {', '.join(again)} twice")
+            raise ConfigError(f"data sets of a joint estimate need different names: {', '.join(again)} twice")
         for one, groups in zip(self.experiments, self.groups, strict=True):
             check_problem(one)
             if one.fields:
@@ -114,8 +114,6 @@ def sharing(experiments: Sequence[InverseProblem], names: Sequence[str]) -> Join
     for name in names:
         if sum(name in one.prior.names for one in experiments) < 2:
             known = sorted({name for one in experiments for name in one.prior.names})
-            raise ConfigError(
-                f"{name}: not estimated in two data sets, so that it could be shared{suggest(name, known)}"
-            )
+            raise ConfigError(f"{name}: cannot be shared, for no two data sets estimate it{suggest(name, known)}")
     groups = tuple({name: EVERYONE for name in names if name in one.prior.names} for one in experiments)
     return JointProblem(tuple(experiments), groups)

@@ -55,7 +55,7 @@ def normalised(logs: Array) -> tuple[Array, float]:
     """
     top = float(logs.max())
     if not np.isfinite(top):
-        raise ValueError("no population that was drawn explains the data")
+        raise ValueError("none of the populations that were drawn explains the data")
     weights = np.exp(logs - top)
     return weights / weights.sum(), top + math.log(float(weights.mean()))
 

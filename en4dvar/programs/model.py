@@ -47,7 +47,7 @@ def _pattern(text: str) -> str:
     try:
         groups = re.compile(text).groups
     except re.error as error:
-        raise ValueError(f"is no regular expression: {error}") from None
+        raise ValueError(f"is not a regular expression: {error}") from None
     if groups != 1:
         raise ValueError(f"has {groups} groups; put the number, and nothing else, in parentheses")
     return text
@@ -221,7 +221,7 @@ class CommandSettings(_Section):
         known = {*self.parameters, "input", "output"}
         for name in _NAME.findall(self.command):
             if name not in known:
-                raise ValueError(f"command: {{{name}}} is nothing that is filled in{suggest(name, known)}")
+                raise ValueError(f"command: {{{name}}} is not something that can be filled in{suggest(name, known)}")
         if "{input}" in self.command and not self.templates:
             raise ValueError("command: {input} is the first of templates, and there is none")
         for template in self.templates.values():

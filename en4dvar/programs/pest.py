@@ -154,4 +154,4 @@ def _number(text: str, name: str, where: str) -> float:
     try:
         return float(text.strip().lower().replace("d", "e"))
     except ValueError:
-        raise ProgramError(f"{where}: {text.strip() or 'nothing'!r} is no number for {name}") from None
+        raise ProgramError(f"{where}: {text.strip() or 'nothing'!r} is not a number for {name}") from None

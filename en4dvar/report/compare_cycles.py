@@ -89,7 +89,7 @@ def _require_same_readings(runs: Mapping[str, xr.Dataset]) -> None:
     (first, one), *others = runs.items()
     for name, other in others:
         if not all(_same(one, other, key) for key in READINGS):
-            raise OutputError(f"{name} and {first} hold other readings or errors: their evidences do not compare")
+            raise OutputError(f"{name} and {first} hold other readings or errors: their evidences cannot be compared")
 
 
 def _same(one: xr.Dataset, other: xr.Dataset, key: str) -> bool:

@@ -75,7 +75,7 @@ def planned_problem(config: Config) -> InverseProblem:
     for name, file in files_needed(config).items():
         measured = read_observations(plan, file, name, config.weights)
     if config.weights != "sum":
-        raise ConfigError([config.document.fault(("assimilation", "weights"), "only weights of sum are Bayesian")])
+        raise ConfigError([config.document.fault(("assimilation", "weights"), "only 'weights: sum' is Bayesian")])
     if times is None and measured is not None:
         return problem_of(config, measured)
     assert times is not None

@@ -183,7 +183,7 @@ class Given:
     def _function(self, function: Any) -> FunctionModel:
         names = [name for name in self.priors if name not in {p.name for p in OF_READINGS}]
         if wrong := [name for name in names if not str(name).isidentifier()]:
-            raise ConfigError(f"priors: {wrong[0]!r} is no name of a parameter; write letters, digits and _")
+            raise ConfigError(f"priors: {wrong[0]!r} cannot be the name of a parameter; use letters, digits and _")
         columns = {name for one in self.series for name in one.columns}
         observed = [one.observed([name for name in one.columns if name != TIME]) for one in self.series]
         unknown = self.units.keys() - self.priors.keys() - columns - set(observed)

@@ -82,7 +82,7 @@ def listed_files(work: Path) -> tuple[str, ...]:
     except FileNotFoundError:
         return ()
     except UnicodeDecodeError:
-        raise OutputError(f"{listing}: damaged; it is no list of files") from None
+        raise OutputError(f"{listing}: damaged; it is not a list of files") from None
     for name in names:
         inside(work, name)
     return names

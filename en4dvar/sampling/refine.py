@@ -62,7 +62,7 @@ def mode_cautions(
         yield caution("starts-disagree", words)
     elif result is None and not agree:
         costs = ", ".join(f"{m.cost:.1f}" for m in minima[1:]) or "elsewhere"
-        words = f"of all descents one alone ended in the lowest minimum, J = {lowest:.1f}; others ended at {costs}"
+        words = f"only one descent ended in the lowest minimum, J = {lowest:.1f}; others ended at {costs}"
         yield caution("starts-disagree", words)
     seen = [m for m, weight in zip(minima, weights, strict=True) if weight >= SEEN]
     if len(seen) < 2:

@@ -173,7 +173,7 @@ def _without_shift(problem: InverseProblem) -> InverseProblem:
     """The problem whose control vector is what a sweep searches. Raises :class:`ConfigError` where that is nothing."""
     terms = tuple(t for t in problem.prior.terms if t.parameter.name != TIME_SHIFT.name)
     if not terms:
-        raise ConfigError("nothing but the time shift is estimated; a sweep needs a prior on a parameter")
+        raise ConfigError("only the time shift is estimated; a sweep needs a prior on another parameter")
     fixed = {name: value for name, value in problem.fixed.items() if name != TIME_SHIFT.name}
     return replace(problem, prior=problem.prior.of(terms), fixed=fixed)
 

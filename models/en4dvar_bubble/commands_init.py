@@ -80,7 +80,7 @@ def init(
     if movie is not None and (data is not None or example is not None):
         raise click.UsageError("--movie makes the data; not together with --data or --example")
     if movie is None and (given := [f"--{name}" for name, text in of_movie.items() if text is not None]):
-        raise click.UsageError(f"{given[0]} is of a --movie")
+        raise click.UsageError(f"{given[0]} needs a --movie")
     if example is not None:
         if data is not None or out is not None:
             raise click.UsageError("--example comes with its own data and file names")
@@ -126,7 +126,7 @@ def _tracked(movie: Path, target: Path, options: Mapping[str, str | None], force
     root = context.find_root()
     command = root.command.get_command(root, "track") if isinstance(root.command, click.Group) else None
     if command is None:
-        raise click.UsageError("no command 'track' is installed, which reads movies")
+        raise click.UsageError("the command 'track', which reads movies, is not installed")
     table = target.with_suffix(".csv")
     given = [word for name, text in options.items() if text is not None for word in (f"--{name}", text)]
     words = ["--out", str(table), *given, *["--force"] * force, "--", str(movie)]

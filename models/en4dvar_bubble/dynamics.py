@@ -203,7 +203,9 @@ class Dynamics:
         p_v = medium.p_v if self.vapour == "none" else saturated_vapour_pressure(medium.T_inf)
         gas = (medium.p_inf + 2 * medium.S / rest - p_v) * (rest / R) ** 3 * values.get(GAS_CONTENT.name, 1.0)
         if np.any(gas <= 0):
-            raise ValueError("the vapour pressure exceeds the equilibrium pressure: no gas would be in the bubble")
+            raise ValueError(
+                "the vapour pressure exceeds the equilibrium pressure: there would be no gas in the bubble"
+            )
         x = np.empty((len(rest), layout.size))
         Rdot = values.get(RDOT_START.name, 0.0)
         fields = {"R": R, "Rdot": Rdot, "p_b": gas + p_v, "T": medium.T_inf, "T_m": medium.T_inf, **values}

@@ -90,7 +90,7 @@ def open_movie(path: str | Path, raw: str | None = None) -> Movie:
     if suffix in VIDEO:
         return _video(path)
     kinds = ", ".join((*TIFF, *VIDEO))
-    raise DataError(f"{path}: not a movie by its suffix ({kinds}, or a folder of frames); of a raw file say --raw")
+    raise DataError(f"{path}: not a movie by its suffix ({kinds}, or a folder of frames); for a raw file give --raw")
 
 
 def library(name: str) -> ModuleType:
@@ -245,7 +245,7 @@ def _raw(path: Path, raw: str) -> Movie:
     frame = width * height * kind.itemsize
     size = path.stat().st_size if path.is_file() else 0
     if not frame or not size or size % frame:
-        raise DataError(f"{path}: {size} bytes are no whole number of frames of {raw} ({frame} bytes each)")
+        raise DataError(f"{path}: {size} bytes are not a whole number of frames of {raw} ({frame} bytes each)")
 
     count = size // frame
     return Movie(path, lambda: _blocks(path, 0, count, kind, (height, width)), count)
@@ -266,6 +266,6 @@ def with_scale(movie: Movie, pixel: float | None, rate: float | None) -> Movie:
     missing = ["--pixel '2.76 um'"] * (not pixel > 0) + ["--frame-rate '270 kHz'"] * (not rate > 0)
     if missing:
         raise DataError(
-            f"{movie.path}: the file does not tell its scale, which is never guessed: add {' '.join(missing)}"
+            f"{movie.path}: the file does not state its scale, which is never guessed: add {' '.join(missing)}"
         )
     return replace(movie, pixel=pixel, rate=rate)

@@ -88,7 +88,7 @@ def test_a_campaign_of_fields(tmp_path: Path) -> None:
         ("radius: 300 cm", "by: correlation, radius: 1 m", "localisation.radius: not with by: correlation"),
         ("radius: 300 cm", "by: correlation, threshold: 2", "assimilation.localisation.threshold: "),
         ("radius: 300 cm", "by: correlation", "assimilation.localisation: by correlation there is no cost"),
-        ("radius: 300 cm", "radius: 3 m, at: {k: 1 m}", "localisation: at: 'k' is no parameter with a prior"),
+        ("radius: 300 cm", "radius: 3 m, at: {k: 1 m}", "localisation: at: 'k' is not a parameter with a prior"),
         ("radius: 300 cm", "radius: 3 m, at: {u: [1 m, 2 m]}", "localisation: u has 1 coordinates, the readings"),
         ("radius: 300 cm", "radius: 3 m, at: {offset: 1 s}", "assimilation.localisation: "),
         ("  localisation: {radius: 300 cm}\n", "", "assimilation.localisation: a field estimated cell by cell needs"),

@@ -95,12 +95,12 @@ class TestYaml:
     @pytest.mark.parametrize(
         ("entry", "words"),
         [
-            ("c: {tied: q}", "'q' is no other parameter of the model; known: A, k"),
-            ("c: {tied: c}", "'c' is no other parameter of the model"),
+            ("c: {tied: q}", "'q' is not another parameter of the model; known: A, k"),
+            ("c: {tied: c}", "'c' is not another parameter of the model"),
             ("c: {tied: A}", "A is in m, c in N/m"),
             ("c: {tied: k, factor: two}", "should be a valid number"),
             ("c: {tied: k, factors: 2}", "unknown key 'factors'; did you mean 'factor'?"),
-            ("c: 1 N/m\n  t_s: {tied: k}", "t_s is no parameter of the model and cannot be tied"),
+            ("c: 1 N/m\n  t_s: {tied: k}", "t_s is not a parameter of the model and cannot be tied"),
         ],
     )
     def test_bad_input_is_told_in_place(self, tmp_path, entry, words):

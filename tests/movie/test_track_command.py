@@ -67,7 +67,7 @@ def test_from_the_movie_to_the_configuration_in_one_step(tmp_path, monkeypatch):
     mute = CliRunner().invoke(main, ["init", "--movie", "gel.tif", "--out", "mute.yaml"])
     assert mute.exit_code == 2
     assert "never guessed" in mute.output
-    for wrong, words in ((["--data", "gel.csv", "--movie", "gel.tif"], "not together"), (scale, "is of a --movie")):
+    for wrong, words in ((["--data", "gel.csv", "--movie", "gel.tif"], "not together"), (scale, "needs a --movie")):
         refused = CliRunner().invoke(main, ["init", *wrong])
         assert refused.exit_code == 2
         assert words in refused.output
@@ -93,7 +93,7 @@ def test_flashes_raw_frames_and_corrections_go_through_that_step_too(tmp_path, m
     assert len(problem.observations.times) > 10
     refused = CliRunner().invoke(main, ["init", "--flashes", "0 us, 1 us"])
     assert refused.exit_code == 2
-    assert "--flashes is of a --movie" in refused.output
+    assert "--flashes needs a --movie" in refused.output
 
 
 def test_nothing_is_replaced_and_the_scale_is_asked_for(tmp_path, monkeypatch):

@@ -62,9 +62,9 @@ def test_instructions_read_what_they_say(instructions, expected):
     [
         ("pif @\nl30 !a!\n", "out: has 7 lines, but line 30 is to be read"),
         ("pif @\n@depth@ !a!\n", "out: no 'depth' below line 0"),
-        ("pif @\nl1 !a!\n", "out:1: 'SCHLUMBERGER' is no number for a"),
+        ("pif @\nl1 !a!\n", "out:1: 'SCHLUMBERGER' is not a number for a"),
         ("pif @\nl1 @depth@ !a!\n", "out:1: no 'depth' behind column 0"),
-        ("pif @\nl3 [a]60:70\n", "out:3: 'nothing' is no number for a"),
+        ("pif @\nl3 [a]60:70\n", "out:3: 'nothing' is not a number for a"),
     ],
 )
 def test_what_cannot_be_read_is_told_with_its_line(instructions, words):

@@ -170,7 +170,10 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "no program": ({"command": "no-such-program {a}"}, "model.command: no program 'no-such-program' on the PATH"),
     "no file": ({"command": "./solver {a}"}, "solver: no such file"),
     "not executable": ({"command": "./in.json.j2"}, "is not executable; chmod +x it"),
-    "placeholder": ({"command": "echo {aa}", "templates": []}, "model: command: {aa} is nothing that is filled in"),
+    "placeholder": (
+        {"command": "echo {aa}", "templates": []},
+        "model: command: {aa} is not something that can be filled in",
+    ),
     "no input": ({"templates": []}, "model: command: {input} is the first of templates, and there is none"),
     "parameters": ({"parameters": {}}, "model.parameters: give at least 1"),
     "name": ({"parameters": {"a b": "1"}}, "model.parameters: 'a b' cannot be the name of a parameter"),
@@ -183,7 +186,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "ways": ({"outputs": {"y": {"column": 1, "key": "k"}}}, "model.outputs.y: give one of column, key, pattern"),
     "no way": ({"outputs": {"y": {}}}, "model.outputs.y: give one of column, key, pattern, instructions; given: none"),
     "column": ({"outputs": {"y": {"column": 0}}}, "model.outputs.y.column: columns are counted from 1"),
-    "pattern": ({"outputs": {"y": {"pattern": "("}}}, "model.outputs.y.pattern: is no regular expression"),
+    "pattern": ({"outputs": {"y": {"pattern": "("}}}, "model.outputs.y.pattern: is not a regular expression"),
     "groups": ({"outputs": {"y": {"pattern": "a"}}}, "model.outputs.y.pattern: has 0 groups; put the number"),
     "time": ({"outputs": {"y": {"pattern": "(a)", "time": 1}}}, "model.outputs.y: time goes with column or key"),
     "observations": (

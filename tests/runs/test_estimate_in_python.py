@@ -179,7 +179,7 @@ def test_each_fault_is_one_message_with_its_argument(fault):
     ("function", "reason"),
     [
         (lambda p, t: p["c"] + t, "KeyError: 'c'"),
-        (lambda p, t: t[1:], "the function returned shape (11,) for y, expected (12,), one a time"),
+        (lambda p, t: t[1:], "the function returned shape (11,) for y, expected (12,), one per time"),
         (lambda p, t: {"z": t}, "the function returned z, but no 'y'"),
         (lambda p, t: None, "the function returned shape () for y"),
         (lambda p, t: t * np.nan, "non-finite prediction"),
