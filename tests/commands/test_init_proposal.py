@@ -54,6 +54,10 @@ def test_synthetic_data_to_a_run(tmp_path: Path, start: str, times: str, noise_s
         truth = TRUTH[start][term.parameter.name]
         transformed = np.log(truth) if term.transform == "lognormal" else truth
         assert abs(transformed - term.mean) < 3 * term.std, term.parameter.name
+    for term in problem.prior.terms:  # a prior wider than the documentation advises says how wide it is, and why
+        if term.transform == "lognormal" and term.std > 0.7:
+            (line,) = (line for line in text.splitlines() if line.startswith(f"  {term.parameter.name}: "))
+            assert f"may be off by a factor of {np.exp(1.645 * term.std):.2g}; narrow it" in line
     assert text.startswith("# yaml-language-server: $schema=en4dvar.schema.json\n")
     schema = json.loads(Path("en4dvar.schema.json").read_text(encoding="utf-8"))
     assert list(Draft202012Validator(schema).iter_errors(read_document(Path("bubble.yaml")).data)) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -27,7 +28,9 @@ LEAST_NOISE = 0.01  # of R_max: what single-bubble models agree to with good dat
 TIMING = 0.05  # of the step between samples
 NUCLEUS = 0.5e-6  # m: order of the stress-free radii in Mancia et al. (2021), Table 1
 GAS_FRACTION = 0.12  # R_eq/R_max of laser-induced bubbles, where no radius at rest is seen
-WIDTHS = {"G": (1.0, 1.5), "mu": (0.7, 1.2)}  # bounds of the log_std of a guess
+# Bounds of the log_std of a guess: it errs by that much, so that a narrower prior would exclude what made the data.
+WIDTHS = {"G": (1.0, 1.5), "mu": (0.7, 1.2)}
+BETWEEN = 1.645  # standard deviations from the median to 5 and 95 %
 SAME_CLOCK = 2e-6  # s: what a first guess can be off by
 BUBBLES = (1e-7, 0.1)  # m: between these radii
 
@@ -258,7 +261,9 @@ def _parameters(model: BubbleModel, start: Start, look: Look, guess: Guess) -> t
             width = float(np.clip(guess.log_std[p.name], low, high))
             value = _text(guess.values[p.name], p.unit, p.display_unit)
             from_what = "R_max and collapse time" if start == "acoustic" else "collapse time and rebound"
-            words = f"{p.label}: first guess from {from_what}; put what you knew before"
+            off = math.exp(BETWEEN * width)
+            words = f"{p.label}: first guess from {from_what}, may be off by a factor of {off:.2g}; "
+            words += "narrow it to what you knew before"
             lines.append(Entry(p.name, f"{{prior: lognormal, median: {value}, log_std: {width:.2g}}}", words))
         else:
             lines.append(_example(p, model))
