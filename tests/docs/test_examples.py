@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from pathlib import Path
 
@@ -75,6 +76,14 @@ def test_every_benchmark_is_on_the_page_of_figures():
     scripts = [p for p in (ROOT / "benchmarks").glob("*.py") if "__main__" in p.read_text(encoding="utf-8")]
     assert scripts
     assert [p.name for p in scripts if f"benchmarks/{p.name}" not in text] == []
+
+
+def test_every_figure_names_its_commit():
+    text = (ROOT / "docs" / "figures.md").read_text(encoding="utf-8")
+    rows = [line for line in text.splitlines() if line.startswith("|") and "`" in line]
+    assert len(rows) > 30
+    commit = re.compile(r"\| (?:[0-9a-f]{7}|tests|–)(?:[,;] (?:[0-9a-f]{7}|tests))* \|$")
+    assert [row for row in rows if not commit.search(row)] == []
 
 
 def test_merged_keeps_what_is_not_named():
