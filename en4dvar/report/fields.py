@@ -10,14 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from en4dvar.field_prior import regular_grid
-from en4dvar.report.style import COLUMN, LIGHT, styled
+from en4dvar.report.style import COLUMN, LIGHT, band, styled
 from en4dvar.report.text import shown, with_unit
 from en4dvar.state import Array
 from en4dvar.storage.store import StoredResult
 
 CAPTION = (
     "Fields of the initial state: posterior mean, and posterior over prior standard deviation (1: the data say nothing "
-    "of the cell); of one along a line mean ± std of the posterior (blue) over those of the prior (grey)."
+    "about the cell); for a field along a line, mean and std of the posterior (blue) over those of the prior (grey)."
 )
 
 
@@ -53,9 +53,10 @@ def _label(data: xr.Dataset, name: str) -> str:
 
 def _line(ax: Axes, data: xr.Dataset, name: str, at: Array) -> None:
     order = np.argsort(at)
+    positive = not np.any(data[name].values <= 0)
     for kind, colour in (("prior_", "prior"), ("", "posterior")):
         mean, std = (shown(data[f"{name}_{kind}{what}"])[order] for what in ("mean", "std"))
-        ax.fill_between(at[order], mean - std, mean + std, color=LIGHT[colour], alpha=0.3, lw=0)
+        ax.fill_between(at[order], *band(mean, std, 1, positive), color=LIGHT[colour], alpha=0.3, lw=0)
         ax.plot(at[order], mean, color=LIGHT[colour])
     ax.set(xlabel=with_unit("place", str(data[f"{name}_at"].attrs["units"])), ylabel=_label(data, name))
 

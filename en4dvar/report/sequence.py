@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from en4dvar.report.cycles import RANKS, labelled, ranks, stacked_axes, write_cycles_page
 from en4dvar.report.drawing import Captioned
-from en4dvar.report.style import LIGHT, PAGE, styled
+from en4dvar.report.style import LIGHT, PAGE, band, styled
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
 from en4dvar.state import Array
 from en4dvar.storage.cycles_file import read_cycles
@@ -78,7 +78,7 @@ def in_time(data: xr.Dataset, kind: str, chosen: npt.NDArray[np.intp]) -> Figure
         unit, shown = str(data["units"].values[i]), str(data["display_units"].values[i])
         mean, std = (convert(data[f"{kind}_{what}"].values[:, i], unit, shown) for what in ("mean", "std"))
         colour = LIGHT["posterior"]
-        low, high = _band(mean, std, bool(data["positive"].values[i]))
+        low, high = band(mean, std, 2, bool(data["positive"].values[i]))
         ax.fill_between(time, low, high, color=colour, alpha=0.25, lw=0, label="± 2 std")
         ax.plot(time, mean, color=colour, lw=0.9, label=kind)
         if name in read_as:
@@ -87,15 +87,6 @@ def in_time(data: xr.Dataset, kind: str, chosen: npt.NDArray[np.intp]) -> Figure
         ax.set_ylabel(with_unit(name, shown))
     stack = sorted(stack, key=lambda ax: len(ax.get_lines()), reverse=True)[:1] + list(stack)  # its legend has it all
     return labelled(figure, stack, str(data["time"].attrs["display_units"]))
-
-
-def _band(mean: Array, std: Array, positive: bool) -> tuple[Array, Array]:
-    """± 2 std, of what is positive by the lognormal of the same mean and standard deviation."""
-    if not positive:
-        return mean - 2 * std, mean + 2 * std
-    width = np.sqrt(np.log1p((std / mean) ** 2))
-    centre = np.log(mean) - width**2 / 2
-    return np.exp(centre - 2 * width), np.exp(centre + 2 * width)
 
 
 @styled

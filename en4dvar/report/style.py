@@ -133,3 +133,12 @@ def inline_svg(figure: Figure, name: str, description: str) -> Markup:
     label = description.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     head = f'<svg role="img" aria-label="{label}" viewBox="0 0 {width * 72:g} {height * 72:g}"'
     return Markup(re.sub(r"^<svg[^>]*", head, svg, count=1))
+
+
+def band(mean: Array, std: Array, reach: float, positive: bool) -> tuple[Array, Array]:
+    """Mean ± ``reach`` std, of what is positive by the lognormal of the same mean and standard deviation."""
+    if not positive:
+        return mean - reach * std, mean + reach * std
+    width = np.sqrt(np.log1p((std / mean) ** 2))
+    centre = np.log(mean) - width**2 / 2
+    return np.exp(centre - reach * width), np.exp(centre + reach * width)
