@@ -189,11 +189,11 @@ FAULTS = [
     ("{column: w}", "half", "data.series.heads.weights: write a list"),
     ("{column: w}", "[0, 0, 0, 0]", "all weights are zero"),
     ("{column: w}", "{function: ./nowhere.py:f}", "data.series.heads.weights.function:"),
-    ("{column: w}", "{function: f}", "names no function of a file"),
+    ("{column: w}", "{function: f}", "is not a function in a file"),
     ("{column: w}", "{zero_near_minima: 3 kg}", "data.series.heads.weights.zero_near_minima:"),
     ("f.csv", "g.csv", "17:13: data.series.heads.path:"),
     ("weights: {column: w}", "group: [1]\n      weights: {column: w}", "data.series.heads.group:"),
-    ("mean: 0, std: 2}\n  b", "mean: maximum, std: 2}\n  b", "parameters.a.mean: 'maximum' is that of a single series"),
+    ("mean: 0, std: 2}\n  b", "mean: maximum, std: 2}\n  b", "parameters.a.mean: 'maximum' is defined only for a single series"),
     ("mean: 0, std: 2}\n  b", "mean: 0, std: 2, shared: all}\n  b", "parameters.a.shared: not where a data set"),
 ]  # fmt: skip
 

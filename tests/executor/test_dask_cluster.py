@@ -38,7 +38,7 @@ def test_no_scheduler(tmp_path, monkeypatch):
 
 def test_an_address_is_of_dask_only(tmp_path):
     path = make_campaign(tmp_path, 2)
-    with pytest.raises(ConfigError, match="address is that of a dask scheduler"):
+    with pytest.raises(ConfigError, match="address is for a dask scheduler only"):
         configuration(path, tmp_path / "run", address="tcp://127.0.0.1:9", executor="threads")
     with pytest.raises(ConfigError, match="address"):
         configuration(path, tmp_path / "run", address="127.0.0.1")

@@ -157,7 +157,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
         "priors.a.mean: 0 has no unit; write e.g. '0 m'",
     ),
     "odd unit": ({"units": {"c": "m"}}, "units: 'c' is neither a parameter in priors nor a column"),
-    "name of a prior": ({"priors": {"a b": 1.0}}, "priors: 'a b' is no name of a parameter"),
+    "name of a prior": ({"priors": {"a b": 1.0}}, "priors: 'a b' cannot be the name of a parameter"),
     "nothing estimated": ({"priors": {"a": 1.0, "b": 2.0}}, "no parameter has a prior; nothing to estimate"),
     "an object": ({"priors": {"a": {"prior": object}}}, "priors.a.prior: <class 'object'> is neither number, text"),
     "odd section": ({"asimilation": {}}, "asimilation: unknown key 'asimilation'; did you mean 'assimilation'?"),
