@@ -27,7 +27,7 @@ def _completed(context: click.Context, parameter: click.Parameter, typed: str) -
 
 @click.command()
 @click.argument("names", nargs=-1, metavar="[LAW]...", shell_complete=_completed)
-@click.option("--check", is_flag=True, help="Check on the laws what every law must satisfy.")
+@click.option("--check", is_flag=True, help="Run the checks that every law must pass.")
 def laws(names: tuple[str, ...], check: bool) -> None:
     """List constitutive laws with parameters and units, or check them.
 
