@@ -193,7 +193,7 @@ FAULTS = [
     ("{column: w}", "{zero_near_minima: 3 kg}", "data.series.heads.weights.zero_near_minima:"),
     ("f.csv", "g.csv", "17:13: data.series.heads.path:"),
     ("weights: {column: w}", "group: [1]\n      weights: {column: w}", "data.series.heads.group:"),
-    ("mean: 0, std: 2}\n  b", "mean: maximum, std: 2}\n  b", "parameters.a.mean: 'maximum' is defined only for a single series"),
+    ("mean: 0, std: 2}\n  b", "mean: maximum, std: 2}\n  b", "'maximum' is defined only for a single series"),
     ("mean: 0, std: 2}\n  b", "mean: 0, std: 2, shared: all}\n  b", "parameters.a.shared: not where a data set"),
 ]  # fmt: skip
 

@@ -120,7 +120,7 @@ def busy_until(end):
 
 def test_a_limit_needs_a_process_to_end(tmp_path):
     path = faulty(tmp_path)
-    with pytest.raises(ConfigError, match="only a process can be ended at its limit; write executor: processes, not threads"):
+    with pytest.raises(ConfigError, match="ended at its limit; write executor: processes, not threads"):
         configuration(path, tmp_path / "run", executor="threads", time_limit="1 s")
     with pytest.raises(ConfigError, match=r"'2 pints' is not a size of memory; write e\.g\. 2 GB"):
         configuration(path, tmp_path / "run", memory_limit="2 pints")
