@@ -60,7 +60,7 @@ def test_the_same_bits_again(campaign, tmp_path):
 
 
 def test_bad_questions(campaign, tmp_path):
-    with pytest.raises(ConfigError, match=r"q: not estimated in two data sets.*"):
+    with pytest.raises(ConfigError, match=r"q: cannot be shared, for no two data sets.*"):
         join([campaign], ["q"], tmp_path)
     with pytest.raises(OutputError, match="no such file"):
         join([tmp_path / "nothing"], ["k"], tmp_path)
