@@ -169,7 +169,7 @@ def test_an_interlaced_movie(tmp_path):
 
 def test_raw_of_another_length(tmp_path):
     (tmp_path / "m.raw").write_bytes(FRAMES.tobytes()[:-1])
-    with pytest.raises(DataError, match="no whole number of frames"):
+    with pytest.raises(DataError, match="not a whole number of frames"):
         open_movie(tmp_path / "m.raw", "48x32x8")
 
 
