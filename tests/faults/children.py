@@ -24,6 +24,12 @@ from pathlib import Path
 from typing import Any
 
 TESTS = Path(__file__).resolve().parents[1]
+USED_LATER = (
+    "dask.array", "distributed", "fontTools.subset", "matplotlib.backends.backend_agg",
+    "matplotlib.backends.backend_pdf", "matplotlib.backends.backend_svg", "matplotlib.pyplot", "PIL.PngImagePlugin",
+    "rich.progress",
+)  # fmt: skip
+"""What libraries import when they are used."""
 
 
 @dataclass
@@ -149,22 +155,14 @@ def _of_few(draw: Callable[..., Any]) -> Callable[..., Any]:
 
 def _import_everything() -> None:
     """What the commands import as they go as well: half of the time of a child was that."""
-    import dask.array
-    import distributed
-    import fontTools.subset
-    import matplotlib.backends.backend_agg
-    import matplotlib.backends.backend_pdf
-    import matplotlib.backends.backend_svg
-    import matplotlib.pyplot
-    import PIL.PngImagePlugin
-    import rich.progress  # noqa: F401
-
     import en4dvar.report.cycles
     import en4dvar_agarose
     import en4dvar_bubble
     import en4dvar_lorenz
     from en4dvar.storage.fingerprint import source_digest
 
+    for name in USED_LATER:
+        import_module(name)
     for package in (en4dvar, en4dvar_agarose, en4dvar_bubble, en4dvar_lorenz):
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             import_module(found.name)
