@@ -263,8 +263,7 @@ def test_plus_minus_and_verdicts():
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory):
     """Every other data set of the twin."""
-    # no test here asks how good the populations are
-    few = {"rounds": 60, "passes": 1, "draws": 300, "exact": 50, "components": 4}
+    few = {"rounds": 60, "passes": 1, "draws": 300, "exact": 50}  # no test here asks how good the populations are
     changes = {"sweep.trajectories": 8192, **{f"population.{key}": value for key, value in few.items()}}
     file = write_study(tmp_path_factory.mktemp("twin"), "*[02468]")
     return run_study(load_study(file, changes), workers=2)
