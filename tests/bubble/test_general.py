@@ -41,7 +41,7 @@ class TestAgreementWithThePaperEquations:
     def test_same_path(self, gas, nodes, reading, monkeypatch):
         gel = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}
         t = np.linspace(5e-6, 30e-6, 26)
-        options = {"gas": gas, "driving_read": reading, "accuracy": Accuracy(nodes=nodes, rtol=1e-7)}
+        options = {"gas": gas, "driving_read": reading, "accuracy": Accuracy(nodes=nodes, rtol=1e-8)}
         fast = simulate(parameters=gel, times=t, **options)
         monkeypatch.setattr(System, "general", True)
         general = simulate(parameters=gel, times=t, **options)
