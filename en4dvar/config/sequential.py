@@ -210,7 +210,10 @@ def per_time(spec: Knots, std: float, path: str) -> float:
     """Variance per unit of time. Raises :class:`ConfigError`."""
     if spec.every is None:
         raise ConfigError([Fault("give every, the time after which it is std: in a series it grows all along", path)])
-    return std**2 / spec.every
+    try:
+        return std**2 / spec.every
+    except OverflowError:
+        raise ConfigError([Fault("too large: its square is no number", f"{path}.std")]) from None
 
 
 def localisation_of(
