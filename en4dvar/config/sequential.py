@@ -17,7 +17,7 @@ from en4dvar.config.validate import Faults
 from en4dvar.config.varies import ErrorOf, Knots
 from en4dvar.cycling.coordinates import EnsembleCoordinates
 from en4dvar.cycling.model_error import ModelError
-from en4dvar.cycling.sequential import SequentialSettings
+from en4dvar.cycling.settings import SequentialSettings
 from en4dvar.cycling.smoothers import EnKS, EnRTS
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel

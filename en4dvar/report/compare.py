@@ -144,7 +144,7 @@ def compare_runs(
 
     Raises
     ------
-    OutputError: fewer than two runs, a run given twice, a directory without results, or results in a list, without names.
+    OutputError: fewer than two runs, a run given twice, a directory without results, or results without names.
     """
     if len(runs) < 2:
         raise OutputError("compare needs at least two run directories")
