@@ -132,21 +132,17 @@ def _tell(error: ValidationError, schema: type[BaseModel]) -> Iterator[_Finding]
 
 
 def _one_each(findings: Sequence[tuple[Place, _Finding]]) -> Iterator[tuple[Place, _Finding]]:
-    """One finding a place: where no kind fits, one that names all that do; none where a part is at fault."""
-    of_kind: dict[Place, list[_Finding]] = {}
-    for place, finding in findings:
-        if finding.kind:
-            of_kind.setdefault(place, []).append(finding)
+    """One finding a place: where no kind fits, one that names all that do, unless more is told of it or its parts."""
     known = set[Place]()
     for place, finding in findings:
-        others = of_kind.get(place, [])
-        if not finding.kind and place not in known:
-            known.add(place)
-            yield place, finding
-        elif others and finding is others[0] and not any(p[: len(place)] == place != p for p, _ in findings):
-            words = dict.fromkeys(one.message.partition(_NOT)[0] for one in others)
-            message = " or ".join(words) + _NOT + finding.message.partition(_NOT)[2]
-            yield place, replace(finding, message=message)
+        more = any(p[: len(place)] == place and (p != place or not other.kind) for p, other in findings)
+        if place in known or (finding.kind and more):
+            continue
+        known.add(place)
+        if finding.kind:
+            words = dict.fromkeys(other.message.partition(_NOT)[0] for p, other in findings if p == place)
+            finding = replace(finding, message=" or ".join(words) + _NOT + finding.message.partition(_NOT)[2])
+        yield place, finding
 
 
 def _written(finding: _Finding, path: Sequence[str | int], document: Document) -> Place:
