@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.population.effort import Effort
 from en4dvar.population.likelihoods import JITTER, EmulatedLikelihood, draw_interim, fit_likelihood
@@ -25,8 +24,8 @@ SETTLING = 6  # the walkers' positions are kept after this part of their rounds
 class Training:
     """Points (S, B, n) that were run and what came of them (S, B, K); ``count`` forward runs.
 
-    The first are visited by walkers of each set under N(mean, std²). They start from draws of that posterior, all its modes
-    in their proportions, by importance sampling from N(mean, std²) and ``start``, which may have ended in a single mode.
+    The first are visited by walkers of each set under N(mean, std²). They start from draws of that posterior, all its
+    modes in their proportions, by importance sampling from N(mean, std²) and ``start``, which may have missed some.
     """
 
     def __init__(

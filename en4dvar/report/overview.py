@@ -68,8 +68,8 @@ def render_overview(
 ) -> str:
     """The page as HTML.
 
-    ``joint``, ``population``: addresses of the pages of such estimates. ``pages``: stem of a data set → address of its page, for those
-    that have one; ``failures``: name of a data set without a posterior → reason.
+    ``joint``, ``population``: addresses of the pages of such estimates. ``pages``: stem of a data set → address of its
+    page, for those that have one; ``failures``: name of a data set without a posterior → reason.
     """
     listed = set(map(id, sorted(sets, key=lambda s: -s.gravity)[:LISTED]))
     return render(

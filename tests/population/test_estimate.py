@@ -67,7 +67,7 @@ class Cusped(Curved):
 
 
 class Twofold(Curved):
-    """Each set leaves two a open, 0.2 ± its distance; ``start`` is at the one of every set that the data put less in."""
+    """Each set leaves two a open, on both sides of 0.2; ``start`` is at the one that the data put less in."""
 
     def predictions(self, x, sets=None):
         a, b = x[..., 0], x[..., 1]
