@@ -48,8 +48,8 @@ def sampled_evidence(runs: CampaignRuns, prior: Prior, seed: int) -> Evidence:
 
 
 def sample_sets(runs: CampaignRuns, control: Callable[[Array], Array], samplers: Mapping[int, Importance]) -> None:
-    """Rounds of all samplers, by the number of their set, until they have enough draws; ``control`` makes control vectors
-    of their coordinates (B, n).
+    """Rounds of all samplers, by the number of their set, until they have enough draws. ``control``: coordinates
+    (B, n) → control vectors.
     """
     for _ in range(MOST_ROUNDS):
         going = np.array([s for s, one in samplers.items() if one.effective < ENOUGH], dtype=int)
