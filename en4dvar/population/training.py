@@ -73,6 +73,8 @@ class Training:
         }
         sample_sets(self.runs, lambda z: mean + std * z, found)
         self.count += sum(len(one.z) for one in found.values())
+        if failed := [s for s, one in found.items() if not np.isfinite(one.log)]:
+            raise ValueError(f"no forward run of data set number {failed[0] + 1} succeeded")
         x = np.stack([mean + std * one.z[resampled(one.shares, walkers, stream)] for one in found.values()], axis=1)
         x = stream.permuted(x, axis=0)
         return x, log_likelihood(self.runs, self._run(x)) + _log_gauss(x, mean, std)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -15,13 +17,17 @@ from en4dvar.runs.population_run import population
 from en4dvar.runs.runner import run_campaign, write_report
 from en4dvar.storage.population_file import load_population
 
-SMALL = Effort(rounds=36, refits=1, degree=2, components=2, hyper_walkers=32, draws=1500, exact=400)
+SMALL = Effort(
+    rounds=30, refits=1, degree=2, components=2, hyper_walkers=16, hyper_rounds=30, draws=400, exact=100, passes=1
+)
 ASKED = "population: {of: [k], mean_std: 2, spread: 0.7}\n"
 
 
-@pytest.fixture(autouse=True)
-def _small(monkeypatch):
-    monkeypatch.setattr("en4dvar.population.estimate.Effort", lambda: SMALL)
+@pytest.fixture(autouse=True, scope="module")
+def _small():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("en4dvar.population.estimate.Effort", lambda: SMALL)
+        yield
 
 
 def springs(folder, asked=ASKED, n=4, model="toy_models:Oscillator"):
@@ -31,13 +37,30 @@ def springs(folder, asked=ASKED, n=4, model="toy_models:Oscillator"):
     return path
 
 
-def test_a_run_ends_with_what_the_command_says(tmp_path):
-    path, run = springs(tmp_path), tmp_path / "run"
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run with a population, and what it printed."""
+    folder = tmp_path_factory.mktemp("springs")
+    path, run = springs(folder), folder / "run"
     result = CliRunner().invoke(main, ["run", str(path), "--out", str(run), "--no-report"])
     assert result.exit_code == 0, result.output
-    assert "mean of the population" in result.output
+    return run, result.output
+
+
+@pytest.mark.slow
+def test_a_run_ends_with_its_population(finished):
+    run, output = finished
+    assert "mean of the population" in output
     within = load_population(run / "population.nc")
     assert within.tree.attrs["hyperprior_mean_std"] == 2.0
+    assert 1.5 < float(within.group("posterior")["k_mean"].median()) < 2.2  # the springs are 1.6 to 2.05
+
+
+@pytest.mark.slow
+def test_it_is_what_the_command_says_and_has_a_page(finished, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished[0], run)
+    within = load_population(run / "population.nc")
     after, _ = population([run], ["k"], tmp_path / "after", hyper=HyperPrior(2.0, 0.7))
     for name, values in after.group("posterior").data_vars.items():
         assert np.array_equal(values, within.group("posterior")[name]), name
