@@ -55,8 +55,10 @@ def population(
     attributes = {**provenance("", None), "runs": ", ".join(run_dir.name for run_dir in run_dirs)}
     path = out / FILE
     with choose_executor(first.model, None, workers) as executor:
-        options = {"hyper": hyper, "effort": effort, "workers": workers or 1, "executor": executor}
-        _save(sets, attributes, path, tell, names=names, seed=first.seed, **options)
+        _save(
+            sets, attributes, path, tell, names=names, seed=first.seed, hyper=hyper, effort=effort,
+            workers=workers or 1, executor=executor,
+        )  # fmt: skip
     stored = load_population(path)
     return stored, write_population(stored, out)
 
@@ -69,8 +71,10 @@ def population_within(work: Worklist, executor: Executor) -> None:
     config, asked = work.config, work.config.population
     if asked is None:
         return
-    options = {"hyper": asked.hyper, "workers": config.execution.workers or 1, "executor": executor}
-    estimate = partial(_save, names=asked.of, seed=config.seed, **options)
+    estimate = partial(
+        _save, names=asked.of, seed=config.seed, hyper=asked.hyper, workers=config.execution.workers or 1,
+        executor=executor,
+    )  # fmt: skip
     once_together(work, FILE, "population", FEWEST_SETS, estimate)
 
 
