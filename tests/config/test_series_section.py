@@ -196,7 +196,7 @@ FAULTS = [
     ("mean: 0, std: 2}\n  b", "mean: maximum, std: 2}\n  b", "'maximum' is defined only for a single series"),
     ("mean: 0, std: 2}\n  b", "mean: 0, std: 2, shared: all}\n  b", "parameters.a.shared: not where a data set"),
     ("parameters:\n", "parameters:\n  reading_scale: {prior: lognormal, median: 1, log_std: 0.1}\n",
-     "25:18: parameters.reading_scale: one number for several series"),
+     "25:18: parameters.reading_scale: cannot be one number for several series"),
     ("path: pq.csv", "path: -1", "5:9: data.path: expected text; put it in quotes or expected a list"),
     ("path: pq.csv", "path: [1]", "5:10: data.path.0: expected text; put it in quotes, not 1"),
     ("columns: {p: {name: p, unit: \"1\"}}", "columns: {}", "columns.p: required: the column of p"),
