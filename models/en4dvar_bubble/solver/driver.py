@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,9 +16,10 @@ from en4dvar_bubble import tables as tables_module
 from en4dvar_bubble.driving import Driving, Reading
 from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import integrate, rows
-from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output
+from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output, Scratch, scratch
 from en4dvar_bubble.solver.arrow import spans
 from en4dvar_bubble.solver.collocation import ball, exterior
+from en4dvar_bubble.solver.fields import scratch_rows
 
 stamp_with_sources(integrate.integrate, Path(__file__).parent, Path(tables_module.__file__))
 
@@ -265,5 +266,14 @@ class Solver:
             np.zeros(n_members, dtype=np.int64),
             np.zeros((n_members, integrate.RECORD)),
         )
-        call = partial(integrate.integrate, members, self.equations(memory, viscous, pulse), self.control, output)
+        equations, control = self.equations(memory, viscous, pulse), self.control
+
+        def call() -> None:
+            integrate.integrate(members, equations, control, output, self._scratch(members.parameters.shape[1]))
+
         return call, Solution(*output)
+
+    def _scratch(self, parameters: int) -> Scratch:
+        system = self.system
+        size = len(spans(system.dims)) if system.general else system.size
+        return scratch(system.dims, size, scratch_rows(system.dims), parameters, int(_ELASTIC_SPAN[3]))
