@@ -59,15 +59,16 @@ class Equations(NamedTuple):
     size: Any
     dims: Dims
     gas: Array  # collocation: gas+1 rows of d/dy (the last is the wall), gas of the Laplacian, radii, averaging weights
-    medium: Array  # likewise: medium+1 rows of d/dx, medium of the Laplacian, x − x⁻², x⁻⁶
     elastic_span: Array  # of the tables against ln λ: first, last, cells per unit, cells
-    memory: Array  # tables of the memory variables
-    viscous: Array  # tables of ν against ln |V|
-    viscous_span: Array
     driving: Array  # table of the far-field pressure over its amplitude; of members of their own shape, one each
     driving_span: Array
-    spans: IntArray  # of the general equations: where their matrix is not zero, see :mod:`arrow`
     reading: int  # when the driving is read, see :mod:`rows`
+    # Of the general equations, otherwise None:
+    medium: Any  # like ``gas``: medium+1 rows of d/dx, medium of the Laplacian, x − x⁻², x⁻⁶
+    memory: Any  # tables of the memory variables
+    viscous: Any  # tables of ν against ln |V|
+    viscous_span: Any
+    spans: Any  # where their matrix is not zero, see :mod:`arrow`
 
 
 class Control(NamedTuple):

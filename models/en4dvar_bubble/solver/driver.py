@@ -145,7 +145,6 @@ class System:
 
 
 _ELASTIC_SPAN, _VISCOUS_SPAN = GRID.span, VISCOUS_GRID.span
-_NO_SPANS = np.zeros((0, 16), dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -231,10 +230,13 @@ class Solver:
     def equations(self, memory: Array, viscous: Array, pulse: Array) -> Equations:
         """What the compiled equations read beside the members' parameters; tables of laws and pulses (…, cells, 8)."""
         system, driving = self.system, self.driving
-        gas, medium = _gas_operators(system.gas), _medium_operators(system.medium, system.medium_length)
-        tables = (_ELASTIC_SPAN, memory, viscous, _VISCOUS_SPAN, pulse, driving.span)
-        nonzero = spans(system.dims) if system.general else _NO_SPANS
-        return Equations(*self.lengths, system.dims, gas, medium, *tables, nonzero, READINGS[self.reading])
+        medium = _medium_operators(system.medium, system.medium_length)
+        general: tuple[Any, ...] = (None,) * 5  # what nobody reads need not be compiled either
+        if system.general:
+            general = medium, memory, viscous, _VISCOUS_SPAN, spans(system.dims)
+        gas, reading = _gas_operators(system.gas), READINGS[self.reading]
+        shared = gas, _ELASTIC_SPAN, pulse, driving.span
+        return Equations(*self.lengths, system.dims, *shared, reading, *general)
 
     @cached_property
     def control(self) -> Control:
