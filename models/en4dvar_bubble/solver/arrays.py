@@ -96,7 +96,7 @@ class Output(NamedTuple):
 class Scratch(NamedTuple):
     """What one thread works on: ``block`` (rows, WIDTH) of zeros, where the rows of :class:`Workspace` and
     :class:`Lanes` end ``edges`` (25,), ``marks`` (4, WIDTH) of integers, ``elastic`` (WIDTH, cells, 8). Made by NumPy:
-    a kernel without allocation is compiled in half of the time.
+    a kernel without allocation is compiled faster.
     """
 
     block: Array
