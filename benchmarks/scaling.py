@@ -30,7 +30,6 @@ from en4dvar.config import Config, load_config
 from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.ensemble.members import Reading
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, ThreadsExecutor, one_blas_thread
-from en4dvar.files import write_bytes
 from en4dvar.prior import own_seed
 from en4dvar.runs.jobs import Job, estimate
 from en4dvar.runs.runner import run_campaign
@@ -149,7 +148,7 @@ def spent(config: Config, emulator: Literal["off", "auto"]) -> list[float]:
             with watch.watching("forecast", *forward), watch.watching("result", *making):
                 total = seconds(lambda: [estimate(job) for job in work], clock)
             forecast, result = watch.spent["forecast"], watch.spent["result"]
-            write = seconds(lambda: [write_bytes(Path(folder, "x.nc"), content) for content in contents])
+            write = seconds(lambda: [content.write(Path(folder, "x.nc")) for content in contents])
             rows.append((read, forecast, total - forecast - result, result, write))
     return list(1e3 * np.median(rows, axis=0) / len(work))
 

@@ -15,9 +15,10 @@ from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.executor import Executor
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.runs.campaign import DatasetOutcome
-from en4dvar.storage.checkpoint import Keeper, digest
+from en4dvar.storage.checkpoint import Keeper
 from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import to_bytes
+from en4dvar.storage.seal import SealedBytes
 from en4dvar.summary import remarks, summarise
 
 SEND_EVERY = 0.1  # s; a worker sends the records of its iterations no more often
@@ -53,7 +54,7 @@ class Job:
 class Estimate:
     """``content`` is the netCDF file; ``ending`` tells how the iterations ended."""
 
-    content: bytes
+    content: SealedBytes
     ending: str
     outcome: DatasetOutcome
 
@@ -76,7 +77,7 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
         warnings=analysis.cautions,
         summary=summarise(analysis),
         n_observations=len(analysis.observations),
-        sha256=digest(content),
+        sha256=content.sha256,
         remarks=remarks(analysis),
     )
     converged = "converged" if analysis.converged else "not converged"

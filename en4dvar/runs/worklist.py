@@ -14,7 +14,7 @@ from en4dvar.config import Config
 from en4dvar.config.build import build_one
 from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
-from en4dvar.files import readable, write_bytes
+from en4dvar.files import readable
 from en4dvar.inputs.asked import DataFile
 from en4dvar.prior import own_seed
 from en4dvar.runs.campaign import DatasetOutcome, file_names
@@ -180,7 +180,7 @@ class Worklist:
     def _keep(self, d: Dataset, value: Estimate) -> None:
         warnings = [f"{warning.severity}: {warning}" for warning in value.outcome.warnings]
         self.run.log.write("\n".join(f"{d.name}: {line}" for line in (value.ending, *warnings)))
-        write_bytes(self.run.directory.at(d.file), value.content)
+        value.content.write(self.run.directory.at(d.file))
         self._end(d, value.outcome)
 
     def _fail(self, d: Dataset, error: Exception) -> None:

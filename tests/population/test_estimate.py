@@ -208,10 +208,9 @@ def test_interim_draws_have_the_moments_of_quadrature():
     emulators = fitted(x, seen, runs.values, runs.weight, degree=2)
     mean, std = np.zeros(2), np.array([0.9, 0.7])
     draws = draw_interim(emulators, mean, std, 4, "x", count=400)
-    a, b = np.meshgrid(np.linspace(-4, 4, 801), np.linspace(-3, 3, 601), indexing="ij")
-    at = np.stack([a, b], axis=-1)
+    a, b = np.meshgrid(np.linspace(-4, 4, 401), np.linspace(-3, 3, 301), indexing="ij")
+    predictions = runs.predictions(np.stack([a, b], axis=-1))
     for s in range(3):
-        predictions = runs.predictions(at)
         log = -0.5 * np.sum(runs.weight[s] * (runs.values[s] - predictions) ** 2, axis=-1)
         density = np.exp(log - 0.5 * (a / std[0]) ** 2 - 0.5 * (b / std[1]) ** 2)
         density /= density.sum()
