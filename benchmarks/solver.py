@@ -19,6 +19,7 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -168,6 +169,19 @@ def threads() -> list[str]:
     return lines
 
 
+def simulated() -> list[str]:
+    """``simulate`` on one worker and on two against the forecast of the same members."""
+    model, lines = BubbleModel(), []
+    for n in (8, 48, 480):
+        theta = members(n)
+        x = model.initial_states(theta)
+        calls: list[Callable[[], object]] = [partial(forecast, model, x)]
+        calls += [partial(simulate, parameters=theta, times=TIMES, workers=workers) for workers in (1, 2)]
+        spent = interleaved(calls, 41, time.perf_counter)
+        lines.append(f"| {n} | {' | '.join(f'{s * 1e3:.2f}' for s in spent)} | **{spent[1] / spent[0]:.2f}** |")
+    return lines
+
+
 def by_members() -> list[str]:
     model, lines = BubbleModel(), []
     for n in (1, 2, 4, 8, 16, 32, 64, 256, 1024, 4096):
@@ -287,6 +301,10 @@ TABLES: dict[str, tuple[str, Callable[[], list[str]]]] = {
         lambda: equal_accuracy(ACCURACIES["standard"].nodes, ACCURACIES["standard"].rtol),
     ),
     "threads": ("| members | one thread, ms | two threads, ms | ratio |\n|---|---|---|---|", threads),
+    "simulate": (
+        "| members | forecast, ms | `simulate`, ms | `workers=2`, ms | `simulate` / forecast |\n|---|---|---|---|---|",
+        simulated,
+    ),
     "members": ("| members | ms | ms per member |\n|---|---|---|", by_members),
     "nodes": ("| nodes | ms per trajectory | rms error / R_max |\n|---|---|---|", by_nodes),
     "physics": (

@@ -37,6 +37,12 @@ def kernel(function: F) -> F:
     return _compiled(function, numba.njit(cache=True, nogil=True))
 
 
+def kernel_without_allocation(function: F) -> F:
+    """A :func:`kernel` that makes no arrays: no references to them need be counted."""
+    options: dict[str, Any] = {"_nrt": False}  # which numba's annotations leave out
+    return _compiled(function, numba.njit(cache=True, nogil=True, **options))
+
+
 def summing_kernel(function: F) -> F:
     """A :func:`kernel` whose sums may be added in another order, side by side; the order is the same in every run."""
     return _compiled(function, numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"}))

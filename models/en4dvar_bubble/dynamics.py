@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -39,6 +39,11 @@ R_EQ = positive(
 R_MAX = positive(
     "R_max", "m", "maximum radius, where the bubble is released", r"$R_{\max}$", "Estrada et al. (2018)", "um"
 )
+
+
+@cache
+def _usual_driving(start: Start) -> Driving:
+    return histotripsy() if start == "acoustic" else silence()
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +85,7 @@ class Dynamics:
 
     def __post_init__(self) -> None:
         if self.driving is None:
-            object.__setattr__(self, "driving", histotripsy() if self.start == "acoustic" else silence())
+            object.__setattr__(self, "driving", _usual_driving(self.start))
         if self.accuracy is None:
             object.__setattr__(self, "accuracy", preset("standard", self.start))
         if self.gas != "heat" and (self.vapour == "transport" or self.medium_heat != "cold"):

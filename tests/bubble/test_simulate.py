@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
 import en4dvar_bubble
 from en4dvar.errors import ConfigError
+from en4dvar_bubble import api
 from en4dvar_bubble.medium import UNITS, WATER_25C
 
 GEL = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}
@@ -30,6 +32,20 @@ def test_dataset_has_si_fields_with_units_and_the_parameters():
     }  # fmt: skip
     assert (data.status == 0).all()
     assert list(data.reason.values) == ["", "", ""]
+
+
+@pytest.mark.parametrize(("members", "threads"), [(48, 1), (128, 2), (1000, 2)])
+def test_few_members_are_integrated_by_one_thread(members, threads, monkeypatch):
+    asked = []
+
+    class Pool(ThreadPoolExecutor):
+        def __init__(self, workers):
+            asked.append(workers)
+            super().__init__(workers)
+
+    monkeypatch.setattr(api, "ThreadPoolExecutor", Pool)
+    en4dvar_bubble.simulate(parameters={**GEL, "G": np.full(members, 5e3)}, times=TIMES[:1], workers=2)
+    assert asked == [threads]
 
 
 def test_velocity_is_the_derivative_of_the_radius():

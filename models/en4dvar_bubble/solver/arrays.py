@@ -10,6 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from en4dvar.state import Array
+from en4dvar_bubble.solver import rodas5p
+from en4dvar_bubble.solver.general import SHARED
+from en4dvar_bubble.solver.lanes import WIDTH
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
@@ -56,15 +59,16 @@ class Equations(NamedTuple):
     size: Any
     dims: Dims
     gas: Array  # collocation: gas+1 rows of d/dy (the last is the wall), gas of the Laplacian, radii, averaging weights
-    medium: Array  # likewise: medium+1 rows of d/dx, medium of the Laplacian, x − x⁻², x⁻⁶
     elastic_span: Array  # of the tables against ln λ: first, last, cells per unit, cells
-    memory: Array  # tables of the memory variables
-    viscous: Array  # tables of ν against ln |V|
-    viscous_span: Array
     driving: Array  # table of the far-field pressure over its amplitude; of members of their own shape, one each
     driving_span: Array
-    spans: IntArray  # of the general equations: where their matrix is not zero, see :mod:`arrow`
     reading: int  # when the driving is read, see :mod:`rows`
+    # Of the general equations, otherwise None:
+    medium: Any  # like ``gas``: medium+1 rows of d/dx, medium of the Laplacian, x − x⁻², x⁻⁶
+    memory: Any  # tables of the memory variables
+    viscous: Any  # tables of ν against ln |V|
+    viscous_span: Any
+    spans: Any  # where their matrix is not zero, see :mod:`arrow`
 
 
 class Control(NamedTuple):
@@ -87,6 +91,34 @@ class Output(NamedTuple):
     states: Array
     status: IntArray
     record: Array
+
+
+class Scratch(NamedTuple):
+    """What one thread works on: ``block`` (rows, WIDTH) of zeros, where the rows of :class:`Workspace` and
+    :class:`Lanes` end ``edges`` (25,), ``marks`` (4, WIDTH) of integers, ``elastic`` (WIDTH, cells, 8). Made by NumPy:
+    a kernel without allocation is compiled faster.
+    """
+
+    block: Array
+    edges: IntArray
+    marks: IntArray
+    elastic: Array
+
+
+def scratch(dims: Dims, size: int, of_fields: int, parameters: int, cells: int) -> Scratch:
+    """That for a matrix of ``size`` rows, ``of_fields`` rows of scratch for the fields, members of so many
+    ``parameters`` and tables of so many ``cells``.
+    """
+    n = dims.gas + dims.vapour + dims.medium + dims.wall + dims.memory + 2
+    own = size - dims.gas - dims.vapour - dims.medium
+    step = of_fields, n, size * size, 1, rodas5p.STAGES * n, n, n, 1, 3, 3 * n
+    border = own, own, SHARED, own, SHARED, size
+    lanes = n, 1, 1, parameters, 1, 1, 1, 1
+    edges = np.cumsum([0, *step, *border, *lanes])
+    raw = np.zeros((edges[-1] + 1) * WIDTH)
+    first = -(raw.ctypes.data // 8) % WIDTH  # on a 64-byte boundary: a row that straddles two cache lines costs twice
+    block = raw[first : first + edges[-1] * WIDTH].reshape(-1, WIDTH)
+    return Scratch(block, edges, np.zeros((4, WIDTH), dtype=np.int64), np.zeros((WIDTH, cells, 8)))
 
 
 class Loaded(NamedTuple):

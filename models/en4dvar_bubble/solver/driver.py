@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,9 +16,10 @@ from en4dvar_bubble import tables as tables_module
 from en4dvar_bubble.driving import Driving, Reading
 from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import integrate, rows
-from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output
+from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output, Scratch, scratch
 from en4dvar_bubble.solver.arrow import spans
 from en4dvar_bubble.solver.collocation import ball, exterior
+from en4dvar_bubble.solver.fields import scratch_rows
 
 stamp_with_sources(integrate.integrate, Path(__file__).parent, Path(tables_module.__file__))
 
@@ -144,7 +145,6 @@ class System:
 
 
 _ELASTIC_SPAN, _VISCOUS_SPAN = GRID.span, VISCOUS_GRID.span
-_NO_SPANS = np.zeros((0, 16), dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -230,10 +230,13 @@ class Solver:
     def equations(self, memory: Array, viscous: Array, pulse: Array) -> Equations:
         """What the compiled equations read beside the members' parameters; tables of laws and pulses (…, cells, 8)."""
         system, driving = self.system, self.driving
-        gas, medium = _gas_operators(system.gas), _medium_operators(system.medium, system.medium_length)
-        tables = (_ELASTIC_SPAN, memory, viscous, _VISCOUS_SPAN, pulse, driving.span)
-        nonzero = spans(system.dims) if system.general else _NO_SPANS
-        return Equations(*self.lengths, system.dims, gas, medium, *tables, nonzero, READINGS[self.reading])
+        medium = _medium_operators(system.medium, system.medium_length)
+        general: tuple[Any, ...] = (None,) * 5  # what nobody reads need not be compiled either
+        if system.general:
+            general = medium, memory, viscous, _VISCOUS_SPAN, spans(system.dims)
+        gas, reading = _gas_operators(system.gas), READINGS[self.reading]
+        shared = gas, _ELASTIC_SPAN, pulse, driving.span
+        return Equations(*self.lengths, system.dims, *shared, reading, *general)
 
     @cached_property
     def control(self) -> Control:
@@ -265,5 +268,14 @@ class Solver:
             np.zeros(n_members, dtype=np.int64),
             np.zeros((n_members, integrate.RECORD)),
         )
-        call = partial(integrate.integrate, members, self.equations(memory, viscous, pulse), self.control, output)
+        equations, control = self.equations(memory, viscous, pulse), self.control
+
+        def call() -> None:
+            integrate.integrate(members, equations, control, output, self._scratch(members.parameters.shape[1]))
+
         return call, Solution(*output)
+
+    def _scratch(self, parameters: int) -> Scratch:
+        system = self.system
+        size = len(spans(system.dims)) if system.general else system.size
+        return scratch(system.dims, size, scratch_rows(system.dims), parameters, int(_ELASTIC_SPAN[3]))

@@ -34,10 +34,9 @@ _DELTA = 1e-7  # relative, of differences with respect to the border
 # Rows of the scratch: k, θ, θ^b; τ' (and at the wall), ∇²τ; Y' (likewise), ∇²Y; θ_m' (likewise), ∇²θ_m.
 
 
-@nb.njit
-def scratch(dims):
+def scratch_rows(dims):
     """How many rows of scratch the fields need."""
-    return _of_medium(dims.gas) + 2 * dims.medium + 1
+    return int(_of_medium.py_func(dims.gas)) + 2 * dims.medium + 1
 
 
 @nb.njit

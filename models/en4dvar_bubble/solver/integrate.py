@@ -7,15 +7,12 @@ from __future__ import annotations
 import math
 
 import numba as nb
-import numpy as np
 from numba.core import types
 
-from en4dvar.compiled import kernel
+from en4dvar.compiled import kernel_without_allocation
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.arrays import Lanes, Loaded, Workspace
-from en4dvar_bubble.solver.fields import scratch
-from en4dvar_bubble.solver.general import SHARED
-from en4dvar_bubble.solver.lanes import WIDTH, peek, take
+from en4dvar_bubble.solver.lanes import WIDTH, peek, rows_of, take
 from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, TABLE
 from en4dvar_bubble.solver.step import LEAST_ERROR, attempt, interpolant
 from en4dvar_bubble.tables import fill
@@ -36,33 +33,41 @@ _TURNS_PER_LOOK = 64  # attempted steps between looks at the clock
 _clock = types.ExternalFunction("time", types.int64(types.intp))  # time(NULL) of the C library, seconds
 
 
-@nb.njit
-def _rows(count):
-    """(count, WIDTH) uninitialised, on a 64-byte boundary: a row that straddles two cache lines costs twice."""
-    raw = np.empty((count + 1) * WIDTH)
-    first = (-(raw.ctypes.data // 8)) % WIDTH
-    return raw[first : first + count * WIDTH].reshape(count, WIDTH)
+@nb.njit(inline="always")
+def _workspace(block, at):
+    """The first rows of the block, parted at ``at``."""
+    return Workspace(
+        rows_of(block, at[0], at[1]),
+        rows_of(block, at[1], at[2]),
+        rows_of(block, at[2], at[3]),
+        rows_of(block, at[3], at[4]),
+        rows_of(block, at[4], at[5]),
+        rows_of(block, at[5], at[6]),
+        rows_of(block, at[6], at[7]),
+        rows_of(block, at[7], at[8]),
+        rows_of(block, at[8], at[9]),
+        rows_of(block, at[9], at[10]),
+        rows_of(block, at[10], at[11]),
+        rows_of(block, at[11], at[12]),
+        rows_of(block, at[12], at[13]),
+        rows_of(block, at[13], at[14]),
+        rows_of(block, at[14], at[15]),
+        rows_of(block, at[15], at[16]),
+    )
 
 
-@nb.njit
-def _workspace(eq, n):
-    dims, size = eq.dims, max(n, len(eq.spans))
-    work = _rows(scratch(dims))
-    f, jac, dt, k = _rows(n), _rows(size * size), _rows(1), _rows(rodas5p.STAGES * n)
-    own = size - dims.gas - dims.vapour - dims.medium
-    general = _rows(own), _rows(own), _rows(SHARED), _rows(own), _rows(SHARED), _rows(size)
-    return Workspace(work, f, jac, dt, k, _rows(n), _rows(n), _rows(1), _rows(3), _rows(3 * n), *general)
-
-
-@nb.njit
-def _idle_lanes(n, parameters, cells, step):
-    y, t, h, par = _rows(n), _rows(1), _rows(1), _rows(parameters)
-    y[:], t[:], h[:], par[:] = 0.0, 0.0, step, 0.0
-    member = np.full(WIDTH, -1, dtype=np.int64)
-    began, observed, next_break = np.zeros_like(member), np.zeros_like(member), np.zeros_like(member)
-    proposed, last_h, last_root = np.empty(WIDTH), np.empty(WIDTH), np.empty(WIDTH)
-    rejected = np.zeros(WIDTH, dtype=np.bool_)
-    loaded = Loaded(par, np.zeros((WIDTH, cells, 8)))
+@nb.njit(inline="always")
+def _idle_lanes(block, at, marks, elastic, step):
+    """The last rows of the block, parted at ``at``, and the marks."""
+    y, t, h = rows_of(block, at[0], at[1]), rows_of(block, at[1], at[2]), rows_of(block, at[2], at[3])
+    loaded = Loaded(rows_of(block, at[3], at[4]), elastic)
+    proposed, last_h = rows_of(block, at[4], at[5]), rows_of(block, at[5], at[6])
+    last_root, rejected = rows_of(block, at[6], at[7]), rows_of(block, at[7], at[8])
+    member, began = rows_of(marks, 0, 1), rows_of(marks, 1, 2)
+    observed, next_break = rows_of(marks, 2, 3), rows_of(marks, 3, 4)
+    for lane in range(WIDTH):
+        h[0, lane] = step
+        member[lane] = -1
     return Lanes(y, t, h, loaded, member, began, observed, next_break, proposed, last_h, last_root, rejected)
 
 
@@ -73,14 +78,14 @@ def _begin(i, lane, clock, members, lanes, control, out):
     out.record[i, :] = 0.0
     out.record[i, MIN_LOG_R] = members.initial[i, n - 1]
     out.record[i, END_TIME] = start
-    out.record[i, BEYOND] = np.inf
+    out.record[i, BEYOND] = math.inf
     out.status[i] = OK
     done = 0
     while done < n_times and members.times[i, done] <= start:
         done += 1
     for q in range(n_times):
         for j in range(n):
-            out.states[i, q, j] = members.initial[i, j] if q < done else np.nan
+            out.states[i, q, j] = members.initial[i, j] if q < done else math.nan
     if done == n_times:
         return 0
     lanes.member[lane], lanes.began[lane], lanes.observed[lane] = i, clock, done
@@ -97,7 +102,7 @@ def _begin(i, lane, clock, members, lanes, control, out):
             for j in range(8):
                 elastic[lane, cell, j] = members.tables[i, cell, j]
     lanes.t[0, lane], lanes.h[0, lane] = start, control.first_step
-    lanes.last_h[lane], lanes.rejected[lane] = -1.0, False
+    lanes.last_h[lane], lanes.rejected[lane] = -1.0, 0.0
     b = 0
     while b < len(control.breaks) and _break(b, lane, lanes, control) <= start:
         b += 1
@@ -157,7 +162,7 @@ def _next_step(lane, cut, lanes, w):
         trend = lanes.last_h[lane] / step * root * root / lanes.last_root[lane] / _SAFETY
         shrink = max(shrink, trend)
     grown = step / min(max(shrink, 1.0 / _GROW), 1.0 / _SHRINK)
-    if lanes.rejected[lane]:
+    if lanes.rejected[lane] > 0.0:
         grown = min(grown, step)
     if cut and grown < lanes.proposed[lane] and e < 1.0:
         grown = max(grown, min(lanes.proposed[lane], step * _GROW))
@@ -183,19 +188,19 @@ def _accept(lane, members, lanes, eq, control, w, have_dense, out):
     record[MAX_MACH] = max(record[MAX_MACH], w.norm[2, lane])
     if w.norm[2, lane] > control.valid_mach:
         record[BEYOND] = min(record[BEYOND], now)
-    record[MIN_LOG_R] = min(record[MIN_LOG_R], lanes.y[-1, lane])
+    record[MIN_LOG_R] = min(record[MIN_LOG_R], lanes.y[len(lanes.y) - 1, lane])
     if eq.dims.gas > 0:
         record[MAX_THETA] = max(record[MAX_THETA], lanes.y[0, lane])
     lanes.h[0, lane] = _next_step(lane, cut, lanes, w)
     lanes.last_h[lane], lanes.last_root[lane] = step, max(w.norm[1, lane], _LEAST_ROOT)
-    lanes.rejected[lane] = False
+    lanes.rejected[lane] = 0.0
     return have_dense
 
 
 @nb.njit(inline="always")
 def _reject(lane, lanes, w, out):
     """Shorten a lane's step."""
-    lanes.rejected[lane] = True
+    lanes.rejected[lane] = 1.0
     out.record[lanes.member[lane], REJECTED] += 1
     if math.isfinite(w.norm[0, lane]):
         lanes.h[0, lane] = lanes.h[0, lane] / min(max(w.norm[1, lane] / _SAFETY, 1.0 / _GROW), 1.0 / _SHRINK)
@@ -207,7 +212,7 @@ def _reject(lane, lanes, w, out):
 def _failure(lane, clock, lanes, eq, control, w, out):
     """Why a lane's member cannot go on; OK where it can."""
     failure, dims = OK, eq.dims
-    if not lanes.rejected[lane] and w.norm[2, lane] > control.mach_limit:
+    if lanes.rejected[lane] == 0.0 and w.norm[2, lane] > control.mach_limit:
         failure = MACH_LIMIT
     record = out.record[lanes.member[lane]]
     if record[STEPS] + record[REJECTED] >= control.step_limit:
@@ -221,10 +226,13 @@ def _failure(lane, clock, lanes, eq, control, w, out):
     return failure
 
 
-# With all that it calls: nothing is allocated, so no references to arrays need be counted.
-@nb.njit(_nrt=False)
-def _march(members, lanes, eq, control, w, out):
-    """Refill the lanes, step, look at every lane, until no member is left."""
+@kernel_without_allocation
+def integrate(members, eq, control, out, scratch):
+    """Integrate all members and write their states at the output times: refill the lanes, step, look at every lane,
+    until no member is left. The arguments are those of :mod:`arrays`.
+    """
+    w = _workspace(scratch.block, scratch.edges)
+    lanes = _idle_lanes(scratch.block, scratch.edges[len(w) :], scratch.marks, scratch.elastic, control.first_step)
     n_times = members.times.shape[1]
     waiting, running, attempts, clock = True, 0, 0, _clock(0)
     while True:
@@ -261,12 +269,3 @@ def _march(members, lanes, eq, control, w, out):
                 lanes.member[lane] = -1
                 lanes.h[0, lane] = control.first_step
                 running -= 1
-
-
-@kernel
-def integrate(members, eq, control, out):
-    """Integrate all members and write their states at the output times; the arguments are those of :mod:`arrays`."""
-    w = _workspace(eq, members.initial.shape[1])
-    cells = int(eq.elastic_span[3])
-    lanes = _idle_lanes(members.initial.shape[1], members.parameters.shape[1], cells, control.first_step)
-    _march(members, lanes, eq, control, w, out)
