@@ -68,16 +68,16 @@ def join_within(work: Worklist, executor: Executor) -> None:
     Raises :class:`ConfigError`, :class:`TooFewMembersError`, :class:`OutputError`.
     """
     config, run = work.config, work.run
-    good = [d for d in work.sets if not work.ended[d.name].failure]
+    good = work.good()
     if len(good) < 2:
         run.notice("no joint estimate, for which two data sets need a posterior")
         return
-    made_of = [run.identity.settings, *(f"{d.name}: {work.ended[d.name].sha256}" for d in good)]
+    made_of = [run.identity.settings, *(f"{name}: {work.ended[name].sha256}" for name in good)]
     fingerprint, path = digest("\n".join(made_of).encode()), run.directory.at(FILE)
     done = run.restore(JOINED, fingerprint, str, "the joint estimate is made again")
     if done is not None and path.exists() and file_digest(path) == done:
         return
-    sets = [finished_set(config, load_stored(run.directory.at(d.file)), run.directory.path) for d in good]
+    sets = [finished_set(config, load_stored(address), run.directory.path) for address in good.values()]
     attributes = {**run.attributes, "identity": run.identity.settings, "runs": config.name}
     log = run.log
     _save(_as_configured(sets), sets, config, executor, attributes, path, lambda words: log.write(f"joint: {words}"))
