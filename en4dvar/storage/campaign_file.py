@@ -135,7 +135,7 @@ def failed_datasets(path: Path) -> dict[str, str]:
 
 
 def _root_attribute(path: Path, name: str) -> str:
-    """"" where the file has none. Raises :class:`OutputError`."""
+    """ "" where the file has none. Raises :class:`OutputError`."""
     check_seal(path)
     try:
         with netCDF4.Dataset(path) as file:
@@ -194,7 +194,11 @@ def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequen
     for variable in group.variables.values():
         if variable.dimensions[:1] != ("dataset",):
             continue
-        rows = np.full((len(block), *variable.shape[1:]), _missing(variable), dtype=object if variable.dtype is str else variable.dtype)
+        rows = np.full(
+            (len(block), *variable.shape[1:]),
+            _missing(variable),
+            dtype=object if variable.dtype is str else variable.dtype,
+        )
         if variable.name == "dataset":
             rows[:] = names
         elif "attribute" in variable.ncattrs():

@@ -13,6 +13,7 @@ from en4dvar.report.result import load_result
 from en4dvar.runs.campaign import Campaign, DatasetOutcome, file_names
 from en4dvar.runs.runner import run_campaign, write_report
 from en4dvar.storage.campaign_file import GROUPS
+from en4dvar.storage.pack import PACK, results_of
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +44,7 @@ def test_failures_are_named_and_the_rest_is_estimated(campaign):
         assert f"{outcome.name}: failed: {outcome.failure.splitlines()[0]}" in log
         assert [r["failure"] for r in rows if r["dataset"] == outcome.name] == [outcome.failure]
     assert {r["dataset"]: r["name"] for r in rows if not r["failure"]} == dict.fromkeys(["set0", "set1", "set3"], "k")
-    assert sorted(p.name for p in (campaign.directory / "datasets").iterdir()) == ["set0.nc", "set1.nc", "set3.nc"]
+    assert [p.name for p in results_of(campaign.directory / PACK)] == ["set0", "set1", "set3"]
 
 
 @pytest.mark.parametrize(
