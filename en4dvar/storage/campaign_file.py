@@ -28,6 +28,7 @@ GROUPS = (
     "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "observation_errors",
     "constant_data", "sample_stats", "log_likelihood",
 )  # fmt: skip
+_PATHS = frozenset(f"/{name}" for name in GROUPS)
 LEFT_OUT = {"path_time", "iteration", "mode", "descent"}
 RENAMED = {"time": "observation", "time_column": "observation_column"}  # padded to the longest data set
 PARAMETER = "parameter"
@@ -104,7 +105,7 @@ def _layout(sources: Mapping[str, Path]) -> _Layout:
     layout, damaged, reasons = _Layout(), [], []
     for name, address in sources.items():
         try:
-            layout.add(unpacked(read_result(address)))
+            layout.add(unpacked(read_result(address), _PATHS))
         except OutputError as error:
             damaged.append(name)
             reasons.append(str(error))
@@ -117,12 +118,12 @@ def _blocks(sources: Mapping[str, Path]) -> Iterator[tuple[int, list[str], list[
     """Place of the first, names and groups of as many data sets as are written at once."""
     begin, size, names, block = 0, 0, [], []
     for name, address in sources.items():
-        content = read_result(address)
+        content = read_result(address, check=False)  # it was for the layout
         if block and size + len(content) > BLOCK:
             yield begin, names, block
             begin, size, names, block = begin + len(names), 0, [], []
         names.append(name)
-        block.append(unpacked(content))
+        block.append(unpacked(content, _PATHS))
         size += len(content)
     yield begin, names, block
 
@@ -180,7 +181,7 @@ def _create(
 ) -> netCDF4.Variable:
     """A variable; where it is ``padded``, floats that are missing are NaN."""
     fill = np.nan if padded and kind.kind == "f" else None
-    stored = str if kind.kind in "OU" else np.dtype(np.int8) if kind == bool else kind
+    stored = str if kind.kind in "OU" else np.dtype(np.int8) if kind.kind == "b" else kind
     made = group.createVariable(name, stored, dims, fill_value=fill)
     made.setncatts(attributes)
     made.set_auto_maskandscale(False)
@@ -190,15 +191,13 @@ def _create(
 def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequence[Group]) -> None:
     """The values of consecutive data sets; what one lacks stays missing."""
     found = [_all(source) for source in block]
-    places = [_places(group, source) for source in found]
+    names_here = group[PARAMETER][...].tolist() if PARAMETER in group.variables else []
+    places = [_places(names_here, source) for source in found]
     for variable in group.variables.values():
         if variable.dimensions[:1] != ("dataset",):
             continue
-        rows = np.full(
-            (len(block), *variable.shape[1:]),
-            _missing(variable),
-            dtype=object if variable.dtype is str else variable.dtype,
-        )
+        kind, shape = object if variable.dtype is str else variable.dtype, variable.shape[1:]
+        rows = np.full((len(block), *shape), _missing(variable), dtype=kind)
         if variable.name == "dataset":
             rows[:] = names
         elif "attribute" in variable.ncattrs():
@@ -207,15 +206,23 @@ def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequen
                 if key in source.attrs:
                     rows[i] = source.attrs[key]
         else:
-            for i, source in enumerate(found):
-                if (given := source.get(variable.name)) is not None and given.values.size:  # no parameter, no value
-                    where = (
-                        places[i] if dim == PARAMETER else slice(n)
-                        for dim, n in zip(given.dims, given.values.shape, strict=True)
-                    )  # fmt: skip
-                    rows[(i, *where)] = given.values
-        if rows.dtype != object or (rows != "").any():  # text that is not written is empty
+            for i, (source, place) in enumerate(zip(found, places, strict=True)):
+                if variable.name in source:
+                    _place(rows[i, ...], source[variable.name], place)
+        if kind is not object or (rows != "").any():  # text that is not written is empty
             variable[begin : begin + len(block)] = rows
+
+
+def _place(row: np.ndarray[Any, Any], given: Variable, places: list[int] | None) -> None:
+    """Put the values of one data set into its part of a variable, each parameter in its place."""
+    if row.shape == given.values.shape and (places is None or PARAMETER not in given.dims):
+        row[...] = given.values
+    elif given.values.size:  # no parameter, no value
+        where = (
+            places if places and dim == PARAMETER else slice(n)
+            for dim, n in zip(given.dims, given.values.shape, strict=True)
+        )  # fmt: skip
+        row[tuple(where)] = given.values
 
 
 def _missing(variable: netCDF4.Variable) -> Any:
@@ -224,9 +231,7 @@ def _missing(variable: netCDF4.Variable) -> Any:
     return getattr(variable, "_FillValue", netCDF4.default_fillvals[np.dtype(variable.dtype).str[1:]])
 
 
-def _places(group: netCDF4.Group, source: Mapping[str, Variable]) -> slice | list[int]:
-    """Where the parameters of a data set stand among those of the campaign."""
-    if PARAMETER not in source:
-        return slice(None)
-    names = group[PARAMETER][...].tolist()
-    return [names.index(name) for name in source[PARAMETER].values.tolist()]
+def _places(names: list[str], source: Mapping[str, Variable]) -> list[int] | None:
+    """Where the parameters of a data set stand among those of the campaign, None where they are the same."""
+    own = source[PARAMETER].values.tolist() if PARAMETER in source else names
+    return None if own == names else [names.index(name) for name in own]

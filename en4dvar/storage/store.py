@@ -196,8 +196,8 @@ def result_files(run_dir: Path) -> list[Path]:
         return results_of(run_dir / PACK)
     if (run_dir / "datasets").is_dir():
         raise OutputError(
-            f"{run_dir}: a campaign of an earlier version of en4dvar, with a file for each data set in datasets/; run it "
-            "again, or read these files one by one (load_result)"
+            f"{run_dir}: a campaign of an earlier version of en4dvar, with a file for each data set in datasets/; run "
+            "it again, or read these files one by one (load_result)"
         )
     return [run_dir / "posterior.nc"]
 

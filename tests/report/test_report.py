@@ -30,7 +30,7 @@ from en4dvar.report.figures import all_figures, traces
 from en4dvar.report.history import history
 from en4dvar.report.overview import LISTED, SetSummary, overview_figures, render_overview
 from en4dvar.report.page import judge_chi2
-from en4dvar.report.result import Result
+from en4dvar.report.result import Result, load_result
 from en4dvar.storage.pack import PACK
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.store import save

@@ -17,7 +17,7 @@ from en4dvar.forward import Alternative
 from en4dvar.problem import AssimilationSettings
 from en4dvar.report import write_pages
 from en4dvar.report.responses import StoredShift, shift_text, stored_ledger, stored_shifts
-from en4dvar.report.result import Result
+from en4dvar.report.result import Result, load_result
 from en4dvar.storage.campaign_file import save_campaign
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.store import load_stored, save
