@@ -116,7 +116,9 @@ def _layout(sources: Mapping[str, Path]) -> _Layout:
 
 def _blocks(sources: Mapping[str, Path]) -> Iterator[tuple[int, list[str], list[Groups]]]:
     """Place of the first, names and groups of as many data sets as are written at once."""
-    begin, size, names, block = 0, 0, [], []
+    begin, size = 0, 0
+    names: list[str] = []
+    block: list[Groups] = []
     for name, address in sources.items():
         content = read_result(address, check=False)  # it was for the layout
         if block and size + len(content) > BLOCK:
@@ -206,9 +208,9 @@ def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequen
                 if key in source.attrs:
                     rows[i] = source.attrs[key]
         else:
-            for i, (source, place) in enumerate(zip(found, places, strict=True)):
-                if variable.name in source:
-                    _place(rows[i, ...], source[variable.name], place)
+            for i, (one, place) in enumerate(zip(found, places, strict=True)):
+                if variable.name in one:
+                    _place(rows[i, ...], one[variable.name], place)
         if kind is not object or (rows != "").any():  # text that is not written is empty
             variable[begin : begin + len(block)] = rows
 

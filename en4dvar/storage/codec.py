@@ -72,7 +72,7 @@ def _plain(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
 
 
 @functools.cache
-def _hints(kind: Any) -> dict[str, Any]:
+def _hints(kind: type) -> dict[str, Any]:
     hints = typing.get_type_hints(kind)
     return {f.name: hints[f.name] for f in fields(kind)}
 
@@ -93,7 +93,7 @@ def _typed(raw: Any, kind: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
             raise ValueError(f"{raw!r} is not one of {arguments}")
         return raw
     if is_dataclass(kind):
-        hints = _hints(kind)
+        hints = _hints(typing.cast(type, kind))
         if set(raw) != set(hints):
             raise ValueError(f"the fields of {kind} differ")
         return typing.cast(Any, kind)(**{name: _typed(item, hints[name], arrays) for name, item in raw.items()})

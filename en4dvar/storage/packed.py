@@ -25,7 +25,8 @@ _ALIGNED = 8  # bytes
 
 def packed(groups: Groups) -> bytes:
     """The bytes of the groups."""
-    numbers, words = bytearray(), []
+    numbers = bytearray()
+    words: list[Any] = []
     layout = []
     for path, group in groups.items():
         parts = (group.variables, group.coords)
@@ -44,9 +45,15 @@ def unpacked(content: bytes, wanted: Collection[str] | None = None) -> dict[str,
         begin = _SIZES.size + first
         attributes, words = json.loads(held[begin : begin + second])
         numbers = memoryview(held)[begin + second :]
+
+        def restored(part: list[Any]) -> dict[str, Variable]:
+            return {name: _restored(numbers, words, *v) for name, *v in part}
+
         return {
-            path: Group(*({name: _restored(*v, numbers, words) for name, *v in part} for part in parts), _whole(said))
-            for (path, *parts), said in zip(_layout(bytes(held[_SIZES.size : begin])), attributes, strict=True)
+            path: Group(restored(variables), restored(coords), _whole(said))
+            for (path, variables, coords), said in zip(
+                _layout(bytes(held[_SIZES.size : begin])), attributes, strict=True
+            )
             if wanted is None or path in wanted
         }
     except (struct.error, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
@@ -84,8 +91,8 @@ def _place(v: Variable, numbers: bytearray, words: list[Any]) -> list[Any]:
 
 
 def _restored(
-    dims: tuple[str, ...], shape: list[int], fill: bool, attributes: dict[str, Any], kind: str, where: int,
     numbers: memoryview, words: list[Any],
+    dims: tuple[str, ...], shape: list[int], fill: bool, attributes: dict[str, Any], kind: str, where: int,
 ) -> Variable:  # fmt: skip
     if kind:
         values = np.frombuffer(numbers, kind, math.prod(shape), where)

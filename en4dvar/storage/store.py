@@ -193,7 +193,7 @@ def result_files(run_dir: Path) -> list[Path]:
     """
     require_settled(run_dir)
     if (run_dir / PACK).is_file():
-        return results_of(run_dir / PACK)
+        return results_of(run_dir / PACK) or [run_dir / "posterior.nc"]
     if (run_dir / "datasets").is_dir():
         raise OutputError(
             f"{run_dir}: a campaign of an earlier version of en4dvar, with a file for each data set in datasets/; run "
