@@ -251,8 +251,8 @@ TABLES: dict[str, tuple[str, Callable[[], list[str]]]] = {
         campaign,
     ),
     "many": (
-        "| data sets of a straight line | main process, ms a set | workers, ms a set | memory, MB | resume, s | on disk, MB |"
-        "\n|---|---|---|---|---|---|",
+        "| data sets of a straight line | main process, ms a set | workers, ms a set | memory, MB | resume, s | "
+        "on disk, MB |\n|---|---|---|---|---|---|",
         many,
     ),
 }
