@@ -114,7 +114,7 @@ class Worklist:
             try:
                 if entry.fingerprint != self._fingerprint(d):
                     raise OutputError(f"{self.pack.path / d.stem}: belongs to another run")
-                done = decode_text(self.pack.ending(d.stem), DatasetOutcome)
+                done = decode_text(self.pack.outcome(d.stem), DatasetOutcome)
             except (OutputError, ValueError) as error:
                 self.run.notice(f"{error}; {d.name} is estimated again")
                 continue

@@ -37,14 +37,14 @@ class Entry:
     begin: int
     line: int
     fingerprint: str
-    ending_size: int
+    outcome_size: int
     content_size: int
-    ending_digest: str
+    outcome_digest: str
     content_digest: str
 
     @property
     def end(self) -> int:
-        return self.begin + self.line + self.ending_size + self.content_size
+        return self.begin + self.line + self.outcome_size + self.content_size
 
 
 class Pack:
@@ -60,15 +60,15 @@ class Pack:
         if path.exists():
             self.entries, self._end = _scan(path)
 
-    def append(self, name: str, fingerprint: str, ending: bytes, content: bytes, content_digest: str) -> None:
+    def append(self, name: str, fingerprint: str, outcome: bytes, content: bytes, content_digest: str) -> None:
         """Add a record. Raises :class:`OutputError`; the file is then as it was."""
-        sizes, digests = (len(ending), len(content)), (digest(ending), content_digest)
+        sizes, digests = (len(outcome), len(content)), (digest(outcome), content_digest)
         words = json.dumps([name, fingerprint, *sizes, *digests]).encode("ascii")
         line = b"%s%s %08x %s\n" % (_MAGIC, VERSION.encode("ascii"), zlib.crc32(words), words)
         try:
             file = own_file(self.path)
             try:
-                _append(file, self._end, b"".join((line, ending, content)))
+                _append(file, self._end, b"".join((line, outcome, content)))
                 if time.monotonic() - self._flushed > FLUSH_EVERY:
                     os.fsync(file)
                     self._flushed = time.monotonic()
@@ -87,16 +87,16 @@ class Pack:
         except OSError as error:
             raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from None
 
-    def ending(self, name: str) -> bytes:
+    def outcome(self, name: str) -> bytes:
         """How a data set ended. Raises :class:`OutputError` where it is damaged."""
         e = self.entries[name]
-        return _read(self.path, name, e.begin + e.line, e.ending_size, e.ending_digest)
+        return _read(self.path, name, e.begin + e.line, e.outcome_size, e.outcome_digest)
 
     def content(self, name: str, check: bool = True) -> bytes:
         """The groups of a data set. Raises :class:`OutputError` where they are damaged, if that is to be checked."""
         e = self.entries[name]
         expected = e.content_digest if check else ""
-        return _read(self.path, name, e.begin + e.line + e.ending_size, e.content_size, expected)
+        return _read(self.path, name, e.begin + e.line + e.outcome_size, e.content_size, expected)
 
 
 def results_of(pack: Path) -> list[Path]:

@@ -192,7 +192,7 @@ def result_files(run_dir: Path) -> list[Path]:
     Raises :class:`OutputError` as :func:`require_settled`, and of a campaign of an earlier version.
     """
     require_settled(run_dir)
-    if (run_dir / PACK).is_file():
+    if (run_dir / PACK).exists():
         return results_of(run_dir / PACK) or [run_dir / "posterior.nc"]
     if (run_dir / "datasets").is_dir():
         raise OutputError(
