@@ -37,10 +37,10 @@ from en4dvar.config import Config, load_config
 from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.ensemble.members import Reading
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, ThreadsExecutor, one_blas_thread
-from en4dvar.files import write_bytes
 from en4dvar.prior import own_seed
 from en4dvar.runs.jobs import Job, estimate
 from en4dvar.runs.runner import run_campaign
+from en4dvar.storage.pack import PACK, Pack
 from en4dvar_bubble.model import BubbleModel
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -134,7 +134,7 @@ def profile() -> list[str]:
         "forecast: F and H of all members",
         "analysis and bookkeeping: the rest of the estimate",
         "result: summary and packing",
-        "result: to disk, flushed",
+        "result: to disk",
     )
     return [
         f"| {label} | {a:.2f} | {100 * a / plain[1]:.0f} % | {b:.2f} | {100 * b / whole[1]:.0f} % |"
@@ -150,13 +150,14 @@ def spent(config: Config, emulator: Literal["off", "auto"]) -> list[float]:
     forward = (BubbleModel, "initial_states"), (SerialExecutor, "trajectories"), (Reading, "observe")
     making = (en4dvar.runs.jobs, "build_groups"), (en4dvar.runs.jobs, "packed"), (en4dvar.runs.jobs, "summarise")
     with tempfile.TemporaryDirectory() as folder:
+        pack = Pack(Path(folder, PACK))
         for _ in range(REPEATS):
             read = seconds(lambda: jobs(config), clock)
             watch = Stopwatch()
             with watch.watching("forecast", *forward), watch.watching("result", *making):
                 total = seconds(lambda: [estimate(job) for job in work], clock)
             forecast, result = watch.spent["forecast"], watch.spent["result"]
-            write = seconds(lambda: [write_bytes(Path(folder, "x.nc"), content) for content in contents])
+            write = seconds(lambda: [pack.append("set", "", b"", content, "") for content in contents])
             rows.append((read, forecast, total - forecast - result, result, write))
     return list(1e3 * np.median(rows, axis=0) / len(work))
 

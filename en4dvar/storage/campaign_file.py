@@ -106,7 +106,7 @@ def _layout(sources: Mapping[str, Path]) -> _Layout:
     for name, address in sources.items():
         try:
             layout.add(unpacked(read_result(address), _PATHS))
-        except OutputError as error:
+        except (OutputError, KeyError, ValueError) as error:  # the last two: written by somebody else
             damaged.append(name)
             reasons.append(str(error))
     if damaged:

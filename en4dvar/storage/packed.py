@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.errors import OutputError
 from en4dvar.storage.netcdf import Group, Groups, Variable
 
 _SIZES = struct.Struct("<QQ")  # of the texts
@@ -38,7 +37,7 @@ def packed(groups: Groups) -> bytes:
 
 
 def unpacked(content: bytes, wanted: Collection[str] | None = None) -> dict[str, Group]:
-    """The groups, or those ``wanted``, whose arrays can be written to. Raises :class:`~en4dvar.errors.OutputError`."""
+    """The groups, or those ``wanted``, whose arrays can be written to. Raises :class:`ValueError`."""
     held = bytearray(content)
     try:
         first, second = _SIZES.unpack_from(held)
@@ -57,7 +56,7 @@ def unpacked(content: bytes, wanted: Collection[str] | None = None) -> dict[str,
             if wanted is None or path in wanted
         }
     except (struct.error, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
-        raise OutputError(f"not a result of en4dvar: {error}") from None
+        raise ValueError(f"no packed groups: {error}") from None
 
 
 @functools.lru_cache(maxsize=16)

@@ -210,6 +210,13 @@ def load_stored(path: str | Path) -> StoredResult:
     OutputError: it is not one, of another version, cut short or altered (see :mod:`en4dvar.storage.seal`).
     """
     path = Path(path)
-    nodes = datasets_of(unpacked(read_result(path))) if path.parent.name == PACK else read_groups(path)
+    nodes = _in_pack(path) if path.parent.name == PACK else read_groups(path)
     check_complete(path, nodes)
     return StoredResult(xr.DataTree.from_dict(nodes))
+
+
+def _in_pack(address: Path) -> dict[str, xr.Dataset]:
+    try:
+        return datasets_of(unpacked(read_result(address)))
+    except ValueError as error:  # anybody can write a checksum: the sizes of dimensions differ, for instance
+        raise OutputError(f"{address}: not a result of en4dvar: {error}") from None
