@@ -194,9 +194,9 @@ def _entry(line: bytes, begin: int) -> tuple[str, Entry | None]:
     if words[1] != b"%08x" % zlib.crc32(words[2][:-1]) or not words[2].endswith(b"\n"):
         return "", None
     name, *rest = json.loads(words[2])
-    kinds = (str, int, int, str, str)
-    if tuple(map(type, rest)) != kinds or min(rest[1:3]) < 0 or name != Path(str(name)).name:  # a stranger's
-        return "", None
+    kinds = [str, int, int, str, str]
+    if list(map(type, rest)) != kinds or min(rest[1:3]) < 0 or not name or Path(str(name)).name != name:
+        return "", None  # written by hand
     return name, Entry(begin, len(line), *rest)
 
 

@@ -129,7 +129,7 @@ def mounted(folder, options):
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can mount")
 @pytest.mark.parametrize(
-    "size", [60, 300, 600, pytest.param(1000, marks=pytest.mark.long)], ids=["begin", "datasets", "campaign", "report"]
+    "size", [60, 140, 250, pytest.param(450, marks=pytest.mark.long)], ids=["begin", "datasets", "campaign", "report"]
 )
 @pytest.mark.fault("disk-full")
 def test_a_small_disk(quiet, tmp_path, size):
