@@ -163,7 +163,11 @@ def _begin(work: Worklist) -> None:
 
 
 def _estimate(work: Worklist, executor: Executor) -> None:
-    """Every data set, and the campaign's file; a result that was damaged since it was written is estimated again."""
+    """Every data set, and the campaign's file; a result that was damaged since it was written is estimated again, once.
+
+    Raises what :meth:`Worklist.work` does; :class:`DamagedError` where that was of no use, as on a disk that fails.
+    """
+    repeated: set[str] = set()
     while True:
         work.work(executor)
         work.pack.flush()
@@ -176,6 +180,9 @@ def _estimate(work: Worklist, executor: Executor) -> None:
             save_campaign(work.run.directory.at("posterior.nc"), good, attributes, failures)
             return
         except DamagedError as error:
+            if not repeated.isdisjoint(error.names):
+                raise
+            repeated.update(error.names)
             work.estimate_again(error.names)
 
 

@@ -34,7 +34,7 @@ RENAMED = {"time": "observation", "time_column": "observation_column"}  # padded
 PARAMETER = "parameter"
 FAILURES = "failed_datasets"  # root attribute: JSON of name → reason
 MADE_OF = "datasets_sha256"  # root attribute: digest of the results in the file
-BLOCK = 1 << 24  # bytes of results that are written at once
+BLOCK = 1 << 22  # bytes of results that are written at once
 
 
 class DamagedError(OutputError):
