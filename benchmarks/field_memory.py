@@ -26,7 +26,6 @@ from en4dvar.assimilate import assimilate
 from en4dvar.descent.field import field_en4dvar, field_esmda
 from en4dvar.descent.field_data import FieldData
 from en4dvar.field_prior import FieldPrior
-from en4dvar.files import write_bytes
 from en4dvar.forward import ForwardModel, Observable, StateField
 from en4dvar.noise import noise_of
 from en4dvar.observations import Observations
@@ -73,7 +72,7 @@ def problem(side: int, members: int) -> None:
     found = assimilate(asked, AssimilationSettings("es-mda", members=members, localisation=near), 0)
     told("assimilate, es-mda", found.fields[0].members.nbytes, side, members, began)
     with tempfile.TemporaryDirectory() as folder:
-        write_bytes(Path(folder) / "posterior.nc", to_bytes(build_groups(found, {})))
+        to_bytes(build_groups(found, {})).write(Path(folder) / "posterior.nc")
         told("and its file", found.fields[0].members.nbytes, side, members, began)
 
 

@@ -27,9 +27,10 @@ from en4dvar.state import TIME_SHIFT, Array, Field, Parameter, StateLayout
 # one solution of an oracle took four times the CPU time. What tests start has the number that it would have anyway.
 threadpool_limits(1, user_api="blas")
 
-# A file is one worker's (``--dist loadfile``). Where xdist keeps the order (``--no-loadscope-reorder``, as in .ci/run),
-# the files that take longest start first, or one worker would be left with them at the end.
-LONGEST = ("test_commands", "test_study", "test_examples", "test_imr_suite", "test_terminal", "test_generated_input")
+# A file is one worker's (``--dist loadfile``), and the files keep the order given below (``--no-loadscope-reorder``).
+# First the file that compiles what most bubbles need: begun by both workers at once it would be compiled by both. Then
+# those that take longest, or one worker would be left with them at the end.
+FIRST = ("test_solver", "test_study", "test_commands", "test_examples", "test_imr_suite", "test_terminal")
 
 FAILED = 3
 
@@ -136,9 +137,9 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The :data:`LONGEST` files first, then those with the most tests."""
+    """The files of :data:`FIRST`, then those with the most tests."""
     tests = Counter(item.path for item in items)
-    ranks = {path: LONGEST.index(path.stem) if path.stem in LONGEST else len(LONGEST) for path in tests}
+    ranks = {path: FIRST.index(path.stem) if path.stem in FIRST else len(FIRST) for path in tests}
     items.sort(key=lambda item: (ranks[item.path], -tests[item.path]))
 
 

@@ -88,6 +88,8 @@ def _estimate(config: Config, force: bool, resume: bool) -> None:
 def _tell(campaign: Campaign, with_report: bool) -> None:
     """The posterior on standard output, warnings on standard error. Raises :class:`Failed` where a data set has."""
     from en4dvar.storage.joint_file import FILE, load_joint
+    from en4dvar.storage.population_file import FILE as POPULATION
+    from en4dvar.storage.population_file import load_population
     from en4dvar.summary import results_table
 
     if len(campaign) <= MOST_TOLD:
@@ -100,10 +102,16 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
         from en4dvar.report.joint import joint_table
 
         click.echo(f"\n{joint_table(together)}")
+    behind = load_population(campaign.directory / POPULATION) if (campaign.directory / POPULATION).exists() else None
+    if behind:
+        from en4dvar.report.population import population_lines
+
+        click.echo("\n" + "\n".join(population_lines(behind)))
     for notice in campaign.notices:
         click.echo(f"warning: {notice}", err=True)
     found = [(o.name, warning) for o in campaign.outcomes for warning in o.warnings]
     found += [("all together", warning) for warning in (together.cautions if together else ())]
+    found += [("population", warning) for warning in (behind.cautions if behind else ())]
     told = sorted(found, key=lambda of_set: of_set[1].rank)  # the worst first; the mildest are left out
     for name, warning in told[:MOST_TOLD]:
         click.echo(f"{warning.kind}: {name}: {warning}", err=True)

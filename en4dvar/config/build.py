@@ -81,7 +81,11 @@ def problem_of(config: Config, observations: Observations) -> InverseProblem:
     problem = InverseProblem(config.model, config.observable, observations, prior, fixed, perturbations, tied, fields)
     if varying:
         problem = problem.varied(varying)
-    check_problem(problem)
+    try:
+        check_problem(problem)
+    except ConfigError as error:
+        located = [config.document.fault(tuple(f.path.split(".")), f.message) if f.path else f for f in error.problems]
+        raise ConfigError(located) from None
     if localised:
         try:
             gain_of(problem, asked)

@@ -89,7 +89,12 @@ class Data(Section):
         if block is not None and block.size > 1 and "places" not in given:
             faults.add(("places",), f"required: {block.name!r} is a field of {block.size} values; say which were read")
         columns = given.get("columns")
-        if not isinstance(columns, dict) or context.observed:
+        if context.observed:
+            if not isinstance(columns, dict) or context.observed.name not in columns:
+                name = context.observed.name
+                faults.add(("columns", name), f"required: the column of {name}, {{name: <column>, unit: <unit>}}")
+            return
+        if not isinstance(columns, dict):
             return
         roles = ["time", *(observable.name for observable in context.units.observables)]
         for name in columns:

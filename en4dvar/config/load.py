@@ -17,6 +17,7 @@ from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.initial_state import PERTURBED, Initial, Perturbed
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, entries
+from en4dvar.config.population import PopulationSection, check_population
 from en4dvar.config.schema import Assimilation, Execution, File, Output, Section
 from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.sharing import Groups, Sharing, sharing_of
@@ -49,6 +50,8 @@ class Estimation(File):
     groups: Groups | None = None
     """What data sets have in common, e.g. ``gel: {soft: 'a_*', stiff: [b_*, c_01]}``: under each kind of group the
     groups, with patterns of the names of their data sets."""
+    population: PopulationSection | None = None
+    """Mean and spread of parameters over the data sets, estimated at the end of the run."""
     prior: PriorFile | None = None
     """A file of members, for the parameters with ``{prior: ensemble}``."""
     prior_correlation: tuple[PriorCorrelation, ...] | None = None
@@ -102,6 +105,7 @@ class Config:
     model_error: tuple[ErrorOf, ...] = ()
     dependence: tuple[Dependence, ...] = ()
     design: Design = field(default_factory=Design)
+    population: PopulationSection | None = None
 
     @property
     def text(self) -> str:
@@ -139,6 +143,8 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
     apart = {} if NOISE_SCALE.name in own else {NOISE_SCALE.name: "it is the scale of the errors"}
     others = [one.term.parameter.name for one in file.initial_state or () if isinstance(one, Perturbed)]
     parameters, blocks = resolved(file.parameters, file.prior, file.prior_correlation or (), others, apart, document)
+    if file.population is not None:
+        check_population(file.population, parameters, document)
     return Config(
         document=document,
         name=file.name,
@@ -160,6 +166,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
         model_error=file.model_error or (),
         dependence=blocks,
         design=file.design or Design(),
+        population=file.population,
     )
 
 

@@ -136,7 +136,9 @@ class Tied:
                 [Fault(f"{self.to!r} is no other parameter of the model{suggest(self.to, names)}", "tied")]
             )
         if isinstance(other, Tied):
-            raise ConfigError([Fault(f"{self.to} is tied itself; tie {name} to {other.to}", "tied")])
+            raise ConfigError(
+                [Fault(f"{self.to} is tied itself; tie {name} to a parameter with a prior or a value", "tied")]
+            )
         if isinstance(other, Uncertain) and other.spec.varies is not None:
             raise ConfigError([Fault(f"{self.to} varies in time, and nothing can follow that", "tied")])
         if other.parameter.unit != self.parameter.unit:
@@ -348,7 +350,7 @@ def entries(kind: str = "") -> Made:
             for name, entry in found.items():
                 if kind and entry.needs_data:
                     faults.add((name,), f"{kind} has no data file to take a value from")
-                if isinstance(entry, Tied):
+                if isinstance(entry, Tied) and (entry.to in found or entry.to not in given):  # else that is told
                     with faults.at(name):
                         entry.check(found, [p.name for p in model.parameters])
                 if kind and isinstance(entry, Tied):

@@ -17,7 +17,7 @@ from en4dvar.config.validate import Faults
 from en4dvar.config.varies import ErrorOf, Knots
 from en4dvar.cycling.coordinates import EnsembleCoordinates
 from en4dvar.cycling.model_error import ModelError
-from en4dvar.cycling.sequential import SequentialSettings
+from en4dvar.cycling.settings import SequentialSettings
 from en4dvar.cycling.smoothers import EnKS, EnRTS
 from en4dvar.errors import ConfigError, Fault
 from en4dvar.forward import ForwardModel
@@ -210,7 +210,10 @@ def per_time(spec: Knots, std: float, path: str) -> float:
     """Variance per unit of time. Raises :class:`ConfigError`."""
     if spec.every is None:
         raise ConfigError([Fault("give every, the time after which it is std: in a series it grows all along", path)])
-    return std**2 / spec.every
+    try:
+        return std**2 / spec.every
+    except OverflowError:
+        raise ConfigError([Fault("too large: its square is no number", f"{path}.std")]) from None
 
 
 def localisation_of(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -17,12 +18,15 @@ from en4dvar.hints import shown, suggest
 M = TypeVar("M", bound=BaseModel)
 Place = tuple[str | int, ...]
 
+_KIND = re.compile(r"\w+_(type|parsing|parsing_size|from_float)|finite_number")  # verdicts on what a value is
+_NOT = ", not "
 _SECTION = "expected 'key: value' lines"
 _MESSAGES = {
     "missing": "required, but not given",
     "dict_type": _SECTION,
     "model_type": _SECTION,
     "model_attributes_type": _SECTION,
+    "string_too_short": "must not be empty",
     "tuple_type": "expected a list, e.g. [1, 2]",
     "string_type": "expected text; put it in quotes",
     "path_type": "expected the path of a file or folder",
@@ -42,8 +46,9 @@ def check(
     try:
         return schema.model_validate(value, context=context)
     except ValidationError as error:
-        for finding in _tell(error, schema):
-            fault = document.fault(_written(finding, path, document), finding.message, at_key=finding.at_key)
+        findings = [(_written(finding, path, document), finding) for finding in _tell(error, schema)]
+        for place, finding in _one_each(findings):
+            fault = document.fault(place, finding.message, at_key=finding.at_key)
             if fault not in faults:
                 faults.append(fault)
     return None
@@ -51,12 +56,14 @@ def check(
 
 @dataclass(frozen=True)
 class _Finding:
-    """What is wrong at ``place``; ``absent``: its last key may be one that the file lacks."""
+    """What is wrong at ``place``; ``absent``: its last key may be one that the file lacks; ``kind``: the value is of no
+    kind that can stand there, of which there may be several."""
 
     place: Place
     message: str
     at_key: bool = False
     absent: bool = False
+    kind: bool = False
 
 
 class Faults:
@@ -77,8 +84,10 @@ class Faults:
         message = finding.message
         for declared, written in self._names.items():
             message = message.replace(declared, written)
-        context = {"message": message, "at_key": finding.at_key, "absent": finding.absent}
+        context = {"message": message, "at_key": finding.at_key, "absent": finding.absent, "kind": finding.kind}
         where = tuple(self._names.get(str(part), part) for part in finding.place)
+        if not finding.kind and any(line["loc"] == where for line in self._lines):
+            return  # one at a place: what holds for several sections is told once
         self._lines.append({"type": PydanticCustomError("fault", "{message}", context), "loc": where, "input": None})
 
     @contextmanager
@@ -118,8 +127,22 @@ def _tell(error: ValidationError, schema: type[BaseModel]) -> Iterator[_Finding]
         elif kind == "extra_forbidden":
             hint = suggest(place[-1], sorted(_known(schema, place[:-1])))
             yield _Finding(place, f"unknown key {shown(str(place[-1]))}{hint}", at_key=True)
-        else:
-            yield _Finding(place, _message(item), absent=kind == "missing")
+        elif kind != "too_short" or len(item["input"]) < context["min_length"]:  # else of its parts some are at fault
+            yield _Finding(place, _message(item), absent=kind == "missing", kind=bool(_KIND.fullmatch(kind)))
+
+
+def _one_each(findings: Sequence[tuple[Place, _Finding]]) -> Iterator[tuple[Place, _Finding]]:
+    """One finding a place: where no kind fits, one that names all that do, unless more is told of it or its parts."""
+    known = set[Place]()
+    for place, finding in findings:
+        more = any(p[: len(place)] == place and (p != place or not other.kind) for p, other in findings)
+        if place in known or (finding.kind and more):
+            continue
+        known.add(place)
+        if finding.kind:
+            words = dict.fromkeys(other.message.partition(_NOT)[0] for p, other in findings if p == place)
+            finding = replace(finding, message=" or ".join(words) + _NOT + finding.message.partition(_NOT)[2])
+        yield place, finding
 
 
 def _written(finding: _Finding, path: Sequence[str | int], document: Document) -> Place:
@@ -140,7 +163,7 @@ def _message(item: Any) -> str:
     if kind == "too_short":
         return f"give at least {context['min_length']}, not {shown(item['input'])}"
     message = _MESSAGES.get(kind, item["msg"].replace("Input should be", "should be"))
-    return message if kind == "missing" else f"{message}, not {shown(item['input'])}"
+    return message if kind == "missing" else f"{message}{_NOT}{shown(item['input'])}"
 
 
 def _not_one_of(given: object, expected: str) -> str:

@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from en4dvar.cycling.aligned import aligned
-from en4dvar.cycling.sequential import SequentialResult, SequentialSettings, SequentialState, run_sequential
+from en4dvar.cycling.outcome import SequentialResult, SequentialState
+from en4dvar.cycling.sequential import run_sequential
 from en4dvar.cycling.series import CycleSeries
+from en4dvar.cycling.settings import SequentialSettings
 from en4dvar.cycling.start import InitialEnsemble
 from en4dvar.executor import Executor
 from en4dvar.forward import Observable

@@ -15,19 +15,18 @@ those of one ensemble; its reason is kept.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.cycling.coordinates import EnsembleCoordinates
-from en4dvar.cycling.model_error import ModelError, fresh_noise
+from en4dvar.cycling.model_error import fresh_noise
 from en4dvar.cycling.moments import InnovationRecorder, Moments, MomentsRecorder
 from en4dvar.cycling.moving import Flow, MembersLost
+from en4dvar.cycling.outcome import SequentialResult, SequentialState
 from en4dvar.cycling.rotation import Rotations, rotate
-from en4dvar.cycling.series import CycleSeries
-from en4dvar.cycling.smoothers import EnKS, Smoother
+from en4dvar.cycling.series import CycleSeries as CycleSeries
+from en4dvar.cycling.settings import SequentialSettings as SequentialSettings
 from en4dvar.cycling.window import Ahead, Batch, CycleDescent, CycleWindow, is_filter
 from en4dvar.descent.loop import iterate
 from en4dvar.ensemble.linalg import centre
@@ -36,110 +35,11 @@ from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.forward import ForwardModel, Observable
 from en4dvar.prior import member_stream
-from en4dvar.schemes.base import SeriesScheme, Weights
-from en4dvar.schemes.bootstrap_filter import BootstrapFilter
-from en4dvar.schemes.inflation import Inflation
-from en4dvar.schemes.localisation import Localisation
+from en4dvar.schemes.base import Weights
 from en4dvar.state import Array
 
-NO_INFLATION = Inflation()
 ALL = slice(None)
 Rows = npt.NDArray[np.intp] | slice  # of an ensemble: those that survive
-
-
-@dataclass(frozen=True)
-class SequentialSettings:
-    """How the loop treats the ensemble of ``scheme``.
-
-    ``rotation``: every analysis is turned by a random mean-preserving rotation (:mod:`en4dvar.cycling.rotation`).
-    ``stochastic_model``: a model that gives other numbers when a member is run again is accepted.
-    ``to_end``: the last times, which no whole window follows, are smoothed by the observations that there are.
-    ``innovations``: what was expected of each observation is recorded. ``members_every``: analysis ensembles are kept
-    after so many observation times, and the last; 0: the last alone.
-    ``smoother``: what goes behind a filter (:mod:`en4dvar.cycling.smoothers`).
-
-    Raises
-    ------
-    ValueError: a smoother behind what is no cycled filter, localisation of what has no local analysis.
-    """
-
-    scheme: SeriesScheme
-    inflation: Inflation = NO_INFLATION
-    rotation: bool = False
-    localisation: Localisation | None = None
-    min_active_fraction: float = 0.5
-    stochastic_model: bool = False
-    model_error: ModelError | None = None
-    coordinates: EnsembleCoordinates = field(default_factory=EnsembleCoordinates)
-    to_end: bool = False
-    innovations: bool = False
-    members_every: int = 0
-    smoother: Smoother | None = None
-
-    def __post_init__(self) -> None:
-        if self.smoother and (self.scheme.lag or not self.scheme.cycled):
-            raise ValueError("a smoother goes behind a filter that is cycled, not behind ienks or a baseline")
-        if self.localisation and isinstance(self.smoother, EnKS):
-            raise ValueError("enks needs the weights of one analysis for all of the state; with localisation use enrts")
-        if self.localisation and isinstance(self.scheme, BootstrapFilter):
-            raise ValueError("members survive as a whole: the particle filter takes no localisation")
-
-    @property
-    def smooths(self) -> bool:
-        """Whether there are smoothed states."""
-        return bool(self.scheme.lag or self.smoother)
-
-
-@dataclass(frozen=True)
-class SequentialState:
-    """All that the rest of a run depends on, besides its arguments, and what it has found so far.
-
-    ``cycle`` observation times are done; ``ensemble`` (N', n_state + changes) stands at ``start`` (0: time zero, k:
-    observation time k). Random numbers are drawn by cycle, so that no generator has a state.
-    """
-
-    cycle: int
-    start: int
-    ensemble: Array
-    forecast: Moments
-    analysis: Moments
-    smoothed: Moments
-    predicted: Moments
-    ranks: Array
-    evidence: Array
-    iterations: Array
-    effective: Array
-    kept: tuple[tuple[int, Array], ...]
-    forward_runs: int
-    failures: tuple[str, ...] = ()
-    trail: tuple[Array, ...] = ()
-
-
-@dataclass(frozen=True)
-class SequentialResult:
-    """What a run leaves: moments of forecast, analysis (by y_1…y_k) and smoothed ensemble (by y_1…y_{k+L}).
-
-    The last L smoothed rows of the IEnKS, unless ``to_end``, and all of a filter without a smoother are NaN.
-    ``predicted``: moments (K, p) of the forecast where it was observed. ``ranks`` (K, p): share of the members, with
-    the errors of the observations, that lie below the observation, NaN where there was none. ``evidence`` (K,): log
-    density of the observations of a time given those before, of the Gaussian of the forecast; NaN in a twin experiment.
-    ``iterations`` (K,) forecasts of the window. ``effective`` (K,): members that the weights of a particle filter
-    leave, NaN: all. ``members`` (N', n) the final ensemble at the start of the last window; ``kept``: index of a time →
-    analysis members (N', n), physical; ``failures`` the reasons of the members lost.
-    """
-
-    forecast: Moments
-    analysis: Moments
-    smoothed: Moments
-    predicted: Moments
-    ranks: Array
-    evidence: Array
-    iterations: Array
-    effective: Array
-    members: Array
-    kept: tuple[tuple[int, Array], ...] = ()
-    failures: tuple[str, ...] = ()
-    forward_runs: int = 0
 
 
 def run_sequential(

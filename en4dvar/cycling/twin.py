@@ -18,8 +18,10 @@ import numpy as np
 
 from en4dvar.cycling.moments import Moments
 from en4dvar.cycling.moving import Flow, MembersLost, predictions
-from en4dvar.cycling.sequential import SequentialResult, SequentialSettings, SequentialState, run_sequential
+from en4dvar.cycling.outcome import SequentialResult, SequentialState
+from en4dvar.cycling.sequential import run_sequential
 from en4dvar.cycling.series import CycleSeries
+from en4dvar.cycling.settings import SequentialSettings
 from en4dvar.cycling.start import InitialEnsemble
 from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import Executor, SerialExecutor

@@ -11,7 +11,7 @@ import numpy as np
 
 from en4dvar.ensemble.members import EVERYONE, Indices, InitialStates, Reading, out_of_bounds
 from en4dvar.ensemble.readout import Readout, batched, operators_of
-from en4dvar.errors import ConfigError
+from en4dvar.errors import ConfigError, Fault
 from en4dvar.executor import Executor, SerialExecutor
 from en4dvar.noise import Predicted
 from en4dvar.problem import InverseProblem
@@ -203,7 +203,8 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
             raise ConfigError(f"{', '.join(sorted(names))}: {message}")
     for given, parameter in ((problem.has_reading_scale, READING_SCALE), (problem.has_reading_offset, READING_OFFSET)):
         if given and problem.observations.parts:
-            raise ConfigError(f"{parameter.name}: one number for several series or for places means nothing")
+            where = f"parameters.{parameter.name}"
+            raise ConfigError([Fault("one number for several series or for places means nothing", where)])
     _operators(problem)
     return tuple(known[name] for name in problem.fixed)
 

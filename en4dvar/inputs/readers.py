@@ -98,8 +98,9 @@ def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int
     fits = {"std": stds > 0, "weight": stds >= 0, "place": np.isfinite(stds)}[column.kind]
     wrong = np.flatnonzero(~(np.isfinite(stds) & fits))
     if len(wrong):
-        said, sign = written[kept[wrong[0]]], {"std": "not positive", "weight": "negative", "place": "not finite"}
-        what = "is blank" if np.isnan(said) else f"is {said:g}, {sign[column.kind]}"
+        said = written[kept[wrong[0]]]
+        sign = {"std": "not positive", "weight": "negative"}[column.kind] if np.isfinite(said) else "not finite"
+        what = "is blank" if np.isnan(said) else f"is {said:g}, {sign}"
         noun = {"std": "error"}.get(column.kind, column.kind)
         raise DataError(f"{path}: the {noun} of reading {kept[wrong[0]] + 1} in column {column.name!r} {what}")
     return stds

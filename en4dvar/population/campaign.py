@@ -16,7 +16,7 @@ from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor
 from en4dvar.hints import suggest
 from en4dvar.population.effort import Effort
-from en4dvar.population.estimate import Population, estimate_population, moments
+from en4dvar.population.estimate import FEWEST_SETS, Population, estimate_population, moments
 from en4dvar.population.hyper import HyperPrior
 from en4dvar.prior import Prior, PriorTerm, member_stream
 from en4dvar.problem import InverseProblem
@@ -127,6 +127,14 @@ def terms_of(problems: Sequence[InverseProblem], names: Sequence[str]) -> tuple[
     return tuple(found)
 
 
+def runs_of(problems: Sequence[InverseProblem], names: Sequence[str], executor: Executor | None = None) -> ForwardRuns:
+    """Forward runs for the population of ``names``. Raises :class:`ConfigError`, see :func:`population_of`."""
+    if any(one.prior.blocks for one in problems):
+        raise ConfigError("a population needs priors that are not correlated")
+    terms_of(problems, names)
+    return ForwardRuns(problems, executor, white=True)
+
+
 def population_of(
     problems: Sequence[InverseProblem],
     start: Sequence[Array],
@@ -151,12 +159,10 @@ def population_of(
         cannot take; a correlated prior; a prior of ``names`` that is not the same in all. ValueError: too few
         successful runs about the best fit of one.
     """
-    if len(problems) < 3:
-        raise ConfigError("a population needs at least 3 data sets")
-    if any(one.prior.blocks for one in problems):
-        raise ConfigError("a population needs priors that are not correlated")
+    if len(problems) < FEWEST_SETS:
+        raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets")
+    runs = runs_of(problems, names, executor)
     terms, scales = terms_of(problems, names), hyper or HyperPrior()
-    runs = ForwardRuns(problems, executor, white=True)
     count = min(map(len, start))
     starts = np.stack([one[:count] for one in start])
     found = estimate_population(runs, starts, white_prior(problems[0].prior), names, seed, scales, effort, workers)

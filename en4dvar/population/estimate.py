@@ -41,6 +41,7 @@ from en4dvar.sampling.forward_runs import CampaignRuns
 from en4dvar.sampling.mixture import StudentMixture
 from en4dvar.state import Array
 
+FEWEST_SETS = 3  # with fewer nothing is known of a spread
 FEWEST = 100.0  # effective draws of a result that can be trusted
 WIDER = 1.3  # the interim prior than the population found
 NODES = 24  # of the quadrature
@@ -135,8 +136,8 @@ def estimate_population(
     ValueError: fewer than 3 sets, a correlated prior, or too few successful runs about the best fit of one.
     """
     scales, effort = hyper or HyperPrior(), effort or Effort()
-    if len(start) < 3:
-        raise ValueError("a population needs at least 3 data sets")
+    if len(start) < FEWEST_SETS:
+        raise ValueError(f"a population needs at least {FEWEST_SETS} data sets")
     if prior.blocks:
         raise ValueError("a population needs a prior of independent parameters")
     with one_blas_thread():

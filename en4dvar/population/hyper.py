@@ -11,8 +11,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Gt
 
 from en4dvar.population.mixtures import Mixture, log_marginal
 from en4dvar.prior import Prior
@@ -27,8 +29,12 @@ MOVES = 5  # of one half of the walkers while the other stands still
 class HyperPrior:
     """Standard deviation of ν about the prior mean and scale of τ, in transformed coordinates."""
 
-    mean_std: float = 1.0
-    spread: float = 0.5
+    mean_std: Annotated[
+        float, Gt(0), "Hyperprior of the mean: normal about the prior's, with so many of its standard deviations."
+    ] = 1.0
+    spread: Annotated[
+        float, Gt(0), "Hyperprior of the spread: half-normal, with so many of the prior's standard deviations."
+    ] = 0.5
 
 
 class Hyper:

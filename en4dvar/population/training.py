@@ -5,27 +5,27 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from en4dvar.population.effort import Effort
 from en4dvar.population.likelihoods import JITTER, EmulatedLikelihood, draw_interim, fit_likelihood
 from en4dvar.population.marginals import TEMPERATURE
 from en4dvar.prior import member_stream
+from en4dvar.sampling.evidence import sample_sets
 from en4dvar.sampling.forward_runs import CampaignRuns, Sets, log_likelihood
+from en4dvar.sampling.importance import Importance, standard
+from en4dvar.sampling.mixture import StudentMixture, resampled
 from en4dvar.state import Array
 
-SAMPLE, SEARCH = 512, 80  # of the interim prior, and rounds of a search from it
-POOR = 4.0  # standard deviations of χ²
+DRAWS = 400  # of a round of the search for all modes
+NARROWEST = 0.03  # standard deviation of what is drawn about the start, in units of the interim prior
 SETTLING = 6  # the walkers' positions are kept after this part of their rounds
-PIECES = 8  # of a large batch of control vectors, run one after the other
 
 
 class Training:
     """Points (S, B, n) that were run and what came of them (S, B, K); ``count`` forward runs.
 
-    The first are visited by walkers of each set under N(mean, std²), from ``start`` on. Where that fits too badly to be
-    chance (it may have ended in a minimum that is not the lowest), they start from where a search from a sample of
-    N(mean, std²) ends, if that is better.
+    The first are visited by walkers of each set under N(mean, std²). They start from draws of that posterior, all its
+    modes in their proportions, by importance sampling from N(mean, std²) and ``start``, which may have missed some.
     """
 
     def __init__(
@@ -67,17 +67,17 @@ class Training:
         self, start: Array, walkers: int, mean: Array, std: Array, stream: np.random.Generator
     ) -> tuple[Array, Array]:
         """(W, S, n) where the walkers start, and their log-densities (W, S)."""
-        x = start[:, stream.permutation(start.shape[1])[:walkers]].transpose(1, 0, 2).copy()
-        logs = log_likelihood(self.runs, self._run(x))
-        density = logs + _log_gauss(x, mean, std)
-        observations = np.sum(self.runs.weight > 0, axis=1)
-        poor = np.flatnonzero(-2 * logs.mean(axis=0) > observations + POOR * np.sqrt(2 * observations))
-        if len(poor):
-            found, best = self._searched(poor, mean, std, walkers, stream)
-            better = poor[best.max(axis=0) > density[:, poor].max(axis=0)]
-            chosen = np.isin(poor, better)
-            x[:, better], density[:, better] = found[:, chosen], best[:, chosen]
-        return x, density
+        found = {
+            s: Importance(_about(standard(len(mean)), (one - mean) / std), member_stream(self.seed, "start", s), DRAWS)
+            for s, one in enumerate(start)
+        }
+        sample_sets(self.runs, lambda z: mean + std * z, found)
+        self.count += sum(len(one.z) for one in found.values())
+        if failed := [s for s, one in found.items() if not np.isfinite(one.log)]:
+            raise ValueError(f"no forward run of data set number {failed[0] + 1} succeeded")
+        x = np.stack([mean + std * one.z[resampled(one.shares, walkers, stream)] for one in found.values()], axis=1)
+        x = stream.permuted(x, axis=0)
+        return x, log_likelihood(self.runs, self._run(x)) + _log_gauss(x, mean, std)
 
     def _visit(
         self, x: Array, density: Array, mean: Array, std: Array, rounds: int, stream: np.random.Generator
@@ -110,31 +110,6 @@ class Training:
         )
         return positions
 
-    def _searched(
-        self, sets: npt.NDArray[np.intp], mean: Array, std: Array, count: int, stream: np.random.Generator
-    ) -> tuple[Array, Array]:
-        """(count, s, n) coordinates that differential evolution finds for ``sets``, and their log-densities."""
-
-        def evaluated(at: Array) -> Array:
-            pieces = [log_likelihood(self.runs, self._run(p, sets), sets) for p in np.array_split(at, PIECES)]
-            return np.concatenate(pieces) + _log_gauss(at, mean, std)
-
-        own = np.arange(len(sets))
-        x = mean + std * stream.standard_normal((SAMPLE, len(sets), len(mean)))
-        density = evaluated(x)
-        first = np.argsort(-density, axis=0)[:count]
-        x, density = x[first, own], density[first, own]
-        for _ in range(SEARCH):
-            a = stream.integers(count, size=density.shape)
-            b = (a + stream.integers(1, count, size=density.shape)) % count
-            top = x[np.argmax(density, axis=0), own]
-            pull, push = stream.uniform(0, 1, (2, *density.shape, 1))
-            trial = x + pull * (top - x) + push * (x[a, own] - x[b, own])
-            new = evaluated(trial)
-            better = new > density
-            x, density = np.where(better[..., None], trial, x), np.where(better, new, density)
-        return x, density
-
     def _fitted(self, draws: Array, mean: Array, std: Array) -> list[EmulatedLikelihood]:
         values, weight = self.runs.values, self.runs.weight
         log_prior = _log_gauss(self.at, mean, std)
@@ -146,3 +121,13 @@ class Training:
 
 def _log_gauss(x: Array, mean: Array, std: Array) -> Array:
     return np.asarray(-0.5 * np.sum(((x - mean) / std) ** 2, axis=-1))
+
+
+def _about(first: StudentMixture, z: Array) -> StudentMixture:
+    """``first`` and, as often, draws about points (N, n)."""
+    covariance = np.cov(z, rowvar=False).reshape(first.root.shape[1:]) + NARROWEST**2 * np.eye(z.shape[1])
+    return StudentMixture(
+        np.append(first.share, 1.0) / 2,
+        np.vstack([first.centre, z.mean(axis=0)]),
+        np.concatenate([first.root, np.linalg.cholesky(covariance)[None]]),
+    )

@@ -24,6 +24,7 @@ from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
 from en4dvar.storage.campaign_file import failed_datasets
 from en4dvar.storage.joint_file import FILE
 from en4dvar.storage.pack import PACK
+from en4dvar.storage.population_file import FILE as POPULATION
 from en4dvar.storage.store import StoredResult, load_stored, result_files
 from en4dvar.summary import summary_csv
 from en4dvar.tables import csv_text
@@ -32,6 +33,7 @@ PAGES = 40  # data sets of a campaign with a page from the start
 SHARE = 20  # pages that are worth the start of a process
 TABLES = {"what_if.csv": SHIFT_COLUMNS, "ledger.csv": ENTRY_COLUMNS, "varying.csv": PIECE_COLUMNS}
 JOINT_FILES = ("joint.html", "joint.csv")  # of a joint estimate
+POPULATION_FILES = ("population.html", "population.csv", "population.tex")
 
 
 def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int = 1, files: bool = False) -> Path:
@@ -114,8 +116,9 @@ def _write_campaign(
                 raise value
     figures = draw(overview_figures(sets), folder=inside(run_dir, "figures") if files else None)
     joint = JOINT_FILES[0] if (run_dir / FILE).exists() else ""
+    population = POPULATION_FILES[0] if (run_dir / POPULATION).exists() else ""
     pages = {s.stem: quote(f"pages/{s.stem}.html") for s in paged}
-    return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures, joint))
+    return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures, joint, population))
 
 
 def _write_page(

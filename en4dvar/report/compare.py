@@ -144,11 +144,13 @@ def compare_runs(
 
     Raises
     ------
-    OutputError: fewer than two runs, a run given twice, or a directory without results.
+    OutputError: fewer than two runs, a run given twice, a directory without results, or results without names.
     """
     if len(runs) < 2:
         raise OutputError("compare needs at least two run directories")
     if not isinstance(runs, Mapping):
+        if any(isinstance(run, StoredResult) for run in runs):
+            raise OutputError("results at hand have no names: give {'one': result, 'other': result}")
         paths = [Path(run) for run in runs]
         runs = dict(zip(_labels(paths), paths, strict=True))
     results = {name: _results(run) for name, run in runs.items()}

@@ -64,11 +64,12 @@ def render_overview(
     failures: Mapping[str, str],
     figures: Sequence[Drawing],
     joint: str = "",
+    population: str = "",
 ) -> str:
     """The page as HTML.
 
-    ``joint``: address of the page of a joint estimate. ``pages``: stem of a data set → address of its page, for those
-    that have one; ``failures``: name of a data set without a posterior → reason.
+    ``joint``, ``population``: addresses of the pages of such estimates. ``pages``: stem of a data set → address of its
+    page, for those that have one; ``failures``: name of a data set without a posterior → reason.
     """
     listed = set(map(id, sorted(sets, key=lambda s: -s.gravity)[:LISTED]))
     return render(
@@ -84,6 +85,7 @@ def render_overview(
         listed=[one for one in sets if id(one) in listed],
         pages=pages,
         joint=joint,
+        population=population,
         without_page=sum(1 for one in sets if one.stem not in pages),
         warned=sum(1 for one in sets if one.cautions),
         tally=_tally(sets),

@@ -14,8 +14,8 @@ from typing import Any, Generic, TypeVar
 import xarray as xr
 
 from en4dvar.config import SequenceConfig, TwinConfig
+from en4dvar.cycling.outcome import SequentialState
 from en4dvar.cycling.problem import SeriesResult
-from en4dvar.cycling.sequential import SequentialState
 from en4dvar.cycling.twin import TwinResult
 from en4dvar.executor import Executor, make_executor
 from en4dvar.files import write_text

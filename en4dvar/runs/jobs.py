@@ -19,6 +19,7 @@ from en4dvar.storage.checkpoint import Keeper, digest
 from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import to_bytes
 from en4dvar.storage.packed import packed
+from en4dvar.storage.seal import SealedBytes
 from en4dvar.summary import remarks, summarise
 
 SEND_EVERY = 0.1  # s; a worker sends the records of its iterations no more often
@@ -55,7 +56,7 @@ class Job:
 class Estimate:
     """``content`` is the netCDF file, or what goes into a pack; ``ending`` tells how the iterations ended."""
 
-    content: bytes
+    content: SealedBytes | bytes
     ending: str
     outcome: DatasetOutcome
 
@@ -79,7 +80,7 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
         warnings=analysis.cautions,
         summary=summarise(analysis),
         n_observations=len(analysis.observations),
-        sha256=digest(content),
+        sha256=content.sha256 if isinstance(content, SealedBytes) else digest(content),
         remarks=remarks(analysis),
     )
     converged = "converged" if analysis.converged else "not converged"

@@ -1,19 +1,27 @@
-"""``en4dvar population``: mean and spread of parameters over the data sets of finished runs."""
+"""Mean and spread of parameters over data sets: those of a run whose configuration has ``population:``, or of several
+finished runs (``en4dvar population``).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from en4dvar.caution import Caution, caution
+from en4dvar.config import Config
 from en4dvar.diagnostics import HARDLY_INFORMED
-from en4dvar.executor import choose_executor
+from en4dvar.errors import ConfigError, TooFewMembersError
+from en4dvar.executor import Executor, choose_executor
 from en4dvar.files import make_folder
 from en4dvar.population import Effort, HyperPrior
-from en4dvar.population.campaign import CampaignPopulation, population_of
-from en4dvar.report.population import write_population
-from en4dvar.runs.finished import carried, finished
+from en4dvar.population.campaign import FEWEST_SETS, CampaignPopulation, population_of, runs_of
+from en4dvar.problem import InverseProblem
+from en4dvar.runs.finished import Finished, carried, finished
+from en4dvar.runs.together import once_together
 from en4dvar.runs.trust import Ask
+from en4dvar.runs.worklist import Worklist
 from en4dvar.storage.population_file import FILE, StoredPopulation, load_population, save_population
 from en4dvar.storage.provenance import provenance
 
@@ -39,21 +47,66 @@ def population(
     ------
     RefusedError: code of a stranger, see :func:`~en4dvar.runs.rerun.rerun`. OutputError: there is no result, or it is
         damaged. ConfigError: there is no population of these data sets, as
-        :func:`~en4dvar.population.campaign.population_of` says.
+        :func:`~en4dvar.population.campaign.population_of` says. TooFewMembersError: too many forward runs failed.
     """
+    from en4dvar.report.population import write_population  # what draws pages is slow to import
+
     first, sets = finished(run_dirs, trust, ask)
-    tell(f"population of {', '.join(names)} behind {len(sets)} data sets")
+    attributes = {**provenance("", None), "runs": ", ".join(run_dir.name for run_dir in run_dirs)}
+    path = out / FILE
     with choose_executor(first.model, None, workers) as executor:
-        found = population_of(
-            [one.problem for one in sets], [one.white for one in sets], names, first.seed,
-            executor=executor, hyper=hyper, effort=effort, workers=workers or 1,
+        _save(
+            sets, attributes, path, tell, names=names, seed=first.seed, hyper=hyper, effort=effort,
+            workers=workers or 1, executor=executor,
         )  # fmt: skip
-    tell(f"{found.estimate.forward_runs} forward runs, {found.estimate.size:.0f} effective draws")
-    attributes = {**provenance("", None), "seed": first.seed, "runs": ", ".join(run_dir.name for run_dir in run_dirs)}
-    cautions = (*_cautions(found), *carried(sets))
-    file = save_population(make_folder(out) / FILE, found, [one.members for one in sets], cautions, attributes)
-    stored = load_population(file)
+    stored = load_population(path)
     return stored, write_population(stored, out)
+
+
+def population_within(work: Worklist, executor: Executor) -> None:
+    """The population that the configuration of a run asks for: ``population.nc`` in its directory.
+
+    Raises :class:`ConfigError`, :class:`TooFewMembersError`, :class:`OutputError`.
+    """
+    config, asked = work.config, work.config.population
+    if asked is None:
+        return
+    estimate = partial(
+        _save, names=asked.of, seed=config.seed, hyper=asked.hyper, workers=config.execution.workers or 1,
+        executor=executor,
+    )  # fmt: skip
+    once_together(work, FILE, "population", FEWEST_SETS, estimate)
+
+
+def require_population(config: Config, problem: InverseProblem, count: int) -> None:
+    """Refuse a run before anything is computed, whose ``count`` data sets, such as ``problem``, have no population.
+
+    Raises :class:`ConfigError`.
+    """
+    if config.population is None:
+        return
+    try:
+        if count < FEWEST_SETS:
+            raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets, not {count}")
+        runs_of([problem], config.population.of)
+    except ConfigError as error:
+        raise ConfigError([config.document.fault(("population",), str(error), at_key=True)]) from None
+
+
+def _save(
+    sets: Sequence[Finished], attributes: Mapping[str, Any], path: Path, tell: Callable[[str], None], *,
+    names: Sequence[str], seed: int, **options: Any,
+) -> None:  # fmt: skip
+    """Estimate it and write the file."""
+    tell(f"population of {', '.join(names)} behind {len(sets)} data sets")
+    try:
+        found = population_of([one.problem for one in sets], [one.white for one in sets], names, seed, **options)
+    except ValueError as error:  # of forward runs that failed
+        raise TooFewMembersError(f"no population: {error}") from None
+    tell(f"{found.estimate.forward_runs} forward runs, {found.estimate.size:.0f} effective draws")
+    cautions = (*_cautions(found), *carried(sets))
+    make_folder(path.parent)
+    save_population(path, found, [one.members for one in sets], cautions, {**attributes, "seed": seed})
 
 
 def _cautions(found: CampaignPopulation) -> Iterator[Caution]:

@@ -37,6 +37,7 @@ from en4dvar.storage.store import COMPLETE, NEXT, require_settled
 FIXED = (
     "config.yaml", "config.resolved.yaml", "posterior.nc", PACK, "twin.nc", "run.log", "report.html", "summary.csv",
     "what_if.csv", "ledger.csv", "varying.csv", "joint.nc", "joint.csv", "joint.html",
+    "population.nc", "population.csv", "population.tex", "population.html",
 )  # fmt: skip
 GIVEN = "data.csv"  # readings that a script handed over, written before its run begins
 Mode = Literal["new", "force", "resume", "report"]

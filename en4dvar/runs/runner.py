@@ -16,12 +16,16 @@ from en4dvar.files import write_text
 from en4dvar.inputs.asked import DataFile
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
 from en4dvar.runs.interrupt import terminate_as_interrupt
-from en4dvar.runs.joint_run import JOINED, join_within
+from en4dvar.runs.joint_run import join_within
+from en4dvar.runs.population_run import population_within, require_population
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.runs.session import directory_mode, session
+from en4dvar.runs.together import checkpoint_of
 from en4dvar.runs.worklist import Worklist, datasets
 from en4dvar.storage.campaign_file import DamagedError, save_campaign
 from en4dvar.storage.joint_file import FILE, load_joint
+from en4dvar.storage.population_file import FILE as POPULATION
+from en4dvar.storage.population_file import load_population
 from en4dvar.summary import summary_csv
 
 if TYPE_CHECKING:
@@ -76,7 +80,8 @@ def run_campaign(
 
     A data set that cannot be read or loses its ensemble does not end the campaign: it is named with its reason in
     ``Campaign.failures``, in ``summary.csv`` and in the log. Where the configuration shares parameters, all that have a
-    posterior are then estimated together (``joint.nc``).
+    posterior are then estimated together (``joint.nc``), and with ``population:`` the population behind them
+    (``population.nc``).
 
     ``report_workers``: processes that draw the report. They import the main script, which must guard what it does then.
     """
@@ -103,6 +108,7 @@ def run_campaign(
                 _estimate(work, executor)
                 if config.sharing:
                     join_within(work, executor)
+                population_within(work, executor)
                 _finish(work, report_workers)
             except BaseException:  # no worker writes once the directory is free for others
                 work.stop.set()
@@ -135,7 +141,7 @@ def _require_one_usable(config: Config, files: Mapping[str, DataFile]) -> None:
     unusable: list[DataError] = []
     for name, file in files.items():
         try:
-            build_one(config, name, file)
+            require_population(config, build_one(config, name, file), len(files))
         except ConfigError as error:
             faults += error.problems
         except DataError as error:
@@ -155,9 +161,9 @@ def _executor(config: Config) -> Executor:
 def _begin(work: Worklist) -> None:
     """Write what the run is; of one that is resumed, take over what is done. What has failed is tried again."""
     run, sets = work.run, work.sets
-    together = (FILE, JOINED) if work.config.sharing else ()
-    iterations = (d.iteration for d in sets)
-    run.begin("posterior.nc", work.record, *together, *iterations, retried=work.failed_earlier())
+    together = [FILE] * bool(work.config.sharing) + [POPULATION] * (work.config.population is not None)
+    files = (*together, *map(checkpoint_of, together), *(d.iteration for d in sets))
+    run.begin("posterior.nc", work.record, *files, retried=work.failed_earlier())
     if run.resumed:
         work.recall()
 
@@ -198,7 +204,7 @@ def _finish(work: Worklist, report_workers: int) -> None:
 
 
 def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
-    from en4dvar.report import JOINT_FILES, TABLES, write_pages  # what draws pages is slow to import
+    from en4dvar.report import JOINT_FILES, POPULATION_FILES, TABLES, write_pages  # what draws pages is slow to import
 
     directory.claim("report.html", "summary.csv", *TABLES)
     if (directory.work / FILE).exists():
@@ -206,6 +212,11 @@ def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int 
 
         directory.claim(*JOINT_FILES)
         write_joint(load_joint(directory.work / FILE), directory.work)
+    if (directory.work / POPULATION).exists():
+        from en4dvar.report.population import write_population
+
+        directory.claim(*POPULATION_FILES)
+        write_population(load_population(directory.work / POPULATION), directory.work)
     with directory.claiming("figures", "pages"):
         return write_pages(directory.work, datasets, workers, figures)
 

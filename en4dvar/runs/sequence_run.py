@@ -10,8 +10,8 @@ import numpy as np
 
 from en4dvar.config import SequenceConfig, load_sequence
 from en4dvar.config.build_sequence import build_sequence, sequence_data
+from en4dvar.cycling.outcome import SequentialState
 from en4dvar.cycling.problem import SeriesProblem, SeriesResult, assimilate_series
-from en4dvar.cycling.sequential import SequentialState
 from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor
 from en4dvar.runs.cycles import Keep, Work, run_cycles

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from en4dvar.config import TwinConfig, load_twin
-from en4dvar.cycling.sequential import SequentialState
+from en4dvar.cycling.outcome import SequentialState
 from en4dvar.cycling.twin import TwinResult, conduct
 from en4dvar.executor import Executor
 from en4dvar.runs.cycles import Keep, Work, run_cycles

@@ -14,7 +14,7 @@ from en4dvar.config import Config
 from en4dvar.config.build import build_one
 from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
-from en4dvar.files import readable, write_bytes
+from en4dvar.files import readable
 from en4dvar.inputs.asked import DataFile
 from en4dvar.prior import own_seed
 from en4dvar.runs.campaign import DatasetOutcome, file_names
@@ -24,6 +24,7 @@ from en4dvar.runs.session import Session
 from en4dvar.storage.checkpoint import FOLDER, Keeper, file_digest
 from en4dvar.storage.codec import decode_text, encode_text
 from en4dvar.storage.pack import PACK, Entry, Pack
+from en4dvar.storage.seal import SealedBytes
 
 
 @dataclass(frozen=True)
@@ -218,9 +219,11 @@ class Worklist:
     def _keep(self, d: Dataset, value: Estimate) -> None:
         warnings = [f"{warning.severity}: {warning}" for warning in value.outcome.warnings]
         self.run.log.write("\n".join(f"{d.name}: {line}" for line in (value.ending, *warnings)))
-        if self.alone:
-            write_bytes(self.run.directory.at(d.file), value.content)
-        self._end(d, value.outcome, b"" if self.alone else value.content)
+        content = value.content
+        if isinstance(content, SealedBytes):  # a file of its own
+            content.write(self.run.directory.at(d.file))
+            content = b""
+        self._end(d, value.outcome, content)
 
     def _fail(self, d: Dataset, error: Exception) -> None:
         if isinstance(error, OutputError | ExecutorError):

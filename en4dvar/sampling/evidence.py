@@ -9,7 +9,7 @@ end, was off by up to nine, and proposals that start about its ensemble do not f
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,22 +39,24 @@ def sampled_evidence(runs: CampaignRuns, prior: Prior, seed: int) -> Evidence:
     """
     every, first = range(len(runs.values)), standard(len(prior.names))
     found = {s: Importance(first, member_stream(seed, "evidence", s), DRAWS) for s in every}
-    _sample(runs, prior, found)
+    sample_sets(runs, prior.from_white, found)
     again = {s: member_stream(seed, "evidence again", s) for s, one in found.items() if one.effective < TOO_FEW}
     second = {s: Importance(first, stream, MORE * DRAWS) for s, stream in again.items()}
-    _sample(runs, prior, second)
+    sample_sets(runs, prior.from_white, second)
     found |= {s: one for s, one in second.items() if one.effective > found[s].effective}
     return Evidence(np.array([found[s].log for s in every]), np.array([found[s].effective for s in every]))
 
 
-def _sample(runs: CampaignRuns, prior: Prior, samplers: Mapping[int, Importance]) -> None:
-    """Rounds of all samplers, by the number of their set, until they have enough draws."""
+def sample_sets(runs: CampaignRuns, control: Callable[[Array], Array], samplers: Mapping[int, Importance]) -> None:
+    """Rounds of all samplers, by the number of their set, until they have enough draws. ``control``: coordinates
+    (B, n) → control vectors.
+    """
     for _ in range(MOST_ROUNDS):
         going = np.array([s for s, one in samplers.items() if one.effective < ENOUGH], dtype=int)
         if not len(going):
             break
         z = np.stack([samplers[s].draw() for s in going])  # in units of the prior
-        x = prior.from_white(z.transpose(1, 0, 2))
+        x = control(z.transpose(1, 0, 2))
         logs = log_likelihood(runs, runs.predictions(x, going), going).T
         for s, at, log in zip(going, z, logs, strict=True):
             samplers[s].add(at, log)

@@ -14,7 +14,6 @@ import xarray as xr
 from en4dvar.design.evaluate import FAN, Evaluated
 from en4dvar.design.laws import Decision
 from en4dvar.errors import OutputError
-from en4dvar.files import write_bytes
 from en4dvar.state import Array
 from en4dvar.storage.netcdf import Group, read_groups, to_bytes, variable
 
@@ -71,7 +70,7 @@ class Designs:
 
 def save_designs(path: Path, rows: Sequence[DesignRow], asked: Asked, attributes: Mapping[str, Any]) -> Path:
     """Write the file; it appears complete or not at all. Raises :class:`OutputError`."""
-    return write_bytes(path, to_bytes({"/": _group(rows, asked, attributes)}))
+    return to_bytes({"/": _group(rows, asked, attributes)}).write(path)
 
 
 def _group(rows: Sequence[DesignRow], asked: Asked, attributes: Mapping[str, Any]) -> Group:

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from en4dvar.analysis import Analysis, FieldEstimate
 from en4dvar.state import Array
 from en4dvar.storage.netcdf import Group, Variable, variable
@@ -37,9 +35,9 @@ def _variables(found: FieldEstimate) -> dict[str, Variable]:
     def of_cells(values: Array, what: str) -> Variable:
         return variable(cells, values, field.unit, f"{field.label}, {what}", **about)
 
-    members = found.members.astype(np.float32)
+    posterior = f"{field.label}, posterior members"
     return {
-        name: variable(("draw", cells), members, field.unit, f"{field.label}, posterior members", **about),
+        name: variable(("draw", cells), found.members, field.unit, posterior, single=True, **about),
         **{f"{name}_{kind}": of_cells(getattr(found, kind), words) for kind, words in KINDS.items()},
         f"{name}_at": variable(
             (cells, f"{name}_axis"), found.prior.places, field.coordinate_unit, "where the cells are"

@@ -14,7 +14,6 @@ import xarray as xr
 
 from en4dvar.caution import Caution, worst_first
 from en4dvar.errors import OutputError
-from en4dvar.files import write_bytes
 from en4dvar.joint.estimate import JointEstimate
 from en4dvar.state import Array, Parameter
 from en4dvar.storage.netcdf import Group, Groups, Variable, read_groups, to_bytes, variable
@@ -35,7 +34,7 @@ class Alone:
 
 def save_joint(path: Path, found: JointEstimate, alone: Sequence[Alone], attributes: Mapping[str, Any]) -> Path:
     """Write the file; it appears complete or not at all. Raises :class:`OutputError`."""
-    return write_bytes(path, to_bytes(joint_groups(found, alone, attributes)))
+    return to_bytes(joint_groups(found, alone, attributes)).write(path)
 
 
 def joint_groups(found: JointEstimate, alone: Sequence[Alone], attributes: Mapping[str, Any]) -> Groups:

@@ -23,7 +23,7 @@ import xarray as xr
 
 from en4dvar.errors import OutputError
 from en4dvar.files import atomic_path
-from en4dvar.storage.seal import check_seal, seal_file, sealed
+from en4dvar.storage.seal import SealedBytes, check_seal, seal_file
 
 _LOCK = threading.Lock()  # the netCDF library is not safe to use from several threads
 _MORE = 1 << 18  # bytes; more than the library had left to write
@@ -33,12 +33,16 @@ _LARGE = 1 << 24  # bytes of a variable
 
 @dataclass(frozen=True)
 class Variable:
-    """Values along named dimensions: floats, integers, truth values or text. ``fill``: NaN means a missing value."""
+    """Values along named dimensions: floats, integers, truth values or text. ``fill``: NaN means a missing value.
+
+    ``single``: floats are stored in single precision.
+    """
 
     dims: tuple[str, ...]
     values: np.ndarray[Any, Any]
     attrs: Mapping[str, Any]
     fill: bool = True
+    single: bool = False
 
 
 @dataclass(frozen=True)
@@ -70,12 +74,19 @@ def netcdf_attributes(attributes: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def variable(
-    dims: str | tuple[str, ...], values: Any, units: str, long_name: str, *, fill: bool = True, **attrs: Any
+    dims: str | tuple[str, ...],
+    values: Any,
+    units: str,
+    long_name: str,
+    *,
+    fill: bool = True,
+    single: bool = False,
+    **attrs: Any,
 ) -> Variable:
     """A variable with what CF asks of it."""
     dims = (dims,) if isinstance(dims, str) else dims
     attributes = netcdf_attributes({"units": units, "long_name": long_name, **attrs})
-    return Variable(dims, np.asarray(values), attributes, fill)
+    return Variable(dims, np.asarray(values), attributes, fill, single)
 
 
 Groups = Mapping[str, Group]
@@ -91,7 +102,8 @@ def datasets_of(groups: Groups) -> dict[str, xr.Dataset]:
     """Each group as xarray shows it, by path."""
 
     def shown(v: Variable) -> xr.Variable:
-        return xr.Variable(v.dims, v.values, v.attrs, {} if v.fill else {"_FillValue": None})
+        values = v.values.astype(np.float32) if v.single else v.values
+        return xr.Variable(v.dims, values, v.attrs, {} if v.fill else {"_FillValue": None})
 
     def dataset(group: Group) -> xr.Dataset:
         variables, coords = ({n: shown(v) for n, v in part.items()} for part in (group.variables, group.coords))
@@ -100,21 +112,31 @@ def datasets_of(groups: Groups) -> dict[str, xr.Dataset]:
     return {path: dataset(group) for path, group in groups.items()}
 
 
-def to_bytes(groups: Groups) -> bytes:
+def to_bytes(groups: Groups) -> SealedBytes:
     """The file of the groups; its last line seals it."""
-    sizes = [v.values.nbytes for group in groups.values() for v in group.variables.values()]
+    sizes = [v.values.nbytes // (1 + v.single) for group in groups.values() for v in group.variables.values()]
     memory = _INITIAL_SIZE + sum(size for size in sizes if size > _LARGE)  # growing takes it twice
     with _LOCK:
         file = netCDF4.Dataset("in-memory.nc", "w", format="NETCDF4", memory=memory)
         try:
             data = [item for path, group in groups.items() for item in _define(file, path, group)]
             for variable, values in data:
-                variable[...] = values if values.ndim else values[()]
+                _write(variable, values)
         except BaseException:
             file.close()
             raise
         content = file.close()
-    return sealed(content)
+    return SealedBytes.of(content)
+
+
+def _write(variable: Any, values: np.ndarray[Any, Any]) -> None:
+    """A block of rows at a time: what the library has to convert is never there twice."""
+    if values.nbytes <= _LARGE:
+        variable[...] = values if values.ndim else values[()]
+        return
+    rows = max(1, _LARGE * len(values) // values.nbytes)
+    for first in range(0, len(values), rows):
+        variable[first : first + rows] = values[first : first + rows]
 
 
 def read_groups(path: Path) -> dict[str, xr.Dataset]:
@@ -170,7 +192,7 @@ def _define(file: netCDF4.Dataset, path: str, content: Group) -> Iterator[tuple[
         values, attributes = variable.values, attributes_of(variable)
         if values.dtype == bool:
             values = values.astype(np.int8)
-        kind = str if values.dtype.kind in "OU" else values.dtype
+        kind = str if values.dtype.kind in "OU" else np.dtype(np.float32) if variable.single else values.dtype
         missing = values.dtype.kind == "f" and variable.fill and name in content.variables
         target = group.createVariable(name, kind, variable.dims, fill_value=np.nan if missing else None)
         target.set_auto_maskandscale(False)

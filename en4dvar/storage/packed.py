@@ -83,10 +83,11 @@ def _place(v: Variable, numbers: bytearray, words: list[Any]) -> list[Any]:
     if v.values.dtype.kind in "OU":
         words.append(v.values.ravel().tolist())
         return [*about, "", len(words) - 1]
+    values = v.values.astype(np.float32) if v.single else v.values
     where = len(numbers)
-    numbers += v.values.tobytes()
+    numbers += values.tobytes()
     numbers += b"\0" * (-len(numbers) % _ALIGNED)
-    return [*about, v.values.dtype.str, where]
+    return [*about, values.dtype.str, where]
 
 
 def _restored(

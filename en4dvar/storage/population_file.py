@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from en4dvar.caution import Caution, worst_first
-from en4dvar.files import write_bytes
 from en4dvar.population.campaign import CampaignPopulation, Combination, Draws
 from en4dvar.prior import PriorTerm
 from en4dvar.state import Array, Parameter
@@ -32,7 +31,7 @@ def save_population(
 
     Raises :class:`OutputError`.
     """
-    return write_bytes(path, to_bytes(population_groups(found, alone, cautions, attributes)))
+    return to_bytes(population_groups(found, alone, cautions, attributes)).write(path)
 
 
 def population_groups(

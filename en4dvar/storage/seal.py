@@ -9,19 +9,44 @@ from __future__ import annotations
 
 import hashlib
 import os
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Self
 
 from en4dvar.errors import OutputError
-from en4dvar.files import open_plain
+from en4dvar.files import atomic_path, open_plain
 
 FORMAT = "en4dvar-result"
 VERSION = "1"
 _LENGTH = len(f"\n{FORMAT} {VERSION} sha256 {'0' * 64}\n")
 
 
-def sealed(content: bytes | memoryview) -> bytes:
-    """``content`` with its last line."""
-    return b"".join((content, _line(hashlib.sha256(content).hexdigest())))
+@dataclass(frozen=True)
+class SealedBytes:
+    """A result file in memory: ``content``, which may be large and is never copied, and its last line."""
+
+    content: bytes | memoryview
+    line: bytes
+    sha256: str
+
+    @classmethod
+    def of(cls, content: bytes | memoryview) -> Self:
+        """``content`` with its last line, and the digest of both."""
+        digest = hashlib.sha256(content)
+        line = _line(digest.hexdigest())
+        digest.update(line)
+        return cls(content, line, digest.hexdigest())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (bytes(self.content), self.line, self.sha256)
+
+    def write(self, path: Path) -> Path:
+        """Write the file atomically. Raises :class:`OutputError`."""
+        with atomic_path(path) as partial:
+            partial.write_bytes(self.content)
+            with partial.open("ab") as file:
+                file.write(self.line)
+        return path
 
 
 def seal_file(path: Path) -> None:

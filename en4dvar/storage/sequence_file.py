@@ -10,8 +10,8 @@ import numpy.typing as npt
 import xarray as xr
 
 from en4dvar.cycling.moments import Moments
+from en4dvar.cycling.outcome import SequentialResult
 from en4dvar.cycling.problem import SeriesProblem, SeriesResult, normalised_innovations
-from en4dvar.cycling.sequential import SequentialResult
 from en4dvar.cycling.series import CycleSeries
 from en4dvar.forward import ForwardModel, Observable, StateField
 from en4dvar.state import Array

@@ -9,7 +9,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from en4dvar.files import inside, make_folder, write_bytes, write_text
+from en4dvar.files import inside, make_folder, write_text
 from en4dvar.population import HyperPrior
 from en4dvar.report.palette import DARK, LIGHT, css_variables
 from en4dvar.report.style import COLUMN, inline_svg, save_figure
@@ -34,7 +34,7 @@ def write_study(study: Study, directory: Path) -> Path:
         write_text(directory / f"table{number}.tex", tables.as_latex(study, rows, route))
     write_text(directory / "sets.csv", tables.per_set_csv(study))
     write_text(directory / "study.yaml", study.plan.text)
-    write_bytes(directory / "study.nc", study_netcdf(study))
+    study_netcdf(study).write(directory / "study.nc")
     figures = []
     for drawn in all_figures(study):
         save_figure(drawn.figure, figures_folder, drawn.name)

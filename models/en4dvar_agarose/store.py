@@ -11,10 +11,11 @@ import numpy as np
 from en4dvar.population import Population
 from en4dvar.state import Parameter
 from en4dvar.storage.netcdf import Group, Variable, to_bytes
+from en4dvar.storage.seal import SealedBytes
 from en4dvar_agarose.fits import Fit, Study
 
 
-def study_netcdf(study: Study) -> bytes:
+def study_netcdf(study: Study) -> SealedBytes:
     """Groups ``/<gel>/<model>``: ``sweep_<parameter>`` (dataset), ``<parameter>`` (dataset, draw) of the posterior
     ensembles, NRMSE, log-evidence, DFS, ``truth_<parameter>``; ``/<gel>/population``: draws of mean and spread. SI.
     """

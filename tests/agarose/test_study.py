@@ -1,4 +1,4 @@
-"""The study: its files on a small campaign; on the whole twin (slow) the paper's qualitative findings."""
+"""The study: its files on a small campaign; on half of the twin (slow) the paper's qualitative findings."""
 
 from __future__ import annotations
 
@@ -31,21 +31,28 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 GELS = ("0.3 %", "1 %")
 
 
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    """Both gels with three data sets each, the sweep at 128 trajectories."""
-    folder = tmp_path_factory.mktemp("study")
+def write_study(folder, sets):
+    """The shipped study, with the data sets of both gels whose names end so; its file."""
     for key in ("03", "10"):
         for model in ("nh", "qs", "qlkv"):
             text = (CONFIGS / f"agarose_{key}_{model}.yaml").read_text()
-            data = CONFIGS / "data" / "agarose_twin" / f"agarose_{key}_0[1-3].csv"
+            data = CONFIGS / "data" / "agarose_twin" / f"agarose_{key}_{sets}.csv"
             text = text.replace(f"data/agarose_twin/agarose_{key}_*.csv", str(data))
             (folder / f"agarose_{key}_{model}.yaml").write_text(text)
     text = (CONFIGS / "agarose_study.yaml").read_text()
     (folder / "study.yaml").write_text(text.replace("data/agarose_twin", str(CONFIGS / "data" / "agarose_twin")))
-    call = [str(folder / "study.yaml"), "--set", "sweep.trajectories=128", "--set", "sweep.rounds=1"]
+    return folder / "study.yaml"
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """Both gels with three data sets each, the sweep at 128 trajectories."""
+    folder = tmp_path_factory.mktemp("study")
+    file = write_study(folder, "0[1-3]")
+    call = [str(file), "--set", "sweep.trajectories=128", "--set", "sweep.rounds=1"]
     call += ["--set", "sweep.step=0.1 us", "--out", str(folder / "out"), "--set", "population.rounds=30"]
     call += ["--set", "population.passes=1", "--set", "population.draws=200", "--set", "population.exact=50"]
+    call += ["--set", "population.components=3"]
     result = CliRunner().invoke(study_command, call)
     assert result.exit_code == 0, (result.output, result.exception)
     return folder / "out", result.output, call
@@ -254,10 +261,12 @@ def test_plus_minus_and_verdicts():
 
 
 @pytest.fixture(scope="module")
-def twin():
+def twin(tmp_path_factory):
+    """Every other data set of the twin."""
     few = {"rounds": 60, "passes": 1, "draws": 300, "exact": 50}  # no test here asks how good the populations are
     changes = {"sweep.trajectories": 8192, **{f"population.{key}": value for key, value in few.items()}}
-    return run_study(load_study(CONFIGS / "agarose_study.yaml", changes), workers=2)
+    file = write_study(tmp_path_factory.mktemp("twin"), "*[02468]")
+    return run_study(load_study(file, changes), workers=2)
 
 
 @pytest.mark.slow

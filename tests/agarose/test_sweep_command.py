@@ -1,11 +1,7 @@
-"""``en4dvar sweep``: its files, its folder of chunks, and a sweep that was killed."""
+"""``en4dvar sweep``: its files and its folder of chunks."""
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -42,22 +38,3 @@ def test_command(tmp_path):
     assert CliRunner().invoke(sweep_command, [*call, "--resume"]).exit_code == 0
     assert CliRunner().invoke(sweep_command, [*call, "--force", "--resume"]).exit_code == 2
     assert CliRunner().invoke(sweep_command, [*call, "--shift", "1 kPa"]).exit_code == 2
-
-
-@pytest.mark.slow
-@pytest.mark.fault("kill-commands")
-def test_a_killed_sweep_is_resumed_to_the_same_numbers(tmp_path):
-    call = [sys.executable, "-c", "from en4dvar.cli import main; main()", "sweep"]
-    call += [str(CONFIGS / "agarose_03_nh.yaml"), "--trajectories", "16384"]
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    subprocess.run([*call, "--out", str(whole)], check=True, capture_output=True)
-    with subprocess.Popen(
-        [*call, "--out", str(killed)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    ) as process:
-        while process.poll() is None and len(list(killed.glob("chunks/*.npz"))) < 2:
-            time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
-    assert process.returncode == -signal.SIGKILL
-    assert 2 <= len(list(killed.glob("chunks/*.npz"))) < 8
-    subprocess.run([*call, "--out", str(killed), "--resume"], check=True, capture_output=True)
-    assert (killed / "sweep.csv").read_bytes() == (whole / "sweep.csv").read_bytes()

@@ -195,6 +195,12 @@ FAULTS = [
     ("weights: {column: w}", "group: [1]\n      weights: {column: w}", "data.series.heads.group:"),
     ("mean: 0, std: 2}\n  b", "mean: maximum, std: 2}\n  b", "parameters.a.mean: 'maximum' is that of a single series"),
     ("mean: 0, std: 2}\n  b", "mean: 0, std: 2, shared: all}\n  b", "parameters.a.shared: not where a data set"),
+    ("parameters:\n", "parameters:\n  reading_scale: {prior: lognormal, median: 1, log_std: 0.1}\n",
+     "25:18: parameters.reading_scale: one number for several series"),
+    ("path: pq.csv", "path: -1", "5:9: data.path: expected text; put it in quotes or expected a list"),
+    ("path: pq.csv", "path: [1]", "5:10: data.path.0: expected text; put it in quotes, not 1"),
+    ("columns: {p: {name: p, unit: \"1\"}}", "columns: {}", "columns.p: required: the column of p"),
+    ("time: {name: t, unit: s}\n", "time: {name: t, unit: s}\n    z: 1\n", "data.columns.z: unknown column role 'z'"),
 ]  # fmt: skip
 
 

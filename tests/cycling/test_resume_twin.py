@@ -15,7 +15,8 @@ from twin_models import Ring
 
 from en4dvar.config import load_twin
 from en4dvar.cycling.moments import Moments
-from en4dvar.cycling.sequential import SequentialSettings, SequentialState, run_sequential
+from en4dvar.cycling.outcome import SequentialState
+from en4dvar.cycling.sequential import SequentialSettings, run_sequential
 from en4dvar.cycling.series import CycleSeries
 from en4dvar.cycling.smoothers import EnKS, EnRTS
 from en4dvar.errors import OutputError

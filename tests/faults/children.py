@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import pkgutil
 import resource
 import shutil
 import subprocess
@@ -17,11 +18,18 @@ import threading
 import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 TESTS = Path(__file__).resolve().parents[1]
+USED_LATER = (
+    "dask.array", "distributed", "fontTools.subset", "matplotlib.backends.backend_agg",
+    "matplotlib.backends.backend_pdf", "matplotlib.backends.backend_svg", "matplotlib.pyplot", "PIL.PngImagePlugin",
+    "rich.progress",
+)  # fmt: skip
+"""What libraries import when they are used."""
 
 
 @dataclass
@@ -92,6 +100,8 @@ def _child(task: Task, told: int) -> None:
     os.dup2(told, 2)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     if task.limit is not None:
+        # Python takes the part of a module's bytecode that had room for the whole, here and in every later process
+        sys.dont_write_bytecode = True
         resource.setrlimit(resource.RLIMIT_FSIZE, (task.limit, task.limit))
     if task.fails:
         _break(task.fails, getattr(errno, task.error))
@@ -144,18 +154,18 @@ def _of_few(draw: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _import_everything() -> None:
-    import matplotlib.backends.backend_agg
-    import matplotlib.backends.backend_pdf
-    import matplotlib.backends.backend_svg
-    import matplotlib.pyplot  # noqa: F401
-
+    """What the commands import as they go as well: half of the time of a child was that."""
     import en4dvar.report.cycles
-    import en4dvar.report.overlay
-    import en4dvar.runs.runner
-    import en4dvar_agarose.commands  # noqa: F401
-    import en4dvar_bubble  # noqa: F401
+    import en4dvar_agarose
+    import en4dvar_bubble
+    import en4dvar_lorenz
     from en4dvar.storage.fingerprint import source_digest
 
+    for name in USED_LATER:
+        import_module(name)
+    for package in (en4dvar, en4dvar_agarose, en4dvar_bubble, en4dvar_lorenz):
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            import_module(found.name)
     source_digest("en4dvar")
     for module in (en4dvar.report, en4dvar.report.cycles):
         module.draw = _of_few(module.draw)  # type: ignore[attr-defined]

@@ -76,7 +76,7 @@ def calls(folder, out):
         "run of a twin": (["run", f"{folder}/twin.yaml", "--out", out], ""),
         "report": (["report", out], done),
         "report of a twin": (["report", out], twin),
-        "compare": (["compare", done, other, "--out", out], ""),
+        "compare": (["compare", done, other, "--stored", "--out", out], ""),
         "export": (["export", done, "--out", f"{out}.csv"], ""),
         "simulate": (["simulate", toy, "--set", "parameters.A=1 mm", "--out", f"{out}.csv"], ""),
         "simulate a campaign": (["simulate", f"{folder}/synthetic.yaml", "--out", out], ""),

@@ -15,10 +15,12 @@ from en4dvar.ensemble.forecast import cost
 from en4dvar.errors import ConfigError
 from en4dvar.executor import ThreadsExecutor
 from en4dvar.population import Effort, HyperPrior, estimate_population
+from en4dvar.population.estimate import _Estimate
 from en4dvar.population.likelihoods import draw_interim, fit_likelihood
 from en4dvar.population.marginals import DEFENSIVE, SetPosterior, marginals
 from en4dvar.population.mixtures import Mixture, fit_mixtures, log_marginal
 from en4dvar.population.training import Training
+from en4dvar.population.weights import Weighed
 from en4dvar.prior import Prior, PriorTerm, member_stream
 from en4dvar.sampling.forward_runs import ForwardRuns, log_likelihood
 from en4dvar.state import Parameter
@@ -39,9 +41,9 @@ class Curved:
     ``outlier``: how much further than the others the first bubble's a lies.
     """
 
-    def __init__(self, n_sets=8, seed=0, outlier=0.0):
+    def __init__(self, n_sets=8, seed=0, outlier=0.0, middle=0.4):
         rng = np.random.default_rng(seed)
-        self.truth = np.stack([0.4 + 0.3 * rng.standard_normal(n_sets), 0.5 * rng.standard_normal(n_sets)], axis=1)
+        self.truth = np.stack([middle + 0.3 * rng.standard_normal(n_sets), 0.5 * rng.standard_normal(n_sets)], axis=1)
         self.truth[0, 0] += outlier
         self.weight = np.tile(1 / np.array([0.1, 0.5]) ** 2, (n_sets, 1))
         exact = self.predictions(self.truth[None])[0]
@@ -62,6 +64,18 @@ class Cusped(Curved):
     def predictions(self, x, sets=None):
         a, b = x[..., 0], x[..., 1]
         return np.stack([a + b + 0.6 * b**2, 1.5 * np.sqrt(np.abs(a - 0.4 * b - 0.5))], axis=-1)
+
+
+class Twofold(Curved):
+    """Each set leaves two a open, on both sides of 0.2; ``start`` is at the one that the data put less in."""
+
+    def predictions(self, x, sets=None):
+        a, b = x[..., 0], x[..., 1]
+        return np.stack([(a - 0.2) ** 2 + 0.1 * b, 0.5 * a - 0.3 * b], axis=-1)
+
+    def start(self, seed):
+        noise = np.random.default_rng(seed).standard_normal((len(self.truth), 30, 2))
+        return self.truth[:, None] * [-1, 1] + [0.4, 0.0] + 0.02 * noise
 
 
 def by_quadrature(runs, prior, hyper):
@@ -101,6 +115,7 @@ def estimated(runs, seed):
         pytest.param(Curved(), id="curved", marks=pytest.mark.slow),
         pytest.param(Curved(outlier=2.0), id="outlier", marks=pytest.mark.slow),
         pytest.param(Cusped(), id="cusped", marks=pytest.mark.slow),
+        pytest.param(Twofold(middle=1.2), id="twofold", marks=pytest.mark.slow),
     ],
 )
 def test_a_population_of_curved_likelihoods_against_quadrature(runs):
@@ -163,7 +178,16 @@ def test_ensembles_in_a_minimum_that_is_not_the_lowest_are_left():
     root = np.array([2.196, 0.0])
     for s in range(3):
         assert np.median(np.abs(training.at[s] - root)[:, 0]) < 0.2
-    assert training.count == 3 * 81 * 16 + 2 * (512 + 80 * 16)
+    assert training.count < 3 * 81 * 16 + 3 * 8 * 400
+
+
+def test_where_hardly_a_draw_is_left_no_proposal_is_fitted_to_it(monkeypatch):
+    h = np.random.default_rng(0).standard_normal((3000, 2))
+    logs = np.where(np.arange(3000) == 7, 0.0, -np.inf)
+    monkeypatch.setattr("en4dvar.population.estimate.with_emulators", lambda *rest: Weighed(h, logs, h[:, None, None]))
+    one = object.__new__(_Estimate)
+    one.effort, one.seed, one.tries, one.hyper, one.workers = SMALL, 1, 0, None, 1
+    assert one._weighed([], h).effective == 1.0
 
 
 def fitted(x, predictions, values, weight, degree, must=0):
@@ -208,10 +232,9 @@ def test_interim_draws_have_the_moments_of_quadrature():
     emulators = fitted(x, seen, runs.values, runs.weight, degree=2)
     mean, std = np.zeros(2), np.array([0.9, 0.7])
     draws = draw_interim(emulators, mean, std, 4, "x", count=400)
-    a, b = np.meshgrid(np.linspace(-4, 4, 801), np.linspace(-3, 3, 601), indexing="ij")
-    at = np.stack([a, b], axis=-1)
+    a, b = np.meshgrid(np.linspace(-4, 4, 401), np.linspace(-3, 3, 301), indexing="ij")
+    predictions = runs.predictions(np.stack([a, b], axis=-1))
     for s in range(3):
-        predictions = runs.predictions(at)
         log = -0.5 * np.sum(runs.weight[s] * (runs.values[s] - predictions) ** 2, axis=-1)
         density = np.exp(log - 0.5 * (a / std[0]) ** 2 - 0.5 * (b / std[1]) ** 2)
         density /= density.sum()

@@ -18,7 +18,7 @@ from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.report.compare import ALL, _effective, compare_runs, comparison_table, model_probabilities
 from en4dvar.report.overlay import overlay
 from en4dvar.report.result import Result
-from en4dvar.storage.store import save
+from en4dvar.storage.store import load_stored, save
 
 
 def run_dir(path, names, seeds=(1,), std=0.1, wide=1.0):
@@ -108,6 +108,7 @@ def test_what_cannot_be_compared_is_refused(tmp_path):
         ([one, one], "given twice"),
         ([one], "at least two"),
         ([one, tmp_path / "nowhere"], "no such file"),
+        ([load_stored(next(one.rglob("*.nc")))] * 2, "have no names"),
     ):
         with pytest.raises(OutputError, match=message):
             compare_runs(runs)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import drift_series
 import numpy as np
 import pytest
 import xarray as xr
 import yaml
+from drift_series import STD, TIMES, VALUES
 from linear_drift import Drift
 
 import en4dvar
@@ -27,33 +29,10 @@ from en4dvar_lorenz import Lorenz96
 from en4dvar_lorenz.lorenz96 import Lorenz96Settings
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-TIMES = np.array([0.2, 0.5, 1.1, 1.3, 2.0, 2.2, 3.1])
-VALUES = np.array([0.3, 0.1, np.nan, 0.9, 1.4, 0.8, 2.0])
-STD, RATES = 0.4, (0.2**2 / 0.5, 0.1**2 / 2)  # of the readings; variances of x and c in a unit of time
-
-BASE = {
-    "name": "drift",
-    "seed": 3,
-    "model": {"name": "linear_drift:Drift"},
-    "data": {
-        "path": "drift.csv",
-        "columns": {"time": {"name": "t", "unit": "1"}, "x": {"name": "x", "unit": "1"}},
-        "error": {"x_std": STD},
-    },
-    "parameters": {"c": {"prior": "normal", "mean": 0.5, "std": 0.3, "varies": {"std": 0.1, "every": 2}}},
-    "sequence": {"initial_std": {"x": 0.5}},
-    "model_error": {"x": {"std": 0.2, "every": 0.5}},
-    "assimilation": {"scheme": "etkf", "members": 8},
-    "output": {"report": False},
-}
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    rows = "".join(f"{t},{'' if np.isnan(v) else v}\n" for t, v in zip(TIMES, VALUES, strict=True))
-    (tmp_path / "drift.csv").write_text(f"t,x\n{rows}")
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+folder = drift_series.folder
+RATES = 0.2**2 / 0.5, 0.1**2 / 2  # variances of x and c in a unit of time
+WALK = {"c": {"prior": "normal", "mean": 0.5, "std": 0.3, "varies": {"std": 0.1, "every": 2}}}
+BASE = drift_series.BASE | {"parameters": WALK}
 
 
 def written(folder, **changes):

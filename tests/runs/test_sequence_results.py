@@ -7,10 +7,12 @@ import io
 import random
 from pathlib import Path
 
+import drift_series
 import numpy as np
 import pytest
 import xarray as xr
 import yaml
+from drift_series import STD, TIMES, VALUES
 from run_files import kill_after_writes, resumed_until_done, run_cli
 from scipy.stats import multivariate_normal
 
@@ -22,32 +24,9 @@ from en4dvar.report.export_cycles import cycles_table
 from en4dvar.runs.rerun import rerun
 from en4dvar.runs.sequence_run import run_sequence
 
-TIMES = np.array([0.2, 0.5, 1.1, 1.3, 2.0, 2.2, 3.1])
-VALUES = np.array([0.3, 0.1, np.nan, 0.9, 1.4, 0.8, 2.0])
-STD, RATE, START = 0.4, 0.2**2 / 0.5, 0.5
-BASE = {
-    "name": "drift",
-    "seed": 3,
-    "model": {"name": "linear_drift:Drift"},
-    "data": {
-        "path": "drift.csv",
-        "columns": {"time": {"name": "t", "unit": "1"}, "x": {"name": "x", "unit": "1"}},
-        "error": {"x_std": STD},
-    },
-    "parameters": {"c": {"prior": "normal", "mean": 0.5, "std": 0.3}},
-    "sequence": {"initial_std": {"x": START}},
-    "model_error": {"x": {"std": 0.2, "every": 0.5}},
-    "assimilation": {"scheme": "etkf", "members": 8, "additive": "square-root"},
-    "output": {"report": False},
-}
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    rows = "".join(f"{t},{'' if np.isnan(v) else v}\n" for t, v in zip(TIMES, VALUES, strict=True))
-    (tmp_path / "drift.csv").write_text(f"t,x\n{rows}")
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+folder = drift_series.folder
+RATE, START = 0.2**2 / 0.5, 0.5
+BASE = drift_series.BASE | {"assimilation": {"scheme": "etkf", "members": 8, "additive": "square-root"}}
 
 
 def conducted(name="drift", **changes):

@@ -165,8 +165,9 @@ main()
 
 
 @pytest.mark.slow
+@pytest.mark.fault("kill-commands")
 def test_a_killed_sweep_is_resumed_to_the_same_numbers(tmp_path):
-    words = ["sweep", str(CONFIGS / "agarose_03_nh.yaml"), "--trajectories", "16384", "--out"]
+    words = ["sweep", str(CONFIGS / "agarose_03_nh.yaml"), "--trajectories", "8192", "--out"]
     call = [sys.executable, "-c", "from en4dvar.cli import main; main()", *words]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     subprocess.run([*call, str(whole)], check=True, capture_output=True)

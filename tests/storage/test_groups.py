@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from en4dvar.report.result import Result
+from en4dvar.storage import netcdf
 from en4dvar.storage.groups import build_groups
-from en4dvar.storage.netcdf import to_bytes
+from en4dvar.storage.netcdf import Group, Variable, to_bytes, tree_of
 from en4dvar.storage.store import save
 from en4dvar.summary import summarise
 
@@ -28,10 +29,23 @@ def contents(group, name=""):
 
 
 def test_file_is_what_xarray_would_write(analysis, tmp_path):
-    (tmp_path / "ours.nc").write_bytes(to_bytes(build_groups(analysis, {"note": "x"})))
+    to_bytes(build_groups(analysis, {"note": "x"})).write(tmp_path / "ours.nc")
     save(Result.from_analysis(analysis, {"note": "x"}), tmp_path / "xarray.nc")
     with netCDF4.Dataset(tmp_path / "ours.nc") as ours, netCDF4.Dataset(tmp_path / "xarray.nc") as theirs:
         assert contents(ours) == contents(theirs)
+
+
+def test_large_variables_are_written_in_blocks(tmp_path, monkeypatch):
+    values = np.arange(60.0).reshape(10, 6)[:, 1:] / 7
+    groups = {"/": Group({"x": Variable(("a", "b"), values, {}, single=True), "y": Variable(("c",), values[0], {})})}
+    to_bytes(groups).write(tmp_path / "whole.nc")
+    monkeypatch.setattr(netcdf, "_LARGE", 100)  # two rows and a half
+    to_bytes(groups).write(tmp_path / "blocks.nc")
+    with netCDF4.Dataset(tmp_path / "whole.nc") as whole, netCDF4.Dataset(tmp_path / "blocks.nc") as blocks:
+        assert contents(whole) == contents(blocks)
+        assert np.array_equal(blocks["x"][...], values.astype(np.float32))
+        assert blocks["x"].dtype == np.float32
+    assert tree_of(groups)["x"].dtype == np.float32
 
 
 def test_summary_of_the_analysis_is_that_of_the_result(analysis):

@@ -14,7 +14,7 @@ from en4dvar.errors import OutputError
 from en4dvar.report.result import Result, load_result
 from en4dvar.storage.beside import BESIDE
 from en4dvar.storage.provenance import git_commit, provenance
-from en4dvar.storage.seal import sealed
+from en4dvar.storage.seal import SealedBytes
 from en4dvar.storage.store import save
 
 FAILED = 3
@@ -227,7 +227,7 @@ def test_foreign_netcdf_is_refused(tmp_path):
     xr.Dataset({"x": ("t", [1.0])}).to_netcdf(path)
     with pytest.raises(OutputError, match="not a complete result of en4dvar"):
         load_result(path)
-    path.write_bytes(sealed(path.read_bytes()))
+    SealedBytes.of(path.read_bytes()).write(path)
     with pytest.raises(OutputError, match="not a result of en4dvar: no group prior"):
         load_result(path)
 
