@@ -1,12 +1,14 @@
 """Scaling and cost of a campaign.
 
-    python benchmarks/scaling.py [--docs] [profile] [workers] [campaign]
+    python benchmarks/scaling.py [--docs] [profile] [workers] [campaign] [many]
 
 Prints Markdown tables; ``--docs`` writes them between the markers of ``docs/performance.md``. ``profile``: what one
 worker's time goes into in the 19 data sets of ``configs/agarose_03_qs.yaml``, without and with the emulator that
 examines the shape of the posterior. ``workers``: 40 synthetic acoustic data sets (quadratic law, truths from the 30 %
 priors, 1.4 µm noise, 15 points) on one and two workers that are already there. ``campaign``: such sets as `en4dvar run`
-estimates them, start of the workers, files and campaign file included. Times are by the wall clock, medians, taken in
+estimates them, start of the workers, files and campaign file included. ``many``: up to 20 000 data sets of a straight
+line on two processes, so that the framework is what is measured, in processor time of the main process and of the
+workers; then the same run resumed, of which nothing is left to do. Times are by the wall clock, medians, taken in
 turns; in the profile processor time, but for the disk. Compilation is not counted. Ratios mean something on an idle
 machine only.
 """
@@ -14,15 +16,20 @@ machine only.
 from __future__ import annotations
 
 import argparse
+import os
+import resource
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from cheap_model import write_campaign
 
 import en4dvar.runs.jobs
 import en4dvar_bubble
@@ -33,12 +40,13 @@ from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, Thread
 from en4dvar.prior import own_seed
 from en4dvar.runs.jobs import Job, estimate
 from en4dvar.runs.runner import run_campaign
+from en4dvar.storage.pack import PACK, Pack
 from en4dvar_bubble.model import BubbleModel
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs" / "performance.md"
 STUDY = ROOT / "configs" / "agarose_03_qs.yaml"
-SETS, CAMPAIGNS = 40, (40, 160)
+SETS, CAMPAIGNS, MANY = 40, (40, 160), (1000, 5000, 20_000)
 REPEATS = 5
 MEDIAN = {"G": 500.0, "alpha": 0.03, "mu": 0.1, "R0": 0.5e-6}
 YAML = """\
@@ -125,8 +133,8 @@ def profile() -> list[str]:
         "reading the data file",
         "forecast: F and H of all members",
         "analysis and bookkeeping: the rest of the estimate",
-        "result: summary and netCDF in memory",
-        "result: to disk, flushed",
+        "result: summary and packing",
+        "result: to disk",
     )
     return [
         f"| {label} | {a:.2f} | {100 * a / plain[1]:.0f} % | {b:.2f} | {100 * b / whole[1]:.0f} % |"
@@ -140,15 +148,16 @@ def spent(config: Config, emulator: Literal["off", "auto"]) -> list[float]:
     contents = [estimate(job).content for job in work]
     clock, rows = time.thread_time, []
     forward = (BubbleModel, "initial_states"), (SerialExecutor, "trajectories"), (Reading, "observe")
-    making = (en4dvar.runs.jobs, "build_groups"), (en4dvar.runs.jobs, "to_bytes"), (en4dvar.runs.jobs, "summarise")
+    making = (en4dvar.runs.jobs, "build_groups"), (en4dvar.runs.jobs, "packed"), (en4dvar.runs.jobs, "summarise")
     with tempfile.TemporaryDirectory() as folder:
+        pack = Pack(Path(folder, PACK))
         for _ in range(REPEATS):
             read = seconds(lambda: jobs(config), clock)
             watch = Stopwatch()
             with watch.watching("forecast", *forward), watch.watching("result", *making):
                 total = seconds(lambda: [estimate(job) for job in work], clock)
             forecast, result = watch.spent["forecast"], watch.spent["result"]
-            write = seconds(lambda: [content.write(Path(folder, "x.nc")) for content in contents])
+            write = seconds(lambda: [pack.append("set", "", b"", content, "") for content in contents])
             rows.append((read, forecast, total - forecast - result, result, write))
     return list(1e3 * np.median(rows, axis=0) / len(work))
 
@@ -196,6 +205,38 @@ def campaign() -> list[str]:
     return rows
 
 
+def many() -> list[str]:
+    """The framework's own cost a data set, and what each further one adds."""
+    rows, found = [], []
+    for n_sets in MANY:
+        with tempfile.TemporaryDirectory() as name, ProcessPoolExecutor(1, get_context("spawn")) as fresh:
+            found.append(fresh.submit(of_many, write_campaign(Path(name), n_sets)).result())
+        main, workers, memory, resume, size = found[-1]
+        each = f"{1e3 * main / n_sets:.2f} | {1e3 * workers / n_sets:.1f}"
+        rows.append(f"| {n_sets} | {each} | {memory:.0f} | {resume:.1f} | {size:.0f} |")
+    rise = np.subtract(found[-1], found[0]) / (MANY[-1] - MANY[0])
+    more = f"{1e3 * rise[0]:.2f} | {1e3 * rise[1]:.1f} | {1e3 * rise[2]:.1f} kB | {1e3 * rise[3]:.2f} ms"
+    return [*rows, f"| each more | {more} | {1e3 * rise[4]:.0f} kB |"]
+
+
+def of_many(path: Path) -> tuple[float, float, float, float, float]:
+    """Processor seconds of this process and its workers, its peak of memory (MB), those of a resume, MB on disk."""
+
+    def spent() -> tuple[float, float]:
+        now = os.times()
+        return now.user + now.system, now.children_user + now.children_system
+
+    execution = {"execution.executor": "processes", "execution.workers": 2}
+    overrides = {**execution, "output.directory": str(path.parent / "run")}
+    begun = spent()
+    run_campaign(path, overrides=overrides)
+    ended = spent()
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    run_campaign(path, overrides=overrides, resume=True)
+    size = sum(file.stat().st_size for file in (path.parent / "run").rglob("*") if file.is_file())
+    return ended[0] - begun[0], ended[1] - begun[1], memory, spent()[0] - ended[0], size / 1e6
+
+
 TABLES: dict[str, tuple[str, Callable[[], list[str]]]] = {
     "profile": (
         "| one worker, 19 data sets, ms per set | `emulator: off` | of the forecast | `auto` | of the forecast |\n"
@@ -209,6 +250,11 @@ TABLES: dict[str, tuple[str, Callable[[], list[str]]]] = {
     "campaign": (
         "| data sets, `en4dvar run` | one worker, s | two threads, s | two processes, s |\n|---|---|---|---|",
         campaign,
+    ),
+    "many": (
+        "| data sets of a straight line | main process, ms a set | workers, ms a set | memory, MB | resume, s | "
+        "on disk, MB |\n|---|---|---|---|---|---|",
+        many,
     ),
 }
 

@@ -23,7 +23,10 @@ import netCDF4
 import numpy as np
 from cheap_model import write_campaign
 
+from en4dvar.storage.pack import read_result
+from en4dvar.storage.packed import unpacked
 from en4dvar.storage.provenance import cpu_model, git_commit
+from en4dvar.storage.store import result_files
 
 HERE = Path(__file__).resolve().parent
 ALLOWED = {0, 1}  # exit codes: 1 where data sets have failed, as they must
@@ -91,20 +94,17 @@ def disturb(process: subprocess.Popen[str], every: float, draw: random.Random) -
 
 
 def same_bits(a: Path, b: Path) -> bool:
-    """Every value of every group."""
+    """Every number and word of every group; the path of the data and the time of the making may differ."""
 
-    def values(group: netCDF4.Group) -> dict[str, bytes]:
-        own = {
-            name: np.asarray(v[...]).astype(str if v.dtype is str else v.dtype).tobytes()
-            for name, v in group.variables.items()
+    def values(file: Path) -> dict[str, bytes]:
+        groups = unpacked(read_result(file)).items()
+        return {
+            f"{path}/{name}": np.asarray(v.values, dtype=str if v.values.dtype == object else None).tobytes()
+            for path, group in groups
+            for name, v in {**group.variables, **group.coords}.items()
         }
-        for name, child in group.groups.items():
-            own |= {f"{name}/{key}": value for key, value in values(child).items()}
-        return own
 
-    with netCDF4.Dataset(a) as x, netCDF4.Dataset(b) as y:
-        x.set_auto_mask(False), y.set_auto_mask(False)
-        return values(x) == values(y)
+    return values(a) == values(b)
 
 
 def soak(sets: int, every: float, seed: int) -> dict[str, object]:
@@ -119,8 +119,9 @@ def soak(sets: int, every: float, seed: int) -> dict[str, object]:
         for label, process in (("troubled", troubled), ("quiet", quiet)):
             if process.wait() not in ALLOWED:
                 raise SystemExit(f"the {label} run: exit {process.returncode}\n{(folder / f'{label}.txt').read_text()}")
-        files = sorted(p.name for p in (folder / "quiet" / "datasets").iterdir())
-        equal = sum(same_bits(folder / "quiet" / "datasets" / f, folder / "troubled" / "datasets" / f) for f in files)
+        files = result_files(folder / "quiet")
+        troubled_files = {file.name: file for file in result_files(folder / "troubled")}
+        equal = sum(same_bits(file, troubled_files[file.name]) for file in files if file.name in troubled_files)
         with (folder / "troubled" / "summary.csv").open(newline="") as file:
             named = {row["dataset"]: row["failure"] for row in csv.DictReader(file) if row["failure"]}
         with netCDF4.Dataset(folder / "troubled" / "posterior.nc") as result:

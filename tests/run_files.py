@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +17,13 @@ from execution_models import Stops
 from toy_config import csv_text, write_toy
 
 from en4dvar.config import Config, load_config
+from en4dvar.report.result import Result, load_result
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.runner import run_campaign
+from en4dvar.storage.checkpoint import digest
+from en4dvar.storage.netcdf import Group, Variable, netcdf_attributes
+from en4dvar.storage.pack import PACK, Pack, results_of
+from en4dvar.storage.packed import packed
 
 TESTS = Path(__file__).parent
 
@@ -56,27 +61,50 @@ def interrupt(path: Path, out: Path, call: int, resume: bool = False) -> str:
     return str(stopped.value)
 
 
-def posterior_files(run: Path) -> dict[str, Path]:
-    return {p.relative_to(run).as_posix(): p for p in sorted(run.rglob("*.nc"))}
+def trees(run: Path) -> dict[str, xr.DataTree]:
+    """What is in every netCDF file and every result of a pack, by their names."""
+    packs = [address for pack in sorted(run.rglob(PACK)) for address in results_of(pack)]
+    found = {p.relative_to(run).as_posix(): load_result(p).tree for p in packs}
+    return found | {p.relative_to(run).as_posix(): xr.load_datatree(p) for p in sorted(run.rglob("*.nc"))}
+
+
+def add_to_pack(run: Path, name: str, result: Result) -> Path:
+    """Add a result to the pack of a run directory, which need not be one of a run; its address."""
+
+    def variables(held: Mapping[Hashable, xr.DataArray]) -> dict[str, Variable]:
+        return {
+            str(key): Variable(tuple(map(str, v.dims)), v.values, netcdf_attributes(v.attrs)) for key, v in held.items()
+        }
+
+    run.mkdir(parents=True, exist_ok=True)
+    nodes = {node.path: node.to_dataset(inherit=False) for node in result.tree.subtree}
+    content = packed(
+        {
+            path: Group(variables(d.data_vars), variables(d.coords), netcdf_attributes(d.attrs))
+            for path, d in nodes.items()
+        }
+    )
+    Pack(run / PACK).append(name, "", b"", content, digest(content))
+    return run / PACK / name
 
 
 def assert_same_results(a: Path, b: Path) -> None:
-    """Every value of every group of every netCDF file agrees bit for bit; attributes of the making may differ."""
-    left, right = posterior_files(a), posterior_files(b)
+    """Every value of every group of every result agrees bit for bit; attributes of the making may differ."""
+    left, right = trees(a), trees(b)
     assert left, f"no result in {a}"
     assert left.keys() == right.keys()
     for name in left:
-        with xr.open_datatree(left[name]) as x, xr.open_datatree(right[name]) as y:
-            assert x.groups == y.groups
-            for group in x.groups:
-                one, two = x[group].to_dataset(inherit=False), y[group].to_dataset(inherit=False)
-                assert set(one.variables) == set(two.variables), (name, group)
-                for key in one.variables.keys() - {"data_source"}:
-                    u, v = one[key].values, two[key].values
-                    assert u.dtype == v.dtype
-                    assert u.tobytes() == v.tobytes() if u.dtype != object else np.array_equal(u, v), (name, group, key)
-                if group != "/":
-                    assert stated(one) == stated(two), (name, group)
+        x, y = left[name], right[name]
+        assert x.groups == y.groups
+        for group in x.groups:
+            one, two = x[group].to_dataset(inherit=False), y[group].to_dataset(inherit=False)
+            assert set(one.variables) == set(two.variables), (name, group)
+            for key in one.variables.keys() - {"data_source"}:
+                u, v = one[key].values, two[key].values
+                assert u.dtype == v.dtype
+                assert u.tobytes() == v.tobytes() if u.dtype != object else np.array_equal(u, v), (name, group, key)
+            if group != "/":
+                assert stated(one) == stated(two), (name, group)
 
 
 def stated(dataset: xr.Dataset) -> dict[str, str]:

@@ -23,6 +23,7 @@ from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, Lines, respon
 from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
 from en4dvar.storage.campaign_file import failed_datasets
 from en4dvar.storage.joint_file import FILE
+from en4dvar.storage.pack import PACK
 from en4dvar.storage.population_file import FILE as POPULATION
 from en4dvar.storage.store import StoredResult, load_stored, result_files
 from en4dvar.summary import summary_csv
@@ -38,7 +39,7 @@ POPULATION_FILES = ("population.html", "population.csv", "population.tex")
 def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int = 1, files: bool = False) -> Path:
     """Write the report of a run and return the path of ``report.html``.
 
-    Reads ``datasets/*.nc`` where the run has several data sets, else ``posterior.nc``. ``datasets`` are names of data
+    Reads ``datasets.pack`` where the run has several data sets, else ``posterior.nc``. ``datasets`` are names of data
     sets of a campaign: their pages are written and the overview links to them. ``files``: figures are also kept as PDF
     and PNG, in a campaign of ``datasets`` or, where none is named, of all that have a page. Pages of a campaign are
     drawn by up to ``workers`` processes, each with its share of :data:`SHARE` or more.
@@ -60,9 +61,9 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     sets, lines, held = [], [], {}
     for path in stored:
         result = load_stored(path)
-        sets.append(SetSummary.of(result, path.stem))
+        sets.append(SetSummary.of(result, path.name))
         if len(stored) <= PAGES:  # to read one takes as long as to draw it
-            held[path.stem] = result
+            held[path.name] = result
         lines.append(_lines(result))
     _write_tables(run_dir, lines)
     failures = failed_datasets(whole)
@@ -126,7 +127,7 @@ def _write_page(
     """The page of one data set of a campaign; ``copies``: prefix of its figures as PDF and PNG, None for none;
     ``held``: what is stored, where it has been read.
     """
-    result = held or load_stored(run_dir / "datasets" / f"{stem}.nc")
+    result = held or load_stored(run_dir / PACK / stem)
     folder = None if copies is None else inside(run_dir, "figures")
     figures = draw(all_figures(result), IDENTIFIERS, folder, copies or "")
     write_text(inside(run_dir, f"pages/{stem}.html"), render_set(result, figures, trail, copies is not None))

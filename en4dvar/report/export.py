@@ -48,7 +48,7 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
     OutputError: the directory holds no results.
     """
     files = result_files(Path(run_dir))
-    if not files[0].is_file():
+    if files == [Path(run_dir) / "posterior.nc"]:
         posterior_file(run_dir)  # says what is missing
     results = map(load_stored, files)  # one is in memory at a time
     if kind == "members":

@@ -15,9 +15,10 @@ from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.executor import Executor
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.runs.campaign import DatasetOutcome
-from en4dvar.storage.checkpoint import Keeper
+from en4dvar.storage.checkpoint import Keeper, digest
 from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import to_bytes
+from en4dvar.storage.packed import packed
 from en4dvar.storage.seal import SealedBytes
 from en4dvar.summary import remarks, summarise
 
@@ -31,7 +32,7 @@ class Job:
 
     ``attributes`` go into the file. ``keeper`` keeps the state of the iterations; a worker that does not see its folder
     keeps none. ``resume`` is where to start. ``stop`` gives the job up after the iteration under way (within one
-    process only).
+    process only). ``alone``: the result is a file of its own, not one of a pack.
     """
 
     problem: InverseProblem
@@ -41,6 +42,7 @@ class Job:
     keeper: Keeper | None = None
     resume: LoopState | None = None
     stop: threading.Event | None = None
+    alone: bool = False
 
     def keep(self, state: Callable[[], LoopState]) -> None:
         """Keep the state of the iterations. Raises :class:`StoppedError` where the job was given up."""
@@ -52,9 +54,9 @@ class Job:
 
 @dataclass(frozen=True)
 class Estimate:
-    """``content`` is the netCDF file; ``ending`` tells how the iterations ended."""
+    """``content`` is the netCDF file, or what goes into a pack; ``ending`` tells how the iterations ended."""
 
-    content: SealedBytes
+    content: SealedBytes | bytes
     ending: str
     outcome: DatasetOutcome
 
@@ -71,13 +73,14 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
     TooFewMembersError: the ensemble is lost. OutputError: a checkpoint cannot be written.
     """
     analysis = assimilate(job.problem, job.settings, job.seed, executor, progress, job.resume, keep=job.keep)
-    content = to_bytes(build_groups(analysis, job.attributes))
+    groups = build_groups(analysis, job.attributes)
+    content = to_bytes(groups) if job.alone else packed(groups)
     outcome = DatasetOutcome(
         analysis.name,
         warnings=analysis.cautions,
         summary=summarise(analysis),
         n_observations=len(analysis.observations),
-        sha256=content.sha256,
+        sha256=content.sha256 if isinstance(content, SealedBytes) else digest(content),
         remarks=remarks(analysis),
     )
     converged = "converged" if analysis.converged else "not converged"

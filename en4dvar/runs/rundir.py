@@ -31,10 +31,11 @@ from en4dvar.runs.replacement import (
     replace_earlier_run,
     write_list,
 )
+from en4dvar.storage.pack import PACK
 from en4dvar.storage.store import COMPLETE, NEXT, require_settled
 
 FIXED = (
-    "config.yaml", "config.resolved.yaml", "posterior.nc", "twin.nc", "run.log", "report.html", "summary.csv",
+    "config.yaml", "config.resolved.yaml", "posterior.nc", PACK, "twin.nc", "run.log", "report.html", "summary.csv",
     "what_if.csv", "ledger.csv", "varying.csv", "joint.nc", "joint.csv", "joint.html",
     "population.nc", "population.csv", "population.tex", "population.html",
 )  # fmt: skip

@@ -22,7 +22,7 @@ from en4dvar.runs.rundir import RunDirectory
 from en4dvar.runs.session import directory_mode, session
 from en4dvar.runs.together import checkpoint_of
 from en4dvar.runs.worklist import Worklist, datasets
-from en4dvar.storage.campaign_file import save_campaign
+from en4dvar.storage.campaign_file import DamagedError, save_campaign
 from en4dvar.storage.joint_file import FILE, load_joint
 from en4dvar.storage.population_file import FILE as POPULATION
 from en4dvar.storage.population_file import load_population
@@ -105,7 +105,7 @@ def run_campaign(
             work = Worklist(config, run, datasets(files), progress, ended)
             try:
                 _begin(work)
-                work.work(executor)
+                _estimate(work, executor)
                 if config.sharing:
                     join_within(work, executor)
                 population_within(work, executor)
@@ -161,25 +161,41 @@ def _executor(config: Config) -> Executor:
 def _begin(work: Worklist) -> None:
     """Write what the run is; of one that is resumed, take over what is done. What has failed is tried again."""
     run, sets = work.run, work.sets
-    results = (file for d in sets for file in (d.file, d.iteration, d.done))
     together = [FILE] * bool(work.config.sharing) + [POPULATION] * (work.config.population is not None)
-    records = map(checkpoint_of, together)
-    run.begin("posterior.nc", *together, *records, *results, retried=work.failed_earlier())
-    if len(sets) > 1:
-        run.directory.folder("datasets")
+    files = (*together, *map(checkpoint_of, together), *(d.iteration for d in sets))
+    run.begin("posterior.nc", work.record, *files, retried=work.failed_earlier())
     if run.resumed:
         work.recall()
 
 
-def _finish(work: Worklist, report_workers: int) -> None:
-    """The campaign's file and the report."""
-    directory = work.run.directory
-    good = {d.name: directory.at(d.file) for d in work.sets if not work.ended[d.name].failure}
-    failures = {name: done.failure for name, done in work.ended.items() if done.failure}
-    if good and len(work.sets) > 1:
-        longest = max(work.ended[name].n_observations for name in good)
+def _estimate(work: Worklist, executor: Executor) -> None:
+    """Every data set, and the campaign's file; a result that was damaged since it was written is estimated again, once.
+
+    Raises what :meth:`Worklist.work` does; :class:`DamagedError` where that was of no use, as on a disk that fails.
+    """
+    repeated: set[str] = set()
+    while True:
+        work.work(executor)
+        work.pack.flush()
+        good = work.good()
+        if work.alone or not good:
+            return
+        failures = {name: done.failure for name, done in work.ended.items() if done.failure}
         attributes = {**work.run.attributes, "identity": work.run.identity.settings}
-        save_campaign(directory.at("posterior.nc"), good, longest, attributes, failures)
+        try:
+            save_campaign(work.run.directory.at("posterior.nc"), good, attributes, failures)
+            return
+        except DamagedError as error:
+            if not repeated.isdisjoint(error.names):
+                raise
+            repeated.update(error.names)
+            work.estimate_again(error.names)
+
+
+def _finish(work: Worklist, report_workers: int) -> None:
+    """The report."""
+    directory, good = work.run.directory, work.good()
+    failures = {name: done.failure for name, done in work.ended.items() if done.failure}
     if good and work.config.report:
         _report(directory, workers=report_workers, figures=work.config.figures)
     else:

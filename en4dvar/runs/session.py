@@ -44,23 +44,21 @@ class Session:
         """The identity of the run that is resumed. Raises :class:`CheckpointError`."""
         return read_checkpoint(self.directory.at(IDENTITY), "run", Identity) if self.resumed else None
 
-    def begin(self, *files: str, retried: Mapping[str, str] | None = None) -> None:
+    def begin(self, *files: str, retried: frozenset[str] = frozenset()) -> None:
         """Write what the run is and claim the ``files`` it will write; a resumed run must be the same run.
 
-        ``retried``: data sets, whose data files may differ, and the records of their failure, which are removed.
+        ``retried``: data sets that failed, whose data files may differ.
 
         Raises :class:`OutputError`: the run is not the same (says what has changed), the directory cannot be written.
         """
-        directory, config, retried = self.directory, self.config, retried or {}
+        directory, config = self.directory, self.config
         directory.folder(FOLDER)
         earlier = self.earlier()
-        if earlier is not None and (difference := self.identity.difference(earlier, frozenset(retried))):
+        if earlier is not None and (difference := self.identity.difference(earlier, retried)):
             raise OutputError(
                 f"{directory.path}: the run cannot be resumed to the same result, for this has changed:\n{difference}\n"
                 "give --force to compute everything again, or another --out"
             )
-        for record in retried.values():
-            directory.remove(record)
         directory.claim("run.log", "config.yaml", "config.resolved.yaml", IDENTITY, *files)
         write_text(directory.at("config.yaml"), config.text)
         write_text(directory.at("config.resolved.yaml"), config.resolved)

@@ -26,16 +26,16 @@ def once_together(work: Worklist, file: str, what: str, fewest: int, estimate: E
     Raises what ``estimate`` does, and :class:`OutputError`.
     """
     config, run = work.config, work.run
-    good = [d for d in work.sets if not work.ended[d.name].failure]
+    good = work.good()
     if len(good) < fewest:
         run.notice(f"no {what}, for which {fewest} data sets need a posterior")
         return
-    made_of = [run.identity.settings, *(f"{d.name}: {work.ended[d.name].sha256}" for d in good)]
+    made_of = [run.identity.settings, *(f"{name}: {work.ended[name].sha256}" for name in good)]
     fingerprint, path = digest("\n".join(made_of).encode()), run.directory.at(file)
     done = run.restore(checkpoint_of(file), fingerprint, str, f"the {what} is made again")
     if done is not None and path.exists() and file_digest(path) == done:
         return
-    sets = [finished_set(config, load_stored(run.directory.at(d.file)), run.directory.path) for d in good]
+    sets = [finished_set(config, load_stored(address), run.directory.path) for address in good.values()]
     attributes = {**run.attributes, "identity": run.identity.settings, "runs": config.name}
     estimate(sets, attributes, path, lambda words: run.log.write(f"{what}: {words}"))
     write_checkpoint(run.directory.at(checkpoint_of(file)), fingerprint, file_digest(path))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 import traceback
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from en4dvar.analysis import IterationRecord, Progress, Record, StartRecord
 from en4dvar.assimilate import LoopState
@@ -21,30 +21,35 @@ from en4dvar.runs.campaign import DatasetOutcome, file_names
 from en4dvar.runs.jobs import Estimate, Job, Records, estimate, estimate_and_tell
 from en4dvar.runs.progress import LiveProgress, describe
 from en4dvar.runs.session import Session
-from en4dvar.storage.checkpoint import FOLDER, CheckpointError, Keeper, file_digest, read_checkpoint, write_checkpoint
+from en4dvar.storage.checkpoint import FOLDER, Keeper, file_digest
+from en4dvar.storage.codec import decode_text, encode_text
+from en4dvar.storage.pack import PACK, Entry, Pack
+from en4dvar.storage.seal import SealedBytes
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """A data set of the run: its data file, and where its results go, relative to the run directory."""
+    """A data set of the run: its data file, its name in a pack, and where its results go, relative to the run
+    directory: an address in a pack, or a file.
+    """
 
     name: str
     source: DataFile
+    stem: str
     file: str
     iteration: str
-    done: str
 
 
 def datasets(files: Mapping[str, DataFile]) -> tuple[Dataset, ...]:
-    """Where the results of each data set go: ``posterior.nc`` for a single one, else ``datasets/*.nc``."""
+    """Where the results of each data set go: ``posterior.nc`` for a single one, else ``datasets.pack``."""
     stems = file_names(files)
     return tuple(
         Dataset(
             name,
             file,
-            f"datasets/{stems[name]}.nc" if len(files) > 1 else "posterior.nc",
+            stems[name],
+            f"{PACK}/{stems[name]}" if len(files) > 1 else "posterior.nc",
             f"{FOLDER}/{stems[name]}.iteration",
-            f"{FOLDER}/{stems[name]}.done",
         )
         for name, file in files.items()
     )
@@ -66,38 +71,71 @@ class Worklist:
     ):
         self.config, self.run, self.sets, self.progress, self.ended = config, run, sets, progress, ended
         self.stop = threading.Event()
+        self.alone = len(sets) == 1
+        self.pack = Pack(run.directory.at(self.record))
         self._reached: dict[str, tuple[int, int]] = {}  # data set at work → its last round, iteration
+
+    def good(self) -> dict[str, Path]:
+        """Where the posterior of each data set is that has one."""
+        work = self.run.directory.work
+        return {d.name: work / d.file for d in self.sets if not self.ended[d.name].failure}
 
     def outcomes(self) -> tuple[DatasetOutcome, ...]:
         """What came of each data set, in order."""
         folder, ended = self.run.directory.home, [(d, self.ended[d.name]) for d in self.sets if d.name in self.ended]
         return tuple(one if one.failure else replace(one, file=folder / d.file) for d, one in ended)
 
-    def failed_earlier(self) -> dict[str, str]:
-        """The data sets that have failed in the run that is resumed, and the records of it."""
+    @property
+    def record(self) -> str:
+        """The file that records how data sets ended."""
+        return f"{FOLDER}/ended" if self.alone else PACK
+
+    def failed_earlier(self) -> frozenset[str]:
+        """The data sets that have failed in the run that is resumed."""
         earlier = self.run.earlier()
-        failed = {}
-        for d in self.sets:
-            if earlier is not None and d.name in earlier.content:
-                with suppress(CheckpointError):
-                    done = read_checkpoint(self.run.directory.at(d.done), earlier.of_dataset(d.name), DatasetOutcome)
-                    if done is not None and done.failure:
-                        failed[d.name] = d.done
-        return failed
+        known = {} if earlier is None else earlier.content
+        return frozenset(
+            d.name
+            for d in self.sets
+            if earlier is not None
+            and d.name in known
+            and (entry := self.pack.entries.get(d.stem)) is not None
+            and entry.fingerprint == earlier.of_dataset(d.name)
+            and self._failed(entry)
+        )
 
     def recall(self) -> None:
-        """Take over what an earlier run finished; what cannot be trusted is estimated again."""
-        directory = self.run.directory
+        """Take over what an earlier run finished, without reading it; what has failed is tried again, and a record that
+        cannot be trusted is not used.
+        """
         for d in self.sets:
-            done = self.run.restore(d.done, self._fingerprint(d), DatasetOutcome, f"{d.name} is estimated again")
-            if done is None:
+            entry = self.pack.entries.get(d.stem)
+            if entry is None or self._failed(entry):
                 continue
-            if file_digest(directory.at(d.file)) == done.sha256:
-                self.ended[d.name] = done
-                directory.remove(d.iteration)  # of a run killed between its last two steps
-            else:
-                self.run.notice(f"{directory.path / d.file}: missing or changed since it was written; estimated again")
+            try:
+                if entry.fingerprint != self._fingerprint(d):
+                    raise OutputError(f"{self.pack.path / d.stem}: belongs to another run")
+                done = decode_text(self.pack.outcome(d.stem), DatasetOutcome)
+            except (OutputError, ValueError) as error:
+                self.run.notice(f"{error}; {d.name} is estimated again")
+                continue
+            if self.alone and file_digest(self.run.directory.at(d.file)) != done.sha256:
+                self.estimate_again([d.name])
+                continue
+            self.ended[d.name] = done
+            self.run.directory.remove(d.iteration)  # of a run killed between its last two steps
         self.run.log.write(f"resumed: {len(self.ended)} of {len(self.sets)} data sets are done")
+
+    def estimate_again(self, names: Sequence[str]) -> None:
+        """Forget that data sets are done, whose results cannot be read."""
+        for d in self.sets:
+            if d.name in names:
+                self.ended.pop(d.name, None)
+                path = self.run.directory.path / d.file
+                self.run.notice(f"{path}: missing or changed since it was written; estimated again")
+
+    def _failed(self, entry: Entry) -> bool:
+        return not self.alone and not entry.content_size
 
     def work(self, executor: Executor) -> None:
         """Estimate every data set that is not done yet.
@@ -156,6 +194,7 @@ class Worklist:
             keeper=Keeper(path, fingerprint, config.execution.checkpoint_every),
             resume=resume,
             stop=stop,
+            alone=self.alone,
         )
 
     def _hear(self, _: int, records: Records) -> None:
@@ -180,8 +219,11 @@ class Worklist:
     def _keep(self, d: Dataset, value: Estimate) -> None:
         warnings = [f"{warning.severity}: {warning}" for warning in value.outcome.warnings]
         self.run.log.write("\n".join(f"{d.name}: {line}" for line in (value.ending, *warnings)))
-        value.content.write(self.run.directory.at(d.file))
-        self._end(d, value.outcome)
+        content = value.content
+        if isinstance(content, SealedBytes):  # a file of its own
+            content.write(self.run.directory.at(d.file))
+            content = b""
+        self._end(d, value.outcome, content)
 
     def _fail(self, d: Dataset, error: Exception) -> None:
         if isinstance(error, OutputError | ExecutorError):
@@ -196,8 +238,8 @@ class Worklist:
         exit_code = error.exit_code if isinstance(error, En4dvarError) else 1
         self._end(d, DatasetOutcome(d.name, failure=reason, exit_code=exit_code))
 
-    def _end(self, d: Dataset, outcome: DatasetOutcome) -> None:
-        write_checkpoint(self.run.directory.at(d.done), self._fingerprint(d), outcome)
+    def _end(self, d: Dataset, outcome: DatasetOutcome, content: bytes = b"") -> None:
+        self.pack.append(d.stem, self._fingerprint(d), encode_text(outcome), content, outcome.sha256)
         self.run.directory.remove(d.iteration)
         self.ended[d.name] = outcome
         self._reached.pop(d.name, None)

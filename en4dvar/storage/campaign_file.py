@@ -1,15 +1,16 @@
-"""``posterior.nc`` of a campaign: the files of its data sets side by side along the dimension ``dataset``.
+"""``posterior.nc`` of a campaign: the results of its data sets side by side along the dimension ``dataset``.
 
-It is written by streaming: one data set is in memory at a time. Dimensions follow the files of the data sets, in the
+It is written by streaming, a block of data sets at a time. Dimensions follow the results of the data sets, in the
 ArviZ schema, with ``dataset`` in front; ``time`` becomes ``observation`` (padded with NaN to the longest data set) and
 the observation times a variable. Scalars that judge a fit become variables of ``sample_stats``. The paths between the
-observations, the iterations, the descents and the modes stay in ``datasets/``.
+observations, the iterations, the descents and the modes stay in ``datasets.pack``.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,154 +18,222 @@ import netCDF4
 import numpy as np
 
 from en4dvar.errors import OutputError
-from en4dvar.storage.netcdf import netcdf_file
+from en4dvar.storage.checkpoint import digest
+from en4dvar.storage.netcdf import Group, Groups, Variable, attributes_of, netcdf_file
+from en4dvar.storage.pack import content_digest, read_result
+from en4dvar.storage.packed import unpacked
 from en4dvar.storage.seal import check_seal
 
 GROUPS = (
     "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "observation_errors",
     "constant_data", "sample_stats", "log_likelihood",
 )  # fmt: skip
+_PATHS = frozenset(f"/{name}" for name in GROUPS)
 LEFT_OUT = {"path_time", "iteration", "mode", "descent"}
 RENAMED = {"time": "observation", "time_column": "observation_column"}  # padded to the longest data set
 PARAMETER = "parameter"
 FAILURES = "failed_datasets"  # root attribute: JSON of name → reason
+MADE_OF = "datasets_sha256"  # root attribute: digest of the results in the file
+BLOCK = 1 << 22  # bytes of results that are written at once
+
+
+class DamagedError(OutputError):
+    """Results that cannot be read any more; ``names`` are those of their data sets."""
+
+    def __init__(self, names: Sequence[str], reason: str):
+        super().__init__(reason)
+        self.names = names
+
+
+@dataclass
+class _Layout:
+    """What the file must have room for: the results as a whole, of which one is in memory at a time."""
+
+    widest: Groups = field(default_factory=dict)  # the (first) data set with most parameters
+    n_parameters: int = -1
+    n_observations: int = 0
+    scalars: dict[str, dict[str, Any]] = field(default_factory=lambda: {group: {} for group in GROUPS})
+
+    def add(self, groups: Groups) -> None:
+        """One that varies in time has the more parameters the longer the window, one that was sampled more scalars."""
+        n_parameters = groups["/sample_stats"].sizes[PARAMETER]
+        if n_parameters > self.n_parameters:
+            self.widest, self.n_parameters = groups, n_parameters
+        for name, kinds in self.scalars.items():
+            group = groups[f"/{name}"]
+            self.n_observations = max(self.n_observations, group.sizes.get("time", 0))
+            for key, value in group.attrs.items():
+                kinds.setdefault(key, str if isinstance(value, str) else np.dtype(float))
 
 
 def save_campaign(
-    path: Path,
-    sources: Mapping[str, Path],
-    n_observations: int,
-    attributes: Mapping[str, Any],
-    failures: Mapping[str, str],
+    path: Path, sources: Mapping[str, Path], attributes: Mapping[str, Any], failures: Mapping[str, str]
 ) -> Path:
-    """Write the campaign's file.
+    """Write the campaign's file; one that is there already, of the same results, is left as it is.
 
     Parameters
     ----------
-    sources: name of the data set → its file, in order; not empty.
-    n_observations: of the longest data set.
+    sources: name of the data set → address of its result (:mod:`en4dvar.storage.pack`), in order; not empty.
     attributes: of the root. failures: name of the data set without a posterior → reason.
 
     Raises
     ------
-    OutputError: the file cannot be written.
+    DamagedError: results cannot be read. OutputError: the file cannot be written.
     """
-    with netcdf_file(path) as partial:
-        _write(partial, sources, n_observations, {**attributes, FAILURES: json.dumps(failures, ensure_ascii=False)})
+    made_of = digest(json.dumps([[*map(content_digest, sources.values())], [*sources], failures]).encode())
+    if _holds(path, made_of):
+        return path
+    layout = _layout(sources)
+    told = {FAILURES: json.dumps(failures, ensure_ascii=False), MADE_OF: made_of}
+    with netcdf_file(path) as partial, netCDF4.Dataset(partial, "w", format="NETCDF4") as target:
+        target.setncatts({**attributes, **told})
+        _define(target, layout, len(sources))
+        for begin, names, block in _blocks(sources):
+            for group in GROUPS:
+                _write(target[group], begin, names, [groups[f"/{group}"] for groups in block])
     return path
 
 
-def _write(path: Path, sources: Mapping[str, Path], n_observations: int, attributes: Mapping[str, Any]) -> None:
-    with netCDF4.Dataset(path, "w", format="NETCDF4") as target:
-        target.setncatts(attributes)
-        with netCDF4.Dataset(max(sources.values(), key=_parameters)) as widest:
-            widest.set_auto_maskandscale(False)
-            _define(target, widest, _scalars(sources.values()), len(sources), n_observations)
-        for i, (name, file) in enumerate(sources.items()):
-            with netCDF4.Dataset(file) as source:
-                source.set_auto_maskandscale(False)
-                for group in GROUPS:
-                    target[group]["dataset"][i] = name
-                    _copy(target[group], source[group], i)
+def _holds(path: Path, made_of: str) -> bool:
+    try:
+        return path.exists() and _root_attribute(path, MADE_OF) == made_of
+    except OutputError:  # damaged: it is written anew
+        return False
 
 
-def _parameters(file: Path) -> int:
-    """How many a data set has: one that varies in time has the more changes the longer the window."""
-    with netCDF4.Dataset(file) as source:
-        return len(source["sample_stats"].dimensions[PARAMETER])
+def _layout(sources: Mapping[str, Path]) -> _Layout:
+    layout, damaged, reasons = _Layout(), [], []
+    for name, address in sources.items():
+        try:
+            layout.add(unpacked(read_result(address), _PATHS))
+        except (OutputError, KeyError, ValueError) as error:  # the last two: written by somebody else
+            damaged.append(name)
+            reasons.append(str(error))
+    if damaged:
+        raise DamagedError(damaged, "\n".join(reasons))
+    return layout
 
 
-def _scalars(files: Iterable[Path]) -> dict[str, dict[str, Any]]:
-    """Group → name → type of every scalar that any data set has: one that was sampled has more than its neighbour."""
-    found: dict[str, dict[str, Any]] = {group: {} for group in GROUPS}
-    for file in files:
-        with netCDF4.Dataset(file) as source:
-            for group, kinds in found.items():
-                for key in source[group].ncattrs():
-                    text = isinstance(source[group].getncattr(key), str)
-                    kinds.setdefault(key, str if text else np.dtype(float))
-    return found
+def _blocks(sources: Mapping[str, Path]) -> Iterator[tuple[int, list[str], list[Groups]]]:
+    """Place of the first, names and groups of as many data sets as are written at once."""
+    begin, size = 0, 0
+    names: list[str] = []
+    block: list[Groups] = []
+    for name, address in sources.items():
+        content = read_result(address, check=False)  # it was for the layout
+        if block and size + len(content) > BLOCK:
+            yield begin, names, block
+            begin, size, names, block = begin + len(names), 0, [], []
+        names.append(name)
+        block.append(unpacked(content, _PATHS))
+        size += len(content)
+    yield begin, names, block
 
 
 def failed_datasets(path: Path) -> dict[str, str]:
     """Name of the data set without a posterior → reason, from a campaign's file; empty where there is no such file."""
     if not path.is_file():
         return {}
+    return {str(k): str(v) for k, v in json.loads(_root_attribute(path, FAILURES) or "{}").items()}
+
+
+def _root_attribute(path: Path, name: str) -> str:
+    """ "" where the file has none. Raises :class:`OutputError`."""
     check_seal(path)
     try:
         with netCDF4.Dataset(path) as file:
-            return {str(k): str(v) for k, v in json.loads(getattr(file, FAILURES, "{}")).items()}
+            return str(getattr(file, name, ""))
     except OSError as error:
         raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
 
 
-def _define(
-    target: netCDF4.Dataset,
-    widest: netCDF4.Dataset,
-    scalars: Mapping[str, Mapping[str, Any]],
-    n_datasets: int,
-    n_observations: int,
-) -> None:
-    """Groups, dimensions, variables and coordinates, as in the file of the (first) data set with most parameters, and
-    the ``scalars`` of all.
-    """
+def _all(group: Group) -> dict[str, Variable]:
+    return {**group.variables, **group.coords}
+
+
+def _define(target: netCDF4.Dataset, layout: _Layout, n_datasets: int) -> None:
+    """Groups, dimensions, variables and coordinates, as of the widest data set, and the scalars of all."""
     for name in GROUPS:
-        source, group = widest[name], target.createGroup(name)
+        source, group = layout.widest[f"/{name}"], target.createGroup(name)
         group.createDimension("dataset", n_datasets)
-        kept = [v for v in source.variables.values() if not LEFT_OUT & {*v.dimensions, v.name}]
-        for dim in sorted({dim for variable in kept for dim in variable.dimensions}):
-            size = n_observations if dim in RENAMED else len(source.dimensions[dim])
-            group.createDimension(RENAMED.get(dim, dim), size)
-        _create(group, "dataset", str, ("dataset",), {"units": "1", "long_name": "data set"})
-        for variable in kept:
-            own = variable.name not in variable.dimensions or variable.name == "time"  # of each data set
-            dims = tuple(RENAMED.get(dim, dim) for dim in variable.dimensions)
-            attributes = {k: variable.getncattr(k) for k in variable.ncattrs() if k != "_FillValue"}
-            made = _create(group, variable.name, variable.dtype, ("dataset", *dims) if own else dims, attributes, own)
+        kept = {key: v for key, v in _all(source).items() if not LEFT_OUT & {*v.dims, key}}
+        for dim in sorted({dim for variable in kept.values() for dim in variable.dims}):
+            group.createDimension(RENAMED.get(dim, dim), layout.n_observations if dim in RENAMED else source.sizes[dim])
+        _create(group, "dataset", np.dtype(object), ("dataset",), {"units": "1", "long_name": "data set"})
+        for key, variable in kept.items():
+            own = key not in variable.dims or key == "time"  # of each data set
+            dims = tuple(RENAMED.get(dim, dim) for dim in variable.dims)
+            kind = variable.values.dtype
+            made = _create(group, key, kind, ("dataset", *dims) if own else dims, attributes_of(variable), own)
             if not own:
-                made[...] = variable[...]
-        for key, kind in scalars[name].items():
+                made[...] = variable.values
+        for key, kind in layout.scalars[name].items():
             variable_name = f"{key}_total" if key in group.variables else key  # a parameter's share keeps its name
             about = {"units": "1", "long_name": key.replace("_", " "), "attribute": key}
-            _create(group, variable_name, kind, ("dataset",), about, padded=True)
+            _create(group, variable_name, np.dtype(kind), ("dataset",), about, padded=True)
 
 
 def _create(
     group: netCDF4.Group,
     name: str,
-    kind: Any,
+    kind: np.dtype[Any],
     dims: tuple[str, ...],
     attributes: Mapping[str, Any],
     padded: bool = False,
 ) -> netCDF4.Variable:
     """A variable; where it is ``padded``, floats that are missing are NaN."""
-    fill = np.nan if padded and kind is not str and kind.kind == "f" else None
-    made = group.createVariable(name, kind, dims, fill_value=fill)
+    fill = np.nan if padded and kind.kind == "f" else None
+    stored = str if kind.kind in "OU" else np.dtype(np.int8) if kind.kind == "b" else kind
+    made = group.createVariable(name, stored, dims, fill_value=fill)
     made.setncatts(attributes)
     made.set_auto_maskandscale(False)
     return made
 
 
-def _copy(group: netCDF4.Group, source: netCDF4.Group, i: int) -> None:
-    """The values of data set ``i``; what it lacks stays missing."""
-    places = _places(group, source)
+def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequence[Group]) -> None:
+    """The values of consecutive data sets; what one lacks stays missing."""
+    found = [_all(source) for source in block]
+    names_here = group[PARAMETER][...].tolist() if PARAMETER in group.variables else []
+    places = [_places(names_here, source) for source in found]
     for variable in group.variables.values():
-        if variable.dimensions[:1] != ("dataset",) or variable.name == "dataset":
+        if variable.dimensions[:1] != ("dataset",):
             continue
-        if "attribute" in variable.ncattrs():
+        kind, shape = object if variable.dtype is str else variable.dtype, variable.shape[1:]
+        rows = np.full((len(block), *shape), _missing(variable), dtype=kind)
+        if variable.name == "dataset":
+            rows[:] = names
+        elif "attribute" in variable.ncattrs():
             key = variable.getncattr("attribute")
-            if key in source.ncattrs():
-                variable[i] = source.getncattr(key)
-        elif variable.name in source.variables and (given := source[variable.name]).size:  # no parameter, no value
-            where = (
-                places if dim == PARAMETER else slice(n) for dim, n in zip(given.dimensions, given.shape, strict=True)
-            )
-            variable[(i, *where)] = given[...]
+            for i, source in enumerate(block):
+                if key in source.attrs:
+                    rows[i] = source.attrs[key]
+        else:
+            for i, (one, place) in enumerate(zip(found, places, strict=True)):
+                if variable.name in one:
+                    _place(rows[i, ...], one[variable.name], place)
+        if kind is not object or (rows != "").any():  # text that is not written is empty
+            variable[begin : begin + len(block)] = rows
 
 
-def _places(group: netCDF4.Group, source: netCDF4.Group) -> slice | list[int]:
-    """Where the parameters of a data set stand among those of the campaign."""
-    if PARAMETER not in source.variables:
-        return slice(None)
-    names = group[PARAMETER][...].tolist()
-    return [names.index(name) for name in source[PARAMETER][...].tolist()]
+def _place(row: np.ndarray[Any, Any], given: Variable, places: list[int] | None) -> None:
+    """Put the values of one data set into its part of a variable, each parameter in its place."""
+    if row.shape == given.values.shape and (places is None or PARAMETER not in given.dims):
+        row[...] = given.values
+    elif given.values.size:  # no parameter, no value
+        where = (
+            places if places and dim == PARAMETER else slice(n)
+            for dim, n in zip(given.dims, given.values.shape, strict=True)
+        )  # fmt: skip
+        row[tuple(where)] = given.values
+
+
+def _missing(variable: netCDF4.Variable) -> Any:
+    if variable.dtype is str:
+        return ""
+    return getattr(variable, "_FillValue", netCDF4.default_fillvals[np.dtype(variable.dtype).str[1:]])
+
+
+def _places(names: list[str], source: Mapping[str, Variable]) -> list[int] | None:
+    """Where the parameters of a data set stand among those of the campaign, None where they are the same."""
+    own = source[PARAMETER].values.tolist() if PARAMETER in source else names
+    return None if own == names else [names.index(name) for name in own]

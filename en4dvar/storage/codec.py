@@ -6,6 +6,7 @@ by their name. What is read back is checked against the annotations of the datac
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import types
@@ -27,6 +28,20 @@ def encode(value: Any) -> bytes:
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **{_TEXT: np.array(text)}, **arrays)
     return buffer.getvalue()
+
+
+def encode_text(value: Any) -> bytes:
+    """As :func:`encode`, of a dataclass without arrays: its JSON text alone."""
+    return json.dumps(_plain(value, {})).encode("ascii")
+
+
+def decode_text(content: bytes, kind: type[D]) -> D:
+    """The dataclass of :func:`encode_text`. Raises :class:`ValueError` where the bytes are not one of ``kind``."""
+    try:
+        value: D = _typed(json.loads(content), kind, {})
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"not a {kind.__name__}: {error}") from error
+    return value
 
 
 def decode(content: bytes, kind: type[D]) -> D:
@@ -56,6 +71,12 @@ def _plain(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
     raise TypeError(f"cannot store a {type(value).__name__}")
 
 
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    hints = typing.get_type_hints(kind)
+    return {f.name: hints[f.name] for f in fields(kind)}
+
+
 def _typed(raw: Any, kind: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
@@ -72,8 +93,8 @@ def _typed(raw: Any, kind: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
             raise ValueError(f"{raw!r} is not one of {arguments}")
         return raw
     if is_dataclass(kind):
-        hints = typing.get_type_hints(kind)
-        if set(raw) != {f.name for f in fields(kind)}:
+        hints = _hints(typing.cast(type, kind))
+        if set(raw) != set(hints):
             raise ValueError(f"the fields of {kind} differ")
         return typing.cast(Any, kind)(**{name: _typed(item, hints[name], arrays) for name, item in raw.items()})
     if kind is float and type(raw) in (int, float):

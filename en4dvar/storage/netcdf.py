@@ -95,6 +95,11 @@ Groups = Mapping[str, Group]
 
 def tree_of(groups: Groups) -> xr.DataTree:
     """The groups as xarray shows them."""
+    return xr.DataTree.from_dict(datasets_of(groups))
+
+
+def datasets_of(groups: Groups) -> dict[str, xr.Dataset]:
+    """Each group as xarray shows it, by path."""
 
     def shown(v: Variable) -> xr.Variable:
         values = v.values.astype(np.float32) if v.single else v.values
@@ -104,7 +109,7 @@ def tree_of(groups: Groups) -> xr.DataTree:
         variables, coords = ({n: shown(v) for n, v in part.items()} for part in (group.variables, group.coords))
         return xr.Dataset(variables, coords, group.attrs)
 
-    return xr.DataTree.from_dict({path: dataset(group) for path, group in groups.items()})
+    return {path: dataset(group) for path, group in groups.items()}
 
 
 def to_bytes(groups: Groups) -> SealedBytes:
@@ -172,6 +177,11 @@ def _write_more(partial: Path) -> None:
         os.fsync(file.fileno())
 
 
+def attributes_of(variable: Variable) -> dict[str, Any]:
+    """With what tells that a variable holds truth values, which netCDF knows as bytes."""
+    return {**variable.attrs, **({"dtype": "bool"} if variable.values.dtype == bool else {})}
+
+
 def _define(file: netCDF4.Dataset, path: str, content: Group) -> Iterator[tuple[Any, Any]]:
     """Define a group; yields its variables with the values to be written."""
     group = file if path == "/" else file.createGroup(path)
@@ -179,9 +189,9 @@ def _define(file: netCDF4.Dataset, path: str, content: Group) -> Iterator[tuple[
     for name, size in content.sizes.items():
         group.createDimension(name, size)
     for name, variable in (*content.variables.items(), *content.coords.items()):
-        values, attributes = variable.values, dict(variable.attrs)
+        values, attributes = variable.values, attributes_of(variable)
         if values.dtype == bool:
-            values, attributes["dtype"] = values.astype(np.int8), "bool"
+            values = values.astype(np.int8)
         kind = str if values.dtype.kind in "OU" else np.dtype(np.float32) if variable.single else values.dtype
         missing = values.dtype.kind == "f" and variable.fill and name in content.variables
         target = group.createVariable(name, kind, variable.dims, fill_value=np.nan if missing else None)

@@ -21,7 +21,9 @@ from en4dvar.storage.axes import Axis, axes_of
 from en4dvar.storage.beside import BESIDE, joined
 from en4dvar.storage.complete import check_complete, of_members
 from en4dvar.storage.groups import build_groups
-from en4dvar.storage.netcdf import netcdf_file, read_groups, tree_of
+from en4dvar.storage.netcdf import datasets_of, netcdf_file, read_groups, tree_of
+from en4dvar.storage.pack import PACK, read_result, results_of
+from en4dvar.storage.packed import unpacked
 from en4dvar.storage.record import observations_of
 from en4dvar.summary import ParameterSummary, living, results_table
 
@@ -184,22 +186,37 @@ def require_settled(run_dir: Path) -> None:
 
 
 def result_files(run_dir: Path) -> list[Path]:
-    """The files of a run directory's data sets, by name; of a single one ``posterior.nc``, which need not exist.
+    """Where the results of a run directory's data sets are, by name; of a single one ``posterior.nc``, which need not
+    exist.
 
-    Raises :class:`OutputError` as :func:`require_settled`.
+    Raises :class:`OutputError` as :func:`require_settled`, and of a campaign of an earlier version.
     """
     require_settled(run_dir)
-    return sorted((run_dir / "datasets").glob("*.nc")) or [run_dir / "posterior.nc"]
+    if (run_dir / PACK).exists():
+        return results_of(run_dir / PACK) or [run_dir / "posterior.nc"]
+    if (run_dir / "datasets").is_dir():
+        raise OutputError(
+            f"{run_dir}: a campaign of an earlier version of en4dvar, with a file for each data set in datasets/; run "
+            "it again, or read these files one by one (load_result)"
+        )
+    return [run_dir / "posterior.nc"]
 
 
 def load_stored(path: str | Path) -> StoredResult:
-    """Read a file of :func:`save` into memory and close it.
+    """Read a file of :func:`save` into memory and close it, or what is at an address in a pack.
 
     Raises
     ------
     OutputError: it is not one, of another version, cut short or altered (see :mod:`en4dvar.storage.seal`).
     """
     path = Path(path)
-    nodes = read_groups(path)
+    nodes = _in_pack(path) if path.parent.name == PACK else read_groups(path)
     check_complete(path, nodes)
     return StoredResult(xr.DataTree.from_dict(nodes))
+
+
+def _in_pack(address: Path) -> dict[str, xr.Dataset]:
+    try:
+        return datasets_of(unpacked(read_result(address)))
+    except ValueError as error:  # anybody can write a checksum: the sizes of dimensions differ, for instance
+        raise OutputError(f"{address}: not a result of en4dvar: {error}") from None

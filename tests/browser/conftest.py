@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from run_files import add_to_pack
 
 from en4dvar import report
 from en4dvar.caution import caution
@@ -107,10 +108,9 @@ def _write_pages(analysis: Any, renamed: Any, folder: Path) -> dict[str, Path]:
     comparison = compare_runs([folder / "single", folder / "calm"])
     found["compare"] = overlay.write_comparison(comparison, folder / "compare")
     campaign = folder / "campaign"
-    (campaign / "datasets").mkdir(parents=True)
     for i, (stem, name) in enumerate((("b", "beta"), ("a", "alpha"), ("c", EVIL))):
         one = replace(renamed(calm, name), posterior=(1 + 0.2 * i) * calm.posterior, cautions=notes[:i])
-        save(Result.from_analysis(one, provenance("name: test\n")), campaign / "datasets" / f"{stem}.nc")
+        add_to_pack(campaign, stem, Result.from_analysis(one, provenance("name: test\n")))
     with pytest.MonkeyPatch.context() as patch:  # two figures on each page tell as much as five
         patch.setattr(report, "all_figures", lambda result: islice(all_figures(result), 2))
         found["campaign"] = write_pages(campaign)

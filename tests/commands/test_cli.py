@@ -19,6 +19,7 @@ from en4dvar.commands.run import _tell
 from en4dvar.config import load_config
 from en4dvar.report.result import load_result
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
+from en4dvar.storage.pack import PACK
 
 
 def call(*arguments: str | Path) -> Result:
@@ -75,7 +76,7 @@ def test_campaign(tmp_path: Path) -> None:
         (tmp_path / f"set{n}.csv").write_text(csv_text(k=1.5 + n / 4))
     outcome = call("run", path, "--out", tmp_path / "run", "--data", tmp_path / "set*.csv", "--no-report")
     assert outcome.exit_code == 0, outcome.output
-    results = [load_result(tmp_path / "run" / "datasets" / f"set{n}.nc") for n in (1, 2)]
+    results = [load_result(tmp_path / "run" / PACK / f"set{n}") for n in (1, 2)]
     assert [r.name for r in results] == ["set1", "set2"]
     means = [r.summary()[1].mean for r in results]
     assert means == pytest.approx([1.75, 2.0], rel=0.02)
@@ -242,10 +243,10 @@ def test_force_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None
     outcome = call("run", path, "--out", out, "--force", "--data", tmp_path / "*.csv")
     assert outcome.exit_code == 0, outcome.output
     assert (out / "notes.txt").read_text() == (out / "figures" / "mine.png").read_text() == "mine"
-    assert (out / "datasets" / "other.nc").exists()
+    assert (out / PACK).exists()
     assert not (out / "figures" / "posterior.png").exists()
     assert call("run", path, "--out", out, "--force").exit_code == 0
-    assert not (out / "datasets").exists()
+    assert not (out / PACK).exists()
     (out / ".en4dvar-files").unlink()  # now nothing tells that a run wrote the files
     refused = call("run", path, "--out", out, "--force")
     assert refused.exit_code == 2

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from run_files import add_to_pack
 
 from en4dvar.analysis import Analysis
 from en4dvar.caution import caution
@@ -37,9 +38,8 @@ def two(
     tmp_path_factory: pytest.TempPathFactory, analysis: Analysis, renamed: Callable[[Analysis, str], Analysis]
 ) -> Path:
     folder = tmp_path_factory.mktemp("two")
-    (folder / "datasets").mkdir()
     for name in ("a_1", "b&2"):
-        save(Posterior.from_analysis(renamed(analysis, name), {}), folder / "datasets" / f"{name[0]}.nc")
+        add_to_pack(folder, name[0], Posterior.from_analysis(renamed(analysis, name), {}))
     return folder
 
 

@@ -1,9 +1,11 @@
 """The numbers do not depend on where the work is done, nor on a worker that dies."""
 
 import pytest
-from run_files import assert_same_results, configuration, make_campaign
+from run_files import add_to_pack, assert_same_results, configuration, make_campaign
 
+from en4dvar.report.result import load_result
 from en4dvar.runs.runner import run_campaign
+from en4dvar.storage.pack import PACK, results_of
 
 EVERYWHERE = [
     ("serial", 2), ("threads", 2), ("processes", 2), ("dask", 2),
@@ -59,7 +61,7 @@ def test_members_on_workers_where_data_sets_are_few(few, tmp_path, kind):
 @pytest.mark.fault("worker-killed")
 def test_death_of_a_worker_changes_nothing(request, tmp_path, monkeypatch, kind, campaign, workers):
     _, run = request.getfixturevalue(campaign)
-    sets = len(list((run / "datasets").iterdir()))
+    sets = len(results_of(run / PACK))
     path = make_campaign(tmp_path, sets, "execution_models:DiesOnce", large=sets // 2)
     monkeypatch.setenv("EN4DVAR_TEST_FLAG", str(tmp_path / "died"))
     done = run_campaign(configuration(path, tmp_path / "run", executor=kind, workers=workers))
@@ -80,7 +82,6 @@ def test_a_data_set_that_kills_every_worker_is_named_and_the_others_are_not_dist
     assert campaign.exit_code == 1
     (tmp_path / "run" / "posterior.nc").unlink()
     expected = tmp_path / "expected"
-    (expected / "datasets").mkdir(parents=True)
     for i in (0, 1, 3):
-        (expected / "datasets" / f"set{i}.nc").write_bytes((run / "datasets" / f"set{i}.nc").read_bytes())
+        add_to_pack(expected, f"set{i}", load_result(run / PACK / f"set{i}"))
     assert_same_results(tmp_path / "run", expected)

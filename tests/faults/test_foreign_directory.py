@@ -16,6 +16,7 @@ from en4dvar.files import atomic_path, inside, write_text
 from en4dvar.runs.lock import LOCK
 from en4dvar.runs.replacement import LISTING, OLD
 from en4dvar.runs.rundir import RunDirectory
+from en4dvar.storage.pack import PACK
 from en4dvar.storage.store import COMPLETE, NEXT
 
 pytestmark = [
@@ -44,7 +45,7 @@ def beside_own_files(path: Path, run: Path, folder: Path) -> tuple[Path, Path, P
     shutil.copytree(run, folder / "run")
     outside = folder / "outside"
     outside.mkdir()
-    for name in ("rc", "run", ".set0.nc.7.tmp", "set0.done", "chunk_00000.npz"):
+    for name in ("rc", "run", ".set0.nc.7.tmp", "ended", "chunk_00000.npz"):
         (outside / name).write_text(SECRET)
     return path, folder / "run", outside
 
@@ -116,7 +117,9 @@ ATTACKS: dict[str, Callable[[Path, Path], None]] = {
     "log": lambda run, outside: replaced_by_link(run / "run.log", outside / "rc"),
     "log is a hard link": lambda run, outside: ((run / "run.log").unlink(), os.link(outside / "rc", run / "run.log")),
     "log is a pipe": lambda run, outside: replaced_by_pipe(run / "run.log"),
-    "datasets": lambda run, outside: replaced_by_link(run / "datasets", outside),
+    "pack": lambda run, outside: replaced_by_link(run / PACK, outside / "rc"),
+    "pack is a hard link": lambda run, outside: ((run / PACK).unlink(), os.link(outside / "rc", run / PACK)),
+    "pack is a pipe": lambda run, outside: replaced_by_pipe(run / PACK),
     "figures": lambda run, outside: replaced_by_link(run / "figures", outside),
     "pages": lambda run, outside: replaced_by_link(run / "pages", outside),
     "list": lambda run, outside: replaced_by_link(run / LISTING, outside / "rc"),
@@ -195,11 +198,11 @@ def test_who_reads_writes_nothing(foreign: tuple[Path, Path, Path], words: tuple
 def test_a_result_that_is_a_pipe_is_refused(foreign: tuple[Path, Path, Path]) -> None:
     """Opening it would wait for ever."""
     _, run, _ = foreign
-    (run / "datasets" / "set0.nc").unlink()
-    os.mkfifo(run / "datasets" / "set0.nc")
+    (run / PACK).unlink()
+    os.mkfifo(run / PACK)
     told = call("export", run)
     assert told.exit_code == 2
-    assert "set0.nc: cannot be read: Not a plain file" in told.stderr
+    assert "datasets.pack: cannot be read: Not a plain file" in told.stderr
 
 
 def test_a_linked_folder_for_a_comparison_is_not_followed(foreign: tuple[Path, Path, Path]) -> None:

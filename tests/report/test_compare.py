@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from run_files import add_to_pack
 from toys import Linear, make_problem
 
 from en4dvar.assimilate import assimilate
@@ -28,9 +29,9 @@ def run_dir(path, names, seeds=(1,), std=0.1, wide=1.0):
         observations = replace(problem.observations, name=f"set{seed}")
         prior = Prior(tuple(PriorTerm.normal(p, 0.0, wide) for p in model.parameters))
         analysis = assimilate(InverseProblem(model, problem.observable, observations, prior), AssimilationSettings(), 1)
-        place = path / "datasets" / f"set{seed}.nc" if len(seeds) > 1 else path / "posterior.nc"
-        place.parent.mkdir(parents=True, exist_ok=True)
-        save(Result.from_analysis(analysis, {"configuration": json.dumps({})}), place)
+        path.mkdir(parents=True, exist_ok=True)
+        result = Result.from_analysis(analysis, {"configuration": json.dumps({})})
+        add_to_pack(path, f"set{seed}", result) if len(seeds) > 1 else save(result, path / "posterior.nc")
     return path
 
 

@@ -12,6 +12,7 @@ from html import unescape
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from run_files import add_to_pack
 
 from en4dvar.caution import caution
 from en4dvar.cli import main
@@ -34,9 +35,11 @@ LITTLE = caution("not-informed", "R0 is hardly informed by the data", parameters
 MISFIT = caution("misfit", "χ² of the residuals is 400 where about 38 is expected")
 
 
-def written(folder, analysis, *cautions, file="posterior.nc"):
-    (folder / file).parent.mkdir(parents=True, exist_ok=True)
-    save(Result.from_analysis(replace(analysis, cautions=cautions), provenance("name: test\n")), folder / file)
+def written(folder, analysis, *cautions, name=None):
+    """The run directory of a single result, or of a campaign with one of that ``name``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    result = Result.from_analysis(replace(analysis, cautions=cautions), provenance("name: test\n"))
+    save(result, folder / "posterior.nc") if name is None else add_to_pack(folder, name, result)
     return folder
 
 
@@ -116,7 +119,7 @@ def test_latex_has_footnotes_and_no_interval(bounded):
 
 def test_latex_of_a_campaign_marks_single_numbers(tmp_path, analysis, renamed):
     for name, cautions in (("one", (MISFIT,)), ("two", ())):
-        written(tmp_path, renamed(analysis, name), *cautions, file=f"datasets/{name}.nc")
+        written(tmp_path, renamed(analysis, name), *cautions, name=name)
     one, two = (line for line in export_table(tmp_path, "latex").splitlines() if line.startswith(("  one", "  two")))
     assert one.startswith(r"  one\textsuperscript{a} &")
     assert one.count(r"\textsuperscript{b}") == 4
@@ -156,8 +159,8 @@ def test_terminal_tells_the_worst_first(tmp_path, capsys):
 
 def test_page_and_index_stand_in_the_same_order(tmp_path, analysis, renamed, one_figure):
     mixed = (LITTLE, AT_BOUND, MISFIT)  # as a file of anybody might hold them
-    written(tmp_path, renamed(analysis, "mixed"), *mixed, file="datasets/mixed.nc")
-    written(tmp_path, renamed(analysis, "mild"), LITTLE, file="datasets/mild.nc")
+    written(tmp_path, renamed(analysis, "mixed"), *mixed, name="mixed")
+    written(tmp_path, renamed(analysis, "mild"), LITTLE, name="mild")
     index = write_pages(tmp_path).read_text(encoding="utf-8")
     page = (tmp_path / "pages" / "mixed.html").read_text(encoding="utf-8")
     expected = ["misfit", "at-bound", "not-informed"]

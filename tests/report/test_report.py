@@ -16,6 +16,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 from PIL import Image
+from run_files import add_to_pack
 
 from en4dvar import report
 from en4dvar.caution import Caution
@@ -29,7 +30,8 @@ from en4dvar.report.figures import all_figures, traces
 from en4dvar.report.history import history
 from en4dvar.report.overview import LISTED, SetSummary, overview_figures, render_overview
 from en4dvar.report.page import judge_chi2
-from en4dvar.report.result import Result
+from en4dvar.report.result import Result, load_result
+from en4dvar.storage.pack import PACK
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.store import save
 
@@ -184,10 +186,9 @@ def test_summary_table(reported, analysis):
 def campaign_dir(analysis, renamed, tmp_path_factory):
     """The report of three data sets, one with a name that must be escaped and quoted."""
     folder = tmp_path_factory.mktemp("campaign")
-    (folder / "datasets").mkdir()
     for name, file in (("one", "one"), ("two", "two"), ("<script>alert('é')</script>", "é 100%")):
         result = Result.from_analysis(renamed(analysis, name), provenance("name: test\n"))
-        save(result, folder / "datasets" / f"{file}.nc")
+        add_to_pack(folder, file, result)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "all_figures", first_figure)
         write_pages(folder)
@@ -228,7 +229,7 @@ def test_the_script_that_runs_is_the_one_the_policy_names(campaign_dir):
 
 @pytest.mark.slow
 def test_large_campaign_gets_pages_on_demand(campaign_dir, tmp_path, monkeypatch):
-    shutil.copytree(campaign_dir / "datasets", tmp_path / "datasets")
+    shutil.copy(campaign_dir / PACK, tmp_path)
     monkeypatch.setattr(report, "all_figures", first_figure)
     monkeypatch.setattr(report, "PAGES", 1)
     html = write_pages(tmp_path).read_text(encoding="utf-8")
@@ -252,7 +253,8 @@ def test_processes_draw_the_same_pages(campaign_dir, tmp_path, monkeypatch):
     monkeypatch.setattr(report, "SHARE", 1)
     one, two = tmp_path / "one", tmp_path / "two"
     for run in (one, two):  # two data sets are enough
-        shutil.copytree(campaign_dir / "datasets", run / "datasets", ignore=shutil.ignore_patterns("é*"))
+        for name in ("one", "two"):
+            add_to_pack(run, name, load_result(campaign_dir / PACK / name))
     write_pages(one)
     monkeypatch.setattr(report, "render_set", None)  # this process draws no page
     write_pages(two, workers=2)
@@ -272,7 +274,7 @@ def test_the_page_of_a_process_that_dies_is_drawn_here(campaign_dir, tmp_path, m
         def map(self, function, calls, hear=None):
             return ((i, WorkerLostError("killed") if i == 1 else function(*call)) for i, call in enumerate(calls))
 
-    shutil.copytree(campaign_dir / "datasets", tmp_path / "datasets")
+    shutil.copy(campaign_dir / PACK, tmp_path)
     for name, value in {"SHARE": 1, "all_figures": first_figure, "ProcessesExecutor": Deadly}.items():
         monkeypatch.setattr(report, name, value)
     write_pages(tmp_path, workers=2)

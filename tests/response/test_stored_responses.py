@@ -10,13 +10,14 @@ import netCDF4
 import numpy as np
 import pytest
 from acting import Acting, acting_problem
+from run_files import add_to_pack
 
 from en4dvar.assimilate import assimilate
 from en4dvar.forward import Alternative
 from en4dvar.problem import AssimilationSettings
 from en4dvar.report import write_pages
 from en4dvar.report.responses import StoredShift, shift_text, stored_ledger, stored_shifts
-from en4dvar.report.result import Result
+from en4dvar.report.result import Result, load_result
 from en4dvar.storage.campaign_file import save_campaign
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.store import load_stored, save
@@ -103,8 +104,8 @@ def test_a_page_without_them_is_silent(run_dir, tmp_path):
 
 
 def test_a_campaign_keeps_them(run_dir, tmp_path):
-    sources = {"a": run_dir / "posterior.nc", "b": run_dir / "posterior.nc"}
-    with netCDF4.Dataset(save_campaign(tmp_path / "posterior.nc", sources, len(TIMES), {}, {})) as file:
+    sources = {name: add_to_pack(tmp_path, name, load_result(run_dir / "posterior.nc")) for name in ("a", "b")}
+    with netCDF4.Dataset(save_campaign(tmp_path / "posterior.nc", sources, {}, {})) as file:
         stats = file["sample_stats"]
         assert stats["what_if_change"].dimensions == ("dataset", "alternative", "parameter")
         assert list(stats["alternative"][:]) == ["clock", "scale", "other"]

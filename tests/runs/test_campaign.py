@@ -12,7 +12,8 @@ from en4dvar.errors import DataError, TooFewMembersError
 from en4dvar.report.result import load_result
 from en4dvar.runs.campaign import Campaign, DatasetOutcome, file_names
 from en4dvar.runs.runner import run_campaign, write_report
-from en4dvar.storage.campaign_file import GROUPS
+from en4dvar.storage.campaign_file import GROUPS, save_campaign
+from en4dvar.storage.pack import PACK, results_of
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +44,7 @@ def test_failures_are_named_and_the_rest_is_estimated(campaign):
         assert f"{outcome.name}: failed: {outcome.failure.splitlines()[0]}" in log
         assert [r["failure"] for r in rows if r["dataset"] == outcome.name] == [outcome.failure]
     assert {r["dataset"]: r["name"] for r in rows if not r["failure"]} == dict.fromkeys(["set0", "set1", "set3"], "k")
-    assert sorted(p.name for p in (campaign.directory / "datasets").iterdir()) == ["set0.nc", "set1.nc", "set3.nc"]
+    assert [p.name for p in results_of(campaign.directory / PACK)] == ["set0", "set1", "set3"]
 
 
 @pytest.mark.parametrize(
@@ -79,6 +80,15 @@ def test_one_file_for_all(campaign):
             assert str(one["sample_stats"]["stop_reason"].values) == result.sample_stats.attrs["stop_reason"]
             assert one["constant_data"]["c"] == 0.02
         assert {len(r.observed_data["time"]) for r in single.values()} == {25, 31}
+
+
+def test_blocks_make_no_difference(campaign, tmp_path, monkeypatch):
+    sources = {load_result(address).name: address for address in results_of(campaign.directory / PACK)}
+    monkeypatch.setattr("en4dvar.storage.campaign_file.BLOCK", 1)
+    one_by_one = xr.load_datatree(save_campaign(tmp_path / "posterior.nc", sources, {}, {}))
+    together = xr.load_datatree(campaign.directory / "posterior.nc")
+    for group in GROUPS:
+        xr.testing.assert_identical(one_by_one[group].to_dataset(), together[group].to_dataset())
 
 
 def test_the_log_says_where_descents_ended(campaign):

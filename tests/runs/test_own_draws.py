@@ -43,7 +43,7 @@ def campaign(tmp_path_factory):
 
 def test_sets_of_a_campaign_differ_in_draws_and_agree_in_their_moments(campaign):
     folder, _ = campaign
-    first, second, third = (prior_of(load_result(folder / f"together/datasets/set{i}.nc")) for i in range(3))
+    first, second, third = (prior_of(load_result(folder / f"together/datasets.pack/set{i}")) for i in range(3))
     for other in (second, third):
         assert np.abs(first - other).min() > 1e-9
         for what in (np.mean, np.std):
@@ -59,8 +59,8 @@ def test_a_set_has_the_same_bits_alone_and_among_others(campaign):
     names = "[data/set2.csv, data/set1.csv]"
     backwards.write_text(path.read_text().replace("data/*.csv", names))
     run_campaign(configuration(backwards, folder / "backwards", executor="serial"))
-    together = load_result(folder / "together/datasets/set1.nc")
-    for other in (folder / "alone/posterior.nc", folder / "backwards/datasets/set1.nc"):
+    together = load_result(folder / "together/datasets.pack/set1")
+    for other in (folder / "alone/posterior.nc", folder / "backwards/datasets.pack/set1"):
         found = load_result(other)
         for group in ("prior", "posterior", "iterations"):
             assert found.dataset(group).identical(together.dataset(group))
@@ -72,7 +72,7 @@ def test_files_made_when_all_sets_had_one_seed_are_repeated_to_the_bit(campaign,
     with monkeypatch.context() as before:
         before.setattr("en4dvar.runs.worklist.own_seed", lambda seed, name: seed)
         run_campaign(configuration(path, folder / "before"))
-    first, second = (load_result(folder / f"before/datasets/set{i}.nc") for i in range(2))
+    first, second = (load_result(folder / f"before/datasets.pack/set{i}") for i in range(2))
     assert first.attributes["seed"] == 3
     np.testing.assert_array_equal(first.prior["k"], second.prior["k"])
     assert rerun(folder / "before").same

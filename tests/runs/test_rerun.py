@@ -1,14 +1,14 @@
 """A run repeated from its result files alone: the same bits, or what has changed."""
 
 import pytest
-from run_files import configuration, make_campaign, run_cli
+from run_files import add_to_pack, configuration, make_campaign, run_cli
 from toy_config import write_toy
 
 from en4dvar.errors import OutputError
 from en4dvar.report.result import load_result
 from en4dvar.runs.rerun import rerun
 from en4dvar.runs.runner import run, run_campaign
-from en4dvar.storage.store import save
+from en4dvar.storage.pack import PACK
 
 
 @pytest.fixture
@@ -45,10 +45,10 @@ def test_without_the_data_and_with_other_data(campaign):
 
 @pytest.mark.slow
 def test_what_differs_is_named(campaign):
-    file = campaign / "run" / "datasets" / "set1.nc"
+    file = campaign / "run" / PACK / "set1"
     result = load_result(file)
     result.tree["posterior/k"].values[0, 2] *= 1 + 1e-9
-    save(result, file)
+    add_to_pack(campaign / "run", "set1", result)
     done = run_cli("rerun", campaign / "run")
     assert done.returncode == 1
     assert "set0: the same bits" in done.stdout

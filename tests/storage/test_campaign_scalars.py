@@ -2,6 +2,7 @@
 
 import netCDF4
 import numpy as np
+from run_files import add_to_pack
 from wells import two_wells
 
 from en4dvar.assimilate import assimilate
@@ -9,7 +10,6 @@ from en4dvar.problem import AssimilationSettings
 from en4dvar.report.result import Result
 from en4dvar.storage.campaign_file import save_campaign
 from en4dvar.storage.provenance import provenance
-from en4dvar.storage.store import save
 
 
 def test_scalars_of_the_sets_that_were_sampled_are_kept(tmp_path):
@@ -17,9 +17,8 @@ def test_scalars_of_the_sets_that_were_sampled_are_kept(tmp_path):
     problem, sources = two_wells(), {}
     for name, refine in (("plain", "none"), ("drawn", "auto")):
         analysis = assimilate(problem, AssimilationSettings(refine=refine), 1)
-        sources[name] = tmp_path / f"{name}.nc"
-        save(Result.from_analysis(analysis, provenance("name: test\n")), sources[name])
-    with netCDF4.Dataset(save_campaign(tmp_path / "posterior.nc", sources, 9, {}, {})) as file:
+        sources[name] = add_to_pack(tmp_path, name, Result.from_analysis(analysis, provenance("name: test\n")))
+    with netCDF4.Dataset(save_campaign(tmp_path / "posterior.nc", sources, {}, {})) as file:
         file.set_auto_mask(False)
         stats = file["sample_stats"]
         assert np.isnan(stats["importance_draws"][0])

@@ -21,6 +21,7 @@ from en4dvar.report.varying import bands as varying_figure
 from en4dvar.report.varying import stored_walks, verdict
 from en4dvar.runs.checks import validate
 from en4dvar.runs.runner import run, run_campaign, write_report
+from en4dvar.storage.pack import PACK
 
 K = "k: {prior: lognormal, median: 3 N/m, log_std: 0.3}"
 
@@ -255,7 +256,7 @@ def test_a_campaign_of_windows_of_different_length_with_any_executor(tmp_path):
         assert lost.values.tolist() == [[False] * 3 + [True], [False] * 4]
         assert posterior["k_change_3"].isel(dataset=0).isnull().all()
         for i in range(2):
-            own = load_result(tmp_path / "serial" / "datasets" / f"set{i}.nc").sample_stats["centre"]
+            own = load_result(tmp_path / "serial" / PACK / f"set{i}").sample_stats["centre"]
             assert np.array_equal(centre.isel(dataset=i).sel(parameter=own["parameter"]), own)
 
 

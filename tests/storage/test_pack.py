@@ -1,0 +1,51 @@
+"""A pack in the hands of others: what is written by hand is read as a result or refused in words, and ends."""
+
+import json
+import zlib
+
+import pytest
+
+from en4dvar.errors import OutputError
+from en4dvar.storage.checkpoint import digest
+from en4dvar.storage.pack import PACK, Pack, read_result, results_of
+from en4dvar.storage.store import load_stored
+
+
+def line(*words):
+    text = json.dumps(words).encode()
+    return b"\nen4dvar-pack 1 %08x %s\n" % (zlib.crc32(text), text)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("a", "f", 0, -300, "", ""),
+        ("a", "f", -1, 0, "", ""),
+        ("a", "f", "0", "5", "", ""),
+        ("a", "f", 0, 5, ""),
+        ("../a", "f", 0, 5, "", ""),
+        ("", "f", 0, 5, "", ""),
+        (7, "f", 0, 5, "", ""),
+        ("a", "f", 0, 10**15, "", ""),
+    ],
+)
+def test_a_forged_line_is_passed_over(tmp_path, words):
+    pack = tmp_path / PACK
+    pack.write_bytes(line(*words) + b"12345")
+    Pack(pack).append("good", "f", b"", b"content", digest(b"content"))
+    assert results_of(pack) == [pack / "good"]
+    assert read_result(pack / "good") == b"content"
+
+
+def test_the_last_record_of_a_name_counts(tmp_path):
+    pack = Pack(tmp_path / PACK)
+    for content in (b"first", b"second"):
+        pack.append("a", "f", b"", content, digest(content))
+    assert read_result(tmp_path / PACK / "a") == b"second"
+
+
+@pytest.mark.parametrize("content", [b"", b"x" * 7, b"\xff" * 64, bytes(16) + b"[]"])
+def test_a_good_checksum_makes_no_result(tmp_path, content):
+    Pack(tmp_path / PACK).append("a", "f", b"", content, digest(content))
+    with pytest.raises(OutputError, match=r"datasets\.pack/a: not a result of en4dvar"):
+        load_stored(tmp_path / PACK / "a")
