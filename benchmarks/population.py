@@ -30,38 +30,48 @@ from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.state import Array
 
 RECORDS = Path("runs") / "population"
+PRIORS = {"nh": laser_twin.laser_prior(), "ql": acoustic_twin.prior(acoustic_twin.WIDE)}
 LAWS = {"nh": ("G", "mu"), "ql": ("G", "alpha", "mu")}
 SETTINGS = AssimilationSettings(what_if=False, refine="none")
 MEAN_STD, SPREAD = 1.0, 0.5
 
 
-def design(law: str, seed: int) -> InverseProblem:
-    """A bubble of the law, whose readings are to be replaced."""
-    twin = laser_twin.make_laser_twin(seed) if law == "nh" else acoustic_twin.make_twin(seed)
-    return twin.problem
+def bubble(law: str, seed: int, rng: np.random.Generator, truth: Array) -> InverseProblem | None:
+    """Readings of a truth (n,), transformed; None where it cannot be integrated, or yields too few."""
+    if law == "ql":
+        twin = acoustic_twin.read_twin(seed, rng, PRIORS[law], truth)
+        return twin and twin.problem
+    design = laser_twin.make_laser_twin(0).problem
+    observed = design.observations
+    run = forecast(design, truth[None])
+    if run.failures[0]:
+        return None
+    values = run.predictions[0] + observed.std * rng.standard_normal(len(observed))
+    return replace(design, observations=replace(observed, values=values))
 
 
 def campaign(law: str, seed: int, bubbles: int) -> tuple[list[InverseProblem], Array, Array, Array]:
-    """Problems, and the truth: ν and τ (p,) in units of the prior, control vectors (bubbles, n)."""
-    base = design(law, 0)
-    prior, observed = base.prior, base.observations
+    """Problems, and the truth: ν and τ (p,) in units of the prior, control vectors (bubbles, n).
+
+    All truths are drawn again where one bubble cannot be read: the fit knows nothing of a choice among populations.
+    """
+    prior, rng = PRIORS[law], np.random.default_rng([20264, seed])
     where = [prior.names.index(name) for name in LAWS[law]]
-    rng = np.random.default_rng([20264, seed])
-    nu = MEAN_STD * rng.standard_normal(len(where))
-    tau = SPREAD * np.abs(rng.standard_normal(len(where)))
-    problems: list[InverseProblem] = []
-    truths: list[Array] = []
-    while len(problems) < bubbles:
-        z = rng.standard_normal(len(prior.names))
-        z[where] = nu + tau * z[where]
-        run = forecast(base, prior.from_white(z)[None])
-        if run.failures[0]:
-            continue
-        values = run.predictions[0] + observed.std * rng.standard_normal(len(observed))
-        data = replace(observed, values=values, name=f"bubble{len(problems)}")
-        problems.append(replace(base, observations=data))
-        truths.append(prior.from_white(z))
-    return problems, nu, tau, np.array(truths)
+    while True:
+        nu = MEAN_STD * rng.standard_normal(len(where))
+        tau = SPREAD * np.abs(rng.standard_normal(len(where)))
+        problems: list[InverseProblem] = []
+        truths: list[Array] = []
+        for i in range(bubbles):
+            z = rng.standard_normal(len(prior.names))
+            z[where] = nu + tau * z[where]
+            one = bubble(law, 1000 * seed + i, rng, prior.from_white(z))
+            if one is None:
+                break
+            problems.append(replace(one, observations=replace(one.observations, name=f"bubble{i}")))
+            truths.append(prior.from_white(z))
+        if len(problems) == bubbles:
+            return problems, nu, tau, np.array(truths)
 
 
 def ranks(law: str, seed: int, bubbles: int) -> Record:
