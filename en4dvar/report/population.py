@@ -59,7 +59,8 @@ def sentences(found: StoredPopulation) -> tuple[str, ...]:
     lines += [_together(found, one) for one in found.combinations]
     effective = float(found.tree.attrs["effective_draws_without_hyperprior"])
     if effective < FEWEST:
-        return (*lines, "Without the hyperprior nothing can be said: the data leave mean or spread open.")
+        words = "the data leave mean or spread open, or lie in its tail"
+        return (*lines, f"What would hold without the hyperprior cannot be told from it: {words}.")
     free = (f"{m.name} {_range(m)}, spread {_range(s)}" for m, s in zip(free_means, free_spreads, strict=True))
     return (*lines, f"Without the hyperprior (mean and spread equally likely everywhere): {'; '.join(free)}.")
 
