@@ -76,7 +76,7 @@ class Training:
         if failed := [s for s, one in found.items() if not np.isfinite(one.log)]:
             raise ValueError(f"no forward run of data set number {failed[0] + 1} succeeded")
         x = np.stack([mean + std * one.z[resampled(one.shares, walkers, stream)] for one in found.values()], axis=1)
-        x = stream.permuted(x, axis=0)
+        x = stream.permutation(x)  # which are in the order of their draws
         return x, log_likelihood(self.runs, self._run(x)) + _log_gauss(x, mean, std)
 
     def _visit(

@@ -181,6 +181,21 @@ def test_ensembles_in_a_minimum_that_is_not_the_lowest_are_left():
     assert training.count < 3 * 81 * 16 + 3 * 8 * 400
 
 
+def test_walkers_start_as_draws_of_the_posterior():
+    """The data determine a + b to 0.02, and neither a nor b by itself."""
+
+    class Sheet:
+        values, weight = np.full((3, 1), 1.0), np.full((3, 1), 0.02**-2)
+
+        def predictions(self, x, sets=None):
+            return x.sum(axis=-1, keepdims=True)
+
+    start = np.array([0.5, 0.5]) + 0.01 * np.random.default_rng(3).standard_normal((3, 30, 2))
+    training = Training(Sheet(), start, np.zeros(2), np.ones(2), 1, replace(SMALL, rounds=1, refits=0))
+    assert np.median(np.abs(training.outputs - 1.0)) < 0.1
+    assert training.at[..., 0].std() > 0.3  # all along the sheet
+
+
 def test_where_hardly_a_draw_is_left_no_proposal_is_fitted_to_it(monkeypatch):
     h = np.random.default_rng(0).standard_normal((3000, 2))
     logs = np.where(np.arange(3000) == 7, 0.0, -np.inf)
