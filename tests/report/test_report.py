@@ -282,7 +282,7 @@ def test_the_page_of_a_process_that_dies_is_drawn_here(campaign_dir, tmp_path, m
 
 
 def test_overview_of_many_data_sets_stays_small(analysis):
-    one = SetSummary.of(Result.from_analysis(analysis, provenance("name: test\n")), "set")
+    one = SetSummary.of(Result.from_analysis(analysis, provenance("name: test\n")).plain, "set")
     sets = [replace(one, name=f"set {i:04d}", stem=f"set_{i:04d}", cautions=()) for i in range(20_000)]
     sets[7_777] = replace(sets[7_777], cautions=one.cautions)
     html = render_overview(sets, {}, {}, draw(overview_figures(sets)))
