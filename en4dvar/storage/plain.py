@@ -65,7 +65,7 @@ class PlainResult:
     def summary(self) -> tuple[ParameterSummary, ...]:
         """One row a parameter, as of :func:`~en4dvar.summary.summarise`."""
         stats, cautions = self.groups["/sample_stats"], self.cautions
-        places = {str(name): i for i, name in enumerate(stats.coords["parameter"].values)}
+        places = {str(name): i for i, name in enumerate(stats.every["parameter"].values)}
 
         def row(name: str) -> ParameterSummary:
             prior, posterior = self.members("prior", name), self.members("posterior", name)

@@ -88,7 +88,7 @@ class StoredResult:
     @property
     def name(self) -> str:
         """Name of the data set."""
-        return self.plain.name
+        return str(self.tree.attrs["dataset"])
 
     @property
     def observable(self) -> str:

@@ -33,7 +33,7 @@ from en4dvar.report.page import judge_chi2
 from en4dvar.report.result import Result, load_result
 from en4dvar.storage.pack import PACK
 from en4dvar.storage.provenance import provenance
-from en4dvar.storage.store import save
+from en4dvar.storage.store import load_stored, save
 
 FIGURES = ("posterior", "history", "influence", "cost", "iterations", "pairs")
 VOID = {"meta", "link", "br", "img", "path", "use"}
@@ -242,6 +242,22 @@ def test_large_campaign_gets_pages_on_demand(campaign_dir, tmp_path, monkeypatch
     assert {p.name for p in (tmp_path / "figures").iterdir()} == kept
     with pytest.raises(OutputError, match="no data set 'tow'; did you mean 'two'"):
         write_pages(tmp_path, ["tow"])
+
+
+def test_no_more_results_are_loaded_than_get_a_page(campaign_dir, tmp_path, monkeypatch):
+    """The table, the figure and the CSV files of a large campaign come without xarray, to the same digits."""
+    loaded = []
+
+    def load(address):
+        loaded.append(address.name)
+        return load_stored(address)
+
+    shutil.copy(campaign_dir / PACK, tmp_path)
+    for name, value in {"PAGES": 1, "all_figures": first_figure, "load_stored": load}.items():
+        monkeypatch.setattr(report, name, value)
+    write_pages(tmp_path)
+    assert loaded == ["one"]
+    assert (tmp_path / "summary.csv").read_bytes() == (campaign_dir / "summary.csv").read_bytes()
 
 
 def contents(run):
