@@ -203,7 +203,10 @@ def load_stored(path: str | Path) -> StoredResult:
     """
     path = Path(path)
     if path.parent.name == PACK:
-        return StoredResult(tree_of(load_plain(path).groups))
+        try:
+            return StoredResult(tree_of(load_plain(path).groups))
+        except ValueError as error:  # of xarray; anybody can write a checksum
+            raise OutputError(f"{path}: not a result of en4dvar: {error}") from None
     nodes = read_groups(path)
     check_complete(path, groups_of(nodes))
     return StoredResult(xr.DataTree.from_dict(nodes))
