@@ -165,6 +165,7 @@ def _product(tokens: list[re.Match[str]], i: int, text: str) -> tuple[Unit, int]
     return unit, i
 
 
+@lru_cache(maxsize=1024)
 def _factor(from_unit: str, to_unit: str) -> Fraction:
     source, target = parse_unit(from_unit), parse_unit(to_unit)
     if source.powers != target.powers:

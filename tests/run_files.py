@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,6 @@ from en4dvar.report.result import Result, load_result
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.runner import run_campaign
 from en4dvar.storage.checkpoint import digest
-from en4dvar.storage.netcdf import Group, Variable, netcdf_attributes
 from en4dvar.storage.pack import PACK, Pack, results_of
 from en4dvar.storage.packed import packed
 
@@ -71,19 +70,8 @@ def trees(run: Path) -> dict[str, xr.DataTree]:
 def add_to_pack(run: Path, name: str, result: Result) -> Path:
     """Add a result to the pack of a run directory, which need not be one of a run; its address."""
 
-    def variables(held: Mapping[Hashable, xr.DataArray]) -> dict[str, Variable]:
-        return {
-            str(key): Variable(tuple(map(str, v.dims)), v.values, netcdf_attributes(v.attrs)) for key, v in held.items()
-        }
-
     run.mkdir(parents=True, exist_ok=True)
-    nodes = {node.path: node.to_dataset(inherit=False) for node in result.tree.subtree}
-    content = packed(
-        {
-            path: Group(variables(d.data_vars), variables(d.coords), netcdf_attributes(d.attrs))
-            for path, d in nodes.items()
-        }
-    )
+    content = packed(result.plain.groups)
     Pack(run / PACK).append(name, "", b"", content, digest(content))
     return run / PACK / name
 

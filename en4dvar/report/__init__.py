@@ -24,8 +24,9 @@ from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
 from en4dvar.storage.campaign_file import failed_datasets
 from en4dvar.storage.joint_file import FILE
 from en4dvar.storage.pack import PACK
+from en4dvar.storage.plain import PlainResult, load_plain
 from en4dvar.storage.population_file import FILE as POPULATION
-from en4dvar.storage.store import StoredResult, load_stored, result_files
+from en4dvar.storage.store import load_stored, result_files
 from en4dvar.summary import summary_csv
 from en4dvar.tables import csv_text
 
@@ -55,23 +56,21 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     if stored == [whole]:
         result = load_stored(whole)
         write_text(run_dir / "summary.csv", summary_csv([(result.name, result.summary(), result.cautions)], {}))
-        _write_tables(run_dir, [_lines(result)])
+        _write_tables(run_dir, [_lines(result.plain)])
         figures = draw(all_figures(result), IDENTIFIERS, inside(run_dir, "figures") if files else None)
         return write_text(run_dir / "report.html", render_set(result, figures, copies=files))
-    sets, lines, held = [], [], {}
+    sets, lines = [], []
     for path in stored:
-        result = load_stored(path)
-        sets.append(SetSummary.of(result, path.name))
-        if len(stored) <= PAGES:  # to read one takes as long as to draw it
-            held[path.name] = result
-        lines.append(_lines(result))
+        plain = load_plain(path)
+        sets.append(SetSummary.of(plain, path.name))
+        lines.append(_lines(plain))
     _write_tables(run_dir, lines)
     failures = failed_datasets(whole)
     write_text(run_dir / "summary.csv", summary_csv(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
-    return _write_campaign(run_dir, sets, failures, _asked(run_dir, sets, datasets), workers, files, held)
+    return _write_campaign(run_dir, sets, failures, _asked(run_dir, sets, datasets), workers, files)
 
 
-def _lines(result: StoredResult) -> tuple[Lines, ...]:
+def _lines(result: PlainResult) -> tuple[Lines, ...]:
     """Of each of :data:`TABLES`, the name of the data set first."""
     return *response_lines(result), piece_lines(result)
 
@@ -95,19 +94,19 @@ def _asked(run_dir: Path, sets: Sequence[SetSummary], names: Sequence[str]) -> f
 
 def _write_campaign(
     run_dir: Path, sets: Sequence[SetSummary], failures: Mapping[str, str], asked: frozenset[str], workers: int,
-    files: bool, held: Mapping[str, StoredResult],
+    files: bool,
 ) -> Path:  # fmt: skip
     folder = make_folder(inside(run_dir, "pages"))
     first = {s.stem for s in sorted(sets, key=lambda s: -s.gravity)[:PAGES]}
     paged = [s for s in sets if s.stem in asked | first or (folder / f"{s.stem}.html").is_file()]
     workers = min(workers, len(paged) // SHARE)
-    calls: list[tuple[Path, str, str | None, list[tuple[str, str]], StoredResult | None]] = []
+    calls: list[tuple[Path, str, str | None, list[tuple[str, str]]]] = []
     for before, one, after in zip([None, *paged[:-1]], paged, [*paged[1:], None], strict=True):
         neighbours = (("← ", before), ("→ ", after))
         trail = [("All data sets", "../report.html")]
         trail += [(f"{arrow}{s.name}", quote(f"{s.stem}.html")) for arrow, s in neighbours if s is not None]
         copies = f"{one.stem}_" if files and (one.stem in asked or not asked) else None
-        calls.append((run_dir, one.stem, copies, trail, held.get(one.stem) if workers <= 1 else None))
+        calls.append((run_dir, one.stem, copies, trail))
     with ProcessesExecutor(workers) if workers > 1 else SerialExecutor() as executor:
         for i, value in executor.map(_write_page, calls):
             if isinstance(value, WorkerLostError):
@@ -121,13 +120,9 @@ def _write_campaign(
     return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures, joint, population))
 
 
-def _write_page(
-    run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]], held: StoredResult | None
-) -> None:
-    """The page of one data set of a campaign; ``copies``: prefix of its figures as PDF and PNG, None for none;
-    ``held``: what is stored, where it has been read.
-    """
-    result = held or load_stored(run_dir / PACK / stem)
+def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:
+    """The page of one data set of a campaign; ``copies``: prefix of its figures as PDF and PNG, None for none."""
+    result = load_stored(run_dir / PACK / stem)
     folder = None if copies is None else inside(run_dir, "figures")
     figures = draw(all_figures(result), IDENTIFIERS, folder, copies or "")
     write_text(inside(run_dir, f"pages/{stem}.html"), render_set(result, figures, trail, copies is not None))

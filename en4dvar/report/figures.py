@@ -137,7 +137,7 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
         + (" Each series has its own panels." if len(result.axes) > 1 else ""),
         history(result),
     )
-    if varying.stored_walks(result):
+    if varying.stored_walks(result.plain):
         yield (
             "varying",
             "What varies in time: median and 5–95 % of the posterior (blue) over 5–95 % of the prior (grey).",

@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from en4dvar.report.text import fixed, number_like, pretty_unit, symbol_html
-from en4dvar.storage.store import StoredResult
+from en4dvar.storage.plain import PlainResult
 from en4dvar.units import convert
 
 Lines = list[tuple[object, ...]]
@@ -70,35 +70,35 @@ class StoredEntry:
         return self.parameter, self.quantity, self.unit, self.low, self.median, self.high
 
 
-def stored_ledger(result: StoredResult) -> tuple[tuple[StoredEntry, ...], ...]:
+def stored_ledger(result: PlainResult) -> tuple[tuple[StoredEntry, ...], ...]:
     """A row a parameter that acts along the path, in it one entry a quantity of the path; display units."""
-    stats = result.sample_stats
-    if "ledger_weight" not in stats:
+    stats, about = result.groups["/sample_stats"], {name: v.attrs for name, v in result.parameters.items()}
+    if "ledger_weight" not in stats.variables:
         return ()
     ending = "_quantiles"
-    quantities = [str(v).removesuffix(ending) for v in stats.data_vars if str(v).endswith(ending)]
+    quantities = [name.removesuffix(ending) for name in stats.variables if name.endswith(ending)]
 
     def entry(i: int, parameter: str, quantity: str) -> StoredEntry:
-        v = stats[quantity + ending]
+        v = stats.variables[quantity + ending]
         shown = v.attrs["display_units"]
         numbers = convert(np.asarray(v.values[i], dtype=float), v.attrs["units"], shown).tolist()
-        symbol = result.posterior[parameter].attrs["symbol"]
+        symbol = about[parameter]["symbol"]
         return StoredEntry(parameter, symbol, quantity.removeprefix("ledger_"), v.attrs["long_name"], shown, *numbers)
 
-    names = list(map(str, stats["path_parameter"].values))
+    names = list(map(str, stats.coords["path_parameter"].values))
     return tuple(tuple(entry(i, name, q) for q in quantities) for i, name in enumerate(names))
 
 
-def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
+def stored_shifts(result: PlainResult) -> tuple[tuple[StoredShift, ...], ...]:
     """A row an alternative, in it one shift a parameter; the largest first, then those unknown, then small ones."""
-    stats = result.sample_stats
-    if "what_if_change" not in stats:
+    stats = result.groups["/sample_stats"]
+    if "what_if_change" not in stats.variables:
         return ()
-    of = {key: stats[f"what_if_{key}"].values for key in ("words", "cost_change", "reason")}
+    of = {key: stats.variables[f"what_if_{key}"].values for key in ("words", "cost_change", "reason")}
     change, relative, in_std = (
-        stats[f"what_if_{key}"].values for key in ("change", "relative_change", "change_in_std")
+        stats.variables[f"what_if_{key}"].values for key in ("change", "relative_change", "change_in_std")
     )
-    names, abouts = list(map(str, result.posterior)), [v.attrs for v in result.posterior.data_vars.values()]
+    parameters, alternatives = result.parameters, stats.coords["alternative"].values
 
     def row(i: int, alternative: str) -> tuple[StoredShift, ...]:
         common = float(of["cost_change"][i]), str(of["reason"][i])
@@ -114,11 +114,11 @@ def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
                 float(in_std[i, j]),
                 *common,
             )
-            for j, (name, about) in enumerate(zip(names, abouts, strict=True))
+            for j, (name, about) in enumerate((name, v.attrs) for name, v in parameters.items())
         )
 
     largest = np.where(of["reason"] == "", np.abs(in_std).max(axis=1), 1.0)
-    return tuple(row(i, str(stats["alternative"].values[i])) for i in np.argsort(-largest, kind="stable"))
+    return tuple(row(i, str(alternatives[i])) for i in np.argsort(-largest, kind="stable"))
 
 
 def shift_text(shift: StoredShift) -> str:
@@ -157,7 +157,7 @@ def exceeding(rows: Iterable[Sequence[StoredShift]]) -> list[Sequence[StoredShif
     return [row for row in rows if row[0].reason or any(shift.exceeds for shift in row)]
 
 
-def response_lines(result: StoredResult) -> tuple[Lines, Lines]:
+def response_lines(result: PlainResult) -> tuple[Lines, Lines]:
     """Lines of ``what_if.csv`` and of ``ledger.csv``, the name of the data set first."""
     return (
         [(result.name, *shift.cells) for row in stored_shifts(result) for shift in row],

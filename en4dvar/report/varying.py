@@ -12,6 +12,7 @@ from en4dvar.diagnostics import change_words
 from en4dvar.report.chart import POINTS, Chart, Panel, Row, steps
 from en4dvar.report.text import with_unit
 from en4dvar.state import Array
+from en4dvar.storage.plain import PlainResult
 from en4dvar.storage.store import StoredResult
 from en4dvar.storage.varying import PIECE, PIECES
 from en4dvar.units import convert
@@ -46,26 +47,25 @@ class StoredWalk:
         ]
 
 
-def stored_walks(result: StoredResult) -> tuple[StoredWalk, ...]:
+def stored_walks(result: PlainResult) -> tuple[StoredWalk, ...]:
     """The parameters that vary."""
-    group = result.dataset("posterior")
     return tuple(
-        _stored_walk(result, str(name).removesuffix(PIECES))
-        for name, variable in group.data_vars.items()
-        if variable.dims[2:] == (f"{str(name).removesuffix(PIECES)}{PIECE}",)
+        _stored_walk(result, name.removesuffix(PIECES))
+        for name, variable in result.groups["/posterior"].variables.items()
+        if variable.dims[2:] == (f"{name.removesuffix(PIECES)}{PIECE}",)
     )
 
 
-def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
-    variable = result.dataset("posterior")[name + PIECES]
-    about, time = variable.attrs, variable[name + PIECE]
+def _stored_walk(result: PlainResult, name: str) -> StoredWalk:
+    posterior, observed = result.groups["/posterior"], result.groups["/observed_data"].every
+    about, time = posterior.variables[name + PIECES].attrs, posterior.coords[name + PIECE]
     shown, clock = about["display_units"], time.attrs["display_units"]
     begins = np.asarray(time.values, dtype=float)
-    last = max(float(result.observed_data[axis.time].values[-1]) for axis in result.axes)
+    last = max(float(observed[axis.time].values[-1]) for axis in result.axes)
     edges = np.append(begins, max(last, begins[-1] + 0.02 * (begins[-1] - begins[0])))
 
     def quantiles(group: str) -> Array:
-        values = np.asarray(result.dataset(group)[name + PIECES].values[0], dtype=float)
+        values = np.asarray(result.groups[f"/{group}"].variables[name + PIECES].values[0], dtype=float)
         values = values[result.alive] if group == "posterior" else values
         values = values[np.isfinite(values).all(axis=1)]
         found = np.quantile(values, LEVELS, axis=0) if len(values) else np.full((3, len(begins)), np.nan)
@@ -74,12 +74,12 @@ def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
     after = quantiles("posterior")
     if untrusted(result.cautions, name):
         after[[0, 2]] = np.nan  # the interval
-    label = str(result.posterior[name].attrs["long_name"])
+    label = str(posterior.variables[name].attrs["long_name"])
     shown_edges = convert(edges, time.attrs["units"], clock)
     return StoredWalk(name, label, about["symbol"], shown, clock, shown_edges, after, quantiles("prior"))
 
 
-def piece_lines(result: StoredResult) -> list[tuple[object, ...]]:
+def piece_lines(result: PlainResult) -> list[tuple[object, ...]]:
     """Lines of ``varying.csv``, the name of the data set first."""
     return [(result.name, *cells) for walk in stored_walks(result) for cells in walk.cells]
 
@@ -95,7 +95,7 @@ def verdict(result: StoredResult) -> str:
 def bands(result: StoredResult) -> Chart:
     """Median and 5–95 % of each parameter that varies, over the prior's."""
     rows = []
-    for walk in stored_walks(result):
+    for walk in stored_walks(result.plain):
         least, most = float(np.nanmin(walk.posterior)), float(np.nanmax(walk.prior))
         steep = least > 0 and math.isfinite(most) and most > 5 * least
         panel = Panel(

@@ -147,16 +147,12 @@ def _root_attribute(path: Path, name: str) -> str:
         raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
 
 
-def _all(group: Group) -> dict[str, Variable]:
-    return {**group.variables, **group.coords}
-
-
 def _define(target: netCDF4.Dataset, layout: _Layout, n_datasets: int) -> None:
     """Groups, dimensions, variables and coordinates, as of the widest data set, and the scalars of all."""
     for name in GROUPS:
         source, group = layout.widest[f"/{name}"], target.createGroup(name)
         group.createDimension("dataset", n_datasets)
-        kept = {key: v for key, v in _all(source).items() if not LEFT_OUT & {*v.dims, key}}
+        kept = {key: v for key, v in source.every.items() if not LEFT_OUT & {*v.dims, key}}
         for dim in sorted({dim for variable in kept.values() for dim in variable.dims}):
             group.createDimension(RENAMED.get(dim, dim), layout.n_observations if dim in RENAMED else source.sizes[dim])
         _create(group, "dataset", np.dtype(object), ("dataset",), {"units": "1", "long_name": "data set"})
@@ -192,7 +188,7 @@ def _create(
 
 def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequence[Group]) -> None:
     """The values of consecutive data sets; what one lacks stays missing."""
-    found = [_all(source) for source in block]
+    found = [source.every for source in block]
     names_here = group[PARAMETER][...].tolist() if PARAMETER in group.variables else []
     places = [_places(names_here, source) for source in found]
     for variable in group.variables.values():

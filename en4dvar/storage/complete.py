@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-import xarray as xr
-
 from en4dvar.config.symbols import symbol_fault
 from en4dvar.errors import OutputError
 from en4dvar.storage.axes import Axis, axes_of
-from en4dvar.storage.beside import BESIDE, joined
+from en4dvar.storage.beside import BESIDE
+from en4dvar.storage.netcdf import Group, Groups, Variable
 from en4dvar.storage.readings import MEMBER
 from en4dvar.units import UnitError, convert
 
@@ -41,31 +40,38 @@ _SHOWN = ("", "_std", "_reading_std", "_path")  # of the observable, in its disp
 _NAMED = ("/prior", "/posterior", "/constant_data")  # groups whose variables go into tables and labels
 
 
-def check_complete(path: Path, nodes: Mapping[str, xr.Dataset]) -> None:
-    """Check the groups of a file, by their path in it. Raises :class:`OutputError`, which names what is missing."""
-    together = {path: joined(node, nodes.get(f"/{BESIDE.get(path[1:])}")) for path, node in nodes.items()}
+def check_complete(path: Path, groups: Groups) -> None:
+    """Check the groups of a file. Raises :class:`OutputError`, which names what is missing."""
+    together = {name: _joined(group, groups.get(f"/{BESIDE.get(name[1:])}")) for name, group in groups.items()}
     for fault in _faults(together):
         raise OutputError(f"{path}: not a result of en4dvar: {fault}")
 
 
-def of_members(dataset: xr.Dataset) -> xr.Dataset:
-    """A group of parameters without the values of pieces of time: what has one number a member."""
-    return dataset[[name for name, variable in dataset.data_vars.items() if variable.dims == MEMBER]]
+def of_members(group: Group) -> dict[str, Variable]:
+    """The parameters of a group, without the values of pieces of time: what has one number a member."""
+    return {name: variable for name, variable in group.variables.items() if variable.dims == MEMBER}
 
 
-def _faults(nodes: Mapping[str, xr.Dataset]) -> Iterator[str]:
+def _joined(group: Group, beside: Group | None) -> Group:
+    """As :func:`~en4dvar.storage.beside.joined`."""
+    if beside is None:
+        return group
+    return Group({**group.variables, **beside.variables}, {**group.coords, **beside.coords}, group.attrs)
+
+
+def _faults(nodes: Groups) -> Iterator[str]:
     if missing := [group for group in _GROUPS if f"/{group}" not in nodes]:
         yield f"no group {', '.join(missing)}"
     for group, attributes in _ATTRIBUTES.items():
         if missing := [name for name in attributes if name not in nodes[group].attrs]:
             yield f"{group} has no attribute {', '.join(missing)}"
-    parameters = map(str, of_members(nodes["/posterior"]).data_vars)
-    axes = axes_of(list(map(str, nodes["/log_likelihood"].data_vars)))
+    parameters = of_members(nodes["/posterior"])
+    axes = axes_of(list(nodes["/log_likelihood"].variables))
     if not axes:
         yield "/log_likelihood has no variable"
     named = {"*": list(parameters), "%": [axis.name for axis in axes], "@": [axis.own("") for axis in axes]}
     for group, names in {**_VARIABLES, "/posterior": "*", "/constant_data": ""}.items():
-        held, group_needs = nodes[group].variables, list(_expanded(names, named))
+        held, group_needs = nodes[group].every, list(_expanded(names, named))
         if missing := [name for name in group_needs if name not in held]:
             yield f"{group} has no variable {', '.join(missing)}"
         yield from _curve_faults(group, nodes[group], axes, nodes["/observed_data"])
@@ -77,22 +83,22 @@ def _expanded(names: str, named: Mapping[str, list[str]]) -> Iterator[str]:
         yield from (name.replace(name[0], one, 1) for one in named.get(name[0], [name[0]]))
 
 
-def _curve_faults(group: str, dataset: xr.Dataset, axes: Sequence[Axis], observed: xr.Dataset) -> Iterator[str]:
+def _curve_faults(name: str, group: Group, axes: Sequence[Axis], observed: Group) -> Iterator[str]:
     """Curves along the path, which a series has but for one of a field."""
-    if not group.endswith("_predictive"):
+    if not name.endswith("_predictive"):
         return
     for axis in axes:
-        if f"{axis.name}_path" not in dataset and f"{axis.name}_place" not in observed:
-            yield f"{group} has no variable {axis.name}_path"
-        elif f"{axis.name}_path" in dataset and "path_time" not in dataset.variables:
-            yield f"{group} has no variable path_time"
+        if f"{axis.name}_path" not in group.variables and f"{axis.name}_place" not in observed.every:
+            yield f"{name} has no variable {axis.name}_path"
+        elif f"{axis.name}_path" in group.variables and "path_time" not in group.every:
+            yield f"{name} has no variable path_time"
 
 
-def _label_faults(group: str, dataset: xr.Dataset, axes: Sequence[Axis]) -> Iterator[str]:
+def _label_faults(group: str, content: Group, axes: Sequence[Axis]) -> Iterator[str]:
     """What keeps variables with a display unit or a symbol from being shown."""
     times, names = [axis.time for axis in axes], [axis.name for axis in axes]
     displayed = ("path_time", *times, *(name + end for name in names for end in _SHOWN))
-    for name, variable in dataset.variables.items():
+    for name, variable in content.every.items():
         about = variable.attrs
         wanted = ["units"]
         if group in _NAMED and name not in ("chain", "draw"):

@@ -54,10 +54,21 @@ class Group:
     attrs: Mapping[str, Any] = field(default_factory=dict)
 
     @property
+    def every(self) -> dict[str, Variable]:
+        """Variables and coordinates."""
+        return {**self.variables, **self.coords}
+
+    @property
     def sizes(self) -> dict[str, int]:
         """Length of every dimension."""
-        every = (*self.variables.values(), *self.coords.values())
-        return {dim: size for v in every for dim, size in zip(v.dims, v.values.shape, strict=True)}
+        return {dim: size for v in self.every.values() for dim, size in zip(v.dims, v.values.shape, strict=True)}
+
+    def check_sizes(self) -> None:
+        """Raise :class:`ValueError` where variables do not agree on the length of a dimension, as xarray does."""
+        sizes = self.sizes
+        for name, v in self.every.items():
+            if v.values.shape != tuple(sizes[dim] for dim in v.dims):
+                raise ValueError(f"{name} has the shape {v.values.shape}, its dimensions have other sizes")
 
 
 def netcdf_attributes(attributes: Mapping[Any, Any]) -> dict[str, Any]:
@@ -110,6 +121,21 @@ def datasets_of(groups: Groups) -> dict[str, xr.Dataset]:
         return xr.Dataset(variables, coords, group.attrs)
 
     return {path: dataset(group) for path, group in groups.items()}
+
+
+def groups_of(nodes: Mapping[str, xr.Dataset]) -> dict[str, Group]:
+    """What xarray shows, by path, as groups again; how it is encoded is left out."""
+
+    def variables(held: Mapping[Any, xr.DataArray]) -> dict[str, Variable]:
+        return {
+            str(name): Variable(tuple(map(str, v.dims)), v.values, netcdf_attributes(v.attrs))
+            for name, v in held.items()
+        }
+
+    return {
+        path: Group(variables(node.data_vars), variables(node.coords), netcdf_attributes(node.attrs))
+        for path, node in nodes.items()
+    }
 
 
 def to_bytes(groups: Groups) -> SealedBytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -12,20 +13,21 @@ import numpy.typing as npt
 import xarray as xr
 
 from en4dvar.analysis import Analysis
-from en4dvar.caution import Caution, worst_first
+from en4dvar.caution import Caution
 from en4dvar.errors import OutputError
 from en4dvar.forward import Observable
 from en4dvar.observations import Observations
-from en4dvar.state import Array, Parameter
-from en4dvar.storage.axes import Axis, axes_of
+from en4dvar.state import Array
+from en4dvar.storage.axes import Axis
 from en4dvar.storage.beside import BESIDE, joined
-from en4dvar.storage.complete import check_complete, of_members
+from en4dvar.storage.complete import check_complete
 from en4dvar.storage.groups import build_groups
-from en4dvar.storage.netcdf import datasets_of, netcdf_file, read_groups, tree_of
-from en4dvar.storage.pack import PACK, read_result, results_of
-from en4dvar.storage.packed import unpacked
+from en4dvar.storage.netcdf import groups_of, netcdf_file, read_groups, tree_of
+from en4dvar.storage.pack import PACK, results_of
+from en4dvar.storage.plain import PlainResult, load_plain
+from en4dvar.storage.readings import MEMBER
 from en4dvar.storage.record import observations_of
-from en4dvar.summary import ParameterSummary, living, results_table
+from en4dvar.summary import ParameterSummary, results_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,15 +50,20 @@ class StoredResult:
         """Lay out an analysis; ``attributes`` (see :func:`en4dvar.storage.provenance.provenance`) join the root's."""
         return cls(tree_of(build_groups(analysis, attributes)))
 
+    @cached_property
+    def plain(self) -> PlainResult:
+        """The same without xarray."""
+        return PlainResult(groups_of({node.path: node.to_dataset(inherit=False) for node in self.tree.subtree}))
+
     @property
     def prior(self) -> xr.Dataset:
         """Parameters (chain, draw) before the data."""
-        return of_members(self.dataset("prior"))
+        return _of_members(self.dataset("prior"))
 
     @property
     def posterior(self) -> xr.Dataset:
         """Parameters (chain, draw) given the data."""
-        return of_members(self.dataset("posterior"))
+        return _of_members(self.dataset("posterior"))
 
     @property
     def observed_data(self) -> xr.Dataset:
@@ -91,7 +98,7 @@ class StoredResult:
     @property
     def axes(self) -> tuple[Axis, ...]:
         """The series of the data set, and how their variables are called."""
-        return axes_of([str(name) for name in self.dataset("log_likelihood").data_vars])
+        return self.plain.axes
 
     def of_readings(self, group: str, name: str, shared: bool = False) -> Array:
         """(…, K) of all readings, one series after the other: the variables ``<series>_<name>``, or of a single series
@@ -103,7 +110,7 @@ class StoredResult:
     @property
     def cautions(self) -> tuple[Caution, ...]:
         """Why not to trust the posterior, or read it with care: code, severity, words, advice; the worst first."""
-        return worst_first(map(Caution.parse, str(self.tree.attrs["warnings"]).splitlines()))
+        return self.plain.cautions
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -126,31 +133,16 @@ class StoredResult:
 
     def members(self, group: str, name: str) -> Array:
         """(N',) finite values of a parameter in ``group`` (prior or posterior), display unit, members in order."""
-        values = np.asarray(self.dataset(group)[name].values, dtype=float).ravel()
-        return living(values, self.alive if group == "posterior" else True, self._parameter(name))
+        return self.plain.members(group, name)
 
     @property
     def alive(self) -> npt.NDArray[np.bool_]:
         """(N,) the members that survived the posterior forecast."""
-        return np.asarray(self.sample_stats["active"].values.ravel(), dtype=bool)
+        return self.plain.alive
 
     def summary(self) -> tuple[ParameterSummary, ...]:
         """One row a parameter, as of :func:`~en4dvar.summary.summarise`."""
-        cautions = self.cautions
-
-        def row(name: str) -> ParameterSummary:
-            prior, posterior = self.members("prior", name), self.members("posterior", name)
-            at = self.sample_stats.sel(parameter=name)
-            centre, dfs = float(at["centre"]), float(at["dfs"])
-            return ParameterSummary.of(self._parameter(name), prior, posterior, centre, dfs, cautions)
-
-        return tuple(row(str(name)) for name in self.posterior.data_vars)
-
-    def _parameter(self, name: str) -> Parameter:
-        about = self.posterior[name].attrs
-        return Parameter(
-            name, about["units"], label=about["long_name"], symbol=about["symbol"], display_unit=about["display_units"]
-        )
+        return self.plain.summary()
 
     def to_dataframe(self) -> pd.DataFrame:
         """Posterior members as rows (index ``draw``), parameters as columns, SI; NaN where a member failed."""
@@ -210,13 +202,16 @@ def load_stored(path: str | Path) -> StoredResult:
     OutputError: it is not one, of another version, cut short or altered (see :mod:`en4dvar.storage.seal`).
     """
     path = Path(path)
-    nodes = _in_pack(path) if path.parent.name == PACK else read_groups(path)
-    check_complete(path, nodes)
+    if path.parent.name == PACK:
+        try:
+            return StoredResult(tree_of(load_plain(path).groups))
+        except ValueError as error:  # of xarray; anybody can write a checksum
+            raise OutputError(f"{path}: not a result of en4dvar: {error}") from None
+    nodes = read_groups(path)
+    check_complete(path, groups_of(nodes))
     return StoredResult(xr.DataTree.from_dict(nodes))
 
 
-def _in_pack(address: Path) -> dict[str, xr.Dataset]:
-    try:
-        return datasets_of(unpacked(read_result(address)))
-    except ValueError as error:  # anybody can write a checksum: the sizes of dimensions differ, for instance
-        raise OutputError(f"{address}: not a result of en4dvar: {error}") from None
+def _of_members(dataset: xr.Dataset) -> xr.Dataset:
+    """A group of parameters without the values of pieces of time: what has one number a member."""
+    return dataset[[name for name, variable in dataset.data_vars.items() if variable.dims == MEMBER]]

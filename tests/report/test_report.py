@@ -33,7 +33,7 @@ from en4dvar.report.page import judge_chi2
 from en4dvar.report.result import Result, load_result
 from en4dvar.storage.pack import PACK
 from en4dvar.storage.provenance import provenance
-from en4dvar.storage.store import save
+from en4dvar.storage.store import load_stored, save
 
 FIGURES = ("posterior", "history", "influence", "cost", "iterations", "pairs")
 VOID = {"meta", "link", "br", "img", "path", "use"}
@@ -244,6 +244,22 @@ def test_large_campaign_gets_pages_on_demand(campaign_dir, tmp_path, monkeypatch
         write_pages(tmp_path, ["tow"])
 
 
+def test_no_more_results_are_loaded_than_get_a_page(campaign_dir, tmp_path, monkeypatch):
+    """The table, the figure and the CSV files of a large campaign come without xarray, to the same digits."""
+    loaded = []
+
+    def load(address):
+        loaded.append(address.name)
+        return load_stored(address)
+
+    shutil.copy(campaign_dir / PACK, tmp_path)
+    for name, value in {"PAGES": 1, "all_figures": first_figure, "load_stored": load}.items():
+        monkeypatch.setattr(report, name, value)
+    write_pages(tmp_path)
+    assert loaded == ["one"]
+    assert (tmp_path / "summary.csv").read_bytes() == (campaign_dir / "summary.csv").read_bytes()
+
+
 def contents(run):
     return {p.relative_to(run).as_posix(): p.read_bytes() for p in run.rglob("*.*") if p.is_file()}
 
@@ -282,7 +298,7 @@ def test_the_page_of_a_process_that_dies_is_drawn_here(campaign_dir, tmp_path, m
 
 
 def test_overview_of_many_data_sets_stays_small(analysis):
-    one = SetSummary.of(Result.from_analysis(analysis, provenance("name: test\n")), "set")
+    one = SetSummary.of(Result.from_analysis(analysis, provenance("name: test\n")).plain, "set")
     sets = [replace(one, name=f"set {i:04d}", stem=f"set_{i:04d}", cautions=()) for i in range(20_000)]
     sets[7_777] = replace(sets[7_777], cautions=one.cautions)
     html = render_overview(sets, {}, {}, draw(overview_figures(sets)))

@@ -55,7 +55,7 @@ def lines(path):
 
 
 def test_shifts_are_read_back_the_largest_first(analysis, run_dir):
-    rows = stored_shifts(load_stored(run_dir / "posterior.nc"))
+    rows = stored_shifts(load_stored(run_dir / "posterior.nc").plain)
     assert (
         [row[0].alternative for row in rows]
         == [shift.name for shift in analysis.what_if]
@@ -68,7 +68,7 @@ def test_shifts_are_read_back_the_largest_first(analysis, run_dir):
 
 
 def test_the_ledger_is_read_back(analysis, run_dir):
-    ((u, x),) = stored_ledger(load_stored(run_dir / "posterior.nc"))
+    ((u, x),) = stored_ledger(load_stored(run_dir / "posterior.nc").plain)
     assert (u.parameter, u.quantity, u.label, x.quantity) == ("theta", "u", "input", "x")
     np.testing.assert_array_equal([u.low, u.median, u.high], analysis.ledger.quantiles[0, 0])
 

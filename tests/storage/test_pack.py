@@ -3,11 +3,15 @@
 import json
 import zlib
 
+import numpy as np
 import pytest
 
 from en4dvar.errors import OutputError
 from en4dvar.storage.checkpoint import digest
+from en4dvar.storage.netcdf import Group, Variable
 from en4dvar.storage.pack import PACK, Pack, read_result, results_of
+from en4dvar.storage.packed import packed
+from en4dvar.storage.plain import load_plain
 from en4dvar.storage.store import load_stored
 
 
@@ -49,3 +53,11 @@ def test_a_good_checksum_makes_no_result(tmp_path, content):
     Pack(tmp_path / PACK).append("a", "f", b"", content, digest(content))
     with pytest.raises(OutputError, match=r"datasets\.pack/a: not a result of en4dvar"):
         load_stored(tmp_path / PACK / "a")
+
+
+def test_dimensions_have_one_size(tmp_path):
+    columns = {f"of {n}": Variable(("draw",), np.zeros(n), {}) for n in (3, 4)}
+    content = packed({"/posterior": Group(columns)})
+    Pack(tmp_path / PACK).append("a", "f", b"", content, digest(content))
+    with pytest.raises(OutputError, match=r"datasets\.pack/a: not a result of en4dvar: of 3 has the shape \(3,\)"):
+        load_plain(tmp_path / PACK / "a")

@@ -150,7 +150,7 @@ def test_a_run_with_a_model_error(tmp_path):
     run(load_config(path, {"output.directory": str(out)}))
     result = load_result(out / "posterior.nc")
     assert "v_change_1" in result.posterior
-    assert stored_walks(result) == ()
+    assert stored_walks(result.plain) == ()
     assert verdict(result).startswith("v of the state: the data ")
     assert "What varies in time" in (out / "report.html").read_text(encoding="utf-8")
     assert not (out / "varying.csv").exists()
@@ -213,7 +213,7 @@ def test_pieces_in_the_file(finished):
     off = pieces.mean(("chain", "draw")) - np.array([2.0, 2.0, 1.2])
     assert np.all(np.abs(off) < 2 * pieces.std(("chain", "draw")))
     result.tree.attrs["warnings"] = ""  # data without noise have residuals of a structure: no interval would stand
-    (walk,) = stored_walks(result)
+    (walk,) = stored_walks(result.plain)
     assert walk.edges == pytest.approx([0.0, 0.04, 0.08, 0.15])
     assert np.all(np.diff(walk.posterior, axis=0) > 0)
     assert result.sample_stats.attrs["log_evidence_change"] > 3
@@ -223,7 +223,7 @@ def test_pieces_in_the_file(finished):
 def test_pieces_of_what_is_not_to_be_trusted_have_no_interval(finished):
     result = load_result(finished / "posterior.nc")
     result.tree.attrs["warnings"] = caution("at-bound", "piles up", parameters=("k",)).line
-    (walk,) = stored_walks(result)
+    (walk,) = stored_walks(result.plain)
     assert np.isnan(walk.posterior[[0, 2]]).all()
     assert np.isfinite(walk.posterior[1]).all()
     assert len(varying_figure(result).rows) == 1
