@@ -258,13 +258,13 @@ def _parameters(model: BubbleModel, start: Start, look: Look, guess: Guess) -> t
     for p in model.law.parameters:
         if p.name in guess.values:
             low, high = WIDTHS[p.name]
-            width = float(np.clip(guess.log_std[p.name], low, high))
+            width = f"{np.clip(guess.log_std[p.name], low, high):.2g}"
             value = _text(guess.values[p.name], p.unit, p.display_unit)
             from_what = "R_max and collapse time" if start == "acoustic" else "collapse time and rebound"
-            off = math.exp(BETWEEN * width)
+            off = math.exp(BETWEEN * float(width))
             words = f"{p.label}: first guess from {from_what}, may be off by a factor of {off:.2g}; "
             words += "narrow it to what you knew before"
-            lines.append(Entry(p.name, f"{{prior: lognormal, median: {value}, log_std: {width:.2g}}}", words))
+            lines.append(Entry(p.name, f"{{prior: lognormal, median: {value}, log_std: {width}}}", words))
         else:
             lines.append(_example(p, model))
     lines += _radii(start, look)
