@@ -193,10 +193,13 @@ def _entry(line: bytes, begin: int) -> tuple[str, Entry | None]:
         return "", None
     if words[1] != b"%08x" % zlib.crc32(words[2][:-1]) or not words[2].endswith(b"\n"):
         return "", None
-    name, *rest = json.loads(words[2])
+    try:
+        name, *rest = json.loads(words[2])
+    except (ValueError, TypeError, RecursionError):  # written by hand, as what follows
+        return "", None
     kinds = [str, int, int, str, str]
     if list(map(type, rest)) != kinds or min(rest[1:3]) < 0 or not name or Path(str(name)).name != name:
-        return "", None  # written by hand
+        return "", None
     return name, Entry(begin, len(line), *rest)
 
 

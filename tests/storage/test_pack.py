@@ -16,7 +16,10 @@ from en4dvar.storage.store import load_stored
 
 
 def line(*words):
-    text = json.dumps(words).encode()
+    return sealed_line(json.dumps(words).encode())
+
+
+def sealed_line(text):
     return b"\nen4dvar-pack 1 %08x %s\n" % (zlib.crc32(text), text)
 
 
@@ -39,6 +42,12 @@ def test_a_forged_line_is_passed_over(tmp_path, words):
     Pack(pack).append("good", "f", b"", b"content", digest(b"content"))
     assert results_of(pack) == [pack / "good"]
     assert read_result(pack / "good") == b"content"
+
+
+@pytest.mark.parametrize("text", [b"{nonsense", b"5", b"[]", b"[" * 3000, b"\xff"])
+def test_a_forged_line_of_other_words_is_passed_over(tmp_path, text):
+    (tmp_path / PACK).write_bytes(sealed_line(text))
+    assert Pack(tmp_path / PACK).entries == {}
 
 
 def test_the_last_record_of_a_name_counts(tmp_path):
