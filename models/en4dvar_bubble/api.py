@@ -125,6 +125,8 @@ def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> _Output:
     alone are 32 kB per member).
     """
     n = len(x)
+    workers = max(1, min(workers, n * model.system.size // _SHARE))
+    chunk = _CHUNK * workers
     out = _Output(
         {name: np.empty((n, len(t))) for name in _FIELDS},
         np.empty(n, dtype=np.int64),
@@ -149,8 +151,6 @@ def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> _Output:
         out.status[rows], out.record[rows] = solution.status, solution.record
         out.reasons[rows] = [solution.reason(i) for i in range(len(failed))]
 
-    workers = max(1, min(workers, n * model.system.size // _SHARE))
-    chunk = _CHUNK * workers
     with ThreadPoolExecutor(workers) as pool:  # its threads begin with the first work for them
         for begin in range(0, n, chunk):
             run(begin, pool)
