@@ -122,6 +122,8 @@ def test_without_data_a_starter_is_written() -> None:
     assert done.exit_code == 0, done.output
     assert load_config("bubble.yaml").document.data["model"]["start"] == "laser"
     assert "bubble.csv: no such file" in call("validate", "bubble.yaml").stderr
+    _, proposed = Path("bubble.yaml").read_text(encoding="utf-8").split("  name: bubble\n")
+    assert [line for line in proposed.split("assimilation:")[0].splitlines() if "#" not in line] == []
 
 
 def test_names_are_quoted_where_yaml_needs_it() -> None:
