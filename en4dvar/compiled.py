@@ -66,13 +66,13 @@ def compilations() -> int:
 
 
 @contextmanager
-def compilation_told(tell: Callable[[], None]) -> Iterator[None]:
+def watch_compilation(tell: Callable[[], None]) -> Iterator[None]:
     """Within, ``tell`` is called when this process begins to compile what is not kept on disk."""
-    with install_listener("numba:compile", _Teller(tell)):
+    with install_listener("numba:compile", _Watcher(tell)):
         yield
 
 
-class _Teller(Listener):
+class _Watcher(Listener):
     def __init__(self, tell: Callable[[], None]):
         self._tell = tell
 

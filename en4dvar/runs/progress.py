@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from en4dvar.analysis import ChainRecord, Descents, IterationRecord, Record, StartRecord
-from en4dvar.compiled import compilation_told
+from en4dvar.compiled import watch_compilation
 from en4dvar.errors import OutputError
 from en4dvar.files import own_file
 from en4dvar.runs.interrupt import Interrupted
@@ -175,7 +175,7 @@ def terminal_progress(n_datasets: int) -> Iterator[LiveProgress | None]:
     )
     with shown(Bar(*columns, console=console, transient=True)) as bar:
         progress = LiveProgress(bar, n_datasets)
-        with compilation_told(progress.compiling):
+        with watch_compilation(progress.compiling):
             yield progress
 
 
