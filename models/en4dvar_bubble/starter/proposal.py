@@ -27,7 +27,7 @@ MODEL: Mapping[Start, Mapping[str, str]] = {
 WHY = {
     "heat": "the gas gives heat to the wall",
     "polytropic": "quick, but without heat to the wall: look at 'What if' in the report, and compare with gas: heat",
-    "saturated": "of water, constant; vapour: transport in its place, with gas: heat, solves it",
+    "saturated": "that of water, constant; vapour: transport, with gas: heat, solves it instead",
 }
 LEAST_NOISE = 0.01  # of R_max: what single-bubble models agree to with good data at best
 TIMING = 0.05  # of the step between samples
