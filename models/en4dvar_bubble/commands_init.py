@@ -181,9 +181,9 @@ def _columns_of(data: str, asked: _Asked, layout: Layout) -> dict[str, Any]:
     first, contents, layout = _first_with_columns(files, layout)
     shown = {name: f"{len(v)} values, {_range(v)}" for name, v in contents.columns.items()}
     commas = ", decimal commas" if layout.decimal == "," else ""
-    one_of = f", one of {len(files)} files" if len(files) > 1 else ""
+    one_of = f"; one of {len(files)} files" if len(files) > 1 else ""
     columns = "; ".join(f"{name} ({words})" for name, words in shown.items())
-    click.echo(f"{first}{commas}{one_of}: {columns}", err=True)
+    click.echo(f"{first}{commas}: {columns}{one_of}", err=True)
     if contents.scalars:
         told = ", ".join(f"{name} {value:g}" for name, value in contents.scalars.items())
         click.echo(f"others in the file: {told}", err=True)
