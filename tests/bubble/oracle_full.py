@@ -180,8 +180,7 @@ class Bubble:
         scale = np.r_[1e-7, 1e-2, 1.0, np.full(gas, 300.0), np.full(gas if self.transport else 0, 1.0)]
         scale = np.r_[scale, np.full(self.n, 300.0)]
         atol = rtol * scale
-        s = solve_ivp(
-            self.rhs, (0, times[-1]), state, method, rtol=rtol, atol=atol, t_eval=times, jac=differenced(self.rhs, scale)
-        )
+        jac = differenced(self.rhs, scale)
+        s = solve_ivp(self.rhs, (0, times[-1]), state, method, rtol=rtol, atol=atol, t_eval=times, jac=jac)
         assert s.success, s.message
         return s.y[0]

@@ -277,8 +277,7 @@ class Case:
         X[3 + self.N : 3 + self.N + self.M] = 1.0
         X[3 + self.N + self.M : 3 + self.N + self.M + self.C] = self.kv0
         t = np.asarray(times) / self.t0
-        s = solve_ivp(
-            self.rhs, (0, t[-1]), X, method, rtol=rtol, atol=rtol * 1e-3, t_eval=t, jac=differenced(self.rhs)
-        )
+        jac = differenced(self.rhs)
+        s = solve_ivp(self.rhs, (0, t[-1]), X, method, rtol=rtol, atol=rtol * 1e-3, t_eval=t, jac=jac)
         assert s.success, s.message
         return s.y[0]

@@ -19,7 +19,6 @@ from en4dvar.report.design import front, readings_text, remarks
 from en4dvar.runs import design_run
 from en4dvar.runs.design_run import run_design
 
-
 PAGE = {"output.report": True}
 
 
