@@ -1,12 +1,13 @@
 """Is a posterior that the product calls sampled the posterior?
 
 Against a tempered population that shares none of its samplers: laser-induced bubbles with rebounds where J has two
-minima that count (``laser:SEED``), the same refined by a Markov chain (``mcmc:SEED``), and the measured bubbles in
-polyacrylamide where their files are there. For each parameter, transformed: how far the mean is from the population's
-in its standard deviations, and the ratio of standard deviations; the largest are shown.
+minima that count (``laser:SEED``), and the measured bubbles in polyacrylamide where their files are there; each with
+its own settings (the default ones) and, ``mcmc:``, by a chain of 6000 effective draws (``refine: mcmc, draws: 6000``).
+For each parameter, transformed: how far the mean is from the population's in its standard deviations, and the ratio of
+standard deviations; the largest are shown.
 
     python benchmarks/against_tempered.py [--find 60] [--data FOLDER] [--minutes 5]
-    python benchmarks/against_tempered.py --sets laser:54        this one alone
+    python benchmarks/against_tempered.py --sets laser:54 mcmc:laser:54 --particles 6000     this one, held against more
 
 Both sides are draws. The error of ours is that of so many independent ones, 1/√n of the mean and 1/√(2n) of the spread
 in standard deviations; that of the reference is how far one of its two populations is from both together.
@@ -36,7 +37,7 @@ from en4dvar.problem import AssimilationSettings, InverseProblem
 
 CHAIN, LASER, DRAWS = "mcmc:", "laser:", 6000
 ROOT = Path(__file__).resolve().parents[1]
-PARTICLES, WALK = 2000, 40
+WALK = 40
 TOLERANCE = 0.05
 RIGHT_SCALE = 2.76e-6 / 3.7037e-6  # of PA1_exp2: metres a pixel instead of seconds a frame (shared/data/README.md)
 STIFF, SOFT = ("polyacrylamide_estrada", "PA1_exp2_RofTdata_0.mat"), ("polyacrylamide_soft", "A_E2_002.mat")
@@ -58,7 +59,7 @@ class Case(NamedTuple):
     seed: int
 
 
-def reference(problem: InverseProblem, seed: int) -> Record:
+def reference(problem: InverseProblem, seed: int, particles: int) -> Record:
     """Moments (n,) of two populations together; by how much the mean of one differs from that of both, in standard
     deviations, and ln of the ratio of these."""
     prior = problem.prior
@@ -66,7 +67,7 @@ def reference(problem: InverseProblem, seed: int) -> Record:
     def log_likelihood(x: np.ndarray) -> np.ndarray:
         return log_posterior(problem, x) + 0.5 * np.sum(((x - prior.mean) / prior.std) ** 2, axis=1)
 
-    a, b = (tempered(log_likelihood, prior.mean, prior.std, s, PARTICLES, WALK) for s in (seed, seed + 10_000))
+    a, b = (tempered(log_likelihood, prior.mean, prior.std, s, particles, WALK) for s in (seed, seed + 10_000))
     both = Tempered(np.concatenate([a.draws, b.draws]), a.runs + b.runs)
     spread = float(np.max(np.abs(np.log(a.std / both.std))))
     error = [float(np.max(np.abs(a.mean - both.mean) / both.std)), spread]
@@ -110,17 +111,19 @@ def case(key: str, data: Path) -> Case:
     return found._replace(settings=settings)
 
 
-def compared(keys: Sequence[str], records: Path, data: Path, minutes: float) -> dict[str, Record]:
+def compared(keys: Sequence[str], given: argparse.Namespace) -> dict[str, Record]:
     """The sets, each beside its reference (``of``), as far as the minutes suffice."""
-    end = time.monotonic() + 60 * minutes
-    mine = fill(records / "estimates.jsonl", keys, lambda key: estimate(case(key, data)), minutes)
+    data, end = given.data, time.monotonic() + 60 * given.minutes
+    mine = fill(given.records / "estimates.jsonl", keys, lambda key: estimate(case(key, data)), given.minutes)
     names = dict.fromkeys(key.removeprefix(CHAIN) for key in keys)
 
     def population(name: str) -> Record:
         one = case(name, data)
-        return reference(one.problem, one.seed)
+        return reference(one.problem, one.seed, given.particles)
 
-    theirs = fill(records / "references.jsonl", names, population, (end - time.monotonic()) / 60)
+    theirs = fill(
+        given.records / f"references_{given.particles}.jsonl", names, population, (end - time.monotonic()) / 60
+    )
     known = {key: theirs[key.removeprefix(CHAIN)] for key in mine if key.removeprefix(CHAIN) in theirs}
     return {key: {**mine[key], "of": of} for key, of in known.items()}
 
@@ -157,12 +160,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--find", type=int, default=60, help="laser twins among which those with two modes are found")
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="the measured bubbles")
+    parser.add_argument("--particles", type=int, default=2000, help="of each population")
     parser.add_argument("--minutes", type=float, default=1e9)
     parser.add_argument("--records", type=Path, default=Path("runs/against_tempered"))
     parser.add_argument("--sets", nargs="*", help="the sets, instead of those that --find says")
     given = parser.parse_args()
     if given.sets:
-        table(compared(given.sets, given.records, given.data, given.minutes))
+        table(compared(given.sets, given))
         return
     seeds = with_two_modes(given.records / "modes.jsonl", given.find, given.minutes)
     measured = [key for key, (_, file, _) in MEASURED.items() if (given.data / file).is_file()]
@@ -170,7 +174,7 @@ def main() -> None:
         print(f"skipped, no file: {key}")
     sets = [*measured, *(f"{LASER}{i}" for i in seeds)]
     keys = [how + name for name in sets for how in ("", CHAIN)]
-    table(compared(keys, given.records, given.data, given.minutes))
+    table(compared(keys, given))
 
 
 if __name__ == "__main__":
