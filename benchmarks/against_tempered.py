@@ -173,7 +173,7 @@ def main() -> None:
     for key in MEASURED.keys() - measured:
         print(f"skipped, no file: {key}")
     sets = [*measured, *(f"{LASER}{i}" for i in seeds)]
-    keys = [how + name for name in sets for how in ("", CHAIN)]
+    keys = [by + name for name in sets for by in ("", CHAIN)]
     table(compared(keys, given))
 
 
