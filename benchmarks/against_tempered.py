@@ -1,12 +1,13 @@
 """Is a posterior that the product calls sampled the posterior?
 
 Against a tempered population that shares none of its samplers: laser-induced bubbles with rebounds where J has two
-minima that count (``laser:SEED``), the same refined by a Markov chain (``mcmc:SEED``), and the measured bubbles in
-polyacrylamide where their files are there. For each parameter, transformed: how far the mean is from the population's
-in its standard deviations, and the ratio of standard deviations; the largest are shown.
+minima that count (``laser:SEED``), and the measured bubbles in polyacrylamide where their files are there; each with
+its own settings (the default ones) and, ``mcmc:``, by a chain of 6000 effective draws (``refine: mcmc, draws: 6000``).
+For each parameter, transformed: how far the mean is from the population's in its standard deviations, and the ratio of
+standard deviations; the largest are shown.
 
     python benchmarks/against_tempered.py [--find 60] [--data FOLDER] [--minutes 5]
-    python benchmarks/against_tempered.py --sets laser:54        this one alone
+    python benchmarks/against_tempered.py --sets laser:54 mcmc:laser:54 --particles 6000     this one, held against more
 
 Both sides are draws. The error of ours is that of so many independent ones, 1/√n of the mean and 1/√(2n) of the spread
 in standard deviations; that of the reference is how far one of its two populations is from both together.
@@ -15,7 +16,11 @@ in standard deviations; that of the reference is how far one of its two populati
 from __future__ import annotations
 
 import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from laser_twin import make_laser_twin
@@ -30,9 +35,9 @@ from en4dvar.ensemble.forecast import log_posterior
 from en4dvar.prior import own_seed
 from en4dvar.problem import AssimilationSettings, InverseProblem
 
-CHAIN = {"assimilation.refine": "mcmc"}
+CHAIN, LASER, DRAWS = "mcmc:", "laser:", 6000
 ROOT = Path(__file__).resolve().parents[1]
-PARTICLES, WALK = 3000, 40
+WALK = 40
 TOLERANCE = 0.05
 RIGHT_SCALE = 2.76e-6 / 3.7037e-6  # of PA1_exp2: metres a pixel instead of seconds a frame (shared/data/README.md)
 STIFF, SOFT = ("polyacrylamide_estrada", "PA1_exp2_RofTdata_0.mat"), ("polyacrylamide_soft", "A_E2_002.mat")
@@ -41,36 +46,42 @@ WIDE = {"parameters.G.log_std": 1.0, "parameters.mu.log_std": 0.7}
 MEASURED = {
     "PA1_exp2, as it is": (*STIFF, {}),
     "PA1_exp2, right scale": (*STIFF, SCALED),
-    "PA1_exp2, right scale, `refine: mcmc`": (*STIFF, SCALED | CHAIN),
     "soft gel A_E2_002": (*SOFT, {}),
-    "soft gel A_E2_002, `refine: mcmc`": (*SOFT, CHAIN),
     "soft gel, wide priors": (*SOFT, WIDE),
 }
 
 
-def reference(problem: InverseProblem, seed: int) -> tuple[Tempered, list[float]]:
-    """Two populations together; by how much the mean of one differs from that of both, in standard deviations, and
-    ln of the ratio of these."""
+class Case(NamedTuple):
+    """The arguments of :func:`~en4dvar.assimilate.assimilate`."""
+
+    problem: InverseProblem
+    settings: AssimilationSettings
+    seed: int
+
+
+def reference(problem: InverseProblem, seed: int, particles: int) -> Record:
+    """Moments (n,) of two populations together; by how much the mean of one differs from that of both, in standard
+    deviations, and ln of the ratio of these."""
     prior = problem.prior
 
     def log_likelihood(x: np.ndarray) -> np.ndarray:
         return log_posterior(problem, x) + 0.5 * np.sum(((x - prior.mean) / prior.std) ** 2, axis=1)
 
-    a, b = (tempered(log_likelihood, prior.mean, prior.std, s, PARTICLES, WALK) for s in (seed, seed + 10_000))
+    a, b = (tempered(log_likelihood, prior.mean, prior.std, s, particles, WALK) for s in (seed, seed + 10_000))
     both = Tempered(np.concatenate([a.draws, b.draws]), a.runs + b.runs)
     spread = float(np.max(np.abs(np.log(a.std / both.std))))
-    return both, [float(np.max(np.abs(a.mean - both.mean) / both.std)), spread]
+    error = [float(np.max(np.abs(a.mean - both.mean) / both.std)), spread]
+    return {"mean": both.mean, "std": both.std, "error": error, "runs": both.runs}
 
 
-def compared(problem: InverseProblem, settings: AssimilationSettings, seed: int) -> Record:
-    """What the product and the population say (n,)."""
-    analysis = assimilate(problem, settings, seed)
-    x, (population, error) = problem.prior.from_physical(analysis.posterior), reference(problem, seed)
+def estimate(case: Case) -> Record:
+    """What the product says (n,)."""
+    analysis = assimilate(*case)
+    x = case.problem.prior.from_physical(analysis.posterior)
     return {
-        "shift": (x.mean(axis=0) - population.mean) / population.std,
-        "ratio": x.std(axis=0, ddof=1) / population.std,
-        "error": error,
-        "runs": [analysis.forward_runs, population.runs],
+        "mean": x.mean(axis=0),
+        "std": x.std(axis=0, ddof=1),
+        "runs": analysis.forward_runs,
         "draws": max(analysis.refinement.get(f"{by}_effective_sample_size", 0) for by in ("importance", "mcmc")),
         "modes": [float(mode.weight) for mode in analysis.modes],
         "how": how(analysis),
@@ -85,15 +96,36 @@ def how(analysis: Analysis) -> str:
     return "chain" if analysis.refinement else "Gaussian"
 
 
-def run(key: str, data: Path) -> Record:
-    kind, _, number = key.partition(":")
-    if kind in ("laser", "mcmc"):
-        settings = AssimilationSettings(what_if=False, refine="mcmc" if kind == "mcmc" else "auto")
-        return compared(make_laser_twin(int(number)).problem, settings, int(number))
-    name, file, changes = MEASURED[key]
-    config = load_config(ROOT / "configs" / f"{name}.yaml", {"data.path": str(data / file), **changes})
-    (problem,) = build(config)
-    return compared(problem, config.assimilation, own_seed(config.seed, problem.observations.name))
+def case(key: str, data: Path) -> Case:
+    """What is estimated, and how: a set, or ``mcmc:`` and a set."""
+    name, chain = key.removeprefix(CHAIN), key.startswith(CHAIN)
+    if name.startswith(LASER):
+        seed, settings = int(name.removeprefix(LASER)), AssimilationSettings(what_if=False)
+        found = Case(make_laser_twin(seed).problem, settings, seed)
+    else:
+        file, path, changes = MEASURED[name]
+        config = load_config(ROOT / "configs" / f"{file}.yaml", {"data.path": str(data / path), **changes})
+        (problem,) = build(config)
+        found = Case(problem, config.assimilation, own_seed(config.seed, problem.observations.name))
+    settings = replace(found.settings, refine="mcmc", draws=DRAWS) if chain else found.settings
+    return found._replace(settings=settings)
+
+
+def compared(keys: Sequence[str], given: argparse.Namespace) -> dict[str, Record]:
+    """The sets, each beside its reference (``of``), as far as the minutes suffice."""
+    data, end = given.data, time.monotonic() + 60 * given.minutes
+    mine = fill(given.records / "estimates.jsonl", keys, lambda key: estimate(case(key, data)), given.minutes)
+    names = dict.fromkeys(key.removeprefix(CHAIN) for key in keys)
+
+    def population(name: str) -> Record:
+        one = case(name, data)
+        return reference(one.problem, one.seed, given.particles)
+
+    theirs = fill(
+        given.records / f"references_{given.particles}.jsonl", names, population, (end - time.monotonic()) / 60
+    )
+    known = {key: theirs[key.removeprefix(CHAIN)] for key in mine if key.removeprefix(CHAIN) in theirs}
+    return {key: {**mine[key], "of": of} for key, of in known.items()}
 
 
 def with_two_modes(path: Path, count: int, minutes: float) -> list[int]:
@@ -110,18 +142,17 @@ def with_two_modes(path: Path, count: int, minutes: float) -> list[int]:
 def table(records: dict[str, Record]) -> None:
     print("| set | by | draws that count | modes | mean off by | std ratio | reference ± | runs (its) | warns |")
     print("|---|---|---|---|---|---|---|---|---|")
+    within = 0
     for key, r in records.items():
-        shift = float(np.max(np.abs(r["shift"])))
-        ratio = float(np.exp(np.max(np.abs(np.log(r["ratio"])))))
+        of = r["of"]
+        shift = float(np.max(np.abs(np.subtract(r["mean"], of["mean"])) / of["std"]))
+        ratio = float(np.max(np.abs(np.log(np.divide(r["std"], of["std"])))))
+        within += max(shift, ratio) < TOLERANCE
         modes = ", ".join(f"{w:.2f}" for w in r["modes"])
-        runs = "{} ({})".format(*r["runs"])
-        codes = ", ".join(r["warned"])
-        error = ", ".join(f"{e:.3f}" for e in r["error"])
-        cells = [key, r["how"], f"{r['draws']:.0f}", modes, f"{shift:.3f}", f"{ratio:.3f}", error, runs, codes]
+        error = ", ".join(f"{e:.3f}" for e in of["error"])
+        cells = [key, r["how"], f"{r['draws']:.0f}", modes, f"{shift:.3f}", f"{np.exp(ratio):.3f}", error]
+        cells += [f"{r['runs']} ({of['runs']})", ", ".join(r["warned"])]
         print(f"| {' | '.join(cells)} |")
-    within = sum(
-        max(np.abs(r["shift"])) < TOLERANCE and max(np.abs(np.log(r["ratio"]))) < TOLERANCE for r in records.values()
-    )
     print(f"\nwithin {TOLERANCE} in mean and spread: {within} of {len(records)}")
 
 
@@ -129,19 +160,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--find", type=int, default=60, help="laser twins among which those with two modes are found")
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="the measured bubbles")
+    parser.add_argument("--particles", type=int, default=2000, help="of each population")
     parser.add_argument("--minutes", type=float, default=1e9)
     parser.add_argument("--records", type=Path, default=Path("runs/against_tempered"))
     parser.add_argument("--sets", nargs="*", help="the sets, instead of those that --find says")
     given = parser.parse_args()
     if given.sets:
-        table(fill(given.records / "sets.jsonl", given.sets, lambda key: run(key, given.data), given.minutes))
+        table(compared(given.sets, given))
         return
     seeds = with_two_modes(given.records / "modes.jsonl", given.find, given.minutes)
     measured = [key for key, (_, file, _) in MEASURED.items() if (given.data / file).is_file()]
     for key in MEASURED.keys() - measured:
         print(f"skipped, no file: {key}")
-    keys = [*measured, *(f"laser:{i}" for i in seeds), *(f"mcmc:{i}" for i in seeds[:2])]
-    table(fill(given.records / "sets.jsonl", keys, lambda key: run(key, given.data), given.minutes))
+    sets = [*measured, *(f"{LASER}{i}" for i in seeds)]
+    keys = [by + name for name in sets for by in ("", CHAIN)]
+    table(compared(keys, given))
 
 
 if __name__ == "__main__":

@@ -19,9 +19,10 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -105,10 +106,10 @@ ROWS: dict[str, Callable[[int], Twin]] = {
 }
 
 
-def with_discrepancy(problem: InverseProblem) -> InverseProblem:
-    """As ``data.error.discrepancy: estimated`` has it."""
+def with_discrepancy(problem: InverseProblem, given: Mapping[str, Any] = MappingProxyType({})) -> InverseProblem:
+    """As ``data.error.discrepancy`` has it; {} means ``estimated``."""
     observed, context = problem.observations, Context(Path(), problem.model, observed=problem.observable)
-    section = DiscrepancySection.model_validate({}, context=context)
+    section = DiscrepancySection.model_validate(given, context=context)
     times, parameters = observed.times, discrepancy_parameters(problem.model, problem.observable)
     terms = section.terms(parameters, float(observed.values.max()), float(times[-1] - times[0]))
     noise = noise_of(observed.noise.std, observed.noise.time_std, discrepancy=section.kernel_at(times))

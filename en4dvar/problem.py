@@ -208,6 +208,12 @@ class AssimilationSettings:
         Literal["auto", "none", "mcmc"],
         "auto: sample the posterior where the ensemble leaves a doubt (cheap models); mcmc: by a Markov chain, always.",
     ] = "auto"
+    draws: Annotated[
+        int | None,
+        Ge(400),
+        "Effective draws where the posterior is sampled, whose mean is known to 1/√draws of its std; "
+        "default: 1500, of a chain 1000.",
+    ] = None
     emulator: Annotated[
         Literal["auto", "on", "off"],
         "A few hundred more runs to tell how Gaussian the posterior is: auto (compiled models), on, or off.",

@@ -11,13 +11,14 @@ from en4dvar.config import Config
 from en4dvar.descent.preview import Preview
 from en4dvar.field_prior import FieldPrior
 from en4dvar.problem import InverseProblem
+from en4dvar.sampling.modes import ENOUGH
 from en4dvar.sampling.refine import may_sample
 from en4dvar.series import Part
 from en4dvar.state import Parameter
 from en4dvar.tables import table
 from en4dvar.units import convert
 
-SAMPLED = 5000  # forward runs of a posterior that is sampled, typically
+RUNS_A_DRAW = 10 / 3  # that counts, of a posterior that is sampled, typically
 MOST_PAIRS, MOST_NAMED, LEAST_SHOWN = 15, 100, 0.005  # of correlations: rows, parameters of a block, size
 
 
@@ -83,7 +84,8 @@ def cost_summary(config: Config, one: Preview, count: int) -> str:
     runs = f"about {one.runs} forward runs" + (f" a data set, {total} in all" if count > 1 else "")
     more = "; the Markov chain comes on top" if config.assimilation.refine == "mcmc" else ""
     if may_sample(one.problem, config.assimilation):
-        more = f"; a posterior that leaves a doubt is sampled by some {SAMPLED} more, {_seconds(SAMPLED * one.seconds)}"
+        sampled = round(RUNS_A_DRAW * (config.assimilation.draws or ENOUGH))
+        more = f"; a posterior that leaves a doubt is sampled by some {sampled} more, {_seconds(sampled * one.seconds)}"
     took = f"{_seconds(one.seconds)} each: {_seconds(total * one.seconds)} on one thread"
     return f"cost: {runs}, {took}, plus some seconds for files and report{more}"
 

@@ -36,6 +36,7 @@ JUMPS = 0.5  # share of the steps where there is a mixture to draw from
 GUIDED_SHARE, GUIDED_MOVES = 0.85, 60  # of the steps where there is an emulator; its moves in one of them
 BURN_IN = 0.25  # of the chain, dropped at its start
 MAX_R_HAT = 1.1  # Gelman et al. (2013), § 11.5
+ENOUGH = 1000.0  # effective sample size
 BLOCK = 50  # steps between two looks at convergence
 SCATTER = 0.1  # walkers are spread by this much more than the ensemble, so that no two coincide
 ASTRAY = 10.0  # by which J exceeds the emulator's where a walker must not start: an empty basin would trap it
@@ -127,7 +128,7 @@ def sample(
     *,
     walkers: int = 48,
     max_steps: int = 4000,
-    target: float = 1000.0,
+    target: float | None = None,
     resume: ChainState | None = None,
     keep: Callable[[ChainState], None] | None = None,
     look: Callable[[ChainRecord], None] | None = None,
@@ -141,7 +142,8 @@ def sample(
     log_density: of positions (B, n) → (B,), −inf where it vanishes; called with half of the walkers at a time.
     ensemble: (N, n) the Gaussian approximation; walkers start from its members, slightly scattered.
     seed: of the walkers; the same seed gives the same bits.
-    walkers: at least 2 (n + 1), even. max_steps: at most. target: effective sample size to reach in each direction.
+    walkers: at least 2 (n + 1), even. max_steps: at most. target: effective sample size to reach in each direction
+        (default: :data:`ENOUGH`).
     resume: where an earlier call with the same arguments was interrupted; the chain has the same bits as without.
     keep: called with the state of the chain at each look at convergence. look: with what it shows.
     emulated: an approximation at no cost; it guides the walkers, which start from draws of it.
@@ -153,7 +155,7 @@ def sample(
     """
     import emcee  # a twentieth of a second that most runs do not need
 
-    n = ensemble.shape[1]
+    n, target = ensemble.shape[1], ENOUGH if target is None else target
     walkers = max(walkers, 2 * (n + 1)) + max(walkers, 2 * (n + 1)) % 2
     chain = resume
     state = _start(emcee, log_density, ensemble, seed, walkers, emulated) if chain is None else chain.emcee_state(emcee)

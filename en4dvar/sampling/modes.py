@@ -6,6 +6,7 @@ share of the evidence, whatever its shape.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -19,8 +20,8 @@ from en4dvar.sampling.importance import Importance
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 from en4dvar.state import Array
 
-DRAWS, MOST_ROUNDS = 400, 30
-ENOUGH = 1500.0  # effective draws that end the rounds
+DRAWS = 400  # of a round
+ENOUGH, MOST_RUNS = 1500.0, 8.0  # effective draws that end the rounds, and runs for each of them
 WIDER = 1.8  # at 1 the tail of a bent posterior is not found: standard deviations were up to 30 % too small
 TOO_FEW = 200.0  # below so many the draws stand for nothing
 OF_PRIOR = 0.2  # share of the first draws that come from the prior: what no descent found is not excluded
@@ -76,17 +77,20 @@ class WeightedDraws:
         return with_moments(chosen, self.mean, self.covariance)
 
 
-def sample_modes(cost: Cost, prior: Prior, minima: Sequence[Minimum], seed: int) -> WeightedDraws:
-    """Draws of exp(−J) by at most :data:`MOST_ROUNDS` times :data:`DRAWS` runs.
+def sample_modes(
+    cost: Cost, prior: Prior, minima: Sequence[Minimum], seed: int, enough: float | None = None
+) -> WeightedDraws:
+    """Draws of exp(−J) until ``enough`` of them (default: :data:`ENOUGH`) are effective, by at most eight runs each.
 
     ``cost``: J (B,) of control vectors (B, n), with the prior's own mean and covariance, +inf where the model fails.
     Deterministic in ``seed``.
     """
     sampler = Importance(_about(prior, minima), member_stream(seed, "modes"), DRAWS, WIDER)
-    for _ in range(MOST_ROUNDS):
+    enough = ENOUGH if enough is None else enough
+    for _ in range(math.ceil(MOST_RUNS * enough / DRAWS)):
         z = sampler.draw()
         sampler.add(z, 0.5 * np.sum(z**2, axis=1) - cost(prior.from_white(z)))
-        if sampler.effective >= ENOUGH:
+        if sampler.effective >= enough:
             break
     if not np.isfinite(sampler.log):
         raise ValueError("no draw about a minimum of J can be run")

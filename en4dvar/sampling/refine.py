@@ -131,9 +131,9 @@ def refined(
     weighted draws are too few. ``resume`` is asked when the chain begins; it, ``keep``, ``look``: see
     :func:`~en4dvar.sampling.mcmc.sample`.
     """
-    prior, exact = space.problem.prior, space.settings.sampling == "exact"
+    prior, exact, enough = space.problem.prior, space.settings.sampling == "exact", space.settings.draws
     chain = space.settings.refine == "mcmc"
-    draws = sample_modes(cost, prior, minima, seed) if len(minima) > 1 or not chain else None
+    draws = sample_modes(cost, prior, minima, seed, enough) if len(minima) > 1 or not chain else None
     if draws is not None and not chain and draws.effective >= TOO_FEW:
         members = draws.members(len(posterior), member_stream(seed, "members of the modes"), exact)
         summary = _summary(draws, posterior)
@@ -145,6 +145,7 @@ def refined(
         lambda x: -cost(x),
         start,
         seed,
+        target=enough,
         resume=resume(),
         keep=keep,
         look=look,

@@ -95,6 +95,8 @@ def test_the_cost_is_that_of_a_run(tmp_path: Path) -> None:
         assert float(told[2]) > 0
         sampled = "a posterior that leaves a doubt is sampled by some 5000 more" in done.stdout
         assert sampled == (path.name == "quickstart.yaml")  # the toy is not cheap
+    more = call("validate", path, "--set", "assimilation.draws=6000").stdout
+    assert "a posterior that leaves a doubt is sampled by some 20000 more" in more
     two = tmp_path / "two.csv"
     two.write_text(csv_text(k=1.9))
     done = call("validate", write_toy(tmp_path), "--data", tmp_path / "t*.csv")

@@ -59,6 +59,14 @@ def test_a_chain_moves_between_the_wells(case):
     assert positive == pytest.approx(mass_of_positive(problem), abs=0.03)
 
 
+@pytest.mark.parametrize(("refine", "by"), [("auto", "importance"), ("mcmc", "mcmc")])
+def test_as_many_draws_are_effective_as_are_asked_for(refine, by):
+    few, many = (assimilate(two_wells(), AssimilationSettings(refine=refine, draws=n), 1) for n in (400, 4000))
+    assert few.refinement[f"{by}_effective_sample_size"] >= 400
+    assert many.refinement[f"{by}_effective_sample_size"] >= 4000
+    assert few.forward_runs < many.forward_runs
+
+
 def test_without_jumps_walkers_of_two_wells_do_not_agree(monkeypatch):
     """R-hat compares walkers that started in different modes, so that it is near 1 only where they were exchanged."""
     problem = two_wells()
