@@ -11,6 +11,7 @@ import numba as nb
 
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.arrow import begins
+from en4dvar_bubble.solver.equations import products
 from en4dvar_bubble.solver.general import (
     CONDUCT,
     CONTENT_SUM,
@@ -48,30 +49,6 @@ def _of_medium(mT):
 
 
 @nb.njit
-def _products(y, first, count, matrix, work, at):
-    """d/dy at the nodes and at the wall, then the Laplacian, of the unknowns ``first … first+count−1`` to ``work``,
-    without what the wall adds. Returns d/dy at the wall.
-    """
-    number = 2 * count + 1
-    for i in range(
-        0, number, 4
-    ):  # four sums at a time, which do not wait for each other; the last ones may be repeated
-        b, c, d = min(i + 1, number - 1), min(i + 2, number - 1), min(i + 3, number - 1)
-        sum_a, sum_b, sum_c, sum_d = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
-        for j in range(count):
-            value = load(y, first + j)
-            sum_a = sum_a + value * matrix[i, j]
-            sum_b = sum_b + value * matrix[b, j]
-            sum_c = sum_c + value * matrix[c, j]
-            sum_d = sum_d + value * matrix[d, j]
-        store(work, at + i, sum_a)
-        store(work, at + b, sum_b)
-        store(work, at + c, sum_c)
-        store(work, at + d, sum_d)
-    return load(work, at + count)
-
-
-@nb.njit
 def _add_wall(value, count, matrix, work, at):
     """What the value at the wall adds to the derivatives in ``work``."""
     for i in range(2 * count + 1):
@@ -100,10 +77,10 @@ def _sum_up(y, eq, par, work, border):
                 store(work, 2 * mT + i, exp(power * log(maximum(theta, 1e-12))))
         content = content + share
     store(border, CONTENT_SUM, content)
-    store(border, SLOPE_SUM, _products(y, 0, mT, eq.gas, work, 3 * mT))
+    store(border, SLOPE_SUM, products(y, 0, mT, eq.gas, work, 3 * mT))
     if mY:
-        store(border, VAPOUR_SUM, _products(y, mT, mY, eq.gas, work, 5 * mT + 1))
-    return _products(y, mT + mY, mM, eq.medium, work, _of_medium(mT))
+        store(border, VAPOUR_SUM, products(y, mT, mY, eq.gas, work, 5 * mT + 1))
+    return products(y, mT + mY, mM, eq.medium, work, _of_medium(mT))
 
 
 @nb.njit

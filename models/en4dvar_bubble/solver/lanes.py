@@ -121,6 +121,9 @@ class Value:
     def __mul__(self, other: Value) -> Value:
         return Value(self.builder, self.builder.fmul(self.value, other.value, flags=_CONTRACT))
 
+    def __neg__(self) -> Value:
+        return Value(self.builder, self.builder.fneg(self.value))
+
     def inverse(self) -> Value:
         return Value(self.builder, self.builder.fdiv(ir.Constant(_VEC, [1.0] * WIDTH), self.value))
 

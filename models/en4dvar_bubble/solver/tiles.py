@@ -116,35 +116,26 @@ def _minus_product(tile, left, up):
 
 
 @_of_registers
-def _factorised(tile, _, __):
-    """LU without pivoting; the diagonal is replaced by its inverse."""
+def _times(tile, right, _):
+    return [
+        sum((tile[k * EDGE + r] * right[c * EDGE + k] for k in range(1, EDGE)), tile[r] * right[c * EDGE])
+        for c in range(EDGE)
+        for r in range(EDGE)
+    ]
+
+
+@_of_registers
+def _inverse(tile, _, __):
+    """By elimination without pivoting."""
     for k in range(EDGE):
         pivot = tile[k * EDGE + k] = tile[k * EDGE + k].inverse()
-        for r in range(k + 1, EDGE):
-            tile[k * EDGE + r] *= pivot
-            for c in range(k + 1, EDGE):
+        others = [i for i in range(EDGE) if i != k]
+        for c in others:
+            tile[c * EDGE + k] *= pivot
+            for r in others:
                 tile[c * EDGE + r] -= tile[k * EDGE + r] * tile[c * EDGE + k]
-    return tile
-
-
-@_of_registers
-def _over_upper(tile, diagonal, _):
-    """``tile`` times the inverse of the upper factor."""
-    for c in range(EDGE):
-        for r in range(EDGE):
-            for k in range(c):
-                tile[c * EDGE + r] -= tile[k * EDGE + r] * diagonal[c * EDGE + k]
-            tile[c * EDGE + r] *= diagonal[c * EDGE + c]
-    return tile
-
-
-@_of_registers
-def _under_lower(tile, diagonal, _):
-    """The inverse of the lower factor times ``tile``."""
-    for k in range(EDGE):
-        for r in range(k + 1, EDGE):
-            for c in range(EDGE):
-                tile[c * EDGE + r] -= diagonal[k * EDGE + r] * tile[c * EDGE + k]
+        for r in others:
+            tile[k * EDGE + r] = -(tile[k * EDGE + r] * pivot)
     return tile
 
 
@@ -157,26 +148,17 @@ def _minus_part(part, tile, x):
 
 
 @_of_registers
-def _lower_solved(part, diagonal, _):
-    for k in range(EDGE):
-        for r in range(k + 1, EDGE):
-            part[r] -= diagonal[k * EDGE + r] * part[k]
-    return part
-
-
-@_of_registers
-def _upper_solved(part, diagonal, _):
-    for k in range(EDGE - 1, -1, -1):
-        part[k] *= diagonal[k * EDGE + k]
-        for r in range(k):
-            part[r] -= diagonal[k * EDGE + r] * part[k]
-    return part
+def _of_part(part, tile, _):
+    return [
+        sum((tile[k * EDGE + r] * part[k] for k in range(1, EDGE)), tile[r] * part[0]) for r in range(EDGE)
+    ]
 
 
 @nb.njit
 def factorise(a, h, where, places, algebraic):
     """LU without pivoting, in place, of the matrix ``a`` plus 1/(hγ) on the diagonal of the unknowns but number
-    ``algebraic``, and 1 where no unknown is.
+    ``algebraic``, and 1 where no unknown is. The lower factor has tiles of unity on its diagonal; on that of the upper
+    one there are the inverses of its tiles.
     """
     inverse_h = 1.0 / load(h, 0) * (1.0 / rodas5p.GAMMA)
     unknown = 0
@@ -198,35 +180,36 @@ def factorise(a, h, where, places, algebraic):
                 if left >= 0 and up >= 0:
                     tile = _minus_product(tile, a, left, a, up)
             if i == j:
-                tile = _factorised(tile, a, own, a, own)
+                tile = _inverse(tile, a, own, a, own)
             elif i > j:
-                tile = _over_upper(tile, a, where[j, j] * AREA, a, own)
-            else:
-                tile = _under_lower(tile, a, where[i, i] * AREA, a, own)
+                tile = _times(tile, a, where[j, j] * AREA, a, own)
             _keep(a, own, tile)
+
+
+@nb.njit
+def _rest(a, where, x, i, first, last):
+    """Part ``i`` of ``x`` without what parts ``first … last−1`` say of it."""
+    part = _part(x, i * EDGE)
+    for j in range(first, last):
+        if where[i, j] >= 0:
+            part = _minus_part(part, a, where[i, j] * AREA, x, j * EDGE)
+    return part
 
 
 @nb.njit
 def solve(a, where, places, x, b, row):
     """Solve in place for the right-hand side of the unknowns in rows ``row …`` of ``b``; ``x`` is scratch."""
-    size = len(where)
+    size, unknown = len(where), 0
     for i in range(size * EDGE):
-        store(x, i, 0.0)
-    for i in range(len(places)):
-        store(x, places[i], load(b, row + i))
-    for i in range(size):
-        part = _part(x, i * EDGE)
-        for j in range(i):
-            if where[i, j] >= 0:
-                part = _minus_part(part, a, where[i, j] * AREA, x, j * EDGE)
-        own = where[i, i] * AREA
-        _keep(x, i * EDGE, _lower_solved(part, a, own, a, own))
+        value = splat(0.0)
+        if unknown < len(places) and places[unknown] == i:
+            value = load(b, row + unknown)
+            unknown += 1
+        store(x, i, value)
+    for i in range(1, size):
+        _keep(x, i * EDGE, _rest(a, where, x, i, 0, i))
     for i in range(size - 1, -1, -1):
-        part = _part(x, i * EDGE)
-        for j in range(i + 1, size):
-            if where[i, j] >= 0:
-                part = _minus_part(part, a, where[i, j] * AREA, x, j * EDGE)
         own = where[i, i] * AREA
-        _keep(x, i * EDGE, _upper_solved(part, a, own, a, own))
+        _keep(x, i * EDGE, _of_part(_rest(a, where, x, i, i + 1, size), a, own, a, own))
     for i in range(len(places)):
         store(b, row + i, load(x, places[i]))
