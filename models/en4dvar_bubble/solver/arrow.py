@@ -1,8 +1,8 @@
 """The matrix of the general equations: blocks of fields that meet only in a border.
 
-It is extended by the sums over the nodes (:mod:`general`), unknowns without a rate: rows and columns are the fields τ, Y
-and θ_m, then the border, which begins with the sums. τ, Y and θ_m fill blocks of their own, Y's rows also the columns of
-τ, and all else is zero but for the border. Elimination in this order fills nothing in.
+It is extended by the sums over the nodes (:mod:`general`), unknowns without a rate: rows and columns are the fields τ,
+Y and θ_m, then the border, which begins with the sums. τ, Y and θ_m fill blocks of their own, Y's rows also the columns
+of τ, and all else is zero but for the border. Elimination in this order fills nothing in.
 """
 
 from __future__ import annotations

@@ -244,12 +244,13 @@ class Solver:
         """What the compiled equations read beside the members' parameters; tables of laws and pulses (…, cells, 8)."""
         system, driving = self.system, self.driving
         medium = _medium_operators(system.medium, system.medium_length)
-        general: tuple[Any, ...] = (None,) * 4  # what nobody reads need not be compiled either
+        general: tuple[Any, Any, Any, Any] = (None,) * 4  # what nobody reads need not be compiled either
         if system.general:
             general = medium, memory, viscous, _VISCOUS_SPAN
         gas, reading = _gas_operators(system.gas), READINGS[self.reading]
         shared = gas, _ELASTIC_SPAN, pulse, driving.span
-        return Equations(*self.lengths, system.dims, *shared, reading, *general, *self.tiles)
+        where, places = self.tiles
+        return Equations(*self.lengths, system.dims, *shared, reading, *general, where, places)
 
     @cached_property
     def control(self) -> Control:

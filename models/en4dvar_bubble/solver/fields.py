@@ -48,6 +48,15 @@ def _of_medium(mT):
     return 7 * mT + 2
 
 
+@nb.njit(forceinline=True)
+def _theta(tau, k):
+    """θ = 1 + 2τ/(k+1) and 1/θ by one division, which takes the time of ten multiplications."""
+    below = k + 1.0
+    above = below + tau * 2.0
+    inverse = 1.0 / (below * above)
+    return above * above * inverse, below * below * inverse
+
+
 @nb.njit
 def _add_wall(value, count, matrix, work, at):
     """What the value at the wall adds to the derivatives in ``work``."""
@@ -66,10 +75,10 @@ def _sum_up(y, eq, par, work, border):
     for i in range(mT):
         tau = load(y, i)
         k = sqrt(maximum(a * tau * 2.0 + 1.0, 1e-12))
-        theta = tau * 2.0 / (k + 1.0) + 1.0
+        theta, inverse = _theta(tau, k)
         store(work, i, k)
         store(work, mT + i, theta)
-        share = eq.gas[2 * mT + 2, i] / theta
+        share = inverse * eq.gas[2 * mT + 2, i]
         if mY:
             share = share * load(y, mT + i)
             store(work, 2 * mT + i, splat(1.0))

@@ -149,9 +149,7 @@ def _minus_part(part, tile, x):
 
 @_of_registers
 def _of_part(part, tile, _):
-    return [
-        sum((tile[k * EDGE + r] * part[k] for k in range(1, EDGE)), tile[r] * part[0]) for r in range(EDGE)
-    ]
+    return [sum((tile[k * EDGE + r] * part[k] for k in range(1, EDGE)), tile[r] * part[0]) for r in range(EDGE)]
 
 
 @nb.njit
