@@ -43,7 +43,9 @@ PHYSICS: dict[str, dict[str, Any]] = {
     "heat, vapour transport, conducting medium": {"vapour": "transport", "medium_heat": "conducting"},
 }
 TIMES = np.linspace(6e-6, 80e-6, 60)
+RELEASED_TIMES = np.linspace(1e-6, 60e-6, 60)
 BASELINE_MEMBERS = 12  # of the 48, for the slow integrators
+SINGLE_MEMBERS = 5  # likewise, of every physics
 _FORECASTS = 10  # in a row between two runs of a slow integrator, which empties the caches
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "solver.md"
 
@@ -85,12 +87,12 @@ def rms(R: Array, exact: Array) -> Array:
     return np.sqrt(np.mean((R - exact) ** 2, axis=1)) / exact.max(axis=1)
 
 
-def tuned(integrator: Integrator, problem: Problem, exact: Array, target: float) -> tuple[float, float]:
-    """The tolerance whose median error is ``target``, by secant steps in logarithms, and that error."""
+def tuned(radii: Callable[[float], Array], exact: Array, target: float) -> tuple[float, float]:
+    """The tolerance whose median error of R (N, K) is ``target``, by secant steps in logarithms, and that error."""
     rtol, slope = target / 3, 1.0
     last: tuple[float, float] | None = None
     for _ in range(7):
-        error = float(np.median(rms(run(integrator, problem, rtol) * 1e-6, exact)))
+        error = float(np.median(rms(radii(rtol), exact)))
         if abs(np.log(error / target)) < 0.1:
             break
         if last is not None and last[0] != rtol:
@@ -116,7 +118,7 @@ def equal_accuracy(nodes: int, rtol: float) -> list[str]:
     calls: list[Callable[[], object]] = [lambda: [forecast(model, x) for _ in range(_FORECASTS)]]
     lines = []
     for name, integrator in others:
-        chosen, reached = tuned(integrator, problem, exact, error)
+        chosen, reached = tuned(lambda tol, f=integrator: run(f, problem, tol) * 1e-6, exact, error)  # type: ignore[misc]
         calls.append(lambda f=integrator, tol=chosen: run(f, problem, tol))  # type: ignore[misc]
         lines.append((name, reached, chosen))
     spent = interleaved(calls, 7)
@@ -224,24 +226,58 @@ def accuracies() -> list[str]:
     return lines
 
 
-def by_physics() -> list[str]:
-    """A laser bubble with each physics: steps, cost, error in time (same nodes, 1e-10) and in all (finer grids)."""
+def released(accuracy: Accuracy, options: dict[str, Any]) -> tuple[BubbleModel, Array]:
+    """Laser bubbles of some physics: the model and 48 states."""
     rng = np.random.default_rng(0)
     theta = {name: value * np.exp(0.1 * rng.standard_normal(48)) for name, value in RELEASED.items()}
-    times, lines, cheapest = np.linspace(1e-6, 60e-6, 60), [], 0.0
+    model = BubbleModel(law=get_law("neo-hookean-kelvin-voigt"), start="laser", accuracy=accuracy, **options)
+    return model, model.initial_states(theta)
 
-    def radii(accuracy: Accuracy, options: dict[str, Any]) -> tuple[Any, Callable[[], Any]]:
-        model = BubbleModel(law=get_law("neo-hookean-kelvin-voigt"), start="laser", accuracy=accuracy, **options)
-        x, t = model.initial_states(theta), np.broadcast_to(times, (48, len(times)))
-        return model.integrate(x, t), lambda: model.integrate(x, t)["R"]
 
-    standard = preset("standard", "laser")
+def integrated(model: BubbleModel, x: Array) -> Any:
+    """The paths of laser bubbles."""
+    return model.integrate(x, np.broadcast_to(RELEASED_TIMES, (len(x), len(RELEASED_TIMES))))
+
+
+def by_integrator() -> list[str]:
+    """Each physics by the lanes kernel, LSODA and CVODE at the error of the first."""
+    from single_bubble import INTEGRATORS, Bubble
+
+    standard, lines = preset("standard", "laser"), []
     for name, options in PHYSICS.items():
-        paths, call = radii(standard, options)
-        seconds = median_time(call, 5) / 48
+        model, x = released(standard, options)
+        exact = integrated(*released(replace(standard, rtol=1e-10), options))["R"]
+        error = float(np.median(rms(integrated(model, x)["R"], exact)))
+        bubbles = [Bubble(model, x, i) for i in range(SINGLE_MEMBERS)]
+        calls, told = [partial(integrated, model, x)], [("en4dvar", error, standard.rtol, 48)]
+        for integrator, solve in INTEGRATORS.items():
+            if integrator == "CVODE" and not find_spec("sksundae"):
+                continue
+
+            def radii(rtol: float, solve: Any = solve, bubbles: list[Any] = bubbles) -> Array:
+                return np.array([solve(bubble, RELEASED_TIMES * 1e6, rtol) for bubble in bubbles]) * 1e-6
+
+            rtol, reached = tuned(radii, exact[:SINGLE_MEMBERS], error)
+            calls.append(partial(radii, rtol))
+            told.append((integrator, reached, rtol, SINGLE_MEMBERS))
+        spent = [s / n for s, (*_, n) in zip(interleaved(calls, 5), told, strict=True)]
+        for seconds, (integrator, reached, rtol, _) in zip(spent, told, strict=True):
+            costs = f"{seconds * 1e3:.3g} | **{seconds / spent[0]:.0f}**"
+            lines.append(f"| {name} | {integrator} | {reached:.0e} | {rtol:.1e} | {costs} |")
+    return lines
+
+
+def by_physics() -> list[str]:
+    """A laser bubble with each physics: steps, cost, error in time (same nodes, 1e-10) and in all (finer grids)."""
+    standard, lines, cheapest = preset("standard", "laser"), [], 0.0
+    for name, options in PHYSICS.items():
+        model, x = released(standard, options)
+        paths = integrated(model, x)
+        seconds = median_time(lambda model=model, x=x: integrated(model, x)["R"], 5) / 48  # type: ignore[misc]
         cheapest = cheapest or seconds
-        in_time = rms(paths["R"], radii(replace(standard, rtol=1e-10), options)[0]["R"])
-        in_all = rms(paths["R"], radii(Accuracy(nodes=32, rtol=1e-9, medium_nodes=48), options)[0]["R"])
+        in_time = rms(paths["R"], integrated(*released(replace(standard, rtol=1e-10), options))["R"])
+        finer = Accuracy(nodes=32, rtol=1e-9, medium_nodes=48)
+        in_all = rms(paths["R"], integrated(*released(finer, options))["R"])
         errors = " | ".join(f"{np.nanmedian(e):.0e}" for e in (in_time, in_all))
         steps, size = paths.solution.record[:, STEPS].mean(), paths.model.system.size
         lines.append(
@@ -311,6 +347,11 @@ TABLES: dict[str, tuple[str, Callable[[], list[str]]]] = {
         "| laser bubble, `standard` | unknowns | steps | error in time | everything | ms per trajectory | ratio |\n"
         "|---|---|---|---|---|---|---|",
         by_physics,
+    ),
+    "integrators": (
+        "| laser bubble, `standard` | integrator | rms error / R_max | rtol | ms per trajectory | ratio |\n"
+        "|---|---|---|---|---|---|",
+        by_integrator,
     ),
     "random": (
         "| random members | s on two threads | failures | most steps | largest wall Mach |\n|---|---|---|---|---|",

@@ -137,7 +137,7 @@ class Dynamics:
         radii = (R0,) if self.start == "acoustic" else (R_EQ, R_MAX)
         return (*self.law.parameters, *radii, *(p for p in self.optional_parameters if p.name in self.named))
 
-    @property
+    @cached_property
     def optional_parameters(self) -> tuple[Parameter, ...]:
         """The :mod:`numbers` that the equations contain; a law's own parameter of such a name goes before."""
         heat, transport = self.gas == "heat", self.vapour == "transport"

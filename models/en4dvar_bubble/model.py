@@ -78,7 +78,8 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
 
     def with_parameters(self, names: Collection[str]) -> BubbleModel:
         """See :mod:`en4dvar_bubble.numbers`."""
-        return replace(self, named=tuple(p.name for p in self.optional_parameters if p.name in names))
+        named = tuple(p.name for p in self.optional_parameters if p.name in names)
+        return self if named == self.named else replace(self, named=named)
 
     @property
     def cheap(self) -> bool:

@@ -2,38 +2,24 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numba as nb
 import numpy as np
 import pytest
 
-from en4dvar_bubble.solver.arrays import Dims, IntArray
-from en4dvar_bubble.solver.arrow import arrow_factors, arrow_solve, pattern, spans
+from en4dvar_bubble.solver.arrow import pattern, places, tiles
 from en4dvar_bubble.solver.driver import System
 from en4dvar_bubble.solver.general import sums
 from en4dvar_bubble.solver.lanes import WIDTH
 from en4dvar_bubble.solver.rodas5p import GAMMA
+from en4dvar_bubble.solver.tiles import AREA, EDGE, factorise, place, solve
 
 SYSTEMS = [System(3, 3, 2), System(5, 0, 4, 2), System(4), System(0, memory=2), System(7, 7)]
 
 
-class Equations(NamedTuple):
-    dims: Dims
-    spans: IntArray
-
-
-class Workspace(NamedTuple):
-    jac: np.ndarray
-    k: np.ndarray
-    border: np.ndarray
-    extended: np.ndarray
-
-
 @nb.njit
-def solved(h, eq, w, row):
-    arrow_factors(h, eq, w)
-    arrow_solve(eq, w, row)
+def solved(a, h, where, places, algebraic, x, b, row):
+    factorise(a, h, where, places, algebraic)
+    solve(a, where, places, x, b, row)
 
 
 @pytest.mark.slow  # for what it compiles
@@ -41,7 +27,7 @@ def solved(h, eq, w, row):
 def test_solution_is_that_of_the_full_matrix(system):
     """Of 1/(hγ) − J, extended by the sums, which have no rate and nothing on their right-hand side."""
     dims, rng = system.dims, np.random.default_rng(0)
-    full, kept = pattern(dims), sums(dims)
+    full, kept = pattern(dims), sums.py_func(dims)
     size, fields = len(full), dims.gas + dims.vapour + dims.medium
     minus_J = np.where(full[:, :, None], 0.3 * rng.standard_normal((size, size, WIDTH)), 0.0)
     a_sum = np.zeros(size, dtype=bool)
@@ -56,9 +42,14 @@ def test_solution_is_that_of_the_full_matrix(system):
     extended = np.zeros((size, WIDTH))
     extended[~a_sum] = right
     expected = np.linalg.solve(matrix.transpose(2, 0, 1), extended.T[:, :, None])[:, ~a_sum, 0].T
-    before = np.ones((2, WIDTH))
-    stages, border = np.vstack([before, right]), np.empty((size - fields, WIDTH))
-    scratch = Workspace(minus_J.reshape(-1, WIDTH), stages, border, np.empty((size, WIDTH)))
-    solved(h, Equations(dims, spans(dims)), scratch, len(before))
-    np.testing.assert_array_equal(scratch.k[:2], before)
-    np.testing.assert_allclose(scratch.k[2:], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+    where, of_unknowns = tiles(dims)
+    kept_numbers = np.zeros(((where.max() + 1) * AREA, WIDTH))
+    for i, j in np.argwhere(full):
+        kept_numbers[place.py_func(where, *places(dims)[[i, j]])] = minus_J[i, j]
+    before, scratch = np.ones((2, WIDTH)), np.full((len(where) * EDGE, WIDTH), np.nan)
+    stages = np.vstack([before, right])
+    algebraic = fields if dims.wall else -1
+    solved(kept_numbers, h, where, of_unknowns, algebraic, scratch, stages, len(before))
+    np.testing.assert_array_equal(stages[:2], before)
+    np.testing.assert_allclose(stages[2:], expected, rtol=0, atol=1e-12 * np.abs(expected).max())

@@ -50,9 +50,10 @@ class Dims(NamedTuple):
 class Equations(NamedTuple):
     """What the equations read that is the same for all members.
 
-    ``nodes`` and ``size`` are None for the equations with every option; for the paper's, a zero per temperature node
-    and a zero per unknown. Only their lengths count. That of a tuple belongs to its type: the compiler knows it and
-    unrolls; arrays serve any length.
+    ``nodes`` is None for the equations with every option; for the paper's, a zero per temperature node. Only its length
+    counts. That of a tuple belongs to its type: the compiler knows it and unrolls; an array serves any length. With a
+    tuple, ``size`` has a zero per unknown, and the matrix is one dense block; otherwise it is None, and the matrix is
+    kept in tiles.
     """
 
     nodes: Any
@@ -68,7 +69,9 @@ class Equations(NamedTuple):
     memory: Any  # tables of the memory variables
     viscous: Any  # tables of ν against ln |V|
     viscous_span: Any
-    spans: Any  # where their matrix is not zero, see :mod:`arrow`
+    # Of a matrix in tiles, otherwise None, see :mod:`tiles`:
+    where: Any
+    places: Any
 
 
 class Control(NamedTuple):
@@ -105,16 +108,18 @@ class Scratch(NamedTuple):
     elastic: Array
 
 
-def scratch(dims: Dims, size: int, of_fields: int, parameters: int, cells: int) -> Scratch:
-    """That for a matrix of ``size`` rows, ``of_fields`` rows of scratch for the fields, members of so many
-    ``parameters`` and tables of so many ``cells``.
+def scratch(
+    dims: Dims, matrix: int, tiles: tuple[int, int], border: int, of_fields: int, parameters: int, cells: int
+) -> Scratch:
+    """That for a matrix of so many numbers, and in ``tiles`` of so many numbers and rows, a ``border`` of so many
+    unknowns, ``of_fields`` rows of scratch for the fields, members of so many ``parameters`` and tables of so many
+    ``cells``.
     """
     n = dims.gas + dims.vapour + dims.medium + dims.wall + dims.memory + 2
-    own = size - dims.gas - dims.vapour - dims.medium
-    step = of_fields, n, size * size, 1, rodas5p.STAGES * n, n, n, 1, 3, 3 * n
-    border = own, own, SHARED, own, SHARED, size
+    step = of_fields, n, matrix, 1, rodas5p.STAGES * n, n, n, 1, 3, 3 * n
+    general = border, border, SHARED, border, SHARED
     lanes = n, 1, 1, parameters, 1, 1, 1, 1
-    edges = np.cumsum([0, *step, *border, *lanes])
+    edges = np.cumsum([0, *step, *tiles, *general, *lanes])
     raw = np.zeros((edges[-1] + 1) * WIDTH)
     first = -(raw.ctypes.data // 8) % WIDTH  # on a 64-byte boundary: a row that straddles two cache lines costs twice
     block = raw[first : first + edges[-1] * WIDTH].reshape(-1, WIDTH)
@@ -147,7 +152,7 @@ class Lanes(NamedTuple):
 
 class Workspace(NamedTuple):
     """Scratch of a step, and what it leaves: the stages ``k``, ``y_new``; ``norm`` (3, WIDTH) of the error, its fifth
-    root, wall Mach number. From ``border`` on it is that of the general equations.
+    root, wall Mach number. From ``border`` on it is that of the general equations, whose matrix is in ``tiles`` only.
     """
 
     work: Array
@@ -160,9 +165,10 @@ class Workspace(NamedTuple):
     t_stage: Array
     norm: Array
     dense: Array
+    tiles: Array  # the matrix in tiles; a right-hand side and its solution
+    extended: Array
     border: Array  # unknowns of the border and their rates; what the fields read of it
     border_f: Array
     shared: Array
     moved_f: Array  # the last two where an unknown of the border is moved
     moved: Array
-    extended: Array  # a right-hand side and its solution

@@ -17,9 +17,11 @@ from en4dvar_bubble.driving import Driving, Reading
 from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import integrate, rows
 from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output, Scratch, scratch
-from en4dvar_bubble.solver.arrow import spans
+from en4dvar_bubble.solver.arrow import tiles
 from en4dvar_bubble.solver.collocation import ball, exterior
 from en4dvar_bubble.solver.fields import scratch_rows
+from en4dvar_bubble.solver.general import sums
+from en4dvar_bubble.solver.tiles import AREA, EDGE, kept_tiles
 
 stamp_with_sources(integrate.integrate, Path(__file__).parent, Path(tables_module.__file__))
 
@@ -225,18 +227,30 @@ class Solver:
             return None, None
         if system.gas in UNROLLED:
             return (0,) * system.gas, (0,) * system.size
-        return np.zeros(system.gas), np.zeros(system.size)
+        return np.zeros(system.gas), None
+
+    @cached_property
+    def tiles(self) -> tuple[Any, Any]:
+        """``where`` and ``places`` of the equations."""
+        system = self.system
+        if system.general:
+            return tiles(system.dims)
+        if system.gas in UNROLLED:
+            return None, None
+        every = np.arange(system.size)
+        return kept_tiles(np.ones((len(every), len(every)), dtype=bool), every), every
 
     def equations(self, memory: Array, viscous: Array, pulse: Array) -> Equations:
         """What the compiled equations read beside the members' parameters; tables of laws and pulses (…, cells, 8)."""
         system, driving = self.system, self.driving
         medium = _medium_operators(system.medium, system.medium_length)
-        general: tuple[Any, ...] = (None,) * 5  # what nobody reads need not be compiled either
+        general: tuple[Any, Any, Any, Any] = (None,) * 4  # what nobody reads need not be compiled either
         if system.general:
-            general = medium, memory, viscous, _VISCOUS_SPAN, spans(system.dims)
+            general = medium, memory, viscous, _VISCOUS_SPAN
         gas, reading = _gas_operators(system.gas), READINGS[self.reading]
         shared = gas, _ELASTIC_SPAN, pulse, driving.span
-        return Equations(*self.lengths, system.dims, *shared, reading, *general)
+        where, places = self.tiles
+        return Equations(*self.lengths, system.dims, *shared, reading, *general, where, places)
 
     @cached_property
     def control(self) -> Control:
@@ -276,6 +290,9 @@ class Solver:
         return call, Solution(*output)
 
     def _scratch(self, parameters: int) -> Scratch:
-        system = self.system
-        size = len(spans(system.dims)) if system.general else system.size
-        return scratch(system.dims, size, scratch_rows(system.dims), parameters, int(_ELASTIC_SPAN[3]))
+        system, (where, _) = self.system, self.tiles
+        matrix = 0 if system.general else system.size**2
+        of_tiles = (0, 0) if where is None else ((where.max() + 1) * AREA, len(where) * EDGE)
+        border = system.size - system.wall_row + sums.py_func(system.dims) if system.general else 0
+        of_fields = scratch_rows(system.dims)
+        return scratch(system.dims, matrix, of_tiles, border, of_fields, parameters, int(_ELASTIC_SPAN[3]))

@@ -44,8 +44,34 @@ from en4dvar_bubble.solver.rows import (
 
 
 @nb.njit(forceinline=True)
+def products(y, first, count, matrix, work, at):
+    """d/dy at the nodes and at the wall, then the Laplacian, of the unknowns ``first … first+count−1`` to ``work``,
+    without what the wall adds. Returns d/dy at the wall.
+
+    Four sums at a time, which do not wait for each other; the last ones may be repeated.
+    """
+    number = 2 * count + 1
+    for i in range(0, number, 4):
+        b, c, d = min(i + 1, number - 1), min(i + 2, number - 1), min(i + 3, number - 1)
+        sum_a, sum_b, sum_c, sum_d = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
+        for j in range(count):
+            value = load(y, first + j)
+            sum_a = sum_a + value * matrix[i, j]
+            sum_b = sum_b + value * matrix[b, j]
+            sum_c = sum_c + value * matrix[c, j]
+            sum_d = sum_d + value * matrix[d, j]
+        store(work, at + i, sum_a)
+        store(work, at + b, sum_b)
+        store(work, at + c, sum_c)
+        store(work, at + d, sum_d)
+    return load(work, at + count)
+
+
+@nb.njit(forceinline=True)
 def _gas(y, nodes, par, ops, work):
-    """Pressure p, π̇, E and wall gradient; rows of ``work``: k (0…), θ (m…), τ' (2m…), ∇²τ (3m…)."""
+    """Pressure p, π̇, E and wall gradient; rows of ``work``: k (0…), θ (m…), τ' (2m…, last at the wall), ∇²τ (3m+1…),
+    ⟨1/θ⟩ (4m+1).
+    """
     m = len(nodes)
     V = load(y, m)
     u = load(y, m + 1)
@@ -64,19 +90,8 @@ def _gas(y, nodes, par, ops, work):
         store(work, i, k)
         store(work, m + i, theta)
         inverse_mean = inverse_mean + weights[i] / theta
-    wall = zero
-    for j in range(m):
-        wall = wall + load(y, j) * ops[m, j]
-    for i in range(m):
-        first = zero
-        second = zero
-        for j in range(m):
-            tau = load(y, j)
-            first = first + tau * ops[i, j]
-            second = second + tau * ops[m + 1 + i, j]
-        store(work, 2 * m + i, first)
-        store(work, 3 * m + i, second)
-    store(work, 4 * m, inverse_mean)
+    wall = products(y, 0, m, ops, work, 2 * m)
+    store(work, 4 * m + 1, inverse_mean)
     p = exp(load(par, LOG_GAS) - u * 3.0) / inverse_mean
     E = load(par, CONDUCTION) / p * exp(u * (-2.0))
     rate = (kappa - 1.0) * E * wall * 3.0 - kappa * V * 3.0
@@ -85,7 +100,7 @@ def _gas(y, nodes, par, ops, work):
 
 @nb.njit(forceinline=True)
 def rhs(y, t, eq, loaded, work, out):
-    """Write dy/dt (n, 8) to ``out``; ``work`` (4m+1, 8) is scratch."""
+    """Write dy/dt (n, 8) to ``out``; ``work`` (4m+2, 8) is scratch."""
     nodes, par, ops, reading = eq.nodes, loaded.par, eq.gas, eq.reading
     m = len(nodes)
     p, rate, E, _wall = _gas(y, nodes, par, ops, work)
@@ -98,7 +113,7 @@ def rhs(y, t, eq, loaded, work, out):
         conduct = k1 * load(work, i) * load(work, m + i)
         radius = ops[2 * m + 1, i]
         drift = first * radius
-        dtau = drift * V + E * (conduct * load(work, 3 * m + i) - k1 * first * first)
+        dtau = drift * V + E * (conduct * load(work, 3 * m + 1 + i) - k1 * first * first)
         store(out, i, dtau + (conduct + drift / (kappa * 3.0)) * rate)
     R = exp(u)
     ic = load(par, INVERSE_C)
@@ -199,20 +214,20 @@ def jacobian(y, t, eq, loaded, w):
         return
 
     a = load(par, SLOPE)
-    mean = load(work, 4 * m)
+    mean = load(work, 4 * m + 1)
     for j in range(m):  # ∂ln p/∂τ_j and ∂π̇/∂τ_j, kept in the rows that the sums below need
         k = load(work, j)
         theta = load(work, m + j)
         share = ops[2 * m + 2, j] / (k * theta * theta * mean)
         rate_j = heat * (ops[m, j] - share * wall)
         store(jac, row_V + j, (one * p * share + Ric * p * (share * rate + rate_j)) * inverse)
-        store(work, 4 * m + 1 + j, share)
-        store(work, 5 * m + 1 + j, rate_j)
+        store(work, 4 * m + 2 + j, share)
+        store(work, 5 * m + 2 + j, rate_j)
     for i in range(m):
         k = load(work, i)
         theta = load(work, m + i)
         first = load(work, 2 * m + i)
-        second = load(work, 3 * m + i)
+        second = load(work, 3 * m + 1 + i)
         radius = ops[2 * m + 1, i]
         conduct = k1 * k * theta
         drift = first * radius
@@ -223,7 +238,7 @@ def jacobian(y, t, eq, loaded, w):
         on_second = conduct * E
         for j in range(m):
             value = on_first * ops[i, j] + on_second * ops[m + 1 + i, j]
-            value = value - load(work, 4 * m + 1 + j) * diffusion + coupling * load(work, 5 * m + 1 + j)
+            value = value - load(work, 4 * m + 2 + j) * diffusion + coupling * load(work, 5 * m + 2 + j)
             if i == j:
                 value = value + k1 * (a * theta + k) / k * (E * second + rate)
             store(jac, i * n + j, value)

@@ -53,6 +53,7 @@ def _workspace(block, at):
         rows_of(block, at[13], at[14]),
         rows_of(block, at[14], at[15]),
         rows_of(block, at[15], at[16]),
+        rows_of(block, at[16], at[17]),
     )
 
 

@@ -106,6 +106,28 @@ _operator(operator.gt, mask, lambda builder, a, b: builder.fcmp_ordered(">", a, 
 _operator(operator.ge, mask, lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
 
 
+class Value:
+    """Lanes while code is made, for kernels that Python unrolls."""
+
+    def __init__(self, builder: Any, value: Any) -> None:
+        self.builder, self.value = builder, value
+
+    def __sub__(self, other: Value) -> Value:
+        return Value(self.builder, self.builder.fsub(self.value, other.value, flags=_CONTRACT))
+
+    def __add__(self, other: Value) -> Value:
+        return Value(self.builder, self.builder.fadd(self.value, other.value, flags=_CONTRACT))
+
+    def __mul__(self, other: Value) -> Value:
+        return Value(self.builder, self.builder.fmul(self.value, other.value, flags=_CONTRACT))
+
+    def __neg__(self) -> Value:
+        return Value(self.builder, self.builder.fneg(self.value))
+
+    def inverse(self) -> Value:
+        return Value(self.builder, self.builder.fdiv(ir.Constant(_VEC, [1.0] * WIDTH), self.value))
+
+
 @infer_global(operator.neg)
 class _Negate(ConcreteTemplate):
     cases = [signature(lanes, lanes)]  # noqa: RUF012
@@ -116,7 +138,8 @@ def _lower_negate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return builder.fneg(args[0])
 
 
-def _row_pointer(context: Any, builder: Any, array_type: Any, array: Any, row: Any) -> Any:
+def row_pointer(context: Any, builder: Any, array_type: Any, array: Any, row: Any) -> Any:
+    """Where the lanes of a row of an array begin."""
     data = cgutils.create_struct_proxy(array_type)(context, builder, value=array).data
     pointer = builder.gep(data, [builder.mul(row, ir.Constant(_I64, WIDTH))])
     return builder.bitcast(pointer, _VEC.as_pointer())
@@ -190,7 +213,7 @@ def load(typingctx, array, row):
 
     def codegen(context, builder, sig, args):
         row = context.cast(builder, args[1], sig.args[1], types.int64)
-        return builder.load(_row_pointer(context, builder, sig.args[0], args[0], row), align=8)
+        return builder.load(row_pointer(context, builder, sig.args[0], args[0], row), align=8)
 
     return lanes(array, types.int64), codegen
 
@@ -200,7 +223,7 @@ def store(typingctx, array, row, value):
     """Write ``value`` (lanes or a number for all) to ``array[row]``."""
 
     def codegen(context, builder, sig, args):
-        pointer = _row_pointer(context, builder, sig.args[0], args[0], args[1])
+        pointer = row_pointer(context, builder, sig.args[0], args[0], args[1])
         builder.store(_splat(builder, args[2]), pointer, align=8)
         return context.get_dummy_value()
 

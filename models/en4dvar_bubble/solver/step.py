@@ -7,15 +7,15 @@ every call of a compiled function passes each field of the named groups by itsel
 from __future__ import annotations
 
 import numba as nb
-from numba.core.types import NoneType
+from numba.core.types import BaseTuple, NoneType
 from numba.extending import overload
 
 from en4dvar_bubble.solver import rodas5p
-from en4dvar_bubble.solver.arrow import arrow_factors, arrow_solve
 from en4dvar_bubble.solver.equations import jacobian, rhs
 from en4dvar_bubble.solver.fields import general_jacobian, general_rhs
 from en4dvar_bubble.solver.lanes import absolute, exp, load, log, maximum, splat, sqrt, store
 from en4dvar_bubble.solver.rows import INVERSE_C
+from en4dvar_bubble.solver.tiles import factorise, place, solve
 
 _A, _C, _ALPHA, _D, _H = rodas5p.A, rodas5p.C, rodas5p.ALPHA, rodas5p.D, rodas5p.H
 _GAMMA, _STAGES = rodas5p.GAMMA, rodas5p.STAGES
@@ -61,9 +61,14 @@ def _is_general(eq):
     return isinstance(eq.types[eq.fields.index("nodes")], NoneType)
 
 
+def _is_unrolled(eq):
+    """Whether it is that of the paper's equations with few nodes."""
+    return isinstance(eq.types[eq.fields.index("size")], BaseTuple)
+
+
 @nb.njit(forceinline=True)
-def _dense(lanes, eq, w):
-    """:func:`_linearise` of the paper's equations."""
+def _unrolled(lanes, eq, w):
+    """:func:`_linearise` of the paper's equations with few nodes."""
     jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
     n = len(w.f)
     inverse_h = 1.0 / load(lanes.h, 0)
@@ -75,15 +80,28 @@ def _dense(lanes, eq, w):
 
 
 @nb.njit
+def _dense(lanes, eq, w):
+    """:func:`_linearise` of the paper's equations with many."""
+    jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
+    n = len(w.f)
+    for i in range(len(w.tiles)):
+        store(w.tiles, i, 0.0)
+    for i in range(n):
+        for j in range(n):
+            store(w.tiles, place(eq.where, i, j), -load(w.jac, i * n + j))
+    factorise(w.tiles, lanes.h, eq.where, eq.places, -1)
+
+
+@nb.njit
 def _general(lanes, eq, w):
     """:func:`_linearise` of the equations with every option."""
     general_jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
-    arrow_factors(lanes.h, eq, w)
+    factorise(w.tiles, lanes.h, eq.where, eq.places, _algebraic_row(eq))
 
 
 def _linearise(lanes, eq, w):
     """dy/dt to ``f``, ∂f_V/∂t to ``dt``, and 1/(hγ) − ∂f/∂y, without 1/(hγ) in the algebraic row, as its factors to
-    ``jac``, of the equations that the compiler chooses by the type of ``eq``.
+    ``jac`` or ``tiles``, of the equations that the compiler chooses by the type of ``eq``.
     """
 
 
@@ -91,6 +109,8 @@ def _linearise(lanes, eq, w):
 def _choose_matrix(lanes, eq, w):
     if _is_general(eq):
         return lambda lanes, eq, w: _general(lanes, eq, w)
+    if _is_unrolled(eq):
+        return lambda lanes, eq, w: _unrolled(lanes, eq, w)
     return lambda lanes, eq, w: _dense(lanes, eq, w)
 
 
@@ -100,9 +120,9 @@ def _substitute(eq, w, row):
 
 @overload(_substitute, jit_options={"forceinline": True})
 def _choose_solve(eq, w, row):
-    if _is_general(eq):
-        return lambda eq, w, row: arrow_solve(eq, w, row)
-    return lambda eq, w, row: _solve(w.jac, eq.size, w.k, row)
+    if _is_unrolled(eq):
+        return lambda eq, w, row: _solve(w.jac, eq.size, w.k, row)
+    return lambda eq, w, row: solve(w.tiles, eq.where, eq.places, w.extended, w.k, row)
 
 
 def _rhs(y, t, eq, loaded, w):
