@@ -62,7 +62,6 @@ window.look = (() => {
       "th:not([scope])": () => true,
       "svg, img, a, button, [role=button]": (e) =>
         !(e.textContent.trim() || e.getAttribute("aria-label") || e.alt) && e.getAttribute("aria-hidden") !== "true",
-      "a[href^='#']": (e) => !document.getElementById(e.getAttribute("href").slice(1)),
     };
     return Object.entries(silent).flatMap(([what, bad]) =>
       [...document.querySelectorAll(what)].filter(bad).map((e) => `${what}: ${e.outerHTML.slice(0, 80)}`));
