@@ -11,12 +11,13 @@ import os
 import stat
 import sys
 import tempfile
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+from numba.core.event import Listener, install_listener
 
 from en4dvar.errors import OutputError
 from en4dvar.kernel_cache import compile_once
@@ -62,6 +63,24 @@ def _compiled(function: F, compile_: Callable[[F], Any]) -> F:
 def compilations() -> int:
     """How often a kernel was compiled in this process, because nothing kept on disk served its arguments."""
     return sum(sum(kernel.stats.cache_misses.values()) for kernel in KERNELS)
+
+
+@contextmanager
+def watch_compilation(tell: Callable[[], None]) -> Iterator[None]:
+    """Within, ``tell`` is called when this process begins to compile what is not kept on disk."""
+    with install_listener("numba:compile", _Watcher(tell)):
+        yield
+
+
+class _Watcher(Listener):
+    def __init__(self, tell: Callable[[], None]):
+        self._tell = tell
+
+    def on_start(self, event: Any) -> None:
+        self._tell()
+
+    def on_end(self, event: Any) -> None:
+        """What comes next is told by who does it."""
 
 
 def _keep_in_a_temporary_folder() -> None:

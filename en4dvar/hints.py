@@ -64,9 +64,17 @@ def _letters(text: str) -> str:
 
 
 def natural(path: Path) -> tuple[list[list[str | int]], Path]:
-    """Key to sort by: numbers in a path by their size, so that ``bubble10`` comes after ``bubble2``."""
-    parts = (re.split(r"([0-9]{1,40})", part) for part in path.with_suffix("").parts)
-    return [[int(s) if i % 2 else s for i, s in enumerate(part)] for part in parts], path
+    """Key to sort files by: as :func:`numbered`, part by part, whatever their suffixes."""
+    return [numbered(part) for part in path.with_suffix("").parts], path
+
+
+def numbered(name: str) -> list[str | int]:
+    """Key to sort by: numbers in a name by their size, so that ``bubble10`` comes after ``bubble2``.
+
+    >>> sorted(["bubble10", "bubble2"], key=numbered)
+    ['bubble2', 'bubble10']
+    """
+    return [int(s) if i % 2 else s for i, s in enumerate(re.split(r"([0-9]{1,40})", name))]
 
 
 def short(text: str, most: int = 60) -> str:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
+import os
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import replace
 from itertools import islice
 from typing import Any
@@ -26,6 +28,10 @@ from en4dvar.state import TIME_SHIFT, Array, Field, Parameter, StateLayout
 # Of several test processes on the same cores, each with as many threads of BLAS, these wait for each other, spinning:
 # one solution of an oracle took four times the CPU time. What tests start has the number that it would have anyway.
 threadpool_limits(1, user_api="blas")
+
+# What this process writes need not outlive a loss of power: the fifty flushes of a run were a third of its time. The
+# programs that tests start flush, and ``faults/test_commands.py`` has that fail.
+os.fsync = lambda file: None  # type: ignore[assignment]
 
 # A file is one worker's (``--dist loadfile``), and the files keep the order given below (``--no-loadscope-reorder``).
 # First the file that compiles what most bubbles need: begun by both workers at once it would be compiled by both. Then
@@ -141,6 +147,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     tests = Counter(item.path for item in items)
     ranks = {path: FIRST.index(path.stem) if path.stem in FIRST else len(FIRST) for path in tests}
     items.sort(key=lambda item: (ranks[item.path], -tests[item.path]))
+
+
+def pytest_collection_finish() -> None:
+    """What the imported modules consist of is never garbage: to look through it took 6 % of the time."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_xdist_auto_num_workers() -> Generator[None, int, int]:
+    """One more than cores: tests wait for processes they started, for terminals and disks."""
+    return (yield) + 1
 
 
 @pytest.fixture(scope="session")

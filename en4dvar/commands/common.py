@@ -103,7 +103,9 @@ def config_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The argument CONFIG with --data and --set, which the command gets as one :class:`Source`."""
 
     @click.argument("config", type=click.Path(path_type=Path))
-    @click.option("--data", metavar="FILE", help="Data file, folder or pattern instead of data.path.")
+    @click.option(
+        "--data", metavar="FILE", type=click.Path(), help="Data file, folder or pattern instead of data.path."
+    )
     @click.option(
         "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a value, e.g. assimilation.members=96."
     )

@@ -29,6 +29,16 @@ _COMMANDS = (
 )
 Kind = Literal["csv", "latex", "members"]
 _ESCAPES = {c: f"\\{c}" for c in "#$%&_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
+_GREEK = dict(zip("αβγδεθκλμνπρστχωΓΔΘΛΣΩ", (
+    "alpha", "beta", "gamma", "delta", "epsilon", "theta", "kappa", "lambda", "mu", "nu", "pi", "rho", "sigma", "tau",
+    "chi", "omega", "Gamma", "Delta", "Theta", "Lambda", "Sigma", "Omega",
+), strict=True))  # fmt: skip
+_SIGNS = {
+    "²": "^2", "³": "^3", "±": r"\pm", "×": r"\times", "−": "-", "→": r"\to", "≤": r"\le", "≥": r"\ge", "≈": r"\approx",
+    "√": r"\surd", "°": r"^\circ", "µ": r"\mu", "Ṙ": r"\dot R",
+}  # fmt: skip
+_ESCAPES |= {c: f"$\\{name}$" for c, name in _GREEK.items()} | {c: f"${sign}$" for c, sign in _SIGNS.items()}
+_ESCAPES |= {"–": "--", "—": "---", "…": r"\dots{}"}
 
 
 def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:

@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from en4dvar.analysis import ChainRecord, Descents, IterationRecord, Record, StartRecord
+from en4dvar.compiled import watch_compilation
 from en4dvar.errors import OutputError
 from en4dvar.files import own_file
 from en4dvar.runs.interrupt import Interrupted
@@ -105,6 +106,10 @@ class LiveProgress:
             self._open[name] = record.rounds if isinstance(record, StartRecord) else record.iteration
         self._show(_short(name, record))
 
+    def compiling(self) -> None:
+        """The model is being compiled, which later runs are spared."""
+        self._show("first use of this model: compiling, once")
+
     def begin(self, done: int) -> None:
         """``done`` data sets were done by an earlier run."""
         self._before = self._done = done
@@ -169,7 +174,9 @@ def terminal_progress(n_datasets: int) -> Iterator[LiveProgress | None]:
         TextColumn("{task.fields[left]}"),
     )
     with shown(Bar(*columns, console=console, transient=True)) as bar:
-        yield LiveProgress(bar, n_datasets)
+        progress = LiveProgress(bar, n_datasets)
+        with watch_compilation(progress.compiling):
+            yield progress
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from typing import BinaryIO
 
 from en4dvar.errors import OutputError
 from en4dvar.files import open_plain, own_file
+from en4dvar.hints import numbered
 from en4dvar.storage.checkpoint import digest
 
 PACK = "datasets.pack"
@@ -100,8 +101,9 @@ def read_outcome(path: Path, name: str, entry: Entry) -> bytes:
 
 
 def results_of(pack: Path) -> list[Path]:
-    """The addresses of the results in a pack, by name. Raises :class:`OutputError`."""
-    return sorted(pack / name for name, entry in _opened(pack).entries.items() if entry.content_size)
+    """The addresses of the results in a pack, in the order of their names and numbers. Raises :class:`OutputError`."""
+    held = [name for name, entry in _opened(pack).entries.items() if entry.content_size]
+    return [pack / name for name in sorted(sorted(held), key=numbered)]
 
 
 def read_result(address: Path, check: bool = True) -> bytes:

@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import Iterable
 from contextlib import suppress
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -34,7 +35,7 @@ def provenance(config_text: str, config_path: str | Path | None = None, command:
         "configuration": config_text,
         "configuration_file": Path(config_path).name if config_path else "",
         "configuration_git_commit": git_commit(Path(config_path)) if config_path else "",
-        "git_commit": git_commit(Path(__file__)),
+        "git_commit": _own_commit(),
         "package_versions": ", ".join(f"{name} {v}" for name, v in versions.items()),
         "python_version": platform.python_version(),
         "platform": f"{platform.system()} {platform.release()} {platform.machine()}",
@@ -47,8 +48,16 @@ def package_versions(names: Iterable[str]) -> dict[str, str]:
     versions = {}
     for name in names:
         with suppress(metadata.PackageNotFoundError):
-            versions[name] = metadata.version(name)
+            versions[name] = _version(name)
     return versions
+
+
+_version = cache(metadata.version)  # modules stay what they were when they were imported
+
+
+@cache
+def _own_commit() -> str:
+    return git_commit(Path(__file__))
 
 
 def git_commit(path: Path) -> str:

@@ -15,7 +15,7 @@ from en4dvar.commands.common import note_beginning
 @click.command()
 @click.argument("configs", metavar="CONFIG...", nargs=-1, required=True, type=click.Path())
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a value of the configuration.")
-@click.option("--data", metavar="FILE", help="Data file (or glob) instead of data.path.")
+@click.option("--data", metavar="FILE", type=click.Path(), help="Data file, folder or pattern instead of data.path.")
 @click.option(
     "--trajectories", type=click.IntRange(min=2), default=50_000, show_default=True, help="Size of the design."
 )

@@ -18,7 +18,7 @@ class CheckFailed(En4dvarError):
     """A law does not pass the battery."""
 
 
-def _completed(context: click.Context, parameter: click.Parameter, typed: str) -> list[str]:
+def completed_law(context: click.Context, parameter: click.Parameter, typed: str) -> list[str]:
     """Names of laws that the shell offers."""
     from en4dvar_bubble.laws.loading import available
 
@@ -26,7 +26,7 @@ def _completed(context: click.Context, parameter: click.Parameter, typed: str) -
 
 
 @click.command()
-@click.argument("names", nargs=-1, metavar="[LAW]...", shell_complete=_completed)
+@click.argument("names", nargs=-1, metavar="[LAW]...", shell_complete=completed_law)
 @click.option("--check", is_flag=True, help="Run the checks that every law must pass.")
 def laws(names: tuple[str, ...], check: bool) -> None:
     """List constitutive laws with parameters and units, or check them.

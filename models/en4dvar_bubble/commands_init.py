@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from en4dvar_bubble.commands import completed_law
+
 if TYPE_CHECKING:
     from en4dvar.inputs.asked import Layout
     from en4dvar.inputs.contents import Contents
@@ -24,14 +26,19 @@ _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 
 
 @click.command()
-@click.option("--data", metavar="PATH", help="CSV, Excel, .mat file, folder or pattern; without it, an empty starter.")
+@click.option(
+    "--data",
+    metavar="PATH",
+    type=click.Path(),
+    help="CSV, Excel, .mat file, folder or pattern; without it, an empty starter.",
+)
 @click.option("--movie", type=click.Path(path_type=Path), help="Movie to read first, as 'en4dvar track' does.")
 @click.option("--pixel", metavar="LENGTH", help="Size of a pixel of the movie, e.g. '2.76 um'.")
 @click.option("--frame-rate", metavar="RATE", help="Frame rate of the movie, or of the data's, e.g. '270 kHz'.")
 @click.option("--exposure", metavar="TIME", help="Exposure of a frame of the movie, e.g. '500 ns'.")
 @click.option("--flashes", metavar="TIMES", help="Flashes of one exposure of the movie, as '0 us, 2 us, 4 us'.")
 @click.option("--raw", metavar="WxHxBITS", help="Shape of the frames of a movie without header, e.g. 512x128x8.")
-@click.option("--corrections", metavar="FILE", help="Frames of the movie corrected by hand.")
+@click.option("--corrections", metavar="FILE", type=click.Path(), help="Frames of the movie corrected by hand.")
 @click.option("--example", type=click.Choice(["quickstart"]), help="An example and its synthetic data instead.")
 @click.option("--time-unit", metavar="UNIT", help="Unit of the times in the file, e.g. us.")
 @click.option("--radius-unit", metavar="UNIT", help="Unit of the radii in the file, e.g. um.")
@@ -45,7 +52,7 @@ _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
     "--repeated", type=click.Choice(["refuse", "average"]), help="What to do with several readings of a time."
 )
 @click.option("--start", type=click.Choice(["acoustic", "laser"]), help="Start; default: what the data suggest.")
-@click.option("--law", metavar="LAW", help="Constitutive law, see 'en4dvar laws'.")
+@click.option("--law", metavar="LAW", shell_complete=completed_law, help="Constitutive law, see 'en4dvar laws'.")
 @click.option("--out", type=click.Path(path_type=Path), help="YAML file to write; default <name of the data>.yaml.")
 @click.option("--force", is_flag=True, help="Replace that file.")
 def init(
@@ -170,10 +177,13 @@ def _columns_of(data: str, asked: _Asked, layout: Layout) -> dict[str, Any]:
     from en4dvar_bubble.starter.page import TRACKED, TRACKED_COLUMNS
     from en4dvar_bubble.starter.summaries import summary_rows
 
-    first, contents, layout = _first_with_columns(list(find_files(Path.cwd(), [data]).values()), layout)
+    files = list(find_files(Path.cwd(), [data]).values())
+    first, contents, layout = _first_with_columns(files, layout)
     shown = {name: f"{len(v)} values, {_range(v)}" for name, v in contents.columns.items()}
     commas = ", decimal commas" if layout.decimal == "," else ""
-    click.echo(f"{first}{commas}: {'; '.join(f'{name} ({words})' for name, words in shown.items())}", err=True)
+    one_of = f"; one of {len(files)} files" if len(files) > 1 else ""
+    columns = "; ".join(f"{name} ({words})" for name, words in shown.items())
+    click.echo(f"{first}{commas}: {columns}{one_of}", err=True)
     if contents.scalars:
         told = ", ".join(f"{name} {value:g}" for name, value in contents.scalars.items())
         click.echo(f"others in the file: {told}", err=True)

@@ -80,7 +80,7 @@ def test_files_beside_the_code_are_packaged():
         p
         for root in ("en4dvar", "models")
         for p in (ROOT / root).rglob("*")
-        if p.is_file() and p.suffix not in (".py", ".pyc", ".nbi", ".nbc") and "egg-info" not in str(p)
+        if p.is_file() and p.suffix != ".py" and "__pycache__" not in p.parts and "egg-info" not in str(p)
     ]
     assert [p.name for p in beside if not any(p.match(pattern) for pattern in patterns)] == []
 

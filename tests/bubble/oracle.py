@@ -35,6 +35,19 @@ def even_chebyshev(m):
     return y, first, second + 2 / y[:, None] * first
 
 
+def differenced(rhs, least=1.0):
+    """∂f/∂x (n, n) of ``rhs(t, x)``, which takes states (n, k), by differences of one call: LSODA would make n.
+
+    ``least``: below what size a number is taken for one of that size.
+    """
+
+    def jacobian(t, x):
+        step = 1.5e-8 * np.maximum(np.abs(x), least)
+        return (rhs(t, x[:, None] + np.diag(step)) - rhs(t, x)[:, None]) / step
+
+    return jacobian
+
+
 def integrate(times, G, alpha, mu, R0, m=20, rtol=1e-8, start=4.5e-6, reading="instantaneous", heat=True):
     """R (K,) at ``times`` > ``start`` for the acoustic quadratic-law Kelvin–Voigt bubble."""
     y, D, L = even_chebyshev(m)

@@ -21,7 +21,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from oracle import even_chebyshev
+from oracle import differenced, even_chebyshev
 from scipy.integrate import solve_ivp
 
 GAS_CONSTANT = 8.314462618
@@ -62,7 +62,8 @@ class Bubble:
         k = constants or Constants()
         self.k, self.G, self.mu, self.R_max, self.R_eq = k, G, mu, R_max, R_eq
         self.transport, self.conducting = vapour == "transport", conducting
-        self.y, self.D1, self.L = even_chebyshev(nodes)  # wall first
+        y, self.D1, self.L = even_chebyshev(nodes)  # wall first
+        self.y = y[:, None]
         self.m, self.n = nodes, cells if conducting else 0
         pv = 0.0 if vapour == "none" else p_sat(k.T_inf)
         pg = (k.p_inf + 2 * k.S / R_eq - pv) * (R_eq / R_max) ** 3
@@ -75,7 +76,7 @@ class Bubble:
             first, last = 2e-18, 2e-11
             self.faces = first * np.expm1(zeta * np.log1p(last / first))
             self.centres = first * np.expm1((zeta[1:] + zeta[:-1]) / 2 * np.log1p(last / first))
-            self.volumes = np.diff(self.faces)
+            self.volumes = np.diff(self.faces)[:, None]
 
     def saturated(self, T, p):
         """Mass fraction of vapour in equilibrium at a wall of temperature T."""
@@ -105,17 +106,20 @@ class Bubble:
         for _ in range(30):
             f = balance(w)
             step = f / ((balance(w + 1e-5) - f) / 1e-5)
-            w -= min(max(step, -5.0), 5.0)
-            if abs(step) < 1e-10:
+            w = w - np.clip(step, -5.0, 5.0)
+            if np.all(np.abs(step) < 1e-10):
                 break
         return w
 
     def rhs(self, t, state):
+        """d/dt of one state (n,), or of those in the columns (n, k)."""
         k, y, D1, m = self.k, self.y, self.D1, self.m
-        R, V, p = state[0], state[1], np.exp(state[2])
-        T = np.r_[k.T_inf, state[3 : 2 + m]]
-        C = np.r_[0.0, state[2 + m : 1 + 2 * m]] if self.transport else None
-        T_m = state[len(state) - self.n :]
+        X = state.reshape(len(state), -1)
+        R, V, p = X[0], X[1], np.exp(X[2])
+        T = X[2 : 2 + m].copy()
+        T[0] = k.T_inf
+        C = X[1 + m : 1 + 2 * m].copy() if self.transport else None
+        T_m = X[len(X) - self.n :]
         if self.conducting:
             T[0] = self.wall_temperature(R, p, T, C, T_m)
         K = k.A * T + k.B
@@ -132,7 +136,7 @@ class Bubble:
         p_dot = 3 / R * drive
         v = (heat - y * R * p_dot / 3) / (k.kappa * p)
         energy = p_dot + K * (self.L @ T) / R**2 + k.A * dT**2
-        rates = [np.zeros(0)] * 2
+        rates = [X[:0]] * 2
         if self.transport:
             v = v + D * (self.Rv - self.Rg) / Rmix * dC
             rho = p / (Rmix * T)
@@ -144,19 +148,20 @@ class Bubble:
             rates[1] = C_dot[1:]
         T_dot = (k.kappa - 1) / k.kappa * T / p * energy - (v - y * V) * dT
         rates[0] = T_dot[1:]
-        medium = self.medium(R, V, T[0], T_m) if self.conducting else np.zeros(0)
-        return np.concatenate([[V, self.acceleration(R, V, p, p_dot), p_dot / p], *rates, medium])
+        medium = self.medium(R, V, T[0], T_m) if self.conducting else X[:0]
+        out = np.concatenate([[V, self.acceleration(R, V, p, p_dot), p_dot / p], *rates, medium])
+        return out.reshape(state.shape)
 
     def medium(self, R, V, wall, T_m):
         k = self.k
-        r = np.cbrt(R**3 + 3 * self.faces)
-        flux = np.zeros(self.n + 1)
-        flux[1:-1] = r[1:-1] ** 4 * np.diff(T_m) / np.diff(self.centres)
+        r = np.cbrt(R**3 + 3 * self.faces[:, None])
+        flux = np.zeros((self.n + 1, len(R)))
+        flux[1:-1] = r[1:-1] ** 4 * np.diff(T_m, axis=0) / np.diff(self.centres)[:, None]
         e0, e1 = self.centres[:2]
         slope = -(e0 + e1) / (e0 * e1) * wall + e1 / (e0 * (e1 - e0)) * T_m[0] - e0 / (e1 * (e1 - e0)) * T_m[1]
         flux[0] = R**4 * slope
-        heating = 12 * self.mu * R**4 * V**2 / np.cbrt(R**3 + 3 * self.centres) ** 6
-        return (k.K_m * np.diff(flux) / self.volumes + heating) / (k.rho * k.c_m)
+        heating = 12 * self.mu * R**4 * V**2 / np.cbrt(R**3 + 3 * self.centres[:, None]) ** 6
+        return (k.K_m * np.diff(flux, axis=0) / self.volumes + heating) / (k.rho * k.c_m)
 
     def acceleration(self, R, V, p, p_dot):
         k, s = self.k, self.R_eq / R
@@ -175,6 +180,7 @@ class Bubble:
         scale = np.r_[1e-7, 1e-2, 1.0, np.full(gas, 300.0), np.full(gas if self.transport else 0, 1.0)]
         scale = np.r_[scale, np.full(self.n, 300.0)]
         atol = rtol * scale
-        s = solve_ivp(self.rhs, (0, times[-1]), state, method, rtol=rtol, atol=atol, t_eval=times)
+        jac = differenced(self.rhs, scale)
+        s = solve_ivp(self.rhs, (0, times[-1]), state, method, rtol=rtol, atol=atol, t_eval=times, jac=jac)
         assert s.success, s.message
         return s.y[0]

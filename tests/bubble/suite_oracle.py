@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from oracle import even_chebyshev
+from oracle import differenced, even_chebyshev
 from scipy.integrate import solve_ivp
 
 RAYLEIGH_PLESSET, PRESSURE, ENTHALPY, GILMORE = 1, 2, 3, 4
@@ -102,12 +102,13 @@ class Case:
         self.gas_g = np.array([c["ATg"] * c["T8"], c["BTg"]]) / K8
         self.guess = 0.0
         if suite.differences:
-            self.y, self.D, self.L = differences(n)
+            y, self.D, self.L = differences(n)
         else:
-            self.y, self.D, self.L = (a[::-1] for a in even_chebyshev(n))
+            y, self.D, self.L = (a[::-1] for a in even_chebyshev(n))
             self.D, self.L = self.D[:, ::-1], self.L[:, ::-1]
+        self.y = y[:, None]
         self.hm = -2.0 / (suite.medium_nodes - 1)
-        self.xi = np.linspace(1, -1, suite.medium_nodes)[:-1]
+        self.xi = np.linspace(1, -1, suite.medium_nodes)[:-1, None]
         self.yT = (2 / (self.xi + 1) - 1) * suite.length + 1
 
     def vapour_fraction(self):
@@ -135,14 +136,14 @@ class Case:
             slope = (-1.5 * T + 2 * Tm[1] - 0.5 * Tm[2]) / self.hm * (-2 / self.s.length)
             return out - self.chi * self.iota * slope
 
-        w = self.guess
+        w = np.full(len(P), self.guess)
         for _ in range(30):
             f = balance(w)
             step = f / ((balance(w + 1e-7) - f) / 1e-7)
-            w -= step
-            if abs(step) < 1e-12:
+            w = w - step
+            if np.all(np.abs(step) < 1e-12):
                 break
-        self.guess = w
+        self.guess = w[0]
         return w
 
     def wall(self, theta, Tm):
@@ -158,12 +159,14 @@ class Case:
             f = gas1 * w + gas0 - k * (-1.5 * T + 2 * Tm[1] - 0.5 * Tm[2])
             df = gas1 + k * 1.5 / root
             step = f / df
-            w -= step
-            if abs(step) < 1e-14:
+            w = w - step
+            if np.all(np.abs(step) < 1e-14):
                 break
         return w
 
-    def rhs(self, t, X):
+    def rhs(self, t, state):
+        """d/dt of one state (n,), or of those in the columns (n, k)."""
+        X = state.reshape(len(state), -1)
         R, V, P = X[0], X[1], X[2]
         k, s = self.kappa, self.s
         N, M = self.N, self.M
@@ -227,12 +230,12 @@ class Case:
             A = 4 * self.LAM * self.iRe
         out[0], out[2] = V, Pdot
         out[1] = self.acceleration(R, V, P, Pdot, S, Sdot, A)
-        return out
+        return out.reshape(state.shape)
 
     def medium(self, R, V, Tm, wall):
         Tm[0], Tm[-1] = wall, 1.0
         x1, y, L = self.xi + 1, self.yT, self.s.length
-        d, dd = np.zeros_like(y), np.zeros_like(y)
+        d, dd = np.zeros((2, len(y), len(R)))
         d[1:] = (Tm[2:] - Tm[:-2])[: len(y) - 1] / (2 * self.hm)
         dd[1:] = (Tm[2:] - 2 * Tm[1:-1] + Tm[:-2])[: len(y) - 1] / self.hm**2
         flow = x1**2 / (L * R) * (V / y**2 * (1 - y**3) / 2 + self.Fo / R * (x1 / (2 * L) - 1 / y)) * d
@@ -274,6 +277,7 @@ class Case:
         X[3 + self.N : 3 + self.N + self.M] = 1.0
         X[3 + self.N + self.M : 3 + self.N + self.M + self.C] = self.kv0
         t = np.asarray(times) / self.t0
-        s = solve_ivp(self.rhs, (0, t[-1]), X, method, rtol=rtol, atol=rtol * 1e-3, t_eval=t)
+        jac = differenced(self.rhs)
+        s = solve_ivp(self.rhs, (0, t[-1]), X, method, rtol=rtol, atol=rtol * 1e-3, t_eval=t, jac=jac)
         assert s.success, s.message
         return s.y[0]

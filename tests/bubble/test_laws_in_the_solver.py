@@ -66,7 +66,12 @@ def direct(law, values):
     return path.y[0], np.array(J)
 
 
-@pytest.mark.parametrize("name", available())
+def some(names):
+    """Slow are those whose viscosity depends on the shear rate: they are compiled by themselves."""
+    return [pytest.param(n, marks=[pytest.mark.slow] * get_law(n).shear_dependent) for n in names]
+
+
+@pytest.mark.parametrize("name", some(available()))
 def test_the_solver_integrates_the_law(name):
     law = get_law(name)
     values = law.example_values()

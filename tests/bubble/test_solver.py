@@ -193,6 +193,7 @@ class TestCache:
 
 
 class TestBounce:
+    @pytest.mark.slow  # a viscosity that depends on the shear rate is compiled by itself, for a quarter of a minute
     @pytest.mark.parametrize("law", ["carreau", "cross"])
     def test_shear_thinning_bubble_passes_its_bounce(self, law):
         """The wall turns in 1e-12 µs, below the spacing of doubles near t, and the viscosity has its knee there."""

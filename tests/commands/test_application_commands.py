@@ -5,7 +5,9 @@ import re
 from importlib.metadata import entry_points
 from pathlib import Path
 
+import click
 import pytest
+from click.shell_completion import ShellComplete
 from click.testing import CliRunner
 
 from en4dvar.cli import main
@@ -42,16 +44,24 @@ def test_an_interrupted_sweep_says_how_to_continue(tmp_path: Path, monkeypatch: 
     assert CliRunner().invoke(main, [*call[:-1], "--resume"]).exit_code == 0
 
 
-def test_the_shell_completes_commands_options_and_laws() -> None:
-    def offered(words: str) -> list[str]:
-        typed = {
-            "COMP_WORDS": words,
-            "COMP_CWORD": str(len(words.split(" ")) - 1),
-            "_EN4DVAR_COMPLETE": "bash_complete",
-        }
-        return CliRunner().invoke(main, env=typed, prog_name="en4dvar").output.split()
+def offered(*words: str) -> set[str]:
+    """What the shell is told after these words, the last one unfinished; "file" stands for files and folders."""
+    found = ShellComplete(main, {}, "en4dvar", "_EN4DVAR_COMPLETE").get_completions(list(words[:-1]), words[-1])
+    return {item.value if item.type == "plain" else item.type for item in found}
 
-    assert "plain,rerun" in offered("en4dvar r")
-    assert offered("en4dvar run --wo") == ["plain,--workers"]
-    assert offered("en4dvar laws neo") == ["plain,neo-hookean-kelvin-voigt"]
-    assert offered("en4dvar run ") == ["file,"]
+
+def test_the_shell_completes_commands_choices_and_laws() -> None:
+    assert offered("") == set(main.list_commands(click.Context(main)))
+    assert offered("init", "--start", "") == {"acoustic", "laser"}
+    assert offered("laws", "neo") == offered("init", "--law", "neo") == {"neo-hookean-kelvin-voigt"}
+
+
+@pytest.mark.parametrize("command", main.list_commands(click.Context(main)))
+def test_the_shell_completes_options_and_files(command: str) -> None:
+    shown = CliRunner().invoke(main, [command, "--help"]).output
+    options = set(re.findall(r"^ +(?:-\w, )?(--[\w-]+)", shown, re.M))
+    assert offered(command, "--") == options
+    words = re.findall(r"^ +(--[\w-]+) (?:FILE|PATH|RUN_DIR)\b", shown, re.M)
+    assert [word for word in words if offered(command, word, "") != {"file"}] == []
+    if re.search(r"^Usage: .* \[?(CONFIG|RUN_DIR|MOVIE)", shown):
+        assert offered(command, "") == {"file"}

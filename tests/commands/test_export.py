@@ -124,6 +124,7 @@ def test_a_skewed_posterior_stands_as_its_median_with_unequal_sides(analysis: An
 
 def test_what_latex_would_not_print_is_escaped() -> None:
     assert escaped(r"50 % of_{a}\b") == r"50 \% of\_\{a\}\textbackslash{}b"
+    assert escaped("χ² is −1 ± 2 µm – less …") == r"$\chi$$^2$ is $-$1 $\pm$ 2 $\mu$m -- less \dots{}"
     assert latex_unit("J/m^2") == r"J/m$^{2}$"
 
 

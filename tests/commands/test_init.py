@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,7 @@ def test_a_folder_is_a_campaign_and_its_odd_file_is_named(tmp_path: Path) -> Non
     done = call("init", "--data", folder, *UNITS)
     assert done.exit_code == 0, done.output
     assert len(build(proposed(Path("gel_one.yaml")))) == 2
+    assert re.search(r"b1\.csv: .*; one of 2 files\n", done.stderr)
     simulate("acoustic", "0 us:40 us:0.5 us", "1 um", folder / "other.csv")
     text = (folder / "other.csv").read_text().replace("t_us,radius_um", "t_us,R_um")
     (folder / "other.csv").write_text(text)
@@ -122,6 +124,8 @@ def test_without_data_a_starter_is_written() -> None:
     assert done.exit_code == 0, done.output
     assert load_config("bubble.yaml").document.data["model"]["start"] == "laser"
     assert "bubble.csv: no such file" in call("validate", "bubble.yaml").stderr
+    _, proposed = Path("bubble.yaml").read_text(encoding="utf-8").split("  name: bubble\n")
+    assert [line for line in proposed.split("assimilation:")[0].splitlines() if "#" not in line] == []
 
 
 def test_names_are_quoted_where_yaml_needs_it() -> None:

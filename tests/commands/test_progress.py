@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+from numba.core.event import trigger_event
 from toy_config import csv_text, write_toy
 
 from en4dvar.analysis import Analysis, ChainRecord, StartRecord
@@ -47,6 +48,16 @@ def test_no_color(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Monkey
     err = capsys.readouterr().err
     assert "files and report" in err
     assert not re.search(r"\x1b\[[0-9;]*(3|4|9)\d*m", err)
+
+
+def test_what_is_compiled_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"FORCE_COLOR": "1", "COLUMNS": "120"}.items():
+        monkeypatch.setenv(name, value)
+    with terminal_progress(1) as progress:
+        assert progress is not None
+        with trigger_event("numba:compile", {}):  # numba's own, as where it compiles
+            pass
+        assert progress._bar.tasks[0].description == "first use of this model: compiling, once"
 
 
 def test_data_sets_are_counted_as_they_end(

@@ -26,7 +26,7 @@ TERMS = {
 
 def summed(problem, mode, std):
     """Mean and std (n,) of the posterior by the sum over a grid of 2 parameters."""
-    axes = [m + s * np.linspace(-6, 10, 121) for m, s in zip(mode, std, strict=True)]
+    axes = [m + s * np.linspace(-6, 10, 61) for m, s in zip(mode, std, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     grid = grid[problem.prior.to_physical(grid)[:, 1] > 0.05]
     log = log_posterior(problem, grid)

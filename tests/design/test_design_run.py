@@ -19,8 +19,11 @@ from en4dvar.report.design import front, readings_text, remarks
 from en4dvar.runs import design_run
 from en4dvar.runs.design_run import run_design
 
+PAGE = {"output.report": True}
+
 
 def _plan(**design):
+    """Without the page: drawing it takes longer than what it shows; those who look at it ask with ``PAGE``."""
     return {
         "name": "plan",
         "seed": 3,
@@ -45,6 +48,7 @@ def _plan(**design):
             "inner": 50,
             **design,
         },
+        "output": {"report": False},
     }
 
 
@@ -57,7 +61,7 @@ def _same(one, other):
 
 
 def test_every_combination_and_the_file_itself(tmp_path):
-    found, directory = run_design(_plan(), out=tmp_path / "out")
+    found, directory = run_design(_plan(), out=tmp_path / "out", overrides=PAGE)
     assert [row.settings for row in found.rows][:3] == [
         {},
         {"error": "0.1 m", "every": "0.2 s"},
@@ -160,7 +164,7 @@ def test_designs_that_leave_what_the_model_is_valid_for(tmp_path, most, kept):
 def test_when_to_stop(tmp_path):
     """Readings that tell nothing to speak of: it is said."""
     found, directory = run_design(
-        _plan(knobs={}), out=tmp_path / "out", overrides={"data.error.y_std": "40 m", "design.method": "linear"}
+        _plan(knobs={}), out=tmp_path / "out", overrides={"data.error.y_std": "40 m", "design.method": "linear", **PAGE}
     )
     assert "less than design.enough = 0.1: no experiment among these is worth making" in remarks(found)[0]
     assert "is worth making" in (directory / "design.html").read_text()
@@ -171,7 +175,8 @@ def test_what_is_taken_to_the_lab(tmp_path):
     found, _ = run_design(_plan(knobs={}, method="laplace"), out=tmp_path / "out")
     assert readings_text(found, found.rows[0]) == "7 from 0.1 to 2.5 s, every 0.4 s"
     assert not remarks(found)
-    found, directory = run_design(_plan(knobs={}, choose={"readings": 3}, method="laplace"), out=tmp_path / "three")
+    three = _plan(knobs={}, choose={"readings": 3}, method="laplace")
+    found, directory = run_design(three, out=tmp_path / "three", overrides=PAGE)
     taken = ", ".join(f"{t:.4g}" for t in found.rows[0].found.times)
     assert readings_text(found, found.rows[0]) == f"3, at {taken} s"
     assert f"3, at {taken} s" in (directory / "design.html").read_text()
@@ -180,7 +185,7 @@ def test_what_is_taken_to_the_lab(tmp_path):
 def test_as_a_command(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "plan.yaml").write_text(json.dumps(_plan()))
-    outcome = CliRunner().invoke(main, ["design", "plan.yaml"])
+    outcome = CliRunner().invoke(main, ["design", "plan.yaml", "--set", "output.report=true"])
     assert outcome.exit_code == 0, outcome.output
     assert "what is known" in outcome.output
     assert (tmp_path / "runs/plan_design/design.html").exists()
@@ -206,7 +211,9 @@ def test_bad_input(tmp_path, change, message):
 
 def test_the_shipped_linear_plan_is_the_closed_form(tmp_path):
     found, _ = run_design(
-        TESTS.parent / "configs" / "linear_design.yaml", overrides={"design.method": "laplace"}, out=tmp_path / "line"
+        TESTS.parent / "configs" / "linear_design.yaml",
+        overrides={"design.method": "laplace", "output.report": False},
+        out=tmp_path / "line",
     )
     for row in found.rows:
         H = np.column_stack([np.ones_like(row.found.times), row.found.times])

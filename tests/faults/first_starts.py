@@ -7,17 +7,17 @@ from pathlib import Path
 
 from run_files import assert_same_results, command, environment
 
-CONFIG = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 CHEAP = ("assimilation.members=8", "assimilation.max_iterations=2", "output.report=false")
 
 
-def start_together(folder: Path, count: int) -> int:
+def start_together(folder: Path, count: int, config: str = "quickstart") -> int:
     """How many of ``count`` processes, started at once, ended with the bits of a later run that finds all compiled."""
     variables = {"NUMBA_CACHE_DIR": folder / "cache", "HOME": folder}
     settings = [word for key in CHEAP for word in ("--set", key)]
 
     def start(run: int) -> subprocess.Popen[str]:
-        words = command("run", CONFIG, "--out", folder / f"run{run}", *settings)
+        words = command("run", CONFIGS / f"{config}.yaml", "--out", folder / f"run{run}", *settings)
         return subprocess.Popen(words, env=environment(**variables), stderr=subprocess.PIPE, text=True)
 
     started = [start(i) for i in range(count)]

@@ -97,10 +97,12 @@ def test_memory_grows_with_the_members_not_with_their_square(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [2, pytest.param(20, marks=pytest.mark.long)])
+@pytest.mark.parametrize(  # one model is compiled in a second, the other in a quarter of a minute
+    ("count", "config"), [(2, "predator_prey"), pytest.param(20, "quickstart", marks=pytest.mark.long)]
+)
 @pytest.mark.fault("first-starts")
-def test_first_starts_at_once(tmp_path, count):
-    assert start_together(tmp_path, count) == count
+def test_first_starts_at_once(tmp_path, count, config):
+    assert start_together(tmp_path, count, config) == count
 
 
 @pytest.mark.slow

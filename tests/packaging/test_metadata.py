@@ -7,6 +7,8 @@ import tomllib
 from importlib.metadata import version
 from pathlib import Path
 
+import yaml
+
 import en4dvar
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -15,10 +17,16 @@ CI = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def test_the_version_is_that_of_the_installation():
-    assert en4dvar.__version__ == version("en4dvar")
-    assert re.match(r"\d+\.\d+", en4dvar.__version__)
-    assert "version" in PROJECT["project"]["dynamic"]
+def test_there_is_one_version():
+    """Of the installation, the changelog's newest release and the citation, which also share a date."""
+    stated = PROJECT["project"]["version"]
+    assert en4dvar.__version__ == version("en4dvar") == stated
+    (named, date), *_ = re.findall(
+        r"^## \[([\d.]+)\] – (.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.M
+    )
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert named == cited["version"] == stated
+    assert date == str(cited["date-released"])
 
 
 def test_python_versions_agree():

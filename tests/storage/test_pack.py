@@ -57,6 +57,13 @@ def test_the_last_record_of_a_name_counts(tmp_path):
     assert read_result(tmp_path / PACK / "a") == b"second"
 
 
+def test_results_are_in_the_order_of_their_numbers(tmp_path):
+    pack = Pack(tmp_path / PACK)
+    for name in ("gel10", "gel2", "gel_b", "gel02"):
+        pack.append(name, "f", b"", b"content", digest(b"content"))
+    assert [address.name for address in results_of(tmp_path / PACK)] == ["gel02", "gel2", "gel10", "gel_b"]
+
+
 @pytest.mark.parametrize("content", [b"", b"x" * 7, b"\xff" * 64, bytes(16) + b"[]"])
 def test_a_good_checksum_makes_no_result(tmp_path, content):
     Pack(tmp_path / PACK).append("a", "f", b"", content, digest(content))

@@ -24,14 +24,15 @@ GROUPS = {
 }  # fmt: skip
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def result(analysis):
     return Result.from_analysis(analysis, provenance("prior: {G: 1 kPa}\n"))
 
 
-@pytest.fixture
-def path(result, tmp_path):
-    return save(result, tmp_path / "posterior.nc")
+@pytest.fixture(scope="module")
+def path(result, tmp_path_factory):
+    """Its file, which tests read."""
+    return save(result, tmp_path_factory.mktemp("stored") / "posterior.nc")
 
 
 def test_file_has_every_group_with_units_and_names(path):

@@ -24,6 +24,11 @@ MODEL: Mapping[Start, Mapping[str, str]] = {
     "acoustic": {"gas": "heat"},
     "laser": {"gas": "polytropic", "vapour_pressure": "saturated"},
 }
+WHY = {
+    "heat": "the gas gives heat to the wall",
+    "polytropic": "quick, but without heat to the wall: look at 'What if' in the report, and compare with gas: heat",
+    "saturated": "that of water, constant; vapour: transport, with gas: heat, solves it instead",
+}
 LEAST_NOISE = 0.01  # of R_max: what single-bubble models agree to with good data at best
 TIMING = 0.05  # of the step between samples
 NUCLEUS = 0.5e-6  # m: order of the stress-free radii in Mancia et al. (2021), Table 1
@@ -245,7 +250,7 @@ def _model(law: str, start: Start, look: Look | None) -> tuple[Entry, ...]:
         Entry("name", "bubble"),
         Entry("law", law, "others: en4dvar laws"),
         Entry("start", start, look.reason if look else "or " + ("laser" if start == "acoustic" else "acoustic")),
-        *(Entry(key, value) for key, value in MODEL[start].items()),
+        *(Entry(key, value, WHY[value]) for key, value in MODEL[start].items()),
     ]
     if start == "acoustic":
         pulse = "{kind: histotripsy, amplitude: -24 MPa, frequency: 1 MHz, exponent: 3.7, delay: 5 us}"
