@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 T = TypeVar("T")
 
 
-class Shared(Generic[T]):
+class CommonValue(Generic[T]):
     """A value that is pickled once for all calls, and made again once in each worker process."""
 
     def __init__(self, value: T):
@@ -24,5 +24,5 @@ class Shared(Generic[T]):
 
 
 @functools.lru_cache(maxsize=2)
-def _made_again(pickled: bytes) -> Shared[Any]:
-    return Shared(pickle.loads(pickled))
+def _made_again(pickled: bytes) -> CommonValue[Any]:
+    return CommonValue(pickle.loads(pickled))

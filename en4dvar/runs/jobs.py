@@ -15,7 +15,7 @@ from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.config import Config
 from en4dvar.config.build import build_one
 from en4dvar.executor import Executor
-from en4dvar.executor.shared import Shared
+from en4dvar.executor.shared import CommonValue
 from en4dvar.inputs.asked import DataFile
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.runs.campaign import DatasetOutcome
@@ -35,7 +35,7 @@ Records = tuple[tuple[str, Record], ...]  # each with the name of its data set
 class Unread:
     """The problem of a data file that the worker reads."""
 
-    config: Shared[Config]
+    config: CommonValue[Config]
     name: str
     source: DataFile
 

@@ -14,7 +14,7 @@ from en4dvar.config import Config
 from en4dvar.config.build import build_one
 from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
-from en4dvar.executor.shared import Shared
+from en4dvar.executor.shared import CommonValue
 from en4dvar.files import readable
 from en4dvar.inputs.asked import DataFile
 from en4dvar.prior import own_seed
@@ -161,7 +161,9 @@ class Worklist:
         todo = [d for d in self.sets if d.name not in self.ended]
         sent: list[Dataset] = []
 
-        def jobs(stop: threading.Event | None = None, config: Shared[Config] | None = None) -> Iterator[tuple[Job]]:
+        def jobs(
+            stop: threading.Event | None = None, config: CommonValue[Config] | None = None
+        ) -> Iterator[tuple[Job]]:
             for d in todo:
                 try:
                     job = self._job(d, stop, config)
@@ -173,7 +175,7 @@ class Worklist:
 
         if len(todo) > 1 and len(todo) >= executor.workers > 1:
             stop = self.stop if isinstance(executor, ThreadsExecutor) else None
-            config = Shared(self.config) if executor.reads else None
+            config = CommonValue(self.config) if executor.reads else None
             ends = executor.map(estimate_and_tell, jobs(stop, config), self._hear)
         else:
             ends = SerialExecutor().map(lambda job: estimate(job, executor, self._record), jobs())
@@ -186,7 +188,7 @@ class Worklist:
     def _fingerprint(self, d: Dataset) -> str:
         return self.run.identity.of_dataset(d.name)
 
-    def _job(self, d: Dataset, stop: threading.Event | None, shared: Shared[Config] | None) -> Job:
+    def _job(self, d: Dataset, stop: threading.Event | None, shared: CommonValue[Config] | None) -> Job:
         config, identity, fingerprint = self.config, self.run.identity, self._fingerprint(d)
         resume = self.run.restore(d.iteration, fingerprint, LoopState, f"{d.name} is estimated from the start")
         if resume is not None:

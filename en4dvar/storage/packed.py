@@ -25,7 +25,7 @@ _ALIGNED = 8  # bytes
 
 
 @dataclass(frozen=True)
-class Layout:
+class PackedLayout:
     """Which variables there are: of each group the path, then of its variables and of its coordinates the name and what
     :func:`_place` tells; ``named``: which texts stand along dimensions; ``sizes`` of these by path; ``texts``: how many
     words each has; ``length`` of the numbers in bytes.
@@ -44,7 +44,7 @@ class Content:
     attributes, variables of text; ``numbers`` are as they were.
     """
 
-    layout: Layout
+    layout: PackedLayout
     attributes: list[dict[str, Any]]
     words: list[list[str]]
     numbers: memoryview
@@ -122,7 +122,7 @@ def _understanding() -> Iterator[None]:
 
 
 @functools.lru_cache(maxsize=64)
-def _layout(text: bytes) -> Layout:
+def _layout(text: bytes) -> PackedLayout:
     def understood(part: list[Any]) -> list[Any]:
         return [(name, tuple(dims), shape, fill, _whole(said), *rest) for name, dims, shape, fill, said, *rest in part]
 
@@ -141,7 +141,7 @@ def _layout(text: bytes) -> Layout:
             else:
                 texts[where] = math.prod(shape)
     named = [where for _, _, coords in groups for *_, kind, where in coords if not kind]
-    return Layout(groups, named, sizes, texts, length + -length % _ALIGNED)
+    return PackedLayout(groups, named, sizes, texts, length + -length % _ALIGNED)
 
 
 def _attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:

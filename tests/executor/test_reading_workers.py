@@ -6,7 +6,7 @@ import pickle
 from run_files import configuration, make_campaign
 
 from en4dvar.executor import ProcessesExecutor
-from en4dvar.executor.shared import Shared
+from en4dvar.executor.shared import CommonValue
 from en4dvar.runs import worklist
 from en4dvar.runs.runner import run_campaign
 
@@ -18,7 +18,7 @@ def test_names_of_files_mean_the_same_in_a_worker(tmp_path, monkeypatch):
 
 
 def test_what_calls_share_is_made_once():
-    shared = Shared(["one"])
+    shared = CommonValue(["one"])
     first, second = (pickle.loads(pickle.dumps(shared)) for _ in range(2))
     assert first.value == ["one"]
     assert first.value is second.value is not shared.value
