@@ -1,11 +1,12 @@
 """What a user waits for: `en4dvar run` with and without its page, as ratios within one run of this program.
 
-    python benchmarks/user_time.py [--repeats 3] [--sets 200 800]
+    python benchmarks/user_time.py [--docs] [--repeats 3] [--sets 200 800]
 
 Rows: the quick start, the 19 bubbles of ``configs/agarose_03_qs.yaml`` on two workers, and synthetic campaigns of
 ``--sets`` data sets (those of ``scaling.py``), whose slope between the first and the last is what one data set costs;
 of these also the resume of a finished run. Processor time of the command and its workers, medians of runs taken in
-turns, after one that compiles; seconds by the wall clock mean something on an idle machine only.
+turns, after one that compiles; seconds by the wall clock mean something on an idle machine only. ``--docs`` writes the
+table into ``docs/performance.md``.
 """
 
 from __future__ import annotations
@@ -19,10 +20,13 @@ import time
 from pathlib import Path
 
 import numpy as np
-from scaling import ROOT, make
-from solver import machine
+from scaling import DOCS, ROOT, make
+from solver import machine, replaced
 
 QUICK, STUDY = ROOT / "configs" / "quickstart.yaml", ROOT / "configs" / "agarose_03_qs.yaml"
+HEAD = """\
+| processor time, s (by the clock) | without page | with | ratio | resume of the finished run |
+|---|---|---|---|---|"""
 COMMAND = [sys.executable, "-c", "from en4dvar.cli import main; main()", "run"]
 
 
@@ -55,23 +59,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--sets", type=int, nargs="*", default=[200, 800], help="sizes of the synthetic campaigns")
+    parser.add_argument("--docs", action="store_true", help="write the table into docs/performance.md")
     options = parser.parse_args()
-    print(f"{machine()}\n")
-    print("| processor time, s (by the clock) | without page | with | ratio | resume of the finished run |")
-    print("|---|---|---|---|---|")
-    spent = []
+    print(f"{machine()}\n\n{HEAD}")
+    lines, spent = [HEAD], []
     with tempfile.TemporaryDirectory() as name:
         for label, config in (("quick start", QUICK), ("19 bubbles", STUDY)):
-            print(row(label, config, options.repeats, Path(name, label.split()[0]))[0], flush=True)
+            lines.append(row(label, config, options.repeats, Path(name, label.split()[0]))[0])
+            print(lines[-1], flush=True)
         for count in options.sets:
             folder = Path(name, str(count))
             folder.mkdir()
             line, seconds = row(f"{count} synthetic", make(folder, count), 1, folder / "runs")
             spent.append((count, seconds))
+            lines.append(line)
             print(line, flush=True)
     if len(spent) > 1:
         (few, first), (many, last) = spent[0], spent[-1]
-        print(f"\nSlope without page: {1e3 * (last - first) / (many - few):.1f} ms of processor time a data set.")
+        slope = 1e3 * (last - first) / (many - few)
+        lines.append(f"\nSlope without page: {slope:.1f} ms of processor time a data set.")
+        print(lines[-1])
+    if options.docs:
+        table = "\n".join([*lines, f"\n{machine()}, {time.strftime('%Y-%m-%d')}."])
+        DOCS.write_text(replaced(DOCS.read_text(encoding="utf-8"), "user time", table), encoding="utf-8")
 
 
 if __name__ == "__main__":

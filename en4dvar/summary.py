@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -171,12 +171,15 @@ def summary_csv(
     and column ``untrusted`` says for which warnings; so are mean and standard deviation of several modes, which
     ``informed`` says.
     """
-    lines: list[list[object]] = [["dataset", *CSV_COLUMNS, "failure", "warnings"]]
-    for name, summary, cautions in summaries:
-        warned = " ".join(codes(cautions))
-        lines += [[name, *csv_cells(row), "", warned] for row in summary]
-    lines += [[name, *("" for _ in CSV_COLUMNS), reason, ""] for name, reason in failures.items()]
-    return csv_text(lines)
+
+    def lines() -> Iterator[Sequence[object]]:
+        yield ["dataset", *CSV_COLUMNS, "failure", "warnings"]
+        for name, summary, cautions in summaries:
+            warned = " ".join(codes(cautions))
+            yield from ([name, *csv_cells(row), "", warned] for row in summary)
+        yield from ([name, *("" for _ in CSV_COLUMNS), reason, ""] for name, reason in failures.items())
+
+    return csv_text(lines())
 
 
 CSV_COLUMNS = tuple(f.name for f in fields(ParameterSummary) if f.name not in ("label", "symbol", "modal"))

@@ -32,6 +32,7 @@ class Executor(ABC):
     """Runs calls on ``workers`` workers; use it as a context manager. The results do not depend on the choice."""
 
     workers: int = 1
+    reads: bool = False  # whether calls run in processes that see the files of this one
 
     @abstractmethod
     def map(

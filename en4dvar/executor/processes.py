@@ -42,7 +42,7 @@ class _Worker:
 
     def __init__(self, limits: Limits):
         self.pipe, theirs = _SPAWN.Pipe()
-        self.process = _SPAWN.Process(target=_serve, args=(theirs, limits), name="en4dvar-worker")
+        self.process = _SPAWN.Process(target=_serve, args=(theirs, limits, _here()), name="en4dvar-worker")
         self.process.start()
         theirs.close()  # so that its end is closed when the process ends
 
@@ -88,6 +88,7 @@ class ProcessesExecutor(PoolExecutor):
     """
 
     attempts = 3
+    reads = True
 
     def __init__(self, workers: int, limits: Limits = NO_LIMITS):
         super().__init__(workers)
@@ -186,9 +187,19 @@ def _end(workers: list[_Worker]) -> None:
         workers.pop().end()
 
 
-def _serve(pipe: Connection, limits: Limits) -> None:
-    """What a worker does until its pipe is closed."""
+def _here() -> str:
+    """The current folder, "" where it was removed."""
+    try:
+        return os.getcwd()
+    except OSError:
+        return ""
+
+
+def _serve(pipe: Connection, limits: Limits, folder: str) -> None:
+    """What a worker does until its pipe is closed. Names of files mean what they mean in ``folder``."""
     prepare_worker(limits)
+    with contextlib.suppress(OSError):  # a new process is where the main process was when that began
+        os.chdir(folder)
 
     def tell(message: Any) -> None:
         pipe.send_bytes(TOLD + bytes(ForkingPickler.dumps(message)))

@@ -125,7 +125,12 @@ def _along(panel: Panel, result: StoredResult, one: SeriesShown, band: Band) -> 
     seen = np.isfinite(values).any(axis=0)
     if not seen.any():
         return
-    low, high = np.nanquantile(values[:, seen], band.levels, axis=0)
+    finite = np.isfinite(values[:, seen])
+    whole = finite.all(axis=1)
+    if (whole | ~finite.any(axis=1)).all():  # as nanquantile, which goes from instant to instant
+        low, high = np.quantile(values[whole][:, seen], band.levels, axis=0)
+    else:
+        low, high = np.nanquantile(values[:, seen], band.levels, axis=0)
     panel.band(shown(held["path_time"])[seen], low, high, band.colour, band.alpha, band.label)
 
 

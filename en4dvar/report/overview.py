@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,7 +39,7 @@ class SetSummary:
         """``stem``: name of the file without suffix."""
         stats = result.groups["/sample_stats"].attrs
         keys = ("n_observations", "chi2_per_observation", "nrmse", "dfs", "n_active", "n_members")
-        about = {key: str(result.attributes.get(key, "")) for key in ("date_created", "configuration")}
+        about = {key: sys.intern(str(result.attributes.get(key, ""))) for key in ("date_created", "configuration")}
         scalars = {key: float(stats[key]) for key in keys}
         rows = {row.name: row for row in result.summary()}
         return cls(result.name, stem, rows, result.cautions, scalars, about)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,10 +47,10 @@ class Campaign:
     """
 
     directory: Path
-    outcomes: tuple[DatasetOutcome, ...]
+    outcomes: Sequence[DatasetOutcome]
     notices: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def failures(self) -> tuple[DatasetOutcome, ...]:
         """The data sets without a posterior."""
         return tuple(o for o in self.outcomes if o.failure)

@@ -128,10 +128,8 @@ class _Work:
     ):
         self.config, self.every, self.run, self.tell = config, every, run, tell
         fingerprint = digest(run.identity.settings.encode())
-        self.state = DesignState()
-        if run.resumed:
-            again = "all designs are evaluated again"
-            self.state = run.restore(STATE, fingerprint, DesignState, again) or DesignState()
+        again = "all designs are evaluated again"
+        self.state = run.restore(STATE, fingerprint, DesignState, again) or DesignState()
         self.keeper = Keeper(run.directory.at(STATE), fingerprint, config.execution.checkpoint_every)
 
     def everything(self, executor: Executor) -> None:

@@ -17,7 +17,8 @@ from en4dvar.errors import ConfigError, OutputError
 from en4dvar.problem import InverseProblem
 from en4dvar.runs.trust import Ask, of_strangers
 from en4dvar.state import Array
-from en4dvar.storage.store import StoredResult, load_stored, result_files
+from en4dvar.storage.plain import PlainResult
+from en4dvar.storage.store import plain_result, result_files
 
 CARRIED = ("implausible-data", "misfit", "residual-structure", "model-validity")
 MOST_NAMES = 4
@@ -54,9 +55,10 @@ def finished(run_dirs: Sequence[Path], trust: bool, ask: Ask | None) -> tuple[Co
     first: Config | None = None
     found: list[Finished] = []
     for run_dir in run_dirs:
-        config, results = _recorded(run_dir, trust, ask)
+        files = result_files(run_dir)
+        config = _recorded(run_dir, plain_result(files[0]), trust, ask)
         first = first or config
-        found += [finished_set(config, result, run_dir) for result in results]
+        found += [finished_set(config, plain_result(file), run_dir) for file in files]
     if first is None:
         raise ConfigError("no run is given")
     return first, list(_named_apart(found))
@@ -73,18 +75,17 @@ def carried(sets: Sequence[Finished]) -> Iterator[Caution]:
             yield caution(code, f"of single data sets, {told}", "serious")
 
 
-def _recorded(run_dir: Path, trust: bool, ask: Ask | None) -> tuple[Config, list[StoredResult]]:
-    """The configuration of a run and its results."""
-    results = [load_stored(file) for file in result_files(run_dir)]
-    attributes = results[0].attributes
+def _recorded(run_dir: Path, result: PlainResult, trust: bool, ask: Ask | None) -> Config:
+    """The configuration of a run."""
+    attributes = result.attributes
     if "configuration_resolved" not in attributes:
         raise OutputError(f"{run_dir}: its results do not record a configuration; they were written by a program")
     document = parse_document(str(attributes["configuration_resolved"]), f"{run_dir}: configuration_resolved")
     with of_strangers(run_dir, ask, trust):
-        return resolve(document, run_dir.absolute()), results
+        return resolve(document, run_dir.absolute())
 
 
-def finished_set(config: Config, result: StoredResult, run_dir: Path) -> Finished:
+def finished_set(config: Config, result: PlainResult, run_dir: Path) -> Finished:
     """One data set of a run. Raises :class:`ConfigError`, :class:`OutputError`, see :func:`finished`."""
     if len(result.axes) > 1:  # files and pages of such estimates know one series a data set
         raise ConfigError(f"{run_dir}: {result.name} has several series; it cannot be estimated with others")
@@ -92,10 +93,10 @@ def finished_set(config: Config, result: StoredResult, run_dir: Path) -> Finishe
     if problem.varying:
         raise ConfigError(f"{run_dir}: parameters that vary in time cannot be estimated with other data sets")
     names, prior = problem.prior.names, problem.prior
-    columns = [np.asarray(result.posterior[name].values, dtype=float).ravel() for name in names]
+    columns = [np.asarray(result.parameters[name].values, dtype=float).ravel() for name in names]
     members = np.column_stack(columns)
     members = members[result.alive & np.isfinite(members).all(axis=1)]
-    centre = np.asarray(result.sample_stats["centre"].sel(parameter=list(names)).values, dtype=float)
+    centre = result.centres(names)
     try:
         white = prior.white(prior.from_physical(np.vstack([members, centre])))
     except ValueError as error:

@@ -12,10 +12,15 @@ from typing import Any
 
 from en4dvar.analysis import IterationRecord, Progress, Record
 from en4dvar.assimilate import LoopState, assimilate
+from en4dvar.config import Config
+from en4dvar.config.build import build_one
 from en4dvar.executor import Executor
+from en4dvar.executor.shared import CommonValue
+from en4dvar.inputs.asked import DataFile
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.runs.campaign import DatasetOutcome
 from en4dvar.storage.checkpoint import Keeper, digest
+from en4dvar.storage.codec import encode_text
 from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import to_bytes
 from en4dvar.storage.packed import packed
@@ -27,15 +32,29 @@ Records = tuple[tuple[str, Record], ...]  # each with the name of its data set
 
 
 @dataclass(frozen=True)
+class Unread:
+    """The problem of a data file that the worker reads."""
+
+    config: CommonValue[Config]
+    name: str
+    source: DataFile
+
+    def read(self) -> InverseProblem:
+        """Raises what :func:`~en4dvar.config.build.build_one` does."""
+        return build_one(self.config.value, self.name, self.source)
+
+
+@dataclass(frozen=True)
 class Job:
-    """Everything that the estimate of one data set needs; picklable, so that it can be made anywhere.
+    """Everything that the estimate of one data set needs; picklable, so that it can be made anywhere, or where its data
+    file is where ``problem`` is :class:`Unread`.
 
     ``attributes`` go into the file. ``keeper`` keeps the state of the iterations; a worker that does not see its folder
     keeps none. ``resume`` is where to start. ``stop`` gives the job up after the iteration under way (within one
     process only). ``alone``: the result is a file of its own, not one of a pack.
     """
 
-    problem: InverseProblem
+    problem: InverseProblem | Unread
     settings: AssimilationSettings
     seed: int
     attributes: Mapping[str, Any]
@@ -54,11 +73,14 @@ class Job:
 
 @dataclass(frozen=True)
 class Estimate:
-    """``content`` is the netCDF file, or what goes into a pack; ``ending`` tells how the iterations ended."""
+    """``content`` is the netCDF file, or what goes into a pack, with its ``digest``; ``outcome`` is the record of a
+    :class:`~en4dvar.runs.campaign.DatasetOutcome`; ``told`` are lines of the log.
+    """
 
     content: SealedBytes | bytes
-    ending: str
-    outcome: DatasetOutcome
+    digest: str
+    outcome: bytes
+    told: tuple[str, ...]
 
 
 class StoppedError(Exception):
@@ -70,21 +92,26 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
 
     Raises
     ------
-    TooFewMembersError: the ensemble is lost. OutputError: a checkpoint cannot be written.
+    ConfigError, DataError: the data file cannot be used. TooFewMembersError: the ensemble is lost. OutputError: a
+        checkpoint cannot be written.
     """
-    analysis = assimilate(job.problem, job.settings, job.seed, executor, progress, job.resume, keep=job.keep)
+    problem = job.problem.read() if isinstance(job.problem, Unread) else job.problem
+    analysis = assimilate(problem, job.settings, job.seed, executor, progress, job.resume, keep=job.keep)
     groups = build_groups(analysis, job.attributes)
-    content = to_bytes(groups) if job.alone else packed(groups)
+    content: SealedBytes | bytes = to_bytes(groups) if job.alone else packed(groups)
+    sha256 = content.sha256 if isinstance(content, SealedBytes) else digest(content)
     outcome = DatasetOutcome(
         analysis.name,
         warnings=analysis.cautions,
         summary=summarise(analysis),
         n_observations=len(analysis.observations),
-        sha256=content.sha256 if isinstance(content, SealedBytes) else digest(content),
+        sha256=sha256,
         remarks=remarks(analysis),
     )
     converged = "converged" if analysis.converged else "not converged"
-    return Estimate(content, f"{converged}: {analysis.stop_reason}; {analysis.forward_runs} forward runs", outcome)
+    ending = f"{converged}: {analysis.stop_reason}; {analysis.forward_runs} forward runs"
+    warnings = (f"{warning.severity}: {warning}" for warning in analysis.cautions)
+    return Estimate(content, sha256, encode_text(outcome), (ending, *warnings))
 
 
 def estimate_and_tell(job: Job, tell: Callable[[Records], None]) -> Estimate:

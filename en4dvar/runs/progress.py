@@ -50,7 +50,7 @@ def _stage(record: StartRecord) -> str:
 
 
 class RunLog:
-    """``run.log``: time and message, written line by line so that a killed run leaves what it knew.
+    """``run.log``: time and message, each written at once so that a killed run leaves what it knew.
 
     Raises :class:`OutputError` where it cannot be opened or, while the run is at work, written.
     """
@@ -69,7 +69,7 @@ class RunLog:
         """Append every line of ``message`` with the time of day."""
         now = datetime.now().astimezone().isoformat(timespec="milliseconds")
         try:
-            self._file.writelines(f"{now} {line}\n" for line in message.splitlines())
+            self._file.write("".join(f"{now} {line}\n" for line in message.splitlines()))
         except OSError as error:
             raise OutputError(f"{self._path}: cannot be written: {error.strerror}") from None
 

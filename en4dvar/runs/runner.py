@@ -14,7 +14,7 @@ from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.executor import Executor, choose_executor, one_blas_thread
 from en4dvar.files import write_text
 from en4dvar.inputs.asked import DataFile
-from en4dvar.runs.campaign import Campaign, DatasetOutcome
+from en4dvar.runs.campaign import Campaign
 from en4dvar.runs.interrupt import terminate_as_interrupt
 from en4dvar.runs.joint_run import join_within
 from en4dvar.runs.population_run import population_within, require_population
@@ -88,7 +88,7 @@ def run_campaign(
     config = _loaded(config, overrides)
     mode = directory_mode(force, resume)
     files = data_files(inverse_plan(config))
-    ended: dict[str, DatasetOutcome] = {}
+    ended: dict[str, str] = {}
 
     def kept() -> str:
         if resume and not ended:  # stopped, perhaps, before it was read what had been done
@@ -115,7 +115,7 @@ def run_campaign(
                 with suppress(KeyboardInterrupt):  # of an impatient user: on to the next step
                     executor.kill()
                 raise
-    return Campaign(config.directory, work.outcomes(), tuple(run.notices))
+    return Campaign(config.directory, work.outcomes(directory.home), tuple(run.notices))
 
 
 def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
@@ -180,10 +180,9 @@ def _estimate(work: Worklist, executor: Executor) -> None:
         good = work.good()
         if work.alone or not good:
             return
-        failures = {name: done.failure for name, done in work.ended.items() if done.failure}
         attributes = {**work.run.attributes, "identity": work.run.identity.settings}
         try:
-            save_campaign(work.run.directory.at("posterior.nc"), good, attributes, failures)
+            save_campaign(work.run.directory.at("posterior.nc"), good, attributes, work.failures())
             return
         except DamagedError as error:
             if not repeated.isdisjoint(error.names):
@@ -195,12 +194,11 @@ def _estimate(work: Worklist, executor: Executor) -> None:
 def _finish(work: Worklist, report_workers: int) -> None:
     """The report."""
     directory, good = work.run.directory, work.good()
-    failures = {name: done.failure for name, done in work.ended.items() if done.failure}
     if good and work.config.report:
         _report(directory, workers=report_workers, figures=work.config.figures)
     else:
-        rows = ((name, work.ended[name].summary, work.ended[name].warnings) for name in good)
-        write_text(directory.claim("summary.csv"), summary_csv(rows, failures))
+        rows = ((o.name, o.summary, o.warnings) for o in work.outcomes(directory.work) if not o.failure)
+        write_text(directory.claim("summary.csv"), summary_csv(rows, work.failures()))
 
 
 def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:

@@ -66,7 +66,11 @@ class Session:
         self.begun = True
 
     def restore(self, file: str, fingerprint: str, kind: type[S], otherwise: str) -> S | None:
-        """What a checkpoint holds; one that cannot be used is told, with what is done ``otherwise``."""
+        """What a checkpoint of the run that is resumed holds; one that cannot be used is told, with what is done
+        ``otherwise``.
+        """
+        if not self.resumed:
+            return None
         try:
             return read_checkpoint(self.directory.at(file), fingerprint, kind)
         except CheckpointError as error:

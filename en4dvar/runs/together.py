@@ -9,7 +9,7 @@ from typing import Any
 from en4dvar.runs.finished import Finished, finished_set
 from en4dvar.runs.worklist import Worklist
 from en4dvar.storage.checkpoint import FOLDER, digest, file_digest, write_checkpoint
-from en4dvar.storage.store import load_stored
+from en4dvar.storage.store import plain_result
 
 Estimated = Callable[[Sequence[Finished], Mapping[str, Any], Path, Callable[[str], None]], object]
 
@@ -30,12 +30,13 @@ def once_together(work: Worklist, file: str, what: str, fewest: int, estimate: E
     if len(good) < fewest:
         run.notice(f"no {what}, for which {fewest} data sets need a posterior")
         return
-    made_of = [run.identity.settings, *(f"{name}: {work.ended[name].sha256}" for name in good)]
+    digests = {name: work.pack.entries[address.name].content_digest for name, address in good.items()}
+    made_of = [run.identity.settings, *(f"{name}: {one}" for name, one in digests.items())]
     fingerprint, path = digest("\n".join(made_of).encode()), run.directory.at(file)
     done = run.restore(checkpoint_of(file), fingerprint, str, f"the {what} is made again")
     if done is not None and path.exists() and file_digest(path) == done:
         return
-    sets = [finished_set(config, load_stored(address), run.directory.path) for address in good.values()]
+    sets = [finished_set(config, plain_result(address), run.directory.path) for address in good.values()]
     attributes = {**run.attributes, "identity": run.identity.settings, "runs": config.name}
     estimate(sets, attributes, path, lambda words: run.log.write(f"{what}: {words}"))
     write_checkpoint(run.directory.at(checkpoint_of(file)), fingerprint, file_digest(path))

@@ -175,8 +175,6 @@ class _Runs:
         return tuple(tuple(runs[i : i + self.seeds]) for i in range(0, len(runs), self.seeds))
 
     def _restored(self, fingerprint: str) -> TwinRun | None:
-        if not self.session.resumed:
-            return None
         return self.session.restore(self._file(fingerprint), fingerprint, TwinRun, "its run is conducted again")
 
     def _file(self, fingerprint: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from en4dvar.analysis import IterationRecord, Progress, Record, StartRecord
@@ -14,16 +14,18 @@ from en4dvar.config import Config
 from en4dvar.config.build import build_one
 from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
+from en4dvar.executor.shared import CommonValue
 from en4dvar.files import readable
 from en4dvar.inputs.asked import DataFile
 from en4dvar.prior import own_seed
 from en4dvar.runs.campaign import DatasetOutcome, file_names
-from en4dvar.runs.jobs import Estimate, Job, Records, estimate, estimate_and_tell
+from en4dvar.runs.jobs import Estimate, Job, Records, Unread, estimate, estimate_and_tell
+from en4dvar.runs.outcomes import Outcomes
 from en4dvar.runs.progress import LiveProgress, describe
 from en4dvar.runs.session import Session
 from en4dvar.storage.checkpoint import FOLDER, Keeper, file_digest
-from en4dvar.storage.codec import decode_text, encode_text
-from en4dvar.storage.pack import PACK, Entry, Pack
+from en4dvar.storage.codec import encode_text
+from en4dvar.storage.pack import PACK, Entry, Pack, read_outcome
 from en4dvar.storage.seal import SealedBytes
 
 
@@ -58,7 +60,8 @@ def datasets(files: Mapping[str, DataFile]) -> tuple[Dataset, ...]:
 class Worklist:
     """Estimates what is left to do and keeps each data set's file and record as it ends.
 
-    ``ended`` fills with what is done. ``stop`` ends the estimates in threads of this process.
+    ``ended`` fills with what is done: name → why there is no posterior, "" where there is one; everything else that is
+    known of a data set stays on disk. ``stop`` ends the estimates in threads of this process.
     """
 
     def __init__(
@@ -67,7 +70,7 @@ class Worklist:
         run: Session,
         sets: tuple[Dataset, ...],
         progress: Progress | None,
-        ended: dict[str, DatasetOutcome],
+        ended: dict[str, str],
     ):
         self.config, self.run, self.sets, self.progress, self.ended = config, run, sets, progress, ended
         self.stop = threading.Event()
@@ -78,12 +81,16 @@ class Worklist:
     def good(self) -> dict[str, Path]:
         """Where the posterior of each data set is that has one."""
         work = self.run.directory.work
-        return {d.name: work / d.file for d in self.sets if not self.ended[d.name].failure}
+        return {d.name: work / d.file for d in self.sets if not self.ended[d.name]}
 
-    def outcomes(self) -> tuple[DatasetOutcome, ...]:
-        """What came of each data set, in order."""
-        folder, ended = self.run.directory.home, [(d, self.ended[d.name]) for d in self.sets if d.name in self.ended]
-        return tuple(one if one.failure else replace(one, file=folder / d.file) for d, one in ended)
+    def failures(self) -> dict[str, str]:
+        """Why a data set has no posterior, of those that have none."""
+        return {name: reason for name, reason in self.ended.items() if reason}
+
+    def outcomes(self, folder: Path) -> Outcomes:
+        """What came of each data set, in order; ``folder`` is where the files of the run are."""
+        files = {d.stem: folder / d.file for d in self.sets if d.name in self.ended}
+        return Outcomes(folder / self.record, self.pack.entries, files)
 
     @property
     def record(self) -> str:
@@ -108,6 +115,7 @@ class Worklist:
         """Take over what an earlier run finished, without reading it; what has failed is tried again, and a record that
         cannot be trusted is not used.
         """
+        left = {f"{FOLDER}/{path.name}" for path in self.run.directory.at(FOLDER).iterdir()}
         for d in self.sets:
             entry = self.pack.entries.get(d.stem)
             if entry is None or self._failed(entry):
@@ -115,15 +123,16 @@ class Worklist:
             try:
                 if entry.fingerprint != self._fingerprint(d):
                     raise OutputError(f"{self.pack.path / d.stem}: belongs to another run")
-                done = decode_text(self.pack.outcome(d.stem), DatasetOutcome)
-            except (OutputError, ValueError) as error:
+                read_outcome(self.pack.path, d.stem, entry)
+            except OutputError as error:
                 self.run.notice(f"{error}; {d.name} is estimated again")
                 continue
-            if self.alone and file_digest(self.run.directory.at(d.file)) != done.sha256:
+            if self.alone and file_digest(self.run.directory.at(d.file)) != entry.content_digest:
                 self.estimate_again([d.name])
                 continue
-            self.ended[d.name] = done
-            self.run.directory.remove(d.iteration)  # of a run killed between its last two steps
+            self.ended[d.name] = ""
+            if d.iteration in left:  # of a run killed between its last two steps
+                self.run.directory.remove(d.iteration)
         self.run.log.write(f"resumed: {len(self.ended)} of {len(self.sets)} data sets are done")
 
     def estimate_again(self, names: Sequence[str]) -> None:
@@ -152,10 +161,12 @@ class Worklist:
         todo = [d for d in self.sets if d.name not in self.ended]
         sent: list[Dataset] = []
 
-        def jobs(stop: threading.Event | None = None) -> Iterator[tuple[Job]]:
+        def jobs(
+            stop: threading.Event | None = None, config: CommonValue[Config] | None = None
+        ) -> Iterator[tuple[Job]]:
             for d in todo:
                 try:
-                    job = self._job(d, stop)
+                    job = self._job(d, stop, config)
                 except Exception as error:
                     self._fail(d, error)
                 else:
@@ -164,7 +175,8 @@ class Worklist:
 
         if len(todo) > 1 and len(todo) >= executor.workers > 1:
             stop = self.stop if isinstance(executor, ThreadsExecutor) else None
-            ends = executor.map(estimate_and_tell, jobs(stop), self._hear)
+            config = CommonValue(self.config) if executor.reads else None
+            ends = executor.map(estimate_and_tell, jobs(stop, config), self._hear)
         else:
             ends = SerialExecutor().map(lambda job: estimate(job, executor, self._record), jobs())
         for i, value in ends:
@@ -176,14 +188,14 @@ class Worklist:
     def _fingerprint(self, d: Dataset) -> str:
         return self.run.identity.of_dataset(d.name)
 
-    def _job(self, d: Dataset, stop: threading.Event | None) -> Job:
+    def _job(self, d: Dataset, stop: threading.Event | None, shared: CommonValue[Config] | None) -> Job:
         config, identity, fingerprint = self.config, self.run.identity, self._fingerprint(d)
         resume = self.run.restore(d.iteration, fingerprint, LoopState, f"{d.name} is estimated from the start")
         if resume is not None:
             self.run.log.write(f"{d.name}: continued {resume.reached}")
         path = self.run.directory.at(d.iteration)
         return Job(
-            problem=build_one(config, d.name, d.source),
+            problem=Unread(shared, d.name, d.source) if shared else build_one(config, d.name, d.source),
             settings=config.assimilation,
             seed=own_seed(config.seed, d.name),
             attributes={
@@ -198,10 +210,16 @@ class Worklist:
         )
 
     def _hear(self, _: int, records: Records) -> None:
-        for name, record in records:
-            self._record(name, record)
+        self.run.log.write("\n".join(line for name, record in records for line in self._lines(name, record)))
+        if self.progress is not None:
+            for name, record in records:
+                self.progress(name, record)
 
     def _record(self, name: str, record: Record) -> None:
+        self._hear(0, ((name, record),))
+
+    def _lines(self, name: str, record: Record) -> Iterator[str]:
+        """What the log says of a record."""
         if isinstance(record, StartRecord | IterationRecord):
             reached = self._reached.get(name, (0, 0))
             place = (
@@ -210,20 +228,17 @@ class Worklist:
                 else (reached[0] | 1, record.iteration)
             )
             if place <= reached:
-                self.run.log.write(f"{name}: its worker was lost; another one repeats it")
+                yield f"{name}: its worker was lost; another one repeats it"
             self._reached[name] = place
-        self.run.log.write(describe(name, record))
-        if self.progress is not None:
-            self.progress(name, record)
+        yield describe(name, record)
 
     def _keep(self, d: Dataset, value: Estimate) -> None:
-        warnings = [f"{warning.severity}: {warning}" for warning in value.outcome.warnings]
-        self.run.log.write("\n".join(f"{d.name}: {line}" for line in (value.ending, *warnings)))
+        self.run.log.write("\n".join(f"{d.name}: {line}" for line in value.told))
         content = value.content
         if isinstance(content, SealedBytes):  # a file of its own
             content.write(self.run.directory.at(d.file))
             content = b""
-        self._end(d, value.outcome, content)
+        self._end(d, "", value.outcome, content, value.digest)
 
     def _fail(self, d: Dataset, error: Exception) -> None:
         if isinstance(error, OutputError | ExecutorError):
@@ -236,12 +251,12 @@ class Worklist:
         if len(self.sets) == 1:
             raise error
         exit_code = error.exit_code if isinstance(error, En4dvarError) else 1
-        self._end(d, DatasetOutcome(d.name, failure=reason, exit_code=exit_code))
+        self._end(d, reason, encode_text(DatasetOutcome(d.name, failure=reason, exit_code=exit_code)))
 
-    def _end(self, d: Dataset, outcome: DatasetOutcome, content: bytes = b"") -> None:
-        self.pack.append(d.stem, self._fingerprint(d), encode_text(outcome), content, outcome.sha256)
+    def _end(self, d: Dataset, failure: str, outcome: bytes, content: bytes = b"", content_digest: str = "") -> None:
+        self.pack.append(d.stem, self._fingerprint(d), outcome, content, content_digest)
         self.run.directory.remove(d.iteration)
-        self.ended[d.name] = outcome
+        self.ended[d.name] = failure
         self._reached.pop(d.name, None)
         if isinstance(self.progress, LiveProgress):
             self.progress.ended(d.name, len(self.ended))

@@ -19,4 +19,9 @@ BESIDE: Mapping[str, str] = {
 
 def joined(group: xr.Dataset, beside: xr.Dataset | None) -> xr.Dataset:
     """A group with the variables of the one beside it; files of earlier versions have all in one."""
-    return group if beside is None else group.assign({name: beside[name] for name in beside.data_vars})
+    if beside is None:
+        return group
+    coords = {name: one.variable for part in (group, beside) for name, one in part.coords.items()}
+    held = {name: one.variable for part in (group, beside) for name, one in part.data_vars.items()}
+    indexes = {**beside.xindexes, **group.xindexes}  # of the same file: nothing to align, which takes ten times as long
+    return xr.Dataset(held, xr.Coordinates(coords, indexes), group.attrs)

@@ -19,9 +19,9 @@ import numpy as np
 
 from en4dvar.errors import OutputError
 from en4dvar.storage.checkpoint import digest
-from en4dvar.storage.netcdf import Group, Groups, Variable, attributes_of, netcdf_file
+from en4dvar.storage.netcdf import Groups, Variable, attributes_of, netcdf_file
 from en4dvar.storage.pack import content_digest, read_result
-from en4dvar.storage.packed import unpacked
+from en4dvar.storage.packed import Alike, Content, opened, unpacked, unpacked_together
 from en4dvar.storage.seal import check_seal
 
 GROUPS = (
@@ -54,15 +54,16 @@ class _Layout:
     n_observations: int = 0
     scalars: dict[str, dict[str, Any]] = field(default_factory=lambda: {group: {} for group in GROUPS})
 
-    def add(self, groups: Groups) -> None:
+    def add(self, content: bytes) -> None:
         """One that varies in time has the more parameters the longer the window, one that was sampled more scalars."""
-        n_parameters = groups["/sample_stats"].sizes[PARAMETER]
+        one = opened(content)
+        sizes, n_parameters = one.layout.sizes, one.layout.sizes["/sample_stats"][PARAMETER]
         if n_parameters > self.n_parameters:
-            self.widest, self.n_parameters = groups, n_parameters
+            self.widest, self.n_parameters = unpacked(content, _PATHS), n_parameters
+        said = dict(zip(sizes, one.attributes, strict=True))
         for name, kinds in self.scalars.items():
-            group = groups[f"/{name}"]
-            self.n_observations = max(self.n_observations, group.sizes.get("time", 0))
-            for key, value in group.attrs.items():
+            self.n_observations = max(self.n_observations, sizes[f"/{name}"].get("time", 0))
+            for key, value in said[f"/{name}"].items():
                 kinds.setdefault(key, str if isinstance(value, str) else np.dtype(float))
 
 
@@ -88,9 +89,10 @@ def save_campaign(
     with netcdf_file(path) as partial, netCDF4.Dataset(partial, "w", format="NETCDF4") as target:
         target.setncatts({**attributes, **told})
         _define(target, layout, len(sources))
-        for begin, names, block in _blocks(sources):
+        for begin, names, contents in _blocks(sources):
+            alike = unpacked_together(contents, _PATHS)
             for group in GROUPS:
-                _write(target[group], begin, names, [groups[f"/{group}"] for groups in block])
+                _write(target[group], begin, names, alike)
     return path
 
 
@@ -105,7 +107,7 @@ def _layout(sources: Mapping[str, Path]) -> _Layout:
     layout, damaged, reasons = _Layout(), [], []
     for name, address in sources.items():
         try:
-            layout.add(unpacked(read_result(address), _PATHS))
+            layout.add(read_result(address))
         except (OutputError, KeyError, ValueError) as error:  # the last two: written by somebody else
             damaged.append(name)
             reasons.append(str(error))
@@ -114,18 +116,18 @@ def _layout(sources: Mapping[str, Path]) -> _Layout:
     return layout
 
 
-def _blocks(sources: Mapping[str, Path]) -> Iterator[tuple[int, list[str], list[Groups]]]:
-    """Place of the first, names and groups of as many data sets as are written at once."""
+def _blocks(sources: Mapping[str, Path]) -> Iterator[tuple[int, list[str], list[Content]]]:
+    """Place of the first, names and contents of as many data sets as are written at once."""
     begin, size = 0, 0
     names: list[str] = []
-    block: list[Groups] = []
+    block: list[Content] = []
     for name, address in sources.items():
         content = read_result(address, check=False)  # it was for the layout
         if block and size + len(content) > BLOCK:
             yield begin, names, block
             begin, size, names, block = begin + len(names), 0, [], []
         names.append(name)
-        block.append(unpacked(content, _PATHS))
+        block.append(opened(content))
         size += len(content)
     yield begin, names, block
 
@@ -186,41 +188,44 @@ def _create(
     return made
 
 
-def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequence[Group]) -> None:
+def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequence[Alike]) -> None:
     """The values of consecutive data sets; what one lacks stays missing."""
-    found = [source.every for source in block]
+    found = [alike.groups[group.path].every for alike in block]
     names_here = group[PARAMETER][...].tolist() if PARAMETER in group.variables else []
     places = [_places(names_here, source) for source in found]
     for variable in group.variables.values():
         if variable.dimensions[:1] != ("dataset",):
             continue
         kind, shape = object if variable.dtype is str else variable.dtype, variable.shape[1:]
-        rows = np.full((len(block), *shape), _missing(variable), dtype=kind)
+        rows = np.full((len(names), *shape), _missing(variable), dtype=kind)
         if variable.name == "dataset":
             rows[:] = names
         elif "attribute" in variable.ncattrs():
             key = variable.getncattr("attribute")
-            for i, source in enumerate(block):
-                if key in source.attrs:
-                    rows[i] = source.attrs[key]
+            for alike in block:
+                for i, attributes in zip(alike.places, alike.attributes, strict=True):
+                    if key in attributes[group.path]:
+                        rows[i] = attributes[group.path][key]
         else:
-            for i, (one, place) in enumerate(zip(found, places, strict=True)):
+            for alike, one, place in zip(block, found, places, strict=True):
                 if variable.name in one:
-                    _place(rows[i, ...], one[variable.name], place)
+                    _place(rows, alike.places, one[variable.name], place)
         if kind is not object or (rows != "").any():  # text that is not written is empty
-            variable[begin : begin + len(block)] = rows
+            variable[begin : begin + len(names)] = rows
 
 
-def _place(row: np.ndarray[Any, Any], given: Variable, places: list[int] | None) -> None:
-    """Put the values of one data set into its part of a variable, each parameter in its place."""
-    if row.shape == given.values.shape and (places is None or PARAMETER not in given.dims):
-        row[...] = given.values
+def _place(rows: np.ndarray[Any, Any], which: list[int], given: Variable, places: list[int] | None) -> None:
+    """Put the values of data sets that are alike into their rows of a variable, each parameter in its place."""
+    if rows.shape[1:] == given.values.shape[1:] and (places is None or PARAMETER not in given.dims):
+        rows[which] = given.values
     elif given.values.size:  # no parameter, no value
         where = (
             places if places and dim == PARAMETER else slice(n)
-            for dim, n in zip(given.dims, given.values.shape, strict=True)
+            for dim, n in zip(given.dims, given.values.shape[1:], strict=True)
         )  # fmt: skip
-        row[tuple(where)] = given.values
+        own = rows[which]
+        own[(slice(None), *where)] = given.values
+        rows[which] = own
 
 
 def _missing(variable: netCDF4.Variable) -> Any:
@@ -231,5 +236,5 @@ def _missing(variable: netCDF4.Variable) -> Any:
 
 def _places(names: list[str], source: Mapping[str, Variable]) -> list[int] | None:
     """Where the parameters of a data set stand among those of the campaign, None where they are the same."""
-    own = source[PARAMETER].values.tolist() if PARAMETER in source else names
+    own = source[PARAMETER].values[0].tolist() if PARAMETER in source else names
     return None if own == names else [names.index(name) for name in own]

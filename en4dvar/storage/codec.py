@@ -11,6 +11,7 @@ import io
 import json
 import types
 import typing
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
@@ -38,7 +39,7 @@ def encode_text(value: Any) -> bytes:
 def decode_text(content: bytes, kind: type[D]) -> D:
     """The dataclass of :func:`encode_text`. Raises :class:`ValueError` where the bytes are not one of ``kind``."""
     try:
-        value: D = _typed(json.loads(content), kind, {})
+        value: D = _reader(typing.cast(Any, kind))(json.loads(content), {})
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"not a {kind.__name__}: {error}") from error
     return value
@@ -49,7 +50,7 @@ def decode(content: bytes, kind: type[D]) -> D:
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-        value: D = _typed(json.loads(str(arrays.pop(_TEXT))), kind, arrays)
+        value: D = _reader(typing.cast(Any, kind))(json.loads(str(arrays.pop(_TEXT))), arrays)
     except (OSError, KeyError, TypeError, ValueError, EOFError) as error:
         raise ValueError(f"not a {kind.__name__}: {error}") from error
     return value
@@ -71,34 +72,50 @@ def _plain(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
     raise TypeError(f"cannot store a {type(value).__name__}")
 
 
-@functools.cache
-def _hints(kind: type) -> dict[str, Any]:
-    hints = typing.get_type_hints(kind)
-    return {f.name: hints[f.name] for f in fields(kind)}
+_Arrays = dict[str, np.ndarray[Any, Any]]
+_Reader = Callable[[Any, _Arrays], Any]  # what the JSON text says → the value of a type
 
 
-def _typed(raw: Any, kind: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
+@functools.cache  # a campaign reads as many of one kind as it has data sets
+def _reader(kind: Any) -> _Reader:
+    """Raises, when it reads, :class:`KeyError`, :class:`TypeError` or :class:`ValueError`."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
-        if raw is None and type(None) in arguments:
-            return None
-        return _typed(raw, next(a for a in arguments if a is not type(None)), arrays)
+        other = _reader(next(a for a in arguments if a is not type(None)))
+        return lambda raw, arrays: None if raw is None and type(None) in arguments else other(raw, arrays)
     if origin in (np.ndarray, npt.NDArray):  # from NumPy 2.5 on NDArray is an alias with a name of its own
-        return arrays[raw["array"]]
+        return lambda raw, arrays: arrays[raw["array"]]
     if origin is tuple:
-        items = arguments[:1] * len(raw) if arguments[1:] == (Ellipsis,) else arguments
-        return tuple(_typed(item, a, arrays) for item, a in zip(raw, items, strict=True))
+        return _tuple_reader(arguments)
     if origin is typing.Literal:
-        if raw not in arguments:
-            raise ValueError(f"{raw!r} is not one of {arguments}")
-        return raw
+        return functools.partial(_choice, arguments)
     if is_dataclass(kind):
-        hints = _hints(typing.cast(type, kind))
-        if set(raw) != set(hints):
-            raise ValueError(f"the fields of {kind} differ")
-        return typing.cast(Any, kind)(**{name: _typed(item, hints[name], arrays) for name, item in raw.items()})
-    if kind is float and type(raw) in (int, float):
-        return raw
-    if type(raw) is not kind:
-        raise TypeError(f"{raw!r} is not a {kind.__name__}")
+        hints = typing.get_type_hints(kind)
+        return functools.partial(_dataclass, kind, {f.name: _reader(hints[f.name]) for f in fields(kind)})
+    return functools.partial(_simple, (int, float) if kind is float else (kind,))
+
+
+def _tuple_reader(arguments: tuple[Any, ...]) -> _Reader:
+    if arguments[1:] == (Ellipsis,):
+        item = _reader(arguments[0])
+        return lambda raw, arrays: tuple(item(one, arrays) for one in raw)
+    items = tuple(map(_reader, arguments))
+    return lambda raw, arrays: tuple(read(one, arrays) for read, one in zip(items, raw, strict=True))
+
+
+def _dataclass(kind: Any, readers: dict[str, _Reader], raw: Any, arrays: _Arrays) -> Any:
+    if set(raw) != set(readers):
+        raise ValueError(f"the fields of {kind} differ")
+    return kind(**{name: readers[name](item, arrays) for name, item in raw.items()})
+
+
+def _choice(choices: tuple[Any, ...], raw: Any, _: _Arrays) -> Any:
+    if raw not in choices:
+        raise ValueError(f"{raw!r} is not one of {choices}")
+    return raw
+
+
+def _simple(kinds: tuple[type, ...], raw: Any, _: _Arrays) -> Any:
+    if type(raw) not in kinds:
+        raise TypeError(f"{raw!r} is not a {kinds[-1].__name__}")
     return raw

@@ -88,16 +88,16 @@ class Pack:
         except OSError as error:
             raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from None
 
-    def outcome(self, name: str) -> bytes:
-        """How a data set ended. Raises :class:`OutputError` where it is damaged."""
-        e = self.entries[name]
-        return _read(self.path, name, e.begin + e.line, e.outcome_size, e.outcome_digest)
-
     def content(self, name: str, check: bool = True) -> bytes:
         """The groups of a data set. Raises :class:`OutputError` where they are damaged, if that is to be checked."""
         e = self.entries[name]
         expected = e.content_digest if check else ""
         return _read(self.path, name, e.begin + e.line + e.outcome_size, e.content_size, expected)
+
+
+def read_outcome(path: Path, name: str, entry: Entry) -> bytes:
+    """How a data set ended. Raises :class:`OutputError` where that is damaged."""
+    return _read(path, name, entry.begin + entry.line, entry.outcome_size, entry.outcome_digest)
 
 
 def results_of(pack: Path) -> list[Path]:
@@ -139,7 +139,8 @@ def _known(path: Path, *state: int) -> Pack:
 
 def _append(file: int, end: int, record: bytes) -> None:
     """Write at ``end``, behind which there is at most what a kill left of a record. Raises :class:`OSError`."""
-    os.ftruncate(file, end)
+    if os.fstat(file).st_size != end:
+        os.ftruncate(file, end)
     left = memoryview(record)
     try:
         while left:

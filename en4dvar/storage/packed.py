@@ -11,7 +11,9 @@ import functools
 import json
 import math
 import struct
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,45 @@ from en4dvar.storage.netcdf import Group, Groups, Variable
 
 _SIZES = struct.Struct("<QQ")  # of the texts
 _ALIGNED = 8  # bytes
+
+
+@dataclass(frozen=True)
+class PackedLayout:
+    """Which variables there are: of each group the path, then of its variables and of its coordinates the name and what
+    :func:`_place` tells; ``named``: which texts stand along dimensions; ``sizes`` of these by path; ``texts``: how many
+    words each has; ``length`` of the numbers in bytes.
+    """
+
+    groups: list[tuple[str, list[Any], list[Any]]]
+    named: list[int]
+    sizes: dict[str, dict[str, int]]
+    texts: dict[int, int]
+    length: int
+
+
+@dataclass(frozen=True, slots=True)
+class Content:
+    """Bytes of :func:`packed` whose texts are read: the layout (one object for equal ones), of each group its
+    attributes, variables of text; ``numbers`` are as they were.
+    """
+
+    layout: PackedLayout
+    attributes: list[dict[str, Any]]
+    words: list[list[str]]
+    numbers: memoryview
+
+
+@dataclass(frozen=True)
+class Alike:
+    """Contents that differ in numbers and attributes only: ``places`` says which of those given these are.
+
+    Variables of ``groups`` have the contents along a first axis of their values; ``attributes`` are, content by
+    content, those of each group.
+    """
+
+    places: list[int]
+    groups: dict[str, Group]
+    attributes: list[dict[str, dict[str, Any]]]
 
 
 def packed(groups: Groups) -> bytes:
@@ -36,37 +77,71 @@ def packed(groups: Groups) -> bytes:
     return b"".join((_SIZES.pack(len(first), len(second)), first, second, numbers))
 
 
+def opened(content: bytes) -> Content:
+    """What the texts say. Raises :class:`ValueError`."""
+    with _understanding():
+        first, second = _SIZES.unpack_from(content)
+        begin = _SIZES.size + first
+        attributes, words = json.loads(content[begin : begin + second])
+        layout = _layout(content[_SIZES.size : begin])
+        numbers = memoryview(content)[begin + second :]
+        held = len(attributes), len(numbers), {k: len(words[k]) for k in layout.texts}
+        if held != (len(layout.groups), layout.length, layout.texts):
+            raise ValueError("there are more or fewer values than it says")
+        return Content(layout, attributes, words, numbers)
+
+
 def unpacked(content: bytes, wanted: Collection[str] | None = None) -> dict[str, Group]:
     """The groups, or those ``wanted``, whose arrays can be written to. Raises :class:`ValueError`."""
-    held = bytearray(content)
+    return _restored([opened(content)], (), wanted)
+
+
+def unpacked_together(contents: Sequence[Content], wanted: Collection[str]) -> list[Alike]:
+    """The groups ``wanted`` of contents, those alike at once: what is done for one is done for all. Raises
+    :class:`ValueError`.
+    """
+    found: dict[Any, list[int]] = {}
+    for i, one in enumerate(contents):
+        found.setdefault((id(one.layout), *(tuple(one.words[k]) for k in one.layout.named)), []).append(i)
+
+    def alike(places: list[int]) -> Alike:
+        every = [contents[i] for i in places]
+        paths = [path for path, *_ in every[0].layout.groups]
+        attributes = [dict(zip(paths, one.attributes, strict=True)) for one in every]
+        return Alike(places, _restored(every, (len(every),), wanted), attributes)
+
+    return list(map(alike, found.values()))
+
+
+@contextmanager
+def _understanding() -> Iterator[None]:
     try:
-        first, second = _SIZES.unpack_from(held)
-        begin = _SIZES.size + first
-        attributes, words = json.loads(held[begin : begin + second])
-        numbers = memoryview(held)[begin + second :]
-
-        def restored(part: list[Any]) -> dict[str, Variable]:
-            return {name: _restored(numbers, words, *v) for name, *v in part}
-
-        return {
-            path: Group(restored(variables), restored(coords), _whole(said))
-            for (path, variables, coords), said in zip(
-                _layout(bytes(held[_SIZES.size : begin])), attributes, strict=True
-            )
-            if wanted is None or path in wanted
-        }
+        yield
     except (struct.error, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
         raise ValueError(f"no packed groups: {error}") from None
 
 
-@functools.lru_cache(maxsize=16)
-def _layout(text: bytes) -> list[Any]:
-    """Of each group the path, then of its variables and of its coordinates name and arguments of :func:`_restored`."""
-
+@functools.lru_cache(maxsize=64)
+def _layout(text: bytes) -> PackedLayout:
     def understood(part: list[Any]) -> list[Any]:
         return [(name, tuple(dims), shape, fill, _whole(said), *rest) for name, dims, shape, fill, said, *rest in part]
 
-    return [(path, *map(understood, parts)) for path, *parts in json.loads(text)]
+    groups = [(path, understood(variables), understood(coords)) for path, variables, coords in json.loads(text)]
+    sizes = {
+        path: {dim: n for _, dims, shape, *_ in (*variables, *coords) for dim, n in zip(dims, shape, strict=True)}
+        for path, variables, coords in groups
+    }
+    texts, length = {}, 0
+    for _, variables, coords in groups:
+        for *_, shape, _, _, kind, where in (*variables, *coords):
+            if where < 0 or min(shape, default=0) < 0 or np.dtype(kind or "f8").hasobject:
+                raise ValueError("a variable is nowhere")
+            if kind:
+                length = max(length, where + math.prod(shape) * np.dtype(kind).itemsize)
+            else:
+                texts[where] = math.prod(shape)
+    named = [where for _, _, coords in groups for *_, kind, where in coords if not kind]
+    return PackedLayout(groups, named, sizes, texts, length + -length % _ALIGNED)
 
 
 def _attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
@@ -90,13 +165,33 @@ def _place(v: Variable, numbers: bytearray, words: list[Any]) -> list[Any]:
     return [*about, values.dtype.str, where]
 
 
-def _restored(
-    numbers: memoryview, words: list[Any],
-    dims: tuple[str, ...], shape: list[int], fill: bool, attributes: dict[str, Any], kind: str, where: int,
-) -> Variable:  # fmt: skip
-    if kind:
-        values = np.frombuffer(numbers, kind, math.prod(shape), where)
-    else:
-        values = np.empty(len(words[where]), dtype=object)
-        values[:] = words[where]
-    return Variable(dims, values.reshape(shape), attributes, fill)
+def _restored(every: Sequence[Content], lead: tuple[int, ...], wanted: Collection[str] | None) -> dict[str, Group]:
+    """The groups of contents of one layout, whose values have the ``lead``ing axis (n,), or none of a single one.
+
+    Attributes are those of the first.
+    """
+
+    def variable(
+        dims: tuple[str, ...], shape: list[int], fill: bool, attributes: dict[str, Any], kind: str, where: int
+    ) -> Variable:
+        values: np.ndarray[Any, Any]
+        if kind:
+            end = where + math.prod(shape) * np.dtype(kind).itemsize
+            values = numbers[:, where:end].view(kind)
+        else:
+            texts = [text for one in every for text in one.words[where]]
+            values = np.empty(len(texts), dtype=object)
+            values[:] = texts
+        return Variable(dims, values.reshape((*lead, *shape)), attributes, fill)
+
+    def variables(part: list[Any]) -> dict[str, Variable]:
+        return {name: variable(*v) for name, *v in part}
+
+    with _understanding():
+        whole = bytearray().join(one.numbers for one in every)
+        numbers = np.frombuffer(whole, np.uint8).reshape(len(every), -1)
+        return {
+            path: Group(variables(held), variables(coords), _whole(said))
+            for (path, held, coords), said in zip(every[0].layout.groups, every[0].attributes, strict=True)
+            if wanted is None or path in wanted
+        }

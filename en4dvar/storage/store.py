@@ -212,6 +212,11 @@ def load_stored(path: str | Path) -> StoredResult:
     return StoredResult(xr.DataTree.from_dict(nodes))
 
 
+def plain_result(path: Path) -> PlainResult:
+    """What :func:`load_stored` gives, of an address without xarray. Raises :class:`OutputError`."""
+    return load_plain(path) if path.parent.name == PACK else load_stored(path).plain
+
+
 def _of_members(dataset: xr.Dataset) -> xr.Dataset:
     """A group of parameters without the values of pieces of time: what has one number a member."""
     return dataset[[name for name, variable in dataset.data_vars.items() if variable.dims == MEMBER]]

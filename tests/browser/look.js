@@ -57,5 +57,14 @@ window.look = (() => {
       const empty = e.tagName === "IMG" ? !e.naturalWidth : !e.querySelector("path");
       return box.width > 100 && box.height > 50 && !empty;
     });
-  return { faint, wide, drawings };
+  const unnamed = () => {
+    const silent = {
+      "th:not([scope])": () => true,
+      "svg, img, a, button, [role=button]": (e) =>
+        !(e.textContent.trim() || e.getAttribute("aria-label") || e.alt) && e.getAttribute("aria-hidden") !== "true",
+    };
+    return Object.entries(silent).flatMap(([what, bad]) =>
+      [...document.querySelectorAll(what)].filter(bad).map((e) => `${what}: ${e.outerHTML.slice(0, 80)}`));
+  };
+  return { faint, wide, drawings, unnamed };
 })();

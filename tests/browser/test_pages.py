@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+
+from en4dvar.report.drawing import draw
+from en4dvar.report.overview import LISTED, SetSummary, overview_figures, render_overview
+from en4dvar.storage.pack import PACK
+from en4dvar.storage.plain import load_plain
 
 pytestmark = pytest.mark.slow  # a browser takes half a minute of the processor
 LOOK = (Path(__file__).parent / "look.js").read_text(encoding="utf-8")
@@ -41,6 +47,39 @@ def test_contrast_is_adequate(opened, pages, kind, scheme):
 def test_fits_a_phone(opened, pages, kind):
     wide = look(opened(pages[kind], width=360), "wide")
     assert wide["scroll"] <= wide["width"] == 360
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_screen_reader_is_told_what_everything_is(opened, pages, kind):
+    seen = opened(pages[kind])
+    assert look(seen, "unnamed") == []
+    for landmark in ("main", "h1", "html[lang=en]"):
+        assert seen.page.locator(landmark).count() == 1
+
+
+def test_the_table_of_data_sets_names_its_rows_and_can_be_skipped_by_key(opened, pages):
+    page = opened(pages["campaign"]).page
+    assert page.get_by_role("rowheader").count() == 3
+    link = page.get_by_role("link", name="Skip the table")
+    while not link.evaluate("e => e === document.activeElement"):
+        page.keyboard.press("Tab")
+    assert link.bounding_box()["height"] > 10  # it can be seen where it is
+    page.keyboard.press("Enter")
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.closest('table')") is None
+
+
+def test_a_page_of_20000_data_sets_is_as_small_as_one_of_2000(opened, pages, tmp_path):
+    """What a browser has to lay out does not grow; the first paint of such a page took 0.3 s."""
+    one = SetSummary.of(load_plain(pages["campaign"].parent / PACK / "a"), "a")
+    sets = [replace(one, name=f"set{i}", stem=f"set{i}") for i in range(20_000)]
+    path = tmp_path / "report.html"
+    path.write_text(render_overview(sets, {}, {}, draw(overview_figures(sets)), "", ""), encoding="utf-8")
+    seen = opened(path)
+    assert seen.complaints == []
+    assert seen.page.locator("table.sets tbody tr").count() == LISTED
+    assert seen.page.locator("*").count() < 50_000
+    assert path.stat().st_size < 5e6
 
 
 def column(page, i):

@@ -304,7 +304,7 @@ def test_overview_of_many_data_sets_stays_small(analysis):
     html = render_overview(sets, {}, {}, draw(overview_figures(sets)))
     assert len(html.encode()) < 3e6
     assert html.count("<tr>") == LISTED + 1
-    assert "<td>set 7777</td>" in html
+    assert '<th scope="row">set 7777</th>' in html
     assert "Of 20000 data sets the 2000 with the gravest warnings are listed" in html
 
 

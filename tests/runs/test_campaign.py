@@ -1,6 +1,7 @@
 """Campaigns: what fails is named and ends nothing; one file for all; names that every file system takes."""
 
 import csv
+import shutil
 
 import numpy as np
 import pytest
@@ -8,12 +9,13 @@ import xarray as xr
 from run_files import configuration, make_campaign, run_cli
 from toy_config import csv_text
 
-from en4dvar.errors import DataError, TooFewMembersError
+from en4dvar.errors import DataError, OutputError, TooFewMembersError
 from en4dvar.report.result import load_result
 from en4dvar.runs.campaign import Campaign, DatasetOutcome, file_names
+from en4dvar.runs.outcomes import Outcomes
 from en4dvar.runs.runner import run_campaign, write_report
 from en4dvar.storage.campaign_file import GROUPS, save_campaign
-from en4dvar.storage.pack import PACK, results_of
+from en4dvar.storage.pack import PACK, Pack, results_of
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +55,14 @@ def test_failures_are_named_and_the_rest_is_estimated(campaign):
 def test_exit_code(tmp_path, codes, expected):
     outcomes = [DatasetOutcome(str(i), None, "reason" if code else "", code) for i, code in enumerate(codes)]
     assert Campaign(tmp_path, tuple(outcomes)).exit_code == expected
+
+
+def test_an_outcome_that_was_altered_is_told(campaign, tmp_path):
+    shutil.copytree(campaign.directory, tmp_path / "run")
+    entries, record = Pack(campaign.directory / PACK).entries, tmp_path / "run" / PACK
+    record.write_bytes(record.read_bytes().replace(b'"failure": ""', b'"failure": 12'))
+    with pytest.raises(OutputError, match=r"datasets\.pack/set0: damaged or altered"):
+        Outcomes(record, entries, {"set0": tmp_path})[0]
 
 
 def test_one_file_for_all(campaign):

@@ -10,7 +10,7 @@ from en4dvar.errors import OutputError
 from en4dvar.storage.checkpoint import digest
 from en4dvar.storage.netcdf import Group, Variable
 from en4dvar.storage.pack import PACK, Pack, read_result, results_of
-from en4dvar.storage.packed import packed
+from en4dvar.storage.packed import opened, packed, unpacked, unpacked_together
 from en4dvar.storage.plain import load_plain
 from en4dvar.storage.store import load_stored
 
@@ -77,3 +77,36 @@ def test_dimensions_have_one_size(tmp_path):
     Pack(tmp_path / PACK).append("a", "f", b"", content, digest(content))
     with pytest.raises(OutputError, match=r"datasets\.pack/a: not a result of en4dvar: of 3 has the shape \(3,\)"):
         load_plain(tmp_path / PACK / "a")
+
+
+def groups(names, count, value):
+    """Of parameters and ``count`` draws, with a scalar that tells them apart."""
+    variables = {"x": Variable(("parameter", "draw"), np.full((len(names), count), value), {})}
+    return {
+        "/": Group(attrs={"of": value}),
+        "/stats": Group(variables, {"parameter": Variable(("parameter",), names, {})}),
+    }
+
+
+def test_contents_are_read_together_as_each_by_itself():
+    a, b = (np.array(names, dtype=object) for names in (["a", "b"], ["b", "a"]))
+    given = [
+        groups(names, count, value) for names, count, value in [(a, 3, 0.0), (a, 4, 1.0), (a, 3, 2.0), (b, 3, 3.0)]
+    ]
+    contents = list(map(packed, given))
+    found = unpacked_together(list(map(opened, contents)), {"/stats"})
+    assert [alike.places for alike in found] == [[0, 2], [1], [3]]
+    for alike in found:
+        for i, place in enumerate(alike.places):
+            assert alike.attributes[i]["/"] == {"of": float(place)}
+            for name, alone in unpacked(contents[place])["/stats"].every.items():
+                together = alike.groups["/stats"].every[name]
+                assert together.dims == alone.dims
+                np.testing.assert_array_equal(together.values[i], alone.values)
+
+
+@pytest.mark.parametrize("end", [-8, None])
+def test_a_content_of_another_length_is_refused(end):
+    content = packed(groups(np.array(["a"], dtype=object), 3, 1.0))
+    with pytest.raises(ValueError, match="more or fewer values"):
+        opened(content[:end] if end else content + bytes(8))

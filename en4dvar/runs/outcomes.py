@@ -1,0 +1,45 @@
+"""How the data sets of a run ended, as it is on disk: of 10⁵ sets nothing is in memory that was not asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import overload
+
+from en4dvar.errors import OutputError
+from en4dvar.runs.campaign import DatasetOutcome
+from en4dvar.storage.codec import decode_text
+from en4dvar.storage.pack import Entry, read_outcome
+
+
+class Outcomes(Sequence[DatasetOutcome]):
+    """Each is read when it is asked for, which raises :class:`OutputError` where it was altered.
+
+    Parameters
+    ----------
+    record: the pack; entries: what it holds. files: name of the data set in the pack → where its posterior is.
+    """
+
+    def __init__(self, record: Path, entries: Mapping[str, Entry], files: Mapping[str, Path]):
+        self._record, self._entries, self._files, self._stems = record, entries, files, tuple(files)
+
+    def __len__(self) -> int:
+        return len(self._stems)
+
+    @overload
+    def __getitem__(self, index: int) -> DatasetOutcome: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[DatasetOutcome, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> DatasetOutcome | tuple[DatasetOutcome, ...]:
+        found = self._stems[index]
+        return self._read(found) if isinstance(found, str) else tuple(map(self._read, found))
+
+    def _read(self, stem: str) -> DatasetOutcome:
+        try:
+            outcome = decode_text(read_outcome(self._record, stem, self._entries[stem]), DatasetOutcome)
+        except ValueError as error:  # anybody can write a checksum
+            raise OutputError(f"{self._record / stem}: {error}") from None
+        return outcome if outcome.failure else replace(outcome, file=self._files[stem])
