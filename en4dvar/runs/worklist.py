@@ -210,13 +210,13 @@ class Worklist:
         )
 
     def _hear(self, _: int, records: Records) -> None:
-        self.run.log.write("\n".join(line for name, record in records for line in self._lines(name, record)))
-        if self.progress is not None:
-            for name, record in records:
-                self.progress(name, record)
+        for name, record in records:
+            self._record(name, record)
 
     def _record(self, name: str, record: Record) -> None:
-        self._hear(0, ((name, record),))
+        self.run.log.write("\n".join(self._lines(name, record)))
+        if self.progress is not None:
+            self.progress(name, record)
 
     def _lines(self, name: str, record: Record) -> Iterator[str]:
         """What the log says of a record."""
