@@ -75,7 +75,8 @@ def test_heat_equation_cold_medium(i):
 def test_heat_equation_conducting_medium(i):
     c, t, expected = case(i)
     assert distance(Case(c).solve(t, rtol=1e-7), expected) < 5e-5
-    coarse, fine = (Case(c, replace(CORRECT, nodes=48, medium_nodes=n)).solve(t, rtol=1e-7) for n in (51, 101))
+    # from 51 and 101 nodes the extrapolation is off by up to 4e-3, where the collapse is hardly damped
+    coarse, fine = (Case(c, replace(CORRECT, nodes=48, medium_nodes=n)).solve(t, rtol=1e-7) for n in (101, 201))
     ours = suite(c, t, FINE)
     assert distance(fine, ours) < distance(coarse, ours) / 2  # the medium's grid is of second order
     assert distance((4 * fine - coarse) / 3, ours) < 1e-3
