@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import os
 from collections import Counter
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 from typing import Any
@@ -153,12 +153,6 @@ def pytest_collection_finish() -> None:
     """What the imported modules consist of is never garbage: to look through it took 6 % of the time."""
     gc.collect()
     gc.freeze()
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_xdist_auto_num_workers() -> Generator[None, int, int]:
-    """One more than cores: tests wait for processes they started, for terminals and disks."""
-    return (yield) + 1
 
 
 @pytest.fixture(scope="session")

@@ -84,6 +84,7 @@ def test_resolved_configuration_gives_the_same_result(finished, tmp_path):
     assert again.stdout.splitlines()[:-1] == outcome.stdout.splitlines()[:-2]
 
 
+@pytest.mark.slow
 def test_report_again_from_the_file(finished):
     directory, _ = finished
     page = (directory / "report.html").read_text()

@@ -6,6 +6,7 @@ import runpy
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import en4dvar
 from en4dvar.config.build import build
@@ -13,6 +14,7 @@ from en4dvar.config.build import build
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
+@pytest.mark.slow
 def test_the_external_program_has_the_bits_of_its_function_and_finds_its_truth(tmp_path):
     path = CONFIGS / "external_program.yaml"
     found = en4dvar.run(path, overrides={"output.directory": str(tmp_path / "run"), "output.report": False})

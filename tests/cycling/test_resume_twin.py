@@ -188,6 +188,7 @@ def test_a_damaged_checkpoint_is_named_and_not_used(interrupted):
     assert_same_files(out, quiet)
 
 
+@pytest.mark.slow
 def test_workers_and_report_may_change(interrupted):
     path, out, quiet = interrupted
     run_twin(

@@ -78,6 +78,7 @@ def interrupted(problem, settings, seed, resume=None):
     return analysis, [decode(encode(state), LoopState) for state in states]
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_from_any_state_to_the_same_bits():
     settings, seen = AssimilationSettings(start="prior-mean"), set()
     for seed in (3, 7):

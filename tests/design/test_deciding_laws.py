@@ -36,7 +36,7 @@ def _evidence(law, std):
     return multivariate_normal(H @ [t.mean for t in terms], H @ B @ H.T + std**2 * np.eye(len(TIMES)))
 
 
-@pytest.mark.parametrize("std", [2.0, 0.6, 0.1])
+@pytest.mark.parametrize("std", [2.0, *(pytest.param(std, marks=pytest.mark.slow) for std in (0.6, 0.1))])
 def test_against_evidences_in_closed_form(std):
     """Two and three parameters: what 200 000 readings of each, explained exactly, tell."""
     laws = [_law(std), _law(std, ("a", "b", "c"))]
@@ -97,6 +97,7 @@ def _plan(**design):
     }
 
 
+@pytest.mark.slow
 def test_as_a_command(tmp_path):
     """A key that differs is a law; designs are ranked by what they tell of it, in every file."""
     found, directory = run_design(_plan(), out=tmp_path / "out")

@@ -60,6 +60,7 @@ def _same(one, other):
         np.testing.assert_array_equal(a.found.fan, b.found.fan)
 
 
+@pytest.mark.slow
 def test_every_combination_and_the_file_itself(tmp_path):
     found, directory = run_design(_plan(), out=tmp_path / "out", overrides=PAGE)
     assert [row.settings for row in found.rows][:3] == [
@@ -79,7 +80,8 @@ def test_every_combination_and_the_file_itself(tmp_path):
     assert "a to ±" in page
 
 
-@pytest.mark.parametrize("executor", ["threads", pytest.param("processes", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("executor", ["threads", "processes"])
+@pytest.mark.slow
 def test_the_same_bits_on_any_workers(tmp_path, executor):
     one, _ = run_design(_plan(method="nested"), out=tmp_path / "one", overrides={"execution.executor": "serial"})
     settings = {"execution.executor": executor, "execution.workers": 2}
@@ -87,6 +89,7 @@ def test_the_same_bits_on_any_workers(tmp_path, executor):
     _same(one, other)
 
 
+@pytest.mark.slow
 def test_resumed(tmp_path, monkeypatch):
     """Stopped after three designs, it goes on with the fourth, to the same bits."""
     whole, _ = run_design(_plan(), out=tmp_path / "whole")

@@ -3,6 +3,7 @@
 import os
 import pickle
 
+import pytest
 from run_files import configuration, make_campaign
 
 from en4dvar.executor import ProcessesExecutor
@@ -24,6 +25,7 @@ def test_what_calls_share_is_made_once():
     assert first.value is second.value is not shared.value
 
 
+@pytest.mark.slow
 def test_what_a_worker_cannot_read_is_told_as_here(tmp_path, monkeypatch):
     path = make_campaign(tmp_path, 3)
     (tmp_path / "data" / "set1.csv").write_text("t_ms,x_um\n")

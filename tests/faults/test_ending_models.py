@@ -210,8 +210,9 @@ def test_whatever_else_ends_the_program(tmp_path, monkeypatch):
     assert done.stderr == "the code of a model ended the program: SystemExit: sys.exit(0)\n"
 
 
-@pytest.mark.parametrize("whose", ["system", pytest.param("python", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("whose", ["system", "python"])
 @pytest.mark.fault("output-closed")
+@pytest.mark.slow
 def test_a_model_that_closes_standard_output(tmp_path, whose):
     path = faulty(tmp_path, "Closes")
     modules = os.pathsep.join([str(Path(__file__).parent), environment()["PYTHONPATH"]])

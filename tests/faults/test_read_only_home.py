@@ -59,6 +59,7 @@ def closed() -> Iterator[tuple[Path, Run]]:
 
 
 @pytest.mark.fault("read-only-home")
+@pytest.mark.slow
 def test_compiled_code_is_kept_in_a_temporary_folder_and_said_so_once(closed: tuple[Path, Run]) -> None:
     here, run = closed
     done = run("laws")

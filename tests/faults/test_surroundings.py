@@ -49,18 +49,18 @@ def test_a_clock_that_jumps_backwards(tmp_path, monkeypatch):
     assert run_campaign(config, resume=True).exit_code == 0
 
 
-@pytest.mark.parametrize(
-    "sets", [40, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.long])], ids=["few", "many"]
-)
+@pytest.mark.parametrize("sets", [40, pytest.param(10_000, marks=pytest.mark.long)], ids=["few", "many"])
 @pytest.mark.fault("many-sets")
+@pytest.mark.slow
 def test_many_data_sets_in_flat_memory(tmp_path, sets):
     early, late, first = estimate_many(tmp_path, sets)
     assert late - early < 60 + 0.008 * sets, "MB; what is told of each data set at the end is kept, no more"
     assert first < 30
 
 
-@pytest.mark.parametrize("rows", [20_000, pytest.param(10**6, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.parametrize("rows", [20_000, pytest.param(10**6, marks=pytest.mark.long)])
 @pytest.mark.fault("many-rows")
+@pytest.mark.slow
 def test_a_long_data_file(tmp_path, rows):
     """Every row is an observation; memory stays at a few arrays of members by observations."""
     path = write_campaign(tmp_path, 1)

@@ -106,8 +106,9 @@ def test_ctrl_c_at_a_terminal(tmp_path, kind, presses):
     assert_same_results(out, tmp_path / "quiet")
 
 
-@pytest.mark.parametrize("kind", [pytest.param("processes", marks=pytest.mark.slow), "serial"])
+@pytest.mark.parametrize("kind", ["processes", "serial"])
 @pytest.mark.fault("interrupt")
+@pytest.mark.slow
 def test_a_terminal_that_is_gone(tmp_path, kind):
     """SIGHUP comes when it is closed, and nothing can be told any more: the exit code and the run say it."""
     path, out = make_campaign(tmp_path, 4, "execution_models:Waits"), tmp_path / "run"
@@ -133,8 +134,9 @@ def test_nohup_stays_in_force():
         signal.signal(signal.SIGHUP, before)
 
 
-@pytest.mark.parametrize("kind", ["processes", pytest.param("dask", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["processes", "dask"])
 @pytest.mark.fault("kill-workers")
+@pytest.mark.slow
 def test_workers_end_with_the_main_process(tmp_path, kind):
     path, out = make_campaign(tmp_path, 4, "execution_models:Waits"), tmp_path / "run"
     process = subprocess.Popen(

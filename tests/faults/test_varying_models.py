@@ -73,6 +73,7 @@ def test_it_can_be_accepted(tmp_path):
 
 
 @pytest.mark.fault("model-varies")
+@pytest.mark.slow
 def test_the_command_line_ends_with_one_line(tmp_path):
     path = write_toy(tmp_path, ("toy_models:Oscillator", "execution_models:Noisy"))
     done = run_cli("run", path, "--out", tmp_path / "run", "--no-report")

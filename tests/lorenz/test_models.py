@@ -149,6 +149,7 @@ def test_written_against_the_public_interface_in_few_lines():
         assert "from en4dvar." not in text or path.name == "rk4.py", path.name  # which compiles for all of them
 
 
+@pytest.mark.slow
 def test_compiled_code_is_kept_for_later_processes():
     """It is compiled here, or was before; then another process finds it."""
     code = "import numpy as np\n"

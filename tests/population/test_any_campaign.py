@@ -48,6 +48,7 @@ def log_marginal(problem: InverseProblem, mean: np.ndarray, variance: np.ndarray
     return density.logpdf(problem.observations.values - mean @ H.T) + k * np.log(STD * np.sqrt(2 * np.pi))
 
 
+@pytest.mark.slow
 def test_population_of_a_linear_hierarchy(campaign):
     prior, runs = campaign[0].prior, ForwardRuns(campaign)
     start = prior.mean + 0.3 * np.random.default_rng(0).standard_normal((SETS, 20, 2))
@@ -85,6 +86,7 @@ def test_a_sweep_finds_the_time_shift():
     assert [p.name for p in found.parameters] == ["a", "b"]
 
 
+@pytest.mark.slow
 def test_a_sweep_has_the_same_bits_in_processes(campaign):
     sets = [replace(p, model=campaign[0].model) for p in campaign[:2]]
     settings = SweepSettings(64, 0.1, 0.05, chunk=32, rounds=1, local=8)

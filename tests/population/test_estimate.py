@@ -240,6 +240,7 @@ def test_what_an_emulator_misses_widens_its_likelihood():
     assert told[2] == pytest.approx(-10 * (4.6 / (2 * line.std()) - 3) ** 2, rel=0.01)
 
 
+@pytest.mark.slow
 def test_interim_draws_have_the_moments_of_quadrature():
     runs, rng = Curved(n_sets=3), np.random.default_rng(2)
     x = runs.truth[:, None] + 0.6 * rng.standard_normal((3, 600, 2))
@@ -305,7 +306,11 @@ def test_a_gaussian_likelihood_has_the_marginal_of_a_gaussian():
     assert told[1] - told[0] == pytest.approx(exact[1] - exact[0], abs=0.1)
 
 
-@pytest.mark.parametrize(("shift", "shrink"), [(0, 1), (0, 0.2), (1, 0.5)], ids=["fitting", "narrow", "beside"])
+@pytest.mark.parametrize(
+    ("shift", "shrink"),
+    [pytest.param(0, 1, marks=pytest.mark.slow), (0, 0.2), (1, 0.5)],
+    ids=["fitting", "narrow", "beside"],
+)
 def test_marginals_are_unbiased_and_their_draws_the_posterior_however_bad_the_mixtures(shift, shrink):
     """Mixtures of a fifth of the standard deviation, or beside the likelihood, alone would give unbounded weights."""
     case, count, repeats = LinearSets(), 60, 4000

@@ -62,6 +62,7 @@ def test_the_next_spring_is_less_certain_than_the_mean(found):
     assert found[0].combinations == ()
 
 
+@pytest.mark.slow
 def test_the_command_and_a_damaged_file(campaign, tmp_path, monkeypatch):
     monkeypatch.setattr("en4dvar.population.estimate.Effort", lambda: SMALL)
     monkeypatch.chdir(tmp_path)

@@ -122,6 +122,7 @@ def test_paper_shows_the_same():
     assert [text.get_text() for text in empty.texts] == ["+0.5"]
 
 
+@pytest.mark.slow
 def test_a_page_imports_no_matplotlib(analysis, tmp_path):
     """Its import takes longer than the whole page."""
     from en4dvar.report.result import Result

@@ -25,7 +25,8 @@ def quiet(tmp_path_factory):
     return path, folder / "run", Stops.calls
 
 
-@pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.slow)], ids=["some", "all"])
+@pytest.mark.parametrize("step", [7, 1], ids=["some", "all"])
+@pytest.mark.slow
 def test_interrupted_at_any_forecast(quiet, tmp_path, step):
     path, run, n_calls = quiet
     told = []

@@ -61,7 +61,8 @@ def test_resumed_in_later_descents():
         assert_same_bits(run(problem, AssimilationSettings(members=9), state)[0], whole)
 
 
-@pytest.mark.parametrize("scheme", ["en4dvar", pytest.param("es-mda", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("scheme", ["en4dvar", "es-mda"])
+@pytest.mark.slow
 def test_refinement_resumed_from_any_look_at_the_chain(scheme, monkeypatch):
     """The chain goes on where it was, with the same draws; its runs are not repeated and still counted."""
     monkeypatch.setattr(mcmc.sample, "__kwdefaults__", {**mcmc.sample.__kwdefaults__, "max_steps": 210})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from run_files import make_campaign
 
 from en4dvar.forward import ForwardModel
@@ -12,6 +13,7 @@ from en4dvar.runs.runner import run_campaign
 from en4dvar.sampling.forward_runs import ForwardRuns, log_likelihood
 
 
+@pytest.mark.slow
 def test_a_cheap_model_is_sampled_and_another_says_so(tmp_path, monkeypatch):
     overrides = {"output.report": False, "output.directory": str(tmp_path / "run")}
     run = run_campaign(make_campaign(tmp_path, n=2), overrides=overrides).directory

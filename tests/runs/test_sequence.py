@@ -212,6 +212,7 @@ def test_other_commands_say_what_it_is(folder):
         run_sequence(written(folder, data={**BASE["data"], "path": "none.csv"}))
 
 
+@pytest.mark.slow
 def test_report_of_a_sequence(folder):
     result = run_sequence(written(folder, assimilation={"scheme": "ienks", "members": 20, "lag": 2},
                                   output={"report": True, "figures": True}))  # fmt: skip

@@ -68,6 +68,7 @@ def test_density_of_a_vector_with_gaps(members, p, correlated):
     assert found[2] == 0  # nothing was observed
 
 
+@pytest.mark.slow
 def test_sequences_are_compared_by_their_evidence(folder):
     right, _ = conducted()
     wrong, _ = conducted("wrong", parameters={"c": {"prior": "normal", "mean": 3, "std": 0.3}})
@@ -95,6 +96,7 @@ def test_what_has_no_evidence_is_told(folder):
         compare_sequences([right, right])
 
 
+@pytest.mark.slow
 def test_tables(folder):
     run_dir, result = conducted()
     rows = list(csv.DictReader(io.StringIO(cycles_table(run_dir / "sequence.nc", "csv"))))

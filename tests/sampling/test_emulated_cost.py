@@ -130,6 +130,7 @@ def nothing_cleared(monkeypatch):
     monkeypatch.setattr("en4dvar.sampling.shape.CLEARED", 1.0)
 
 
+@pytest.mark.slow
 def test_shift_and_ratio_are_those_of_the_posterior(nothing_cleared):
     """Against the posterior on a grid, in units of its standard deviation.
 

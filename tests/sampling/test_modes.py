@@ -59,7 +59,9 @@ def test_a_chain_moves_between_the_wells(case):
     assert positive == pytest.approx(mass_of_positive(problem), abs=0.03)
 
 
-@pytest.mark.parametrize(("refine", "by"), [("auto", "importance"), ("mcmc", "mcmc")])
+@pytest.mark.parametrize(
+    ("refine", "by"), [("auto", "importance"), pytest.param("mcmc", "mcmc", marks=pytest.mark.slow)]
+)
 def test_as_many_draws_are_effective_as_are_asked_for(refine, by):
     few, many = (assimilate(two_wells(), AssimilationSettings(refine=refine, draws=n), 1) for n in (400, 4000))
     assert few.refinement[f"{by}_effective_sample_size"] >= 400

@@ -148,6 +148,7 @@ def test_a_file_of_an_earlier_version_has_errors_and_paths_in_the_same_groups(re
 
 
 @pytest.mark.filterwarnings("ignore")  # of ArviZ, about what it will be and the few members
+@pytest.mark.slow
 def test_arviz_draws_it_without_arguments(result, tmp_path):
     """Wherever every member lives; ``plot_loo_pit`` of ArviZ 0 wants the name of the observable, and that is all."""
     az = pytest.importorskip("arviz")
