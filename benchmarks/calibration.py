@@ -4,7 +4,8 @@
     python benchmarks/calibration.py b                 wide priors, ``refine: mcmc``
     python benchmarks/calibration.py laser             laser-induced bubbles with rebounds, default settings
     python benchmarks/calibration.py rebound           acoustic, through the rebound, wide priors, default settings
-    python benchmarks/calibration.py stiff             a stiff gel as ``init`` proposes it, default settings
+    python benchmarks/calibration.py stiff             a stiff gel, polytropic gas, priors of ``init``, default settings
+    python benchmarks/calibration.py proposed          the same, gas of ``init``: heat, vapour, conducting medium
     python benchmarks/calibration.py b --minutes 4     a piece of it: records are kept and the next call goes on
 
 Over ``--n`` experiments: rank histograms of every parameter uniform (chi-squared, p > 0.01), central 50 and 90 %
@@ -20,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from acoustic_twin import NARROW, WIDE, make_twin, prior, through_the_collapse
-from laser_twin import laser_prior, make_laser_twin, stiff_gel
+from laser_twin import PROPOSED, laser_prior, make_laser_twin, stiff_gel
 from records import Record, fill
 from scipy.stats import binomtest, chisquare
 from worlds import Twin
@@ -95,17 +96,24 @@ def rebound(key: str) -> Record:
 
 
 def stiff(key: str) -> Record:
-    """A stiff gel with the priors of ``init``, as a user would run it."""
+    """A stiff gel with the priors of ``init`` and a polytropic gas, as a user would run it."""
     return experiment(int(key), stiff_gel(int(key)), AssimilationSettings(what_if=False))
 
 
+def proposed(key: str) -> Record:
+    """A stiff gel with the priors and the gas of ``init``, truth and fit, as a user would run it."""
+    return experiment(int(key), stiff_gel(int(key), PROPOSED), AssimilationSettings(what_if=False))
+
+
 REBOUND = through_the_collapse(np.linspace(4e-6, 60e-6, 30), WIDE)
+STIFF = stiff_gel(0).problem.prior
 CASES = {
     "a": (narrow, prior(NARROW)),
     "b": (wide, prior(WIDE)),
     "laser": (laser, laser_prior()),
     "rebound": (rebound, prior(WIDE)),
-    "stiff": (stiff, stiff_gel(0).problem.prior),
+    "stiff": (stiff, STIFF),
+    "proposed": (proposed, STIFF),
 }
 
 

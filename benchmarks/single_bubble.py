@@ -16,7 +16,7 @@ import numpy as np
 from en4dvar_bubble import BubbleModel
 from en4dvar_bubble.packing import pack
 from en4dvar_bubble.solver.arrays import Loaded
-from en4dvar_bubble.solver.integrate import _workspace
+from en4dvar_bubble.solver.integrate import groups
 from en4dvar_bubble.solver.lanes import WIDTH, load, store
 from en4dvar_bubble.solver.rows import TABLE
 from en4dvar_bubble.solver.step import _rhs
@@ -30,9 +30,9 @@ _STEP = 1.5e-8  # relative, of the differences
 
 
 @nb.njit
-def _rates(t, y, out, wall, eq, par, elastic, block, edges):
+def _rates(t, y, out, wall, eq, par, elastic, scratch):
     """dy/dt to ``out`` (n, WIDTH) at the states ``y`` (n, WIDTH)."""
-    w = _workspace(block, edges)
+    w, _ = groups(scratch)
     store(w.t_stage, 0, t)
     for i in range(len(y)):
         store(w.stage, i, load(y, i))
@@ -42,7 +42,7 @@ def _rates(t, y, out, wall, eq, par, elastic, block, edges):
 
 
 @nb.njit
-def _derivatives(t, y, out, wall, eq, par, elastic, block, edges):
+def _derivatives(t, y, out, wall, eq, par, elastic, scratch):
     """∂f/∂y to ``out`` (n, n) at the state ``y`` (n,)."""
     n = len(y)
     moved, f = np.empty((n, WIDTH)), np.empty((n, WIDTH))
@@ -50,7 +50,7 @@ def _derivatives(t, y, out, wall, eq, par, elastic, block, edges):
         moved[:, :] = y.reshape(n, 1)
         for lane in range(min(WIDTH - 1, n - first)):
             moved[first + lane, lane] += _STEP * max(abs(y[first + lane]), 1e-3)
-        _rates(t, moved, f, wall, eq, par, elastic, block, edges)
+        _rates(t, moved, f, wall, eq, par, elastic, scratch)
         for lane in range(min(WIDTH - 1, n - first)):
             j = first + lane
             out[:, j] = (f[:, lane] - f[:, WIDTH - 1]) / (moved[j, lane] - y[j])
@@ -71,7 +71,7 @@ class Bubble:
         par[TABLE] = np.arange(WIDTH) * scratch.elastic[0].size
         fill(np.repeat(members.samples[i : i + 1], WIDTH, axis=0), members.factor, scratch.elastic)
         equations = solver.equations(packed.memory, packed.viscous, packed.pulse)
-        self._rest = wall, equations, par, scratch.elastic, scratch.block, scratch.edges
+        self._rest = wall, equations, par, scratch.elastic, scratch
         self._lanes, self._found = np.empty((self.n, WIDTH)), np.empty((self.n, WIDTH))
 
     def rates(self, t: float, y: Array, out: Array) -> None:

@@ -54,6 +54,10 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
         "caution",
         "look at the figure of the residuals and at these readings before quoting the intervals",
     ),
+    "discrepancy-found": (
+        "caution",
+        "look at the what-if table, and compare with other models, before quoting a value",
+    ),
     "not-bayesian": (
         "caution",
         "say in every quotation how readings were weighted; for the Bayesian posterior state the errors as they are "
@@ -115,6 +119,9 @@ TRIGGERS = {
     "odd-residuals": (
         "residuals are larger where the observable changes fast, or one is an outlier; by chance this would happen "
         "once in a thousand times"
+    ),
+    "discrepancy-found": (
+        "95 % of the members have a discrepancy (discrepancy: estimated) of more than a quarter of the readings' error"
     ),
     "not-bayesian": "readings count with weights other than 0 and 1",
     "overstated-error": "χ² is smaller than the errors explain, except once in two thousand times",

@@ -24,6 +24,7 @@ from en4dvar.kernel_cache import compile_once
 
 F = TypeVar("F", bound=Callable[..., Any])
 CACHE = "NUMBA_CACHE_DIR"
+_NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 KERNELS: list[Any] = []
 """Every kernel that has been declared so far in this process."""
 
@@ -42,6 +43,28 @@ def kernel_without_allocation(function: F) -> F:
     """A :func:`kernel` that makes no arrays: no references to them need be counted."""
     options: dict[str, Any] = {"_nrt": False}  # which numba's annotations leave out
     return _compiled(function, numba.njit(cache=True, nogil=True, **options))
+
+
+def kernel_called_by_address(function: F) -> F:
+    """A :func:`kernel_without_allocation` that only other kernels call, with the numbers that IEEE 754 gives a division
+    by zero.
+    """
+    options: dict[str, Any] = {"_nrt": False, **_NO_ENTRY}
+    return _compiled(function, numba.njit(cache=True, nogil=True, error_model="numpy", **options))
+
+
+def called(function: F) -> F:
+    """``function`` compiled into the kernels that call it. Not to be called from Python: entries for that take time
+    to compile.
+    """
+    compiled: F = numba.njit(**_NO_ENTRY)(function)
+    return compiled
+
+
+def inlined(function: F) -> F:
+    """The same, without a call."""
+    compiled: F = numba.njit(forceinline=True, **_NO_ENTRY)(function)
+    return compiled
 
 
 def summing_kernel(function: F) -> F:

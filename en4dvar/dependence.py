@@ -15,7 +15,6 @@ from typing import Literal
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.spatial.distance import cdist
 
 from en4dvar.errors import ConfigError
 from en4dvar.state import Array
@@ -34,6 +33,8 @@ KernelName = Literal["exponential", "matern-3/2", "matern-5/2", "gaussian"]
 
 def correlation_of_places(kernel: str, places: Array, length: float) -> Array:
     """Correlation matrix (m, m) of what has ``places`` (m, D), by a kernel of their distances over ``length``."""
+    from scipy.spatial.distance import cdist  # not needed to import the package
+
     found = (1 - NUGGET) * KERNELS[kernel](cdist(places, places) / length)
     np.fill_diagonal(found, 1.0)
     return np.asarray(found)

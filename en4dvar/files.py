@@ -43,13 +43,13 @@ def inside(root: str | Path, name: str | Path) -> Path:
     OutputError: ``name`` is absolute, empty or holds ``..``; a part of it is there as a link, a pipe, a socket or a
         device, through which something else would be read or written.
     """
-    given, path = Path(name), Path(root)
+    given, path = Path(name), os.fspath(root)
     if given.anchor or not given.parts or ".." in given.parts or "\0" in str(name):
-        raise OutputError(f"{path}: {str(name)!r} is not the name of a file in this directory")
+        raise OutputError(f"{root}: {str(name)!r} is not the name of a file in this directory")
     for part in given.parts:
-        path /= part
+        path = os.path.join(path, part)
         try:
-            mode = path.lstat().st_mode
+            mode = os.lstat(path).st_mode
         except FileNotFoundError:
             break
         except OSError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
@@ -68,6 +69,7 @@ def natural(path: Path) -> tuple[list[list[str | int]], Path]:
     return [numbered(part) for part in path.with_suffix("").parts], path
 
 
+@functools.lru_cache(maxsize=1024)  # the folders of many files are the same
 def numbered(name: str) -> list[str | int]:
     """Key to sort by: numbers in a name by their size, so that ``bubble10`` comes after ``bubble2``.
 

@@ -192,8 +192,12 @@ class Stages:
         """
         space = self.space
         if self.settings.refine != "mcmc":
-            shape = examine_shape(space, ends.members, ends.mode, self.costs(ends.members, ends.run), self.seed)
-            if not (samples(space) and minima and in_doubt(minima, agree, shape)):
+            cheap = samples(space)
+            # with a discrepancy emulated J costs as much as true J: where that may be sampled, it tells
+            settle = not (cheap and self.problem.discrepancy)
+            costs = self.costs(ends.members, ends.run)
+            shape = examine_shape(space, ends.members, ends.mode, costs, self.seed, settle)
+            if not (cheap and minima and in_doubt(minima, agree, shape)):
                 return Sampled(ends, None, shape)
         sampled = self.refine(ends.members, minima, earlier)
         run = space.forecast(sampled.members, self.grid)

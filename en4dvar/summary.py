@@ -14,7 +14,7 @@ from en4dvar.caution import Caution, codes, of_several_modes, untrusted
 from en4dvar.diagnostics import HARDLY_INFORMED, active_members, change_words
 from en4dvar.response.what_if import Shift
 from en4dvar.state import Array, Parameter
-from en4dvar.tables import csv_text, table
+from en4dvar.tables import table
 from en4dvar.units import convert
 
 MOST_REMARKS = 3
@@ -161,25 +161,21 @@ def estimate_cells(row: ParameterSummary) -> tuple[str, ...]:
     return tuple(f"{v:.4g}" for v in (row.mean, row.std, row.q05, row.q50, row.q95))
 
 
-def summary_csv(
+def summary_rows(
     summaries: Iterable[tuple[str, Iterable[ParameterSummary], Iterable[Caution]]], failures: Mapping[str, str]
-) -> str:
-    """One line a data set and parameter, every digit kept; one line a data set that failed.
+) -> Iterator[Sequence[object]]:
+    """Rows of ``summary.csv``: one a data set and parameter, every digit kept; one a data set that failed.
 
     ``summaries``: (name of the data set, its rows, its warnings: column ``warnings`` holds their codes);
     ``failures``: name of the data set → reason, column ``failure``. An interval that is not to be trusted is left out,
     and column ``untrusted`` says for which warnings; so are mean and standard deviation of several modes, which
     ``informed`` says.
     """
-
-    def lines() -> Iterator[Sequence[object]]:
-        yield ["dataset", *CSV_COLUMNS, "failure", "warnings"]
-        for name, summary, cautions in summaries:
-            warned = " ".join(codes(cautions))
-            yield from ([name, *csv_cells(row), "", warned] for row in summary)
-        yield from ([name, *("" for _ in CSV_COLUMNS), reason, ""] for name, reason in failures.items())
-
-    return csv_text(lines())
+    yield ["dataset", *CSV_COLUMNS, "failure", "warnings"]
+    for name, summary, cautions in summaries:
+        warned = " ".join(codes(cautions))
+        yield from ([name, *csv_cells(row), "", warned] for row in summary)
+    yield from ([name, *("" for _ in CSV_COLUMNS), reason, ""] for name, reason in failures.items())
 
 
 CSV_COLUMNS = tuple(f.name for f in fields(ParameterSummary) if f.name not in ("label", "symbol", "modal"))

@@ -5,6 +5,10 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import IO
+
+from en4dvar.files import atomic_path
 
 _FORMULA = tuple("=+-@＝＋－＠")  # a spreadsheet evaluates a cell that begins so; in wide characters as well
 
@@ -21,18 +25,29 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
     Text that a spreadsheet would take for a formula begins with an apostrophe: names come from files of anybody.
     """
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([_plain(cell) for cell in row] for row in rows)
+    _write(text, rows)
     return text.getvalue()
 
 
-def _plain(cell: object) -> object:
+def write_csv(path: Path, rows: Iterable[Sequence[object]]) -> Path:
+    """The text of :func:`csv_text` as a file, without having it in memory. Raises :class:`OutputError`."""
+    with atomic_path(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+        _write(file, rows)
+    return path
+
+
+def _write(file: IO[str], rows: Iterable[Sequence[object]]) -> None:
+    csv.writer(file, lineterminator="\n").writerows(
+        [_plain(cell) if isinstance(cell, str) else cell for cell in row] for row in rows
+    )
+
+
+def _plain(cell: str) -> str:
     """A cell that is no formula: text as it is, or behind an apostrophe; without the line breaks of old.
 
-    >>> _plain("=1+1"), _plain("-a"), _plain("-1.5"), _plain("a=b"), _plain(-1.5)
-    ("'=1+1", "'-a", '-1.5', 'a=b', -1.5)
+    >>> _plain("=1+1"), _plain("-a"), _plain("-1.5"), _plain("a=b")
+    ("'=1+1", "'-a", '-1.5', 'a=b')
     """
-    if not isinstance(cell, str):
-        return cell
     cell = cell.replace("\r", " ")  # csv does not quote it, and a new line begins there
     if not (cell[:1] in ("\t", "\n") or cell.lstrip()[:1] in _FORMULA):
         return cell

@@ -9,13 +9,13 @@ import numpy as np
 
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.forward import Failure, ForwardModel, Observable, StateField, Trajectory
-from en4dvar.noise import noise_of
+from en4dvar.noise import Kernel, noise_of
 from en4dvar.observations import Observations
 from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import InverseProblem
+from en4dvar.problem import InverseProblem, discrepancy_parameters
 from en4dvar.schemes import window_scheme
 from en4dvar.schemes.base import Weights
-from en4dvar.state import Field, Parameter, StateLayout
+from en4dvar.state import NOISE_SCALE, Field, Parameter, StateLayout
 
 OBSERVABLE = Observable("y", "m", StateField("y", rate_of="v"))
 
@@ -144,6 +144,19 @@ def make_problem(model, truth, *, std=0.1, time_std=0.0, weights=1.0, seed=1, k=
     )
     observations = make_observations(times, values, std, time_std, weights)
     return InverseProblem(model, OBSERVABLE, observations, Prior(tuple(terms)))
+
+
+def with_discrepancy(
+    problem, *, sigma=None, huber=None, correlation=None, amplitude=(0.2, 0.5), length=(0.6, 0.4), **kernel
+):
+    """The problem with a discrepancy whose amplitude and length have lognormal priors (median, log std)."""
+    o = problem.observations
+    noise = noise_of(o.noise.std, o.noise.time_std, correlation, huber, Kernel(o.times, **kernel))
+    parameters = discrepancy_parameters(problem.model, problem.observable)
+    terms = [*problem.prior.terms, *map(PriorTerm.lognormal, parameters, *zip(amplitude, length, strict=True))]
+    if sigma is not None:
+        terms.append(PriorTerm.lognormal(NOISE_SCALE, 1.0, sigma))
+    return replace(problem, observations=replace(o, noise=noise), prior=Prior(tuple(terms)))
 
 
 class Dying(Linear):

@@ -67,7 +67,7 @@ def compare(
     Example:
       en4dvar compare runs/neo_hookean runs/quadratic
     """
-    from en4dvar.report.compare import compare_runs, comparison_table, estimates_table
+    from en4dvar.report.compare import compare_runs, comparison_table, estimates_table, with_evidences
     from en4dvar.storage.cycles_file import cycles_file
 
     if any(map(cycles_file, run_dirs)):
@@ -80,7 +80,7 @@ def compare(
         from en4dvar.runs.evidence_run import sampled_evidences
 
         evidences = [sampled_evidences(run_dir, workers, trust, None, tell) for run_dir in run_dirs]
-        comparison = compare_runs(run_dirs, evidences)
+        comparison = with_evidences(comparison, evidences)
     if len(comparison.estimates) <= MOST_ROWS:
         click.echo(f"{estimates_table(comparison)}\n")
     click.echo(comparison_table(comparison))

@@ -74,12 +74,11 @@ def run(
 
 
 def _estimate(config: Config, force: bool, resume: bool) -> None:
-    from en4dvar.config.build import data_files, inverse_plan
     from en4dvar.executor import available_cores
     from en4dvar.runs.progress import terminal_progress
     from en4dvar.runs.runner import run_campaign
 
-    with continuable(), terminal_progress(len(data_files(inverse_plan(config)))) as progress:
+    with continuable(), terminal_progress() as progress:
         campaign = run_campaign(
             config, force=force, resume=resume, progress=progress, command=command_line(),
             report_workers=config.execution.workers or available_cores(),

@@ -9,7 +9,7 @@ from math import prod
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from en4dvar.config.context import Context, Made, quantity, time_unit
 from en4dvar.config.schema import QuantityText, Section, section_of
@@ -105,8 +105,6 @@ _SampleSizes: Any = section_of(SampleSizes)
 
 class Design(_SampleSizes):
     """Which experiments ``en4dvar design`` compares, and about what."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
 
     about: tuple[str, ...] = ()
     """Parameters that are asked for; the others stay uncertain. Default: all that have a prior."""

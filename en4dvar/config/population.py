@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from en4dvar.config.document import Document
 from en4dvar.config.parameters import Entry, Uncertain
@@ -20,8 +20,6 @@ _HyperPrior: Any = section_of(HyperPrior)
 
 class PopulationSection(_HyperPrior):
     """Mean and spread of parameters over the data sets of the run, estimated at its end."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
 
     of: Annotated[tuple[str, ...], Field(min_length=1)]
     """Parameters that vary from data set to data set about a common mean, e.g. [G, mu]."""

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_type_hints
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
     ConfigDict,
     Field,
     WithJsonSchema,
@@ -26,26 +25,23 @@ from pydantic_core import from_json, to_json
 
 from en4dvar.config.context import Context, Made, Unknown, quantity
 from en4dvar.config.validate import Faults
+from en4dvar.described import Described
 from en4dvar.executor.limits import Limits, parse_bytes
 from en4dvar.problem import AssimilationSettings, Localising
 from en4dvar.schemes import ON_A_WINDOW
 from en4dvar.units import Quantity, parse_quantity
 
 QuantityText = str | int | float
-# For a class that stands in no file: pydantic would search all of them for its text.
-IN_NO_FILE = {"use_attribute_docstrings": False}
 Name = Annotated[str, Field(pattern=r"^\w[\w.+ -]*$", max_length=100)]
 
 
-class Section(BaseModel):
+class Section(Described):
     """Base of every section: unknown keys are errors, values cannot change, numbers are finite.
 
     The text below a key is its description in ``en4dvar schema`` and in the reference of keys.
     """
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
 
     @classmethod
     def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
@@ -83,17 +79,14 @@ def _plain(value: Any) -> Any:
 
 
 def section_of(*kinds: Any, base: type[Section] = Section) -> Any:
-    """``base`` with the fields of dataclasses, declared there as ``members: Annotated[int, Ge(3), "Size."] = 48``.
-
-    A section below it with more keys, and texts below them, turns ``use_attribute_docstrings`` on again.
-    """
+    """``base`` with the fields of dataclasses, declared there as ``members: Annotated[int, Ge(3), "Size."] = 48``."""
     declared: dict[str, Any] = {}
     for kind in kinds:
         hints = get_type_hints(kind, include_extras=True)
         for field in fields(kind):
             words = [text for text in getattr(hints[field.name], "__metadata__", ()) if isinstance(text, str)]
             declared[field.name] = (hints[field.name], Field(field.default, description=" ".join(words) or None))
-    return create_model(f"{base.__name__}Of", __base__=base, __cls_kwargs__=IN_NO_FILE, **declared)
+    return create_model(f"{base.__name__}Of", __base__=base, **declared)
 
 
 def _size(text: str) -> str:
@@ -204,8 +197,6 @@ else:
 
 class Assimilation(_Settings):
     """The settings of the scheme, declared at :class:`AssimilationSettings`, and how observations count."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
 
     scheme: OnAWindow = AssimilationSettings.scheme
     """en4dvar (iterative ensemble smoother), es-mda (multiple data assimilation), or the one analysis of a filter:

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from en4dvar.config.context import TEXT, Context, Made, Spread, parse_spread, quantity, read_each, subject_unit
 from en4dvar.config.initial_state import dynamic_fields
@@ -109,8 +109,6 @@ _Iterations: Any = section_of(*_KINDS.values(), base=_Scheme)
 
 class Sequential(_Iterations):
     """The scheme and what it does to the ensemble."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
 
     inflation: Annotated[float, Field(gt=0)] = 1.0
     """Factor on the anomalies after each analysis; 1 is none."""

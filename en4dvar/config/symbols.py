@@ -14,9 +14,14 @@ GREEK = (
     "alpha|beta|gamma|delta|epsilon|varepsilon|zeta|eta|theta|vartheta|iota|kappa|lambda|mu|nu|xi|pi|rho|sigma|tau|"
     "upsilon|phi|varphi|chi|psi|omega|Gamma|Delta|Theta|Lambda|Xi|Pi|Sigma|Phi|Psi|Omega|infty|ell"
 )
+FUNCTIONS = "exp|ln|log|max|min"
 _LETTER = rf"(?:[A-Za-z0-9]|\\(?:{GREEK})(?![A-Za-z]))"
-_ATOM = rf"(?:{_LETTER}(?:[_^](?:{_LETTER}|\{{[\w, ]+\}}|\{{\\mathrm\{{\w+\}}\}}))?|\\dot\{{[A-Za-z]\}}|[|/()+=,-])"
-_SIMPLE = re.compile(rf"[^$\\]*|\${_ATOM}+\$", re.ASCII)
+_ROMAN = r"\\mathrm\{[A-Za-z0-9]+\}"
+_GROUP = rf"\{{(?:[A-Za-z0-9](?:[, ]*[A-Za-z0-9])*|{_ROMAN}|\\(?:{FUNCTIONS}))\}}"
+_BESIDE = rf"[_^](?:{_LETTER}|{_ROMAN}|{_GROUP})"
+_ATOM = rf"(?:{_LETTER}(?:{_BESIDE})?|\\dot\{{[A-Za-z]\}}|\\(?:{FUNCTIONS})(?![A-Za-z])|[|/()+=,-])"
+FORMULA = rf"\$(?:{_ATOM} ?)+\$"
+_SIMPLE = re.compile(rf"[^$\\]*|{FORMULA}", re.ASCII)
 
 
 def check_symbols(things: Iterable[Parameter | Observable]) -> None:

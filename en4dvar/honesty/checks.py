@@ -32,6 +32,8 @@ ODD = 1e-3  # probability below which residuals are told to be odd
 BEYOND = 0.1  # share of members beyond a limit of the model
 MOVED, WIDENED = 0.3, 0.5  # mean in prior std, relative variance: beyond, a posterior is not its prior
 SERIOUS: Severity = "serious"
+THERE = 0.25  # of the errors' std: a discrepancy beyond it in nearly all members is there
+NINE_OF_TEN = (0.05, 0.95)
 SILENT = 0.1  # DFS of all readings beyond it that count as none
 EXTRAPOLATED = "no action is needed for the parameters; paths beyond the limit are extrapolated"
 Findings = Iterator[Caution]
@@ -99,6 +101,26 @@ def structure(residuals: Residuals | None, robust: bool, unit: str, times: Array
             f"off (probability {_chance(probability)}); its leverage is {residuals.leverage[place]:.0%}"
         )
         yield caution("odd-residuals", words)
+
+
+def missed(analysis: Analysis) -> Findings:
+    """A discrepancy that is there: what the residuals show of it widens the intervals, what parameters absorbed does
+    not.
+    """
+    names, amplitude = analysis.problem.prior.names, next(iter(analysis.problem.discrepancy), None)
+    if amplitude is None or amplitude.name not in names:
+        return
+    low, high = np.nanquantile(analysis.posterior[:, names.index(amplitude.name)], NINE_OF_TEN)
+    error = float(np.median(analysis.error_std))
+    if low > THERE * error:
+        sizes = convert(np.array([low, high, error]), amplitude.unit, amplitude.display_unit)
+        least, most, noise = (shown(size, amplitude) for size in sizes)
+        words = (
+            f"the model misses the readings by {least} to {most} (standard deviation of the discrepancy, 5 to 95 %), "
+            f"beside errors of {noise}: the intervals allow for what shows in the residuals, not for what the "
+            "parameters have absorbed"
+        )
+        yield caution("discrepancy-found", words)
 
 
 def _chance(probability: float) -> str:

@@ -71,6 +71,7 @@ def examine(
         *loss("posterior forecast", a.posterior_failures, prior, control.posterior),
         *_fit(a, odd),
         *odd,
+        *checks.missed(a),
         *(checks.conflict(prior, control.centre) if control.costs is not None else ()),
         *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
         *_validity(a, alive),

@@ -40,7 +40,7 @@ class TimeStep:
     value: float = 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)  # of 10⁵ data sets all are in memory
 class DataFile:
     """Where one data set is: a file, or of a file that holds several the ``part``, as :func:`parts_of` names it.
 
@@ -54,6 +54,8 @@ class DataFile:
     @property
     def paths(self) -> tuple[Path, ...]:
         """The files of all its series, each once."""
+        if not self.others:
+            return (self.path,)
         return tuple(dict.fromkeys((self.path, *(path for other in self.others for path in other.paths))))
 
 

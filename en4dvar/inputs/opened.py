@@ -20,7 +20,7 @@ SHEETS = (".xls", ".xlsb", ".ods")
 def opened(path: Path, layout: Layout) -> Iterator[Format]:
     """The format of a file that is there. Raises :class:`DataError`, also where reading inside fails."""
     require_file(path)
-    kind = layout.format or SUFFIXES.get(path.suffix.lower())
+    kind = format_of(path, layout)
     if kind is None:
         hint = (
             "save the sheet as CSV"
@@ -30,6 +30,11 @@ def opened(path: Path, layout: Layout) -> Iterator[Format]:
         raise DataError(f"{path}: the format cannot be told from the suffix {path.suffix!r}; {hint}")
     with readable(path):
         yield kind
+
+
+def format_of(path: Path, layout: Layout) -> Format | None:
+    """As it is said, else that of the suffix, where it is known."""
+    return layout.format or SUFFIXES.get(path.suffix.lower())
 
 
 @contextmanager

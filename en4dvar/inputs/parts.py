@@ -11,7 +11,7 @@ from en4dvar.errors import DataError
 from en4dvar.hints import listed
 from en4dvar.inputs.asked import ANY, Column, Format, Layout
 from en4dvar.inputs.matfile import mat_variables
-from en4dvar.inputs.opened import opened
+from en4dvar.inputs.opened import format_of, opened
 from en4dvar.inputs.sheets import sheet_lines
 from en4dvar.inputs.text_table import Table, matches, scalars_in
 from en4dvar.inputs.variables import Variables, indexed
@@ -45,12 +45,14 @@ def parts_of(path: Path, value: Column, layout: Layout = ANY, time: str | None =
     ``expts(2).R``, …; or what the column ``by`` of a table says. Raises :class:`DataError`.
     """
     several = "*" in value.name
+    if layout.by is None and not several and format_of(path, layout) in ("csv", "xlsx"):
+        return ()  # whatever is in the file: of 10⁵ files each is opened where it is estimated
     with opened(path, layout) as kind:
         if kind != "mat":
             table = table_of(path, kind, layout, [value.name, *(one for one in (time, layout.by) if one is not None)])
             if layout.by is not None:
                 return _groups(table, layout.by)
-            if not several or value.name in table.names:
+            if value.name in table.names:
                 return ()
             return tuple(name for name in table.names if matches(name, value.name) and name != time)
         _refuse_by(path, layout)

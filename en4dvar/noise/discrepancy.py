@@ -27,7 +27,7 @@ from en4dvar.noise.kernel import Kernel
 from en4dvar.noise.predicted import Linearisation, Predicted
 from en4dvar.state import Array
 
-AT_ONCE = 1 << 21  # elements of covariance matrices in one call
+AT_ONCE = 1 << 15  # elements of covariance matrices in one call: they stay in the processor's cache
 BORDER = 1e300  # beside it every square of a whitened residual is nothing
 SAME = 1e-12  # relative eigenvalue of an information that counts as none
 
@@ -194,7 +194,7 @@ class DiscrepancyNoise(Noise):
         return found
 
     def _in_parts(self, predicted: Predicted, arrays: int, evaluate: Callable[[Predicted], Sequence[Array]]) -> Array:
-        """(arrays, …, K) of what ``evaluate`` gives of some of the runs at a time, so many that they fit in memory."""
+        """(arrays, …, K) of what ``evaluate`` gives of some of the runs at a time."""
         runs = in_rows(predicted)
         found = np.empty((arrays, *runs.values.shape))
         chunk = max(1, AT_ONCE // runs.values.shape[-1] ** 2)

@@ -13,7 +13,6 @@ from typing import Annotated, Any, Self
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
@@ -22,6 +21,7 @@ from pydantic import (
     model_validator,
 )
 
+from en4dvar.described import Described
 from en4dvar.files import expanded
 from en4dvar.function_model import FunctionModel
 from en4dvar.hints import no_such_file, suggest
@@ -79,8 +79,8 @@ Unit = Annotated[str, AfterValidator(_unit)]
 File = Annotated[Path, BeforeValidator(_file, json_schema_input_type=str)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=True)
+class _Section(Described):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True)
 
 
 class ParameterOf(_Section):
@@ -176,14 +176,14 @@ class CommandSettings(_Section):
     """Name → unit, or a section: what is filled in."""
     outputs: Annotated[dict[str, OutputOf], Field(min_length=1)]
     """Observable → where its values are."""
-    templates: Templates = {}
+    templates: Templates = Field({})
     """Input files with {{ NAME }} for a parameter, {{ times }} for the observation times, or of PEST (ptf ~); the first
     one is {input}. Suffixes .j2, .tpl and .template are left out of the name; or write NAME: template."""
     files: Files = ()
     """Further files that are copied into the scratch directory."""
     time_unit: Unit = "s"
     """Unit of times."""
-    environment: dict[str, str] = {}
+    environment: dict[str, str] = Field({})
     """Environment variables, beside those of this process."""
     time_limit: Annotated[float, Quantity("s"), Field(gt=0)] | None = None
     """Longest that one run may take, e.g. 60 s; past it the program is ended and the member has failed."""

@@ -27,8 +27,8 @@ from en4dvar.storage.pack import PACK
 from en4dvar.storage.plain import PlainResult, load_plain
 from en4dvar.storage.population_file import FILE as POPULATION
 from en4dvar.storage.store import load_stored, result_files
-from en4dvar.summary import summary_csv
-from en4dvar.tables import csv_text
+from en4dvar.summary import summary_rows
+from en4dvar.tables import write_csv
 
 PAGES = 40  # data sets of a campaign with a page from the start
 SHARE = 20  # pages that are worth the start of a process
@@ -55,7 +55,7 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     stored, whole = result_files(run_dir), run_dir / "posterior.nc"
     if stored == [whole]:
         result = load_stored(whole)
-        write_text(run_dir / "summary.csv", summary_csv([(result.name, result.summary(), result.cautions)], {}))
+        write_csv(run_dir / "summary.csv", summary_rows([(result.name, result.summary(), result.cautions)], {}))
         _write_tables(run_dir, [_lines(result.plain)])
         figures = draw(all_figures(result), IDENTIFIERS, inside(run_dir, "figures") if files else None)
         return write_text(run_dir / "report.html", render_set(result, figures, copies=files))
@@ -66,7 +66,7 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
         lines.append(_lines(plain))
     _write_tables(run_dir, lines)
     failures = failed_datasets(whole)
-    write_text(run_dir / "summary.csv", summary_csv(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
+    write_csv(run_dir / "summary.csv", summary_rows(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
     return _write_campaign(run_dir, sets, failures, _asked(run_dir, sets, datasets), workers, files)
 
 
@@ -80,7 +80,7 @@ def _write_tables(run_dir: Path, sets: Sequence[tuple[Lines, ...]]) -> None:
     for (name, columns), part in zip(TABLES.items(), zip(*sets, strict=True), strict=True):
         lines = [line for of_set in part for line in of_set]
         if lines:
-            write_text(run_dir / name, csv_text([("dataset", *columns), *lines]))
+            write_csv(run_dir / name, [("dataset", *columns), *lines])
 
 
 def _asked(run_dir: Path, sets: Sequence[SetSummary], names: Sequence[str]) -> frozenset[str]:

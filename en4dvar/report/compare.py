@@ -21,7 +21,8 @@ from en4dvar.errors import OutputError
 from en4dvar.observations import Observations
 from en4dvar.report.text import fixed
 from en4dvar.state import Array
-from en4dvar.storage.store import StoredResult, load_stored, result_files
+from en4dvar.storage.plain import PlainResult
+from en4dvar.storage.store import StoredResult, plain_result, result_files
 from en4dvar.summary import ParameterSummary, estimate_cells
 from en4dvar.tables import table
 
@@ -133,14 +134,10 @@ class Comparison:
         )
 
 
-def compare_runs(
-    runs: Sequence[str | Path] | Mapping[str, str | Path | StoredResult],
-    sampled: Sequence[Mapping[str, float]] = (),
-) -> Comparison:
+def compare_runs(runs: Sequence[str | Path] | Mapping[str, str | Path | StoredResult]) -> Comparison:
     """Compare runs: laws on the same data, or gels.
 
-    ``runs``: run directories or result files (``.nc``); or name → one of these, or a result at hand. ``sampled``: of
-    each of them data set → log-evidence that takes the place of the result's.
+    ``runs``: run directories or result files (``.nc``); or name → one of these, or a result at hand.
 
     Raises
     ------
@@ -166,17 +163,28 @@ def compare_runs(
     if reason := _difference(results):
         scores = [_score(name, dataset, result) for name, held in results.items() for dataset, result in held.items()]
         return Comparison(tuple(scores), estimates, reason, cautions)
-    better = dict(zip(results, sampled, strict=True)) if sampled else {name: {} for name in results}
-    of_each = [
-        _ranked([_resampled(_score(*pair), better[pair[0]]) for pair in pairs if pair[1] == dataset])
-        for dataset in datasets
-    ]
+    return Comparison(_judged([_score(*pair) for pair in pairs], datasets), estimates, "", cautions)
+
+
+def with_evidences(comparison: Comparison, sampled: Sequence[Mapping[str, float]]) -> Comparison:
+    """The same with other evidences. ``sampled``: of each run data set → log-evidence in place of the result's."""
+    better = dict(zip(comparison.runs, sampled, strict=True))
+    scores = [_resampled(score, better[score.run]) for score in comparison.scores if score.dataset != ALL]
+    return replace(comparison, scores=_judged(scores, [name for name in comparison.datasets if name != ALL]))
+
+
+def _judged(scores: Sequence[ModelScore], datasets: Sequence[str]) -> tuple[ModelScore, ...]:
+    """The scores of each data set ranked, and behind those of several the sums."""
+    of_each: dict[str, list[ModelScore]] = {name: [] for name in datasets}
+    for score in scores:
+        of_each[score.dataset].append(score)
+    ranked = list(map(_ranked, of_each.values()))
     if len(datasets) > 1:
-        of_each.append(_ranked([_total(run) for run in zip(*of_each, strict=True)]))
-    return Comparison(tuple(score for ranked in of_each for score in ranked), estimates, "", cautions)
+        ranked.append(_ranked([_total(run) for run in zip(*ranked, strict=True)]))
+    return tuple(score for one in ranked for score in one)
 
 
-def _difference(results: Mapping[str, Mapping[str, StoredResult]]) -> str:
+def _difference(results: Mapping[str, Mapping[str, PlainResult]]) -> str:
     """Why the evidences of the runs do not compare; empty where all of them used the same data."""
     first, *others = results
     for name in others:
@@ -255,15 +263,15 @@ def _labels(runs: Sequence[Path]) -> list[str]:
     return labels
 
 
-def _results(run: str | Path | StoredResult) -> dict[str, StoredResult]:
+def _results(run: str | Path | StoredResult) -> dict[str, PlainResult]:
     """Data set → result of a run."""
     if isinstance(run, StoredResult):
-        return {run.name: run}
+        return {run.name: run.plain}
     files = [Path(run)] if Path(run).suffix == ".nc" else result_files(Path(run))
-    return {result.name: result for result in map(load_stored, files)}
+    return {result.name: result for result in map(plain_result, files)}
 
 
-def _same_data(a: StoredResult, b: StoredResult) -> bool:
+def _same_data(a: PlainResult, b: PlainResult) -> bool:
     ours, theirs = _stated(a.observations()), _stated(b.observations())
     return (a.axes, ours.keys()) == (b.axes, theirs.keys()) and all(
         ours[key].shape == theirs[key].shape and np.allclose(ours[key], theirs[key], rtol=1e-12, atol=0) for key in ours
@@ -283,9 +291,8 @@ def _stated(o: Observations) -> dict[str, Array]:
     }
 
 
-def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:
-    stats = result.sample_stats.attrs
-    likelihood = result.of_readings("log_likelihood", "")[0]
+def _score(run: str, dataset: str, result: PlainResult) -> ModelScore:
+    stats, likelihood = result.groups["/sample_stats"].attrs, result.log_likelihood
     return ModelScore(
         run,
         dataset,
@@ -294,7 +301,7 @@ def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:
         probability=float("nan"),
         chi2_per_observation=float(stats["chi2_per_observation"]),
         dfs=float(stats["dfs"]),
-        effective_parameters=_effective(likelihood[result.alive], result.sample_stats["dfs"].size),
+        effective_parameters=_effective(likelihood[result.alive], len(result.parameters)),
         nrmse=float(stats["nrmse"]),
         warnings=" ".join(codes(result.cautions)),
         doubted=" ".join(codes(c for c in result.cautions if c.spoils)),

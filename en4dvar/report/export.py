@@ -19,7 +19,7 @@ from en4dvar.config.symbols import GREEK
 from en4dvar.errors import OutputError
 from en4dvar.report.text import number_like, plain_number, untrusted_words
 from en4dvar.storage.store import StoredResult, load_stored, require_settled, result_files
-from en4dvar.summary import LITTLE, MODAL, ParameterSummary, summary_csv
+from en4dvar.summary import LITTLE, MODAL, ParameterSummary, summary_rows
 from en4dvar.tables import csv_text
 
 _COMMANDS = (
@@ -65,7 +65,7 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
         return _members_csv(results)
     if kind == "latex":
         return latex_table([(r.name, r.summary(), r.cautions) for r in results])
-    return summary_csv(((r.name, r.summary(), r.cautions) for r in results), {})
+    return csv_text(summary_rows(((r.name, r.summary(), r.cautions) for r in results), {}))
 
 
 def posterior_file(run_dir: str | Path) -> Path:

@@ -18,7 +18,8 @@ from en4dvar.report.style import inline_svg
 from en4dvar.report.text import number_like, percent, plain_number, plus_minus, pretty_unit, shown
 from en4dvar.state import Parameter
 from en4dvar.storage.population_file import WORDS, StoredPopulation
-from en4dvar.summary import ParameterSummary, results_table, summary_csv
+from en4dvar.summary import ParameterSummary, results_table, summary_rows
+from en4dvar.tables import write_csv
 
 CAPTION = "Median and 5–95 % of each data set alone (grey) and given all (below it); band: the mean of the population."
 
@@ -108,7 +109,7 @@ def population_lines(found: StoredPopulation) -> Iterator[str]:
 def write_population(found: StoredPopulation, folder: Path) -> Path:
     """Write ``population.html``, ``.csv`` and ``.tex``. Returns the path of the page. Raises :class:`OutputError`."""
     rows = summaries(found)
-    write_text(folder / "population.csv", summary_csv(rows, {}))
+    write_csv(folder / "population.csv", summary_rows(rows, {}))
     write_text(folder / "population.tex", latex_table(rows))
     posterior = found.group("posterior")
     page = render(

@@ -16,7 +16,7 @@ from en4dvar.report.chart import Chart, Mark, Panel, Row
 from en4dvar.report.paths import Frame, path_of
 from en4dvar.report.text import plain_number
 from en4dvar.report.ticks import numbers, powers, ticks
-from en4dvar.report.words import EM, FONT, SMALL, width_of, written
+from en4dvar.report.words import EM, FONT, SMALL, WIDEST, width_of, written
 
 GAP = 6.0  # between panels
 
@@ -103,7 +103,7 @@ def _below(panel: Panel) -> float:
     """Points that the labels below need."""
     if panel.bare:
         return 2.0
-    under = max((len(t) for t in panel.names), default=0) * EM * SMALL + 4 if panel.names else SMALL + 4
+    under = max((len(t) for t in panel.names), default=0) * WIDEST * SMALL + 6 if panel.names else SMALL + 4
     return (under if panel.x_numbers and panel.xticks != () else 3.0) + (FONT + 4 if panel.xlabel else 0)
 
 

@@ -11,6 +11,7 @@ from en4dvar.report.text import math_pieces
 
 FONT, SMALL = 8.0, 7.0
 EM = 0.56  # width of a character on average, of its height
+WIDEST = 0.64  # the same of digits and small letters in the widest of the usual fonts (DejaVu Sans, Verdana)
 
 
 def written(

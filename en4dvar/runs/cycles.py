@@ -9,9 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
-
-import xarray as xr
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from en4dvar.config import SequenceConfig, TwinConfig
 from en4dvar.cycling.outcome import SequentialState
@@ -27,6 +25,9 @@ from en4dvar.runs.session import Session, directory_mode, session
 from en4dvar.storage.checkpoint import FOLDER, Keeper, digest
 from en4dvar.storage.cycles_file import cycles_file
 from en4dvar.storage.netcdf import netcdf_file
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 Keep = Callable[[Callable[[], SequentialState]], None]
 R = TypeVar("R", SeriesResult, TwinResult)

@@ -107,7 +107,7 @@ def estimate(
         where = Path(directory or Path(held.enter_context(tempfile.TemporaryDirectory())) / "run")
         config = replace(_checked(content, where, ready, resolve), directory=where)
         _keep_data(where / GIVEN, given.csv, resume or force)
-        shown = held.enter_context(terminal_progress(1)) if progress else None
+        shown = held.enter_context(terminal_progress()) if progress else None
         campaign = run_campaign(config, force=force, resume=resume, progress=shown, command="en4dvar.estimate")
         (result,) = campaign
     if directory is None:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from en4dvar.analysis import IterationRecord, Progress, Record
 from en4dvar.assimilate import LoopState, assimilate
@@ -17,6 +17,7 @@ from en4dvar.config.build import build_one
 from en4dvar.executor import Executor
 from en4dvar.executor.shared import CommonValue
 from en4dvar.inputs.asked import DataFile
+from en4dvar.prior import own_seed
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.runs.campaign import DatasetOutcome
 from en4dvar.storage.checkpoint import Keeper, digest
@@ -27,34 +28,28 @@ from en4dvar.storage.packed import packed
 from en4dvar.storage.seal import SealedBytes
 from en4dvar.summary import remarks, summarise
 
-SEND_EVERY = 0.1  # s; a worker sends the records of its iterations no more often
+SEND_EVERY = 0.1  # s; a worker sends the records of its iterations no more often, whatever data sets they are of
 Records = tuple[tuple[str, Record], ...]  # each with the name of its data set
 
 
 @dataclass(frozen=True)
-class Unread:
-    """The problem of a data file that the worker reads."""
+class Common:
+    """What the data sets of a run have in common: its configuration, and ``attributes`` of their files."""
 
-    config: CommonValue[Config]
-    name: str
-    source: DataFile
-
-    def read(self) -> InverseProblem:
-        """Raises what :func:`~en4dvar.config.build.build_one` does."""
-        return build_one(self.config.value, self.name, self.source)
+    config: Config
+    attributes: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that the estimate of one data set needs; picklable, so that it can be made anywhere, or where its data
-    file is where ``problem`` is :class:`Unread`.
+    """Everything that the estimate of one data set needs; picklable, so that it can be made anywhere.
 
     ``attributes`` go into the file. ``keeper`` keeps the state of the iterations; a worker that does not see its folder
     keeps none. ``resume`` is where to start. ``stop`` gives the job up after the iteration under way (within one
     process only). ``alone``: the result is a file of its own, not one of a pack.
     """
 
-    problem: InverseProblem | Unread
+    problem: InverseProblem
     settings: AssimilationSettings
     seed: int
     attributes: Mapping[str, Any]
@@ -72,22 +67,44 @@ class Job:
 
 
 @dataclass(frozen=True)
+class FileJob:
+    """A job that is made where it is done, from the data file; what it shares with the others is pickled once.
+
+    ``attributes`` are those of this data set alone, beside the common ones; the rest is as of :class:`Job`.
+    """
+
+    common: CommonValue[Common]
+    name: str
+    source: DataFile
+    attributes: Mapping[str, Any]
+    keeper: Keeper
+    resume: LoopState | None
+
+    def made(self) -> Job:
+        """Raises what :func:`~en4dvar.config.build.build_one` does."""
+        config, attributes = self.common.value.config, {**self.common.value.attributes, **self.attributes}
+        problem, seed = build_one(config, self.name, self.source), own_seed(config.seed, self.name)
+        return Job(problem, config.assimilation, seed, attributes, self.keeper, self.resume)
+
+
+@dataclass(frozen=True)
 class Estimate:
     """``content`` is the netCDF file, or what goes into a pack, with its ``digest``; ``outcome`` is the record of a
-    :class:`~en4dvar.runs.campaign.DatasetOutcome`; ``told`` are lines of the log.
+    :class:`~en4dvar.runs.campaign.DatasetOutcome`; ``told`` are lines of the log. ``records`` have not been told yet.
     """
 
     content: SealedBytes | bytes
     digest: str
     outcome: bytes
     told: tuple[str, ...]
+    records: Records = ()
 
 
 class StoppedError(Exception):
     """The job was given up."""
 
 
-def estimate(job: Job, executor: Executor | None = None, progress: Progress | None = None) -> Estimate:
+def estimate(job: Job | FileJob, executor: Executor | None = None, progress: Progress | None = None) -> Estimate:
     """Assimilate one data set; members run on ``executor``, by default in this process.
 
     Raises
@@ -95,8 +112,8 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
     ConfigError, DataError: the data file cannot be used. TooFewMembersError: the ensemble is lost. OutputError: a
         checkpoint cannot be written.
     """
-    problem = job.problem.read() if isinstance(job.problem, Unread) else job.problem
-    analysis = assimilate(problem, job.settings, job.seed, executor, progress, job.resume, keep=job.keep)
+    job = job.made() if isinstance(job, FileJob) else job
+    analysis = assimilate(job.problem, job.settings, job.seed, executor, progress, job.resume, keep=job.keep)
     groups = build_groups(analysis, job.attributes)
     content: SealedBytes | bytes = to_bytes(groups) if job.alone else packed(groups)
     sha256 = content.sha256 if isinstance(content, SealedBytes) else digest(content)
@@ -114,22 +131,27 @@ def estimate(job: Job, executor: Executor | None = None, progress: Progress | No
     return Estimate(content, sha256, encode_text(outcome), (ending, *warnings))
 
 
-def estimate_and_tell(job: Job, tell: Callable[[Records], None]) -> Estimate:
-    """As :func:`estimate`, on a worker: ``tell`` gets the records, without their members, as iterations end."""
+def estimate_and_tell(job: Job | FileJob, tell: Callable[[Records], None]) -> Estimate:
+    """As :func:`estimate`, on a worker: ``tell`` gets the records, without their members, as iterations end; the last
+    ones come with the estimate.
+    """
     sender = _Sender(tell)
     try:
-        return estimate(job, None, sender)
-    finally:
+        found = estimate(job, None, sender)
+    except BaseException:
         sender.close()
+        raise
+    return replace(found, records=sender.rest())
 
 
 class _Sender:
     """Sends records at once, or, where the last message is too young, as soon as it is old enough."""
 
+    _sent: ClassVar[float] = -math.inf  # when this process sent the last message, of any data set
+
     def __init__(self, tell: Callable[[Records], None]):
         self._tell, self._lock = tell, threading.Lock()
         self._waiting: list[tuple[str, Record]] = []
-        self._sent = -math.inf
         self._timer: threading.Timer | None = None
 
     def __call__(self, name: str, record: Record) -> None:
@@ -146,18 +168,28 @@ class _Sender:
                 self._timer.start()
 
     def close(self) -> None:
+        """Send what waits."""
+        if records := self.rest():
+            self._tell(records)
+
+    def rest(self) -> Records:
+        """What waits and is not sent any more."""
         with self._lock:
-            self._send()
+            return self._rest()
 
     def _later(self) -> None:
         with self._lock, suppress(OSError):  # nobody is there to hear it: the call's own thread will notice
             self._send()
 
     def _send(self) -> None:
+        if records := self._rest():
+            self._tell(records)
+            _Sender._sent = time.monotonic()
+
+    def _rest(self) -> Records:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        if self._waiting:
-            self._tell(tuple(self._waiting))
-            self._waiting.clear()
-            self._sent = time.monotonic()
+        records = tuple(self._waiting)
+        self._waiting.clear()
+        return records

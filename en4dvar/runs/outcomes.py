@@ -18,11 +18,13 @@ class Outcomes(Sequence[DatasetOutcome]):
 
     Parameters
     ----------
-    record: the pack; entries: what it holds. files: name of the data set in the pack → where its posterior is.
+    folder: of the run. record: the pack in it; entries: what that holds. files: name of the data set in the pack →
+        where its posterior is in the folder.
     """
 
-    def __init__(self, record: Path, entries: Mapping[str, Entry], files: Mapping[str, Path]):
-        self._record, self._entries, self._files, self._stems = record, entries, files, tuple(files)
+    def __init__(self, folder: Path, record: str, entries: Mapping[str, Entry], files: Mapping[str, str]):
+        self._folder, self._record, self._entries = folder, folder / record, entries
+        self._files, self._stems = files, tuple(files)
 
     def __len__(self) -> int:
         return len(self._stems)
@@ -42,4 +44,4 @@ class Outcomes(Sequence[DatasetOutcome]):
             outcome = decode_text(read_outcome(self._record, stem, self._entries[stem]), DatasetOutcome)
         except ValueError as error:  # anybody can write a checksum
             raise OutputError(f"{self._record / stem}: {error}") from None
-        return outcome if outcome.failure else replace(outcome, file=self._files[stem])
+        return outcome if outcome.failure else replace(outcome, file=self._folder / self._files[stem])

@@ -93,11 +93,12 @@ class RunLog:
 class LiveProgress:
     """One line on a terminal: the iteration that ended last, data sets done, time gone and left."""
 
-    def __init__(self, bar: Any, total: int):
-        self._bar, self._total = bar, total
-        self._task = bar.add_task("prior forecast", total=total, left="")
+    def __init__(self, bar: Any):
+        self._bar = bar
+        self._task = bar.add_task("prior forecast", total=None, left="")
         self._began = time.monotonic()
-        self._before = self._done = 0  # data sets that an earlier run had done; that are done
+        self._total = 0  # data sets of the run
+        self._before = self._done = 0  # those that an earlier run had done; that are done
         self._open: dict[str, int] = {}  # data set → its last iteration
         self._lengths: list[int] = []  # iterations of the data sets that have ended
 
@@ -110,9 +111,9 @@ class LiveProgress:
         """The model is being compiled, which later runs are spared."""
         self._show("first use of this model: compiling, once")
 
-    def begin(self, done: int) -> None:
-        """``done`` data sets were done by an earlier run."""
-        self._before = self._done = done
+    def begin(self, done: int, total: int) -> None:
+        """Of ``total`` data sets ``done`` were done by an earlier run."""
+        self._before, self._done, self._total = done, done, total
         self._show(None)
 
     def ended(self, name: str, done: int) -> None:
@@ -123,7 +124,7 @@ class LiveProgress:
         self._show("files and report" if done == self._total else None)
 
     def _show(self, description: str | None) -> None:
-        fields = {"completed": self._done, "left": self._left()}
+        fields = {"completed": self._done, "total": self._total or None, "left": self._left()}
         self._bar.update(self._task, **fields, **({"description": description} if description else {}))
 
     def _left(self) -> str:
@@ -150,7 +151,7 @@ def time_left(gone: float, done: int, total: int, iterations: Sequence[int], len
 
 
 @contextmanager
-def terminal_progress(n_datasets: int) -> Iterator[LiveProgress | None]:
+def terminal_progress() -> Iterator[LiveProgress | None]:
     """A live line on the terminal (standard error) or in a notebook, or None where there is neither.
 
     NO_COLOR is respected. In a notebook rich needs ipywidgets; without it there is no line.
@@ -174,7 +175,7 @@ def terminal_progress(n_datasets: int) -> Iterator[LiveProgress | None]:
         TextColumn("{task.fields[left]}"),
     )
     with shown(Bar(*columns, console=console, transient=True)) as bar:
-        progress = LiveProgress(bar, n_datasets)
+        progress = LiveProgress(bar)
         with watch_compilation(progress.compiling):
             yield progress
 

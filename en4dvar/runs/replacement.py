@@ -74,15 +74,25 @@ def write_list(work: Path, names: Iterable[str]) -> None:
 
 
 def listed_files(work: Path) -> tuple[str, ...]:
-    """The names in the list of ``work``, each of a place in ``work``. Raises :class:`OutputError`."""
+    """The files that the list of ``work`` names, each of a place in ``work``. Raises :class:`OutputError`."""
+    return tuple(name for line in lines_of_list(work) for name in _named(work, line))
+
+
+def _named(work: Path, line: str) -> list[str]:
+    """What a line of the list stands for: a file, or with ``*`` those of a folder that are there."""
+    place = inside(work, line)
+    if "*" not in place.name:
+        return [line]
+    return sorted(found.relative_to(work).as_posix() for found in place.parent.glob(place.name))
+
+
+def lines_of_list(work: Path) -> tuple[str, ...]:
+    """The list of ``work`` as it is written. Raises :class:`OutputError`."""
     listing = inside(work, LISTING)
     try:
         with open_plain(listing) as file:
-            names = tuple(file.read().decode("utf-8").splitlines())
+            return tuple(file.read().decode("utf-8").splitlines())
     except FileNotFoundError:
         return ()
     except UnicodeDecodeError:
         raise OutputError(f"{listing}: damaged; it is not a list of files") from None
-    for name in names:
-        inside(work, name)
-    return names

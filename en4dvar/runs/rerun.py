@@ -9,10 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from en4dvar.assimilate import assimilate
 from en4dvar.config import AnyConfig, Config, TwinConfig, resolve_any
@@ -31,6 +30,9 @@ from en4dvar.storage.cycles_file import cycles_file, read_cycles
 from en4dvar.storage.fingerprint import Identity, digest_of, identity
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.store import result_files
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 SURROUNDINGS = ("python_version", "package_versions", "platform", "cpu", "git_commit")
 
@@ -152,6 +154,8 @@ def _groups(result: Result) -> dict[str, xr.Dataset]:
 
 def differences(recorded: Mapping[str, xr.Dataset], again: Mapping[str, xr.Dataset]) -> tuple[int, tuple[str, ...]]:
     """Number of variables compared, by group, and the words for each that is not the same to the bit."""
+    import xarray as xr
+
     count, told = 0, []
     for group, node in recorded.items():
         variables = again.get(group, xr.Dataset()).variables

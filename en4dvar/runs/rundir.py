@@ -25,6 +25,7 @@ from en4dvar.runs.replacement import (
     LISTING,
     PARTIAL,
     finish_replacement,
+    lines_of_list,
     listed_files,
     remove_folder,
     remove_partial,
@@ -95,8 +96,11 @@ class RunDirectory:
         return inside(self.work, name)
 
     def claim(self, *names: str) -> Path:
-        """List files (relative names) as written by this run; returns the path of the last one."""
-        known, paths = listed_files(self.work), [self.at(name) for name in names]
+        """List files (relative names) as written by this run; returns the path of the last one.
+
+        ``*`` in a name stands for any: of 10⁵ checkpoints a few are there at a time.
+        """
+        known, paths = lines_of_list(self.work), [self.at(name) for name in names]
         if set(names) - set(known):
             write_list(self.work, dict.fromkeys([*known, *names]))
         return paths[-1] if paths else self.work

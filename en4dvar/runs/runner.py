@@ -12,7 +12,6 @@ from en4dvar.config import Config, load_config
 from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.executor import Executor, choose_executor, one_blas_thread
-from en4dvar.files import write_text
 from en4dvar.inputs.asked import DataFile
 from en4dvar.runs.campaign import Campaign
 from en4dvar.runs.interrupt import terminate_as_interrupt
@@ -21,12 +20,13 @@ from en4dvar.runs.population_run import population_within, require_population
 from en4dvar.runs.rundir import RunDirectory
 from en4dvar.runs.session import directory_mode, session
 from en4dvar.runs.together import checkpoint_of
-from en4dvar.runs.worklist import Worklist, datasets
+from en4dvar.runs.worklist import ITERATIONS, SUMMARY, Worklist, datasets
 from en4dvar.storage.campaign_file import DamagedError, save_campaign
 from en4dvar.storage.joint_file import FILE, load_joint
 from en4dvar.storage.population_file import FILE as POPULATION
 from en4dvar.storage.population_file import load_population
-from en4dvar.summary import summary_csv
+from en4dvar.summary import summary_rows
+from en4dvar.tables import write_csv
 
 if TYPE_CHECKING:
     from en4dvar.report.result import Result
@@ -160,9 +160,9 @@ def _executor(config: Config) -> Executor:
 
 def _begin(work: Worklist) -> None:
     """Write what the run is; of one that is resumed, take over what is done. What has failed is tried again."""
-    run, sets = work.run, work.sets
+    run = work.run
     together = [FILE] * bool(work.config.sharing) + [POPULATION] * (work.config.population is not None)
-    files = (*together, *map(checkpoint_of, together), *(d.iteration for d in sets))
+    files = (*together, *map(checkpoint_of, together), ITERATIONS)
     run.begin("posterior.nc", work.record, *files, retried=work.failed_earlier())
     if run.resumed:
         work.recall()
@@ -182,7 +182,8 @@ def _estimate(work: Worklist, executor: Executor) -> None:
             return
         attributes = {**work.run.attributes, "identity": work.run.identity.settings}
         try:
-            save_campaign(work.run.directory.at("posterior.nc"), good, attributes, work.failures())
+            path, sources = work.run.directory.at("posterior.nc"), {d.name: d.stem for d in good}
+            save_campaign(path, work.pack, sources, attributes, work.failures())
             return
         except DamagedError as error:
             if not repeated.isdisjoint(error.names):
@@ -192,19 +193,19 @@ def _estimate(work: Worklist, executor: Executor) -> None:
 
 
 def _finish(work: Worklist, report_workers: int) -> None:
-    """The report."""
-    directory, good = work.run.directory, work.good()
-    if good and work.config.report:
+    """The report, or the table alone, which is there already where there was nothing left to estimate."""
+    directory = work.run.directory
+    if work.good() and work.config.report:
         _report(directory, workers=report_workers, figures=work.config.figures)
-    else:
+    elif not (path := directory.claim(SUMMARY)).exists():
         rows = ((o.name, o.summary, o.warnings) for o in work.outcomes(directory.work) if not o.failure)
-        write_text(directory.claim("summary.csv"), summary_csv(rows, work.failures()))
+        write_csv(path, summary_rows(rows, work.failures()))
 
 
 def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
     from en4dvar.report import JOINT_FILES, POPULATION_FILES, TABLES, write_pages  # what draws pages is slow to import
 
-    directory.claim("report.html", "summary.csv", *TABLES)
+    directory.claim("report.html", SUMMARY, *TABLES)
     if (directory.work / FILE).exists():
         from en4dvar.report.joint import write_joint  # with matplotlib, whose import takes longer than a page
 

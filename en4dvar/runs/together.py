@@ -30,13 +30,13 @@ def once_together(work: Worklist, file: str, what: str, fewest: int, estimate: E
     if len(good) < fewest:
         run.notice(f"no {what}, for which {fewest} data sets need a posterior")
         return
-    digests = {name: work.pack.entries[address.name].content_digest for name, address in good.items()}
-    made_of = [run.identity.settings, *(f"{name}: {one}" for name, one in digests.items())]
+    digests = (f"{d.name}: {work.pack.entries[d.stem].content_digest}" for d in good)
+    made_of = [run.identity.settings, *digests]
     fingerprint, path = digest("\n".join(made_of).encode()), run.directory.at(file)
     done = run.restore(checkpoint_of(file), fingerprint, str, f"the {what} is made again")
     if done is not None and path.exists() and file_digest(path) == done:
         return
-    sets = [finished_set(config, plain_result(address), run.directory.path) for address in good.values()]
+    sets = [finished_set(config, plain_result(run.directory.work / d.file), run.directory.path) for d in good]
     attributes = {**run.attributes, "identity": run.identity.settings, "runs": config.name}
     estimate(sets, attributes, path, lambda words: run.log.write(f"{what}: {words}"))
     write_checkpoint(run.directory.at(checkpoint_of(file)), fingerprint, file_digest(path))

@@ -10,7 +10,6 @@ from functools import cache
 from importlib.metadata import distributions
 from pathlib import Path
 from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 from en4dvar.user_code import RefusedError, permission
 
@@ -55,6 +54,8 @@ def _known(file: Path) -> bool:
 @cache
 def _installed() -> tuple[Path, ...]:
     """Folders of the standard library, of installed packages and of those that are installed to be edited."""
+    from urllib.request import url2pathname  # with it come HTTP, TLS and mail
+
     folders = {Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
     for found in distributions():
         folders.add(Path(str(found.locate_file(""))))

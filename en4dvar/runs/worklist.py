@@ -5,21 +5,19 @@ from __future__ import annotations
 import threading
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from en4dvar.analysis import IterationRecord, Progress, Record, StartRecord
 from en4dvar.assimilate import LoopState
 from en4dvar.config import Config
-from en4dvar.config.build import build_one
 from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
 from en4dvar.executor.shared import CommonValue
 from en4dvar.files import readable
 from en4dvar.inputs.asked import DataFile
-from en4dvar.prior import own_seed
 from en4dvar.runs.campaign import DatasetOutcome, file_names
-from en4dvar.runs.jobs import Estimate, Job, Records, Unread, estimate, estimate_and_tell
+from en4dvar.runs.jobs import Common, Estimate, FileJob, Job, Records, estimate, estimate_and_tell
 from en4dvar.runs.outcomes import Outcomes
 from en4dvar.runs.progress import LiveProgress, describe
 from en4dvar.runs.session import Session
@@ -28,8 +26,11 @@ from en4dvar.storage.codec import encode_text
 from en4dvar.storage.pack import PACK, Entry, Pack, read_outcome
 from en4dvar.storage.seal import SealedBytes
 
+SUMMARY = "summary.csv"
+ITERATIONS = f"{FOLDER}/*.iteration"  # checkpoints of data sets at work
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, slots=True)
 class Dataset:
     """A data set of the run: its data file, its name in a pack, and where its results go, relative to the run
     directory: an address in a pack, or a file.
@@ -39,7 +40,11 @@ class Dataset:
     source: DataFile
     stem: str
     file: str
-    iteration: str
+
+    @property
+    def iteration(self) -> str:
+        """The checkpoint of its iterations, relative to the run directory."""
+        return ITERATIONS.replace("*", self.stem)
 
 
 def datasets(files: Mapping[str, DataFile]) -> tuple[Dataset, ...]:
@@ -51,7 +56,6 @@ def datasets(files: Mapping[str, DataFile]) -> tuple[Dataset, ...]:
             file,
             stems[name],
             f"{PACK}/{stems[name]}" if len(files) > 1 else "posterior.nc",
-            f"{FOLDER}/{stems[name]}.iteration",
         )
         for name, file in files.items()
     )
@@ -76,12 +80,12 @@ class Worklist:
         self.stop = threading.Event()
         self.alone = len(sets) == 1
         self.pack = Pack(run.directory.at(self.record))
+        self.common = CommonValue(Common(config, {**run.attributes, "identity": run.identity.settings}))
         self._reached: dict[str, tuple[int, int]] = {}  # data set at work → its last round, iteration
 
-    def good(self) -> dict[str, Path]:
-        """Where the posterior of each data set is that has one."""
-        work = self.run.directory.work
-        return {d.name: work / d.file for d in self.sets if not self.ended[d.name]}
+    def good(self) -> list[Dataset]:
+        """The data sets that have a posterior."""
+        return [d for d in self.sets if not self.ended[d.name]]
 
     def failures(self) -> dict[str, str]:
         """Why a data set has no posterior, of those that have none."""
@@ -89,8 +93,8 @@ class Worklist:
 
     def outcomes(self, folder: Path) -> Outcomes:
         """What came of each data set, in order; ``folder`` is where the files of the run are."""
-        files = {d.stem: folder / d.file for d in self.sets if d.name in self.ended}
-        return Outcomes(folder / self.record, self.pack.entries, files)
+        files = {d.stem: d.file for d in self.sets if d.name in self.ended}
+        return Outcomes(folder, self.record, self.pack.entries, files)
 
     @property
     def record(self) -> str:
@@ -157,28 +161,28 @@ class Worklist:
         only, also what its estimate raises.
         """
         if isinstance(self.progress, LiveProgress):
-            self.progress.begin(len(self.ended))
+            self.progress.begin(len(self.ended), len(self.sets))
         todo = [d for d in self.sets if d.name not in self.ended]
+        if todo:
+            self.run.directory.remove(SUMMARY)  # of what was done before: where it is there, it is of every data set
         sent: list[Dataset] = []
 
-        def jobs(
-            stop: threading.Event | None = None, config: CommonValue[Config] | None = None
-        ) -> Iterator[tuple[Job]]:
+        def jobs(made_there: bool = False, stop: threading.Event | None = None) -> Iterator[tuple[Job | FileJob]]:
             for d in todo:
                 try:
-                    job = self._job(d, stop, config)
+                    job = self._job(d)
+                    one = job if made_there else replace(job.made(), stop=stop, alone=self.alone)
                 except Exception as error:
                     self._fail(d, error)
                 else:
                     sent.append(d)
-                    yield (job,)
+                    yield (one,)
 
         if len(todo) > 1 and len(todo) >= executor.workers > 1:
             stop = self.stop if isinstance(executor, ThreadsExecutor) else None
-            config = CommonValue(self.config) if executor.reads else None
-            ends = executor.map(estimate_and_tell, jobs(stop, config), self._hear)
+            ends = executor.map(estimate_and_tell, jobs(executor.reads, stop), self._hear)
         else:
-            ends = SerialExecutor().map(lambda job: estimate(job, executor, self._record), jobs())
+            ends = SerialExecutor().map(lambda job: estimate(job, executor, self._hear_one), jobs())
         for i, value in ends:
             if isinstance(value, Exception):
                 self._fail(sent[i], value)
@@ -188,35 +192,27 @@ class Worklist:
     def _fingerprint(self, d: Dataset) -> str:
         return self.run.identity.of_dataset(d.name)
 
-    def _job(self, d: Dataset, stop: threading.Event | None, shared: CommonValue[Config] | None) -> Job:
-        config, identity, fingerprint = self.config, self.run.identity, self._fingerprint(d)
+    def _job(self, d: Dataset) -> FileJob:
+        fingerprint, path = self._fingerprint(d), self.run.directory.at(d.iteration)
         resume = self.run.restore(d.iteration, fingerprint, LoopState, f"{d.name} is estimated from the start")
         if resume is not None:
             self.run.log.write(f"{d.name}: continued {resume.reached}")
-        path = self.run.directory.at(d.iteration)
-        return Job(
-            problem=Unread(shared, d.name, d.source) if shared else build_one(config, d.name, d.source),
-            settings=config.assimilation,
-            seed=own_seed(config.seed, d.name),
-            attributes={
-                **self.run.attributes,
-                "identity": identity.settings,
-                "data_sha256": identity.content[d.name],
-            },
-            keeper=Keeper(path, fingerprint, config.execution.checkpoint_every),
-            resume=resume,
-            stop=stop,
-            alone=self.alone,
-        )
+        keeper = Keeper(path, fingerprint, self.config.execution.checkpoint_every)
+        own = {"data_sha256": self.run.identity.content[d.name]}
+        return FileJob(self.common, d.name, d.source, own, keeper, resume)
 
     def _hear(self, _: int, records: Records) -> None:
-        for name, record in records:
-            self._record(name, record)
+        self._tell(records)
 
-    def _record(self, name: str, record: Record) -> None:
-        self.run.log.write("\n".join(self._lines(name, record)))
+    def _hear_one(self, name: str, record: Record) -> None:
+        self._tell([(name, record)])
+
+    def _tell(self, records: Sequence[tuple[str, Record]], *lines: str) -> None:
+        """Records, and further lines of the log: all of them at once, for each time it is written to takes as long."""
+        self.run.log.write("\n".join([*(line for one in records for line in self._lines(*one)), *lines]))
         if self.progress is not None:
-            self.progress(name, record)
+            for name, record in records:
+                self.progress(name, record)
 
     def _lines(self, name: str, record: Record) -> Iterator[str]:
         """What the log says of a record."""
@@ -233,7 +229,7 @@ class Worklist:
         yield describe(name, record)
 
     def _keep(self, d: Dataset, value: Estimate) -> None:
-        self.run.log.write("\n".join(f"{d.name}: {line}" for line in value.told))
+        self._tell(value.records, *(f"{d.name}: {line}" for line in value.told))
         content = value.content
         if isinstance(content, SealedBytes):  # a file of its own
             content.write(self.run.directory.at(d.file))

@@ -23,13 +23,16 @@ SHIFT, SPREAD = 0.25, 0.15  # of the ensemble, by the emulator, that leave a dou
 CLEARED = 0.85  # effective share of the members above which no run was found that was off (docs: calibration)
 
 
-def examine_shape(space: WeightSpace, ensemble: Array, mode: Array, costs: Array, seed: int) -> dict[str, float]:
+def examine_shape(
+    space: WeightSpace, ensemble: Array, mode: Array, costs: Array, seed: int, settle: bool = True
+) -> dict[str, float]:
     """Numbers for :func:`~en4dvar.diagnostics.is_non_gaussian`, and its answer.
 
     ``ensemble`` (N, n) and its centre ``mode`` (n,), transformed; ``costs`` J (N,) of its members. Deterministic in
-    ``seed``. ``gaussian_fit``: effective share of the members; where an emulator was needed ``mean_shift``, the largest
-    distance of the ensemble's mean from the posterior's in posterior standard deviations, ``spread_ratio``, the
-    standard deviation of the ensemble over the posterior's where that is farthest from 1, ``emulator_fit``, and
+    ``seed``. ``settle``: a doubt of the emulator's is looked into with more moves of its walkers.
+    ``gaussian_fit``: effective share of the members; where an emulator was needed ``mean_shift``, the largest distance
+    of the ensemble's mean from the posterior's in posterior standard deviations, ``spread_ratio``, the standard
+    deviation of the ensemble over the posterior's where that is farthest from 1, ``emulator_fit``, and
     ``emulated_mean_<name>``, ``emulated_std_<name>`` of each parameter, physical and SI.
     """
     shape = diag.gaussianity(ensemble, mode, costs)
@@ -37,7 +40,7 @@ def examine_shape(space: WeightSpace, ensemble: Array, mode: Array, costs: Array
         emulator = guide(space, ensemble, seed, fits=2)
         if emulator is not None:
             found = _off(emulator, ensemble)
-            if doubtful(found):  # by walkers that have not settled, as often as not
+            if settle and doubtful(found):  # by walkers that have not settled, as often as not
                 emulator = emulator.settled(member_stream(seed, "emulator, settled"))
                 found = _off(emulator, ensemble)
             shape |= {**found, "emulator_fit": emulator.share, **_displayed(space.problem.prior, emulator.draws)}

@@ -25,7 +25,6 @@ from typing import Protocol
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.spatial.distance import cdist
 
 from en4dvar.schemes.localisation import gaspari_cohn
 from en4dvar.state import Array
@@ -63,11 +62,15 @@ class ByDistance:
 
     def taper(self, part: slice) -> Array:
         """ρ_xy (m, K) of some of the cells."""
+        from scipy.spatial.distance import cdist  # not needed to import the package
+
         rho = gaspari_cohn(cdist(self.places[part], self.observed), self.radius)
         return np.nan_to_num(rho, copy=False, nan=1.0)
 
     def between(self, Y: Array, Z: Array) -> Array:
         """ρ_yy ∘ YᵀZ/(N−1) (K, K), of anomalies of predictions about two points."""
+        from scipy.spatial.distance import cdist  # not needed to import the package
+
         rho = gaspari_cohn(cdist(self.observed, self.observed), self.radius)
         return np.asarray(rho * (Y.T @ Z) / (len(Y) - 1))
 

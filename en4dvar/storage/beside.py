@@ -7,8 +7,10 @@ of the readings. So the errors of the readings and the paths between them have g
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
-import xarray as xr
+if TYPE_CHECKING:
+    import xarray as xr
 
 BESIDE: Mapping[str, str] = {
     "observed_data": "observation_errors",
@@ -19,6 +21,8 @@ BESIDE: Mapping[str, str] = {
 
 def joined(group: xr.Dataset, beside: xr.Dataset | None) -> xr.Dataset:
     """A group with the variables of the one beside it; files of earlier versions have all in one."""
+    import xarray as xr
+
     if beside is None:
         return group
     coords = {name: one.variable for part in (group, beside) for name, one in part.coords.items()}

@@ -20,8 +20,8 @@ import numpy as np
 from en4dvar.errors import OutputError
 from en4dvar.storage.checkpoint import digest
 from en4dvar.storage.netcdf import Groups, Variable, attributes_of, netcdf_file
-from en4dvar.storage.pack import content_digest, read_result
-from en4dvar.storage.packed import Alike, Content, opened, unpacked, unpacked_together
+from en4dvar.storage.pack import Pack
+from en4dvar.storage.packed import Alike, Content, PackedLayout, opened, unpacked, unpacked_together
 from en4dvar.storage.seal import check_seal
 
 GROUPS = (
@@ -53,10 +53,15 @@ class _Layout:
     n_parameters: int = -1
     n_observations: int = 0
     scalars: dict[str, dict[str, Any]] = field(default_factory=lambda: {group: {} for group in GROUPS})
+    seen: set[tuple[PackedLayout, tuple[str, ...]]] = field(default_factory=set)
 
     def add(self, content: bytes) -> None:
         """One that varies in time has the more parameters the longer the window, one that was sampled more scalars."""
         one = opened(content)
+        kind = one.layout, tuple(key for attributes in one.attributes for key in attributes)
+        if kind in self.seen:  # as most are: there is nothing new in it
+            return
+        self.seen.add(kind)
         sizes, n_parameters = one.layout.sizes, one.layout.sizes["/sample_stats"][PARAMETER]
         if n_parameters > self.n_parameters:
             self.widest, self.n_parameters = unpacked(content, _PATHS), n_parameters
@@ -68,28 +73,29 @@ class _Layout:
 
 
 def save_campaign(
-    path: Path, sources: Mapping[str, Path], attributes: Mapping[str, Any], failures: Mapping[str, str]
+    path: Path, pack: Pack, sources: Mapping[str, str], attributes: Mapping[str, Any], failures: Mapping[str, str]
 ) -> Path:
     """Write the campaign's file; one that is there already, of the same results, is left as it is.
 
     Parameters
     ----------
-    sources: name of the data set → address of its result (:mod:`en4dvar.storage.pack`), in order; not empty.
+    sources: name of the data set → its name in the ``pack``, in order; not empty.
     attributes: of the root. failures: name of the data set without a posterior → reason.
 
     Raises
     ------
     DamagedError: results cannot be read. OutputError: the file cannot be written.
     """
-    made_of = digest(json.dumps([[*map(content_digest, sources.values())], [*sources], failures]).encode())
+    digests = [pack.entries[stem].content_digest for stem in sources.values()]
+    made_of = digest(json.dumps([digests, [*sources], failures]).encode())
     if _holds(path, made_of):
         return path
-    layout = _layout(sources)
+    layout = _layout(pack, sources)
     told = {FAILURES: json.dumps(failures, ensure_ascii=False), MADE_OF: made_of}
     with netcdf_file(path) as partial, netCDF4.Dataset(partial, "w", format="NETCDF4") as target:
         target.setncatts({**attributes, **told})
         _define(target, layout, len(sources))
-        for begin, names, contents in _blocks(sources):
+        for begin, names, contents in _blocks(pack, sources):
             alike = unpacked_together(contents, _PATHS)
             for group in GROUPS:
                 _write(target[group], begin, names, alike)
@@ -103,11 +109,11 @@ def _holds(path: Path, made_of: str) -> bool:
         return False
 
 
-def _layout(sources: Mapping[str, Path]) -> _Layout:
+def _layout(pack: Pack, sources: Mapping[str, str]) -> _Layout:
     layout, damaged, reasons = _Layout(), [], []
-    for name, address in sources.items():
+    for name, stem in sources.items():
         try:
-            layout.add(read_result(address))
+            layout.add(pack.content(stem))
         except (OutputError, KeyError, ValueError) as error:  # the last two: written by somebody else
             damaged.append(name)
             reasons.append(str(error))
@@ -116,13 +122,13 @@ def _layout(sources: Mapping[str, Path]) -> _Layout:
     return layout
 
 
-def _blocks(sources: Mapping[str, Path]) -> Iterator[tuple[int, list[str], list[Content]]]:
+def _blocks(pack: Pack, sources: Mapping[str, str]) -> Iterator[tuple[int, list[str], list[Content]]]:
     """Place of the first, names and contents of as many data sets as are written at once."""
     begin, size = 0, 0
     names: list[str] = []
     block: list[Content] = []
-    for name, address in sources.items():
-        content = read_result(address, check=False)  # it was for the layout
+    for name, stem in sources.items():
+        content = pack.content(stem, check=False)  # it was for the layout
         if block and size + len(content) > BLOCK:
             yield begin, names, block
             begin, size, names, block = begin + len(names), 0, [], []

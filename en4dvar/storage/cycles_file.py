@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-
-import xarray as xr
+from typing import TYPE_CHECKING
 
 from en4dvar.errors import OutputError
 from en4dvar.storage.seal import check_seal
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 FILES = ("twin.nc", "sequence.nc")  # of runs of cycles
 
@@ -19,6 +21,8 @@ def cycles_file(run_dir: Path) -> Path | None:
 
 def read_cycles(path: Path) -> xr.Dataset:
     """A result file, in memory. Raises :class:`OutputError` where there is nothing to read."""
+    import xarray as xr
+
     check_seal(path)
     try:
         with xr.open_dataset(path) as file:

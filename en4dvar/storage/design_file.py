@@ -6,16 +6,18 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from en4dvar.design.evaluate import FAN, Evaluated
 from en4dvar.design.laws import Decision
 from en4dvar.errors import OutputError
 from en4dvar.state import Array
 from en4dvar.storage.netcdf import Group, read_groups, to_bytes, variable
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 DECISION = {  # field → variable, description
     "information": ("law_information", "mutual information of law and data, nats"),

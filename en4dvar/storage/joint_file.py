@@ -7,10 +7,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from en4dvar.caution import Caution, worst_first
 from en4dvar.errors import OutputError
@@ -18,6 +17,9 @@ from en4dvar.joint.estimate import JointEstimate
 from en4dvar.state import Array, Parameter
 from en4dvar.storage.netcdf import Group, Groups, Variable, read_groups, to_bytes, variable
 from en4dvar.units import convert
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 FILE = "joint.nc"
 QUANTILES = (0.05, 0.5, 0.95)
@@ -193,6 +195,8 @@ def load_joint(path: Path) -> StoredJoint:
 
 def load_groups(path: Path, groups: Sequence[str], what: str) -> xr.DataTree:
     """A file with ``groups`` in memory. Raises :class:`OutputError`: it is not ``what``, cut short or altered."""
+    import xarray as xr
+
     nodes = read_groups(path)
     if {f"/{group}" for group in groups} - set(nodes):
         raise OutputError(f"{path}: not {what}")

@@ -15,15 +15,17 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import netCDF4
 import numpy as np
-import xarray as xr
 
 from en4dvar.errors import OutputError
 from en4dvar.files import atomic_path
 from en4dvar.storage.seal import SealedBytes, check_seal, seal_file
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _LOCK = threading.Lock()  # the netCDF library is not safe to use from several threads
 _MORE = 1 << 18  # bytes; more than the library had left to write
@@ -106,11 +108,14 @@ Groups = Mapping[str, Group]
 
 def tree_of(groups: Groups) -> xr.DataTree:
     """The groups as xarray shows them."""
+    import xarray as xr
+
     return xr.DataTree.from_dict(datasets_of(groups))
 
 
 def datasets_of(groups: Groups) -> dict[str, xr.Dataset]:
     """Each group as xarray shows it, by path."""
+    import xarray as xr
 
     def shown(v: Variable) -> xr.Variable:
         values = v.values.astype(np.float32) if v.single else v.values
@@ -172,6 +177,8 @@ def read_groups(path: Path) -> dict[str, xr.Dataset]:
     ------
     OutputError: it is none of ours, cut short or altered (see :mod:`en4dvar.storage.seal`).
     """
+    import xarray as xr
+
     check_seal(path)
     try:
         with xr.open_datatree(path, engine="netcdf4", decode_timedelta=False) as tree:

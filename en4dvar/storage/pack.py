@@ -106,22 +106,12 @@ def results_of(pack: Path) -> list[Path]:
     return [pack / name for name in sorted(sorted(held), key=numbered)]
 
 
-def read_result(address: Path, check: bool = True) -> bytes:
-    """The groups at an address; ``check`` that they are what was written. Raises :class:`OutputError`."""
-    return _holding(address).content(address.name, check)
-
-
-def content_digest(address: Path) -> str:
-    """SHA-256 of the groups at an address, as it was written. Raises :class:`OutputError`."""
-    return _holding(address).entries[address.name].content_digest
-
-
-def _holding(address: Path) -> Pack:
-    """The pack that an address is in. Raises :class:`OutputError`."""
+def read_result(address: Path) -> bytes:
+    """The groups at an address. Raises :class:`OutputError`."""
     pack = _opened(address.parent)
     if address.name not in pack.entries:
         raise OutputError(f"{address}: no such result: it was never written, is cut short or was altered")
-    return pack
+    return pack.content(address.name)
 
 
 def _opened(path: Path) -> Pack:

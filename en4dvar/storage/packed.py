@@ -24,7 +24,7 @@ _SIZES = struct.Struct("<QQ")  # of the texts
 _ALIGNED = 8  # bytes
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PackedLayout:
     """Which variables there are: of each group the path, then of its variables and of its coordinates the name and what
     :func:`_place` tells; ``named``: which texts stand along dimensions; ``sizes`` of these by path; ``texts``: how many
@@ -102,7 +102,7 @@ def unpacked_together(contents: Sequence[Content], wanted: Collection[str]) -> l
     """
     found: dict[Any, list[int]] = {}
     for i, one in enumerate(contents):
-        found.setdefault((id(one.layout), *(tuple(one.words[k]) for k in one.layout.named)), []).append(i)
+        found.setdefault((one.layout, *(tuple(one.words[k]) for k in one.layout.named)), []).append(i)
 
     def alike(places: list[int]) -> Alike:
         every = [contents[i] for i in places]

@@ -62,6 +62,12 @@ class PlainResult:
         """(N,) the members that survived the posterior forecast."""
         return np.asarray(self.groups["/sample_stats"].variables["active"].values.ravel(), dtype=bool)
 
+    @property
+    def log_likelihood(self) -> Array:
+        """(N, K) of every member and reading, one series after the other."""
+        held = self.groups["/log_likelihood"].variables
+        return np.concatenate([held[axis.name].values[0] for axis in self.axes], axis=-1)
+
     def members(self, group: str, name: str) -> Array:
         """(N',) finite values of a parameter in ``group`` (prior or posterior), display unit, members in order."""
         values = np.asarray(self.groups[f"/{group}"].variables[name].values, dtype=float).ravel()

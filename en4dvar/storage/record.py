@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 from scipy.sparse import csr_array
 
 from en4dvar.forward import Observable, Trajectory
@@ -16,6 +16,9 @@ from en4dvar.series import Part, Places
 from en4dvar.state import Array
 from en4dvar.storage.axes import Axis
 from en4dvar.storage.readings import SCALAR
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 def observations_of(

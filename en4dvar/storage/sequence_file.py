@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-import xarray as xr
 
 from en4dvar.cycling.moments import Moments
 from en4dvar.cycling.outcome import SequentialResult
@@ -16,6 +15,9 @@ from en4dvar.cycling.series import CycleSeries
 from en4dvar.forward import ForwardModel, Observable, StateField
 from en4dvar.state import Array
 from en4dvar.tables import csv_text
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 def state_names(model: ForwardModel) -> tuple[list[str], list[str]]:
@@ -81,6 +83,8 @@ def run_attributes(run: SequentialResult) -> dict[str, Any]:
 
 def dataset(result: SeriesResult, attributes: Mapping[str, Any]) -> xr.Dataset:
     """Estimates over (time, state), observations and innovations over (time, observation), members, with units."""
+    import xarray as xr
+
     problem, run, series = result.problem, result.run, result.problem.series
     model = problem.start.model
     names, units = state_names(model)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
-import xarray as xr
 
 from en4dvar.analysis import Analysis
 from en4dvar.caution import Caution
@@ -31,6 +30,7 @@ from en4dvar.summary import ParameterSummary, results_table
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray as xr
 
 NEXT = ".en4dvar-next"  # in a run directory: the run that replaces its result
 COMPLETE = ".en4dvar-complete"  # in that: it is being put in place
@@ -201,6 +201,8 @@ def load_stored(path: str | Path) -> StoredResult:
     ------
     OutputError: it is not one, of another version, cut short or altered (see :mod:`en4dvar.storage.seal`).
     """
+    import xarray as xr
+
     path = Path(path)
     if path.parent.name == PACK:
         try:

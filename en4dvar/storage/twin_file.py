@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from en4dvar.cycling.twin import TwinResult
 from en4dvar.storage.sequence_file import (
@@ -18,6 +17,9 @@ from en4dvar.storage.sequence_file import (
     state_names,
 )
 from en4dvar.tables import csv_text
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 MEAN = "mean_after_burn_in"  # attribute of the scores
 
@@ -35,6 +37,8 @@ def summary_csv(result: TwinResult) -> str:
 
 def dataset(result: TwinResult, attributes: Mapping[str, Any]) -> xr.Dataset:
     """Truth, observations, moments and scores over (time, state), with units."""
+    import xarray as xr
+
     experiment, model = result.experiment, result.experiment.model
     names, units = state_names(model)
     unit = units[int(np.argmax(experiment.dynamic))]

@@ -82,11 +82,6 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
         return self if named == self.named else replace(self, named=named)
 
     @property
-    def cheap(self) -> bool:
-        """All but the equations of vapour and of the medium's temperature, a run of which takes ten times as long."""
-        return not (self.system.vapour or self.system.medium)
-
-    @property
     def validity(self) -> tuple[ValidityLimit, ...]:  # type: ignore[override]
         """The largest Mach number of the wall that the radial equation can bear, and where that is said."""
         value, source = MACH_LIMITS[self.radial]

@@ -21,7 +21,7 @@ from en4dvar.hints import suggest
 from en4dvar.state import Parameter
 from en4dvar.units import Quantity, parse_quantity
 from en4dvar_bubble.driving import Reading
-from en4dvar_bubble.driving.settings import IN_NO_FILE, PULSE_SECTIONS, DrivingSettings, Section, with_kind
+from en4dvar_bubble.driving.settings import PULSE_SECTIONS, DrivingSettings, Section, with_kind
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX, Gas, Heat, Start, Vapour
 from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, get_law
@@ -46,7 +46,12 @@ class _NamedSet(Section):
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
         names = list(get_args(SetName))
-        return {"anyOf": [{"enum": names, "description": "Name of a set of constants."}, handler(core_schema)]}
+        return {
+            "anyOf": [
+                {"enum": names, "description": "Name of a set of constants."},
+                super().__get_pydantic_json_schema__(core_schema, handler),
+            ]
+        }
 
     @model_validator(mode="before")
     @classmethod
@@ -100,7 +105,6 @@ _SOURCES = Field(
 ConstantsSettings = create_model(
     "ConstantsSettings",
     __base__=_NamedSet,
-    __cls_kwargs__=IN_NO_FILE,
     __doc__=_NamedSet.__doc__,
     **{f.name: _key(f) for f in CONSTANTS},  # type: ignore[call-overload]
     sources=(dict[str, str], _SOURCES),

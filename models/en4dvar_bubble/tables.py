@@ -40,19 +40,19 @@ class Grid:
 
 
 @kernel
-def quintic(out, a, da, dda, b, db, ddb):
-    """Quintic on s ∈ [0, 1] from values and derivatives scaled by the cell width."""
+def quintic(out, i, cell, a, da, dda, b, db, ddb):
+    """Quintic on s ∈ [0, 1] from values and derivatives scaled by the cell width, to ``out[i, cell]``."""
     rise = b - a - da - 0.5 * dda
     turn = db - da - dda
     curl = ddb - dda
-    out[0] = a
-    out[1] = da
-    out[2] = 0.5 * dda
-    out[3] = 10.0 * rise - 4.0 * turn + 0.5 * curl
-    out[4] = -15.0 * rise + 7.0 * turn - curl
-    out[5] = 6.0 * rise - 3.0 * turn + 0.5 * curl
-    out[6] = 0.0
-    out[7] = 0.0
+    out[i, cell, 0] = a
+    out[i, cell, 1] = da
+    out[i, cell, 2] = 0.5 * dda
+    out[i, cell, 3] = 10.0 * rise - 4.0 * turn + 0.5 * curl
+    out[i, cell, 4] = -15.0 * rise + 7.0 * turn - curl
+    out[i, cell, 5] = 6.0 * rise - 3.0 * turn + 0.5 * curl
+    out[i, cell, 6] = 0.0
+    out[i, cell, 7] = 0.0
 
 
 def from_values(samples: Array) -> Array:
@@ -65,23 +65,27 @@ def from_values(samples: Array) -> Array:
 @kernel
 def fill(samples, factor, out):
     """Write the coefficients of :func:`from_values`, of ``factor`` times the samples, to ``out`` (N, cells, 8)."""
-    n, total = samples.shape
-    cells = total - 1 - 2 * HALO
-    for i in range(n):
-        row = samples[i]
-        a = da = dda = 0.0
-        for j in range(cells + 1):
-            at = j + HALO
-            b = factor * row[at]
-            db = 0.0
-            ddb = _SECOND_CENTRE * b
-            for r in range(HALO):
-                right, left = row[at + r + 1], row[at - r - 1]
-                db += factor * _FIRST[r] * (right - left)
-                ddb += factor * _SECOND[r] * (right + left)
-            if j > 0:
-                quintic(out[i, j - 1], a, da, dda, b, db, ddb)
-            a, da, dda = b, db, ddb
+    for i in range(len(samples)):
+        fill_one(samples, i, factor, out, i)
+
+
+@kernel
+def fill_one(samples, member, factor, out, at):
+    """Those of one member's row of samples, to ``out[at]``."""
+    cells = samples.shape[1] - 1 - 2 * HALO
+    a = da = dda = 0.0
+    for j in range(cells + 1):
+        here = j + HALO
+        b = factor * samples[member, here]
+        db = 0.0
+        ddb = _SECOND_CENTRE * b
+        for r in range(HALO):
+            right, left = samples[member, here + r + 1], samples[member, here - r - 1]
+            db += factor * _FIRST[r] * (right - left)
+            ddb += factor * _SECOND[r] * (right + left)
+        if j > 0:
+            quintic(out, at, j - 1, a, da, dda, b, db, ddb)
+        a, da, dda = b, db, ddb
 
 
 @kernel
@@ -114,7 +118,7 @@ def from_slopes(slopes, step, zero):
         for j in range(zero - 1, -1, -1):
             value[j] = value[j + 1] - _area(first, second, third, j)
         for j in range(cells):
-            quintic(out[i, j], value[j], first[j], second[j], value[j + 1], first[j + 1], second[j + 1])
+            quintic(out, i, j, value[j], first[j], second[j], value[j + 1], first[j + 1], second[j + 1])
     return out
 
 

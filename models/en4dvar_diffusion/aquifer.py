@@ -12,22 +12,23 @@ from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict
+from pydantic import ConfigDict
 from pydantic import Field as Setting
 from scipy.sparse import coo_matrix, csc_matrix, identity
 from scipy.sparse.linalg import splu
 
 from en4dvar import Failure, Field, ForwardModel, Observable, Parameter, StateField, StateLayout, Trajectory
+from en4dvar.described import Described
 
 Array = npt.NDArray[np.float64]
 Side = Annotated[int, Setting(ge=2)]
 SOURCE = "Bear (1979), Hydraulics of Groundwater, § 5-1"
 
 
-class AquiferSettings(BaseModel):
+class AquiferSettings(Described):
     """The grid, and the steps in time."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
     shape: tuple[Side, Side] = (100, 100)
     """Rows and columns of cells, each of side 1."""
     step: Annotated[float, Setting(gt=0)] = 2.0

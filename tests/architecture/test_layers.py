@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # The modules of one line are a layer together; a package is a layer by itself.
 LAYERS = (
     ("errors",),
-    ("state", "hints", "files", "tables", "caution", "kernel_cache", "user_code", "user_file"),
+    ("state", "hints", "files", "tables", "caution", "kernel_cache", "user_code", "user_file", "described"),
     ("compiled",),
     ("dependence", "parameter_map"),
     ("units", "prior", "forward", "noise"),

@@ -51,6 +51,15 @@ window.look = (() => {
     const page = document.documentElement;
     return { scroll: page.scrollWidth, width: page.clientWidth };
   };
+  const cut = () => {
+    document.querySelectorAll("details").forEach((d) => (d.open = true));
+    const long = [...document.querySelectorAll("pre")].filter((e) => e.scrollWidth > e.clientWidth).map(() => "pre");
+    const outside = [...document.querySelectorAll("svg text")].filter((e) => e.textContent).filter((e) => {
+      const [word, drawing] = [e, e.closest("svg")].map((one) => one.getBoundingClientRect());
+      return word.bottom > drawing.bottom + 1 || word.left < drawing.left - 1 || word.right > drawing.right + 1;
+    });
+    return [...long, ...outside.map((e) => e.textContent)];
+  };
   const drawings = () =>
     [...document.querySelectorAll("svg, img")].map((e) => {
       const box = e.getBoundingClientRect();
@@ -66,5 +75,5 @@ window.look = (() => {
     return Object.entries(silent).flatMap(([what, bad]) =>
       [...document.querySelectorAll(what)].filter(bad).map((e) => `${what}: ${e.outerHTML.slice(0, 80)}`));
   };
-  return { faint, wide, drawings, unnamed };
+  return { cut, faint, wide, drawings, unnamed };
 })();

@@ -178,3 +178,12 @@ def test_prints_in_full(opened, pages, kind):
     for details in seen.page.locator("details").all():
         assert details.locator("> :not(summary)").first.is_visible()
     assert seen.page.pdf(format="A4").startswith(b"%PDF")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_paper_cuts_nothing_off(opened, pages, kind):
+    """Long lines of a configuration are broken, and the words of a figure lie within it, names of data sets too."""
+    seen = opened(pages[kind], width=680)  # A4 without its margins
+    seen.page.emulate_media(media="print")
+    seen.page.evaluate("document.querySelectorAll('pre').forEach(e => e.append('# ' + 'word '.repeat(80)))")
+    assert look(seen, "cut") == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,32 @@ def test_the_lines_to_be_uncommented_are_right(tmp_path: Path) -> None:
     Path("bubble.yaml").write_text(text, encoding="utf-8")
     (problem,) = build(load_config(Path("bubble.yaml")))
     assert {"sigma", "discrepancy_amplitude", "discrepancy_length"} < set(problem.prior.names)
+
+
+def test_a_laser_bubble_gets_the_whole_physics_and_what_to_compare_it_with() -> None:
+    """The options in the file's comment give the polytropic model, and both commands take what they are given."""
+    laser_film()
+    assert call("init", "--data", "film.mat", "--time-step", "0.63 us", "--radius-unit", "um").exit_code == 0
+    text = Path("film.yaml").read_text(encoding="utf-8")
+    model = load_config(Path("film.yaml")).model
+    assert (model.gas, model.vapour, model.medium_heat) == ("heat", "transport", "conducting")
+    (line,) = (line for line in text.splitlines() if line.startswith("  #   en4dvar run THIS_FILE --set"))
+    words = shlex.split(line.replace("THIS_FILE", "film.yaml").removeprefix("  #   en4dvar run "))
+    assert words[-2:] == ["--out", "runs/film_polytropic"]
+    assert call("validate", *words[:-2]).exit_code == 0
+    changes = dict(word.split("=", 1) for word in words if "=" in word)
+    simpler = load_config(Path("film.yaml"), changes).model
+    assert (simpler.gas, simpler.vapour, simpler.medium_heat) == ("polytropic", "none", "cold")
+    assert simpler.medium.p_v == pytest.approx(3.1e3, rel=0.05)
+    assert "  #   en4dvar compare runs/film runs/film_polytropic\n" in text
+
+
+def test_an_acoustic_bubble_gets_no_comparison() -> None:
+    source = Source("b.csv", ("t", "us"), None, ("R", "um"))
+    text = yaml_text("a", source, starter("acoustic", None), "test")
+    assert "gas: heat" in text
+    assert "polytropic" not in text
+    assert "vapour" not in text
 
 
 def test_the_collapse_time_is_rayleigh_s() -> None:

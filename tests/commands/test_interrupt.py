@@ -19,10 +19,10 @@ model: {name: lorenz96, size: 12}
 twin: {cycles: 5, burn_in: 1, interval: 0.05, error: {x_std: 1}, initial_std: {x: 0.1}}
 assimilation: {scheme: etkf, members: 15, inflation: 1.02}
 """
-EARLY = ("en4dvar.config.build.data_files", "en4dvar.runs.runner.build_one", "en4dvar.runs.runner.choose_executor")
+EARLY = tuple(f"en4dvar.runs.runner.{step}" for step in ("data_files", "build_one", "choose_executor"))
 BEGUN = (
     *(f"en4dvar.runs.session.{step}" for step in ("identity", "provenance", "RunLog.write", "write_checkpoint")),
-    *(f"en4dvar.runs.runner.{step}" for step in ("datasets", "summary_csv", "RunDirectory.publish")),
+    *(f"en4dvar.runs.runner.{step}" for step in ("datasets", "summary_rows", "RunDirectory.publish")),
     *(f"en4dvar.runs.{step}" for step in ("twin_run.dataset", "twin_run.conduct", "cycles.RunDirectory.publish")),
 )
 pytestmark = pytest.mark.parametrize("before", ["", "--force", "--resume"])  # a first run, or one after another
@@ -48,6 +48,7 @@ def told_at(
     words = ["run", str(path), "--out", str(folder / "out"), "--no-report"]
     if before:
         assert call(*words).exit_code == 0
+        (folder / "out" / "summary.csv").unlink()  # a finished run that is resumed has this left to do
         words.append(before)
     monkeypatch.setattr("sys.argv", ["en4dvar", *words])
     for each in (step, *later):
@@ -80,7 +81,7 @@ def test_a_run_that_has_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, s
 
 @pytest.mark.fault("interrupt")
 def test_a_second_one_while_the_first_is_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str) -> None:
-    steps = "en4dvar.runs.runner.summary_csv", "en4dvar.executor.local.SerialExecutor.__exit__"
+    steps = "en4dvar.runs.runner.summary_rows", "en4dvar.executor.local.SerialExecutor.__exit__"
     kept, advice, words = told_at(steps[0], before, tmp_path, monkeypatch, steps[1])
     assert kept.startswith("interrupted; ")
     assert advice == [*(w for w in words if w != before), "--resume"]

@@ -17,13 +17,14 @@ from en4dvar.runs.runner import run_campaign
 def test_terminal_only(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, analysis: Analysis) -> None:
     for name in ("FORCE_COLOR", "TTY_COMPATIBLE", "NO_COLOR"):
         monkeypatch.delenv(name, raising=False)
-    with terminal_progress(1) as progress:
+    with terminal_progress() as progress:
         assert progress is None
     assert capsys.readouterr() == ("", "")
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("COLUMNS", "120")
-    with terminal_progress(2) as progress:
+    with terminal_progress() as progress:
         assert progress is not None
+        progress.begin(0, 2)
         progress("gel", last := analysis.iterations[-1])
         progress._bar.refresh()
         progress("gel", ChainRecord(150, 1.02, 812.3))
@@ -41,8 +42,9 @@ def test_terminal_only(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.M
 def test_no_color(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, analysis: Analysis) -> None:
     for name, value in {"FORCE_COLOR": "1", "NO_COLOR": "1", "COLUMNS": "120"}.items():
         monkeypatch.setenv(name, value)
-    with terminal_progress(1) as progress:
+    with terminal_progress() as progress:
         assert progress is not None
+        progress.begin(0, 1)
         progress("gel", analysis.iterations[-1])
         progress.ended("gel", 1)
     err = capsys.readouterr().err
@@ -53,7 +55,7 @@ def test_no_color(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Monkey
 def test_what_is_compiled_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"FORCE_COLOR": "1", "COLUMNS": "120"}.items():
         monkeypatch.setenv(name, value)
-    with terminal_progress(1) as progress:
+    with terminal_progress() as progress:
         assert progress is not None
         with trigger_event("numba:compile", {}):  # numba's own, as where it compiles
             pass
@@ -65,9 +67,9 @@ def test_data_sets_are_counted_as_they_end(
 ) -> None:
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("COLUMNS", "90")
-    with terminal_progress(3) as progress:
+    with terminal_progress() as progress:
         assert progress is not None
-        progress.begin(1)
+        progress.begin(1, 3)
         progress("a very long name of a data set", analysis.iterations[3])
         progress.ended("a very long name of a data set", 2)
         assert "a very long name of a d… iteration 3" in progress._bar.tasks[0].description
@@ -85,7 +87,7 @@ def test_iterations_of_data_sets_side_by_side_are_seen(tmp_path: Path, monkeypat
         {"data.path": "set*.csv", "output.directory": str(tmp_path / "run"), "output.report": False,
          "execution.executor": "threads", "execution.workers": 2},
     )  # fmt: skip
-    with terminal_progress(3) as progress:
+    with terminal_progress() as progress:
         assert progress is not None
         monkeypatch.setattr(progress, "_show", lambda _: told.append((" ".join(progress._open), progress._done)))
         campaign = run_campaign(config, progress=progress)
@@ -142,5 +144,5 @@ def test_log(tmp_path: Path, analysis: Analysis) -> None:
 def test_a_notebook_without_widgets_has_no_line_and_no_warning(monkeypatch):
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
     monkeypatch.setattr("en4dvar.runs.progress.find_spec", lambda name: None)
-    with terminal_progress(1) as progress:
+    with terminal_progress() as progress:
         assert progress is None

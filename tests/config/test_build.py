@@ -8,7 +8,7 @@ from scipy.io import savemat
 from toy_config import csv_text, write_toy
 
 from en4dvar.config import load_config
-from en4dvar.config.build import build
+from en4dvar.config.build import build, data_files, inverse_plan
 from en4dvar.errors import ConfigError, DataError
 
 
@@ -78,6 +78,12 @@ def test_campaign(tmp_path: Path) -> None:
         build(load_config(path, {"data.path": ["a/set1.csv", "b/*.csv"], "name": "all"}))
     with pytest.raises(DataError, match="no file matches"):
         build(load_config(path, {"data.path": "c/*.csv"}))
+
+
+def test_tables_are_counted_without_a_look_into_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = load_config(write_toy(tmp_path))
+    monkeypatch.setattr("en4dvar.inputs.parts.table_of", lambda *_: pytest.fail("a table was read"))
+    assert len(data_files(inverse_plan(config))) == 1
 
 
 def test_refused(tmp_path: Path) -> None:

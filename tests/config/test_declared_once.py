@@ -35,7 +35,8 @@ def test_a_dataclass_gives_its_section() -> None:
 def test_the_settings_of_the_scheme_are_a_plain_dataclass() -> None:
     assert Assimilation().settings == AssimilationSettings()
     assert replace(AssimilationSettings(), members=7).members == 7
-    words = [f.description for name, f in Assimilation.model_fields.items() if name != "weights"]
+    keys = Assimilation.model_json_schema()["properties"]
+    words = [key.get("description") for name, key in keys.items() if name != "weights"]
     assert len(words) == len(AssimilationSettings.__dataclass_fields__)
     assert all(words)
 

@@ -6,6 +6,7 @@ it writes a line of what came of them. :class:`Children` is one such process, fo
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -37,7 +38,8 @@ class Task:
     """``words`` of the command line. ``copy`` is put in place of ``to`` before.
 
     ``limit``: bytes that a file may have (the kernel's own refusal, EFBIG); ``fails``: a function of ``os`` that ends
-    in ``error``; ``kill_at``: number of the operation on files at which the process is gone.
+    in ``error``; ``kill_at``: number of the operation on files at which the process is gone. Standard output is thrown
+    away, or on a ``full`` device: "output", or "both", standard error too.
     """
 
     words: list[str]
@@ -47,6 +49,7 @@ class Task:
     fails: str = ""
     error: str = ""
     kill_at: int = 0
+    full: str = ""
 
 
 @dataclass
@@ -97,8 +100,9 @@ def _child(task: Task, told: int) -> None:
     from en4dvar.cli import main
 
     boundary = Boundary(task.kill_at)
-    os.dup2(told, 2)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    full = os.open("/dev/full", os.O_WRONLY)
+    os.dup2(full if task.full == "both" else told, 2)
+    os.dup2(full if task.full else os.open(os.devnull, os.O_WRONLY), 1)
     if task.limit is not None:
         # Python takes the part of a module's bytecode that had room for the whole, here and in every later process
         sys.dont_write_bytecode = True
@@ -115,8 +119,9 @@ def _child(task: Task, told: int) -> None:
         code = end.code if isinstance(end.code, int) else 1
     except BaseException:
         traceback.print_exc()
-    sys.stderr.flush()
-    os.write(2, f"{len(boundary.seen)}\n".encode())
+    with contextlib.suppress(OSError):
+        sys.stderr.flush()
+    os.write(told, f"{len(boundary.seen)}\n".encode())
     os._exit(code)
 
 

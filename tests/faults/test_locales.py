@@ -4,7 +4,9 @@ import shutil
 import subprocess
 
 import pytest
-from run_files import TESTS, assert_same_results, make_campaign, run_cli
+from run_files import TESTS, assert_same_results, configuration, make_campaign, run_cli
+
+from en4dvar.runs.runner import run_campaign
 
 SET_AT_START = """\
 import locale, pathlib
@@ -18,8 +20,7 @@ def plain(tmp_path_factory):
     """A configuration and its run where nobody has set a locale."""
     folder = tmp_path_factory.mktemp("plain")
     path = make_campaign(folder, 2)
-    done = run_cli("run", path, "--out", folder / "run", "--no-report", LC_ALL="C.UTF-8")
-    assert done.returncode == 0, done.stderr
+    run_campaign(configuration(path, folder / "run"))
     return path, folder / "run"
 
 

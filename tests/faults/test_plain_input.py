@@ -34,7 +34,7 @@ from en4dvar.runs.lock import LOCK, locked
 from en4dvar.state import Array, Parameter
 from en4dvar.storage.seal import seal_file
 from en4dvar.storage.store import save
-from en4dvar.summary import summary_csv
+from en4dvar.summary import summary_rows
 from en4dvar.tables import csv_text as table_text
 
 MODEL = "from toy_models import Oscillator\nclass Own(Oscillator):\n    pass\n"
@@ -252,7 +252,7 @@ FORMULAS = ("=1+1", "+1 mm", "-a", "@SUM(A1)", "\t=1", "\r=1", " =1", "＝1")
 @pytest.mark.fault("formula")
 def test_a_name_is_no_formula_of_a_spreadsheet(stored: Path) -> None:
     result = load_result(stored)
-    text = summary_csv(((name, result.summary(), ()) for name in FORMULAS), {"=lost": "+because"})
+    text = table_text(summary_rows(((name, result.summary(), ()) for name in FORMULAS), {"=lost": "+because"}))
     rows = list(csv.reader(text.splitlines()[:1] + text.splitlines()[-1:]))
     assert (rows[1][0], rows[1][-2]) == ("'=lost", "'+because")
     table = io.StringIO(table_text([[name, -1.5, "-1.5", 1e-300] for name in FORMULAS]), newline="")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import compileall
 import os
 import shutil
 import stat
@@ -38,6 +39,7 @@ def closed() -> Iterator[tuple[Path, Run]]:
     here = Path(tempfile.mkdtemp(prefix="en4dvar_closed_"))
     for top in (ROOT / "en4dvar", *(ROOT / "models").glob("en4dvar_*")):
         shutil.copytree(top, here / "code" / top.name, ignore=shutil.ignore_patterns("__pycache__"))
+    compileall.compile_dir(here / "code", quiet=1)  # once, not by each of the commands, which can keep nothing there
     (here / "home").mkdir()
     (here / "tmp").mkdir()
     for path in (here, *here.rglob("*")):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from toys import Decay, Fragile, Toy, Vectorised, Wave, make_problem, with_noise
+from toys import Decay, Fragile, Toy, Vectorised, Wave, make_problem, with_discrepancy, with_noise
 
 from en4dvar.analysis import Analysis
 from en4dvar.assimilate import assimilate
@@ -92,6 +92,15 @@ def bent(std: float = 0.05) -> InverseProblem:
     return replace(problem, observations=replace(y, values=exact + std * (0.9 * np.sin(5 * y.times) + 0.3 * rough)))
 
 
+def waved(height: float) -> InverseProblem:
+    """Data with a slow wave of so many errors that the model lacks, but a discrepancy allows for."""
+    problem = make_problem(Vectorised(TWO), (1.0, 0.5), k=40, std=0.05)
+    y = problem.observations
+    wave = 0.05 * height * np.sin(5 * y.times)
+    seen = replace(problem, observations=replace(y, values=y.values + wave))
+    return with_discrepancy(seen, amplitude=(0.025, 1.5), length=(0.2, 0.7))
+
+
 def spiked() -> InverseProblem:
     problem = make_problem(Vectorised(TWO), (1.0, 0.5), k=40)
     values = problem.observations.values.copy()
@@ -123,6 +132,7 @@ PROVOKED: dict[str, Callable[[], Analysis]] = {
     "starts-disagree": lambda: run(make_problem(Wave(), [1.5, 3.0], scale=2.5), members=4),
     "residual-structure": lambda: run(bent()),
     "odd-residuals": lambda: run(spiked()),
+    "discrepancy-found": lambda: run(waved(3.0)),
     "one-descent": lambda: run(linear(), starts=1),
     "start-moved": lambda: run(
         make_problem(Fragile(-0.9, names=TWO), (-1.0, 0.5)), start="prior-mean", min_active_fraction=0.2

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from honesty.provoked import decay_experiments, linear_experiments
+from honesty.provoked import decay_experiments, linear_experiments, waved
 
 from en4dvar.assimilate import assimilate
 from en4dvar.config import load_config
@@ -34,6 +34,10 @@ def test_the_quick_start_is_silent():
 def test_linear_experiments_raise_no_false_alarm(settings):
     """By their quantiles misfit, overstated error and conflict together may cry once in 700 experiments."""
     assert len(false_alarms(linear_experiments(50, 77), **settings)) <= 1
+
+
+def test_a_discrepancy_that_is_not_there_is_not_found():
+    assert false_alarms([waved(0.0)]) == []
 
 
 @pytest.mark.slow

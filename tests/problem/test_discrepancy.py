@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
-from toys import Linear, Vectorised, Wave, make_problem
+from toys import Linear, Vectorised, Wave, make_problem, with_discrepancy
 
 from en4dvar.assimilate import assimilate, forecast, log_posterior
 from en4dvar.config import load_config
@@ -19,27 +19,13 @@ from en4dvar.noise import Kernel, Linearisation, Predicted, RobustDiscrepancyNoi
 from en4dvar.noise.kernel import NUGGET
 from en4dvar.noise.robust_discrepancy import _reweighted, solve_boxed
 from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings, discrepancy_parameters
+from en4dvar.problem import AssimilationSettings
 from en4dvar.response.linear import LinearResponse
 from en4dvar.response.what_if import what_if
-from en4dvar.state import NOISE_SCALE
 
 K = 9
 TIMES = np.linspace(0.2, 2.0, K)
 NU = (0.5, 1.5, 2.5)
-
-
-def with_discrepancy(
-    problem, *, sigma=None, huber=None, correlation=None, amplitude=(0.2, 0.5), length=(0.6, 0.4), **kernel
-):
-    """The problem with a discrepancy whose amplitude and length have lognormal priors (median, log std)."""
-    o = problem.observations
-    noise = noise_of(o.noise.std, o.noise.time_std, correlation, huber, Kernel(o.times, **kernel))
-    parameters = discrepancy_parameters(problem.model, problem.observable)
-    terms = [*problem.prior.terms, *map(PriorTerm.lognormal, parameters, *zip(amplitude, length, strict=True))]
-    if sigma is not None:
-        terms.append(PriorTerm.lognormal(NOISE_SCALE, 1.0, sigma))
-    return replace(problem, observations=replace(o, noise=noise), prior=Prior(tuple(terms)))
 
 
 def matern(lag, length, nu):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from honesty.provoked import bent, run, spiked
+from toys import with_discrepancy
 
 from en4dvar.report.page import judge_chi2
 from en4dvar.residuals import Residuals, positive_chance
@@ -67,8 +68,6 @@ def test_no_scale_is_offered_as_a_cure_of_structure():
 
 
 def test_a_discrepancy_takes_the_structure():
-    from problem.test_discrepancy import with_discrepancy
-
     analysis = run(with_discrepancy(bent(), amplitude=(0.05, 1.0), length=(0.3, 0.7), smoothness=1.5, sigma=0.7))
     assert "residual-structure" not in {c.code for c in analysis.cautions}
     found = analysis.discrepancy

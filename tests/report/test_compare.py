@@ -15,7 +15,14 @@ from en4dvar.cli import main
 from en4dvar.errors import OutputError
 from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.report.compare import ALL, _effective, compare_runs, comparison_table, model_probabilities
+from en4dvar.report.compare import (
+    ALL,
+    _effective,
+    compare_runs,
+    comparison_table,
+    model_probabilities,
+    with_evidences,
+)
 from en4dvar.report.overlay import overlay
 from en4dvar.report.result import Result
 from en4dvar.storage.store import load_stored, save
@@ -63,6 +70,17 @@ def test_probabilities_follow_the_exact_evidence_of_linear_models(tmp_path):
     assert comparison.of("set1")[1].dfs == pytest.approx(2, abs=0.01)
     # p_WAIC of a well informed linear parameter is near 1
     assert comparison.of("set1")[0].effective_parameters == pytest.approx(1, abs=0.6)
+
+
+def test_other_evidences_are_judged_as_those_of_the_results(tmp_path):
+    runs = [run_dir(tmp_path / "one", ("a",), (1, 2)), run_dir(tmp_path / "two", ("a", "b"), (1, 2))]
+    comparison = compare_runs(runs)
+    assert with_evidences(comparison, [{}, {}]) == comparison
+    better = with_evidences(comparison, [{}, {"set2": 1e3}])
+    assert [s.stored for s in better.scores] == [True, True, True, False, True, True]
+    assert better.of("set1") == comparison.of("set1")
+    assert [s.probability for s in better.of(ALL)] == [0, 1]
+    assert better.of(ALL)[1].log_evidence == comparison.of("set1")[1].log_evidence + 1e3
 
 
 def test_members_that_do_not_fit_have_no_effective_number_of_parameters():

@@ -19,6 +19,7 @@ from en4dvar.report import write_pages
 from en4dvar.report.responses import StoredShift, shift_text, stored_ledger, stored_shifts
 from en4dvar.report.result import Result, load_result
 from en4dvar.storage.campaign_file import save_campaign
+from en4dvar.storage.pack import PACK, Pack
 from en4dvar.storage.provenance import provenance
 from en4dvar.storage.store import load_stored, save
 
@@ -104,8 +105,10 @@ def test_a_page_without_them_is_silent(run_dir, tmp_path):
 
 
 def test_a_campaign_keeps_them(run_dir, tmp_path):
-    sources = {name: add_to_pack(tmp_path, name, load_result(run_dir / "posterior.nc")) for name in ("a", "b")}
-    with netCDF4.Dataset(save_campaign(tmp_path / "posterior.nc", sources, {}, {})) as file:
+    for name in ("a", "b"):
+        add_to_pack(tmp_path, name, load_result(run_dir / "posterior.nc"))
+    path = save_campaign(tmp_path / "posterior.nc", Pack(tmp_path / PACK), {"a": "a", "b": "b"}, {}, {})
+    with netCDF4.Dataset(path) as file:
         stats = file["sample_stats"]
         assert stats["what_if_change"].dimensions == ("dataset", "alternative", "parameter")
         assert list(stats["alternative"][:]) == ["clock", "scale", "other"]

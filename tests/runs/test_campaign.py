@@ -62,7 +62,7 @@ def test_an_outcome_that_was_altered_is_told(campaign, tmp_path):
     entries, record = Pack(campaign.directory / PACK).entries, tmp_path / "run" / PACK
     record.write_bytes(record.read_bytes().replace(b'"failure": ""', b'"failure": 12'))
     with pytest.raises(OutputError, match=r"datasets\.pack/set0: damaged or altered"):
-        Outcomes(record, entries, {"set0": tmp_path})[0]
+        Outcomes(tmp_path / "run", PACK, entries, {"set0": "set0"})[0]
 
 
 def test_one_file_for_all(campaign):
@@ -93,9 +93,10 @@ def test_one_file_for_all(campaign):
 
 
 def test_blocks_make_no_difference(campaign, tmp_path, monkeypatch):
-    sources = {load_result(address).name: address for address in results_of(campaign.directory / PACK)}
+    pack = Pack(campaign.directory / PACK)
+    sources = {load_result(address).name: address.name for address in results_of(pack.path)}
     monkeypatch.setattr("en4dvar.storage.campaign_file.BLOCK", 1)
-    one_by_one = xr.load_datatree(save_campaign(tmp_path / "posterior.nc", sources, {}, {}))
+    one_by_one = xr.load_datatree(save_campaign(tmp_path / "posterior.nc", pack, sources, {}, {}))
     together = xr.load_datatree(campaign.directory / "posterior.nc")
     for group in GROUPS:
         xr.testing.assert_identical(one_by_one[group].to_dataset(), together[group].to_dataset())

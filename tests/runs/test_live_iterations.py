@@ -24,15 +24,16 @@ class Listener:
         lines = log(self.out)
         if isinstance(record, StartRecord):
             stage = "search for another minimum" if record.further else "start"
-            assert f"{name}: {stage}, round {record.rounds:2d}  lowest J " in lines[-1]
+            assert any(f"{name}: {stage}, round {record.rounds:2d}  lowest J " in line for line in lines)
             self.flag.with_suffix(".start").touch()
             return
         if isinstance(record, Descents):
-            assert f"{name}: {record.words}" in lines[-1]
+            assert any(f"{name}: {record.words}" in line for line in lines)
             return
         if not self.heard:
             assert any(f"{name}: iteration {record.iteration:2d}  J " in line for line in lines)
-            assert not any(f"{name}: converged" in line for line in lines)
+            if self.of in (name, None):  # a data set that does not wait may end before it sends its second message
+                assert not any(f"{name}: converged" in line for line in lines)
         self.heard.append((name, record.iteration))
         if record.iteration == self.last and self.of in (name, None):
             self.flag.touch()

@@ -87,6 +87,21 @@ def test_replacement(earlier):
     assert not (out / NEXT).exists()
 
 
+def test_a_pattern_in_the_list_stands_for_the_files_that_are_there(tmp_path):
+    """As that of the checkpoints of a campaign, of which a killed run leaves some behind."""
+    out, names = tmp_path / "run", {"a.iteration", "b.iteration", "mine.txt"}
+    with RunDirectory.open(out) as directory:
+        directory.claim("run.log", "checkpoints/*.iteration")
+        folder = directory.folder("checkpoints")
+        for file in (out / "run.log", *(folder / name for name in names)):
+            file.write_text("old")
+    with RunDirectory.open(out, "force") as directory:
+        directory.claim("run.log").write_text("new")
+        directory.publish()
+    assert {name for name in contents(out) if name.startswith("checkpoints/")} == {"checkpoints/mine.txt"}
+    assert (out / "run.log").read_text() == "new"
+
+
 def test_replacement_interrupted_anywhere_is_finished_later(earlier, monkeypatch):
     path, out = earlier
     kept = out.with_name("kept")

@@ -9,16 +9,17 @@ from en4dvar.assimilate import assimilate
 from en4dvar.problem import AssimilationSettings
 from en4dvar.report.result import Result
 from en4dvar.storage.campaign_file import save_campaign
+from en4dvar.storage.pack import PACK, Pack
 from en4dvar.storage.provenance import provenance
 
 
 def test_scalars_of_the_sets_that_were_sampled_are_kept(tmp_path):
     """The first set was not sampled: what the second one's draws were worth must not be lost with it."""
-    problem, sources = two_wells(), {}
+    problem, sources = two_wells(), {"plain": "plain", "drawn": "drawn"}
     for name, refine in (("plain", "none"), ("drawn", "auto")):
         analysis = assimilate(problem, AssimilationSettings(refine=refine), 1)
-        sources[name] = add_to_pack(tmp_path, name, Result.from_analysis(analysis, provenance("name: test\n")))
-    with netCDF4.Dataset(save_campaign(tmp_path / "posterior.nc", sources, {}, {})) as file:
+        add_to_pack(tmp_path, name, Result.from_analysis(analysis, provenance("name: test\n")))
+    with netCDF4.Dataset(save_campaign(tmp_path / "posterior.nc", Pack(tmp_path / PACK), sources, {}, {})) as file:
         file.set_auto_mask(False)
         stats = file["sample_stats"]
         assert np.isnan(stats["importance_draws"][0])

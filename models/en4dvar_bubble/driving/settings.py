@@ -7,8 +7,9 @@ from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Union, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, create_model, field_validator, model_validator
+from pydantic import ConfigDict, Field, ValidationInfo, create_model, field_validator, model_validator
 
+from en4dvar.described import Described
 from en4dvar.errors import En4dvarError
 from en4dvar.inputs.asked import Format
 from en4dvar.units import Quantity, convert
@@ -16,14 +17,11 @@ from en4dvar_bubble.driving.base import Driving
 from en4dvar_bubble.driving.pulses import PULSES
 from en4dvar_bubble.driving.tabulated import from_file
 
-# For a class that stands in no file: pydantic would search all of them for its text.
-IN_NO_FILE = {"use_attribute_docstrings": False}
 
-
-class Section(BaseModel):
+class Section(Described):
     """A section of a YAML file: unknown keys are errors, the texts under its keys are their descriptions."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class _Kind(Section):
@@ -54,7 +52,7 @@ def _section(kind: str, function: Callable[..., Driving]) -> type[_Kind]:
         described = " ".join(text for text in hints[name].__metadata__ if isinstance(text, str))
         default = ... if argument.default is argument.empty else argument.default
         keys[name] = (hints[name], Field(default, description=described))
-    section = create_model(kind.capitalize(), __base__=_Kind, __doc__=words, __cls_kwargs__=IN_NO_FILE, **keys)
+    section = create_model(kind.capitalize(), __base__=_Kind, __doc__=words, **keys)
     section.pulse = staticmethod(function)
     return section
 

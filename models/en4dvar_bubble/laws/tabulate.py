@@ -65,7 +65,7 @@ def _coarsen(fine, ratio, cells):  # type: ignore[no-untyped-def]
         for j in range(cells):
             a, b = fine[i, j * ratio], fine[i, (j + 1) * ratio]
             first, second = float(ratio), 2.0 * ratio * ratio
-            quintic(out[i, j], a[0], a[1] * first, a[2] * second, b[0], b[1] * first, b[2] * second)
+            quintic(out, i, j, a[0], a[1] * first, a[2] * second, b[0], b[1] * first, b[2] * second)
     return out
 
 

@@ -98,22 +98,41 @@ class Output(NamedTuple):
 
 class Scratch(NamedTuple):
     """What one thread works on: ``block`` (rows, WIDTH) of zeros, where the rows of :class:`Workspace` and
-    :class:`Lanes` end ``edges`` (25,), ``marks`` (4, WIDTH) of integers, ``elastic`` (WIDTH, cells, 8). Made by NumPy:
-    a kernel without allocation is compiled faster.
+    :class:`Lanes` end ``edges`` (26,), ``marks`` (4, WIDTH) of integers, ``turn`` (4,), ``elastic`` (WIDTH, cells, 8).
+    Made by NumPy: a kernel without allocation is compiled faster.
     """
 
     block: Array
     edges: IntArray
     marks: IntArray
+    turn: IntArray
     elastic: Array
 
 
+class Shared(NamedTuple):
+    """What does not depend on the kind of equations, for what is done between two steps."""
+
+    members: Members
+    control: Control
+    out: Output
+    scratch: Scratch
+    dims: Dims
+    driving_span: Array
+
+
 def scratch(
-    dims: Dims, matrix: int, tiles: tuple[int, int], border: int, of_fields: int, parameters: int, cells: int
+    dims: Dims,
+    matrix: int,
+    tiles: tuple[int, int],
+    border: int,
+    of_fields: int,
+    parameters: int,
+    cells: int,
+    first_step: float,
 ) -> Scratch:
     """That for a matrix of so many numbers, and in ``tiles`` of so many numbers and rows, a ``border`` of so many
     unknowns, ``of_fields`` rows of scratch for the fields, members of so many ``parameters`` and tables of so many
-    ``cells``.
+    ``cells``; lanes that wait for a member have the step ``first_step``.
     """
     n = dims.gas + dims.vapour + dims.medium + dims.wall + dims.memory + 2
     step = of_fields, n, matrix, 1, rodas5p.STAGES * n, n, n, 1, 3, 3 * n
@@ -123,7 +142,10 @@ def scratch(
     raw = np.zeros((edges[-1] + 1) * WIDTH)
     first = -(raw.ctypes.data // 8) % WIDTH  # on a 64-byte boundary: a row that straddles two cache lines costs twice
     block = raw[first : first + edges[-1] * WIDTH].reshape(-1, WIDTH)
-    return Scratch(block, edges, np.zeros((4, WIDTH), dtype=np.int64), np.zeros((WIDTH, cells, 8)))
+    marks, turn = np.zeros((4, WIDTH), dtype=np.int64), np.zeros(4, dtype=np.int64)
+    marks[0] = -1  # no lane has a member
+    block[edges[-7] : edges[-6]] = first_step  # so that one without gets no further than finite numbers
+    return Scratch(block, edges, marks, turn, np.zeros((WIDTH, cells, 8)))
 
 
 class Loaded(NamedTuple):

@@ -16,14 +16,16 @@ from en4dvar_bubble import tables as tables_module
 from en4dvar_bubble.driving import Driving, Reading
 from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
 from en4dvar_bubble.solver import integrate, rows
-from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output, Scratch, scratch
+from en4dvar_bubble.solver.apart import address
+from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output, Scratch, Shared, scratch
 from en4dvar_bubble.solver.arrow import tiles
 from en4dvar_bubble.solver.collocation import ball, exterior
 from en4dvar_bubble.solver.fields import scratch_rows
 from en4dvar_bubble.solver.general import sums
 from en4dvar_bubble.solver.tiles import AREA, EDGE, kept_tiles
 
-stamp_with_sources(integrate.integrate, Path(__file__).parent, Path(tables_module.__file__))
+for _kernel in (integrate.integrate, integrate.between_steps):
+    stamp_with_sources(_kernel, Path(__file__).parent, Path(tables_module.__file__))
 
 AccuracyName = Literal["fast", "standard", "reference"]
 Radial = Literal["rayleigh-plesset", "keller-miksis", "keller-miksis-enthalpy", "gilmore"]
@@ -285,7 +287,9 @@ class Solver:
         equations, control = self.equations(memory, viscous, pulse), self.control
 
         def call() -> None:
-            integrate.integrate(members, equations, control, output, self._scratch(members.parameters.shape[1]))
+            working = self._scratch(members.parameters.shape[1])
+            shared = Shared(members, control, output, working, equations.dims, equations.driving_span)
+            integrate.integrate(address(integrate.between_steps, shared), shared, equations)
 
         return call, Solution(*output)
 
@@ -295,4 +299,5 @@ class Solver:
         of_tiles = (0, 0) if where is None else ((where.max() + 1) * AREA, len(where) * EDGE)
         border = system.size - system.wall_row + sums.py_func(system.dims) if system.general else 0
         of_fields = scratch_rows(system.dims)
-        return scratch(system.dims, matrix, of_tiles, border, of_fields, parameters, int(_ELASTIC_SPAN[3]))
+        of_lanes = parameters, int(_ELASTIC_SPAN[3]), _FIRST_STEP
+        return scratch(system.dims, matrix, of_tiles, border, of_fields, *of_lanes)

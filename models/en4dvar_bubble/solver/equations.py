@@ -21,8 +21,7 @@ Radial motion (Keller & Miksis 1980; the paper's eq. 1), Mach number m = Ṙ/c:
 
 from __future__ import annotations
 
-import numba as nb
-
+from en4dvar.compiled import inlined
 from en4dvar_bubble.solver.lanes import exp, load, maximum, splat, sqrt, store
 from en4dvar_bubble.solver.lookup import driving, lookup
 from en4dvar_bubble.solver.rows import (
@@ -43,7 +42,7 @@ from en4dvar_bubble.solver.rows import (
 )
 
 
-@nb.njit(forceinline=True)
+@inlined
 def products(y, first, count, matrix, work, at):
     """d/dy at the nodes and at the wall, then the Laplacian, of the unknowns ``first … first+count−1`` to ``work``,
     without what the wall adds. Returns d/dy at the wall.
@@ -67,7 +66,7 @@ def products(y, first, count, matrix, work, at):
     return load(work, at + count)
 
 
-@nb.njit(forceinline=True)
+@inlined
 def _gas(y, nodes, par, ops, work):
     """Pressure p, π̇, E and wall gradient; rows of ``work``: k (0…), θ (m…), τ' (2m…, last at the wall), ∇²τ (3m+1…),
     ⟨1/θ⟩ (4m+1).
@@ -98,10 +97,9 @@ def _gas(y, nodes, par, ops, work):
     return p, rate, E, wall
 
 
-@nb.njit(forceinline=True)
-def rhs(y, t, eq, loaded, work, out):
-    """Write dy/dt (n, 8) to ``out``; ``work`` (4m+2, 8) is scratch."""
-    nodes, par, ops, reading = eq.nodes, loaded.par, eq.gas, eq.reading
+def rhs(y, t, eq, loaded, w):
+    """Write dy/dt (n, 8) to ``f`` of the workspace."""
+    nodes, par, ops, reading, work, out = eq.nodes, loaded.par, eq.gas, eq.reading, w.work, w.f
     m = len(nodes)
     p, rate, E, _wall = _gas(y, nodes, par, ops, work)
     V = load(y, m)
@@ -138,7 +136,7 @@ def rhs(y, t, eq, loaded, work, out):
     store(out, m + 1, V)
 
 
-@nb.njit(forceinline=True)
+@inlined
 def jacobian(y, t, eq, loaded, w):
     """Write dy/dt to ``f`` of the workspace, ∂f/∂y to ``jac`` (row i·n+j) and ∂f_V/∂t, the only nonzero one, to ``dt``.
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numba as nb
 
+from en4dvar.compiled import called, inlined
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.arrow import begins
 from en4dvar_bubble.solver.equations import products
@@ -48,7 +49,7 @@ def _of_medium(mT):
     return 7 * mT + 2
 
 
-@nb.njit(forceinline=True)
+@inlined
 def _theta(tau, k):
     """θ = 1 + 2τ/(k+1) and 1/θ by one division, which takes the time of ten multiplications."""
     below = k + 1.0
@@ -57,14 +58,14 @@ def _theta(tau, k):
     return above * above * inverse, below * below * inverse
 
 
-@nb.njit
+@called
 def _add_wall(value, count, matrix, work, at):
     """What the value at the wall adds to the derivatives in ``work``."""
     for i in range(2 * count + 1):
         store(work, at + i, load(work, at + i) + value * matrix[i, count])
 
 
-@nb.njit
+@called
 def _sum_up(y, eq, par, work, border):
     """The interior's share in the derivatives, to ``work``, and in the sums of the border; returns θ_m' at the wall."""
     mT, mY, mM, _, _, _, _ = eq.dims
@@ -92,7 +93,7 @@ def _sum_up(y, eq, par, work, border):
     return products(y, mT + mY, mM, eq.medium, work, _of_medium(mT))
 
 
-@nb.njit
+@called
 def _rates(eq, par, shared, work, out):
     """Rates of the fields to ``out``; the derivatives in ``work`` are completed."""
     mT, mY, mM, _, _, _, _ = eq.dims
@@ -123,7 +124,7 @@ def _rates(eq, par, shared, work, out):
             store(out, mT + mY + j, flow + load(shared, SPREAD) * load(work, at + mM + 1 + j) + heating)
 
 
-@nb.njit
+@called
 def general_rhs(y, t, eq, loaded, w):
     """Write dy/dt (n, 8) to ``f``; the wall's row holds the residual of its algebraic equation. ``w`` leaves what the
     Jacobian needs; returns θ_m' at the wall but for the wall's own share.
@@ -140,7 +141,7 @@ def general_rhs(y, t, eq, loaded, w):
     return outward
 
 
-@nb.njit
+@called
 def _gas_blocks(y, eq, par, w):
     """Minus the derivatives of the gas's rates and of the sums with respect to τ and Y, to ``tiles``."""
     mT, mY, _, _, _, _, _ = eq.dims
@@ -180,7 +181,7 @@ def _gas_blocks(y, eq, par, w):
         store(matrix, diagonal, load(matrix, diagonal) - curved / conduct)
 
 
-@nb.njit
+@called
 def _medium_block(eq, par, w):
     """The same of the medium's, and of the residual of the wall."""
     medium, mM, shared, matrix, where = eq.medium, eq.dims.medium, w.shared, w.tiles, eq.where
@@ -194,7 +195,7 @@ def _medium_block(eq, par, w):
         store(matrix, place(where, wall, first + i), -(load(par, rows.MEDIUM_K) * medium[mM, i]))
 
 
-@nb.njit
+@called
 def _border_column(column, eq, par, change, w):
     """Minus the derivatives of the fields' rates with respect to an unknown of the border, from those of ``shared``."""
     mT, mY, mM, _, _, _, _ = eq.dims
@@ -230,7 +231,7 @@ def _border_column(column, eq, par, change, w):
         store(matrix, place(where, first_M + i, column), -total)
 
 
-@nb.njit
+@called
 def general_jacobian(y, t, eq, loaded, w):
     """Write dy/dt to ``f`` of the workspace, minus its derivatives in the extended form of :mod:`arrow` to ``tiles``
     and ∂f_V/∂t to ``dt``. Those with respect to the border are one-sided differences.

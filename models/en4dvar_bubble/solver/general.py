@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import numba as nb
 
+from en4dvar.compiled import called
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.lanes import absolute, exp, load, log, maximum, splat, sqrt, store
 from en4dvar_bubble.solver.lookup import driving, lookup
@@ -51,7 +52,7 @@ def sums(dims):
     return SUMS if dims.vapour else 2 if dims.gas else 0
 
 
-@nb.njit
+@called
 def _contents(border, V, u, outward, eq, par, shared, out):
     """Pressure and π̇; what the fields read to ``shared``, the residual of the wall to ``out``. ``outward`` is the
     interior's share in θ_m' at the wall.
@@ -101,7 +102,7 @@ def _contents(border, V, u, outward, eq, par, shared, out):
     return p, rate
 
 
-@nb.njit
+@called
 def border_rates(border, t, outward, eq, loaded, shared, out):
     """Rates of the border's unknowns to ``out``, the residual of its algebraic equation in the wall's row; what the
     fields read to ``shared``. ``outward``: see :func:`_contents`.

@@ -7,15 +7,18 @@ from __future__ import annotations
 import math
 
 import numba as nb
+import numpy as np
 from numba.core import types
 
-from en4dvar.compiled import kernel_without_allocation
+from en4dvar.compiled import called, kernel_called_by_address, kernel_without_allocation
 from en4dvar_bubble.solver import rodas5p
+from en4dvar_bubble.solver.apart import call, contents, kept
 from en4dvar_bubble.solver.arrays import Lanes, Loaded, Workspace
-from en4dvar_bubble.solver.lanes import WIDTH, peek, rows_of, take
+from en4dvar_bubble.solver.lanes import WIDTH, peek, take
+from en4dvar_bubble.solver.parts import parted
 from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, TABLE
-from en4dvar_bubble.solver.step import LEAST_ERROR, attempt, interpolant
-from en4dvar_bubble.tables import fill
+from en4dvar_bubble.solver.step import LEAST_ERROR, attempt, interpolant, judge
+from en4dvar_bubble.tables import fill_one
 
 # Status of a member; the reasons users read are made by ``driver.reason``.
 OK, STEP_LIMIT, NON_FINITE, STEP_UNDERFLOW, MACH_LIMIT, TIME_LIMIT, WALL_LIMIT = 0, 1, 2, 3, 4, 5, 6
@@ -29,54 +32,32 @@ _LEAST_ROOT = 1e-2 ** (1.0 / rodas5p.ORDER)
 # step limit bounds the work.
 _SHORTEST = 1e-18
 _TURNS_PER_LOOK = 64  # attempted steps between looks at the clock
+_TURNS, _RUNNING, _EXHAUSTED, _CLOCK = range(
+    4
+)  # of ``turn``: how many so far, lanes with a member, whether all are taken
+_MARKS = np.arange(5)  # the edges of the marks
+_OF_STEP, _PARTS = len(Workspace._fields), len(Workspace._fields) + 8
 
 _clock = types.ExternalFunction("time", types.int64(types.intp))  # time(NULL) of the C library, seconds
 
 
 @nb.njit(inline="always")
-def _workspace(block, at):
-    """The first rows of the block, parted at ``at``."""
-    return Workspace(
-        rows_of(block, at[0], at[1]),
-        rows_of(block, at[1], at[2]),
-        rows_of(block, at[2], at[3]),
-        rows_of(block, at[3], at[4]),
-        rows_of(block, at[4], at[5]),
-        rows_of(block, at[5], at[6]),
-        rows_of(block, at[6], at[7]),
-        rows_of(block, at[7], at[8]),
-        rows_of(block, at[8], at[9]),
-        rows_of(block, at[9], at[10]),
-        rows_of(block, at[10], at[11]),
-        rows_of(block, at[11], at[12]),
-        rows_of(block, at[12], at[13]),
-        rows_of(block, at[13], at[14]),
-        rows_of(block, at[14], at[15]),
-        rows_of(block, at[15], at[16]),
-        rows_of(block, at[16], at[17]),
-    )
+def groups(scratch):
+    """The parts of a thread's scratch: the workspace and the lanes."""
+    f = parted(scratch.block, scratch.edges, _PARTS)
+    m = parted(scratch.marks, _MARKS, 4)
+    w = Workspace(*f[:_OF_STEP])
+    y, t, h, par, proposed, last_h, last_root, rejected = f[_OF_STEP:]
+    loaded = Loaded(par, scratch.elastic)
+    return w, Lanes(y, t, h, loaded, m[0], m[1], m[2], m[3], proposed, last_h, last_root, rejected)
 
 
-@nb.njit(inline="always")
-def _idle_lanes(block, at, marks, elastic, step):
-    """The last rows of the block, parted at ``at``, and the marks."""
-    y, t, h = rows_of(block, at[0], at[1]), rows_of(block, at[1], at[2]), rows_of(block, at[2], at[3])
-    loaded = Loaded(rows_of(block, at[3], at[4]), elastic)
-    proposed, last_h = rows_of(block, at[4], at[5]), rows_of(block, at[5], at[6])
-    last_root, rejected = rows_of(block, at[6], at[7]), rows_of(block, at[7], at[8])
-    member, began = rows_of(marks, 0, 1), rows_of(marks, 1, 2)
-    observed, next_break = rows_of(marks, 2, 3), rows_of(marks, 3, 4)
-    for lane in range(WIDTH):
-        h[0, lane] = step
-        member[lane] = -1
-    return Lanes(y, t, h, loaded, member, began, observed, next_break, proposed, last_h, last_root, rejected)
-
-
-@nb.njit
+@called
 def _begin(i, lane, clock, members, lanes, control, out):
     """Put member ``i`` into a lane; 1, or 0 where no output time lies after its start."""
     n, n_times, start = len(lanes.y), members.times.shape[1], members.start[i]
-    out.record[i, :] = 0.0
+    for column in range(RECORD):
+        out.record[i, column] = 0.0
     out.record[i, MIN_LOG_R] = members.initial[i, n - 1]
     out.record[i, END_TIME] = start
     out.record[i, BEYOND] = math.inf
@@ -97,7 +78,7 @@ def _begin(i, lane, clock, members, lanes, control, out):
         par[j, lane] = members.parameters[i, j]
     par[TABLE, lane] = lane * elastic.shape[1] * 8
     if members.samples.shape[0] > 0:
-        fill(members.samples[i : i + 1], members.factor, elastic[lane : lane + 1])
+        fill_one(members.samples, i, members.factor, elastic, lane)
     else:
         for cell in range(elastic.shape[1]):
             for j in range(8):
@@ -118,9 +99,9 @@ def _break(b, lane, lanes, control):
 
 
 @nb.njit(inline="always")
-def _cut_step(lane, lanes, eq, control):
+def _cut_step(lane, lanes, driving_span, control):
     """Shorten a lane's step while the driving acts, and to end at a break."""
-    h, now, span, par = lanes.h, lanes.t[0, lane], eq.driving_span, lanes.loaded.par
+    h, now, span, par = lanes.h, lanes.t[0, lane], driving_span, lanes.loaded.par
     rate, b = par[PULSE_RATE, lane], lanes.next_break[lane]
     driven = par[AMPLITUDE, lane] != 0.0 and span[0] <= (now - par[PULSE_SHIFT, lane]) * rate < span[1]
     if driven and h[0, lane] > control.longest_driven / rate:
@@ -136,12 +117,12 @@ def _cut_step(lane, lanes, eq, control):
 def _observe(lane, end, members, lanes, w, have_dense, out):
     """Write a lane's state at the output times until ``end``; whether the interpolant has been made."""
     i, q, y = lanes.member[lane], lanes.observed[lane], lanes.y
-    times, n = members.times[i], len(y)
-    while q < len(times) and times[q] <= end:
+    times, n = members.times, len(y)
+    while q < times.shape[1] and times[i, q] <= end:
         if not have_dense:
             interpolant(w)
             have_dense = True
-        theta = (times[q] - lanes.t[0, lane]) / lanes.h[0, lane]
+        theta = (times[i, q] - lanes.t[0, lane]) / lanes.h[0, lane]
         rest = 1.0 - theta
         for j in range(n):
             bend = w.dense[n + j, lane] + theta * w.dense[2 * n + j, lane]
@@ -171,7 +152,7 @@ def _next_step(lane, cut, lanes, w):
 
 
 @nb.njit(inline="always")
-def _accept(lane, members, lanes, eq, control, w, have_dense, out):
+def _accept(lane, members, lanes, dims, control, w, have_dense, out):
     """Take a lane's step: outputs, state, record, next step; whether the interpolant has been made."""
     i, now, step = lanes.member[lane], lanes.t[0, lane], lanes.h[0, lane]
     b = lanes.next_break[lane]
@@ -183,15 +164,15 @@ def _accept(lane, members, lanes, eq, control, w, have_dense, out):
     for j in range(len(lanes.y)):
         lanes.y[j, lane] = w.y_new[j, lane]
     lanes.t[0, lane] = end
-    record = out.record[i]
-    record[STEPS] += 1
-    record[END_TIME] = end
-    record[MAX_MACH] = max(record[MAX_MACH], w.norm[2, lane])
+    record = out.record
+    record[i, STEPS] += 1
+    record[i, END_TIME] = end
+    record[i, MAX_MACH] = max(record[i, MAX_MACH], w.norm[2, lane])
     if w.norm[2, lane] > control.valid_mach:
-        record[BEYOND] = min(record[BEYOND], now)
-    record[MIN_LOG_R] = min(record[MIN_LOG_R], lanes.y[len(lanes.y) - 1, lane])
-    if eq.dims.gas > 0:
-        record[MAX_THETA] = max(record[MAX_THETA], lanes.y[0, lane])
+        record[i, BEYOND] = min(record[i, BEYOND], now)
+    record[i, MIN_LOG_R] = min(record[i, MIN_LOG_R], lanes.y[len(lanes.y) - 1, lane])
+    if dims.gas > 0:
+        record[i, MAX_THETA] = max(record[i, MAX_THETA], lanes.y[0, lane])
     lanes.h[0, lane] = _next_step(lane, cut, lanes, w)
     lanes.last_h[lane], lanes.last_root[lane] = step, max(w.norm[1, lane], _LEAST_ROOT)
     lanes.rejected[lane] = 0.0
@@ -210,13 +191,13 @@ def _reject(lane, lanes, w, out):
 
 
 @nb.njit(inline="always")
-def _failure(lane, clock, lanes, eq, control, w, out):
+def _failure(lane, clock, lanes, dims, control, w, out):
     """Why a lane's member cannot go on; OK where it can."""
-    failure, dims = OK, eq.dims
+    failure = OK
     if lanes.rejected[lane] == 0.0 and w.norm[2, lane] > control.mach_limit:
         failure = MACH_LIMIT
-    record = out.record[lanes.member[lane]]
-    if record[STEPS] + record[REJECTED] >= control.step_limit:
+    record, i = out.record, lanes.member[lane]
+    if record[i, STEPS] + record[i, REJECTED] >= control.step_limit:
         failure = STEP_LIMIT
     if clock - lanes.began[lane] > control.seconds + 1.0:  # the clock ticks in seconds
         failure = TIME_LIMIT
@@ -227,46 +208,73 @@ def _failure(lane, clock, lanes, eq, control, w, out):
     return failure
 
 
-@kernel_without_allocation
-def integrate(members, eq, control, out, scratch):
-    """Integrate all members and write their states at the output times: refill the lanes, step, look at every lane,
-    until no member is left. The arguments are those of :mod:`arrays`.
+@nb.njit(inline="always")
+def _end_step(clock, shared, lanes, w):
+    """Look at every lane after a step: take it or shorten it, and let go of members that are done or cannot go on.
+    Returns how many.
     """
-    w = _workspace(scratch.block, scratch.edges)
-    lanes = _idle_lanes(scratch.block, scratch.edges[len(w) :], scratch.marks, scratch.elastic, control.first_step)
-    n_times = members.times.shape[1]
-    waiting, running, attempts, clock = True, 0, 0, _clock(0)
-    while True:
-        for lane in range(WIDTH):
-            while lanes.member[lane] < 0 and waiting:
-                turn = take(members.counter)
-                waiting = turn < len(members.order)
-                if waiting:
-                    while peek(members.available) <= turn:
-                        pass
-                    running += _begin(members.order[turn], lane, clock, members, lanes, control, out)
-            if lanes.member[lane] >= 0:
-                _cut_step(lane, lanes, eq, control)
-        if running == 0:
-            break
-        attempts += 1
-        if attempts % _TURNS_PER_LOOK == 0:
-            clock = _clock(0)
+    members, control, out, _, dims, _ = shared
+    judge(lanes, dims.shear, control.tolerances, w)
+    gone, have_dense, n_times = 0, False, members.times.shape[1]
+    for lane in range(WIDTH):
+        i = lanes.member[lane]
+        if i < 0:
+            continue
+        if w.norm[0, lane] <= 1.0:  # false for NaN
+            have_dense = _accept(lane, members, lanes, dims, control, w, have_dense, out)
+        else:
+            _reject(lane, lanes, w, out)
+        failure = _failure(lane, clock, lanes, dims, control, w, out)
+        if failure != OK or lanes.observed[lane] == n_times:
+            out.status[i] = failure
+            lanes.member[lane] = -1
+            lanes.h[0, lane] = control.first_step
+            gone += 1
+    return gone
 
-        attempt(lanes, eq, control.tolerances, w)
 
-        have_dense = False
-        for lane in range(WIDTH):
-            i = lanes.member[lane]
-            if i < 0:
-                continue
-            if w.norm[0, lane] <= 1.0:  # false for NaN
-                have_dense = _accept(lane, members, lanes, eq, control, w, have_dense, out)
+@nb.njit(inline="always")
+def _begin_step(turn, shared, lanes):
+    """Give idle lanes a member while there is one, and every lane its step. Returns how many members were begun."""
+    members, control, out, _, _, driving_span = shared
+    begun = 0
+    for lane in range(WIDTH):
+        while lanes.member[lane] < 0 and turn[_EXHAUSTED] == 0:
+            place = take(members.counter)
+            if place >= len(members.order):
+                turn[_EXHAUSTED] = 1
             else:
-                _reject(lane, lanes, w, out)
-            failure = _failure(lane, clock, lanes, eq, control, w, out)
-            if failure != OK or lanes.observed[lane] == n_times:
-                out.status[i] = failure
-                lanes.member[lane] = -1
-                lanes.h[0, lane] = control.first_step
-                running -= 1
+                while peek(members.available) <= place:
+                    pass
+                begun += _begin(members.order[place], lane, turn[_CLOCK], members, lanes, control, out)
+        if lanes.member[lane] >= 0:
+            _cut_step(lane, lanes, driving_span, control)
+    return begun
+
+
+@kernel_called_by_address
+def between_steps(place):
+    """What is done between two steps, of which the first has nothing before it, for the :class:`Shared` kept there: how
+    many lanes have a member.
+    """
+    shared = contents(place)
+    w, lanes = groups(shared.scratch)
+    turn = shared.scratch.turn
+    if turn[_TURNS] % _TURNS_PER_LOOK == 0:
+        turn[_CLOCK] = _clock(0)
+    if turn[_TURNS] > 0:
+        turn[_RUNNING] -= _end_step(turn[_CLOCK], shared, lanes, w)
+    turn[_TURNS] += 1
+    turn[_RUNNING] += _begin_step(turn, shared, lanes)
+    return turn[_RUNNING]
+
+
+@kernel_without_allocation
+def integrate(between, shared, eq):
+    """Integrate all members and write their states at the output times. ``between`` is where the machine code of
+    :func:`between_steps` is; the other arguments are those of :mod:`arrays`.
+    """
+    w, lanes = groups(shared.scratch)
+    place = kept(shared)
+    while call(between, place) > 0:
+        attempt(lanes, eq, w)

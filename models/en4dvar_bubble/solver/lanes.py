@@ -2,8 +2,8 @@
 
 A value of type ``lanes`` holds one number for each of :data:`WIDTH` members; arithmetic, comparison and ``sqrt`` act
 lane by lane, so what one member computes never depends on its neighbours (same bits in any lane, group or chunk).
-Rows of a C-contiguous ``(rows, 8)`` array, or :func:`rows_of` it, are read and written with :func:`load` and
-:func:`store`. Multiply–adds may be fused.
+Rows of a C-contiguous ``(rows, 8)`` array, or of a part of one (:mod:`parts`), are read and written with :func:`load`
+and :func:`store`. Multiply–adds may be fused.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
-import numba as nb
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.core.typing.templates import AbstractTemplate, ConcreteTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, models, overload, register_model
+from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+from en4dvar.compiled import inlined
 
 WIDTH = 8
 
@@ -26,6 +27,7 @@ _VEC = ir.VectorType(_F64, WIDTH)
 _MASK = ir.VectorType(ir.IntType(1), WIDTH)
 _IVEC = ir.VectorType(_I64, WIDTH)
 _CONTRACT = ("contract",)
+TRIED_FIRST = {"target": "cpu"}  # of the meanings of an operator: numba asks those for any target, a dozen, after these
 
 
 class _Lanes(types.Type):
@@ -36,16 +38,6 @@ class _Lanes(types.Type):
 class _Mask(types.Type):
     def __init__(self) -> None:
         super().__init__(name="i1x8")
-
-
-class _Rows(types.Type):
-    """Rows of :data:`WIDTH` numbers: where they begin and how many, 2 words where an array takes 9. The compiler moves
-    every field of the named groups at every call and every access to one of them: with arrays it takes twice as long.
-    """
-
-    def __init__(self, dtype: Any) -> None:
-        self.dtype = dtype
-        super().__init__(name=f"rows({dtype})")
 
 
 lanes = _Lanes()
@@ -64,12 +56,6 @@ class _MaskModel(models.PrimitiveModel):
         super().__init__(dmm, fe_type, _MASK)
 
 
-@register_model(_Rows)
-class _RowsModel(models.StructModel):
-    def __init__(self, dmm: Any, fe_type: Any) -> None:
-        super().__init__(dmm, fe_type, [("data", types.CPointer(fe_type.dtype)), ("count", types.intp)])
-
-
 def _splat(builder: Any, value: Any) -> Any:
     if value.type == _VEC:
         return value
@@ -83,6 +69,7 @@ def _operator(op: Any, result: Any, emit: Callable[[Any, Any, Any], Any]) -> Non
 
     @infer_global(op)
     class _Template(ConcreteTemplate):
+        metadata = TRIED_FIRST
         cases = [  # noqa: RUF012  # numba reads the attribute as a list
             signature(result, lanes, lanes),
             signature(result, lanes, types.float64),
@@ -130,6 +117,7 @@ class Value:
 
 @infer_global(operator.neg)
 class _Negate(ConcreteTemplate):
+    metadata = TRIED_FIRST
     cases = [signature(lanes, lanes)]  # noqa: RUF012
 
 
@@ -143,68 +131,6 @@ def row_pointer(context: Any, builder: Any, array_type: Any, array: Any, row: An
     data = cgutils.create_struct_proxy(array_type)(context, builder, value=array).data
     pointer = builder.gep(data, [builder.mul(row, ir.Constant(_I64, WIDTH))])
     return builder.bitcast(pointer, _VEC.as_pointer())
-
-
-@intrinsic
-def rows_of(typingctx, array, first, end):
-    """Rows ``first … end−1`` of a C-contiguous (rows, 8) array, which must outlive them."""
-
-    def codegen(context, builder, sig, args):
-        data = cgutils.create_struct_proxy(sig.args[0])(context, builder, value=args[0]).data
-        found = cgutils.create_struct_proxy(sig.return_type)(context, builder)
-        found.data = builder.gep(data, [builder.mul(args[1], ir.Constant(_I64, WIDTH))])
-        found.count = builder.sub(args[2], args[1])
-        return found._getvalue()
-
-    return _Rows(array.dtype)(array, types.int64, types.int64), codegen
-
-
-@overload(len)
-def _count(of):
-    return (lambda of: _length(of)) if isinstance(of, _Rows) else None
-
-
-@intrinsic
-def _length(typingctx, of):
-    return types.int64(of), lambda context, builder, sig, args: builder.extract_value(args[0], 1)
-
-
-def _element(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Where ``of[i]``, the ``i``-th number, or ``of[row, lane]`` is."""
-    place = args[1]
-    if isinstance(sig.args[1], types.BaseTuple):
-        row, lane = cgutils.unpack_tuple(builder, place)
-        place = builder.add(builder.mul(row, ir.Constant(_I64, WIDTH)), lane)
-    return builder.gep(builder.extract_value(args[0], 0), [place])
-
-
-@infer_global(operator.getitem)
-class _Read(AbstractTemplate):
-    def generic(self, args: Any, kws: Any) -> Any:
-        return signature(args[0].dtype, args[0], _place(args[1])) if isinstance(args[0], _Rows) else None
-
-
-@infer_global(operator.setitem)
-class _Write(AbstractTemplate):
-    def generic(self, args: Any, kws: Any) -> Any:
-        if isinstance(args[0], _Rows):
-            return signature(types.none, args[0], _place(args[1]), args[0].dtype)
-        return None
-
-
-def _place(index: Any) -> Any:
-    return types.UniTuple(types.int64, 2) if isinstance(index, types.BaseTuple) else types.int64
-
-
-@lower_builtin(operator.getitem, _Rows, types.Any)
-def _lower_read(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    return builder.load(_element(context, builder, sig, args))
-
-
-@lower_builtin(operator.setitem, _Rows, types.Any, types.Any)
-def _lower_write(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    builder.store(args[2], _element(context, builder, sig, args))
-    return context.get_dummy_value()
 
 
 @intrinsic
@@ -387,7 +313,7 @@ _LN2_HIGH = 6.93147180369123816490e-01
 _LN2_LOW = 1.90821492927058770002e-10
 
 
-@nb.njit(forceinline=True)
+@inlined
 def exp(x):
     """e^x lane by lane to about 1 ulp, for any |x| (clamped to the range of normal doubles).
 
@@ -413,7 +339,7 @@ def exp(x):
     return _scale_by_power_of_two(q, k)
 
 
-@nb.njit(forceinline=True)
+@inlined
 def log(x):
     """Natural logarithm lane by lane of positive normal numbers, to about 1 ulp.
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import numba as nb
-
+from en4dvar.compiled import inlined
 from en4dvar_bubble.solver.lanes import any_lane, floor, gather_rows, load, maximum, minimum, select, splat
 from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, PULSE_TABLE
 
 
-@nb.njit(forceinline=True)
+@inlined
 def lookup(table, offset, span, x):
     """Value, first and second derivative of a piecewise quintic; beyond its ends the last interval is extended."""
     origin, per_unit, intervals = span[0], span[2], span[3]
@@ -22,7 +21,7 @@ def lookup(table, offset, span, x):
     return value, first * per_unit, second * (per_unit * per_unit)
 
 
-@nb.njit(forceinline=True)
+@inlined
 def driving(t, eq, par):
     """p_f, dp_f/dt, d²p_f/dt² at the lanes' times; zero outside the table's span."""
     zero, span, rate = splat(0.0), eq.driving_span, load(par, PULSE_RATE)

@@ -10,6 +10,7 @@ import numba as nb
 from numba.core.types import BaseTuple, NoneType
 from numba.extending import overload
 
+from en4dvar.compiled import called, inlined
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.equations import jacobian, rhs
 from en4dvar_bubble.solver.fields import general_jacobian, general_rhs
@@ -23,7 +24,7 @@ _EXPONENT = 1.0 / rodas5p.ORDER
 LEAST_ERROR = 1e-8  # the step grows as if the error were not smaller
 
 
-@nb.njit(forceinline=True)
+@inlined
 def _factorise(a, size):
     """LU without pivoting, in place; the diagonal is replaced by its inverse. Rows i·n+j.
 
@@ -40,7 +41,7 @@ def _factorise(a, size):
                 store(a, i * n + j, load(a, i * n + j) - factor * load(a, k * n + j))
 
 
-@nb.njit(forceinline=True)
+@inlined
 def _solve(a, size, b, row):
     """Solve in place for the right-hand side in rows ``row … row+n−1`` of ``b``."""
     n = len(size)
@@ -66,7 +67,6 @@ def _is_unrolled(eq):
     return isinstance(eq.types[eq.fields.index("size")], BaseTuple)
 
 
-@nb.njit(forceinline=True)
 def _unrolled(lanes, eq, w):
     """:func:`_linearise` of the paper's equations with few nodes."""
     jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
@@ -79,7 +79,7 @@ def _unrolled(lanes, eq, w):
     _factorise(w.jac, eq.size)
 
 
-@nb.njit
+@called
 def _dense(lanes, eq, w):
     """:func:`_linearise` of the paper's equations with many."""
     jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
@@ -92,7 +92,7 @@ def _dense(lanes, eq, w):
     factorise(w.tiles, lanes.h, eq.where, eq.places, -1)
 
 
-@nb.njit
+@called
 def _general(lanes, eq, w):
     """:func:`_linearise` of the equations with every option."""
     general_jacobian(lanes.y, lanes.t, eq, lanes.loaded, w)
@@ -109,9 +109,7 @@ def _linearise(lanes, eq, w):
 def _choose_matrix(lanes, eq, w):
     if _is_general(eq):
         return lambda lanes, eq, w: _general(lanes, eq, w)
-    if _is_unrolled(eq):
-        return lambda lanes, eq, w: _unrolled(lanes, eq, w)
-    return lambda lanes, eq, w: _dense(lanes, eq, w)
+    return _unrolled if _is_unrolled(eq) else lambda lanes, eq, w: _dense(lanes, eq, w)
 
 
 def _substitute(eq, w, row):
@@ -133,7 +131,7 @@ def _rhs(y, t, eq, loaded, w):
 def _choose_rhs(y, t, eq, loaded, w):
     if _is_general(eq):
         return lambda y, t, eq, loaded, w: general_rhs(y, t, eq, loaded, w)
-    return lambda y, t, eq, loaded, w: rhs(y, t, eq, loaded, w.work, w.f)
+    return rhs
 
 
 def _algebraic_row(eq):
@@ -176,7 +174,7 @@ def _stages(lanes, eq, algebraic, w):
 
 
 @nb.njit(inline="always")
-def _judge(lanes, shear, tolerances, w):
+def judge(lanes, shear, tolerances, w):
     """The new state to ``y_new``, error and wall Mach number to ``norm``."""
     n = len(w.f)
     inverse_h = 1.0 / load(lanes.h, 0)
@@ -201,12 +199,11 @@ def _judge(lanes, shear, tolerances, w):
 
 
 @nb.njit(inline="always")
-def attempt(lanes, eq, tolerances, w):
-    """One step of all lanes: see :class:`arrays.Workspace` for what it leaves."""
+def attempt(lanes, eq, w):
+    """The stages of one step of all lanes."""
     algebraic = _algebraic_row(eq)
     _linearise(lanes, eq, w)
     _stages(lanes, eq, algebraic, w)
-    _judge(lanes, eq.dims.shear, tolerances, w)
 
 
 @nb.njit(inline="always")

@@ -17,6 +17,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
+from en4dvar.compiled import called
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.lanes import Value, lanes, load, row_pointer, splat, store
 
@@ -152,7 +153,7 @@ def _of_part(part, tile, _):
     return [sum((tile[k * EDGE + r] * part[k] for k in range(1, EDGE)), tile[r] * part[0]) for r in range(EDGE)]
 
 
-@nb.njit
+@called
 def factorise(a, h, where, places, algebraic):
     """LU without pivoting, in place, of the matrix ``a`` plus 1/(hγ) on the diagonal of the unknowns but number
     ``algebraic``, and 1 where no unknown is. The lower factor has tiles of unity on its diagonal; on that of the upper
@@ -184,7 +185,7 @@ def factorise(a, h, where, places, algebraic):
             _keep(a, own, tile)
 
 
-@nb.njit
+@called
 def _rest(a, where, x, i, first, last):
     """Part ``i`` of ``x`` without what parts ``first … last−1`` say of it."""
     part = _part(x, i * EDGE)
@@ -194,7 +195,7 @@ def _rest(a, where, x, i, first, last):
     return part
 
 
-@nb.njit
+@called
 def solve(a, where, places, x, b, row):
     """Solve in place for the right-hand side of the unknowns in rows ``row …`` of ``b``; ``x`` is scratch."""
     size, unknown = len(where), 0

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from en4dvar.forward import Trajectory
 from en4dvar.state import Array
 from en4dvar_bubble.collapse import lobe
 from en4dvar_bubble.model import BubbleModel
+from en4dvar_bubble.solver.driver import preset
 from en4dvar_bubble.starter.look import second_maximum
 
 GRID: Mapping[str, Array] = {"G": np.geomspace(50.0, 2e5, 25), "mu": np.geomspace(3e-3, 1.0, 18)}  # Pa, Pa s
@@ -56,6 +57,8 @@ def first_guess(model: BubbleModel, fixed: Mapping[str, float], observed: Mappin
     names = [name for name in GRID if any(p.name == name for p in model.parameters)]
     if not names:
         return Guess({}, {}, 0.0)
+    if model.start == "laser":  # whose equations are many; an order of magnitude needs no more
+        model = replace(model, accuracy=preset("fast", "laser"))
     nodes = np.array(list(itertools.product(*(GRID[name] for name in names))))
     theta = {name: np.full(len(nodes), value) for name, value in fixed.items()}
     theta |= {name: nodes[:, i] for i, name in enumerate(names)}

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+import shlex
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from en4dvar.inputs.asked import ANY, Layout
@@ -96,6 +97,7 @@ def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> st
         "    # discrepancy: estimated",
         "model:",
         *_section(proposal.model),
+        *_comparison(name, proposal.simpler),
         "parameters: # a prior is estimated, a quantity such as 'mu: 0.1 Pa s' is fixed",
         *_section(proposal.parameters),
         *(f"  {line}" for line in tail),
@@ -103,6 +105,19 @@ def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> st
         "  members: 48",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _comparison(name: str, simpler: Mapping[str, str]) -> list[str]:
+    """How to compare with ``simpler`` physics; nothing where there is none."""
+    if not simpler:
+        return []
+    options = " ".join(f"--set model.{key}={value}" for key, value in simpler.items())
+    here, there = shlex.quote(f"runs/{name}"), shlex.quote(f"runs/{name}_{simpler['gas']}")
+    return [
+        f"  # A {simpler['gas']} gas is quicker, but makes R_eq and mu wrong, often without a warning. To compare:",
+        f"  #   en4dvar run THIS_FILE {options} --out {there}",
+        f"  #   en4dvar compare {here} {there}",
+    ]
 
 
 def _section(entries: Sequence[Entry]) -> list[str]:

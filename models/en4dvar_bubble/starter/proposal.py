@@ -22,12 +22,17 @@ from en4dvar_bubble.starter.look import Look, Start, look, typical
 LAWS: Mapping[Start, str] = {"acoustic": "quadratic-kelvin-voigt", "laser": "neo-hookean-kelvin-voigt"}
 MODEL: Mapping[Start, Mapping[str, str]] = {
     "acoustic": {"gas": "heat"},
-    "laser": {"gas": "polytropic", "vapour_pressure": "saturated"},
+    "laser": {"gas": "heat", "vapour": "transport", "medium_heat": "conducting"},
 }
 WHY = {
     "heat": "the gas gives heat to the wall",
-    "polytropic": "quick, but without heat to the wall: look at 'What if' in the report, and compare with gas: heat",
-    "saturated": "that of water, constant; vapour: transport, with gas: heat, solves it instead",
+    "transport": "near R_max there is more vapour than gas; it condenses at the wall, through the gas",
+    "conducting": "the wall warms; with a cold one R_eq comes out wrong (docs/calibration.md)",
+}
+# The quicker gas that a laser-induced bubble can be compared with; benchmarks/laser_gas.py has what it costs.
+SIMPLER: Mapping[Start, Mapping[str, str]] = {
+    "acoustic": {},
+    "laser": {"gas": "polytropic", "vapour": "none", "medium_heat": "cold", "vapour_pressure": "saturated"},
 }
 LEAST_NOISE = 0.01  # of R_max: what single-bubble models agree to with good data at best
 TIMING = 0.05  # of the step between samples
@@ -51,11 +56,15 @@ class Entry:
 
 @dataclass(frozen=True)
 class Proposal:
-    """What goes into the configuration; ``remarks`` and ``warnings`` are told to the user."""
+    """What goes into the configuration; ``remarks`` and ``warnings`` are told to the user.
+
+    ``simpler``: keys of the model, and their values, of quicker physics to compare with; empty where there is none.
+    """
 
     data: tuple[Entry, ...]
     model: tuple[Entry, ...]
     parameters: tuple[Entry, ...]
+    simpler: Mapping[str, str]
     remarks: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -100,6 +109,7 @@ def propose(
         _data(chosen, look, model, {**others, **guess.values}),
         _model(law_name, chosen, look),
         _parameters(model, chosen, look, Guess({}, {}, 0.0) if doubted else guess),
+        SIMPLER[chosen],
         tuple(told),
         tuple(warnings),
     )
@@ -123,7 +133,7 @@ def starter(start: Start, law: str | None) -> Proposal:
     lines = [_example(p, model) for p in model.law.parameters]
     lines += _radii(start, None)
     lines += [Entry("t_s", "{prior: normal, mean: 0 us, std: 0.5 us}", "the clock of the data against the model's")]
-    return Proposal(tuple(data), _model(law_name, start, None), tuple(lines))
+    return Proposal(tuple(data), _model(law_name, start, None), tuple(lines), SIMPLER[start])
 
 
 def with_columns(proposal: Proposal, errors: Sequence[str], common: str) -> Proposal:
@@ -301,7 +311,7 @@ def _radii(start: Start, look: Look | None) -> list[Entry]:
         ]
     known = look is not None and np.isfinite(look.rest)
     words = (
-        "the radius at rest; wide, for real gas cools and leaks, the model's does not"
+        "the radius at rest; wide, for gas leaks into the gel, and the model's does not"
         if known
         else f"{GAS_FRACTION:g} R_max: no radius at rest is seen"
     )
