@@ -4,7 +4,8 @@ Against a tempered population that shares none of its samplers: laser-induced bu
 minima that count (``laser:SEED``), and the measured bubbles in polyacrylamide where their files are there; each with
 its own settings (the default ones) and, ``mcmc:``, by a chain of 6000 effective draws (``refine: mcmc, draws: 6000``).
 For each parameter, transformed: how far the mean is from the population's in its standard deviations, and the ratio of
-standard deviations; the largest are shown.
+standard deviations; the largest are shown. Of modes, the weights that the product gives and their shares of the
+population.
 
     python benchmarks/against_tempered.py [--find 60] [--data FOLDER] [--minutes 5]
     python benchmarks/against_tempered.py --sets laser:54 mcmc:laser:54 --particles 6000     this one, held against more
@@ -31,9 +32,13 @@ from en4dvar.analysis import Analysis
 from en4dvar.assimilate import assimilate
 from en4dvar.config.build import build
 from en4dvar.config.load import load_config
+from en4dvar.descent.minima import Minimum
 from en4dvar.ensemble.forecast import log_posterior
+from en4dvar.executor import SerialExecutor
 from en4dvar.prior import own_seed
 from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.sampling.refine import shares_of, that_count
+from en4dvar.stages import Stages
 
 CHAIN, LASER, DRAWS = "mcmc:", "laser:", 6000
 ROOT = Path(__file__).resolve().parents[1]
@@ -59,9 +64,10 @@ class Case(NamedTuple):
     seed: int
 
 
-def reference(problem: InverseProblem, seed: int, particles: int) -> Record:
+def reference(case: Case, particles: int) -> Record:
     """Moments (n,) of two populations together; by how much the mean of one differs from that of both, in standard
-    deviations, and ln of the ratio of these."""
+    deviations, and ln of the ratio of these; what share of both, and of either, belongs to each mode."""
+    problem, seed = case.problem, case.seed
     prior = problem.prior
 
     def log_likelihood(x: np.ndarray) -> np.ndarray:
@@ -71,7 +77,17 @@ def reference(problem: InverseProblem, seed: int, particles: int) -> Record:
     both = Tempered(np.concatenate([a.draws, b.draws]), a.runs + b.runs)
     spread = float(np.max(np.abs(np.log(a.std / both.std))))
     error = [float(np.max(np.abs(a.mean - both.mean) / both.std)), spread]
-    return {"mean": both.mean, "std": both.std, "error": error, "runs": both.runs}
+    minima = minima_of(case)
+    modes = [shares_of(prior, minima, population.draws) for population in (both, a, b)]
+    return {"mean": both.mean, "std": both.std, "error": error, "runs": both.runs, "modes": modes}
+
+
+def minima_of(case: Case) -> Sequence[Minimum]:
+    """Those that count, which say to which mode a draw belongs."""
+    stages = Stages(*case, SerialExecutor(), None, None)
+    prior_run, start, descent = stages.descend()
+    found, _ = stages.searched(start, descent, prior_run)
+    return that_count(found.minima, case.problem.prior)
 
 
 def estimate(case: Case) -> Record:
@@ -115,11 +131,10 @@ def compared(keys: Sequence[str], given: argparse.Namespace) -> dict[str, Record
     """The sets, each beside its reference (``of``), as far as the minutes suffice."""
     data, end = given.data, time.monotonic() + 60 * given.minutes
     mine = fill(given.records / "estimates.jsonl", keys, lambda key: estimate(case(key, data)), given.minutes)
-    names = dict.fromkeys(key.removeprefix(CHAIN) for key in keys)
+    names = dict.fromkeys(key.removeprefix(CHAIN) for key in mine)
 
     def population(name: str) -> Record:
-        one = case(name, data)
-        return reference(one.problem, one.seed, given.particles)
+        return reference(case(name, data), given.particles)
 
     theirs = fill(
         given.records / f"references_{given.particles}.jsonl", names, population, (end - time.monotonic()) / 60
@@ -140,8 +155,9 @@ def with_two_modes(path: Path, count: int, minutes: float) -> list[int]:
 
 
 def table(records: dict[str, Record]) -> None:
-    print("| set | by | draws that count | modes | mean off by | std ratio | reference ± | runs (its) | warns |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    heads = ["set", "by", "draws that count", "modes", "in the reference", "mean off by", "std ratio", "reference ±"]
+    heads += ["runs (its)", "warns"]
+    print(f"| {' | '.join(heads)} |\n{'|---' * len(heads)}|")
     within = 0
     for key, r in records.items():
         of = r["of"]
@@ -149,8 +165,10 @@ def table(records: dict[str, Record]) -> None:
         ratio = float(np.max(np.abs(np.log(np.divide(r["std"], of["std"])))))
         within += max(shift, ratio) < TOLERANCE
         modes = ", ".join(f"{w:.2f}" for w in r["modes"])
+        theirs = ", ".join(f"{w:.2f}" for w in of["modes"][0])
+        theirs += f" ± {np.max(np.abs(np.subtract(of['modes'][1], of['modes'][0]))):.2f}"
         error = ", ".join(f"{e:.3f}" for e in of["error"])
-        cells = [key, r["how"], f"{r['draws']:.0f}", modes, f"{shift:.3f}", f"{np.exp(ratio):.3f}", error]
+        cells = [key, r["how"], f"{r['draws']:.0f}", modes, theirs, f"{shift:.3f}", f"{np.exp(ratio):.3f}", error]
         cells += [f"{r['runs']} ({of['runs']})", ", ".join(r["warned"])]
         print(f"| {' | '.join(cells)} |")
     print(f"\nwithin {TOLERANCE} in mean and spread: {within} of {len(records)}")
