@@ -20,9 +20,15 @@ PULSE, AMBIENT, SURFACE, REST, SCALE, CLOCK = 1.05, 1.02, 0.8, 1.1, 1.01, 1.01
 
 @lru_cache(maxsize=4)  # the data sets of a campaign share their model; not in the model, which is sent to workers
 def alternatives(model: ForwardModel) -> tuple[Alternative, ...]:
-    """Those of a bubble: pulse, ambient pressure, surface tension, gas, vapour, radius at rest, scale, time step."""
+    """Those of a bubble: pulse, ambient pressure, surface tension, gas, medium, vapour, radius at rest, scale, time
+    step; none in whose equations a parameter of the model has no place.
+    """
     assert isinstance(model, Dynamics)
-    return tuple(_alternatives(model))
+    return tuple(one for one in _alternatives(model) if one.model is None or _names(one.model) == _names(model))
+
+
+def _names(model: ForwardModel) -> list[str]:
+    return [p.name for p in model.parameters]
 
 
 def _alternatives(model: Dynamics) -> Iterator[Alternative]:
@@ -30,6 +36,7 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
         return Alternative(name, words, replace(model, **options))  # type: ignore[arg-type]
 
     medium, driving, rest = model.medium, model.driving, model.stress_free_radius
+    saturated = replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))
     if not driving.silent and "p_A" not in model.named:  # what is a parameter has its own uncertainty
         stronger = replace(driving, amplitude=PULSE * driving.amplitude)
         yield changed("pulse_amplitude", "the pulse were 5 % stronger", driving=stronger)
@@ -41,14 +48,17 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
         yield changed("surface_tension", "the surface tension were 20 % lower", medium=tension)
     if model.gas != "heat":
         yield changed("gas_model", "the gas conducted heat to the wall (gas: heat)", gas="heat")
-    elif model.vapour != "transport" and model.medium_heat == "cold":
-        yield changed("gas_model", "the gas were polytropic (gas: polytropic)", gas="polytropic")
+    else:
+        cold = replace(model, gas="heat", medium_heat="cold")
+        simple = replace(cold, vapour="none", medium=saturated) if model.vapour == "transport" else cold
+        yield Alternative("gas_model", "the gas were polytropic (gas: polytropic)", replace(simple, gas="polytropic"))
+    if model.medium_heat == "conducting":
+        yield changed("medium_heat", "the gel stayed cold at the wall (medium_heat: cold)", medium_heat="cold")
     if "p_v" in model.named:
         pass
     elif medium.p_v:
         yield changed("vapour", "there were no vapour in the bubble", medium=replace(medium, p_v=0.0))
     elif model.vapour == "none":
-        saturated = replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))
         yield changed("vapour", "vapour filled the bubble (vapour_pressure: saturated)", medium=saturated)
     else:
         yield changed("vapour", "there were no vapour in the bubble (vapour: none)", vapour="none")

@@ -15,6 +15,7 @@ from en4dvar.prior import Prior, PriorTerm
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.response.what_if import changed_problem
 from en4dvar_bubble import BubbleModel, NeoHookeanKelvinVoigt
+from en4dvar_bubble.gas import saturated_vapour_pressure
 
 SETTINGS = AssimilationSettings(starts=3, refine="none")  # what is predicted is linear: that of Gaussians
 STD = 1.4e-6
@@ -111,6 +112,9 @@ def test_every_alternative_is_told_or_has_a_reason(fits, start):
         {"start": "laser", "vapour": "transport", "medium_heat": "conducting"},
         {"gas": "isothermal"},
         {"gas": "polytropic", "start": "laser"},
+        {"named": ("A",)},
+        {"start": "laser", "vapour": "transport", "named": ("D_v",)},
+        {"start": "laser", "vapour": "transport", "medium_heat": "conducting", "named": ("K_m", "T_inf")},
     ],
 )
 def test_alternatives_can_be_made_for_any_options(options):
@@ -118,6 +122,17 @@ def test_alternatives_can_be_made_for_any_options(options):
     others = [one.model for one in model.alternatives if one.model is not None]
     assert others
     assert all([p.name for p in other.parameters] == [p.name for p in model.parameters] for other in others)
+
+
+def test_of_the_fullest_physics_every_part_could_be_simpler():
+    fullest = BubbleModel(start="laser", vapour="transport", medium_heat="conducting")
+    other = {one.name: one.model for one in fullest.alternatives if one.model is not None}
+    physics = {name: (model.gas, model.vapour, model.medium_heat) for name, model in other.items()}
+    assert physics["medium_heat"] == ("heat", "transport", "cold")
+    assert physics["vapour"] == ("heat", "none", "conducting")
+    assert physics["gas_model"] == ("polytropic", "none", "cold")
+    simple = other["gas_model"].medium
+    assert simple.p_v == saturated_vapour_pressure(simple.T_inf)  # so that R_eq means the same
 
 
 def test_alternatives_are_not_sent_along_with_the_model():
