@@ -26,6 +26,7 @@ _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 
 
 @click.command()
+@click.argument("unnamed", nargs=-1, metavar="")
 @click.option(
     "--data",
     metavar="PATH",
@@ -56,6 +57,7 @@ _RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
 @click.option("--out", type=click.Path(path_type=Path), help="YAML file to write; default <name of the data>.yaml.")
 @click.option("--force", is_flag=True, help="Replace that file.")
 def init(
+    unnamed: tuple[str, ...],
     data: str | None,
     movie: Path | None,
     frame_rate: str | None,
@@ -84,6 +86,10 @@ def init(
       en4dvar init --data bubble.csv --time-unit us --radius-unit um
       en4dvar init --movie bubble.mp4 --pixel '2.76 um' --frame-rate '270 kHz'
     """
+    if unnamed:  # a file alone, or what a shell makes of a pattern
+        several = len(unnamed) > 1 or data is not None
+        wanted = "'FOLDER/*.csv' (a folder, or a pattern in quotes)" if several else shlex.quote(unnamed[0])
+        raise click.UsageError(f"{unnamed[0]}: data are named by --data {wanted}")
     if movie is not None and (data is not None or example is not None):
         raise click.UsageError("--movie makes the data; not together with --data or --example")
     if movie is None and (given := [f"--{name}" for name, text in of_movie.items() if text is not None]):

@@ -146,3 +146,13 @@ def test_one_table_of_many_bubbles(tmp_path: Path) -> None:
     problems = build(proposed(Path("b.yaml")))
     assert [p.observations.name for p in problems] == ["b_one", "b_two"]
     assert np.array_equal(problems[0].observations.values, problems[1].observations.values)
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted"), [(["bubble.csv"], "--data bubble.csv"), (["--data", "a.csv", "b.csv"], "a pattern in quotes")]
+)
+def test_a_file_that_no_option_names_is_answered_with_the_option(words: list[str], wanted: str) -> None:
+    done = call("init", *words)
+    assert done.exit_code == 2
+    assert words[-1] in done.stderr
+    assert wanted in done.stderr
