@@ -72,9 +72,10 @@ class StartRecord:
 class Descents:
     """Where all descents of one data set ended.
 
-    ``members`` (D,) of the prior ensemble from which they started, -1 for its mean; ``minimum`` (D,) the number of the
-    minimum of J in which each ended, 0 is the lowest and -1 none, since the model failed; ``costs`` of the minima;
-    ``spread``, by how much J of those in the lowest differs; forward ``runs`` of the search after the first descents.
+    ``members`` (D,) of the prior ensemble from which they started, -1 for its mean, -2 for a draw of the posterior;
+    ``minimum`` (D,) the number of the minimum of J in which each ended, 0 is the lowest and -1 none, since the model
+    failed; ``costs`` of the minima; ``spread``, by how much J of those in the lowest differs; forward ``runs`` of the
+    search after the first descents.
     """
 
     members: tuple[int, ...]
@@ -106,7 +107,8 @@ def _members(numbers: Sequence[int]) -> str:
     known = [str(i) for i in numbers if i >= 0]
     listed = " and ".join(part for part in (", ".join(known[:-1]), *known[-1:]) if part)
     names = [f"member{'s' * (len(known) > 1)} {listed}"] if known else []
-    return " and ".join([*names, *(["the prior mean"] if -1 in numbers else [])])
+    mean = ["the prior mean"] if -1 in numbers else []
+    return " and ".join([*names, *mean, *(["a draw"] if -2 in numbers else [])])
 
 
 Record = IterationRecord | StartRecord | Descents | ChainRecord

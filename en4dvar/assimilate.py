@@ -62,13 +62,19 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
     """All stages, then what is concluded from them."""
     space, prior = stages.space, stages.problem.prior
     prior_run, start, descent = stages.descend(resume)
-    found, gaussian = stages.searched(start, descent, prior_run)
-    counting = that_count(found.minima, prior)
-    agree = len(found.tried) < 2 or found.agreed
-    descents = conclusions.descents_of(found, len(space.members))
-    if descents:
-        stages.tell(descents)
-    sampled = stages.sampled(gaussian, counting, agree, start.refinement)
+    found, ends = stages.searched(start, descent, prior_run)
+    looking = True
+    while True:
+        counting = that_count(found.minima, prior)
+        agree = len(found.tried) < 2 or found.agreed
+        descents = conclusions.descents_of(found, len(space.members))
+        if descents:
+            stages.tell(descents)
+        sampled = stages.sampled(ends, counting, agree, start.refinement, looking)
+        if sampled.refined is None or sampled.refined.lower is None:
+            break
+        after, ends = stages.searched_from(found, ends, sampled.refined.lower)
+        looking, found = after is not found, after
     ends = sampled.ends
     space.require_members(ends.run.failures, "posterior forecast")
     control = ControlEnsembles(

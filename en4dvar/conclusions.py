@@ -27,12 +27,14 @@ from en4dvar.state import Array
 
 
 def descents_of(found: Found, n_members: int) -> Descents | None:
-    """Where they ended; None where there were none to compare. A start that is no member of the prior has number -1."""
+    """Where they ended; None where there were none to compare. Starts that are no members of the prior have number -1,
+    its mean, or -2, a draw of the posterior.
+    """
     if not found.minima:
         return None
     ended = {member: number for number, minimum in enumerate(found.minima) for member in minimum.members}
     return Descents(
-        members=tuple(i if i < n_members else -1 for i in found.tried),
+        members=tuple(i if i < n_members else -1 - (i > n_members) for i in found.tried),
         minimum=tuple(ended.get(i, -1) for i in found.tried),
         costs=tuple(minimum.cost for minimum in found.minima),
         spread=found.minima[0].spread,

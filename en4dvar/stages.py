@@ -13,7 +13,7 @@ from en4dvar.descent.loop import iterate
 from en4dvar.descent.marginal import marginal_members
 from en4dvar.descent.minima import Minimum, merged
 from en4dvar.descent.noise_scale import mean_beyond_mode
-from en4dvar.descent.search import Found, Search, SearchState
+from en4dvar.descent.search import Found, Search, SearchState, from_draw
 from en4dvar.descent.start import StartState, choose_start
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
@@ -133,7 +133,7 @@ class Stages:
         begun, minima = start.search or SearchState(), start.minima
         if start.search is None:
             minima = merged([Minimum.of(space, descent), *minima])
-        found = Found(descent, before, minima, start.tried, begun.runs)
+        found = Found(descent, before, minima, start.tried, begun.runs, begun.over)
         if self.settings.starts < 2 or not scheme.economical(space.basis):
             return found, self.gaussian(descent)
         if start.search is not None:
@@ -152,6 +152,12 @@ class Stages:
             earlier, found = found, search.round(found, rest)
             ends = ends if found.descent is earlier.descent else self.gaussian(found.descent)
         return found, ends
+
+    def searched_from(self, found: Found, ends: Ends, x: Array) -> tuple[Found, Ends]:
+        """The same, after a descent from a draw x (n,) of the posterior that lies lower than all minima."""
+        assert isinstance(self.scheme, En4DVar)
+        after = from_draw(self.space, self.scheme, found, x, self.seed, self.tell)
+        return after, ends if after is found else self.gaussian(after.descent)
 
     def keep_search(self, state: Callable[[], tuple[Found, SearchState]]) -> None:
         runs = self.space.forward_runs
@@ -184,11 +190,13 @@ class Stages:
         final = space.forecast(np.vstack([members, mode]), self.grid)
         return Ends(members, mode, final[:-1], final[-1:])
 
-    def sampled(self, ends: Ends, minima: Sequence[Minimum], agree: bool, earlier: Refinement | None) -> Sampled:
+    def sampled(
+        self, ends: Ends, minima: Sequence[Minimum], agree: bool, earlier: Refinement | None, looking: bool
+    ) -> Sampled:
         """The ensemble, sampled where that is asked for or there is a doubt.
 
         ``agree``: descents from different members ended in the lowest of the ``minima`` that count. ``earlier``: where
-        a chain was interrupted.
+        a chain was interrupted. ``looking``: end at a draw that lies lower than all minima.
         """
         space = self.space
         if self.settings.refine != "mcmc":
@@ -199,13 +207,15 @@ class Stages:
             shape = examine_shape(space, ends.members, ends.mode, costs, self.seed, settle)
             if not (cheap and minima and in_doubt(minima, agree, shape)):
                 return Sampled(ends, None, shape)
-        sampled = self.refine(ends.members, minima, earlier)
+        sampled = self.refine(ends.members, minima, earlier, looking)
+        if sampled.lower is not None:
+            return Sampled(ends, sampled, {})
         run = space.forecast(sampled.members, self.grid)
         central = ends.central if self.scheme.searches else space.forecast(ends.mode[None], self.grid)
         return Sampled(Ends(sampled.members, ends.mode, run, central), sampled, {})
 
-    def refine(self, posterior: Array, minima: Sequence[Minimum], earlier: Refinement | None) -> Refined:
-        """What takes the place of the posterior ensemble (N, n). ``earlier``: where a chain was interrupted."""
+    def refine(self, posterior: Array, minima: Sequence[Minimum], earlier: Refinement | None, looking: bool) -> Refined:
+        """What takes the place of the posterior ensemble (N, n); for the rest see :meth:`sampled`."""
         space = self.space
 
         def cost(x: Array) -> Array:
@@ -221,7 +231,8 @@ class Stages:
             space.forward_runs = earlier.forward_runs
             return earlier.chain
 
-        return refined(space, cost, posterior, minima, self.seed, resume=resume, keep=keep, look=self.tell)
+        look = self.tell
+        return refined(space, cost, posterior, minima, self.seed, looking=looking, resume=resume, keep=keep, look=look)
 
     def costs(self, members: Array, run: Forecast) -> Array:
         """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""

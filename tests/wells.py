@@ -3,6 +3,7 @@
 import numpy as np
 from toys import Toy, make_problem
 
+from en4dvar.assimilate import log_posterior
 from en4dvar.forward import Trajectory
 from en4dvar.prior import PriorTerm
 
@@ -38,3 +39,12 @@ def two_wells(kind=Wells, compiled=True, mean=0.3, seed=1):
     a, b = model.parameters
     terms = (PriorTerm.normal(a, mean, 1.0), PriorTerm.normal(b, 0.0, 0.5))
     return make_problem(model, [-1.0, 0.3], std=0.2, prior=terms, seed=seed)
+
+
+def mass_of_positive(problem):
+    """Of a > 0, and J at its minimum on either side, on a grid."""
+    axes = [m + s * np.linspace(-5, 5, 161) for m, s in zip(problem.prior.mean, problem.prior.std, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    logs = log_posterior(problem, grid)
+    p = np.exp(logs - logs.max())
+    return p[grid[:, 0] > 0].sum() / p.sum()

@@ -22,6 +22,7 @@ from en4dvar.ensemble.forecast import Forecast
 from en4dvar.errors import TooFewMembersError
 from en4dvar.schemes.base import GaussNewtonStep
 from en4dvar.schemes.en4dvar import En4DVar
+from en4dvar.state import Array
 
 SAME_COST = 0.01  # of J, by which a descent must end lower to be another one
 
@@ -45,8 +46,8 @@ class SearchState:
 @dataclass(frozen=True)
 class Found:
     """The lowest ``descent``, converged, the same as it was ``before`` its last iteration, all minima, the lowest
-    first, the members that were ``tried``, from which descents started (N: the prior mean), and the forward ``runs``
-    of the rounds of a search.
+    first, the members that were ``tried``, from which descents started (N: the prior mean; beyond it draws of the
+    posterior), and the forward ``runs`` of a search of so many ``rounds``.
     """
 
     descent: Descent
@@ -54,6 +55,7 @@ class Found:
     minima: tuple[Minimum, ...]
     tried: tuple[int, ...]
     runs: int = 0
+    rounds: int = 0
 
     @property
     def agreed(self) -> bool:
@@ -102,7 +104,7 @@ class Search:
         if self.begun.over >= self.over:
             return found
         after = self._after(found, members)
-        after = replace(after, runs=found.runs + self.space.forward_runs - self.began)
+        after = replace(after, runs=found.runs + self.space.forward_runs - self.began, rounds=self.over)
         self.keep(lambda: (after, SearchState(self.over, after.descent is not found.descent, after.runs)))
         return after
 
@@ -156,6 +158,34 @@ class Search:
     def _keep(self, found: Found, state: Callable[[], SearchState]) -> None:
         spent = self.space.forward_runs - self.began
         self.keep(lambda: (found, replace(state(), over=self.over - 1, runs=found.runs, spent=spent)))
+
+
+def from_draw(
+    space: WeightSpace, scheme: En4DVar, found: Found, x: Array, seed: int, tell: Callable[[Record], None]
+) -> Found:
+    """After a descent from a draw x (n,) of the posterior, if it ends lower than the lowest minimum; else as before.
+
+    Nothing is kept of it: a resumed run comes to the same draw and repeats it. ``tell``: see
+    :func:`~en4dvar.descent.start.choose_start`.
+    """
+    before, rounds = space.forward_runs, found.rounds + 1
+    draw = len(space.members) + rounds
+    rival = Descent(space.start(space.weights_of(x)), members=(draw,))
+    tell(StartRecord(1, (float(space.try_out(rival.weights.w[None]).costs[0]),), 1, rounds))
+    try:
+        iterate(DataWindow(space, seed, lambda: None, tell), scheme, [rival])
+    except TooFewMembersError:  # the model does not run about it
+        return found
+    if rival.cost > found.descent.cost - SAME_COST:
+        return found
+    return Found(
+        descent=rival,
+        before=found.before,
+        minima=merged([Minimum.of(space, rival), *found.minima]),
+        tried=(*found.tried, draw),
+        runs=found.runs + space.forward_runs - before,
+        rounds=rounds,
+    )
 
 
 def challenger(space: WeightSpace, run: Forecast, found: Found) -> int:

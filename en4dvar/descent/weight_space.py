@@ -82,6 +82,11 @@ class WeightSpace:
         """Control vectors (…, n) of weights (…, N)."""
         return np.asarray(self.mean + w @ self.anomalies)
 
+    def weights_of(self, x: Array) -> Array:
+        """The shortest weights (N,) of a control vector (n,) that the anomalies reach."""
+        scale = np.sqrt(self.prior_variance)
+        return np.asarray(np.linalg.lstsq((self.anomalies / scale).T, (x - self.mean) / scale, rcond=None)[0])
+
     def ensemble(self, w: Array, transform: Array | ThinTransform) -> Array:
         """Control vectors (N + 1, n) of the members w + T_i of a transform T and, last, of w (N,)."""
         if isinstance(transform, ThinTransform):

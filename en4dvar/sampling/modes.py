@@ -34,7 +34,7 @@ class WeightedDraws:
     """Draws (D, n) of a posterior, transformed, with ``shares`` (D,) that sum to one.
 
     ``mode`` (D,) is the number of the minimum that each draw belongs to, ``log_evidence`` is ln ∫ exp(−J_o) N(x) dx,
-    ``lowest`` J of the best draw, ``proposal`` a mixture that resembles them.
+    ``lowest`` J, that of the draw ``best`` (n,), ``proposal`` a mixture that resembles them.
     """
 
     x: Array
@@ -42,6 +42,7 @@ class WeightedDraws:
     mode: npt.NDArray[np.intp]
     log_evidence: float
     lowest: float
+    best: Array
     proposal: StudentMixture
 
     @property
@@ -78,9 +79,15 @@ class WeightedDraws:
 
 
 def sample_modes(
-    cost: Cost, prior: Prior, minima: Sequence[Minimum], seed: int, enough: float | None = None
+    cost: Cost,
+    prior: Prior,
+    minima: Sequence[Minimum],
+    seed: int,
+    enough: float | None = None,
+    below: float = -np.inf,
 ) -> WeightedDraws:
-    """Draws of exp(−J) until ``enough`` of them (default: :data:`ENOUGH`) are effective, by at most eight runs each.
+    """Draws of exp(−J) until ``enough`` of them (default: :data:`ENOUGH`) are effective, by at most eight runs each, or
+    until J of one is ``below`` a value.
 
     ``cost``: J (B,) of control vectors (B, n), with the prior's own mean and covariance, +inf where the model fails.
     Deterministic in ``seed``.
@@ -90,22 +97,28 @@ def sample_modes(
     for _ in range(math.ceil(MOST_RUNS * enough / DRAWS)):
         z = sampler.draw()
         sampler.add(z, 0.5 * np.sum(z**2, axis=1) - cost(prior.from_white(z)))
-        if sampler.effective >= enough:
+        if sampler.effective >= enough or _lowest(sampler) < below:
             break
     if not np.isfinite(sampler.log):
         raise ValueError("no draw about a minimum of J can be run")
     x = prior.from_white(sampler.z)
-    n, proposal = len(prior.names), sampler.next_proposal()
+    proposal = sampler.next_proposal()
     return WeightedDraws(
         x=x,
         shares=sampler.shares,
         mode=nearest(prior, minima, x),
         log_evidence=sampler.log,
-        lowest=float(-sampler.target.max() - 0.5 * n * np.log(2 * np.pi)),
+        lowest=_lowest(sampler),
+        best=x[np.argmax(sampler.target)],
         proposal=StudentMixture(
             proposal.share, prior.from_white(proposal.centre), _of_columns(prior.from_white_change, proposal.root)
         ),
     )
+
+
+def _lowest(sampler: Importance) -> float:
+    """J of the lowest draw."""
+    return float(-sampler.target.max() - 0.5 * sampler.z.shape[1] * np.log(2 * np.pi))
 
 
 def _about(prior: Prior, minima: Sequence[Minimum]) -> StudentMixture:

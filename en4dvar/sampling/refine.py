@@ -24,7 +24,7 @@ from en4dvar.units import convert
 
 COUNTS = math.log(1e-3)  # evidence of a minimum relative to that of the lowest, by Laplace, from which it may matter
 
-MISSED = 0.5  # of J, by which a draw must be lower than all minima to be told
+MISSED = 0.5  # of J, by which a draw must be lower than all minima: another one is looked for there, or it is told
 APART = 2.0  # standard deviations between modes of a parameter from which mean ± std describe none of them
 SEEN = 0.02  # weight of a mode that is told
 OVERLAP = "no action is needed: mean ± std describe the members"
@@ -35,7 +35,7 @@ class Refined:
     """Members (N, n), transformed, that take the ensemble's place, and what judges them.
 
     ``weights`` (M,) of the modes; ``log_evidence`` ln ∫ exp(−J_o) N(x; prior) dx, NaN where it is not known;
-    ``lowest`` J that was met.
+    ``lowest`` J that was met. ``lower`` (n,) is a draw that lies lower than all minima; then nothing else was sampled.
     """
 
     members: Array
@@ -43,6 +43,7 @@ class Refined:
     weights: Array = field(default_factory=lambda: np.ones(1))
     log_evidence: float = math.nan
     lowest: float = math.inf
+    lower: Array | None = None
     warnings: tuple[Caution, ...] = ()
 
 
@@ -121,6 +122,7 @@ def refined(
     minima: Sequence[Minimum],
     seed: int,
     *,
+    looking: bool,
     resume: Callable[[], mcmc.ChainState | None],
     keep: Callable[[mcmc.ChainState], None],
     look: Callable[[ChainRecord], None],
@@ -128,12 +130,15 @@ def refined(
     """Members of the posterior that ``minima`` are the modes of, in place of ``posterior`` (N, n).
 
     ``cost``: J (B,) of control vectors (B, n), by the model. By a Markov chain where the settings want one or
-    weighted draws are too few. ``resume`` is asked when the chain begins; it, ``keep``, ``look``: see
-    :func:`~en4dvar.sampling.mcmc.sample`.
+    weighted draws are too few. ``looking``: end at a draw that lies lower than all minima. ``resume`` is asked when
+    the chain begins; it, ``keep``, ``look``: see :func:`~en4dvar.sampling.mcmc.sample`.
     """
     prior, exact, enough = space.problem.prior, space.settings.sampling == "exact", space.settings.draws
     chain = space.settings.refine == "mcmc"
-    draws = sample_modes(cost, prior, minima, seed, enough) if len(minima) > 1 or not chain else None
+    below = minima[0].cost - MISSED if looking else -math.inf
+    draws = sample_modes(cost, prior, minima, seed, enough, below) if len(minima) > 1 or not chain else None
+    if draws is not None and draws.lowest < below:
+        return Refined(posterior, {}, lowest=draws.lowest, lower=draws.best)
     if draws is not None and not chain and draws.effective >= TOO_FEW:
         members = draws.members(len(posterior), member_stream(seed, "members of the modes"), exact)
         summary = _summary(draws, posterior)
@@ -160,7 +165,7 @@ def refined(
         shares,
         draws.log_evidence if draws is not None and known else math.nan,
         float(-walked.log_density.max()),
-        () if walked.converged else (caution("chain-not-converged", walked.warning()),),
+        warnings=() if walked.converged else (caution("chain-not-converged", walked.warning()),),
     )
 
 

@@ -51,7 +51,8 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
     else:
         cold = replace(model, gas="heat", medium_heat="cold")
         simple = replace(cold, vapour="none", medium=saturated) if model.vapour == "transport" else cold
-        yield Alternative("gas_model", "the gas were polytropic (gas: polytropic)", replace(simple, gas="polytropic"))
+        words = "the gas were polytropic (gas: polytropic)"
+        yield Alternative("gas_model", words, replace(simple, gas="polytropic"))  # type: ignore[arg-type]
     if model.medium_heat == "conducting":
         yield changed("medium_heat", "the gel stayed cold at the wall (medium_heat: cold)", medium_heat="cold")
     if "p_v" in model.named:

@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 from same_bits import assert_same_bits
 from toys import Decay, Wave, make_problem
-from wells import UnlikeWells, Wells, two_wells
+from wells import UnlikeWells, Wells, mass_of_positive, two_wells
 
+from en4dvar import stages
 from en4dvar.analysis import Descents, StartRecord
 from en4dvar.assimilate import LoopState, assimilate
+from en4dvar.prior import PriorTerm
 from en4dvar.problem import AssimilationSettings
+from en4dvar.sampling import refine
 from en4dvar.storage.codec import decode, encode
 
 
@@ -94,6 +97,51 @@ def test_a_search_goes_on_from_any_state_to_the_same_bits():
             assert all(r.search and r.search.over >= begun.over for r in rest)
             assert len(rest) <= len(states) - i + 1
     assert seen == {(False, True, False), (False, False, True), (True, True, False), (True, False, False)}
+
+
+def in_the_wrong_well(monkeypatch):
+    """One descent, from the prior mean, which ends in the well at a = -3; J of the other, at 1, is lower by 2."""
+    model = UnlikeWells(compiled=True)
+    a, b = model.parameters
+    terms = (PriorTerm.normal(a, -0.5, 1.0), PriorTerm.normal(b, 0.0, 0.5))
+    monkeypatch.setattr(stages, "in_doubt", lambda *_: True)
+    return make_problem(model, [-3.0, 0.3], std=3.0, prior=terms), AssimilationSettings(start="prior-mean", starts=1)
+
+
+def test_from_a_draw_below_all_minima_another_descent_starts(monkeypatch):
+    problem, settings = in_the_wrong_well(monkeypatch)
+    heard = []
+    analysis = assimilate(problem, settings, 1, progress=lambda _, record: heard.append(record))
+    told = analysis.descents
+    assert (told.members, told.minimum) == ((-1, -2), (1, 0))
+    assert " from a draw, " in told.words
+    assert [round(float(mode.centre[0])) for mode in analysis.modes] == [1, -3]
+    assert analysis.centre[0] == analysis.modes[0].centre[0]
+    assert analysis.modes[0].weight == pytest.approx(mass_of_positive(problem), abs=0.03)
+    assert "starts-disagree" not in {c.code for c in analysis.cautions}
+    assert [record.further for record in heard if isinstance(record, StartRecord)] == [1]
+    assert [record for record in heard if isinstance(record, Descents)][-1] == told
+
+
+def test_a_draw_that_leads_nowhere_is_told(monkeypatch):
+    """Where the descent from it ends no lower, as that of a rough J may, what was found is sampled, once."""
+    problem, settings = in_the_wrong_well(monkeypatch)
+    tried = []
+    monkeypatch.setattr(stages, "from_draw", lambda space, scheme, found, *_: tried.append(found) or found)
+    analysis = assimilate(problem, settings, 1)
+    assert len(tried) == 1
+    assert analysis.descents.members == (-1,)
+    assert "starts-disagree" in {c.code for c in analysis.cautions}
+
+
+def test_a_chain_behind_a_descent_from_a_draw_goes_on_to_the_same_bits(monkeypatch):
+    problem, settings = in_the_wrong_well(monkeypatch)
+    monkeypatch.setattr(refine, "TOO_FEW", np.inf)
+    whole, states = interrupted(problem, settings, 1)
+    assert whole.descents.members == (-1, -2)
+    of_chain = [state for state in states if state.refinement is not None]
+    assert_same_bits(interrupted(problem, settings, 1, of_chain[-1])[0], whole)
+    assert_same_bits(interrupted(problem, settings, 1, states[0])[0], whole)
 
 
 def test_where_descents_ended_in_words():

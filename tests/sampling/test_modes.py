@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from same_bits import assert_same_bits
-from wells import UnlikeWells, Wells, two_wells
+from wells import UnlikeWells, Wells, mass_of_positive, two_wells
 
 from en4dvar.assimilate import assimilate, log_posterior
 from en4dvar.descent.minima import Minimum
@@ -18,15 +18,6 @@ from en4dvar.state import Parameter
 from en4dvar.summary import summarise
 
 KEYWORDS = mcmc.sample.__kwdefaults__
-
-
-def mass_of_positive(problem):
-    """Of a > 0, and J at its minimum on either side, on a grid."""
-    axes = [m + s * np.linspace(-5, 5, 161) for m, s in zip(problem.prior.mean, problem.prior.std, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    logs = log_posterior(problem, grid)
-    p = np.exp(logs - logs.max())
-    return p[grid[:, 0] > 0].sum() / p.sum()
 
 
 CASES = [(Wells, 0.3), (Wells, 0.0), (UnlikeWells, 0.3), (UnlikeWells, 0.8)]
