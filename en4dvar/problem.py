@@ -110,6 +110,12 @@ class InverseProblem:
         return discrepancy_parameters(self.model, self.observable)
 
     @property
+    def of_errors(self) -> frozenset[str]:
+        """Names of the parameters of R: its scale, amplitude and length of a discrepancy."""
+        scale = (NOISE_SCALE,) if self.has_noise_scale else ()
+        return frozenset(p.name for p in (*self.discrepancy, *scale))
+
+    @property
     def varying(self) -> tuple[Varying, ...]:
         """The parameters, and fields of the state, that vary in time."""
         return self.model.varying if isinstance(self.model, PiecewiseModel) else ()

@@ -30,8 +30,7 @@ ENOUGH = 60.0  # effective draws below which the ensemble stays as it is
 def marginal_members(space: WeightSpace, linear: Linearisation, mode: Array, posterior: Array, seed: int) -> Array:
     """Members (N, n), transformed, in place of ``posterior`` (N, n), the Gaussian about the ``mode`` (n,)."""
     problem, prior = space.problem, space.problem.prior
-    names = {p.name for p in problem.discrepancy} | ({NOISE_SCALE.name} if problem.has_noise_scale else set())
-    of_errors = np.array([name in names for name in prior.names])
+    of_errors = np.array([name in problem.of_errors for name in prior.names])
     if not np.any([p.name in prior.names for p in problem.discrepancy]):
         return posterior
     z_mode = prior.white(mode)

@@ -130,11 +130,13 @@ def _validity(a: Analysis, alive: npt.NDArray[np.bool_]) -> checks.Findings:
 
 
 def _fit(a: Analysis, odd: Sequence[Caution]) -> checks.Findings:
-    """The size of the residuals; where they have a structure, no scale of the errors is offered as a cure."""
+    """The size of the residuals; where they have a structure that no discrepancy explains, no scale of the errors is
+    offered as a cure.
+    """
     last, n_used = a.iterations[-1], len(a.problem.observations.used)
     structured = any(c.code == "residual-structure" for c in odd)
     for one in checks.fit(last.chi2_per_observation * n_used, n_used, last.dfs):
-        if structured and one.code == "overstated-error":
+        if structured and not a.problem.discrepancy and one.code == "overstated-error":
             one = replace(one, advice=CATALOGUE["residual-structure"][1])
         yield one
 

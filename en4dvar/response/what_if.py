@@ -21,6 +21,7 @@ from en4dvar.state import Array
 
 MOST_RUNS = 4  # of one alternative
 SETTLED = 0.1  # of the shift, and of a posterior standard deviation: a correction below one of them counts as small
+FAR = 3.0  # posterior standard deviations that a parameter of R may move: further away a chord seems to settle anywhere
 SMALL = 0.3  # posterior standard deviations of a first step that is believed without a second
 
 
@@ -112,6 +113,7 @@ def _shift(
     except Exception as error:  # a model may offer what does not suit the problem; the reason is kept
         return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be set up: {error}")
     moved, reason, before = np.zeros(len(std)), "beyond linear response", np.inf
+    of_errors = np.array([name in problem.of_errors for name in problem.prior.names])
     for attempt in range(MOST_RUNS):
         if attempt == 0 and _same_run(problem, changed):
             predicted = response.linear.prediction
@@ -124,12 +126,12 @@ def _shift(
                 return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be run: {run.failures[0]}")
             predicted = run.predicted[0]
         misfit = float(changed.observations.cost(predicted))
-        if not np.isfinite(misfit):  # parameters of R can be led where it cannot be factored
-            break
         step, decrease = response.step(changed.observations, predicted, moved, of_prior)
         moved = moved + step
         correction = float(np.max(np.abs(step / std)))
         small = SETTLED * max(1.0, float(np.max(np.abs(moved / std))))
+        if np.any(np.abs(moved / std)[of_errors] > FAR):
+            break
         if correction <= (small if attempt else SMALL):
             reason = ""
         if not reason or correction > before:
