@@ -135,6 +135,14 @@ def make_folder(path: str | Path) -> Path:
     return path
 
 
+def remove_file(path: Path) -> None:
+    """Remove a file, or a link, if it is there. Raises :class:`OutputError`."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be removed: {error.strerror}") from None
+
+
 def expanded(text: str) -> Path:
     """The path, a ``~`` at its beginning as the folder it stands for. Raises :class:`PathError`."""
     try:

@@ -173,9 +173,16 @@ def summary_rows(
     """
     yield ["dataset", *CSV_COLUMNS, "failure", "warnings"]
     for name, summary, cautions in summaries:
-        warned = " ".join(codes(cautions))
-        yield from ([name, *csv_cells(row), "", warned] for row in summary)
+        yield from dataset_rows(name, summary, cautions)
     yield from ([name, *("" for _ in CSV_COLUMNS), reason, ""] for name, reason in failures.items())
+
+
+def dataset_rows(
+    name: str, summary: Iterable[ParameterSummary], cautions: Iterable[Caution]
+) -> Iterator[Sequence[object]]:
+    """Rows of ``summary.csv`` of a data set that has a posterior."""
+    warned = " ".join(codes(cautions))
+    yield from ([name, *csv_cells(row), "", warned] for row in summary)
 
 
 CSV_COLUMNS = tuple(f.name for f in fields(ParameterSummary) if f.name not in ("label", "symbol", "modal"))

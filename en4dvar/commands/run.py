@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import chdir
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +12,7 @@ import click
 from en4dvar.commands.common import Failed, Source, command_line, config_options, continuable, note_beginning
 
 if TYPE_CHECKING:
+    from en4dvar.caution import Caution
     from en4dvar.config import Config, SequenceConfig, TwinConfig
     from en4dvar.cycling.problem import SeriesResult
     from en4dvar.cycling.twin import TwinResult
@@ -93,11 +95,18 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
     from en4dvar.storage.population_file import load_population
     from en4dvar.summary import results_table
 
-    if len(campaign) <= MOST_TOLD:
-        click.echo(results_table({o.name: o.summary for o in campaign.outcomes if not o.failure}))
-    for outcome in campaign.outcomes[:MOST_TOLD]:
-        for remark in outcome.remarks:
-            click.echo(f"{outcome.name}: {remark}")
+    few = len(campaign) <= MOST_TOLD
+    summaries, remarks, warnings = {}, [], _Warnings()
+    for i, outcome in enumerate(campaign.outcomes):  # once: each is read from the disk
+        if few and not outcome.failure:
+            summaries[outcome.name] = outcome.summary
+        if i < MOST_TOLD:
+            remarks += [f"{outcome.name}: {remark}" for remark in outcome.remarks]
+        warnings.add(outcome.name, outcome.warnings)
+    if few:
+        click.echo(results_table(summaries))
+    for remark in remarks:
+        click.echo(remark)
     together = load_joint(campaign.directory / FILE) if (campaign.directory / FILE).exists() else None
     if together:
         from en4dvar.report.joint import joint_table
@@ -110,14 +119,12 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
         click.echo("\n" + "\n".join(population_lines(behind)))
     for notice in campaign.notices:
         click.echo(f"warning: {notice}", err=True)
-    found = [(o.name, warning) for o in campaign.outcomes for warning in o.warnings]
-    found += [("all together", warning) for warning in (together.cautions if together else ())]
-    found += [("population", warning) for warning in (behind.cautions if behind else ())]
-    told = sorted(found, key=lambda of_set: of_set[1].rank)  # the worst first; the mildest are left out
-    for name, warning in told[:MOST_TOLD]:
+    warnings.add("all together", together.cautions if together else ())
+    warnings.add("population", behind.cautions if behind else ())
+    for name, warning in warnings.worst:
         click.echo(f"{warning.kind}: {name}: {warning}", err=True)
-    if len(told) > MOST_TOLD:
-        click.echo(f"and {len(told) - MOST_TOLD} more warnings and notes; see run.log", err=True)
+    if warnings.count > MOST_TOLD:
+        click.echo(f"and {warnings.count - MOST_TOLD} more warnings and notes; see run.log", err=True)
     if len(campaign) and with_report:
         click.echo(f"report: {campaign.directory / 'report.html'}")
     if campaign.failures:
@@ -125,6 +132,19 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
         head = f"{len(reasons)} of {len(campaign.outcomes)} data sets failed:"
         more = [f"and {len(reasons) - MOST_TOLD} more; see summary.csv"] if len(reasons) > MOST_TOLD else []
         raise Failed("\n".join([head, *reasons[:MOST_TOLD], *more]), campaign.exit_code)
+
+
+class _Warnings:
+    """``worst``: those that are told, each with its data set, the worst first. The others are only counted."""
+
+    def __init__(self) -> None:
+        self.worst: list[tuple[str, Caution]] = []
+        self.count = 0
+
+    def add(self, name: str, cautions: Sequence[Caution]) -> None:
+        self.count += len(cautions)
+        known = [*self.worst, *((name, caution) for caution in cautions)]
+        self.worst = sorted(known, key=lambda one: one[1].rank)[:MOST_TOLD]
 
 
 def _conduct(config: TwinConfig, force: bool, resume: bool) -> None:

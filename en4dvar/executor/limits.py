@@ -1,7 +1,9 @@
 """What a forward model may take in a worker process: time for a batch of members, memory for the process.
 
 A batch past its time is interrupted, as Ctrl-C would; where its code never returns to the interpreter (a compiled loop;
-on dask, where calls are not in the main thread, also a system call), the process is ended instead. Memory is the size
+on dask, where calls are not in the main thread, also a system call), the process is ended instead. While a process is
+suspended the time does not count; after more than twice the limit it may be ended as it continues, and its call is
+repeated. Memory is the size
 of the data segment (Linux) beyond what the process had at its start; an allocation past it raises MemoryError, or ends
 a process whose compiled code does not check. Either way the members have failed, with the reason, and the run goes on.
 Other executors share the process of the run, which cannot be ended: they know no limits.
@@ -67,6 +69,7 @@ def parse_bytes(text: object) -> int:
     return int(float(found[1]) * _UNITS[found[2] or ""])
 
 
+MOMENT = 0.01  # s
 _limits = NO_LIMITS  # of this process
 _deadlines: dict[int, float] = {}  # thread → when its process is ended, on the monotonic clock
 _arming = threading.Lock()
@@ -103,7 +106,7 @@ def within_time_limit(batch: Callable[[], T]) -> T:
         return batch()
     by_signal = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
     alarm = _Signal() if by_signal else _ThreadException()
-    _watch(time.monotonic() + 2 * seconds + 1)
+    _watch(_end_of(seconds))
     try:
         try:
             alarm.start(seconds)
@@ -118,16 +121,30 @@ def within_time_limit(batch: Callable[[], T]) -> T:
 
 
 class _Signal:
-    """Raises :class:`TimeLimitError` in the main thread."""
+    """Raises :class:`TimeLimitError` in the main thread.
+
+    A process that was suspended (Ctrl-Z) has the time anew when it continues. Its alarm has gone on meanwhile and is
+    heard first, so that each alarm is asked for once more, a moment later, before it counts.
+    """
 
     def start(self, seconds: float) -> None:
-        self.armed = True
+        self.seconds, self.armed, self.certain = seconds, True, False
         signal.signal(signal.SIGALRM, self._raise)
+        signal.signal(signal.SIGCONT, self._continue)
         signal.setitimer(signal.ITIMER_REAL, seconds)
 
     def _raise(self, *_: Any) -> None:
-        if self.armed:
+        if self.armed and self.certain:
             raise TimeLimitError
+        if self.armed:
+            self.certain = True
+            signal.setitimer(signal.ITIMER_REAL, MOMENT)
+
+    def _continue(self, *_: Any) -> None:
+        if self.armed:
+            self.certain = False
+            _watch(_end_of(self.seconds))
+            signal.setitimer(signal.ITIMER_REAL, self.seconds)
 
     def stop(self) -> None:
         self.armed = False
@@ -153,6 +170,11 @@ class _ThreadException:
         with self.lock:
             self.armed = False
         ctypes.pythonapi.PyThreadState_SetAsyncExc(self.thread, None)  # set, but not raised yet
+
+
+def _end_of(seconds: float) -> float:
+    """When a process is ended whose batch begins now and has so many seconds."""
+    return time.monotonic() + 2 * seconds + 1
 
 
 def _watch(deadline: float | None) -> None:

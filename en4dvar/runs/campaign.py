@@ -37,23 +37,26 @@ class DatasetOutcome:
     n_observations: int = 0
     sha256: str = ""
     remarks: tuple[str, ...] = ()  # that the terminal shows below the table
+    lines: str = ""  # of ``summary.csv``
 
 
 @dataclass(frozen=True)
 class Campaign:
     """The outcome of a run over any number of data sets, in their order; posteriors are read from disk when asked for.
 
-    ``notices`` are what the run itself found worth a warning, e.g. a damaged checkpoint.
+    ``notices`` are what the run itself found worth a warning, e.g. a damaged checkpoint. ``failed``: the outcomes
+    without a posterior, where they are known without reading all of them.
     """
 
     directory: Path
     outcomes: Sequence[DatasetOutcome]
     notices: tuple[str, ...] = ()
+    failed: tuple[DatasetOutcome, ...] | None = None
 
     @cached_property
     def failures(self) -> tuple[DatasetOutcome, ...]:
         """The data sets without a posterior."""
-        return tuple(o for o in self.outcomes if o.failure)
+        return tuple(o for o in self.outcomes if o.failure) if self.failed is None else self.failed
 
     @property
     def exit_code(self) -> int:

@@ -20,16 +20,18 @@ from en4dvar.inputs.asked import DataFile
 from en4dvar.prior import own_seed
 from en4dvar.problem import AssimilationSettings, InverseProblem
 from en4dvar.runs.campaign import DatasetOutcome
+from en4dvar.runs.progress import describe
 from en4dvar.storage.checkpoint import Keeper, digest
 from en4dvar.storage.codec import encode_text
 from en4dvar.storage.groups import build_groups
 from en4dvar.storage.netcdf import to_bytes
 from en4dvar.storage.packed import packed
 from en4dvar.storage.seal import SealedBytes
-from en4dvar.summary import remarks, summarise
+from en4dvar.summary import dataset_rows, remarks, summarise
+from en4dvar.tables import csv_text
 
 SEND_EVERY = 0.1  # s; a worker sends the records of its iterations no more often, whatever data sets they are of
-Records = tuple[tuple[str, Record], ...]  # each with the name of its data set
+Told = tuple[str, Record, str]  # name of a data set, one of its records, and what the log says of it
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ class Estimate:
     digest: str
     outcome: bytes
     told: tuple[str, ...]
-    records: Records = ()
+    records: tuple[Told, ...] = ()
 
 
 class StoppedError(Exception):
@@ -117,13 +119,15 @@ def estimate(job: Job | FileJob, executor: Executor | None = None, progress: Pro
     groups = build_groups(analysis, job.attributes)
     content: SealedBytes | bytes = to_bytes(groups) if job.alone else packed(groups)
     sha256 = content.sha256 if isinstance(content, SealedBytes) else digest(content)
+    summary = summarise(analysis)
     outcome = DatasetOutcome(
         analysis.name,
         warnings=analysis.cautions,
-        summary=summarise(analysis),
+        summary=summary,
         n_observations=len(analysis.observations),
         sha256=sha256,
         remarks=remarks(analysis),
+        lines=csv_text(dataset_rows(analysis.name, summary, analysis.cautions)),
     )
     converged = "converged" if analysis.converged else "not converged"
     ending = f"{converged}: {analysis.stop_reason}; {analysis.forward_runs} forward runs"
@@ -131,7 +135,7 @@ def estimate(job: Job | FileJob, executor: Executor | None = None, progress: Pro
     return Estimate(content, sha256, encode_text(outcome), (ending, *warnings))
 
 
-def estimate_and_tell(job: Job | FileJob, tell: Callable[[Records], None]) -> Estimate:
+def estimate_and_tell(job: Job | FileJob, tell: Callable[[tuple[Told, ...]], None]) -> Estimate:
     """As :func:`estimate`, on a worker: ``tell`` gets the records, without their members, as iterations end; the last
     ones come with the estimate.
     """
@@ -149,16 +153,17 @@ class _Sender:
 
     _sent: ClassVar[float] = -math.inf  # when this process sent the last message, of any data set
 
-    def __init__(self, tell: Callable[[Records], None]):
+    def __init__(self, tell: Callable[[tuple[Told, ...]], None]):
         self._tell, self._lock = tell, threading.Lock()
-        self._waiting: list[tuple[str, Record]] = []
+        self._waiting: list[Told] = []
         self._timer: threading.Timer | None = None
 
     def __call__(self, name: str, record: Record) -> None:
+        line = describe(name, record)  # here, for the process that hears it serves all workers
         if isinstance(record, IterationRecord):
             record = replace(record, members=record.members[:0])
         with self._lock:
-            self._waiting.append((name, record))
+            self._waiting.append((name, record, line))
             rest = self._sent + SEND_EVERY - time.monotonic()
             if rest <= 0:
                 self._send()
@@ -172,7 +177,7 @@ class _Sender:
         if records := self.rest():
             self._tell(records)
 
-    def rest(self) -> Records:
+    def rest(self) -> tuple[Told, ...]:
         """What waits and is not sent any more."""
         with self._lock:
             return self._rest()
@@ -186,7 +191,7 @@ class _Sender:
             self._tell(records)
             _Sender._sent = time.monotonic()
 
-    def _rest(self) -> Records:
+    def _rest(self) -> tuple[Told, ...]:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import overload
@@ -38,6 +39,14 @@ class Outcomes(Sequence[DatasetOutcome]):
     def __getitem__(self, index: int | slice) -> DatasetOutcome | tuple[DatasetOutcome, ...]:
         found = self._stems[index]
         return self._read(found) if isinstance(found, str) else tuple(map(self._read, found))
+
+    def lines(self) -> Iterator[str]:
+        """Those of ``summary.csv``, of each data set; nothing else of it is looked at."""
+        for stem in self._stems:
+            try:
+                yield str(json.loads(read_outcome(self._record, stem, self._entries[stem]))["lines"])
+            except (ValueError, LookupError, TypeError) as error:  # as below
+                raise OutputError(f"{self._record / stem}: {error}") from None
 
     def _read(self, stem: str) -> DatasetOutcome:
         try:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Literal
 
 from en4dvar.errors import OutputError
-from en4dvar.files import inside, make_folder, write_text
+from en4dvar.files import inside, make_folder, remove_file, write_text
 from en4dvar.runs.interrupt import begun
 from en4dvar.runs.lock import LOCK, locked
 from en4dvar.runs.replacement import (
@@ -123,11 +123,7 @@ class RunDirectory:
 
     def remove(self, name: str) -> None:
         """Remove a file if it is there. Raises :class:`OutputError`."""
-        path = self.at(name)
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be removed: {error.strerror}") from None
+        remove_file(self.at(name))
 
     def publish(self) -> None:
         """The run is complete: where it replaces an earlier one, take its place. Raises :class:`OutputError`."""

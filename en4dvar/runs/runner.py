@@ -12,6 +12,7 @@ from en4dvar.config import Config, load_config
 from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.executor import Executor, choose_executor, one_blas_thread
+from en4dvar.files import atomic_path
 from en4dvar.inputs.asked import DataFile
 from en4dvar.runs.campaign import Campaign
 from en4dvar.runs.interrupt import terminate_as_interrupt
@@ -26,7 +27,7 @@ from en4dvar.storage.joint_file import FILE, load_joint
 from en4dvar.storage.population_file import FILE as POPULATION
 from en4dvar.storage.population_file import load_population
 from en4dvar.summary import summary_rows
-from en4dvar.tables import write_csv
+from en4dvar.tables import csv_text
 
 if TYPE_CHECKING:
     from en4dvar.report.result import Result
@@ -115,7 +116,7 @@ def run_campaign(
                 with suppress(KeyboardInterrupt):  # of an impatient user: on to the next step
                     executor.kill()
                 raise
-    return Campaign(config.directory, work.outcomes(directory.home), tuple(run.notices))
+    return work.campaign()
 
 
 def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
@@ -198,8 +199,11 @@ def _finish(work: Worklist, report_workers: int) -> None:
     if work.good() and work.config.report:
         _report(directory, workers=report_workers, figures=work.config.figures)
     elif not (path := directory.claim(SUMMARY)).exists():
-        rows = ((o.name, o.summary, o.warnings) for o in work.outcomes(directory.work) if not o.failure)
-        write_csv(path, summary_rows(rows, work.failures()))
+        header, *failures = summary_rows((), work.failures())
+        with atomic_path(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+            file.write(csv_text([header]))
+            file.writelines(work.outcomes(directory.work).lines())
+            file.write(csv_text(failures))
 
 
 def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:

@@ -14,10 +14,10 @@ from en4dvar.config import Config
 from en4dvar.errors import En4dvarError, OutputError
 from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
 from en4dvar.executor.shared import CommonValue
-from en4dvar.files import readable
+from en4dvar.files import readable, remove_file
 from en4dvar.inputs.asked import DataFile
-from en4dvar.runs.campaign import DatasetOutcome, file_names
-from en4dvar.runs.jobs import Common, Estimate, FileJob, Job, Records, estimate, estimate_and_tell
+from en4dvar.runs.campaign import Campaign, DatasetOutcome, file_names
+from en4dvar.runs.jobs import Common, Estimate, FileJob, Job, Told, estimate, estimate_and_tell
 from en4dvar.runs.outcomes import Outcomes
 from en4dvar.runs.progress import LiveProgress, describe
 from en4dvar.runs.session import Session
@@ -81,6 +81,7 @@ class Worklist:
         self.alone = len(sets) == 1
         self.pack = Pack(run.directory.at(self.record))
         self.common = CommonValue(Common(config, {**run.attributes, "identity": run.identity.settings}))
+        self._failed_sets: dict[str, DatasetOutcome] = {}
         self._reached: dict[str, tuple[int, int]] = {}  # data set at work → its last round, iteration
 
     def good(self) -> list[Dataset]:
@@ -95,6 +96,12 @@ class Worklist:
         """What came of each data set, in order; ``folder`` is where the files of the run are."""
         files = {d.stem: d.file for d in self.sets if d.name in self.ended}
         return Outcomes(folder, self.record, self.pack.entries, files)
+
+    def campaign(self) -> Campaign:
+        """What the run leaves behind. What has failed did so in this process, for a resumed run tries it again."""
+        directory, failed = self.run.directory, self._failed_sets
+        in_order = tuple(failed[d.name] for d in self.sets if d.name in failed)
+        return Campaign(self.config.directory, self.outcomes(directory.home), tuple(self.run.notices), in_order)
 
     @property
     def record(self) -> str:
@@ -193,7 +200,7 @@ class Worklist:
         return self.run.identity.of_dataset(d.name)
 
     def _job(self, d: Dataset) -> FileJob:
-        fingerprint, path = self._fingerprint(d), self.run.directory.at(d.iteration)
+        fingerprint, path = self._fingerprint(d), self._checkpoint(d)
         resume = self.run.restore(d.iteration, fingerprint, LoopState, f"{d.name} is estimated from the start")
         if resume is not None:
             self.run.log.write(f"{d.name}: continued {resume.reached}")
@@ -201,21 +208,27 @@ class Worklist:
         own = {"data_sha256": self.run.identity.content[d.name]}
         return FileJob(self.common, d.name, d.source, own, keeper, resume)
 
-    def _hear(self, _: int, records: Records) -> None:
+    def _checkpoint(self, d: Dataset) -> Path:
+        """Where its iterations are kept: in a folder that was looked at as the run began, where files are replaced or
+        removed, never written in place. To look at each for a link is a tenth of what a data set costs this process.
+        """
+        return self.run.directory.work / d.iteration
+
+    def _hear(self, _: int, records: Sequence[Told]) -> None:
         self._tell(records)
 
     def _hear_one(self, name: str, record: Record) -> None:
-        self._tell([(name, record)])
+        self._tell([(name, record, describe(name, record))])
 
-    def _tell(self, records: Sequence[tuple[str, Record]], *lines: str) -> None:
+    def _tell(self, records: Sequence[Told], *lines: str) -> None:
         """Records, and further lines of the log: all of them at once, for each time it is written to takes as long."""
         self.run.log.write("\n".join([*(line for one in records for line in self._lines(*one)), *lines]))
         if self.progress is not None:
-            for name, record in records:
+            for name, record, _ in records:
                 self.progress(name, record)
 
-    def _lines(self, name: str, record: Record) -> Iterator[str]:
-        """What the log says of a record."""
+    def _lines(self, name: str, record: Record, line: str) -> Iterator[str]:
+        """What the log says of a record, which is its ``line`` unless it is told once more."""
         if isinstance(record, StartRecord | IterationRecord):
             reached = self._reached.get(name, (0, 0))
             place = (
@@ -226,7 +239,7 @@ class Worklist:
             if place <= reached:
                 yield f"{name}: its worker was lost; another one repeats it"
             self._reached[name] = place
-        yield describe(name, record)
+        yield line
 
     def _keep(self, d: Dataset, value: Estimate) -> None:
         self._tell(value.records, *(f"{d.name}: {line}" for line in value.told))
@@ -247,11 +260,12 @@ class Worklist:
         if len(self.sets) == 1:
             raise error
         exit_code = error.exit_code if isinstance(error, En4dvarError) else 1
-        self._end(d, reason, encode_text(DatasetOutcome(d.name, failure=reason, exit_code=exit_code)))
+        self._failed_sets[d.name] = outcome = DatasetOutcome(d.name, failure=reason, exit_code=exit_code)
+        self._end(d, reason, encode_text(outcome))
 
     def _end(self, d: Dataset, failure: str, outcome: bytes, content: bytes = b"", content_digest: str = "") -> None:
         self.pack.append(d.stem, self._fingerprint(d), outcome, content, content_digest)
-        self.run.directory.remove(d.iteration)
+        remove_file(self._checkpoint(d))
         self.ended[d.name] = failure
         self._reached.pop(d.name, None)
         if isinstance(self.progress, LiveProgress):

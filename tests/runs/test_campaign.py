@@ -9,13 +9,16 @@ import xarray as xr
 from run_files import configuration, make_campaign, run_cli
 from toy_config import csv_text
 
+from en4dvar.commands.common import Failed
+from en4dvar.commands.run import _tell
 from en4dvar.errors import DataError, OutputError, TooFewMembersError
 from en4dvar.report.result import load_result
+from en4dvar.runs import outcomes
 from en4dvar.runs.campaign import Campaign, DatasetOutcome, file_names
 from en4dvar.runs.outcomes import Outcomes
 from en4dvar.runs.runner import run_campaign, write_report
 from en4dvar.storage.campaign_file import GROUPS, save_campaign
-from en4dvar.storage.pack import PACK, Pack, results_of
+from en4dvar.storage.pack import PACK, Pack, read_outcome, results_of
 
 
 @pytest.fixture(scope="module")
@@ -185,3 +188,17 @@ def test_command_line(tmp_path):
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 3
     assert not (tmp_path / "none").exists()
+
+
+def test_the_closing_message_reads_each_outcome_once(campaign, monkeypatch, capsys):
+    read = []
+
+    def noted(path, name, entry):
+        read.append(name)
+        return read_outcome(path, name, entry)
+
+    monkeypatch.setattr(outcomes, "read_outcome", noted)
+    with pytest.raises(Failed, match=r"3 of 6 data sets failed:\nempty: .*\nimage: .*\nset2: "):
+        _tell(campaign, with_report=False)
+    assert read == ["empty", "image", "set0", "set1", "set2", "set3"]
+    assert {line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]} == {"set0", "set1", "set3"}
