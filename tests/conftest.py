@@ -10,6 +10,7 @@ from dataclasses import replace
 from itertools import islice
 from typing import Any
 
+import hypothesis
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
@@ -33,10 +34,21 @@ threadpool_limits(1, user_api="blas")
 # programs that tests start flush, and ``faults/test_commands.py`` has that fail.
 os.fsync = lambda file: None  # type: ignore[assignment]
 
+# How long an example takes says how busy a machine is, and what is drawn at random would refuse a change that has
+# nothing to do with it.
+hypothesis.settings.register_profile(
+    "any machine", deadline=None, derandomize=True, database=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)  # fmt: skip
+hypothesis.settings.load_profile("any machine")
+
 # A file is one worker's (``--dist loadfile``), and the files keep the order given below (``--no-loadscope-reorder``).
 # First the file that compiles what most bubbles need: begun by both workers at once it would be compiled by both. Then
 # those that take longest, or one worker would be left with them at the end.
-FIRST = ("test_solver", "test_study", "test_commands", "test_examples", "test_imr_suite", "test_terminal")
+FIRST = (
+    "test_solver", "test_study", "test_examples", "test_same_bits", "test_discrepancy", "test_terminal",
+    "test_commands", "test_ending_models", "test_twin", "test_estimate", "test_imr_suite",
+)  # fmt: skip
 
 FAILED = 3
 

@@ -12,6 +12,10 @@ from en4dvar.errors import OutputError
 from en4dvar.runs.campaign import DatasetOutcome
 from en4dvar.storage.codec import decode_text
 from en4dvar.storage.pack import Entry, read_outcome
+from en4dvar.summary import dataset_rows
+from en4dvar.tables import csv_text
+
+LINES = b'"lines": '  # which outcomes of earlier versions do not have
 
 
 class Outcomes(Sequence[DatasetOutcome]):
@@ -41,16 +45,26 @@ class Outcomes(Sequence[DatasetOutcome]):
         return self._read(found) if isinstance(found, str) else tuple(map(self._read, found))
 
     def lines(self) -> Iterator[str]:
-        """Those of ``summary.csv``, of each data set; nothing else of it is looked at."""
+        """Those of ``summary.csv``, of each data set; nothing else of it is looked at, but where an earlier version wrote
+        none.
+        """
         for stem in self._stems:
+            raw = self._raw(stem)
             try:
-                yield str(json.loads(read_outcome(self._record, stem, self._entries[stem]))["lines"])
+                lines = str(json.loads(raw)["lines"]) if LINES in raw else ""
             except (ValueError, LookupError, TypeError) as error:  # as below
                 raise OutputError(f"{self._record / stem}: {error}") from None
+            if LINES not in raw and not (outcome := self._read(stem)).failure:
+                lines = csv_text(dataset_rows(outcome.name, outcome.summary, outcome.warnings))
+            yield lines
+
+    def _raw(self, stem: str) -> bytes:
+        return read_outcome(self._record, stem, self._entries[stem])
 
     def _read(self, stem: str) -> DatasetOutcome:
+        raw = self._raw(stem)
         try:
-            outcome = decode_text(read_outcome(self._record, stem, self._entries[stem]), DatasetOutcome)
+            outcome = decode_text(raw if LINES in raw else raw.replace(b"{", b'{"lines": "", ', 1), DatasetOutcome)
         except ValueError as error:  # anybody can write a checksum
             raise OutputError(f"{self._record / stem}: {error}") from None
         return outcome if outcome.failure else replace(outcome, file=self._folder / self._files[stem])

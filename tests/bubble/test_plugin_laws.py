@@ -192,7 +192,7 @@ class TestWorkers:
         x = model.initial_state(VALUES)
         call = methodcaller("step", x, 0.0, 12e-6)
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-            there = pool.submit(call, model).result(timeout=120)
+            there = pool.submit(call, model).result(timeout=600)
         np.testing.assert_array_equal(there, call(model))
 
     def test_reference_and_not_code_is_sent(self, yeoh):

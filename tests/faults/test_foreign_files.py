@@ -54,10 +54,10 @@ def test_a_yaml_file_of_100_mb(tmp_path):
     path = write_toy(tmp_path)
     with path.open("ab") as file:
         file.truncate(10**8)
-    begin = time.perf_counter()
+    begin = time.process_time()
     with pytest.raises(ConfigError) as told:
         read_document(path)
-    assert time.perf_counter() - begin < 1
+    assert time.process_time() - begin < 1
     assert row("bomb").told(str(told.value))
 
 

@@ -134,7 +134,7 @@ def test_a_terminal_that_is_gone(quiet, tmp_path, kind):
     terminal = Terminal(command(*again), EN4DVAR_TEST_FLAG=tmp_path / "never")
     assert terminal.read_until_logged(out / "run.log", "iteration  2")
     os.close(terminal.end)
-    assert terminal.process.wait(60) == int(row("interrupt").exit_code)
+    assert terminal.process.wait(300) == int(row("interrupt").exit_code)
     assert "interrupted" in (out / "run.log").read_text()
     assert not (out / ".en4dvar-lock").exists()
     go_on(path, out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 
@@ -78,6 +79,7 @@ class Twofold(Curved):
         return self.truth[:, None] * [-1, 1] + [0.4, 0.0] + 0.02 * noise
 
 
+@functools.cache
 def by_quadrature(runs, prior, hyper):
     """Quantiles of exp(ν + τ²/2) of the first coordinate, and ln p(data), by sums over fine grids."""
     a, b = np.linspace(-5, 5, 1001), np.linspace(-3, 3, 601)
@@ -87,10 +89,9 @@ def by_quadrature(runs, prior, hyper):
     of_a = np.einsum("abs,b->as", np.exp(log), norm(prior.mean[1], prior.std[1]).pdf(b)) * (b[1] - b[0])
     nu, tau = np.linspace(-2.0, 2.0, 101), np.geomspace(4e-3, 2.0, 50)
     total = np.empty((len(nu), len(tau)))
-    for i, v in enumerate(nu):
-        for j, t in enumerate(tau):
-            fine = norm(v, max(t, 0.02)).pdf(a)  # below the grid's spacing of 0.01 nothing changes any more
-            total[i, j] = np.sum(np.log(fine @ of_a * (a[1] - a[0]) + 1e-300))
+    for j, t in enumerate(np.maximum(tau, 0.02)):  # below the grid's spacing of 0.01 nothing changes any more
+        fine = norm.pdf(a, nu[:, None], t)
+        total[:, j] = np.sum(np.log(fine @ of_a * (a[1] - a[0]) + 1e-300), axis=1)
     log = total + norm(prior.mean[0], hyper.mean_std).logpdf(nu)[:, None] + halfnorm(scale=hyper.spread).logpdf(tau)
     width = (nu[1] - nu[0]) * np.gradient(tau)
     weights = np.exp(log - log.max()) * width
@@ -101,10 +102,12 @@ def by_quadrature(runs, prior, hyper):
     return np.interp([0.025, 0.5, 0.975], cdf, mean.ravel()[order]), evidence
 
 
+CURVED, OUTLIER, CUSPED = Curved(), Curved(outlier=2.0), Cusped()
 LEVELS = (0.025, 0.5, 0.975)
 CURVED_PRIOR, CURVED_HYPER = prior_of(("a", "b"), (0.0, 0.0), (0.8, 0.6)), HyperPrior(mean_std=0.8, spread=0.4)
 
 
+@functools.cache
 def estimated(runs, seed):
     return estimate_population(runs, runs.start(seed), CURVED_PRIOR, ["a"], seed, CURVED_HYPER, SMALL)
 
@@ -112,9 +115,9 @@ def estimated(runs, seed):
 @pytest.mark.parametrize(
     "runs",
     [
-        pytest.param(Curved(), id="curved", marks=pytest.mark.slow),
-        pytest.param(Curved(outlier=2.0), id="outlier", marks=pytest.mark.slow),
-        pytest.param(Cusped(), id="cusped", marks=pytest.mark.slow),
+        pytest.param(CURVED, id="curved", marks=pytest.mark.slow),
+        pytest.param(OUTLIER, id="outlier", marks=pytest.mark.slow),
+        pytest.param(CUSPED, id="cusped", marks=pytest.mark.slow),
         pytest.param(Twofold(middle=1.2), id="twofold", marks=pytest.mark.slow),
     ],
 )
@@ -133,9 +136,9 @@ def test_a_population_of_curved_likelihoods_against_quadrature(runs):
 @pytest.mark.parametrize(
     "runs",
     [
-        pytest.param(Curved(), id="curved"),
-        pytest.param(Curved(outlier=2.0), id="outlier", marks=pytest.mark.long),
-        pytest.param(Cusped(), id="cusped", marks=pytest.mark.long),
+        pytest.param(CURVED, id="curved"),
+        pytest.param(OUTLIER, id="outlier", marks=pytest.mark.long),
+        pytest.param(CUSPED, id="cusped", marks=pytest.mark.long),
     ],
 )
 def test_repeated_estimates_are_as_good_as_they_say(runs):
@@ -153,7 +156,7 @@ def test_repeated_estimates_are_as_good_as_they_say(runs):
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_with_any_number_of_threads():
-    runs = Curved()
+    runs = CURVED
     found = estimated(runs, 3)
     again = estimate_population(runs, runs.start(3), CURVED_PRIOR, ["a"], 3, CURVED_HYPER, SMALL, workers=3)
     np.testing.assert_array_equal(again.nu, found.nu)

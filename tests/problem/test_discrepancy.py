@@ -1,5 +1,6 @@
 """Discrepancies of the model: likelihood, gradient, information against closed forms, differences, quadrature."""
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 
@@ -230,12 +231,13 @@ def test_an_alternative_that_leads_to_a_huge_discrepancy_is_beyond_linear_respon
     assert shift.runs == 1
 
 
+@functools.cache
 def known_posterior():
     """y = a x + δ + ε with a, amplitude and length unknown, and its posterior on a grid of the latter two.
 
     The problem; weights (61, 61) on ``z``, standard deviations of their priors; mean and std of a; ln p(y).
     """
-    problem = with_discrepancy(make_problem(Linear(("a",)), [1.0], k=40, std=0.03, seed=2), amplitude=(0.1, 0.5))
+    problem = with_discrepancy(make_problem(Vectorised(("a",)), [1.0], k=40, std=0.03, seed=2), amplitude=(0.1, 0.5))
     o = problem.observations
     rng = np.random.default_rng(8)
     delta = np.linalg.cholesky(np.exp(-o.noise.kernel.lags / 0.5) + 1e-12 * np.eye(40)) @ rng.standard_normal(40)
@@ -250,8 +252,8 @@ def known_posterior():
             solved = np.linalg.solve(covariance, np.column_stack([h, y - 0.8 * h]))
             variances[i, j] = 1 / (1 + h @ solved[:, 0])
             means[i, j] = 0.8 + variances[i, j] * (h @ solved[:, 1])
-            marginal = multivariate_normal(0.8 * h, covariance + np.outer(h, h))
-            log_density[i, j] = marginal.logpdf(y) - 0.5 * z[i] ** 2 - 0.5 * z[j] ** 2
+            marginal = multivariate_normal.logpdf(y, 0.8 * h, covariance + np.outer(h, h))
+            log_density[i, j] = marginal - 0.5 * z[i] ** 2 - 0.5 * z[j] ** 2
     top = log_density.max()
     weights = np.exp(log_density - top)
     evidence = top + np.log(weights.sum() * (z[1] - z[0]) ** 2 / (2 * np.pi))
@@ -291,11 +293,14 @@ def covering(problems, truths, settings):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("structured", [True, False])
-def test_coverage_of_intervals_where_errors_have_a_structure(structured):
-    """80 experiments whose discrepancies are drawn: with them 90 % intervals cover, without them they do not."""
+@pytest.mark.parametrize(("structured", "experiments"), [(True, 80), (False, 40)])
+def test_coverage_of_intervals_where_errors_have_a_structure(structured, experiments):
+    """Discrepancies are drawn: with them 90 % intervals cover, without them they do not.
+
+    Where there is none to cover for, half as many experiments tell by how much the intervals are wider.
+    """
     rng, model = np.random.default_rng(11), Vectorised(("a", "b"))
-    problems, allowed, truths = [], [], rng.standard_normal(80) + 0.8
+    problems, allowed, truths = [], [], rng.standard_normal(experiments) + 0.8
     for i, truth in enumerate(truths):
         problem = make_problem(
             model, [truth, 0.5], std=0.05, k=40, seed=100 + i,

@@ -242,7 +242,7 @@ def test_a_broken_template_is_told_with_its_line(folder):
 
 @pytest.mark.slow
 def test_a_run_costs_less_than_five_milliseconds_beside_the_process(folder):
-    """Against the same process started by subprocess alone; the best of many, since others use this machine."""
+    """Against the same process started by subprocess alone, in turns; the best of many: others use this machine."""
     import subprocess
 
     model = CommandModel(
@@ -252,14 +252,14 @@ def test_a_run_costs_less_than_five_milliseconds_beside_the_process(folder):
         )
     )
 
-    def best(run: Any) -> float:
-        took = []
-        for _ in range(60):
-            began = time.perf_counter()
-            run()
-            took.append(time.perf_counter() - began)
-        return min(took)
+    def took(run: Any) -> float:
+        began = time.perf_counter()
+        run()
+        return time.perf_counter() - began
 
-    ours = best(lambda: model.trajectories(np.ones((1, 1)), np.ones(1)))
-    bare = best(lambda: subprocess.run(["/bin/echo", "1"], capture_output=True, check=True, env=os.environ))
-    assert ours - bare < 5e-3
+    def bare() -> Any:
+        return subprocess.run(["/bin/echo", "1"], capture_output=True, check=True, env=os.environ)
+
+    both = [(took(lambda: model.trajectories(np.ones((1, 1)), np.ones(1))), took(bare)) for _ in range(60)]
+    ours, alone = np.min(both, axis=0)
+    assert ours - alone < 5e-3

@@ -10,7 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar.config.build import build
 from en4dvar.errors import ConfigError, DataError
@@ -168,13 +170,12 @@ main()
 @pytest.mark.fault("kill-commands")
 def test_a_killed_sweep_is_resumed_to_the_same_numbers(tmp_path):
     words = ["sweep", str(CONFIGS / "agarose_03_nh.yaml"), "--trajectories", "8192", "--out"]
-    call = [sys.executable, "-c", "from en4dvar.cli import main; main()", *words]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    subprocess.run([*call, str(whole)], check=True, capture_output=True)
+    assert CliRunner().invoke(main, [*words, str(whole)]).exit_code == 0
     process = subprocess.run([sys.executable, "-c", DIES_AFTER_THREE_CHUNKS, *words, str(killed)], capture_output=True)
     assert process.returncode == -signal.SIGKILL
     assert len(list(killed.glob("chunks/*.npz"))) == 3
-    subprocess.run([*call, str(killed), "--resume"], check=True, capture_output=True)
+    assert CliRunner().invoke(main, [*words, str(killed), "--resume"]).exit_code == 0
     assert (killed / "sweep.csv").read_bytes() == (whole / "sweep.csv").read_bytes()
 
 
