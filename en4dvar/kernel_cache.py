@@ -69,7 +69,7 @@ def compile_once(dispatcher: Any) -> None:
 @contextmanager
 def _without_collection() -> Iterator[None]:
     """Within, Python does not look for cycles: among the million objects that the compiler keeps until it is done, a
-    seventh of its time went into that.
+    tenth of its time went into that.
     """
     if not gc.isenabled():
         yield
