@@ -130,7 +130,7 @@ def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> _Output:
     out = _Output(
         {name: np.empty((n, len(t))) for name in _FIELDS},
         np.empty(n, dtype=np.int64),
-        np.empty(n, dtype=object),
+        np.full(n, "", dtype=object),
         np.empty((n, RECORD)),
     )
 
@@ -149,7 +149,8 @@ def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> _Output:
             values[rows] = paths[name]
             values[rows][failed] = np.nan
         out.status[rows], out.record[rows] = solution.status, solution.record
-        out.reasons[rows] = [solution.reason(i) for i in range(len(failed))]
+        for i in np.flatnonzero(failed):
+            out.reasons[begin + i] = solution.reason(int(i))
 
     with ThreadPoolExecutor(workers) as pool:  # its threads begin with the first work for them
         for begin in range(0, n, chunk):
@@ -167,7 +168,7 @@ def _dataset(model: BubbleModel, theta: Mapping[str, Array], t: Array, out: _Out
         for name, (unit, text) in _FIELDS.items()
     }
     data["status"] = (member, out.status, {"long_name": "0 where the member was integrated to the end"})
-    data["reason"] = (member, out.reasons, {"long_name": "why the member failed"})
+    data["reason"] = (member, out.reasons.astype(str), {"long_name": "why the member failed"})
     data["steps"] = (member, record[:, STEPS].astype(int), {"long_name": "accepted time steps"})
     data["max_wall_mach"] = (member, record[:, MAX_MACH], {"units": "1", "long_name": "largest wall Mach number"})
     if model.system.gas:

@@ -16,7 +16,7 @@ from en4dvar_bubble.laws import ConstitutiveLaw, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.parameters import MANCIA, positive
 from en4dvar_bubble.medium import WATER_25C, Medium
 from en4dvar_bubble.numbers import ALL, GAS_CONTENT, OF_MEDIUM, P_A, R_START, RDOT_START
-from en4dvar_bubble.solver.driver import MEDIUM_LENGTHS, Accuracy, Radial, Solver, System, preset
+from en4dvar_bubble.solver.driver import GAS_CLUSTERING, MEDIUM_LENGTHS, Accuracy, Radial, Solver, System, preset
 
 FIRST_ORDER = "an expansion to first order in the Mach number: Prosperetti & Lezzi (1986), J. Fluid Mech. 168, 457"
 MACH_LIMITS: Mapping[Radial, tuple[float, str]] = {
@@ -110,6 +110,7 @@ class Dynamics:
             memory=len(self.law.relaxed(np.ones(1), self.law.example_values())[0]),
             radial=self.radial,
             shear=self.law.shear_dependent,
+            clustering=GAS_CLUSTERING[self.start],
             medium_length=MEDIUM_LENGTHS[self.start],
         )
 

@@ -23,7 +23,6 @@ from en4dvar_bubble.medium import Medium
 from en4dvar_bubble.numbers import P_A
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.arrays import Members
-from en4dvar_bubble.solver.collocation import ball
 from en4dvar_bubble.solver.lanes import WIDTH
 
 _NO_TABLE = np.zeros((0, GRID.cells, 8))
@@ -123,8 +122,9 @@ def _states(model: Dynamics, x: Array, own: Mapping[str, Array]) -> tuple[Array,
         theta = x[:, layout["T"]] / around.T_inf
         initial[:, :m] = kirchhoff(theta[:, :m], around)
         wall = theta[:, m] if system.wall else np.ones(len(x))
-        share = ball(m).weights[:m] / theta[:, :m]
-        at_wall = ball(m).weights[m] / wall
+        weights = system.ball.weights
+        share = weights[:m] / theta[:, :m]
+        at_wall = weights[m] / wall
         outside = np.zeros(len(x))
         if system.vapour:
             gas_fraction = 1 - mole_fraction(x[:, layout["C"]], around)

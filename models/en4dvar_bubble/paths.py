@@ -15,7 +15,6 @@ from en4dvar_bubble.gas import from_kirchhoff, mass_fraction, saturated_vapour_p
 from en4dvar_bubble.laws.tabulate import GRID
 from en4dvar_bubble.medium import Medium
 from en4dvar_bubble.solver import rows
-from en4dvar_bubble.solver.collocation import ball
 from en4dvar_bubble.solver.driver import Solution
 from en4dvar_bubble.solver.integrate import BEYOND, END_TIME, MAX_MACH
 from en4dvar_bubble.tables import evaluate
@@ -138,7 +137,7 @@ class Paths(Batch):
         gas = self.par[:, None, rows.LOG_GAS]
         if not system.gas:
             return np.asarray(np.exp(gas - 3 * self.model.exponent(medium) * log_R) * medium.rho + medium.p_v)
-        m, weights = system.gas, ball(system.gas).weights
+        m, weights = system.gas, system.ball.weights
         T = self["T"]
         share = weights[:m] * self.medium(2).T_inf / T[:, :, :m]
         wall = T[:, :, m] if system.wall else np.broadcast_to(medium.T_inf, log_R.shape)

@@ -7,11 +7,12 @@ takes eight doubles (six coefficients, one cache line).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.compiled import kernel
+from en4dvar.compiled import called, kernel
 from en4dvar.state import Array
 
 HALO = 4
@@ -39,7 +40,7 @@ class Grid:
         return np.array([self.origin, self.origin + self.step * self.cells, 1.0 / self.step, float(self.cells)])
 
 
-@kernel
+@called
 def quintic(out, i, cell, a, da, dda, b, db, ddb):
     """Quintic on s ∈ [0, 1] from values and derivatives scaled by the cell width, to ``out[i, cell]``."""
     rise = b - a - da - 0.5 * dda
@@ -69,7 +70,7 @@ def fill(samples, factor, out):
         fill_one(samples, i, factor, out, i)
 
 
-@kernel
+@called
 def fill_one(samples, member, factor, out, at):
     """Those of one member's row of samples, to ``out[at]``."""
     cells = samples.shape[1] - 1 - 2 * HALO
@@ -122,7 +123,7 @@ def from_slopes(slopes, step, zero):
     return out
 
 
-@kernel
+@called
 def _area(first, second, third, j):
     return 0.5 * (first[j] + first[j + 1]) + 0.1 * (second[j] - second[j + 1]) + (third[j] + third[j + 1]) / 120.0
 
@@ -134,12 +135,14 @@ def evaluate(table, span, x):
     out = np.empty((n, k))
     for i in range(n):
         for q in range(k):
-            if not np.isfinite(x[i, q]):
+            if not math.isfinite(x[i, q]):
                 out[i, q] = np.nan
                 continue
             position = (x[i, q] - span[0]) * span[2]
             cell = int(min(max(np.floor(position), 0.0), span[3] - 1.0))
             s = position - cell
-            c = table[i, cell]
-            out[i, q] = ((((c[5] * s + c[4]) * s + c[3]) * s + c[2]) * s + c[1]) * s + c[0]
+            value = 0.0
+            for power in range(5, -1, -1):
+                value = value * s + table[i, cell, power]
+            out[i, q] = value
     return out

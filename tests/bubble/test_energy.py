@@ -14,7 +14,6 @@ from scipy.integrate import quad
 from scipy.interpolate import CubicSpline
 
 from en4dvar_bubble import Accuracy, BubbleModel, Medium, get_law
-from en4dvar_bubble.solver.collocation import ball
 
 GEL = {"G": 5e4, "mu": 0.08, "R0": 1.5e-6}
 TIMES = np.concatenate([np.linspace(4.5e-6, 5.6e-6, 4001), np.linspace(5.6e-6, 14e-6, 8001)[1:]])
@@ -72,7 +71,7 @@ def test_gas_pays_for_its_work_and_its_heat(run):
     internal = p * 4 / 3 * np.pi * R**3 / (medium.kappa - 1)
     work = integral(p * 4 * np.pi * R**2 * V)
     if "T" in x:
-        b = ball(model.system.gas)
+        b = model.system.ball
         theta = x["T"] / medium.T_inf - 1
         K = medium.A * x["T"] + medium.B
         heat = integral(4 * np.pi * R * (_wall_flux(b, theta, K, medium)))

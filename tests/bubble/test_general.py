@@ -9,7 +9,7 @@ import pytest
 
 from en4dvar_bubble import WATER_25C, Accuracy, BubbleModel, Medium, get_law, simulate
 from en4dvar_bubble.gas import mole_fraction, saturated_vapour_pressure
-from en4dvar_bubble.solver.collocation import ball, exterior
+from en4dvar_bubble.solver.collocation import exterior
 from en4dvar_bubble.solver.driver import System
 
 NEO_HOOKEAN = "neo-hookean-kelvin-voigt"
@@ -89,7 +89,7 @@ class TestConservation:
         law = get_law(NEO_HOOKEAN)
         model = BubbleModel(law=law, start="laser", vapour="transport", medium_heat="conducting")
         path = model.trajectories(model.initial_state(LASER)[None], TIMES)[0]
-        weights, m = ball(model.system.gas).weights, model.system.gas
+        weights, m = model.system.ball.weights, model.system.gas
         T, chi = path["T"], mole_fraction(path["C"], model.medium)
         wall = weights[m] / T[:, m] * (path["p_b"] - saturated_vapour_pressure(T[:, m]))
         content = path["R"] ** 3 * (path["p_b"] * ((weights[:m] / T[:, :m]) * (1 - chi)).sum(axis=1) + wall)
@@ -104,7 +104,7 @@ class TestConservation:
         )
         path = model.trajectories(model.initial_state(LASER)[None], TIMES)[0]
         system, medium = model.system, model.medium
-        gas, outside = ball(system.gas), exterior(system.medium, system.medium_length)
+        gas, outside = system.ball, exterior(system.medium, system.medium_length)
         T_w = path["T"][:, -1:]
         K = medium.A * T_w[:, 0] + medium.B
         from_gas = K * (path["T"] @ gas.derivative[-1])

@@ -21,7 +21,6 @@ import pytest
 from scipy.optimize import least_squares
 
 from en4dvar_bubble import Accuracy, BubbleModel, Medium, get_law
-from en4dvar_bubble.solver.collocation import ball
 
 AMPLITUDE = 2e-5
 FINE = Accuracy(nodes=16, rtol=1e-11)
@@ -65,7 +64,7 @@ def simulated_rate(R0, G, mu, medium, heat, expected):
     x[model.layout["Rdot"]] = R0 * AMPLITUDE * expected.real
     x[model.layout["p_b"]] = p_g * (1 - AMPLITUDE * np.real(gas))
     if heat:
-        y = ball(model.system.gas).y[: model.system.gas]
+        y = model.system.ball.y[: model.system.gas]
         profile = (medium.kappa - 1) / medium.kappa * -gas * (1 - np.sinh(z * y) / (y * np.sinh(z)))
         x[model.layout["T"]] = medium.T_inf * (1 + AMPLITUDE * np.real(profile))
     period = 2 * np.pi / expected.imag

@@ -9,6 +9,7 @@ from pathlib import Path
 import numba as nb
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 import en4dvar_bubble.solver
 from en4dvar.forward import Failure
@@ -122,6 +123,27 @@ class TestCollocation:
             expected = degree * (degree + 1) * b.y ** max(degree - 2, 0)
             np.testing.assert_allclose(b.laplacian @ f, expected, atol=1e-7)
             assert b.weights @ f == pytest.approx(3 / (degree + 3), rel=1e-12)
+
+    @pytest.mark.parametrize("m", [1, 4, 9])
+    def test_clustered_nodes_are_exact_on_polynomials_in_their_map(self, m):
+        c = 3.0
+        b = ball(m, c)
+
+        def xi(y):
+            return 1 - np.arcsinh((1 - y**2) * np.sinh(c)) / c
+
+        slope = 2 * b.y * np.sinh(c) / (c * np.hypot(1, (1 - b.y**2) * np.sinh(c)))
+        for degree in range(m + 1):
+            expected = degree * xi(b.y) ** max(degree - 1, 0) * slope
+            np.testing.assert_allclose(b.derivative @ xi(b.y) ** degree, expected, atol=1e-9)
+            mean, _ = quad(lambda y, k=degree: 3 * y**2 * xi(y) ** k, 0, 1, epsabs=1e-13)
+            assert b.weights @ xi(b.y) ** degree == pytest.approx(mean, rel=1e-11)
+
+    def test_clustered_nodes_converge_on_even_polynomials_and_lie_nearer_the_wall(self):
+        coarse, fine = ball(12, 3.0), ball(24, 3.0)
+        assert 1 - coarse.y[-2] < 0.4 * (1 - ball(12).y[-2])
+        errors = [np.abs(b.laplacian @ b.y**4 - 20 * b.y**2).max() for b in (coarse, fine)]
+        assert errors[1] < 1e-3 * errors[0]
 
 
 class TestBatching:

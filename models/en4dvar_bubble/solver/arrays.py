@@ -98,7 +98,7 @@ class Output(NamedTuple):
 
 class Scratch(NamedTuple):
     """What one thread works on: ``block`` (rows, WIDTH) of zeros, where the rows of :class:`Workspace` and
-    :class:`Lanes` end ``edges`` (26,), ``marks`` (4, WIDTH) of integers, ``turn`` (4,), ``elastic`` (WIDTH, cells, 8).
+    :class:`Lanes` end ``edges`` (26,), ``marks`` (4, WIDTH) of integers, ``turn`` (5,), ``elastic`` (WIDTH, cells, 8).
     Made by NumPy: a kernel without allocation is compiled faster.
     """
 
@@ -142,7 +142,7 @@ def scratch(
     raw = np.zeros((edges[-1] + 1) * WIDTH)
     first = -(raw.ctypes.data // 8) % WIDTH  # on a 64-byte boundary: a row that straddles two cache lines costs twice
     block = raw[first : first + edges[-1] * WIDTH].reshape(-1, WIDTH)
-    marks, turn = np.zeros((4, WIDTH), dtype=np.int64), np.zeros(4, dtype=np.int64)
+    marks, turn = np.zeros((4, WIDTH), dtype=np.int64), np.zeros(5, dtype=np.int64)
     marks[0] = -1  # no lane has a member
     block[edges[-7] : edges[-6]] = first_step  # so that one without gets no further than finite numbers
     return Scratch(block, edges, marks, turn, np.zeros((WIDTH, cells, 8)))

@@ -1,7 +1,8 @@
-"""Collocation for spherically symmetric fields in the unit ball: even polynomials in y = r/R, nodes in s = y².
+"""Collocation for spherically symmetric fields in the unit ball: even functions of y = r/R, nodes in s = y².
 
-The nodes are the Chebyshev–Radau points of s ∈ (0, 1] with the wall y = 1 last, so no node sits at the centre and the
-fields are smooth there by construction.
+The nodes are the Chebyshev–Radau points ξ ∈ (0, 1] with the wall y = 1 last, so no node sits at the centre and the
+fields are smooth there by construction: polynomials in ξ, where s = ξ, or in a map of s that clusters the nodes at the
+wall. There is the thermal boundary layer of a collapse, which is thinner than the distance of Chebyshev points.
 """
 
 from __future__ import annotations
@@ -14,13 +15,15 @@ from scipy.special import roots_jacobi
 
 from en4dvar.state import Array
 
+_MORE = 30  # points of the quadrature for the map, an entire function
+
 
 @dataclass(frozen=True)
 class Ball:
     """Operators on m interior nodes plus the wall.
 
     ``y`` (m+1,) radii; ``derivative`` (m+1, m+1) d/dy; ``laplacian`` (m+1, m+1) y⁻² d/dy(y² d/dy);
-    ``weights`` (m+1,) of the mean over the ball, 3 ∫ f y² dy, exact for polynomials of degree m in s.
+    ``weights`` (m+1,) of the mean over the ball, 3 ∫ f y² dy, exact for polynomials of degree m in ξ.
     """
 
     y: Array
@@ -30,26 +33,40 @@ class Ball:
 
 
 @cache
-def ball(m: int) -> Ball:
-    """Collocation operators for ``m`` ≥ 1 interior nodes (arrays shared: do not write to them)."""
+def ball(m: int, clustering: float = 0.0) -> Ball:
+    """Collocation operators for ``m`` ≥ 1 interior nodes (arrays shared: do not write to them). ``clustering`` c ≥ 0:
+    1 − s = sinh(c (1−ξ))/sinh(c); 0 is s = ξ.
+    """
     n = m + 1
-    s = (np.cos(2 * np.pi * np.arange(m, -1, -1) / (2 * m + 1)) + 1) / 2
-    s[-1] = 1.0
-    gaps = s[:, None] - s[None, :] + np.eye(n)
+    xi = (np.cos(2 * np.pi * np.arange(m, -1, -1) / (2 * m + 1)) + 1) / 2
+    xi[-1] = 1.0
+    s, ds_dxi = _clustered(xi, clustering)
+    gaps = xi[:, None] - xi[None, :] + np.eye(n)
     barycentric = 1.0 / np.prod(4 * gaps, axis=1) * 4
-    d_ds = barycentric[None, :] / barycentric[:, None] / gaps
-    np.fill_diagonal(d_ds, 0.0)
-    np.fill_diagonal(d_ds, -d_ds.sum(axis=1))
+    d_dxi = barycentric[None, :] / barycentric[:, None] / gaps
+    np.fill_diagonal(d_dxi, 0.0)
+    np.fill_diagonal(d_dxi, -d_dxi.sum(axis=1))
+    d_ds = d_dxi / ds_dxi[:, None]
     y = np.sqrt(s)
     derivative = 2 * y[:, None] * d_ds
     laplacian = 4 * s[:, None] * (d_ds @ d_ds) + 6 * d_ds
-    # Weights: 3 ∫ f y² dy = 3/2 ∫ f √s ds, moments of the Legendre polynomials by Gauss–Jacobi quadrature.
-    x, w = roots_jacobi(n + 1, 0.0, 0.5)
-    moments = np.polynomial.legendre.legvander(x, m).T @ (w / w.sum())
-    weights = np.linalg.solve(np.polynomial.legendre.legvander(2 * s - 1, m).T, moments)
+    # Weights: 3 ∫ f y² dy = 3/2 ∫ f √s ds, moments of the Legendre polynomials by Gauss–Jacobi quadrature in ξ.
+    x, w = roots_jacobi(n + 1 + (_MORE if clustering else 0), 0.0, 0.5)
+    s_there, slope_there = _clustered((x + 1) / 2, clustering)
+    w = w / w.sum() * np.sqrt(2 * s_there / (x + 1)) * slope_there
+    moments = np.polynomial.legendre.legvander(x, m).T @ w
+    weights = np.linalg.solve(np.polynomial.legendre.legvander(2 * xi - 1, m).T, moments)
     for array in (y, derivative, laplacian, weights):
         array.setflags(write=False)
     return Ball(y, derivative, laplacian, weights)
+
+
+def _clustered(xi: Array, clustering: float) -> tuple[Array, Array]:
+    """s and ds/dξ."""
+    if not clustering:
+        return xi, np.ones_like(xi)
+    inward, scale = clustering * (1 - xi), np.sinh(clustering)
+    return 1 - np.sinh(inward) / scale, clustering * np.cosh(inward) / scale
 
 
 @dataclass(frozen=True)

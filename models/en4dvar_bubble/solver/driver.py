@@ -19,7 +19,7 @@ from en4dvar_bubble.solver import integrate, rows
 from en4dvar_bubble.solver.apart import address
 from en4dvar_bubble.solver.arrays import Control, Dims, Equations, Members, Output, Scratch, Shared, scratch
 from en4dvar_bubble.solver.arrow import tiles
-from en4dvar_bubble.solver.collocation import ball, exterior
+from en4dvar_bubble.solver.collocation import Ball, ball, exterior
 from en4dvar_bubble.solver.fields import scratch_rows
 from en4dvar_bubble.solver.general import sums
 from en4dvar_bubble.solver.tiles import AREA, EDGE, kept_tiles
@@ -72,8 +72,10 @@ ACCURACIES: dict[AccuracyName, Accuracy] = {
     "standard": Accuracy(nodes=4, rtol=1e-5, medium_nodes=24),
     "reference": Accuracy(nodes=24, rtol=1e-8, medium_nodes=48),
 }
-# A released bubble is full of gas that is hot in its core when it bounces; the acoustic one has hardly any.
-_NODES_RELEASED: dict[AccuracyName, int] = {"fast": 8, "standard": 16, "reference": 32}
+# A released bubble is full of gas that is hot in its core when it bounces, under a thin layer at the wall; the acoustic
+# one has hardly any.
+_NODES_RELEASED: dict[AccuracyName, int] = {"fast": 8, "standard": 12, "reference": 32}
+GAS_CLUSTERING = {"acoustic": 0.0, "laser": 3.0}
 # It is so large that heat comes a few percent of its radius into the medium, where its grid is dense.
 _MEDIUM_RELEASED: dict[AccuracyName, int] = {"fast": 8, "standard": 12, "reference": 32}
 MEDIUM_LENGTHS = {"acoustic": 0.5, "laser": 0.05}
@@ -92,8 +94,9 @@ class System:
     """Which unknowns there are, in the order of the kernel's rows, and which equations.
 
     ``gas`` temperature nodes, ``vapour`` mole-fraction nodes (0 or ``gas``), ``medium`` temperature nodes, ``memory``
-    variables; ``shear``: a viscosity that depends on the shear rate. ``medium_length``: of the medium's grid map in
-    radii; half of its nodes lie within it of the wall.
+    variables; ``shear``: a viscosity that depends on the shear rate. ``clustering`` of the gas nodes at the wall, see
+    :func:`collocation.ball`. ``medium_length``: of the medium's grid map in radii; half of its nodes lie within it of
+    the wall.
     """
 
     gas: int
@@ -102,6 +105,7 @@ class System:
     memory: int = 0
     radial: Radial = "keller-miksis"
     shear: bool = False
+    clustering: float = 0.0
     medium_length: float = 0.5
 
     @property
@@ -117,6 +121,11 @@ class System:
     @cached_property
     def size(self) -> int:
         return self.gas + self.vapour + self.medium + self.wall + self.memory + 2
+
+    @property
+    def ball(self) -> Ball:
+        """The grid of the gas, which has one."""
+        return ball(self.gas, self.clustering)
 
     @property
     def dims(self) -> Dims:
@@ -184,11 +193,11 @@ def reason(status: int, record: Array) -> str:
 
 
 @cache
-def _gas_operators(m: int) -> Array:
+def _gas_operators(m: int, clustering: float) -> Array:
     """Collocation operators as one array in the kernel's layout, see :class:`arrays.Equations`."""
     ops = np.zeros((2 * m + 3, m + 1))
     if m:
-        b = ball(m)
+        b = ball(m, clustering)
         ops[: m + 1], ops[m + 1 : 2 * m + 1] = b.derivative, b.laplacian[:m]
         ops[2 * m + 1], ops[2 * m + 2] = b.y, b.weights
     return ops
@@ -249,7 +258,7 @@ class Solver:
         general: tuple[Any, Any, Any, Any] = (None,) * 4  # what nobody reads need not be compiled either
         if system.general:
             general = medium, memory, viscous, _VISCOUS_SPAN
-        gas, reading = _gas_operators(system.gas), READINGS[self.reading]
+        gas, reading = _gas_operators(system.gas, system.clustering), READINGS[self.reading]
         shared = gas, _ELASTIC_SPAN, pulse, driving.span
         where, places = self.tiles
         return Equations(*self.lengths, system.dims, *shared, reading, *general, where, places)

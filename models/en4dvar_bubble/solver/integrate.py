@@ -12,7 +12,7 @@ from numba.core import types
 
 from en4dvar.compiled import called, kernel_called_by_address, kernel_without_allocation
 from en4dvar_bubble.solver import rodas5p
-from en4dvar_bubble.solver.apart import call, contents, kept
+from en4dvar_bubble.solver.apart import call, kept
 from en4dvar_bubble.solver.arrays import Lanes, Loaded, Workspace
 from en4dvar_bubble.solver.lanes import WIDTH, peek, take
 from en4dvar_bubble.solver.parts import parted
@@ -32,9 +32,8 @@ _LEAST_ROOT = 1e-2 ** (1.0 / rodas5p.ORDER)
 # step limit bounds the work.
 _SHORTEST = 1e-18
 _TURNS_PER_LOOK = 64  # attempted steps between looks at the clock
-_TURNS, _RUNNING, _EXHAUSTED, _CLOCK = range(
-    4
-)  # of ``turn``: how many so far, lanes with a member, whether all are taken
+# Of ``turn``: how many so far, lanes with a member, whether all are taken, seconds, whether the interpolant is made.
+_TURNS, _RUNNING, _EXHAUSTED, _CLOCK, _DENSE = range(5)
 _MARKS = np.arange(5)  # the edges of the marks
 _OF_STEP, _PARTS = len(Workspace._fields), len(Workspace._fields) + 8
 
@@ -53,8 +52,9 @@ def groups(scratch):
 
 
 @called
-def _begin(i, lane, clock, members, lanes, control, out):
+def _begin(i, lane, shared, lanes):
     """Put member ``i`` into a lane; 1, or 0 where no output time lies after its start."""
+    members, control, out, clock = shared.members, shared.control, shared.out, shared.scratch.turn[_CLOCK]
     n, n_times, start = len(lanes.y), members.times.shape[1], members.start[i]
     for column in range(RECORD):
         out.record[i, column] = 0.0
@@ -92,16 +92,17 @@ def _begin(i, lane, clock, members, lanes, control, out):
     return 1
 
 
-@nb.njit(inline="always")
+@called
 def _break(b, lane, lanes, control):
     """The instant of a break on the clock of the lane's member."""
     return control.breaks[b] / lanes.loaded.par[PULSE_RATE, lane] + lanes.loaded.par[PULSE_SHIFT, lane]
 
 
-@nb.njit(inline="always")
-def _cut_step(lane, lanes, driving_span, control):
+@called
+def _cut_step(lane, shared, lanes):
     """Shorten a lane's step while the driving acts, and to end at a break."""
-    h, now, span, par = lanes.h, lanes.t[0, lane], driving_span, lanes.loaded.par
+    control, span = shared.control, shared.driving_span
+    h, now, par = lanes.h, lanes.t[0, lane], lanes.loaded.par
     rate, b = par[PULSE_RATE, lane], lanes.next_break[lane]
     driven = par[AMPLITUDE, lane] != 0.0 and span[0] <= (now - par[PULSE_SHIFT, lane]) * rate < span[1]
     if driven and h[0, lane] > control.longest_driven / rate:
@@ -113,15 +114,16 @@ def _cut_step(lane, lanes, driving_span, control):
             h[0, lane] = end - now
 
 
-@nb.njit(inline="always")
-def _observe(lane, end, members, lanes, w, have_dense, out):
-    """Write a lane's state at the output times until ``end``; whether the interpolant has been made."""
+@called
+def _observe(lane, end, shared, lanes, w):
+    """Write a lane's state at the output times until ``end``."""
+    members, out, turn = shared.members, shared.out, shared.scratch.turn
     i, q, y = lanes.member[lane], lanes.observed[lane], lanes.y
     times, n = members.times, len(y)
     while q < times.shape[1] and times[i, q] <= end:
-        if not have_dense:
+        if turn[_DENSE] == 0:
             interpolant(w)
-            have_dense = True
+            turn[_DENSE] = 1
         theta = (times[i, q] - lanes.t[0, lane]) / lanes.h[0, lane]
         rest = 1.0 - theta
         for j in range(n):
@@ -130,10 +132,9 @@ def _observe(lane, end, members, lanes, w, have_dense, out):
             out.states[i, q, j] = rest * y[j, lane] + theta * (w.y_new[j, lane] + rest * bend)
         q += 1
     lanes.observed[lane] = q
-    return have_dense
 
 
-@nb.njit(inline="always")
+@called
 def _next_step(lane, cut, lanes, w):
     """The step after an accepted one, by Gustafsson's predictive controller: the trend of the error, not only its size,
     sets it.
@@ -151,16 +152,17 @@ def _next_step(lane, cut, lanes, w):
     return grown
 
 
-@nb.njit(inline="always")
-def _accept(lane, members, lanes, dims, control, w, have_dense, out):
-    """Take a lane's step: outputs, state, record, next step; whether the interpolant has been made."""
+@called
+def _accept(lane, shared, lanes, w):
+    """Take a lane's step: outputs, state, record, next step."""
+    control, dims, out = shared.control, shared.dims, shared.out
     i, now, step = lanes.member[lane], lanes.t[0, lane], lanes.h[0, lane]
     b = lanes.next_break[lane]
     cut, end = False, now + step
     if b < len(control.breaks) and end >= _break(b, lane, lanes, control):
         cut, end = True, _break(b, lane, lanes, control)
         lanes.next_break[lane] += 1
-    have_dense = _observe(lane, end, members, lanes, w, have_dense, out)
+    _observe(lane, end, shared, lanes, w)
     for j in range(len(lanes.y)):
         lanes.y[j, lane] = w.y_new[j, lane]
     lanes.t[0, lane] = end
@@ -176,23 +178,23 @@ def _accept(lane, members, lanes, dims, control, w, have_dense, out):
     lanes.h[0, lane] = _next_step(lane, cut, lanes, w)
     lanes.last_h[lane], lanes.last_root[lane] = step, max(w.norm[1, lane], _LEAST_ROOT)
     lanes.rejected[lane] = 0.0
-    return have_dense
 
 
-@nb.njit(inline="always")
-def _reject(lane, lanes, w, out):
+@called
+def _reject(lane, shared, lanes, w):
     """Shorten a lane's step."""
     lanes.rejected[lane] = 1.0
-    out.record[lanes.member[lane], REJECTED] += 1
+    shared.out.record[lanes.member[lane], REJECTED] += 1
     if math.isfinite(w.norm[0, lane]):
         lanes.h[0, lane] = lanes.h[0, lane] / min(max(w.norm[1, lane] / _SAFETY, 1.0 / _GROW), 1.0 / _SHRINK)
     else:
         lanes.h[0, lane] = lanes.h[0, lane] * 0.1
 
 
-@nb.njit(inline="always")
-def _failure(lane, clock, lanes, dims, control, w, out):
+@called
+def _failure(lane, shared, lanes, w):
     """Why a lane's member cannot go on; OK where it can."""
+    control, dims, out, clock = shared.control, shared.dims, shared.out, shared.scratch.turn[_CLOCK]
     failure = OK
     if lanes.rejected[lane] == 0.0 and w.norm[2, lane] > control.mach_limit:
         failure = MACH_LIMIT
@@ -208,36 +210,32 @@ def _failure(lane, clock, lanes, dims, control, w, out):
     return failure
 
 
-@nb.njit(inline="always")
-def _end_step(clock, shared, lanes, w):
-    """Look at every lane after a step: take it or shorten it, and let go of members that are done or cannot go on.
-    Returns how many.
-    """
-    members, control, out, _, dims, _ = shared
-    judge(lanes, dims.shear, control.tolerances, w)
-    gone, have_dense, n_times = 0, False, members.times.shape[1]
+@called
+def _end_step(shared, lanes, w):
+    """Look at every lane after a step: take it or shorten it, and let go of members that are done or cannot go on."""
+    members, control, turn = shared.members, shared.control, shared.scratch.turn
+    judge(lanes, shared.dims.shear, control.tolerances, w)
+    turn[_DENSE] = 0
     for lane in range(WIDTH):
         i = lanes.member[lane]
         if i < 0:
             continue
         if w.norm[0, lane] <= 1.0:  # false for NaN
-            have_dense = _accept(lane, members, lanes, dims, control, w, have_dense, out)
+            _accept(lane, shared, lanes, w)
         else:
-            _reject(lane, lanes, w, out)
-        failure = _failure(lane, clock, lanes, dims, control, w, out)
-        if failure != OK or lanes.observed[lane] == n_times:
-            out.status[i] = failure
+            _reject(lane, shared, lanes, w)
+        failure = _failure(lane, shared, lanes, w)
+        if failure != OK or lanes.observed[lane] == members.times.shape[1]:
+            shared.out.status[i] = failure
             lanes.member[lane] = -1
             lanes.h[0, lane] = control.first_step
-            gone += 1
-    return gone
+            turn[_RUNNING] -= 1
 
 
-@nb.njit(inline="always")
-def _begin_step(turn, shared, lanes):
-    """Give idle lanes a member while there is one, and every lane its step. Returns how many members were begun."""
-    members, control, out, _, _, driving_span = shared
-    begun = 0
+@called
+def _begin_step(shared, lanes):
+    """Give idle lanes a member while there is one, and every lane its step."""
+    members, turn = shared.members, shared.scratch.turn
     for lane in range(WIDTH):
         while lanes.member[lane] < 0 and turn[_EXHAUSTED] == 0:
             place = take(members.counter)
@@ -246,26 +244,24 @@ def _begin_step(turn, shared, lanes):
             else:
                 while peek(members.available) <= place:
                     pass
-                begun += _begin(members.order[place], lane, turn[_CLOCK], members, lanes, control, out)
+                turn[_RUNNING] += _begin(members.order[place], lane, shared, lanes)
         if lanes.member[lane] >= 0:
-            _cut_step(lane, lanes, driving_span, control)
-    return begun
+            _cut_step(lane, shared, lanes)
 
 
 @kernel_called_by_address
-def between_steps(place):
+def between_steps(shared):
     """What is done between two steps, of which the first has nothing before it, for the :class:`Shared` kept there: how
     many lanes have a member.
     """
-    shared = contents(place)
-    w, lanes = groups(shared.scratch)
-    turn = shared.scratch.turn
+    workspace, group = groups(shared.scratch)
+    w, lanes, turn = kept(workspace), kept(group), shared.scratch.turn
     if turn[_TURNS] % _TURNS_PER_LOOK == 0:
         turn[_CLOCK] = _clock(0)
     if turn[_TURNS] > 0:
-        turn[_RUNNING] -= _end_step(turn[_CLOCK], shared, lanes, w)
+        _end_step(shared, lanes, w)
     turn[_TURNS] += 1
-    turn[_RUNNING] += _begin_step(turn, shared, lanes)
+    _begin_step(shared, lanes)
     return turn[_RUNNING]
 
 

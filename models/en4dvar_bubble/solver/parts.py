@@ -9,7 +9,7 @@ from typing import Any
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, models, overload, register_model
+from numba.extending import intrinsic, lower_builtin, models, register_model
 
 from en4dvar_bubble.solver.lanes import TRIED_FIRST, WIDTH
 
@@ -55,14 +55,15 @@ def parted(typingctx, block, edges, count):
     return types.UniTuple(Rows(block.dtype), count.literal_value)(block, edges, count), codegen
 
 
-@overload(len)
-def _count(of):
-    return (lambda of: _length(of)) if isinstance(of, Rows) else None
+@infer_global(len)
+class _Count(AbstractTemplate):
+    def generic(self, args: Any, kws: Any) -> Any:
+        return signature(types.intp, *args) if isinstance(args[0], Rows) else None
 
 
-@intrinsic
-def _length(typingctx, of):
-    return types.int64(of), lambda context, builder, sig, args: builder.extract_value(args[0], 1)
+@lower_builtin(len, Rows)
+def _lower_count(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    return builder.extract_value(args[0], 1)
 
 
 def _element(context: Any, builder: Any, sig: Any, args: Any) -> Any:

@@ -1,8 +1,4 @@
-"""One step of RODAS5P for all lanes: Jacobian, factorisation, stages, error.
-
-Functions that are inlined before their types are inferred (``inline="always"``) spare the compiler half of its time:
-every call of a compiled function passes each field of the named groups by itself.
-"""
+"""One step of RODAS5P for all lanes: Jacobian, factorisation, stages, error."""
 
 from __future__ import annotations
 
@@ -173,7 +169,7 @@ def _stages(lanes, eq, algebraic, w):
         _substitute(eq, w, s * n)
 
 
-@nb.njit(inline="always")
+@called
 def judge(lanes, shear, tolerances, w):
     """The new state to ``y_new``, error and wall Mach number to ``norm``."""
     n = len(w.f)
@@ -206,7 +202,7 @@ def attempt(lanes, eq, w):
     _stages(lanes, eq, algebraic, w)
 
 
-@nb.njit(inline="always")
+@called
 def interpolant(w):
     """Rows 3n of the dense-output polynomial (K1, K2, K3) of all lanes, to ``dense``."""
     n = len(w.f)

@@ -15,7 +15,7 @@ import numba as nb
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic
+from numba.extending import intrinsic, register_jitable
 
 from en4dvar.compiled import called
 from en4dvar_bubble.solver import rodas5p
@@ -33,7 +33,7 @@ def kept_tiles(pattern: np.ndarray, places: np.ndarray) -> np.ndarray:
     return np.where(found, np.cumsum(found).reshape(found.shape) - 1, -1)
 
 
-@nb.njit
+@register_jitable  # for Python, which makes the arrays, a function like any other
 def whole(count):
     """``count`` rounded up to whole tiles."""
     return (count + EDGE - 1) // EDGE * EDGE
