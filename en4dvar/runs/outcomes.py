@@ -45,7 +45,7 @@ class Outcomes(Sequence[DatasetOutcome]):
         return self._read(found) if isinstance(found, str) else tuple(map(self._read, found))
 
     def lines(self) -> Iterator[str]:
-        """Those of ``summary.csv``, of each data set; the rest is looked at only where an earlier version wrote none."""
+        """Those of ``summary.csv`` of each data set; the rest is looked at only where an earlier version wrote none."""
         for stem in self._stems:
             raw = self._raw(stem)
             try:
