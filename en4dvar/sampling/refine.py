@@ -135,7 +135,7 @@ def refined(
     """
     prior, exact, enough = space.problem.prior, space.settings.sampling == "exact", space.settings.draws
     chain = space.settings.refine == "mcmc"
-    below = minima[0].cost - MISSED if looking else -math.inf
+    below = minima[0].cost - MISSED if looking and minima else -math.inf
     draws = sample_modes(cost, prior, minima, seed, enough, below) if len(minima) > 1 or not chain else None
     if draws is not None and draws.lowest < below:
         return Refined(posterior, {}, lowest=draws.lowest, lower=draws.best)

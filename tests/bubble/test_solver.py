@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numba as nb
@@ -175,6 +177,20 @@ class TestBatching:
             t = t_next
 
 
+CRAWL = """
+import time
+import numpy as np
+from en4dvar_bubble import Accuracy, simulate
+gel = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}
+accuracy, times = Accuracy(rtol=1e-17, step_limit=10**9, time_limit=3.0), np.linspace(6e-6, 80e-6, 60)
+simulate(parameters=gel, times=times[:1], accuracy=Accuracy())
+print("begins", flush=True)
+begun = time.process_time()
+data = simulate(parameters=gel, times=times, accuracy=accuracy)
+print(time.process_time() - begun, data.reason.values[0])
+"""
+
+
 class TestFailures:
     def test_step_limit_is_a_reason_not_an_exception(self):
         model = BubbleModel(accuracy=Accuracy(step_limit=150))
@@ -188,6 +204,21 @@ class TestFailures:
         crawl = Accuracy(rtol=1e-17, step_limit=10**9, time_limit=0.5)
         data = simulate(parameters=gels(1), times=TIMES, accuracy=crawl)
         assert data.reason.values[0].startswith("time limit reached at t =")
+
+    @pytest.mark.slow
+    @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="a system without it")
+    def test_a_member_may_take_its_time_though_the_process_was_suspended(self):
+        """It crawls as above, for 4 s; what it has of them after 6 s of sleep shows in the processor's time."""
+        command = [sys.executable, "-c", CRAWL]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert process.stdout.readline() == "begins\n"
+        time.sleep(0.5)
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(6)
+        process.send_signal(signal.SIGCONT)
+        seconds, reason = process.communicate()[0].split(maxsplit=1)
+        assert reason.startswith("time limit reached at t =")
+        assert float(seconds) > 1
 
     def test_mach_limit_names_the_mach_number_and_spares_the_others(self):
         violent = {"G": [420.0, 2e4], "alpha": [0.0, 0.03], "mu": [0.02, 0.3], "R0": [0.43e-6, 3e-6]}

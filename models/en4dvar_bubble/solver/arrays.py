@@ -83,7 +83,7 @@ class Control(NamedTuple):
     longest_driven: float  # longest step while the driving acts, µs of its table
     step_limit: float
     mach_limit: float
-    seconds: float  # of wall clock per member
+    seconds: float  # of wall clock per member, but for those that the process was suspended
     hottest_wall: float  # τ of the wall above which a breakdown is put down to it
     valid_mach: float  # of the wall: since when it is exceeded is recorded
 
@@ -98,7 +98,7 @@ class Output(NamedTuple):
 
 class Scratch(NamedTuple):
     """What one thread works on: ``block`` (rows, WIDTH) of zeros, where the rows of :class:`Workspace` and
-    :class:`Lanes` end ``edges`` (26,), ``marks`` (4, WIDTH) of integers, ``turn`` (5,), ``elastic`` (WIDTH, cells, 8).
+    :class:`Lanes` end ``edges`` (26,), ``marks`` (4, WIDTH) of integers, ``turn`` (6,), ``elastic`` (WIDTH, cells, 8).
     Made by NumPy: a kernel without allocation is compiled faster.
     """
 
@@ -142,7 +142,7 @@ def scratch(
     raw = np.zeros((edges[-1] + 1) * WIDTH)
     first = -(raw.ctypes.data // 8) % WIDTH  # on a 64-byte boundary: a row that straddles two cache lines costs twice
     block = raw[first : first + edges[-1] * WIDTH].reshape(-1, WIDTH)
-    marks, turn = np.zeros((4, WIDTH), dtype=np.int64), np.zeros(5, dtype=np.int64)
+    marks, turn = np.zeros((4, WIDTH), dtype=np.int64), np.zeros(6, dtype=np.int64)
     marks[0] = -1  # no lane has a member
     block[edges[-7] : edges[-6]] = first_step  # so that one without gets no further than finite numbers
     return Scratch(block, edges, marks, turn, np.zeros((WIDTH, cells, 8)))

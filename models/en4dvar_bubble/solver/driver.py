@@ -55,8 +55,8 @@ _STRESS_SCALE = 10.0  # µm²/µs², about 0.1 bar: errors of a memory variable 
 class Accuracy:
     """Nodes in the gas (temperature, vapour) and in the medium, relative tolerance of the time steps, and limits.
 
-    ``step_limit`` and ``time_limit`` (seconds of wall clock, and up to 2 more) bound the work per member;
-    ``mach_limit`` ends a member whose wall Mach number exceeds it.
+    ``step_limit`` and ``time_limit`` (seconds of wall clock, and up to 2 more; not those in which the process is
+    suspended) bound the work per member; ``mach_limit`` ends a member whose wall Mach number exceeds it.
     """
 
     nodes: int = 4

@@ -32,8 +32,10 @@ _LEAST_ROOT = 1e-2 ** (1.0 / rodas5p.ORDER)
 # step limit bounds the work.
 _SHORTEST = 1e-18
 _TURNS_PER_LOOK = 64  # attempted steps between looks at the clock
-# Of ``turn``: how many so far, lanes with a member, whether all are taken, seconds, whether the interpolant is made.
-_TURNS, _RUNNING, _EXHAUSTED, _CLOCK, _DENSE = range(5)
+# Of ``turn``: how many so far, lanes with a member, whether all are taken, seconds so far, whether the interpolant is
+# made, and the time of day at the last look.
+_TURNS, _RUNNING, _EXHAUSTED, _CLOCK, _DENSE, _SEEN = range(6)
+_MOST_BETWEEN = 2  # s between looks that count: in a longer time the process was suspended (Ctrl-Z)
 _MARKS = np.arange(5)  # the edges of the marks
 _OF_STEP, _PARTS = len(Workspace._fields), len(Workspace._fields) + 8
 
@@ -257,7 +259,10 @@ def between_steps(shared):
     workspace, group = groups(shared.scratch)
     w, lanes, turn = kept(workspace), kept(group), shared.scratch.turn
     if turn[_TURNS] % _TURNS_PER_LOOK == 0:
-        turn[_CLOCK] = _clock(0)
+        now = _clock(0)
+        if turn[_TURNS] > 0:
+            turn[_CLOCK] += min(now - turn[_SEEN], _MOST_BETWEEN)
+        turn[_SEEN] = now
     if turn[_TURNS] > 0:
         _end_step(shared, lanes, w)
     turn[_TURNS] += 1
