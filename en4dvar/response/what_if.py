@@ -126,17 +126,19 @@ def _shift(
                 return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be run: {run.failures[0]}")
             predicted = run.predicted[0]
         misfit = float(changed.observations.cost(predicted))
+        if not np.isfinite(misfit):  # parameters of R can be led where it cannot be factored
+            break
         step, decrease = response.step(changed.observations, predicted, moved, of_prior)
         moved = moved + step
         correction = float(np.max(np.abs(step / std)))
         small = SETTLED * max(1.0, float(np.max(np.abs(moved / std))))
-        if np.any(np.abs(moved / std)[of_errors] > FAR):
-            break
         if correction <= (small if attempt else SMALL):
             reason = ""
         if not reason or correction > before:
             break
         before = correction
+    if np.any(np.abs(moved / std)[of_errors] > FAR):
+        reason = "beyond linear response"
     if reason:
         return Shift(*about, unknown, unknown, unknown, np.nan, runs, reason)
     prior = problem.prior
