@@ -68,7 +68,7 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
         counting = that_count(found.minima, prior)
         agree = len(found.tried) < 2 or found.agreed
         descents = conclusions.descents_of(found, len(space.members))
-        if descents:
+        if descents and looking:  # else they are those that were told
             stages.tell(descents)
         sampled = stages.sampled(ends, counting, agree, start.refinement, looking)
         if sampled.refined is None or sampled.refined.lower is None:

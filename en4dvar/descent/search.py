@@ -127,14 +127,8 @@ class Search:
             before = rival.kept
             self._keep(found, lambda: SearchState(minima=minima, rival=before))
 
-        try:
-            iterate(DataWindow(self.space, self.seed, keep, self.tell), self.scheme, [rival])
-        except TooFewMembersError:  # the model does not run about it
-            return after
-        if rival.cost > found.descent.cost - SAME_COST:
-            return after
-        lowest = Minimum.of(self.space, rival)
-        return replace(after, descent=rival, before=before, minima=merged([lowest, *after.minima]))
+        lowered = lower(DataWindow(self.space, self.seed, keep, self.tell), self.scheme, rival, after)
+        return after if lowered is after else replace(lowered, before=before)
 
     def _compared(
         self, found: Found, members: Sequence[int], comparison: StartState | None
@@ -160,6 +154,17 @@ class Search:
         self.keep(lambda: (found, replace(state(), over=self.over - 1, runs=found.runs, spent=spent)))
 
 
+def lower(window: DataWindow, scheme: En4DVar, rival: Descent, found: Found) -> Found:
+    """After the rest of the ``rival``, if it ends lower than the lowest minimum; else as before."""
+    try:
+        iterate(window, scheme, [rival])
+    except TooFewMembersError:  # the model does not run about it
+        return found
+    if rival.cost > found.descent.cost - SAME_COST:
+        return found
+    return replace(found, descent=rival, minima=merged([Minimum.of(window.space, rival), *found.minima]))
+
+
 def from_draw(
     space: WeightSpace, scheme: En4DVar, found: Found, x: Array, seed: int, tell: Callable[[Record], None]
 ) -> Found:
@@ -172,20 +177,11 @@ def from_draw(
     draw = len(space.members) + rounds
     rival = Descent(space.start(space.weights_of(x)), members=(draw,))
     tell(StartRecord(1, (float(space.try_out(rival.weights.w[None]).costs[0]),), 1, rounds))
-    try:
-        iterate(DataWindow(space, seed, lambda: None, tell), scheme, [rival])
-    except TooFewMembersError:  # the model does not run about it
+    after = lower(DataWindow(space, seed, lambda: None, tell), scheme, rival, found)
+    if after is found:
         return found
-    if rival.cost > found.descent.cost - SAME_COST:
-        return found
-    return Found(
-        descent=rival,
-        before=found.before,
-        minima=merged([Minimum.of(space, rival), *found.minima]),
-        tried=(*found.tried, draw),
-        runs=found.runs + space.forward_runs - before,
-        rounds=rounds,
-    )
+    runs = found.runs + space.forward_runs - before
+    return replace(after, tried=(*found.tried, draw), runs=runs, rounds=rounds)
 
 
 def challenger(space: WeightSpace, run: Forecast, found: Found) -> int:

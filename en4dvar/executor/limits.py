@@ -3,10 +3,9 @@
 A batch past its time is interrupted, as Ctrl-C would; where its code never returns to the interpreter (a compiled loop;
 on dask, where calls are not in the main thread, also a system call), the process is ended instead. While a process is
 suspended the time does not count; after more than twice the limit it may be ended as it continues, and its call is
-repeated. Memory is the size
-of the data segment (Linux) beyond what the process had at its start; an allocation past it raises MemoryError, or ends
-a process whose compiled code does not check. Either way the members have failed, with the reason, and the run goes on.
-Other executors share the process of the run, which cannot be ended: they know no limits.
+repeated. Memory is the size of the data segment (Linux) beyond what the process had at its start; an allocation past it
+raises MemoryError, or ends a process whose compiled code does not check. Either way the members have failed, with the
+reason, and the run goes on. Other executors share the process of the run, which cannot be ended: they know no limits.
 """
 
 from __future__ import annotations

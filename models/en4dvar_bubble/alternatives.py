@@ -49,7 +49,7 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
     if model.gas != "heat":
         yield changed("gas_model", "the gas conducted heat to the wall (gas: heat)", gas="heat")
     else:
-        cold = replace(model, gas="heat", medium_heat="cold")
+        cold = replace(model, medium_heat="cold")
         simple = replace(cold, vapour="none", medium=saturated) if model.vapour == "transport" else cold
         words = "the gas were polytropic (gas: polytropic)"
         yield Alternative("gas_model", words, replace(simple, gas="polytropic"))  # type: ignore[arg-type]
