@@ -24,9 +24,8 @@ from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
 from en4dvar.storage.campaign_file import failed_datasets
 from en4dvar.storage.joint_file import FILE
 from en4dvar.storage.pack import PACK
-from en4dvar.storage.plain import PlainResult, load_plain
 from en4dvar.storage.population_file import FILE as POPULATION
-from en4dvar.storage.store import load_stored, result_files
+from en4dvar.storage.store import StoredResult, load_stored, result_files
 from en4dvar.summary import summary_rows
 from en4dvar.tables import write_csv
 
@@ -56,21 +55,21 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     if stored == [whole]:
         result = load_stored(whole)
         write_csv(run_dir / "summary.csv", summary_rows([(result.name, result.summary(), result.cautions)], {}))
-        _write_tables(run_dir, [_lines(result.plain)])
+        _write_tables(run_dir, [_lines(result)])
         figures = draw(all_figures(result), IDENTIFIERS, inside(run_dir, "figures") if files else None)
         return write_text(run_dir / "report.html", render_set(result, figures, copies=files))
     sets, lines = [], []
     for path in stored:
-        plain = load_plain(path)
-        sets.append(SetSummary.of(plain, path.name))
-        lines.append(_lines(plain))
+        result = load_stored(path)
+        sets.append(SetSummary.of(result, path.name))
+        lines.append(_lines(result))
     _write_tables(run_dir, lines)
     failures = failed_datasets(whole)
     write_csv(run_dir / "summary.csv", summary_rows(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
     return _write_campaign(run_dir, sets, failures, _asked(run_dir, sets, datasets), workers, files)
 
 
-def _lines(result: PlainResult) -> tuple[Lines, ...]:
+def _lines(result: StoredResult) -> tuple[Lines, ...]:
     """Of each of :data:`TABLES`, the name of the data set first."""
     return *response_lines(result), piece_lines(result)
 

@@ -21,8 +21,7 @@ from en4dvar.errors import OutputError
 from en4dvar.observations import Observations
 from en4dvar.report.text import fixed
 from en4dvar.state import Array
-from en4dvar.storage.plain import PlainResult
-from en4dvar.storage.store import StoredResult, plain_result, result_files
+from en4dvar.storage.store import StoredResult, load_stored, result_files
 from en4dvar.summary import ParameterSummary, estimate_cells
 from en4dvar.tables import table
 
@@ -184,7 +183,7 @@ def _judged(scores: Sequence[ModelScore], datasets: Sequence[str]) -> tuple[Mode
     return tuple(score for one in ranked for score in one)
 
 
-def _difference(results: Mapping[str, Mapping[str, PlainResult]]) -> str:
+def _difference(results: Mapping[str, Mapping[str, StoredResult]]) -> str:
     """Why the evidences of the runs do not compare; empty where all of them used the same data."""
     first, *others = results
     for name in others:
@@ -263,15 +262,15 @@ def _labels(runs: Sequence[Path]) -> list[str]:
     return labels
 
 
-def _results(run: str | Path | StoredResult) -> dict[str, PlainResult]:
+def _results(run: str | Path | StoredResult) -> dict[str, StoredResult]:
     """Data set → result of a run."""
     if isinstance(run, StoredResult):
-        return {run.name: run.plain}
+        return {run.name: run}
     files = [Path(run)] if Path(run).suffix == ".nc" else result_files(Path(run))
-    return {result.name: result for result in map(plain_result, files)}
+    return {result.name: result for result in map(load_stored, files)}
 
 
-def _same_data(a: PlainResult, b: PlainResult) -> bool:
+def _same_data(a: StoredResult, b: StoredResult) -> bool:
     ours, theirs = _stated(a.observations()), _stated(b.observations())
     return (a.axes, ours.keys()) == (b.axes, theirs.keys()) and all(
         ours[key].shape == theirs[key].shape and np.allclose(ours[key], theirs[key], rtol=1e-12, atol=0) for key in ours
@@ -291,7 +290,7 @@ def _stated(o: Observations) -> dict[str, Array]:
     }
 
 
-def _score(run: str, dataset: str, result: PlainResult) -> ModelScore:
+def _score(run: str, dataset: str, result: StoredResult) -> ModelScore:
     stats, likelihood = result.groups["/sample_stats"].attrs, result.log_likelihood
     return ModelScore(
         run,

@@ -85,7 +85,7 @@ def _members_csv(results: Iterable[StoredResult]) -> str:
         for row in result.summary():
             header.setdefault(row.name, f"{row.name} ({row.unit})" if row.unit != "1" else row.name)
         warned = " ".join(codes(result.cautions))
-        values = {str(name): result.members("posterior", str(name)) for name in result.posterior.data_vars}
+        values = {name: result.members("posterior", name) for name in result.parameters}
         for i, member in enumerate(np.flatnonzero(result.alive)):
             lines.append((result.name, member, {name: of[i] for name, of in values.items()}, warned))
     rows = (

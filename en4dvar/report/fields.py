@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -13,6 +12,7 @@ from en4dvar.field_prior import regular_grid
 from en4dvar.report.style import COLUMN, LIGHT, band, styled
 from en4dvar.report.text import shown, with_unit
 from en4dvar.state import Array
+from en4dvar.storage.netcdf import Group
 from en4dvar.storage.store import StoredResult
 
 CAPTION = (
@@ -21,12 +21,10 @@ CAPTION = (
 )
 
 
-def stored_fields(result: StoredResult) -> tuple[xr.Dataset, list[str]]:
+def stored_fields(result: StoredResult) -> tuple[Group, list[str]]:
     """The group of the fields, and their names; none of a result without."""
-    if "fields" not in result.tree.children:
-        return xr.Dataset(), []
-    data = result.dataset("fields")
-    return data, [str(name).removesuffix("_at") for name in data.data_vars if str(name).endswith("_at")]
+    data = result.groups.get("/fields", Group())
+    return data, [name.removesuffix("_at") for name in data.variables if name.endswith("_at")]
 
 
 @styled
@@ -46,12 +44,12 @@ def maps(result: StoredResult) -> Figure:
     return figure
 
 
-def _label(data: xr.Dataset, name: str) -> str:
+def _label(data: Group, name: str) -> str:
     about = data[name].attrs
     return with_unit(str(about["symbol"]), str(about["display_units"]))
 
 
-def _line(ax: Axes, data: xr.Dataset, name: str, at: Array) -> None:
+def _line(ax: Axes, data: Group, name: str, at: Array) -> None:
     order = np.argsort(at)
     positive = not np.any(data[name].values <= 0)
     for kind, colour in (("prior_", "prior"), ("", "posterior")):

@@ -41,6 +41,7 @@ def histograms(result: StoredResult) -> Chart:
 def residuals(result: StoredResult) -> Chart:
     """Whitened residuals in time, their autocorrelation, normal quantiles, leverages; the discrepancy if any."""
     time, label = readings.times(result), readings.time_label(result)
+    observed = result.group("observed_data")
     white, studentised, leverage = (
         result.of_readings("sample_stats", key) for key in ("whitened_residual", "studentised", "leverage")
     )
@@ -49,11 +50,11 @@ def residuals(result: StoredResult) -> Chart:
     top.rule(0)
     for axis, (series, colour) in zip(result.axes, readings.each_series(result), strict=True):
         chosen = series[counts[series]]
-        if f"{axis.name}_place" not in result.observed_data:
+        if f"{axis.name}_place" not in observed:
             top.line(time[chosen], white[chosen], "muted", 0.5)
         top.dots(time[chosen], white[chosen], colour, label=axis.name)
     rows = [Row(5.0 * POINTS, [top])]
-    if f"{result.observable}_discrepancy" in result.sample_stats:
+    if f"{result.observable}_discrepancy" in result.group("sample_stats"):
         rows.append(Row(4.4 * POINTS, [_discrepancy(result, time, label)]))
     levers = Panel(label, "leverage", xticks=3, ylim=(0.0, 1.05 * float(np.nanmax(leverage, initial=1e-3))))
     for series, colour in readings.each_series(result, "posterior"):
@@ -65,8 +66,8 @@ def residuals(result: StoredResult) -> Chart:
 
 def cost(result: StoredResult) -> Chart:
     """J and its two terms over the iterations; logarithmic where J falls by more than a factor of 20."""
-    steps = result.iterations["iteration"].values
-    total = result.iterations["J"].values
+    held = result.group("iterations")
+    steps, total = held["iteration"].values, held["J"].values
     steep = bool(total.min() > 0 and total.max() > 20 * total.min())
     panel = Panel("iteration", "cost", xticks=6, whole=True, logarithmic=steep, grid=True, legend=True)
     lines = (
@@ -75,18 +76,19 @@ def cost(result: StoredResult) -> Chart:
         ("J_background", "$J_b$ background", "background", ":"),
     )
     for key, label, colour, dash in lines:
-        panel.line(steps, result.iterations[key].values, colour, dash=dash, label=label)
-        panel.dots(steps, result.iterations[key].values, colour, 3.0, label=label)
+        panel.line(steps, held[key].values, colour, dash=dash, label=label)
+        panel.dots(steps, held[key].values, colour, 3.0, label=label)
     return Chart([Row(5.4 * POINTS, [panel])])
 
 
 def traces(result: StoredResult) -> Chart:
     """Each parameter over the iterations: mean and middle 68 % of the ensemble of the iterate, and its centre."""
-    steps = result.iterations["iteration"].values
+    held = result.group("iterations")
+    steps = held["iteration"].values
     panels = []
     for row in result.summary():
         panel = Panel("iteration", with_unit(row.symbol, row.unit), whole=True, yticks=4)
-        members, centre = (shown(result.iterations[key]) for key in (row.name, f"{row.name}_centre"))
+        members, centre = (shown(held[key]) for key in (row.name, f"{row.name}_centre"))
         alive = np.isfinite(members).all(axis=0)
         if alive.sum() > 1:
             low, high = np.quantile(members[:, alive], (0.16, 0.84), axis=1)  # of what is positive, positive
@@ -117,15 +119,15 @@ def pairs(result: StoredResult) -> Chart:
 
 def all_figures(result: StoredResult) -> Iterator[Captioned]:
     """Everything that the result has enough members for."""
-    named = bool(result.posterior.data_vars)
-    if named:
+    parameters = result.parameters
+    if parameters:
         yield (
             "posterior",
             "Posterior (blue) over prior (grey), each scaled to its peak. Bar: 5–95 % of the posterior, none and (?) "
             "where it is not to be trusted; ticks: members; dashed: the centre, where J is smallest.",
             histograms(result),
         )
-    if "fields" in result.tree.children:
+    if "/fields" in result.groups:
         from en4dvar.report import fields  # with matplotlib, whose import takes longer than all charts
 
         yield "fields", fields.CAPTION, fields.maps(result)
@@ -137,37 +139,37 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
         + (" Each series has its own panels." if len(result.axes) > 1 else ""),
         history(result),
     )
-    if varying.stored_walks(result.plain):
+    if varying.stored_walks(result):
         yield (
             "varying",
             "What varies in time: median and 5–95 % of the posterior (blue) over 5–95 % of the prior (grey).",
             varying.bands(result),
         )
-    if f"{result.observable}_whitened_residual" in result.sample_stats:
+    if f"{result.observable}_whitened_residual" in result.group("sample_stats"):
         yield (
             "residuals",
             "Residuals of the centre, whitened: in time (below it a discrepancy, mean ± std), their "
             "autocorrelation (band: 95 % of independent numbers), against normal quantiles; leverages.",
             residuals(result),
         )
-    if f"{result.observable}_prior_distance" in result.sample_stats:
+    if f"{result.observable}_prior_distance" in result.group("sample_stats"):
         yield "influence", readings.CAPTION, readings.influence(result)
-    if np.isfinite(result.iterations["J"]).any():
+    if np.isfinite(result.group("iterations")["J"].values).any():
         yield "cost", "The cost J and its two terms at the iterate that starts each iteration.", cost(result)
-    if named:
+    if parameters:
         yield (
             "iterations",
             "Parameters over the iterations: ensemble mean and middle 68 % (blue), centre (dashed).",
             traces(result),
         )
-    if 2 <= len(result.posterior.data_vars) <= MAX_PAIRS and result.alive.sum() > 2:
+    if 2 <= len(parameters) <= MAX_PAIRS and result.alive.sum() > 2:
         yield "pairs", "Posterior members in pairs of parameters; above the diagonal the correlation.", pairs(result)
 
 
 def _discrepancy(result: StoredResult, time: Array, label: str) -> Panel:
     """Data less the centre, and mean ± std of what the model misses."""
-    name, stats = result.observable, result.sample_stats
-    residual = shown(result.observed_data[name]) - shown(stats[f"{name}_centre"])
+    name, stats = result.observable, result.group("sample_stats")
+    residual = shown(result.group("observed_data")[name]) - shown(stats[f"{name}_centre"])
     mean, std = shown(stats[f"{name}_discrepancy"]), shown(stats[f"{name}_discrepancy_std"])
     unit = str(stats[f"{name}_discrepancy"].attrs["display_units"])
     panel = Panel(label, with_unit("residual", unit), legend=True)

@@ -48,7 +48,7 @@ class SeriesShown:
 
     @classmethod
     def of(cls, result: StoredResult, axis: Axis) -> SeriesShown:
-        observed, name = result.observed_data, axis.name
+        observed, name = result.group("observed_data"), axis.name
         data, std = shown(observed[name]), shown(observed[f"{name}_std"])
         x, x_label = shown(observed[axis.time]), with_unit("time", observed[axis.time].attrs["display_units"])
         places = np.asarray(observed[f"{name}_place"].values) if f"{name}_place" in observed else np.empty(0)
@@ -59,7 +59,7 @@ class SeriesShown:
         label = str(attrs["long_name"]).removesuffix(", observed")
         label = label if label == attrs["symbol"] else f"{label} {attrs['symbol']}"
         label = with_unit(label, attrs["display_units"])
-        return cls(axis, x, x_label, data, std, shown(result.sample_stats[f"{name}_centre"]), label)
+        return cls(axis, x, x_label, data, std, shown(result.group("sample_stats")[f"{name}_centre"]), label)
 
     @property
     def size(self) -> float:
@@ -92,7 +92,7 @@ def history(result: StoredResult) -> Chart:
 
 def _data(panel: Panel, result: StoredResult, one: SeriesShown) -> None:
     """Data and predictions."""
-    curve = f"{one.axis.name}_path" in result.dataset("prior_predictive")
+    curve = f"{one.axis.name}_path" in result.group("prior_predictive")
     for band in BANDS:
         (_along if curve else _bars)(panel, result, one, band)
     if curve:
@@ -120,8 +120,8 @@ def _residuals(one: SeriesShown) -> Panel:
 
 def _along(panel: Panel, result: StoredResult, one: SeriesShown, band: Band) -> None:
     """Quantiles of the members along the path."""
-    held = result.dataset(band.group)
-    values = shown(held[f"{one.axis.name}_path"][0])
+    held = result.group(band.group)
+    values = shown(held[f"{one.axis.name}_path"])[0]
     seen = np.isfinite(values).any(axis=0)
     if not seen.any():
         return
@@ -136,7 +136,7 @@ def _along(panel: Panel, result: StoredResult, one: SeriesShown, band: Band) -> 
 
 def _bars(panel: Panel, result: StoredResult, one: SeriesShown, band: Band) -> None:
     """Quantiles of the members at each reading of a field."""
-    values = shown(result.dataset(band.group)[one.axis.name][0])
+    values = shown(result.group(band.group)[one.axis.name])[0]
     alive = np.isfinite(values).all(axis=1)
     if not alive.any():
         return

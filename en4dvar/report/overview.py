@@ -16,7 +16,7 @@ from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row
 from en4dvar.report.drawing import Captioned, Drawing
 from en4dvar.report.html import render
 from en4dvar.report.text import figure_text, number_like, pretty_unit, symbol_html, with_unit
-from en4dvar.storage.plain import PlainResult
+from en4dvar.storage.store import StoredResult
 from en4dvar.summary import ParameterSummary
 
 NAMED = 40  # data sets whose names fit below a figure
@@ -35,7 +35,7 @@ class SetSummary:
     about: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, result: PlainResult, stem: str) -> SetSummary:
+    def of(cls, result: StoredResult, stem: str) -> SetSummary:
         """``stem``: name of the file without suffix."""
         stats = result.groups["/sample_stats"].attrs
         keys = ("n_observations", "chi2_per_observation", "nrmse", "dfs", "n_active", "n_members")

@@ -36,7 +36,7 @@ def render_set(
 
     ``trail``: links (words, address) above it; ``copies``: whether the figures are also kept as PDF and PNG.
     """
-    attributes, reasons = result.attributes, result.sample_stats["failure_reason"].values.ravel()
+    attributes, judged = result.attributes, result.group("sample_stats")
     return render(
         "set.html.j2",
         charts=True,
@@ -45,23 +45,23 @@ def render_set(
         copies=copies,
         created=attributes.get("date_created", ""),
         configuration=str(attributes.get("configuration", "")),
-        stats=result.sample_stats.attrs,
+        stats=judged.attrs,
         rows=result.summary(),
         dfs_words=DFS_WORDS,
         cautions=result.cautions,
         tiles=_tiles(result),
         shares=_shares(result),
-        discrepancy_share=result.sample_stats.attrs.get("discrepancy_share"),
-        what_if=(what_if := stored_shifts(result.plain)),
+        discrepancy_share=judged.attrs.get("discrepancy_share"),
+        what_if=(what_if := stored_shifts(result)),
         exceeding=exceeding(what_if),
-        entries=stored_ledger(result.plain),
+        entries=stored_ledger(result),
         readings=reading_words(result),
-        walks=stored_walks(result.plain),
+        walks=stored_walks(result),
         verdict=verdict(result),
         identifiers=IDENTIFIERS,
         figures=figures,
         modes=_modes(result),
-        lost=[(i, str(reason)) for i, reason in enumerate(reasons) if reason],
+        lost=[(i, str(reason)) for i, reason in enumerate(judged["failure_reason"].values.ravel()) if reason],
         iterations=_iterations(result),
         fixed_values=_fixed(result),
         settings=_settings(result),
@@ -71,15 +71,15 @@ def render_set(
 
 def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
     """(quantity, value, in plain words, needs attention) for the tiles on top."""
-    s = result.sample_stats.attrs
-    alive, members, n_estimated = int(s["n_active"]), int(s["n_members"]), len(result.posterior.data_vars)
+    s = result.group("sample_stats").attrs
+    alive, members, n_estimated = int(s["n_active"]), int(s["n_members"]), len(result.parameters)
     chi2, dfs, nrmse = (float(s[key]) for key in ("chi2_per_observation", "dfs", "nrmse"))
     structured = any(c.code in ("residual-structure", "odd-residuals") for c in result.cautions)
     chi2_words, chi2_odd = judge_chi2(chi2, int(s["n_weighted"]), dfs, structured)
     rows = result.summary()
     shares, doubted = sum(row.dfs for row in rows), any(row.untrusted for row in rows)  # of what is reported
     informed = f"numbers determined by the data, of {n_estimated} estimated: the sum of the shares below"
-    if "fields" in result.tree.children:
+    if "/fields" in result.groups:
         shares, informed = dfs, "numbers determined by the data, of cells and parameters"
     information = (
         ("–", "cannot be told where intervals are not to be trusted")
@@ -128,12 +128,11 @@ def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = 
 
 def _shares(result: StoredResult) -> list[tuple[str, str, str, list[str]]]:
     """(symbol, std, unit, its parts from errors, discrepancy and prior) of each parameter; parts add in quadrature."""
-    stats = result.sample_stats
-    if "variance_from_errors" not in stats:
+    if "variance_from_errors" not in result.group("sample_stats"):
         return []
     rows = []
     for row in result.summary():
-        shares = [float(stats[f"variance_from_{source}"].sel(parameter=row.name)) for source in SHARES]
+        shares = [result.of_parameter(f"variance_from_{source}", row.name) for source in SHARES]
         parts = [number_like(row.std * math.sqrt(max(0.0, share)), row.std) for share in shares]
         rows.append((row.symbol, number_like(row.std, row.std), row.unit, parts))
     return rows
@@ -141,16 +140,16 @@ def _shares(result: StoredResult) -> list[tuple[str, str, str, list[str]]]:
 
 def _modes(result: StoredResult) -> list[tuple[str, ...]]:
     """One line a minimum of J: its weight, J, descents that ended there, and its centre in display units."""
-    stats = result.sample_stats
+    stats = result.group("sample_stats")
     if "mode_cost" not in stats:
         return []
     rows = []
     for k in range(stats.sizes["mode"]):
-        of = {key: float(stats[f"mode_{key}"][k]) for key in ("weight", "cost", "cost_spread", "descents")}
+        of = {key: float(stats[f"mode_{key}"].values[k]) for key in ("weight", "cost", "cost_spread", "descents")}
         centre = [
-            number_like(convert(float(stats["mode_centre"][k, j]), a["units"], a["display_units"]), row.std)
+            number_like(convert(float(stats["mode_centre"].values[k, j]), a["units"], a["display_units"]), row.std)
             for j, (row, a) in enumerate(
-                zip(result.summary(), (v.attrs for v in result.posterior.data_vars.values()), strict=True)
+                zip(result.summary(), (v.attrs for v in result.parameters.values()), strict=True)
             )
         ]
         spread = f" (they were ended within {of['cost_spread']:.2g} of its J)" if of["cost_spread"] else ""
@@ -161,21 +160,21 @@ def _modes(result: StoredResult) -> list[tuple[str, ...]]:
 def _fixed(result: StoredResult) -> list[tuple[str, str, float, str]]:
     """(symbol, label, value, unit) of the values held fixed."""
     rows = []
-    for variable in result.dataset("constant_data").data_vars.values():
+    for variable in result.group("constant_data").variables.values():
         a = variable.attrs
         unit = a.get("display_units", a["units"])
-        rows.append((a["symbol"], a["long_name"], convert(float(variable), a["units"], unit), unit))
+        rows.append((a["symbol"], a["long_name"], convert(float(variable.values), a["units"], unit), unit))
     return rows
 
 
 def _iterations(result: StoredResult) -> list[tuple[str, ...]]:
     """One line an iteration: index, J, terms, step, χ²/Ky, DFS, spread, members."""
-    table = result.iterations
+    table = result.group("iterations")
     diagnostics = [key for key in ITERATION_SCALARS if key != "active"]
     columns = [
-        [str(int(i)) for i in table["iteration"]],
-        *([plain_number(float(value)) for value in table[key]] for key in diagnostics),
-        [str(int(n)) for n in table["active"]],
+        [str(int(i)) for i in table["iteration"].values],
+        *([plain_number(float(value)) for value in table[key].values] for key in diagnostics),
+        [str(int(n)) for n in table["active"].values],
     ]
     return list(zip(*columns, strict=True))
 

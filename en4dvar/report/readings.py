@@ -26,22 +26,24 @@ COLOURS = ("ink", "posterior", "centre", "background", "muted")  # of several se
 
 def has_influence(result: StoredResult) -> bool:
     """Whether the file says what leaving out a reading would change."""
-    return result.axes[0].own("influence_in_std") in result.sample_stats
+    return result.axes[0].own("influence_in_std") in result.group("sample_stats")
 
 
 def times(result: StoredResult) -> Array:
     """(K,) of all readings, in the display unit."""
-    return np.concatenate([shown(result.observed_data[axis.time]) for axis in result.axes])
+    observed = result.group("observed_data")
+    return np.concatenate([shown(observed[axis.time]) for axis in result.axes])
 
 
 def time_label(result: StoredResult) -> str:
     """Of an axis of :func:`times`."""
-    return with_unit("time", result.observed_data[result.axes[0].time].attrs["display_units"])
+    return with_unit("time", result.group("observed_data")[result.axes[0].time].attrs["display_units"])
 
 
 def each_series(result: StoredResult, alone: str = "ink") -> list[tuple[npt.NDArray[np.intp], str]]:
     """Places among all readings of each series, and its colour; ``alone``: that of a single one."""
-    sizes = [len(result.observed_data[axis.name]) for axis in result.axes]
+    observed = result.group("observed_data")
+    sizes = [len(observed[axis.name].values) for axis in result.axes]
     parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
     names = [alone] if len(parts) == 1 else [COLOURS[i % len(COLOURS)] for i in range(len(parts))]
     return list(zip(parts, names, strict=True))
@@ -91,7 +93,7 @@ def _most_moving(result: StoredResult) -> Markup:
         return Markup("What leaving out a reading would change only another fit tells: each of them decides too much.")
     j, k = np.unravel_index(int(np.nanargmax(np.abs(in_std))), in_std.shape)
     row = result.summary()[int(j)]
-    about = result.posterior[row.name].attrs
+    about = result.parameters[row.name].attrs
     size = convert(float(change[j, k]), about["units"], about["display_units"])
     words = Markup(
         "Without the reading at {} {} would change most: by {} {}, {} posterior standard deviations."
@@ -114,19 +116,20 @@ def _farthest(result: StoredResult) -> Markup:
 
 
 def _why_not(result: StoredResult) -> Markup:
-    reason = str(result.sample_stats.attrs.get("influence_reason", ""))
+    reason = str(result.group("sample_stats").attrs.get("influence_reason", ""))
     return Markup("What leaving out a reading would change is not told: {}.").format(reason) if reason else Markup("")
 
 
 def _time(result: StoredResult, k: int) -> str:
     """When a reading was taken, of several series of which, of a field where."""
+    observed = result.group("observed_data")
     for axis in result.axes:
-        time = result.observed_data[axis.time]
-        if k < len(time):
+        time = observed[axis.time]
+        if k < len(time.values):
             break
-        k -= len(time)
+        k -= len(time.values)
     words = f"{plain_number(float(shown(time)[k]))} {pretty_unit(time.attrs['display_units'])}".strip()
-    if f"{axis.name}_place" in result.observed_data:
-        place = result.observed_data[f"{axis.name}_place"]
-        words += f", place {plain_number(float(place[k]))} {pretty_unit(str(place.attrs['units']))}".rstrip()
+    if f"{axis.name}_place" in observed:
+        place = observed[f"{axis.name}_place"]
+        words += f", place {plain_number(float(place.values[k]))} {pretty_unit(str(place.attrs['units']))}".rstrip()
     return words if axis.alone else f"{words} ({axis.name})"

@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from en4dvar.report.text import fixed, number_like, pretty_unit, symbol_html
-from en4dvar.storage.plain import PlainResult
+from en4dvar.storage.store import StoredResult
 from en4dvar.units import convert
 
 Lines = list[tuple[object, ...]]
@@ -70,7 +70,7 @@ class StoredEntry:
         return self.parameter, self.quantity, self.unit, self.low, self.median, self.high
 
 
-def stored_ledger(result: PlainResult) -> tuple[tuple[StoredEntry, ...], ...]:
+def stored_ledger(result: StoredResult) -> tuple[tuple[StoredEntry, ...], ...]:
     """A row a parameter that acts along the path, in it one entry a quantity of the path; display units."""
     stats, about = result.groups["/sample_stats"], {name: v.attrs for name, v in result.parameters.items()}
     if "ledger_weight" not in stats.variables:
@@ -89,7 +89,7 @@ def stored_ledger(result: PlainResult) -> tuple[tuple[StoredEntry, ...], ...]:
     return tuple(tuple(entry(i, name, q) for q in quantities) for i, name in enumerate(names))
 
 
-def stored_shifts(result: PlainResult) -> tuple[tuple[StoredShift, ...], ...]:
+def stored_shifts(result: StoredResult) -> tuple[tuple[StoredShift, ...], ...]:
     """A row an alternative, in it one shift a parameter; the largest first, then those unknown, then small ones."""
     stats = result.groups["/sample_stats"]
     if "what_if_change" not in stats.variables:
@@ -157,7 +157,7 @@ def exceeding(rows: Iterable[Sequence[StoredShift]]) -> list[Sequence[StoredShif
     return [row for row in rows if row[0].reason or any(shift.exceeds for shift in row)]
 
 
-def response_lines(result: PlainResult) -> tuple[Lines, Lines]:
+def response_lines(result: StoredResult) -> tuple[Lines, Lines]:
     """Lines of ``what_if.csv`` and of ``ledger.csv``, the name of the data set first."""
     return (
         [(result.name, *shift.cells) for row in stored_shifts(result) for shift in row],

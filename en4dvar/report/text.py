@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 import re
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 from markupsafe import Markup, escape
 
 from en4dvar.state import Array
+from en4dvar.storage.netcdf import Variable
 from en4dvar.summary import ParameterSummary
 from en4dvar.units import convert
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _NAMES = (
@@ -118,7 +122,7 @@ def fixed(value: float, places: int) -> str:
     return f"{value:.{places}f}" if math.isfinite(value) else "–"
 
 
-def shown(variable: xr.DataArray) -> Array:
+def shown(variable: Variable | xr.DataArray) -> Array:
     """The values of a variable of a result file in its display unit."""
     values = np.asarray(variable.values, dtype=float)
     return convert(values, variable.attrs["units"], variable.attrs["display_units"])

@@ -12,7 +12,6 @@ from en4dvar.diagnostics import change_words
 from en4dvar.report.chart import POINTS, Chart, Panel, Row, steps
 from en4dvar.report.text import with_unit
 from en4dvar.state import Array
-from en4dvar.storage.plain import PlainResult
 from en4dvar.storage.store import StoredResult
 from en4dvar.storage.varying import PIECE, PIECES
 from en4dvar.units import convert
@@ -47,7 +46,7 @@ class StoredWalk:
         ]
 
 
-def stored_walks(result: PlainResult) -> tuple[StoredWalk, ...]:
+def stored_walks(result: StoredResult) -> tuple[StoredWalk, ...]:
     """The parameters that vary."""
     return tuple(
         _stored_walk(result, name.removesuffix(PIECES))
@@ -56,7 +55,7 @@ def stored_walks(result: PlainResult) -> tuple[StoredWalk, ...]:
     )
 
 
-def _stored_walk(result: PlainResult, name: str) -> StoredWalk:
+def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
     posterior, observed = result.groups["/posterior"], result.groups["/observed_data"].every
     about, time = posterior.variables[name + PIECES].attrs, posterior.coords[name + PIECE]
     shown, clock = about["display_units"], time.attrs["display_units"]
@@ -79,14 +78,14 @@ def _stored_walk(result: PlainResult, name: str) -> StoredWalk:
     return StoredWalk(name, label, about["symbol"], shown, clock, shown_edges, after, quantiles("prior"))
 
 
-def piece_lines(result: PlainResult) -> list[tuple[object, ...]]:
+def piece_lines(result: StoredResult) -> list[tuple[object, ...]]:
     """Lines of ``varying.csv``, the name of the data set first."""
     return [(result.name, *cells) for walk in stored_walks(result) for cells in walk.cells]
 
 
 def verdict(result: StoredResult) -> str:
     """What the evidence says of all that varies, in a sentence; "" where nothing does."""
-    stats = result.sample_stats.attrs
+    stats = result.group("sample_stats").attrs
     if "log_evidence_change" not in stats:
         return ""
     return change_words(str(stats["varying"]), float(stats["log_evidence_change"]))
@@ -95,7 +94,7 @@ def verdict(result: StoredResult) -> str:
 def bands(result: StoredResult) -> Chart:
     """Median and 5–95 % of each parameter that varies, over the prior's."""
     rows = []
-    for walk in stored_walks(result.plain):
+    for walk in stored_walks(result):
         least, most = float(np.nanmin(walk.posterior)), float(np.nanmax(walk.prior))
         steep = least > 0 and math.isfinite(most) and most > 5 * least
         panel = Panel(

@@ -85,12 +85,12 @@ def report_cycles(directory: RunDirectory, figures: bool = False) -> Path | None
 
     Raises :class:`OutputError`.
     """
-    from en4dvar.report.sequence import write_sequence_report
-    from en4dvar.report.twin import write_twin_report
-
     file = cycles_file(directory.work)
     if file is None:
         return None
+    from en4dvar.report.sequence import write_sequence_report  # with matplotlib, which no page of a data set needs
+    from en4dvar.report.twin import write_twin_report
+
     directory.claim("report.html")
     with directory.claiming("figures"):
         return (write_twin_report if file.stem == "twin" else write_sequence_report)(directory.work, figures)

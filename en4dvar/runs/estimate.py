@@ -111,7 +111,8 @@ def estimate(
         campaign = run_campaign(config, force=force, resume=resume, progress=shown, command="en4dvar.estimate")
         (result,) = campaign
     if directory is None:
-        result.tree["observed_data"].attrs["data_source"] = result.tree.attrs["data_source"] = ARRAYS
+        for path in ("/", "/observed_data"):
+            result = result.with_attributes(path, data_source=ARRAYS)
     return result
 
 

@@ -17,8 +17,7 @@ from en4dvar.errors import ConfigError, OutputError
 from en4dvar.problem import InverseProblem
 from en4dvar.runs.trust import Ask, of_strangers
 from en4dvar.state import Array
-from en4dvar.storage.plain import PlainResult
-from en4dvar.storage.store import plain_result, result_files
+from en4dvar.storage.store import StoredResult, load_stored, result_files
 
 CARRIED = ("implausible-data", "misfit", "residual-structure", "model-validity")
 MOST_NAMES = 4
@@ -56,9 +55,9 @@ def finished(run_dirs: Sequence[Path], trust: bool, ask: Ask | None) -> tuple[Co
     found: list[Finished] = []
     for run_dir in run_dirs:
         files = result_files(run_dir)
-        config = _recorded(run_dir, plain_result(files[0]), trust, ask)
+        config = _recorded(run_dir, load_stored(files[0]), trust, ask)
         first = first or config
-        found += [finished_set(config, plain_result(file), run_dir) for file in files]
+        found += [finished_set(config, load_stored(file), run_dir) for file in files]
     if first is None:
         raise ConfigError("no run is given")
     return first, list(_named_apart(found))
@@ -75,7 +74,7 @@ def carried(sets: Sequence[Finished]) -> Iterator[Caution]:
             yield caution(code, f"of single data sets, {told}", "serious")
 
 
-def _recorded(run_dir: Path, result: PlainResult, trust: bool, ask: Ask | None) -> Config:
+def _recorded(run_dir: Path, result: StoredResult, trust: bool, ask: Ask | None) -> Config:
     """The configuration of a run."""
     attributes = result.attributes
     if "configuration_resolved" not in attributes:
@@ -85,7 +84,7 @@ def _recorded(run_dir: Path, result: PlainResult, trust: bool, ask: Ask | None) 
         return resolve(document, run_dir.absolute())
 
 
-def finished_set(config: Config, result: PlainResult, run_dir: Path) -> Finished:
+def finished_set(config: Config, result: StoredResult, run_dir: Path) -> Finished:
     """One data set of a run. Raises :class:`ConfigError`, :class:`OutputError`, see :func:`finished`."""
     if len(result.axes) > 1:  # files and pages of such estimates know one series a data set
         raise ConfigError(f"{run_dir}: {result.name} has several series; it cannot be estimated with others")

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from en4dvar.errors import OutputError
 from en4dvar.executor import choose_executor, make_executor, one_blas_thread
 from en4dvar.forward import ForwardModel
 from en4dvar.observations import SEVERAL
-from en4dvar.report.result import Result, load_result
 from en4dvar.runs.sequence_run import sequence_work
 from en4dvar.runs.trust import Ask, of_strangers
 from en4dvar.runs.twin_run import twin_work
@@ -29,10 +28,7 @@ from en4dvar.storage.campaign_file import failed_datasets
 from en4dvar.storage.cycles_file import cycles_file, read_cycles
 from en4dvar.storage.fingerprint import Identity, digest_of, identity
 from en4dvar.storage.provenance import provenance
-from en4dvar.storage.store import result_files
-
-if TYPE_CHECKING:
-    import xarray as xr
+from en4dvar.storage.store import StoredResult, load_stored, result_files
 
 SURROUNDINGS = ("python_version", "package_versions", "platform", "cpu", "git_commit")
 
@@ -94,19 +90,20 @@ def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = Fals
         return _of_cycles(cycles, workers, trust, ask)
     campaign = run_dir / "posterior.nc"
     files = result_files(run_dir)
-    first = load_result(files[0])
+    first = load_stored(files[0])
     config = _configuration(files[0], first.attributes, trust, ask)
     assert isinstance(config, Config)
     repeated = []
     with one_blas_thread(), choose_executor(config.model, None, workers) as executor:
         for file in files:
-            recorded = load_result(file)
+            recorded = load_stored(file)
             observables = {one.name: one.observable for one in inverse_plan(config).series}
             problem = problem_of(config, recorded.observations(observables))
             analysis = assimilate(problem, config.assimilation, int(recorded.attributes["seed"]), executor)
-            again = Result.from_analysis(analysis, {})
-            variables, differ = differences(_groups(recorded), _groups(again))
-            repeated.append(Repeated(recorded.name, variables, differ, _data_file(recorded)))
+            again = StoredResult.from_analysis(analysis, {})
+            values = _values(recorded)
+            differ = differences(values, _values(again))
+            repeated.append(Repeated(recorded.name, len(values), differ, _data_file(recorded)))
     failures = failed_datasets(campaign) if files != [campaign] else {}
     return _found(repeated, config.resolved, config.model, first.attributes, failures)
 
@@ -120,8 +117,8 @@ def _of_cycles(file: Path, workers: int | None, trust: bool, ask: Ask | None) ->
         work = twin_work(config) if isinstance(config, TwinConfig) else sequence_work(config)
     with make_executor(work.model, workers or 1) as executor:
         again = work.again(executor)
-    variables, differ = differences({"": recorded}, {"": again})
-    repeated = Repeated(config.name, variables, differ, "")
+    was, now = ({f"/{name}": v.values for name, v in one.variables.items()} for one in (recorded, again))
+    repeated = Repeated(config.name, len(was), differences(was, now), "")
     return _found([repeated], config.resolved, work.model, recorded.attrs, {})
 
 
@@ -148,24 +145,19 @@ def _found(
     return Rerun(tuple(sets), changed, surroundings, failures)
 
 
-def _groups(result: Result) -> dict[str, xr.Dataset]:
-    return {f"/{name}": node.to_dataset() for name, node in result.tree.children.items()}
+def _values(result: StoredResult) -> dict[str, np.ndarray]:
+    return {f"{path}/{name}": v.stored for path, group in result.groups.items() for name, v in group.every.items()}
 
 
-def differences(recorded: Mapping[str, xr.Dataset], again: Mapping[str, xr.Dataset]) -> tuple[int, tuple[str, ...]]:
-    """Number of variables compared, by group, and the words for each that is not the same to the bit."""
-    import xarray as xr
-
-    count, told = 0, []
-    for group, node in recorded.items():
-        variables = again.get(group, xr.Dataset()).variables
-        for name, variable in node.variables.items():
-            count += 1
-            if name not in variables:
-                told.append(f"{group}/{name} is missing")
-            elif not _same_bits(variable.values, variables[name].values):
-                told.append(f"{group}/{name} differs{_by_how_much(variable.values, variables[name].values)}")
-    return count, tuple(told)
+def differences(recorded: Mapping[str, np.ndarray], again: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    """Words for each variable, by its path, that is not the same to the bit."""
+    told = []
+    for name, values in recorded.items():
+        if name not in again:
+            told.append(f"{name} is missing")
+        elif not _same_bits(values, again[name]):
+            told.append(f"{name} differs{_by_how_much(values, again[name])}")
+    return tuple(told)
 
 
 def _same_bits(a: np.ndarray, b: np.ndarray) -> bool:
@@ -183,9 +175,9 @@ def _by_how_much(a: np.ndarray, b: np.ndarray) -> str:
     return f" by up to {float(np.nanmax(np.abs(a - b), initial=0.0)) / scale:.2g} of its largest value"
 
 
-def _data_file(recorded: Result) -> str:
+def _data_file(recorded: StoredResult) -> str:
     """What became of the data file; "" where it is as it was."""
-    sources = [Path(text) for text in str(recorded.observed_data.attrs["data_source"]).split(SEVERAL)]
+    sources = [Path(text) for text in str(recorded.group("observed_data").attrs["data_source"]).split(SEVERAL)]
     source = next((path for path in sources if not path.is_file()), None)
     if source is not None:
         return f"{source} is gone, the recorded observations were used"

@@ -9,7 +9,7 @@ from typing import Any
 from en4dvar.runs.finished import Finished, finished_set
 from en4dvar.runs.worklist import Worklist
 from en4dvar.storage.checkpoint import FOLDER, digest, file_digest, write_checkpoint
-from en4dvar.storage.store import plain_result
+from en4dvar.storage.store import load_stored
 
 Estimated = Callable[[Sequence[Finished], Mapping[str, Any], Path, Callable[[str], None]], object]
 
@@ -36,7 +36,7 @@ def once_together(work: Worklist, file: str, what: str, fewest: int, estimate: E
     done = run.restore(checkpoint_of(file), fingerprint, str, f"the {what} is made again")
     if done is not None and path.exists() and file_digest(path) == done:
         return
-    sets = [finished_set(config, plain_result(run.directory.work / d.file), run.directory.path) for d in good]
+    sets = [finished_set(config, load_stored(run.directory.work / d.file), run.directory.path) for d in good]
     attributes = {**run.attributes, "identity": run.identity.settings, "runs": config.name}
     estimate(sets, attributes, path, lambda words: run.log.write(f"{what}: {words}"))
     write_checkpoint(run.directory.at(checkpoint_of(file)), fingerprint, file_digest(path))

@@ -7,10 +7,8 @@ of the readings. So the errors of the readings and the paths between them have g
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import xarray as xr
+from en4dvar.storage.netcdf import Group, Groups
 
 BESIDE: Mapping[str, str] = {
     "observed_data": "observation_errors",
@@ -19,13 +17,9 @@ BESIDE: Mapping[str, str] = {
 }
 
 
-def joined(group: xr.Dataset, beside: xr.Dataset | None) -> xr.Dataset:
+def joined(groups: Groups, path: str) -> Group:
     """A group with the variables of the one beside it; files of earlier versions have all in one."""
-    import xarray as xr
-
+    group, beside = groups[path], groups.get(f"/{BESIDE.get(path[1:])}")
     if beside is None:
         return group
-    coords = {name: one.variable for part in (group, beside) for name, one in part.coords.items()}
-    held = {name: one.variable for part in (group, beside) for name, one in part.data_vars.items()}
-    indexes = {**beside.xindexes, **group.xindexes}  # of the same file: nothing to align, which takes ten times as long
-    return xr.Dataset(held, xr.Coordinates(coords, indexes), group.attrs)
+    return Group({**group.variables, **beside.variables}, {**group.coords, **beside.coords}, group.attrs)

@@ -8,7 +8,7 @@ from pathlib import Path
 from en4dvar.config.symbols import symbol_fault
 from en4dvar.errors import OutputError
 from en4dvar.storage.axes import Axis, axes_of
-from en4dvar.storage.beside import BESIDE
+from en4dvar.storage.beside import joined
 from en4dvar.storage.netcdf import Group, Groups, Variable
 from en4dvar.storage.readings import MEMBER
 from en4dvar.units import UnitError, convert
@@ -42,21 +42,13 @@ _NAMED = ("/prior", "/posterior", "/constant_data")  # groups whose variables go
 
 def check_complete(path: Path, groups: Groups) -> None:
     """Check the groups of a file. Raises :class:`OutputError`, which names what is missing."""
-    together = {name: _joined(group, groups.get(f"/{BESIDE.get(name[1:])}")) for name, group in groups.items()}
-    for fault in _faults(together):
+    for fault in _faults({path: joined(groups, path) for path in groups}):
         raise OutputError(f"{path}: not a result of en4dvar: {fault}")
 
 
 def of_members(group: Group) -> dict[str, Variable]:
     """The parameters of a group, without the values of pieces of time: what has one number a member."""
     return {name: variable for name, variable in group.variables.items() if variable.dims == MEMBER}
-
-
-def _joined(group: Group, beside: Group | None) -> Group:
-    """As :func:`~en4dvar.storage.beside.joined`."""
-    if beside is None:
-        return group
-    return Group({**group.variables, **beside.variables}, {**group.coords, **beside.coords}, group.attrs)
 
 
 def _faults(nodes: Groups) -> Iterator[str]:

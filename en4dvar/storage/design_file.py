@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,9 +15,6 @@ from en4dvar.design.laws import Decision
 from en4dvar.errors import OutputError
 from en4dvar.state import Array
 from en4dvar.storage.netcdf import Group, read_groups, to_bytes, variable
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 DECISION = {  # field → variable, description
     "information": ("law_information", "mutual information of law and data, nats"),
@@ -144,41 +141,37 @@ def load_designs(path: Path) -> Designs:
     if "asked" not in root.attrs:
         raise OutputError(f"{path}: no result of en4dvar design")
     asked = Asked(**json.loads(root.attrs["asked"]))
-    rows = [_row(root.isel(design=i)) for i in range(root.sizes["design"])]
-    return Designs(asked, tuple(rows), root.attrs)
+    return Designs(asked, tuple(_row(root, i) for i in range(root.sizes["design"])), root.attrs)
 
 
-def _row(one: xr.Dataset) -> DesignRow:
-    def number(name: str) -> float:
-        return float(one[name])
+def _row(root: Group, i: int) -> DesignRow:
+    def of(name: str) -> Any:
+        return root[name].values[i]
 
     def known(name: str) -> Array:
-        values = one[name].values
+        values = of(name)
         return np.asarray(values[np.isfinite(values)], dtype=float)
 
-    settings, failure = json.loads(str(one["settings"].item())), str(one["failure"].item())
+    number, settings, price, failure = int(of("number")), json.loads(of("settings")), float(of("price")), of("failure")
     if failure:
-        return DesignRow(int(one["number"]), settings, None, number("price"), failure)
+        return DesignRow(number, settings, None, price, failure)
     grid = known("grid")
+    decision = {field: float(of(name)) for field, (name, _) in DECISION.items() if name in root}
     found = Evaluated(
-        gain=number("gain"),
-        error=number("gain_error"),
-        method=str(one["method"].item()),
-        std=one["std"].values,
-        relative=one["relative_std"].values,
-        ratio=one["std_ratio"].values,
-        lost=number("lost"),
-        beyond=number("beyond"),
+        gain=float(of("gain")),
+        error=float(of("gain_error")),
+        method=of("method"),
+        std=of("std"),
+        relative=of("relative_std"),
+        ratio=of("std_ratio"),
+        lost=float(of("lost")),
+        beyond=float(of("beyond")),
         readings=known("reading"),
         times=known("time"),
         grid=grid,
-        fan=one["fan"].values[:, : len(grid)],
-        alike=int(one["experiments"]),
-        forward_runs=int(one["forward_runs"]),
-        decision=_decision(one) if "law_information" in one else None,
+        fan=of("fan")[:, : len(grid)],
+        alike=int(of("experiments")),
+        forward_runs=int(of("forward_runs")),
+        decision=Decision(**decision) if decision else None,
     )
-    return DesignRow(int(one["number"]), settings, found, number("price"))
-
-
-def _decision(one: xr.Dataset) -> Decision:
-    return Decision(**{field: float(one[name]) for field, (name, _) in DECISION.items()})
+    return DesignRow(number, settings, found, price)

@@ -16,6 +16,7 @@ from en4dvar.errors import OutputError
 from en4dvar.joint.estimate import JointEstimate
 from en4dvar.state import Array, Parameter
 from en4dvar.storage.netcdf import Group, Groups, Variable, read_groups, to_bytes, variable
+from en4dvar.storage.xarrays import tree_of
 from en4dvar.units import convert
 
 if TYPE_CHECKING:
@@ -195,9 +196,7 @@ def load_joint(path: Path) -> StoredJoint:
 
 def load_groups(path: Path, groups: Sequence[str], what: str) -> xr.DataTree:
     """A file with ``groups`` in memory. Raises :class:`OutputError`: it is not ``what``, cut short or altered."""
-    import xarray as xr
-
-    nodes = read_groups(path)
-    if {f"/{group}" for group in groups} - set(nodes):
+    held = read_groups(path)
+    if {f"/{group}" for group in groups} - set(held):
         raise OutputError(f"{path}: not {what}")
-    return xr.DataTree.from_dict(nodes)
+    return tree_of(held)

@@ -1,10 +1,11 @@
-"""Groups of variables → the bytes of a NETCDF4 file, several times faster than through xarray's file backend.
+"""Groups of variables ⇄ NETCDF4 files, several times faster than through xarray's file backend.
 
 All definitions come before all data: HDF5 then lays out its metadata once. The encoding is xarray's own (NaN as fill
 value of floats, truth values as bytes with ``dtype: bool``, text as variable-length strings), so that every reader
-sees the same. Everything happens in memory: a worker far away can do it, and a file system is touched once.
+sees the same. A file is made in memory: a worker far away can do it, and a file system is touched once.
 
-:class:`Group` and :class:`Variable` are what a worker makes; :func:`tree_of` shows them through xarray.
+:class:`Group` and :class:`Variable` are what the program works with: the import of xarray takes as long as an estimate.
+:mod:`~en4dvar.storage.xarrays` shows them through it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import netCDF4
 import numpy as np
@@ -23,9 +24,6 @@ import numpy as np
 from en4dvar.errors import OutputError
 from en4dvar.files import atomic_path
 from en4dvar.storage.seal import SealedBytes, check_seal, seal_file
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 _LOCK = threading.Lock()  # the netCDF library is not safe to use from several threads
 _MORE = 1 << 18  # bytes; more than the library had left to write
@@ -37,7 +35,7 @@ _LARGE = 1 << 24  # bytes of a variable
 class Variable:
     """Values along named dimensions: floats, integers, truth values or text. ``fill``: NaN means a missing value.
 
-    ``single``: floats are stored in single precision.
+    ``single``: floats are stored in single precision; fields are large, so they are converted as they are written.
     """
 
     dims: tuple[str, ...]
@@ -45,6 +43,11 @@ class Variable:
     attrs: Mapping[str, Any]
     fill: bool = True
     single: bool = False
+
+    @property
+    def stored(self) -> np.ndarray[Any, Any]:
+        """The values as a file holds them."""
+        return self.values.astype(np.float32) if self.single else self.values
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,13 @@ class Group:
     variables: Mapping[str, Variable] = field(default_factory=dict)
     coords: Mapping[str, Variable] = field(default_factory=dict)
     attrs: Mapping[str, Any] = field(default_factory=dict)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.variables or name in self.coords
+
+    def __getitem__(self, name: str) -> Variable:
+        """A variable or a coordinate."""
+        return self.variables[name] if name in self.variables else self.coords[name]
 
     @property
     def every(self) -> dict[str, Variable]:
@@ -106,43 +116,6 @@ Groups = Mapping[str, Group]
 """By path, the root ``/`` first."""
 
 
-def tree_of(groups: Groups) -> xr.DataTree:
-    """The groups as xarray shows them."""
-    import xarray as xr
-
-    return xr.DataTree.from_dict(datasets_of(groups))
-
-
-def datasets_of(groups: Groups) -> dict[str, xr.Dataset]:
-    """Each group as xarray shows it, by path."""
-    import xarray as xr
-
-    def shown(v: Variable) -> xr.Variable:
-        values = v.values.astype(np.float32) if v.single else v.values
-        return xr.Variable(v.dims, values, v.attrs, {} if v.fill else {"_FillValue": None})
-
-    def dataset(group: Group) -> xr.Dataset:
-        variables, coords = ({n: shown(v) for n, v in part.items()} for part in (group.variables, group.coords))
-        return xr.Dataset(variables, coords, group.attrs)
-
-    return {path: dataset(group) for path, group in groups.items()}
-
-
-def groups_of(nodes: Mapping[str, xr.Dataset]) -> dict[str, Group]:
-    """What xarray shows, by path, as groups again; how it is encoded is left out."""
-
-    def variables(held: Mapping[Any, xr.DataArray]) -> dict[str, Variable]:
-        return {
-            str(name): Variable(tuple(map(str, v.dims)), v.values, netcdf_attributes(v.attrs))
-            for name, v in held.items()
-        }
-
-    return {
-        path: Group(variables(node.data_vars), variables(node.coords), netcdf_attributes(node.attrs))
-        for path, node in nodes.items()
-    }
-
-
 def to_bytes(groups: Groups) -> SealedBytes:
     """The file of the groups; its last line seals it."""
     sizes = [v.values.nbytes // (1 + v.single) for group in groups.values() for v in group.variables.values()]
@@ -170,21 +143,52 @@ def _write(variable: Any, values: np.ndarray[Any, Any]) -> None:
         variable[first : first + rows] = values[first : first + rows]
 
 
-def read_groups(path: Path) -> dict[str, xr.Dataset]:
+def read_groups(path: Path) -> dict[str, Group]:
     """The groups of a sealed file by their paths, in memory; the file can be replaced while they are in use.
 
     Raises
     ------
     OutputError: it is none of ours, cut short or altered (see :mod:`en4dvar.storage.seal`).
     """
-    import xarray as xr
-
     check_seal(path)
     try:
-        with xr.open_datatree(path, engine="netcdf4", decode_timedelta=False) as tree:
-            return {node.path: node.to_dataset(inherit=False).load() for node in tree.subtree}
-    except OSError as error:
-        raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
+        with _LOCK, netCDF4.Dataset(path) as file:
+            file.set_auto_maskandscale(False)
+            return dict(_read(file))
+    except (RuntimeError, OSError) as error:
+        raise OutputError(f"{path}: not a readable netCDF file: {getattr(error, 'strerror', '') or error}") from None
+
+
+def _read(group: Any) -> Iterator[tuple[str, Group]]:
+    """A group of a file and those in it, by path."""
+    attributes = _said(group)
+    listed = [str(attributes.pop("coordinates", ""))]  # xarray lists here those that are no dimension
+    held = {}
+    for name, variable in group.variables.items():
+        held[name], also = _read_variable(variable)
+        listed.append(also)
+    aside = {*group.dimensions, *" ".join(listed).split()}
+    variables, coords = ({name: v for name, v in held.items() if (name in aside) == part} for part in (False, True))
+    yield group.path, Group(variables, coords, attributes)
+    for child in group.groups.values():
+        yield from _read(child)
+
+
+def _read_variable(variable: Any) -> tuple[Variable, str]:
+    """With the names of coordinates that xarray lists beside it."""
+    about = _said(variable)
+    fill, listed = "_FillValue" in about, str(about.pop("coordinates", ""))
+    about.pop("_FillValue", None)
+    values = np.asarray(variable[...], dtype=object if variable.dtype is str else None)
+    if about.get("dtype") == "bool":
+        del about["dtype"]
+        values = values.astype(bool)
+    return Variable(variable.dimensions, values, about, fill), listed
+
+
+def _said(held: Any) -> dict[str, Any]:
+    """Attributes of a group or variable."""
+    return {key: held.getncattr(key) for key in held.ncattrs()}
 
 
 @contextmanager

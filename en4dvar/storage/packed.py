@@ -158,8 +158,7 @@ def _place(v: Variable, numbers: bytearray, words: list[Any]) -> list[Any]:
     if v.values.dtype.kind in "OU":
         words.append(v.values.ravel().tolist())
         return [*about, "", len(words) - 1]
-    values = v.values.astype(np.float32) if v.single else v.values
-    where = len(numbers)
+    values, where = v.stored, len(numbers)
     numbers += values.tobytes()
     numbers += b"\0" * (-len(numbers) % _ALIGNED)
     return [*about, values.dtype.str, where]

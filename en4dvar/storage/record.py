@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -15,17 +14,15 @@ from en4dvar.observations import Observations
 from en4dvar.series import Part, Places
 from en4dvar.state import Array
 from en4dvar.storage.axes import Axis
+from en4dvar.storage.netcdf import Group
 from en4dvar.storage.readings import SCALAR
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 
 def observations_of(
-    data: xr.Dataset, axes: Sequence[Axis], name: str, observables: Mapping[str, Observable]
+    data: Group, axes: Sequence[Axis], name: str, observables: Mapping[str, Observable]
 ) -> Observations:
     """From ``observed_data`` and what is beside it: :meth:`en4dvar.storage.store.StoredResult.observations`."""
-    attributes = {str(key): value for key, value in data.attrs.items()}
+    attributes = data.attrs
 
     def each(suffix: str) -> Array:
         return np.concatenate([data[f"{axis.name}{suffix}"].values for axis in axes])
@@ -40,7 +37,7 @@ def observations_of(
         thresholds = np.repeat(within, [p.end - p.begin for p in parts])
         noise = noise_of_readings(each("_reading_std"), own("time_std"), matrix, thresholds)
     else:
-        held = {str(key).removeprefix(f"{axes[0].name}_"): value.values for key, value in data.data_vars.items()}
+        held = {key.removeprefix(f"{axes[0].name}_"): value.values for key, value in data.variables.items()}
         noise = noise_of_record(times, each("_reading_std"), own("time_std"), held, attributes)
     return Observations(
         times=times,
@@ -54,7 +51,7 @@ def observations_of(
     )
 
 
-def _correlation(data: xr.Dataset, count: int) -> csr_array:
+def _correlation(data: Group, count: int) -> csr_array:
     """Of all readings, from the matrix or from its entries that are not zero."""
     values = data["correlation"].values
     if values.ndim == 2:
@@ -63,9 +60,9 @@ def _correlation(data: xr.Dataset, count: int) -> csr_array:
     return csr_array((values, (rows, columns)), shape=(count, count))
 
 
-def _parts(data: xr.Dataset, axes: Sequence[Axis], observables: Mapping[str, Observable]) -> tuple[Part, ...]:
+def _parts(data: Group, axes: Sequence[Axis], observables: Mapping[str, Observable]) -> tuple[Part, ...]:
     """The series; () of a single one without places."""
-    ends = np.cumsum([len(data[axis.name]) for axis in axes]).tolist()
+    ends = np.cumsum([len(data[axis.name].values) for axis in axes]).tolist()
     found = [
         Part(axis.name, observables.get(axis.name) or _unread(data, axis), begin, end, _places(data, axis))
         for axis, begin, end in zip(axes, [0, *ends], ends, strict=False)
@@ -73,7 +70,7 @@ def _parts(data: xr.Dataset, axes: Sequence[Axis], observables: Mapping[str, Obs
     return () if len(found) == 1 and found[0].places is None else tuple(found)
 
 
-def _places(data: xr.Dataset, axis: Axis) -> Places | None:
+def _places(data: Group, axis: Axis) -> Places | None:
     name = f"{axis.name}_place"
     if name not in data:
         return None
@@ -81,7 +78,7 @@ def _places(data: xr.Dataset, axis: Axis) -> Places | None:
     return Places(indices, shares, data[name].values, str(data[name].attrs["units"]))
 
 
-def _unread(data: xr.Dataset, axis: Axis) -> Observable:
+def _unread(data: Group, axis: Axis) -> Observable:
     """What a file knows of an observable; only a model knows how it is predicted."""
 
     def refuse(trajectory: Trajectory) -> Array:

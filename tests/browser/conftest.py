@@ -25,7 +25,6 @@ from en4dvar.report.compare import compare_runs
 from en4dvar.report.figures import all_figures
 from en4dvar.report.result import Result
 from en4dvar.storage.provenance import provenance
-from en4dvar.storage.store import save
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
@@ -103,7 +102,7 @@ def _write_pages(analysis: Any, renamed: Any, folder: Path) -> dict[str, Path]:
     for name, one in (("single", single), ("calm", calm)):
         run = folder / name
         run.mkdir()
-        save(Result.from_analysis(one, provenance("name: test\n")), run / "posterior.nc")
+        Result.from_analysis(one, provenance("name: test\n")).save(run / "posterior.nc")
     found["single"] = write_pages(folder / "single")
     comparison = compare_runs([folder / "single", folder / "calm"])
     found["compare"] = overlay.write_comparison(comparison, folder / "compare")

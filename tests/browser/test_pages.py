@@ -10,7 +10,7 @@ import pytest
 from en4dvar.report.drawing import draw
 from en4dvar.report.overview import LISTED, SetSummary, overview_figures, render_overview
 from en4dvar.storage.pack import PACK
-from en4dvar.storage.plain import load_plain
+from en4dvar.storage.store import load_stored
 
 pytestmark = pytest.mark.slow  # a browser takes half a minute of the processor
 LOOK = (Path(__file__).parent / "look.js").read_text(encoding="utf-8")
@@ -71,7 +71,7 @@ def test_the_table_of_data_sets_names_its_rows_and_can_be_skipped_by_key(opened,
 
 def test_a_page_of_20000_data_sets_is_as_small_as_one_of_2000(opened, pages, tmp_path):
     """What a browser has to lay out does not grow; the first paint of such a page took 0.3 s."""
-    one = SetSummary.of(load_plain(pages["campaign"].parent / PACK / "a"), "a")
+    one = SetSummary.of(load_stored(pages["campaign"].parent / PACK / "a"), "a")
     sets = [replace(one, name=f"set{i}", stem=f"set{i}") for i in range(20_000)]
     path = tmp_path / "report.html"
     path.write_text(render_overview(sets, {}, {}, draw(overview_figures(sets)), "", ""), encoding="utf-8")

@@ -19,7 +19,6 @@ from en4dvar.cli import main
 from en4dvar.report.export import escaped, export_table, latex_table, latex_unit
 from en4dvar.report.result import Result as Posterior
 from en4dvar.report.result import load_result
-from en4dvar.storage.store import save
 
 
 def call(*arguments: str | Path) -> Result:
@@ -29,7 +28,7 @@ def call(*arguments: str | Path) -> Result:
 @pytest.fixture(scope="module")
 def one(tmp_path_factory: pytest.TempPathFactory, analysis: Analysis) -> Path:
     folder = tmp_path_factory.mktemp("one")
-    save(Posterior.from_analysis(analysis, {}), folder / "posterior.nc")
+    Posterior.from_analysis(analysis, {}).save(folder / "posterior.nc")
     return folder
 
 

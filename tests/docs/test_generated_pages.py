@@ -8,7 +8,6 @@ import pytest
 from doc_pages import ROOT, blocks
 
 from en4dvar.report.result import Result
-from en4dvar.storage.store import save
 
 PAGE = ROOT / "docs" / "reference_netcdf.md"
 
@@ -62,6 +61,6 @@ def test_the_page_names_nothing_that_is_not_there(result):
 def test_the_example_reads_a_file(result, tmp_path, monkeypatch):
     (example,) = (b for b in blocks(PAGE) if b.language == "python")
     (tmp_path / "runs" / "quickstart").mkdir(parents=True)
-    save(result, tmp_path / "runs" / "quickstart" / "posterior.nc")
+    result.save(tmp_path / "runs" / "quickstart" / "posterior.nc")
     monkeypatch.chdir(tmp_path)
     exec(compile(example.body, str(PAGE), "exec"), {})

@@ -98,7 +98,8 @@ class Campaign:
         from en4dvar.config import load_config
         from en4dvar.runs.runner import run_campaign
 
-        settings: dict[str, Any] = {"output.directory": str(out), "output.report": self.report}
+        settings: dict[str, Any] = {"output.directory": str(out)}
+        settings |= {"output.report": self.report, "output.figures": self.report}
         settings |= {"execution.executor": self.executor, "execution.checkpoint_every": 0}
         if self.executor != "serial":
             settings["execution.workers"] = 2

@@ -33,7 +33,6 @@ from en4dvar.report.result import load_result
 from en4dvar.runs.lock import LOCK, locked
 from en4dvar.state import Array, Parameter
 from en4dvar.storage.seal import seal_file
-from en4dvar.storage.store import save
 from en4dvar.summary import summary_rows
 from en4dvar.tables import csv_text as table_text
 
@@ -212,7 +211,7 @@ def test_a_lock_of_a_process_that_cannot_be(tmp_path: Path, monkeypatch: pytest.
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     analysis = assimilate(make_problem(Linear(), (1.0, 0.5)), AssimilationSettings(members=8, max_iterations=2), seed=1)
-    return save(Posterior.from_analysis(analysis, {}), tmp_path_factory.mktemp("stored") / "posterior.nc")
+    return Posterior.from_analysis(analysis, {}).save(tmp_path_factory.mktemp("stored") / "posterior.nc")
 
 
 def altered(stored: Path, folder: Path, group: str, variable: str | None, attribute: str, value: str | None) -> Path:

@@ -18,7 +18,6 @@ from en4dvar.runs import trust
 from en4dvar.runs.rerun import rerun
 from en4dvar.runs.runner import run
 from en4dvar.runs.trust import of_strangers
-from en4dvar.storage.store import save
 from en4dvar.user_code import RefusedError
 from en4dvar_bubble.laws.loading import get_law
 
@@ -135,9 +134,7 @@ def sealed(tmp_path):
     def name(path):
         text = f"name: x\nmodel: {{name: bubble, law: '{path}:Law'}}\nparameters: {{}}\n"
         file = tmp_path / "theirs" / "run" / "posterior.nc"
-        result = load_result(file)
-        result.tree.attrs["configuration_resolved"] = text
-        save(result, file)
+        load_result(file).with_attributes("/", configuration_resolved=text).save(file)
         return file.parent, law
 
     return name

@@ -15,7 +15,6 @@ from toys import make_problem
 from en4dvar.caution import CATALOGUE
 from en4dvar.report.result import Result, load_result
 from en4dvar.runs.runner import run_campaign
-from en4dvar.storage.store import save
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +35,7 @@ def campaign(tmp_path_factory):
 def test_file_keeps_code_severity_words_and_advice(tmp_path):
     analysis = run(make_problem(Violent(TWO), (1.0, 0.5), k=9))
     assert analysis.cautions
-    loaded = load_result(save(Result.from_analysis(analysis, {}), tmp_path / "posterior.nc"))
+    loaded = load_result(Result.from_analysis(analysis, {}).save(tmp_path / "posterior.nc"))
     assert loaded.cautions == analysis.cautions
     assert loaded.sample_stats.attrs["warning_codes"] == "model-validity"
     reached = loaded.sample_stats["y_reached"]

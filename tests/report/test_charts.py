@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -120,18 +118,3 @@ def test_paper_shows_the_same():
     assert ax.lines[0].get_xydata().tolist() == [[0, 4], [1, 4], [1, 8], [3, 8]]
     assert ax.lines[0].get_linewidth() == 2.0
     assert [text.get_text() for text in empty.texts] == ["+0.5"]
-
-
-@pytest.mark.slow
-def test_a_page_imports_no_matplotlib(analysis, tmp_path):
-    """Its import takes longer than the whole page."""
-    from en4dvar.report.result import Result
-    from en4dvar.storage.provenance import provenance
-    from en4dvar.storage.store import save
-
-    save(Result.from_analysis(analysis, provenance("name: test\n")), tmp_path / "posterior.nc")
-    script = "import sys; from en4dvar.report import write_pages; write_pages(sys.argv[1]); "
-    script += "sys.exit('matplotlib' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", script, tmp_path], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "report.html").read_text(encoding="utf-8").count("<svg") > 4

@@ -25,7 +25,7 @@ from en4dvar.report.compare import (
 )
 from en4dvar.report.overlay import overlay
 from en4dvar.report.result import Result
-from en4dvar.storage.store import load_stored, save
+from en4dvar.storage.store import load_stored
 
 
 def run_dir(path, names, seeds=(1,), std=0.1, wide=1.0):
@@ -38,7 +38,7 @@ def run_dir(path, names, seeds=(1,), std=0.1, wide=1.0):
         analysis = assimilate(InverseProblem(model, problem.observable, observations, prior), AssimilationSettings(), 1)
         path.mkdir(parents=True, exist_ok=True)
         result = Result.from_analysis(analysis, {"configuration": json.dumps({})})
-        add_to_pack(path, f"set{seed}", result) if len(seeds) > 1 else save(result, path / "posterior.nc")
+        add_to_pack(path, f"set{seed}", result) if len(seeds) > 1 else result.save(path / "posterior.nc")
     return path
 
 

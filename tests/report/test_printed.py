@@ -27,7 +27,7 @@ from en4dvar.report.result import Result
 from en4dvar.report.text import number_like, plus_minus
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
 from en4dvar.storage.provenance import provenance
-from en4dvar.storage.store import load_stored, save
+from en4dvar.storage.store import load_stored
 from en4dvar.summary import INTERVAL, results_table
 
 AT_BOUND = caution("at-bound", "half of the members of G pile up", parameters=("G",))
@@ -39,7 +39,7 @@ def written(folder, analysis, *cautions, name=None):
     """The run directory of a single result, or of a campaign with one of that ``name``."""
     folder.mkdir(parents=True, exist_ok=True)
     result = Result.from_analysis(replace(analysis, cautions=cautions), provenance("name: test\n"))
-    save(result, folder / "posterior.nc") if name is None else add_to_pack(folder, name, result)
+    result.save(folder / "posterior.nc") if name is None else add_to_pack(folder, name, result)
     return folder
 
 
@@ -200,9 +200,7 @@ def test_a_verdict_between_runs_that_warn_is_not_to_be_trusted(tmp_path, analysi
         written(tmp_path / "fine", analysis),
         written(tmp_path / "bad", replace(analysis, log_evidence=5.0), MISFIT),
     ]
-    save(
-        Result.from_analysis(replace(analysis, log_evidence=1.0), provenance("name: test\n")), runs[0] / "posterior.nc"
-    )
+    Result.from_analysis(replace(analysis, log_evidence=1.0), provenance("name: test\n")).save(runs[0] / "posterior.nc")
     verdict = compare_runs(runs).verdict("A_E2_synthetic")
     assert verdict.startswith("bad is preferred")
     assert verdict.endswith("not to be trusted before the warnings of bad (misfit) are settled")

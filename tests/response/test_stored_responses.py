@@ -21,7 +21,7 @@ from en4dvar.report.result import Result, load_result
 from en4dvar.storage.campaign_file import save_campaign
 from en4dvar.storage.pack import PACK, Pack
 from en4dvar.storage.provenance import provenance
-from en4dvar.storage.store import load_stored, save
+from en4dvar.storage.store import load_stored
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference_netcdf.md"
 TIMES = [0.6, 0.7, 0.8, 1.0, 1.4]
@@ -45,7 +45,7 @@ def analysis():
 @pytest.fixture(scope="module")
 def run_dir(analysis, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    save(Result.from_analysis(analysis, provenance("name: test\n")), folder / "posterior.nc")
+    Result.from_analysis(analysis, provenance("name: test\n")).save(folder / "posterior.nc")
     write_pages(folder)
     return folder
 
@@ -56,7 +56,7 @@ def lines(path):
 
 
 def test_shifts_are_read_back_the_largest_first(analysis, run_dir):
-    rows = stored_shifts(load_stored(run_dir / "posterior.nc").plain)
+    rows = stored_shifts(load_stored(run_dir / "posterior.nc"))
     assert (
         [row[0].alternative for row in rows]
         == [shift.name for shift in analysis.what_if]
@@ -69,7 +69,7 @@ def test_shifts_are_read_back_the_largest_first(analysis, run_dir):
 
 
 def test_the_ledger_is_read_back(analysis, run_dir):
-    ((u, x),) = stored_ledger(load_stored(run_dir / "posterior.nc").plain)
+    ((u, x),) = stored_ledger(load_stored(run_dir / "posterior.nc"))
     assert (u.parameter, u.quantity, u.label, x.quantity) == ("theta", "u", "input", "x")
     np.testing.assert_array_equal([u.low, u.median, u.high], analysis.ledger.quantiles[0, 0])
 
@@ -97,7 +97,7 @@ def test_a_page_without_them_is_silent(run_dir, tmp_path):
     model = Acting()
     model.path_quantities = ()
     plain = assimilate(acting_problem(TIMES, model), AssimilationSettings(members=12), 1)
-    save(Result.from_analysis(plain, provenance("name: test\n")), tmp_path / "posterior.nc")
+    Result.from_analysis(plain, provenance("name: test\n")).save(tmp_path / "posterior.nc")
     write_pages(tmp_path)
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "what-if" not in page.split("</style>")[1]
@@ -117,7 +117,7 @@ def test_a_campaign_keeps_them(run_dir, tmp_path):
 
 def test_every_variable_is_documented(run_dir):
     words = set(re.findall(r"`([\w]+)`", PAGE.read_text(encoding="utf-8")))
-    stats = load_stored(run_dir / "posterior.nc").sample_stats
+    stats = load_result(run_dir / "posterior.nc").sample_stats
     present = {str(name) for name in stats.data_vars if str(name).startswith(("what_if_", "ledger_"))}
     of_quantities = {name for name in present if re.fullmatch(r"ledger_(u|x)(_quantiles)?", name)}
     assert len(of_quantities) == 4

@@ -130,8 +130,7 @@ def test_a_result_is_saved_shown_and_compared(tmp_path, result):
 
 
 def test_a_notebook_shows_names_escaped():
-    found = fit(name="a", priors={"a": PRIORS["a"], "b": PRIORS["b"]})
-    found.tree.attrs["dataset"] = "<script>"
+    found = fit(name="a", priors={"a": PRIORS["a"], "b": PRIORS["b"]}).with_attributes("/", dataset="<script>")
     assert "<script>" not in found._repr_html_()
     assert "&lt;script&gt;" in found._repr_html_()
 

@@ -1,16 +1,20 @@
-"""What a worker writes without xarray is what xarray would have written."""
+"""What is written and read without xarray is what xarray would have written and read."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import netCDF4
 import numpy as np
 import pytest
+import xarray as xr
 
 from en4dvar.report.result import Result
 from en4dvar.storage import netcdf
 from en4dvar.storage.groups import build_groups
-from en4dvar.storage.netcdf import Group, Variable, to_bytes, tree_of
-from en4dvar.storage.store import save
+from en4dvar.storage.netcdf import Group, Variable, read_groups, to_bytes
+from en4dvar.storage.seal import seal_file
+from en4dvar.storage.xarrays import tree_of
 from en4dvar.summary import summarise
 
 
@@ -30,9 +34,34 @@ def contents(group, name=""):
 
 def test_file_is_what_xarray_would_write(analysis, tmp_path):
     to_bytes(build_groups(analysis, {"note": "x"})).write(tmp_path / "ours.nc")
-    save(Result.from_analysis(analysis, {"note": "x"}), tmp_path / "xarray.nc")
+    tree_of(build_groups(analysis, {"note": "x"})).to_netcdf(tmp_path / "xarray.nc", engine="netcdf4")
     with netCDF4.Dataset(tmp_path / "ours.nc") as ours, netCDF4.Dataset(tmp_path / "xarray.nc") as theirs:
         assert contents(ours) == contents(theirs)
+
+
+@pytest.mark.parametrize("writer", ["ours", "xarray"])
+def test_a_file_is_read_as_xarray_reads_it(make_analysis, tmp_path, writer):
+    """Missing values, truth values, texts, numbers without dimension, and coordinates that are no dimension."""
+    analysis = make_analysis(posterior_failures=("lost", *[""] * 23))
+    groups, path = build_groups(analysis, {"note": "x", "flag": True, "numbers": np.arange(3.0)}), tmp_path / "file.nc"
+    aside = {"where": Variable(("draw",), np.arange(24.0), {"units": "m"}), "once": Variable((), np.array("äö"), {})}
+    posterior = groups["/posterior"]
+    groups["/posterior"] = replace(posterior, variables={**posterior.variables, **aside})
+    if writer == "ours":
+        to_bytes(groups).write(path)
+    else:
+        tree = tree_of(groups)
+        tree["posterior"] = tree["posterior"].to_dataset().set_coords("where")
+        tree.to_netcdf(path, engine="netcdf4")
+        seal_file(path)
+    found = tree_of(read_groups(path))
+    with xr.open_datatree(path, engine="netcdf4", decode_timedelta=False) as expected:
+        xr.testing.assert_identical(found, expected.load())
+        for node in expected.subtree:
+            for name, variable in node.variables.items():
+                again = found[node.path].variables[name].dtype
+                assert again == variable.dtype or {again.kind, variable.dtype.kind} <= set("OU"), name
+    assert ("where" in found["posterior"].coords) == (writer == "xarray")
 
 
 def test_large_variables_are_written_in_blocks(tmp_path, monkeypatch):

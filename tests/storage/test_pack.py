@@ -11,7 +11,6 @@ from en4dvar.storage.checkpoint import digest
 from en4dvar.storage.netcdf import Group, Variable
 from en4dvar.storage.pack import PACK, Pack, read_result, results_of
 from en4dvar.storage.packed import opened, packed, unpacked, unpacked_together
-from en4dvar.storage.plain import load_plain
 from en4dvar.storage.store import load_stored
 
 
@@ -76,7 +75,7 @@ def test_dimensions_have_one_size(tmp_path):
     content = packed({"/posterior": Group(columns)})
     Pack(tmp_path / PACK).append("a", "f", b"", content, digest(content))
     with pytest.raises(OutputError, match=r"datasets\.pack/a: not a result of en4dvar: of 3 has the shape \(3,\)"):
-        load_plain(tmp_path / PACK / "a")
+        load_stored(tmp_path / PACK / "a")
 
 
 def groups(names, count, value):

@@ -15,10 +15,9 @@ from en4dvar.errors import ConfigError
 from en4dvar.problem import AssimilationSettings
 from en4dvar.report.figures import all_figures
 from en4dvar.report.page import render_set
-from en4dvar.report.result import Result
+from en4dvar.report.result import Result, load_result
 from en4dvar.runs.joint_run import join
 from en4dvar.runs.rerun import rerun
-from en4dvar.storage.store import load_stored, save
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +29,8 @@ def analysis():
 @pytest.fixture(scope="module")
 def result(analysis, tmp_path_factory):
     path = tmp_path_factory.mktemp("series") / "posterior.nc"
-    save(Result.from_analysis(analysis, {}), path)
-    return Result(load_stored(path).tree)
+    Result.from_analysis(analysis, {}).save(path)
+    return load_result(path)
 
 
 def test_each_series_has_its_dimension(analysis, result):
@@ -65,7 +64,7 @@ def test_the_observations_come_back_to_the_bit(analysis, result):
 def test_arviz_reads_it(analysis, result, tmp_path):
     import arviz as az  # takes seconds
 
-    save(result, tmp_path / "posterior.nc")
+    result.save(tmp_path / "posterior.nc")
     data = az.from_netcdf(tmp_path / "posterior.nc")
     assert set(data.log_likelihood.data_vars) == {"p", "q", "f"}
     for name in ("p", "q", "f"):

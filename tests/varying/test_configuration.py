@@ -150,7 +150,7 @@ def test_a_run_with_a_model_error(tmp_path):
     run(load_config(path, {"output.directory": str(out)}))
     result = load_result(out / "posterior.nc")
     assert "v_change_1" in result.posterior
-    assert stored_walks(result.plain) == ()
+    assert stored_walks(result) == ()
     assert verdict(result).startswith("v of the state: the data ")
     assert "What varies in time" in (out / "report.html").read_text(encoding="utf-8")
     assert not (out / "varying.csv").exists()
@@ -212,8 +212,8 @@ def test_pieces_in_the_file(finished):
     assert pieces.values[0, :, 2] == pytest.approx(walked.values[0])
     off = pieces.mean(("chain", "draw")) - np.array([2.0, 2.0, 1.2])
     assert np.all(np.abs(off) < 2 * pieces.std(("chain", "draw")))
-    result.tree.attrs["warnings"] = ""  # data without noise have residuals of a structure: no interval would stand
-    (walk,) = stored_walks(result.plain)
+    # data without noise have residuals of a structure: no interval would stand
+    (walk,) = stored_walks(result.with_attributes("/", warnings=""))
     assert walk.edges == pytest.approx([0.0, 0.04, 0.08, 0.15])
     assert np.all(np.diff(walk.posterior, axis=0) > 0)
     assert result.sample_stats.attrs["log_evidence_change"] > 3
@@ -221,9 +221,9 @@ def test_pieces_in_the_file(finished):
 
 
 def test_pieces_of_what_is_not_to_be_trusted_have_no_interval(finished):
-    result = load_result(finished / "posterior.nc")
-    result.tree.attrs["warnings"] = caution("at-bound", "piles up", parameters=("k",)).line
-    (walk,) = stored_walks(result.plain)
+    warned = caution("at-bound", "piles up", parameters=("k",)).line
+    result = load_result(finished / "posterior.nc").with_attributes("/", warnings=warned)
+    (walk,) = stored_walks(result)
     assert np.isnan(walk.posterior[[0, 2]]).all()
     assert np.isfinite(walk.posterior[1]).all()
     assert len(varying_figure(result).rows) == 1
