@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ from en4dvar_bubble.driving import Driving, Reading
 from en4dvar_bubble.dynamics import Gas, Heat, Start, Vapour
 from en4dvar_bubble.gas import from_kirchhoff
 from en4dvar_bubble.laws import ConstitutiveLaw, get_law
-from en4dvar_bubble.medium import UNITS, WATER_25C, Medium
+from en4dvar_bubble.medium import WATER_25C, Medium
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.solver.driver import Accuracy, AccuracyName, Radial, preset
 from en4dvar_bubble.solver.integrate import MAX_MACH, MAX_THETA, RECORD, STEPS
@@ -134,11 +134,11 @@ def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> _Output:
         np.empty((n, RECORD)),
     )
 
-    def run(begin: int, pool: ThreadPoolExecutor) -> None:
+    def run(begin: int, pool: ThreadPoolExecutor | None) -> None:
         rows = slice(begin, min(begin + chunk, n))
         size = rows.stop - rows.start
         work, finish = model.prepared(x[rows], np.broadcast_to(t, (size, len(t))))
-        others = [pool.submit(work) for _ in range(min(workers, -(-size // WIDTH)) - 1)]
+        others = [pool.submit(work) for _ in range(min(workers, -(-size // WIDTH)) - 1)] if pool else []
         work()
         for other in others:
             other.result()
@@ -147,12 +147,13 @@ def _run(model: BubbleModel, x: Array, t: Array, workers: int) -> _Output:
         failed = solution.status != 0
         for name, values in out.fields.items():
             values[rows] = paths[name]
-            values[rows][failed] = np.nan
+            if failed.any():
+                values[rows][failed] = np.nan
         out.status[rows], out.record[rows] = solution.status, solution.record
         for i in np.flatnonzero(failed):
             out.reasons[begin + i] = solution.reason(int(i))
 
-    with ThreadPoolExecutor(workers) as pool:  # its threads begin with the first work for them
+    with ThreadPoolExecutor(workers - 1) if workers > 1 else nullcontext() as pool:
         for begin in range(0, n, chunk):
             run(begin, pool)
     return out
@@ -178,10 +179,6 @@ def _dataset(model: BubbleModel, theta: Mapping[str, Array], t: Array, out: _Out
     coordinates: dict[str, Any] = {"time": ("time", t, {"units": "s", "long_name": "time"})}
     for p in model.parameters:
         coordinates[p.name] = (member, theta[p.name], {"units": p.unit, "long_name": p.label})
-    constants = {
-        name: {"value": value, "unit": UNITS[name], "source": medium.sources.get(name, "")}
-        for name, value in medium.constants.items()
-    }
     attributes = {
         "law": model.law.name,
         "start": model.start,
@@ -190,7 +187,7 @@ def _dataset(model: BubbleModel, theta: Mapping[str, Array], t: Array, out: _Out
         "radial": model.radial,
         "vapour": model.vapour,
         "medium_heat": model.medium_heat,
-        "constants": json.dumps(constants, ensure_ascii=False),
+        "constants": medium.json,
     }
     return xr.Dataset(data, coords=coordinates, attrs=attributes)
 

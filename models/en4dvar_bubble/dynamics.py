@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -107,7 +108,7 @@ class Dynamics:
             gas=self.accuracy.nodes if heat else 0,
             vapour=self.accuracy.nodes if self.vapour == "transport" else 0,
             medium=self.accuracy.medium_nodes if self.medium_heat == "conducting" else 0,
-            memory=len(self.law.relaxed(np.ones(1), self.law.example_values())[0]),
+            memory=self.law.memory_count,
             radial=self.radial,
             shear=self.law.shear_dependent,
             clustering=GAS_CLUSTERING[self.start],
@@ -136,7 +137,8 @@ class Dynamics:
     def parameters(self) -> tuple[Parameter, ...]:
         """Those of the law, then R0, or R_eq and R_max for the laser start, then the optional ones that are named."""
         radii = (R0,) if self.start == "acoustic" else (R_EQ, R_MAX)
-        return (*self.law.parameters, *radii, *(p for p in self.optional_parameters if p.name in self.named))
+        named = [p for p in self.optional_parameters if p.name in self.named] if self.named else []
+        return (*self.law.parameters, *radii, *named)
 
     @cached_property
     def optional_parameters(self) -> tuple[Parameter, ...]:
@@ -172,22 +174,8 @@ class Dynamics:
         """R, Rdot, p_b, S (stress integral); T of the gas (wall last where the medium conducts), C (mass fraction of
         vapour), T_m of the medium, Z (memory variables) where the model has them; the parameters.
         """
-        system = self.system
-        positive = (0.0, np.inf)
-        state = [
-            Field("R", unit="m", bounds=positive),
-            Field("Rdot", unit="m/s"),
-            Field("p_b", unit="Pa", bounds=(0.0 if "p_v" in self.named else self.medium.p_v, np.inf)),
-            Field("S", unit="Pa"),
-        ]
-        blocks = (
-            Field("T", system.gas + system.wall, "K", positive),
-            Field("C", system.vapour, "1", (0.0, 1.0)),
-            Field("T_m", system.medium, "K", positive),
-            Field("Z", system.memory, "Pa"),
-        )
-        state += [block for block in blocks if block.size]
-        return StateLayout((*state, *(Field(p.name, unit=p.unit) for p in self.parameters)))
+        least = 0.0 if "p_v" in self.named else self.medium.p_v
+        return _layout(self.system, tuple((p.name, p.unit) for p in self.parameters), least)
 
     def initial_states(self, theta: Mapping[str, Array]) -> Array:
         """States (N, n_state) at time zero for parameters name → (N,), SI.
@@ -198,7 +186,8 @@ class Dynamics:
         """
         for p in self.parameters:
             value = np.asarray(theta[p.name], dtype=float)
-            if not np.all((value >= p.bounds[0]) & (value <= p.bounds[1]) & np.isfinite(value)):
+            low, high = float(value.min()), float(value.max())  # NaN if one is
+            if not (p.bounds[0] <= low and high <= p.bounds[1] and math.isfinite(low) and math.isfinite(high)):
                 raise ValueError(f"{p.name} must lie in {p.bounds} {p.unit}")
         values = {p.name: np.asarray(theta[p.name], dtype=float) for p in self.parameters}
         rest = values[self.stress_free_radius]
@@ -235,3 +224,23 @@ class Dynamics:
     def law_values(self, x: Array) -> dict[str, Array]:
         """The law's parameters, name → (N,), of states (N, n_state)."""
         return {p.name: x[:, self.layout[p.name].start] for p in self.law.parameters}
+
+
+@lru_cache(maxsize=64)  # models are made anew by each call of simulate
+def _layout(system: System, parameters: tuple[tuple[str, str], ...], least_pressure: float) -> StateLayout:
+    """See :attr:`Dynamics.layout`; ``parameters`` are names and units."""
+    above_zero = (0.0, np.inf)
+    state = [
+        Field("R", unit="m", bounds=above_zero),
+        Field("Rdot", unit="m/s"),
+        Field("p_b", unit="Pa", bounds=(least_pressure, np.inf)),
+        Field("S", unit="Pa"),
+    ]
+    blocks = (
+        Field("T", system.gas + system.wall, "K", above_zero),
+        Field("C", system.vapour, "1", (0.0, 1.0)),
+        Field("T_m", system.medium, "K", above_zero),
+        Field("Z", system.memory, "Pa"),
+    )
+    state += [block for block in blocks if block.size]
+    return StateLayout((*state, *(Field(name, unit=unit) for name, unit in parameters)))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -93,6 +95,15 @@ class Medium:
     def constants(self) -> dict[str, float]:
         """Name → SI value of every constant that has a source (:data:`UNITS` has the units)."""
         return {name: float(getattr(self, name)) for name in UNITS}
+
+    @cached_property
+    def json(self) -> str:
+        """The :attr:`constants` with unit and source, as JSON."""
+        told = {
+            name: {"value": value, "unit": UNITS[name], "source": self.sources.get(name, "")}
+            for name, value in self.constants.items()
+        }
+        return json.dumps(told, ensure_ascii=False)
 
     def with_constants(self, source: str, **values: float) -> Medium:
         """The medium with some constants replaced, all from ``source``."""

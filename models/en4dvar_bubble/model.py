@@ -26,6 +26,7 @@ from en4dvar_bubble.collapse import doubts
 from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics
 from en4dvar_bubble.emission import OBSERVABLE
 from en4dvar_bubble.events import OBSERVABLES
+from en4dvar_bubble.numbers import NAMES
 from en4dvar_bubble.packing import pack
 from en4dvar_bubble.paths import Paths
 from en4dvar_bubble.settings import BubbleSettings
@@ -78,7 +79,8 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
 
     def with_parameters(self, names: Collection[str]) -> BubbleModel:
         """See :mod:`en4dvar_bubble.numbers`."""
-        named = tuple(p.name for p in self.optional_parameters if p.name in names)
+        asked = NAMES.intersection(names)  # seldom any, and to know which of them the equations contain takes longer
+        named = tuple(p.name for p in self.optional_parameters if p.name in asked) if asked else ()
         return self if named == self.named else replace(self, named=named)
 
     @property

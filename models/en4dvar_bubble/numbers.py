@@ -62,3 +62,4 @@ RDOT_START = Parameter("Rdot_start", "m/s", "normal", label="velocity of the wal
 _OF_PULSES = {p.name: p for made in PULSES.values() for _, _, p in numbers_of(made)}
 _OF_PULSES |= {number.parameter.name: number.parameter for number in OF_RECORD}
 ALL = (*OF_MEDIUM.values(), P_A, GAS_CONTENT, R_START, RDOT_START, *_OF_PULSES.values())
+NAMES = frozenset(p.name for p in ALL)

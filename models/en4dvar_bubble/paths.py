@@ -110,12 +110,16 @@ class Paths(Batch):
     def _stretch(self) -> Array:
         return np.exp(self.solution.states[:, :, -1] - self.par[:, None, rows.LOG_R0])
 
-    def _T(self) -> Array:
-        system, medium = self.model.system, self.medium(2)
+    def _theta(self) -> Array:
+        """Temperature of the gas over that far away."""
+        system = self.model.system
         tau = self.solution.states[:, :, : system.gas]
         if system.wall:
             tau = np.concatenate([tau, self.solution.states[:, :, system.wall_row, None]], axis=2)
-        return from_kirchhoff(tau, medium) * medium.T_inf
+        return from_kirchhoff(tau, self.medium(2))
+
+    def _T(self) -> Array:
+        return self["theta"] * self.medium(2).T_inf
 
     def _chi(self) -> Array:
         system = self.model.system
@@ -137,16 +141,15 @@ class Paths(Batch):
         gas = self.par[:, None, rows.LOG_GAS]
         if not system.gas:
             return np.asarray(np.exp(gas - 3 * self.model.exponent(medium) * log_R) * medium.rho + medium.p_v)
-        m, weights = system.gas, system.ball.weights
-        T = self["T"]
-        share = weights[:m] * self.medium(2).T_inf / T[:, :, :m]
-        wall = T[:, :, m] if system.wall else np.broadcast_to(medium.T_inf, log_R.shape)
-        at_wall = weights[m] * medium.T_inf / wall
+        m, weights, theta = system.gas, system.ball.weights, self["theta"]
+        share = 1 / theta[:, :, :m]
+        wall = theta[:, :, m] if system.wall else np.ones(1)
+        at_wall = weights[m] / wall
         content = np.exp(gas - 3 * log_R) * medium.rho
         if system.vapour:
             share = share * (1 - self["chi"])
-            content = content + saturated_vapour_pressure(wall) * at_wall
-        return np.asarray(content / (share.sum(axis=2) + at_wall) + medium.p_v)
+            content = content + saturated_vapour_pressure(wall * medium.T_inf) * at_wall
+        return np.asarray(content / (share @ weights[:m] + at_wall) + medium.p_v)
 
     def _S(self) -> Array:
         system, rho = self.model.system, self.medium(1).rho

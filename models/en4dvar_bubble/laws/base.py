@@ -108,6 +108,12 @@ class ConstitutiveLaw:
         """Whether the viscosity is the method, not the parameter ``mu``."""
         return type(self).viscosity is not ConstitutiveLaw.viscosity
 
+    @property
+    def memory_count(self) -> int:
+        """Number of memory variables."""
+        has_memory = type(self).memory is not ConstitutiveLaw.memory
+        return len(self.memory(columns(self.example_values()))) if has_memory else 0
+
     def samples(self, values: Mapping[str, Array]) -> Array | None:
         """J_e in Pa of N members at the nodes of the grid and its halo, (N, K); None where the law is W′(λ)."""
         if not self.closed_form:
