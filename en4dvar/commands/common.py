@@ -103,6 +103,7 @@ def config_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The argument CONFIG with --data and --set, which the command gets as one :class:`Source`."""
 
     @click.argument("config", type=click.Path(path_type=Path))
+    @click.argument("more", nargs=-1, metavar="")
     @click.option(
         "--data", metavar="FILE", type=click.Path(), help="Data file, folder or pattern instead of data.path."
     )
@@ -110,7 +111,14 @@ def config_options(command: Callable[..., Any]) -> Callable[..., Any]:
         "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a value, e.g. assimilation.members=96."
     )
     @functools.wraps(command)
-    def with_source(config: Path, data: str | None, settings: tuple[str, ...], **options: Any) -> Any:
+    def with_source(
+        config: Path, more: tuple[str, ...], data: str | None, settings: tuple[str, ...], **options: Any
+    ) -> Any:
+        if more:  # what a shell makes of a pattern
+            raise click.UsageError(
+                f"{more[0]}: there is one configuration; many data files are named by --data 'FOLDER/*.csv' (a folder, "
+                "or a pattern in quotes)"
+            )
         return command(Source(config, data, settings), **options)
 
     return with_source

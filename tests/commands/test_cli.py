@@ -187,6 +187,7 @@ BAD: dict[str, tuple[Callable[[Path], list[str | Path]], str]] = {
     "a folder as configuration": (lambda f: ["run", f], "a folder, not a configuration; 'en4dvar init --data "),
     "unwritable": (lambda f: ["run", write_toy(f), "--out", f / "toy.csv" / "out"], "cannot be used as run directory"),
     "a file as directory": (lambda f: ["run", write_toy(f), "--out", f / "toy.csv"], "cannot be used as run directory"),
+    "an unquoted pattern": (lambda f: ["run", write_toy(f), "--data", "a", "b"], "b: there is one configuration; many"),
     "bad --set": (lambda f: ["run", write_toy(f), "--set", "members"], "'members' is not KEY=VALUE"),
     "unknown --set": (lambda f: ["run", write_toy(f), "--set", "assimilation.x=1"], "--set assimilation.x: "),
     "unknown command": (lambda f: ["rum"], "No such command 'rum'"),
