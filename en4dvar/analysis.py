@@ -72,7 +72,7 @@ class StartRecord:
 class Descents:
     """Where all descents of one data set ended.
 
-    ``members`` (D,) of the prior ensemble from which they started, -1 for its mean, -2 for a draw of the posterior;
+    ``members`` (D,) of the prior ensemble from which they started, -1 for its mean, -2 for a draw beyond the ensemble;
     ``minimum`` (D,) the number of the minimum of J in which each ended, 0 is the lowest and -1 none, since the model
     failed; ``costs`` of the minima; ``spread``, by how much J of those in the lowest differs; forward ``runs`` of the
     search after the first descents.
@@ -108,7 +108,9 @@ def _members(numbers: Sequence[int]) -> str:
     listed = " and ".join(part for part in (", ".join(known[:-1]), *known[-1:]) if part)
     names = [f"member{'s' * (len(known) > 1)} {listed}"] if known else []
     mean = ["the prior mean"] if -1 in numbers else []
-    return " and ".join([*names, *mean, *(["a draw"] if -2 in numbers else [])])
+    draws = sum(i == -2 for i in numbers)
+    beyond = [f"{draws} draws" if draws > 1 else "a draw"] if draws else []
+    return " and ".join([*names, *mean, *beyond])
 
 
 Record = IterationRecord | StartRecord | Descents | ChainRecord

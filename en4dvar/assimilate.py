@@ -81,8 +81,8 @@ def _through(stages: Stages, resume: LoopState | None) -> Analysis:
         space.members,
         ends.members,
         ends.mode,
-        stages.costs(ends.members, ends.run),
-        float(stages.costs(ends.mode[None], ends.central)[0]),
+        space.costs(ends.members, ends.run),
+        float(space.costs(ends.mode[None], ends.central)[0]),
     )
     analysis = replace(
         _concluded(stages, prior_run, found.descent, sampled, control),

@@ -28,7 +28,7 @@ from en4dvar.state import Array
 
 def descents_of(found: Found, n_members: int) -> Descents | None:
     """Where they ended; None where there were none to compare. Starts that are no members of the prior have number -1,
-    its mean, or -2, a draw of the posterior.
+    its mean, or -2, draws beyond the ensemble.
     """
     if not found.minima:
         return None

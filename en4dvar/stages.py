@@ -123,8 +123,9 @@ class Stages:
         """All minima, the lowest descent, and the ensemble about it.
 
         After the first descents one from a member far from the minimum looks for another. Of a cheap model, or for a
-        chain, many are tried where there is one or where J of the posterior members is not that of a Gaussian; else
-        some, where the lowest minimum is that of one descent alone.
+        chain, many are tried where there is one or where J of the posterior members is not that of a Gaussian, and
+        draws beyond the ensemble where the lowest J is higher than noise and prior explain; of another model some,
+        where the lowest minimum is that of one descent alone.
         """
         space, scheme, before = self.space, self.scheme, self.latest.descent
         assert before is not None
@@ -146,18 +147,21 @@ class Stages:
         ends = self.gaussian(found.descent)
         if begun.over > 1 and not begun.lower:
             space.forward_runs = start.forward_runs  # they were counted before the second round
-        fit = diag.gaussianity(ends.members, ends.mode, self.costs(ends.members, ends.run))["gaussian_fit"]
+        fit = diag.gaussianity(ends.members, ends.mode, space.costs(ends.members, ends.run))["gaussian_fit"]
         rest = search.rest(found)
         if rest and (len(found.minima) > 1 or not fit >= CLEARED):
-            earlier, found = found, search.round(found, rest)
-            ends = ends if found.descent is earlier.descent else self.gaussian(found.descent)
-        return found, ends
+            found, ends = self.rather(search.round(found, rest), found, ends)
+        return self.rather(search.widened(found), found, ends)
+
+    def rather(self, after: Found, found: Found, ends: Ends) -> tuple[Found, Ends]:
+        """What was found ``after`` a round, and the ensemble about it: that of before where it is no lower descent."""
+        return after, ends if after.descent is found.descent else self.gaussian(after.descent)
 
     def searched_from(self, found: Found, ends: Ends, x: Array) -> tuple[Found, Ends]:
         """The same, after a descent from a draw x (n,) of the posterior that lies lower than all minima."""
         assert isinstance(self.scheme, En4DVar)
         after = from_draw(self.space, self.scheme, found, x, self.seed, self.tell)
-        return after, ends if after is found else self.gaussian(after.descent)
+        return self.rather(after, found, ends)
 
     def keep_search(self, state: Callable[[], tuple[Found, SearchState]]) -> None:
         runs = self.space.forward_runs
@@ -203,7 +207,7 @@ class Stages:
             cheap = samples(space)
             # with a discrepancy emulated J costs as much as true J: where that may be sampled, it tells
             settle = not (cheap and self.problem.discrepancy)
-            costs = self.costs(ends.members, ends.run)
+            costs = space.costs(ends.members, ends.run)
             shape = examine_shape(space, ends.members, ends.mode, costs, self.seed, settle)
             if not (cheap and minima and in_doubt(minima, agree, shape)):
                 return Sampled(ends, None, shape)
@@ -219,7 +223,7 @@ class Stages:
         space = self.space
 
         def cost(x: Array) -> Array:
-            return self.costs(x, space.forecast(x))
+            return space.costs(x, space.forecast(x))
 
         def keep(state: ChainState) -> None:
             self.keep(lambda: replace(self.latest, refinement=Refinement(state, space.forward_runs)))
@@ -233,11 +237,6 @@ class Stages:
 
         look = self.tell
         return refined(space, cost, posterior, minima, self.seed, looking=looking, resume=resume, keep=keep, look=look)
-
-    def costs(self, members: Array, run: Forecast) -> Array:
-        """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""
-        z = self.problem.prior.white(members)
-        return np.where(run.active, 0.5 * np.sum(z**2, axis=1) + self.space.observation_cost(run), np.inf)
 
     def keep(self, state: Callable[[], LoopState]) -> None:
         if self._keep is not None:

@@ -34,6 +34,22 @@ class UnlikeWells(Wells):
     narrow = True
 
 
+class Hidden(Wells):
+    """y = f(a) + b t, f = 2 tanh a but 2 to 8 in a narrow piece, -1.6 < a < -1.4, from which J leads away."""
+
+    def curve(self, theta, t):
+        a, b = theta
+        return np.where(np.abs(a + 1.5) < 0.1, 2 + 30 * (a + 1.6), 2 * np.tanh(a)) + b * t
+
+
+def hidden_well(seed):
+    """Readings that only the narrow piece explains, with a = -1.5."""
+    model = Hidden(compiled=True)
+    a, b = model.parameters
+    terms = (PriorTerm.normal(a, 0.0, 1.0), PriorTerm.normal(b, 0.0, 0.5))
+    return make_problem(model, [-1.5, 0.3], std=0.2, prior=terms, seed=seed)
+
+
 def two_wells(kind=Wells, compiled=True, mean=0.3, seed=1):
     model = kind(compiled=compiled)
     a, b = model.parameters

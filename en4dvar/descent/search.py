@@ -1,21 +1,24 @@
 """Whether there is another minimum than the one that the first descents ended in.
 
 Members of low J may all lie in the basin of a wrong minimum. A challenger starts from the member farthest from the
-minimum, chosen by the forecast of the prior ensemble that is there anyway; where it ends elsewhere, others follow. All
-rounds are kept as they go, so that an interrupted run repeats no descent.
+minimum, chosen by the forecast of the prior ensemble that is there anyway; where it ends elsewhere, others follow.
+Where noise and prior do not explain the lowest J, no member may lie in the right basin: many more draws of the prior
+are run, and the lowest of them start descents. All rounds are kept as they go, so that an interrupted run repeats no
+descent.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from en4dvar.analysis import Record, StartRecord
 from en4dvar.descent.loop import iterate
 from en4dvar.descent.minima import Minimum, merged
-from en4dvar.descent.start import AGREE, Rounds, StartState, affordable, descent_from
+from en4dvar.descent.start import AGREE, Rounds, StartState, affordable, descent_from, highest_plausible, side_by_side
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
 from en4dvar.ensemble.forecast import Forecast
@@ -25,6 +28,7 @@ from en4dvar.schemes.en4dvar import En4DVar
 from en4dvar.state import Array
 
 SAME_COST = 0.01  # of J, by which a descent must end lower to be another one
+WIDER = 20  # times the ensemble: draws of the prior beyond it
 
 
 @dataclass(frozen=True)
@@ -46,8 +50,8 @@ class SearchState:
 @dataclass(frozen=True)
 class Found:
     """The lowest ``descent``, converged, the same as it was ``before`` its last iteration, all minima, the lowest
-    first, the members that were ``tried``, from which descents started (N: the prior mean; beyond it draws of the
-    posterior), and the forward ``runs`` of a search of so many ``rounds``.
+    first, the members that were ``tried``, from which descents started (N: the prior mean; beyond it draws that
+    are no members), and the forward ``runs`` of a search of so many ``rounds``.
     """
 
     descent: Descent
@@ -93,6 +97,32 @@ class Search:
         while not found.agreed and (rest := self.rest(found)):
             found = self.round(found, rest[:together])
         return found
+
+    def widened(self, found: Found) -> Found:
+        """After descents from the lowest of many draws beyond the ensemble, where J is higher than noise and prior
+        explain and there were none yet.
+        """
+        n_members = len(self.space.members)
+        if found.descent.cost <= highest_plausible(self.space) or max(found.tried) > n_members:
+            return found
+        return self.round(found, [n_members + 1 + i for i in range(side_by_side(self.space))])
+
+    @cached_property
+    def lowest_draws(self) -> Array:
+        """(B, n) of the draws that an ensemble :data:`WIDER` times as large would add, as many as go side by side."""
+        space, n_members = self.space, len(self.space.members)
+        draws = space.problem.prior.sample((1 + WIDER) * n_members, self.seed, "random")[n_members:]
+        costs = np.concatenate([space.costs(x, space.forecast(x)) for x in np.split(draws, WIDER)])
+        return np.asarray(draws[np.argsort(costs, kind="stable")[: side_by_side(space)]])
+
+    def begin(self, number: int) -> Descent:
+        """From a member, the mean or one of :attr:`lowest_draws`, by its number in :attr:`Found.tried`."""
+        beyond = number - len(self.space.members) - 1
+        return (
+            descent_from(self.space, number)
+            if beyond < 0
+            else descent_at(self.space, self.lowest_draws[beyond], number)
+        )
 
     def rest(self, found: Found) -> list[int]:
         """The members for which a descent can be afforded and that were not tried."""
@@ -140,7 +170,7 @@ class Search:
 
         window = Rounds(self.space, self.seed, comparison or StartState(), keep, self.tell, found.minima)
         if comparison is None:
-            window.begin_round([descent_from(self.space, i) for i in members])
+            window.begin_round(list(map(self.begin, members)))
         iterate(window, self.scheme, window.descents)
         window.end_round()
         lowest = window.lowest
@@ -174,14 +204,19 @@ def from_draw(
     :func:`~en4dvar.descent.start.choose_start`.
     """
     before, rounds = space.forward_runs, found.rounds + 1
-    draw = len(space.members) + rounds
-    rival = Descent(space.start(space.weights_of(x)), members=(draw,))
+    draw = max(*found.tried, len(space.members)) + 1
+    rival = descent_at(space, x, draw)
     tell(StartRecord(1, (float(space.try_out(rival.weights.w[None]).costs[0]),), 1, rounds))
     after = lower(DataWindow(space, seed, lambda: None, tell), scheme, rival, found)
     if after is found:
         return found
     runs = found.runs + space.forward_runs - before
     return replace(after, tried=(*found.tried, draw), runs=runs, rounds=rounds)
+
+
+def descent_at(space: WeightSpace, x: Array, number: int) -> Descent:
+    """One that starts at a control vector x (n,) that is no member."""
+    return Descent(space.start(space.weights_of(x)), members=(number,))
 
 
 def challenger(space: WeightSpace, run: Forecast, found: Found) -> int:

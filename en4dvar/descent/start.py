@@ -98,11 +98,16 @@ def descent_from(space: WeightSpace, member: int) -> Descent:
 
 
 def affordable(space: WeightSpace, scheme: En4DVar, run: Forecast) -> list[int]:
-    """Members of lowest J, so many that a linearisation for each costs no more than one bundle of N; at least one."""
+    """Members of lowest J, as many as go :func:`side_by_side`; at least one."""
     costs = space.drawn.background_costs + space.observation_cost(run)
     best = np.argsort(costs, kind="stable").tolist()
-    count = len(space.members) // (space.basis.shape[1] + 1) if scheme.economical(space.basis) else 1
+    count = side_by_side(space) if scheme.economical(space.basis) else 1
     return [i for i in best[:count] if np.isfinite(costs[i])] or best[:1]
+
+
+def side_by_side(space: WeightSpace) -> int:
+    """Descents for which a linearisation of each costs no more than one bundle of N together."""
+    return len(space.members) // (space.basis.shape[1] + 1)
 
 
 def highest_plausible(space: WeightSpace) -> float:

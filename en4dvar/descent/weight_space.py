@@ -128,6 +128,11 @@ class WeightSpace:
         """J_o (B,)."""
         return self.problem.observations.cost(run.predicted)
 
+    def costs(self, x: Array, run: Forecast) -> Array:
+        """J (B,) of control vectors (B, n), from their forecast and the prior's own mean and covariance."""
+        z = self.problem.prior.white(x)
+        return np.where(run.active, 0.5 * np.sum(z**2, axis=1) + self.observation_cost(run), np.inf)
+
     def try_out(self, w: Array) -> Trials:
         """J and predictions of central trajectories at weights (B, N)."""
         run = self.forecast(self.control(w))

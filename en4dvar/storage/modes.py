@@ -28,7 +28,7 @@ def mode_variables(a: Analysis) -> dict[str, Variable]:
 
 def _descents(d: Descents) -> dict[str, Variable]:
     costs = [d.costs[number] if number >= 0 else np.nan for number in d.minimum]
-    member = "member of the prior ensemble from which it started, -1: the mean, -2: a draw of the posterior"
+    member = "member of the prior ensemble from which it started, -1: the mean, -2: a draw beyond it"
     minimum = "number of the minimum of J in which it ended, 0: the lowest, -1: none"
     return {
         "descent_member": variable("descent", np.array(d.members), "1", member, fill=False),

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from same_bits import assert_same_bits
 from toys import Decay, Wave, make_problem
-from wells import UnlikeWells, Wells, mass_of_positive, two_wells
+from wells import UnlikeWells, Wells, hidden_well, mass_of_positive, two_wells
 
 from en4dvar import stages
 from en4dvar.analysis import Descents, StartRecord
 from en4dvar.assimilate import LoopState, assimilate
+from en4dvar.descent.search import Search
 from en4dvar.prior import PriorTerm
 from en4dvar.problem import AssimilationSettings
 from en4dvar.sampling import refine
@@ -73,6 +74,58 @@ def test_descents_go_on_until_two_agree():
         rounds.append(len(analysis.descents.members))
     assert min(rounds) == 3
     assert max(rounds) > 4
+
+
+def hidden(seed):
+    """A problem whose right well holds no member of the ensemble of the same seed."""
+    problem = hidden_well(seed)
+    members = problem.prior.sample(48, seed)
+    assert np.all(np.abs(members[:, 0] + 1.5) > 0.1)
+    return problem
+
+
+def test_a_well_without_a_member_is_found_where_noise_and_prior_explain_nothing_else(monkeypatch):
+    for seed in (0, 4, 8, 15):
+        analysis = assimilate(hidden(seed), AssimilationSettings(), seed)
+        assert analysis.centre[0] == pytest.approx(-1.5, abs=0.05)
+        told = analysis.descents
+        beyond = [number for member, number in zip(told.members, told.minimum, strict=True) if member == -2]
+        assert len(beyond) == 48 // 3
+        assert beyond.count(0) == told.agreeing >= 2
+        assert f" from {told.agreeing} draws (within " in told.words
+        assert told.costs[0] < 10 < 100 < told.costs[1]
+        assert told.runs > 20 * 48
+        assert "misfit" not in {c.code for c in analysis.cautions}
+    monkeypatch.setattr(Search, "widened", lambda self, found: found)
+    lost = assimilate(hidden(15), AssimilationSettings(), 15)
+    assert lost.modes[0].cost > 100
+    assert "misfit" in {c.code for c in lost.cautions}
+
+
+@pytest.mark.parametrize("settings", [{"refine": "none"}, {"starts": 1}])
+def test_no_draws_beyond_the_ensemble_where_the_search_is_to_be_short(settings):
+    assert assimilate(hidden(15), AssimilationSettings(**settings), 15).descents.runs < 20 * 48
+
+
+def test_no_draws_beyond_the_ensemble_where_the_lowest_minimum_is_plausible(monkeypatch):
+    monkeypatch.setattr(Search, "lowest_draws", None)
+    found = [assimilate(two_wells(UnlikeWells, seed=seed), AssimilationSettings(), seed) for seed in range(4)]
+    assert all(-2 not in analysis.descents.members for analysis in found)
+
+
+@pytest.mark.slow
+def test_a_search_among_draws_goes_on_from_any_state_to_the_same_bits():
+    problem, settings, seen = hidden(4), AssimilationSettings(), set()
+    whole, states = interrupted(problem, settings, 4)
+    for state in states:
+        begun = state.search
+        if begun is None:
+            continue
+        descents = begun.comparison.descents if begun.comparison else ()
+        among = max(*state.tried, *(i for d in descents for i in d.members)) > 48
+        seen.add((among, begun.comparison is not None, begun.rival is not None))
+        assert_same_bits(interrupted(problem, settings, 4, state)[0], whole)
+    assert {kind[1:] for kind in seen if kind[0]} == {(True, False), (False, False)}
 
 
 def interrupted(problem, settings, seed, resume=None):
