@@ -118,8 +118,12 @@ def percent(share: float) -> str:
 
 
 def fixed(value: float, places: int) -> str:
-    """A number of so many decimals; an en dash for NaN."""
-    return f"{value:.{places}f}" if math.isfinite(value) else "–"
+    """A number of so many decimals; an en dash for NaN.
+
+    >>> fixed(-1.25, 1), fixed(-0.01, 1)
+    ('-1.2', '0.0')
+    """
+    return f"{value:z.{places}f}" if math.isfinite(value) else "–"
 
 
 def shown(variable: Variable | xr.DataArray) -> Array:
