@@ -34,11 +34,8 @@ class Result(StoredResult):
 
     @cached_property
     def tree(self) -> xr.DataTree:
-        """All groups of the file. Raises :class:`OutputError`: xarray cannot show them."""
-        try:
-            return tree_of(self.groups)
-        except ValueError as error:  # anybody can write a checksum
-            raise OutputError(f"{self.name}: not a result of en4dvar: {error}") from None
+        """All groups of the file."""
+        return tree_of(self.groups)
 
     def dataset(self, group: str) -> xr.Dataset:
         """A group of the file, e.g. ``"prior_predictive"``, with the variables of the group beside it."""

@@ -75,8 +75,12 @@ class Group:
         """Length of every dimension."""
         return {dim: size for v in self.every.values() for dim, size in zip(v.dims, v.values.shape, strict=True)}
 
-    def check_sizes(self) -> None:
-        """Raise :class:`ValueError` where variables do not agree on the length of a dimension, as xarray does."""
+    def check(self) -> None:
+        """Raise :class:`ValueError`, as xarray does, where variables do not agree on the length of a dimension, or
+        where a name is that of a variable and of a coordinate.
+        """
+        if both := self.variables.keys() & self.coords.keys():
+            raise ValueError(f"{', '.join(sorted(both))}: both a variable and a coordinate")
         sizes = self.sizes
         for name, v in self.every.items():
             if v.values.shape != tuple(sizes[dim] for dim in v.dims):

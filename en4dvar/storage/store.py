@@ -194,8 +194,9 @@ def load_stored(path: str | Path) -> StoredResult:
     path = Path(path)
     try:
         groups = unpacked(read_result(path)) if path.parent.name == PACK else read_groups(path)
-        for group in groups.values():
-            group.check_sizes()
+        for path_in_file, group in groups.items():
+            group.check()
+            joined(groups, path_in_file).check()
     except ValueError as error:  # anybody can write a checksum
         raise OutputError(f"{path}: not a result of en4dvar: {error}") from None
     check_complete(path, groups)

@@ -78,6 +78,17 @@ def test_dimensions_have_one_size(tmp_path):
         load_stored(tmp_path / PACK / "a")
 
 
+@pytest.mark.parametrize("beside", ["/observed_data", "/observation_errors"])
+def test_a_name_is_that_of_a_variable_or_of_a_coordinate(tmp_path, beside):
+    """Also together with the group beside it."""
+    column = {"time": Variable(("time",), np.zeros(3), {})}
+    content = {"/observed_data": Group(coords=column), "/observation_errors": Group()}
+    content[beside] = Group(column, content[beside].coords)
+    Pack(tmp_path / PACK).append("a", "f", b"", packed(content), digest(packed(content)))
+    with pytest.raises(OutputError, match=r"datasets\.pack/a: not a result .*: time: both a variable and a coordinate"):
+        load_stored(tmp_path / PACK / "a")
+
+
 def groups(names, count, value):
     """Of parameters and ``count`` draws, with a scalar that tells them apart."""
     variables = {"x": Variable(("parameter", "draw"), np.full((len(names), count), value), {})}
