@@ -23,11 +23,12 @@ from misspecification import ROWS, with_discrepancy
 from records import Record, fill
 from scipy.optimize import minimize
 
-from en4dvar.assimilate import assimilate
+from en4dvar.data.noise import SMOOTHNESS
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.noise import SMOOTHNESS
-from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.state import Array
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.model.state import Array
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
 
 MISSED = (
     "laser, as stated",

@@ -13,11 +13,11 @@ from collections.abc import Callable
 import numpy as np
 from worlds import RIGHT, Twin, World, read_once
 
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.model.state import TIME_SHIFT, Array
+from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
-from en4dvar.state import TIME_SHIFT, Array
 from en4dvar_bubble import BubbleModel
 from en4dvar_bubble.solver.driver import AccuracyName, preset
 

@@ -1,6 +1,6 @@
 """Twin experiments side by side with DAPPER: the same truths and observations, settings and inflation.
 
-    pip install en4dvar[benchmark]
+    pip install '.[benchmark]'
     python benchmarks/against_dapper.py [--cycles 1000] [--seeds 5] [--only 'L96 N=25']
 
 Prints analysis RMSE (after a burn-in of a tenth, averaged over seeds; the ratio with its standard error) and time of
@@ -24,16 +24,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from en4dvar.cycling.model_error import ModelError
-from en4dvar.cycling.sequential import CycleSeries, SequentialSettings, run_sequential
-from en4dvar.forward import Observable
-from en4dvar.prior import member_stream
-from en4dvar.schemes.base import Draw, Evaluation, SeriesScheme, Step, Weights
+from en4dvar.model.forward import Observable
+from en4dvar.priors.prior import member_stream
+from en4dvar.schemes.base import Draw, Evaluation, Scheme, Step, Weights
 from en4dvar.schemes.enkf_n import EnKFN
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 from en4dvar.schemes.inflation import Inflation
-from en4dvar.schemes.localisation import Localisation
+from en4dvar.schemes.localisation import BlockLocalisation
+from en4dvar.series.model_error import ModelError
+from en4dvar.series.sequential import CycleSeries, SequentialSettings, run_sequential
 from en4dvar_lorenz import Lorenz63, Lorenz96
 from en4dvar_lorenz.lorenz63 import Lorenz63Settings
 from en4dvar_lorenz.lorenz96 import Lorenz96Settings
@@ -159,7 +159,7 @@ def draw(case: Case, cycles: int, seed: int) -> tuple[np.ndarray, np.ndarray, np
 def settings_of(case: Case, size: int, n: int) -> SequentialSettings:
     """Ours, for states (size,) of which ``n`` variables move."""
     if isinstance(case.scheme, int):
-        scheme: SeriesScheme = IEnKS(case.scheme, tolerance=case.system.tolerance)
+        scheme: Scheme = IEnKS(case.scheme, tolerance=case.system.tolerance)
     else:
         filters = {"EnKF-N": AsDapper() if case.variant == "DAPPER's" else EnKFN(), "ETKF": ETKF()}
         scheme = filters[case.scheme]
@@ -168,7 +168,7 @@ def settings_of(case: Case, size: int, n: int) -> SequentialSettings:
         places = np.where(moves, np.arange(size), np.nan)
         # DAPPER's radius is where the taper is exp(−½), ours where it is 5/24; two variables share an analysis in both
         radius = 1.82 * case.radius
-        local = Localisation.on_line(places, np.arange(0.0, n, case.seen), radius, float(n), block_size=2)
+        local = BlockLocalisation.on_line(places, np.arange(0.0, n, case.seen), radius, float(n), block_size=2)
     if case.noise:
         error = ModelError(np.where(moves, case.noise, 0.0), case.form)
     return SequentialSettings(

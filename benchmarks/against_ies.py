@@ -1,6 +1,6 @@
 """ES-MDA side by side with ``iterative_ensemble_smoother`` on a linear problem: same posterior, analysis time.
 
-    pip install en4dvar[benchmark]
+    pip install '.[benchmark]'
     python benchmarks/against_ies.py
 
 Both get the same ensemble, and first the same perturbations, so that the posteriors agree to rounding; then each draws

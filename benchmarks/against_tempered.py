@@ -28,17 +28,18 @@ from laser_twin import make_laser_twin
 from records import Record, fill
 from tempered import Tempered, tempered
 
-from en4dvar.analysis import Analysis
-from en4dvar.assimilate import assimilate
-from en4dvar.config.build import build
+from en4dvar.assembly.build import build
 from en4dvar.config.load import load_config
 from en4dvar.descent.minima import Minimum
+from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.ensemble.forecast import log_posterior
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.stages import Stages
 from en4dvar.executor import SerialExecutor
-from en4dvar.prior import own_seed
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.priors.prior import own_seed
+from en4dvar.problem import InverseProblem
 from en4dvar.sampling.refine import shares_of, that_count
-from en4dvar.stages import Stages
+from en4dvar.schemes.settings import AssimilationSettings
 
 CHAIN, LASER, DRAWS = "mcmc:", "laser:", 6000
 ROOT = Path(__file__).resolve().parents[1]
@@ -57,7 +58,7 @@ MEASURED = {
 
 
 class Case(NamedTuple):
-    """The arguments of :func:`~en4dvar.assimilate.assimilate`."""
+    """The arguments of :func:`~en4dvar.estimation.assimilate.assimilate`."""
 
     problem: InverseProblem
     settings: AssimilationSettings

@@ -24,9 +24,10 @@ from records import Record, fill
 from worlds import Twin
 
 from en4dvar.descent.start import highest_plausible
+from en4dvar.estimation.stages import Stages
 from en4dvar.executor import SerialExecutor, one_blas_thread
-from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.stages import Stages
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
 
 STIFF = "stiff gel, gas of init"
 SETS: dict[str, Callable[[int], Twin]] = {**ROWS, STIFF: lambda seed: stiff_gel(seed, PROPOSED)}

@@ -26,14 +26,14 @@ from records import Record, fill
 from scipy.stats import binomtest, chisquare
 from worlds import Twin
 
-from en4dvar.assimilate import assimilate
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.forecast import log_posterior
-from en4dvar.errors import En4dvarError
+from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import SerialExecutor
-from en4dvar.problem import AssimilationSettings
+from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.shape import guide
+from en4dvar.schemes.settings import AssimilationSettings
 
 BINS = 7  # of 49 ranks
 CENTRAL = (25, 45)  # of 49 ranks: the central intervals nearest to 50 and 90 %

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from en4dvar.forward import Failure, ForwardModel, Observable, StateField, Trajectory
-from en4dvar.state import Field, Parameter, StateLayout
+from en4dvar.model.forward import Failure, ForwardModel, Observable, StateField, Trajectory
+from en4dvar.model.state import Field, Parameter, StateLayout
 
 YAML = """\
 name: campaign

@@ -19,15 +19,16 @@ from scipy.io import loadmat
 from scipy.optimize import least_squares, minimize
 from scipy.special import gamma
 
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.joint import JointEstimate, estimate_jointly, sharing
-from en4dvar.joint.estimate import Single
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.estimation.joint import JointEstimate, estimate_jointly, sharing
+from en4dvar.estimation.joint.estimate import Single
+from en4dvar.model.state import Array
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
 from en4dvar.sampling.forward_runs import ForwardRuns
-from en4dvar.state import Array
+from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import BubbleModel, NeoHookeanKelvinVoigt
 from en4dvar_bubble.medium import WATER_25C
 

@@ -28,16 +28,17 @@ from records import Record, fill
 from scipy.special import logsumexp
 from scipy.stats import kendalltau
 
-from en4dvar.assimilate import assimilate
-from en4dvar.design.evaluate import SampleSizes, evaluate
-from en4dvar.design.planned import Planned
-from en4dvar.design.readings import choose
-from en4dvar.errors import En4dvarError
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior
-from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.state import Array
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.design.evaluate import SampleSizes, evaluate
+from en4dvar.estimation.design.planned import Planned
+from en4dvar.estimation.design.readings import choose
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.priors.prior import Prior
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import BubbleModel
 
 ABOUT = ("G", "mu")

@@ -11,9 +11,9 @@ import numpy as np
 
 from en4dvar.descent.field import field_en4dvar, field_esmda
 from en4dvar.descent.field_data import FieldData
-from en4dvar.field_prior import FieldPrior
+from en4dvar.model.state import Array
+from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.schemes.local_gain import ByCorrelation, ByDistance
-from en4dvar.state import Array
 from en4dvar_diffusion import Aquifer
 
 ERROR = 0.02  # of the largest head

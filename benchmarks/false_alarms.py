@@ -24,13 +24,13 @@ from laser_twin import make_laser_twin
 from records import Record, fill
 from worlds import Twin
 
-from en4dvar.assimilate import assimilate
 from en4dvar.descent.weight_space import prior_ensemble
+from en4dvar.diagnosis.honesty.examine import doubts
+from en4dvar.diagnosis.response.what_if import changed_problem
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.forward import Alternative
-from en4dvar.honesty.examine import doubts
-from en4dvar.problem import AssimilationSettings
-from en4dvar.response.what_if import changed_problem
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.model.forward import Alternative
+from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import BubbleModel
 from en4dvar_bubble.laws import NeoHookeanKelvinVoigt
 

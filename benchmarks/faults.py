@@ -30,7 +30,7 @@ from soak import soak  # noqa: E402
 from test_commands import calls, prepare  # noqa: E402
 from test_foreign_directory import ATTACKS, beside_own_files, call, withstood  # noqa: E402
 
-from en4dvar.storage.provenance import cpu_model, git_commit  # noqa: E402
+from en4dvar.results.provenance import cpu_model, git_commit  # noqa: E402
 
 HOUR = 3600.0  # s, nothing takes that long
 

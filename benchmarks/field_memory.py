@@ -22,20 +22,21 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.assimilate import assimilate
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.data.series import Places, Series
 from en4dvar.descent.field import field_en4dvar, field_esmda
 from en4dvar.descent.field_data import FieldData
-from en4dvar.field_prior import FieldPrior
-from en4dvar.forward import ForwardModel, Observable, StateField
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior
-from en4dvar.problem import AssimilationSettings, InverseProblem, Localising
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.model.forward import ForwardModel, Observable, StateField
+from en4dvar.model.state import Field, Parameter, StateLayout
+from en4dvar.priors.field_prior import FieldPrior
+from en4dvar.priors.prior import Prior
+from en4dvar.problem import InverseProblem
+from en4dvar.results.groups import build_groups
+from en4dvar.results.netcdf import to_bytes
 from en4dvar.schemes.local_gain import ByDistance
-from en4dvar.series import Places, Series
-from en4dvar.state import Field, Parameter, StateLayout
-from en4dvar.storage.groups import build_groups
-from en4dvar.storage.netcdf import to_bytes
+from en4dvar.schemes.settings import AssimilationSettings, Localisation
 
 
 class Still(ForwardModel):
@@ -68,7 +69,7 @@ def problem(side: int, members: int) -> None:
         model, model.observables[0], Observations.of_series([series]), Prior(()), {"offset": 0.0}, fields=(field,)
     )
     began = time.process_time()
-    near = Localising(side / 20)
+    near = Localisation(side / 20)
     found = assimilate(asked, AssimilationSettings("es-mda", members=members, localisation=near), 0)
     told("assimilate, es-mda", found.fields[0].members.nbytes, side, members, began)
     with tempfile.TemporaryDirectory() as folder:

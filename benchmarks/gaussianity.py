@@ -24,15 +24,16 @@ import numpy as np
 from acoustic_twin import NARROW, WIDE, make_twin, prior
 from records import Record, fill, load
 
-from en4dvar.analysis import Analysis
-from en4dvar.assimilate import assimilate
+from en4dvar.data.noise import noise_of
 from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.ensemble.forecast import log_posterior
+from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import SerialExecutor
-from en4dvar.noise import noise_of
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.problem import InverseProblem
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.shape import guide
+from en4dvar.schemes.settings import AssimilationSettings
 
 OFF = (0.5, 0.3)  # mean by standard deviations of the chain, std by a fraction
 TARGET = 500.0  # effective sample size of a chain: its mean to 0.045, its std to 3 %

@@ -27,15 +27,16 @@ from laser_twin import MODEL, STD, TIMES, laser_prior
 from records import Record, fill
 from worlds import Twin, World
 
-from en4dvar.assimilate import assimilate
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.errors import En4dvarError
-from en4dvar.joint import JointProblem, estimate_jointly, sharing
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm, own_seed
-from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.state import Array
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.joint import JointProblem, estimate_jointly, sharing
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.priors.prior import Prior, PriorTerm, own_seed
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
 
 SHARED = {"laser": ("G", "mu"), "acoustic": ("G", "alpha", "mu")}
 SETTINGS = AssimilationSettings(what_if=False)

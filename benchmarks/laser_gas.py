@@ -32,7 +32,7 @@ from worlds import Twin, World
 
 import en4dvar
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.problem import AssimilationSettings
+from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 from en4dvar_bubble.starter import propose_config

@@ -12,11 +12,11 @@ from dataclasses import replace
 import numpy as np
 from worlds import RIGHT, Twin, World, read_once
 
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.model.state import TIME_SHIFT
+from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
-from en4dvar.state import TIME_SHIFT
 from en4dvar_bubble import BubbleModel, NeoHookeanKelvinVoigt
 from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.medium import WATER_25C

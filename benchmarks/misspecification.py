@@ -33,12 +33,13 @@ from records import Record, fill
 from worlds import Twin, World
 
 from en4dvar.config.context import Context
-from en4dvar.config.discrepancy import DiscrepancySection
+from en4dvar.config.error import DiscrepancySection
+from en4dvar.data.noise import noise_of
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.noise import noise_of
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings, InverseProblem, discrepancy_parameters
-from en4dvar.state import READING_SCALE
+from en4dvar.model.state import READING_SCALE
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem, discrepancy_parameters
+from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import BubbleModel
 from en4dvar_bubble.laws.kelvin_voigt import FungKelvinVoigt, NeoHookeanKelvinVoigt, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.parameters import ALPHA, MU_P

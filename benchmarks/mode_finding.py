@@ -23,10 +23,11 @@ from laser_twin import make_laser_twin
 from records import Record, fill
 from worlds import Twin
 
-from en4dvar.assimilate import assimilate
 from en4dvar.ensemble.forecast import log_posterior
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.problem import InverseProblem
 from en4dvar.sampling import mcmc
+from en4dvar.schemes.settings import AssimilationSettings
 
 PLAIN = "best member (plain)"
 COUNTED = AssimilationSettings(emulator="off", refine="none", what_if=False)  # without what follows the descents

@@ -21,12 +21,12 @@ import numpy as np
 from calibration import table
 from records import Record, fill
 
-from en4dvar.assimilate import assimilate
+from en4dvar.assembly.build import build
 from en4dvar.config import load_config
-from en4dvar.config.build import build
-from en4dvar.errors import En4dvarError
-from en4dvar.files import write_text
-from en4dvar.problem import AssimilationSettings
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.files import write_text
+from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_movie.filming import film
 from en4dvar_movie.frames import open_movie
 from en4dvar_movie.table import Scale, to_csv

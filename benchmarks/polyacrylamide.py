@@ -16,7 +16,7 @@ from typing import Any
 from movies import SHARED
 
 import en4dvar
-from en4dvar.files import write_text
+from en4dvar.plumbing.files import write_text
 from en4dvar_movie.frames import open_movie
 from en4dvar_movie.table import Scale, to_csv
 from en4dvar_movie.tracking import track
@@ -75,7 +75,7 @@ def movie(folder: Path) -> None:
 
     found = track(open_movie(SHARED / "PAstiff_xy002.mp4"), 2)
     by_hand = scipy.io.loadmat(SHARED / "PAstiff_xy002_RofT.mat")["Rnew"].ravel()
-    person = [replace(r, radius=float(by_hand[r.found.frame])) for r in found.readings]
+    person = [replace(r, radius=float(by_hand[r.sighting.frame])) for r in found.readings]
     scale = Scale(PIXEL, RATE)
     for name, readings in (("hand", person), ("track", found.readings)):
         write_text(folder / f"{name}.csv", to_csv(readings, scale, "PAstiff_xy002.mp4", name))

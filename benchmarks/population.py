@@ -21,13 +21,14 @@ import numpy as np
 from records import Record, fill
 from scipy.stats import kstest
 
-from en4dvar.assimilate import assimilate
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.population import population_of
-from en4dvar.population.estimate import moments
-from en4dvar.prior import own_seed
-from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.state import Array
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.population import population_of
+from en4dvar.estimation.population.estimate import moments
+from en4dvar.model.state import Array
+from en4dvar.priors.prior import own_seed
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
 
 RECORDS = Path("runs") / "population"
 PRIORS = {"nh": laser_twin.laser_prior(), "ql": acoustic_twin.prior(acoustic_twin.WIDE)}

@@ -33,14 +33,14 @@ from cheap_model import write_campaign
 
 import en4dvar.runs.jobs
 import en4dvar_bubble
+from en4dvar.assembly.build import build_one, data_files, inverse_plan
 from en4dvar.config import Config, load_config
-from en4dvar.config.build import build_one, data_files, inverse_plan
 from en4dvar.ensemble.members import Reading
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, ThreadsExecutor, one_blas_thread
-from en4dvar.prior import own_seed
+from en4dvar.priors.prior import own_seed
+from en4dvar.results.pack import PACK, Pack
 from en4dvar.runs.jobs import Job, estimate
 from en4dvar.runs.runner import run_campaign
-from en4dvar.storage.pack import PACK, Pack
 from en4dvar_bubble.model import BubbleModel
 
 ROOT = Path(__file__).resolve().parents[1]

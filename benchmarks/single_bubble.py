@@ -18,7 +18,7 @@ from en4dvar_bubble.packing import pack
 from en4dvar_bubble.solver.arrays import Loaded
 from en4dvar_bubble.solver.integrate import groups
 from en4dvar_bubble.solver.lanes import WIDTH, load, store
-from en4dvar_bubble.solver.rows import TABLE
+from en4dvar_bubble.solver.rows import SMEARED, TABLE
 from en4dvar_bubble.solver.step import _rhs
 from en4dvar_bubble.tables import fill
 
@@ -57,9 +57,9 @@ def _derivatives(t, y, out, wall, eq, par, elastic, scratch):
 
 
 class Bubble:
-    """Member ``i`` of the states ``x`` of a model, from time zero. ``n`` unknowns, ``start`` (n,)."""
+    """Member ``i`` of the states ``x`` of a model, its vapour ``smeared``. ``n`` unknowns, ``start`` (n,)."""
 
-    def __init__(self, model: BubbleModel, x: Array, i: int) -> None:
+    def __init__(self, model: BubbleModel, x: Array, i: int, smeared: float = 0.0) -> None:
         packed = pack(model, x, 0.0, np.ones((len(x), 1)))
         packed.complete()
         members, solver, system = packed.members, model.solver, model.system
@@ -68,6 +68,7 @@ class Bubble:
         wall = system.wall_row if system.wall else -1
         par = np.repeat(members.parameters[i][:, None], WIDTH, axis=1)
         scratch = solver._scratch(len(par))
+        par[SMEARED] = smeared
         par[TABLE] = np.arange(WIDTH) * scratch.elastic[0].size
         fill(np.repeat(members.samples[i : i + 1], WIDTH, axis=0), members.factor, scratch.elastic)
         equations = solver.equations(packed.memory, packed.viscous, packed.pulse)
@@ -80,7 +81,7 @@ class Bubble:
         out[:] = self._found[:, 0]
 
     def lsoda(self, times: Array, rtol: float) -> Array:
-        """R (µm) at ``times`` (µs) by scipy's LSODA (odeint: the whole loop is compiled)."""
+        """R (µm) at ``times`` (µs) by scipy's LSODA (odeint: the whole loop is compiled). Raises RuntimeError."""
         from scipy.integrate import odeint
 
         f, matrix = np.empty(self.n), np.empty((self.n, self.n))
@@ -94,7 +95,10 @@ class Bubble:
             return matrix
 
         grid, options = np.r_[0.0, times], {"rtol": rtol, "atol": rtol * self._atol, "mxstep": 100_000}
-        return np.exp(odeint(rates, self.start, grid, tfirst=True, Dfun=derivatives, **options)[1:, -1])
+        y, told = odeint(rates, self.start, grid, tfirst=True, Dfun=derivatives, full_output=True, **options)
+        if told["message"] != "Integration successful.":
+            raise RuntimeError(told["message"])
+        return np.exp(y[1:, -1])
 
     def cvode(self, times: Array, rtol: float) -> Array:
         """The same by SUNDIALS CVODE (scikit-sundae), BDF."""

@@ -29,8 +29,9 @@ from scalar_bubble import Array, Integrator, Problem, constants, cvode, lsoda, r
 
 from en4dvar.executor import Executor, SerialExecutor, ThreadsExecutor
 from en4dvar_bubble import Accuracy, BubbleModel, get_law, simulate
+from en4dvar_bubble.collapse import RAYLEIGH
 from en4dvar_bubble.solver.driver import ACCURACIES, preset
-from en4dvar_bubble.solver.integrate import STEPS
+from en4dvar_bubble.solver.integrate import MAX_MACH, SMEAR, STEPS
 
 CENTRE = {"G": 6900.0, "alpha": 0.025, "mu": 0.15, "R0": 1.3e-6}  # the paper's 1 % gel
 SPREAD = 0.3
@@ -306,6 +307,38 @@ def random_members(n: int = 20_000) -> list[str]:
     return [f"| {n} | {seconds:.1f} | {failed} ({told}) | {steps} | {mach:.0f} |"]
 
 
+def violent(n: int = 2000, others: int = 8) -> list[str]:
+    """Released bubbles of the widest liquids and gels, over four collapses; ``others`` of them by LSODA as well."""
+    from single_bubble import Bubble
+
+    rng = np.random.default_rng(1)
+    ranges = {"R_max": (50e-6, 1.5e-3), "mu": (5e-4, 0.5), "G": (1.0, 1e5), "R_eq": (0.01, 0.3)}
+    theta = {name: np.exp(rng.uniform(*np.log(ends), n)) for name, ends in ranges.items()}
+    theta["R_eq"] *= theta["R_max"]
+    ends = 4 * RAYLEIGH * theta["R_max"] * np.sqrt(998 / 101325)
+    times, lines = np.linspace(0.01, 1, 200) * ends[:, None], []
+    law, tight = get_law("neo-hookean-kelvin-voigt"), replace(preset("standard", "laser"), rtol=1e-8)
+    for name, options in PHYSICS.items():
+        model = BubbleModel(law=law, start="laser", **options)
+        x = model.initial_states(theta)
+        solution = model.integrate(x, times).solution
+        reasons = Counter(solution.reason(i).split(" at t =")[0] for i in np.flatnonzero(solution.status))
+        told = ", ".join(f"{reason} {count}" for reason, count in reasons.items()) or "none"
+        record, differences = solution.record, []
+        exact = replace(model, accuracy=tight).integrate(x[:others], times[:others])
+        for i in range(others if not model.system.wall else 0):
+            try:
+                R = Bubble(model, x, i, exact.solution.record[i, SMEAR]).lsoda(times[i] * 1e6, 1e-9)
+            except RuntimeError:
+                continue
+            differences.append(float(rms(R[None] * 1e-6, exact["R"][i : i + 1])[0]))
+        second = f"{len(differences)} of {others} | {max(differences):.0e}" if differences else "no | "
+        numbers = f"{sum(reasons.values())} ({told}) | {(record[:, SMEAR] > 0).sum()}"
+        most = f"{record[:, STEPS].max():.0f} | {record[:, MAX_MACH].max():.0f}"
+        lines.append(f"| {name} | {n} | {numbers} | {most} | {second} |")
+    return lines
+
+
 _MEMORY = """
 import re, sys
 sys.path.insert(0, {folder!r})
@@ -356,6 +389,12 @@ TABLES: dict[str, tuple[str, Callable[[], list[str]]]] = {
     "random": (
         "| random members | s on two threads | failures | most steps | largest wall Mach |\n|---|---|---|---|---|",
         random_members,
+    ),
+    "violent": (
+        "| released bubbles | members | failures | smeared | most steps | largest wall Mach | LSODA completes "
+        "| largest rms difference |\n"
+        "|---|---|---|---|---|---|---|---|",
+        violent,
     ),
     "memory": ("| members | peak, MB | before, MB | taken, MB |\n|---|---|---|---|", memory),
 }

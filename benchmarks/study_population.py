@@ -17,16 +17,16 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.assimilate import assimilate
+from en4dvar.assembly.build import build
 from en4dvar.config import load_config
-from en4dvar.config.build import build
 from en4dvar.config.document import read_document
 from en4dvar.config.synthetic import resolve_campaign
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.population import estimate_population
 from en4dvar.executor import ThreadsExecutor
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.population import estimate_population
-from en4dvar.prior import own_seed
+from en4dvar.priors.prior import own_seed
 from en4dvar.runs.synthetic import draw_campaign
 from en4dvar.sampling.forward_runs import ForwardRuns
 from en4dvar_agarose.measured import FOLDER, POPULATION_HEAD

@@ -18,12 +18,12 @@ from pathlib import Path
 
 import numpy as np
 
+from en4dvar.assembly.build import build
 from en4dvar.config import load_config
-from en4dvar.config.build import build
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
 from en4dvar.ensemble.forecast import forecast
 from en4dvar.executor import ThreadsExecutor
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.evidence import sampled_evidence
 from en4dvar.sampling.forward_runs import ForwardRuns

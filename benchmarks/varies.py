@@ -21,12 +21,13 @@ import numpy as np
 from laser_twin import laser_prior
 from records import Record, fill
 
-from en4dvar.assimilate import assimilate
-from en4dvar.diagnostics import DECISIVE
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.varying import PiecewiseModel, RandomWalk
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.diagnosis.diagnostics import DECISIVE
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.priors.varying import PiecewiseModel, RandomWalk
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble.laws import get_law
 from en4dvar_bubble.model import BubbleModel
 

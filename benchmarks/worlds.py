@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from en4dvar.ensemble.forecast import Forecast, forecast
-from en4dvar.prior import Prior
+from en4dvar.model.state import Array, Parameter
+from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
-from en4dvar.state import Array, Parameter
 from en4dvar_bubble import BubbleModel
 
 FAR_OFF = 8.0  # standard deviations of an outlier

@@ -9,11 +9,12 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import threading
 from typing import Any
 
 import click
 
-from en4dvar.commands.common import Failed, give_up_output
+from en4dvar.commands.common import Failed, give_up_output, printable, to_continue
 from en4dvar.commands.design import design
 from en4dvar.commands.joint import joint
 from en4dvar.commands.listings import models, schema
@@ -25,7 +26,8 @@ from en4dvar.commands.simulate import simulate
 from en4dvar.commands.sweep_twin import sweep_twin
 from en4dvar.commands.validate import validate
 from en4dvar.commands.warm_up import warm_up
-from en4dvar.errors import En4dvarError
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.runs.interrupt import heeded
 
 OF_THE_DEVICE = (
     errno.ENOSPC,
@@ -47,45 +49,80 @@ class Commands(click.Group):
         plugin = None if built_in else plugin_commands().get(cmd_name)
         return PluginCommand(plugin) if plugin else built_in
 
-    def invoke(self, ctx: click.Context) -> Any:
+    def main(self, *args: Any, **options: Any) -> Any:
+        """Run as click does, but do not wait for code of a model that was stopped and does not end."""
+        _settle_surroundings()
         try:
-            value = super().invoke(ctx)
+            return super().main(*args, **options)
+        except SystemExit as end:
+            if any(thread.name.startswith("en4dvar") and not thread.daemon for thread in threading.enumerate()):
+                give_up_output()
+                os._exit(end.code if isinstance(end.code, int) else 1)
+            raise
+
+    def invoke(self, ctx: click.Context) -> Any:
+        output = _output()
+        try:
+            with heeded(_end):
+                value = super().invoke(ctx)
             sys.stdout.flush()
+            if _output() != output:  # what was printed is nowhere, or in a file that has its number now
+                raise _closed_output()
             return value
         except En4dvarError as error:
             raise Failed(str(error), error.exit_code) from error
         except SystemExit as end:  # of a model or law: click ends in another way; another package's command may
             if ctx.invoked_subcommand in plugin_commands():
                 raise
-            from en4dvar.user_code import describe
+            from en4dvar.plumbing.user_code import describe
 
             raise Failed(f"the code of a model ended the program: {describe(end)}", 1) from None
         except (KeyboardInterrupt, click.Abort) as interrupt:
             raise Failed(str(interrupt) or "interrupted", 130) from None
         except (OSError, ValueError) as error:
-            if failed := _about_output(error):
-                raise failed from error
+            if _output() != output:
+                raise _closed_output() from error
+            if isinstance(error, OSError) and error.errno in OF_THE_DEVICE:
+                if error.filename is None:  # or what is left of it is tried again, and told, when the interpreter ends
+                    give_up_output()
+                words = f"{error.filename or 'standard output'}: cannot be written: {error.strerror}"
+                raise Failed(words, 2) from error
             raise
 
 
-def _about_output(error: OSError | ValueError) -> Failed | None:
-    """What the user is told where standard output is closed or a device takes no more."""
-    if _output_closed():
-        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  for what is written as Python ends
-        return Failed("standard output was closed, by a model perhaps; what was computed is kept", 1)
-    if not isinstance(error, OSError) or error.errno not in OF_THE_DEVICE:
-        return None
-    if error.filename is None:  # or what is left of it is tried again, and told, when the interpreter ends
-        give_up_output()
-    return Failed(f"{error.filename or 'standard output'}: cannot be written: {error.strerror}", 2)
+def _settle_surroundings() -> None:
+    """Standard streams that were closed lead nowhere, or a file would get their number; what is set wrongly is told."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            handle = os.open(os.devnull, os.O_RDWR)
+            if handle != number:
+                os.dup2(handle, number)
+                os.close(handle)
+            setattr(sys, name, os.fdopen(number, "r" if name == "stdin" else "w", encoding="utf-8", closefd=False))
+    epoch = os.environ.get("SOURCE_DATE_EPOCH")
+    if epoch is not None and not epoch.isdecimal():  # what draws figures would raise
+        click.echo(f"SOURCE_DATE_EPOCH={printable(epoch)}: not a number of seconds; unset it", err=True)
+        sys.exit(2)
 
 
-def _output_closed() -> bool:
+def _end(kept: str) -> None:
+    """End the process, which does not answer a signal; ``kept``: what a run has kept, in words."""
+    to_continue(kept).show()
+    os._exit(130)
+
+
+def _output() -> object:
+    """Which file standard output is; None where it is closed."""
     try:
-        os.fstat(1)
+        status = os.fstat(1)
     except OSError:
-        return True
-    return sys.stdout is None or sys.stdout.closed
+        return None
+    return None if sys.stdout is None or sys.stdout.closed else (status.st_dev, status.st_ino)
+
+
+def _closed_output() -> Failed:
+    sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  for what is written as Python ends
+    return Failed("standard output was closed, by a model perhaps; what was computed is kept", 1)
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from toys import make_observations
 
-from en4dvar.forward import ForwardModel, Observable, PathQuantity, StateField
-from en4dvar.prior import Prior, PriorTerm
+from en4dvar.model.forward import ForwardModel, Observable, PathQuantity, StateField
+from en4dvar.model.state import Field, Parameter, StateLayout
+from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
-from en4dvar.state import Field, Parameter, StateLayout
 
 BEGIN, END = 0.5, 0.9
 

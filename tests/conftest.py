@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
+import shutil
+import tempfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,18 +16,20 @@ from typing import Any
 import hypothesis
 import numpy as np
 import pytest
+from tenths import is_of_tenth
 from threadpoolctl import threadpool_limits
 
 from en4dvar import report
-from en4dvar.analysis import Analysis, Descents, IterationRecord, Mode
-from en4dvar.caution import caution
-from en4dvar.forward import ForwardModel, Observable, StateField
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.diagnosis.analysis import Analysis, Descents, IterationRecord, Mode
+from en4dvar.model.forward import ForwardModel, Observable, StateField
+from en4dvar.model.state import TIME_SHIFT, Array, Field, Parameter, StateLayout
+from en4dvar.plumbing.caution import caution
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
 from en4dvar.report.figures import all_figures
-from en4dvar.state import TIME_SHIFT, Array, Field, Parameter, StateLayout
+from en4dvar.schemes.settings import AssimilationSettings
 
 # Of several test processes on the same cores, each with as many threads of BLAS, these wait for each other, spinning:
 # one solution of an oracle took four times the CPU time. What tests start has the number that it would have anyway.
@@ -33,6 +38,10 @@ threadpool_limits(1, user_api="blas")
 # What this process writes need not outlive a loss of power: the fifty flushes of a run were a third of its time. The
 # programs that tests start flush, and ``faults/test_commands.py`` has that fail.
 os.fsync = lambda file: None  # type: ignore[assignment]
+
+# What a test's configuration names as the user's own code is remembered for the tests of this process alone.
+os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="en4dvar-tests-")
+atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], True)
 
 # How long an example takes says how busy a machine is, and what is drawn at random would refuse a change that has
 # nothing to do with it.
@@ -154,8 +163,14 @@ def _analysis(n_members: int = 24, **changes: Any) -> Analysis:
     return replace(analysis, **changes)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The files of :data:`FIRST`, then those with the most tests."""
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--tenth", type=int, choices=range(10), help="of the tests, one tenth; which, their names decide")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Keep the tenth that is asked for; the files of :data:`FIRST`, then those with the most tests."""
+    if (tenth := config.getoption("--tenth")) is not None:
+        items[:] = [item for item in items if is_of_tenth(item.nodeid, tenth)]
     tests = Counter(item.path for item in items)
     ranks = {path: FIRST.index(path.stem) if path.stem in FIRST else len(FIRST) for path in tests}
     items.sort(key=lambda item: (ranks[item.path], -tests[item.path]))

@@ -1,6 +1,6 @@
 """Reading and running the examples of a documentation page.
 
-A page is one folder and one session, from top to bottom:
+A page is one folder and one session, from top to bottom; ``configs`` and ``benchmarks`` of the clone are in it:
 
 - a ``python`` or ``yaml`` block whose first line is a comment with a file name (``# case.yaml``) is that file; a Python
   file is run at once;
@@ -11,7 +11,8 @@ A page is one folder and one session, from top to bottom:
 - ``text`` and ``bibtex`` blocks are read by people only.
 
 An HTML comment just above a block says otherwise: ``<!-- not run: reason -->`` (its commands are still parsed by the
-real command line, its files and options must exist), or ``<!-- tested by tests/… -->``.
+real command line, its files and options must exist), ``<!-- tested by tests/… -->``, or ``<!-- needs: ../shared/… -->``
+(run where this file lies beside the repository, skipped by name elsewhere).
 """
 
 from __future__ import annotations
@@ -23,12 +24,26 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def hook(name: str) -> ModuleType:
+    """A module of ``docs/hooks``."""
+    spec = spec_from_file_location(name, ROOT / "docs" / "hooks" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 _BLOCK = re.compile(r"^(?:<!-- (?P<mark>[^\n]*?) -->\n+)?```(?P<language>\w*)[^\n]*\n(?P<body>.*?)^```$", re.M | re.S)
 _FILE = re.compile(r"# ([\w./-]+\.(?:py|yaml))\b")
@@ -53,6 +68,12 @@ class Block:
     def not_run(self) -> str | None:
         """Why the block is not run, if it is not."""
         return self.mark.partition("not run:")[2].strip() or None
+
+    @property
+    def missing(self) -> str | None:
+        """The file outside the repository that the block needs, if it is not there."""
+        needed = self.mark.partition("needs:")[2].strip()
+        return needed if needed and not (ROOT / needed).exists() else None
 
     @property
     def tested_by(self) -> str | None:
@@ -103,7 +124,11 @@ class Session:
     """A folder in which the blocks of one page are run."""
 
     def __init__(self, folder: Path, quick_start: Path):
-        self.folder, self.quick_start = folder, quick_start
+        self.folder, self.quick_start = folder / "clone", quick_start
+        self.folder.mkdir()
+        for name in ("configs", "benchmarks"):
+            (self.folder / name).symlink_to(ROOT / name)
+        (folder / "shared").symlink_to(ROOT.parent / "shared")
         path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
         self.environment = {**os.environ, "PATH": path, "MPLBACKEND": "Agg", "NO_COLOR": "1", "COLUMNS": "100"}
 

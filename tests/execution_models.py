@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import signal
 import threading
@@ -11,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from toy_models import Oscillator
 
-from en4dvar.batch import Batch
-from en4dvar.state import Array
+from en4dvar.model.batch import Batch
+from en4dvar.model.state import Array
 
 
 def is_large(x: Array) -> bool:
@@ -55,6 +56,19 @@ class Breaks(Oscillator):
         if t0 == 0.0 and x[0] > 150e-6:
             raise ArithmeticError("too large")
         return super().step(x, t0, t1)
+
+
+class Deaf(Oscillator):
+    """At a data set of large amplitude, hours within one call of compiled code; the file ``EN4DVAR_TEST_FLAG`` tells,
+    and keeps it from it where it is there.
+    """
+
+    def trajectories(self, x, times):
+        flag = Path(os.environ["EN4DVAR_TEST_FLAG"])
+        if is_large(x) and not flag.exists():
+            flag.write_text("now")
+            hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
+        return super().trajectories(x, times)
 
 
 class Stops(Oscillator):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from en4dvar.forward import ForwardModel, Observable, StateField
-from en4dvar.state import Field, Parameter, StateLayout
+from en4dvar.model.forward import ForwardModel, Observable, StateField
+from en4dvar.model.state import Field, Parameter, StateLayout
 
 PLACES = 0.5 * np.arange(30)  # m
 

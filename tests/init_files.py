@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from click.testing import CliRunner, Result
 
+from en4dvar.assembly.build import build
 from en4dvar.cli import main
 from en4dvar.config import Config, load_config
-from en4dvar.config.build import build
 
 UNITS = ("--time-unit", "us", "--radius-unit", "um")
 TRUTH = {

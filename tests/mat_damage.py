@@ -98,9 +98,9 @@ def survive(folder: Path, count: int, seed: int, first: int = 0) -> Counter[str]
 
 
 def main() -> None:
-    from en4dvar.errors import DataError
     from en4dvar.inputs.asked import Column, TimeStep
     from en4dvar.inputs.readers import read_series
+    from en4dvar.plumbing.errors import DataError
 
     folder, (first, count, seed) = Path(sys.argv[1]), map(int, sys.argv[2:])
     found = Counter[str]()

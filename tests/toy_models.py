@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from en4dvar.forward import ForwardModel, Observable, StateField
-from en4dvar.state import Array, Parameter, StateLayout
-from en4dvar.state import Field as StateBlock
-from en4dvar.units import Quantity
+from en4dvar.model.forward import ForwardModel, Observable, StateField
+from en4dvar.model.state import Array, Parameter, StateLayout
+from en4dvar.model.state import Field as StateBlock
+from en4dvar.plumbing.units import Quantity
 
 
 class OscillatorSettings(BaseModel):

@@ -7,15 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from en4dvar.data.noise import Kernel, noise_of
+from en4dvar.data.observations import Observations
 from en4dvar.descent.window import DataWindow, Descent
-from en4dvar.forward import Failure, ForwardModel, Observable, StateField, Trajectory
-from en4dvar.noise import Kernel, noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm
+from en4dvar.model.forward import Failure, ForwardModel, Observable, StateField, Trajectory
+from en4dvar.model.state import NOISE_SCALE, Field, Parameter, StateLayout
+from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem, discrepancy_parameters
-from en4dvar.schemes import window_scheme
 from en4dvar.schemes.base import Weights
-from en4dvar.state import NOISE_SCALE, Field, Parameter, StateLayout
 
 OBSERVABLE = Observable("y", "m", StateField("y", rate_of="v"))
 
@@ -168,12 +167,10 @@ class Dying(Linear):
         return super().trajectories(x, times)
 
 
-def visit(space, w, scheme=None):
+def visit(space, w):
     """The descent at weights ``w`` of a space: J there and the Gauss–Newton step."""
-    scheme = scheme or window_scheme(space.settings)
     descent = Descent(Weights(w, np.eye(len(space.members))))
     window = DataWindow(space, 0, lambda: None, lambda record: None)
-    (runs,) = window.run(scheme, [descent])
-    evaluation = window.whiten(scheme, descent, *scheme.linearise(descent.weights, runs))
-    descent.step = scheme.advance(descent.weights, evaluation, 0, window.draw)
+    (system,) = window.linearise([descent])
+    descent.step = system.step()
     return descent

@@ -8,9 +8,9 @@ import time
 import numpy as np
 from pydantic import BaseModel
 
-from en4dvar.batch import Batch
-from en4dvar.forward import ForwardModel, Observable, StateField
-from en4dvar.state import Field, StateLayout
+from en4dvar.model.batch import Batch
+from en4dvar.model.forward import ForwardModel, Observable, StateField
+from en4dvar.model.state import Field, StateLayout
 
 
 class RingSettings(BaseModel):

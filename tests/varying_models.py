@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from en4dvar.batch import Batch
-from en4dvar.forward import Failure, ForwardModel, Observable, StateField
-from en4dvar.state import Field, Parameter, StateLayout
+from en4dvar.model.batch import Batch
+from en4dvar.model.forward import Failure, ForwardModel, Observable, StateField
+from en4dvar.model.state import Field, Parameter, StateLayout
 
 KNOTS = (1.0, 2.0, 3.5)
 

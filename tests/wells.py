@@ -3,9 +3,9 @@
 import numpy as np
 from toys import Toy, make_problem
 
-from en4dvar.assimilate import log_posterior
-from en4dvar.forward import Trajectory
-from en4dvar.prior import PriorTerm
+from en4dvar.estimation.assimilate import log_posterior
+from en4dvar.model.forward import Trajectory
+from en4dvar.priors.prior import PriorTerm
 
 
 class Wells(Toy):

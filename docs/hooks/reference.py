@@ -204,7 +204,7 @@ def _loaded(command: click.Command) -> click.Command:
 
 def warnings_page() -> str:
     """Every code a result can warn with."""
-    from en4dvar.caution import CATALOGUE, SEVERITIES, TRIGGERS
+    from en4dvar.plumbing.caution import CATALOGUE, SEVERITIES, TRIGGERS
 
     meaning = {
         "serious": "do not trust the posterior before this is settled",

@@ -1,4 +1,4 @@
-"""What several commands share: the CONFIG argument with its options, and how an error of ours is told."""
+"""Parts that several commands share: the CONFIG argument with its options, and how an error of ours is told."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from typing import IO, TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from en4dvar.caution import Caution
     from en4dvar.config import Config
+    from en4dvar.plumbing.caution import Caution
 
 LONGEST = 120  # name of a folder
 
@@ -37,7 +37,7 @@ class Failed(click.ClickException):
 
 
 def give_up_output() -> None:
-    """What is still to be written to standard output and error goes nowhere."""
+    """Discard everything that is still to be written to standard output and error."""
     with suppress(OSError, ValueError):  # a stream without a file
         nowhere = os.open(os.devnull, os.O_WRONLY)
         for stream in (sys.stdout, sys.stderr):
@@ -55,13 +55,13 @@ def printable(text: str) -> str:
 
 def parted(items: Iterable[str], option: str) -> dict[str, str]:
     """Dotted keys → values of ``items`` KEY=VALUE, given with an ``option``."""
-    found = {}
+    settings = {}
     for item in items:
         key, equals, value = item.partition("=")
         if not equals:
             raise click.BadParameter(f"{item!r} is not KEY=VALUE", param_hint=option)
-        found[key.strip()] = value
-    return found
+        settings[key.strip()] = value
+    return settings
 
 
 @dataclass(frozen=True)
@@ -80,10 +80,10 @@ class Source:
 
     def overrides(self, **special: Any) -> dict[str, Any]:
         """Dotted keys → values of --set and --data; ``special`` are further keys, left out where None."""
-        found: dict[str, Any] = {**parted(self.settings, "--set")}
+        overrides: dict[str, Any] = {**parted(self.settings, "--set")}
         # A path on the command line is relative to the shell's folder, one in the file to the file's.
         special["data.path"] = [str(Path(self.data).absolute())] if self.data else None
-        return found | {key: value for key, value in special.items() if value is not None}
+        return overrides | {key: value for key, value in special.items() if value is not None}
 
 
 def folder_of(kind: str, run_dirs: Sequence[Path]) -> Path:
@@ -91,7 +91,7 @@ def folder_of(kind: str, run_dirs: Sequence[Path]) -> Path:
 
     Raises :class:`OutputError` where it would be a link to elsewhere.
     """
-    from en4dvar.files import inside
+    from en4dvar.plumbing.files import inside
 
     names = [run_dir.resolve().name for run_dir in run_dirs]
     names = names if len(set(names)) == len(names) else [str(run_dir) for run_dir in run_dirs]
@@ -133,12 +133,12 @@ trust_option = click.option(
 
 
 def ask(question: str) -> bool:
-    """Whether the user says yes; nobody does where there is no terminal."""
+    """True if the user says yes; nobody does where there is no terminal."""
     return sys.stdin.isatty() and click.confirm(question, err=True)
 
 
 def tell(words: str) -> None:
-    """What is being done, on standard error."""
+    """Print on standard error which step is being done."""
     click.echo(words, err=True)
 
 
@@ -187,7 +187,7 @@ def several_runs(kind: str) -> Callable[[Callable[..., Any]], Callable[..., Any]
 
 def refuse_to_replace(out: Path | None, force: bool) -> None:
     """Raise :class:`OutputError` where ``out`` exists and is not to be replaced."""
-    from en4dvar.errors import OutputError
+    from en4dvar.plumbing.errors import OutputError
 
     if out is not None and out.exists() and not force:
         raise OutputError(f"{out}: exists; give --force to replace it")
@@ -195,7 +195,7 @@ def refuse_to_replace(out: Path | None, force: bool) -> None:
 
 def deliver(text: str, out: Path | None, what: str) -> None:
     """Write to the file ``out`` and say ``what`` is there, or print. Raises :class:`OutputError`."""
-    from en4dvar.files import write_text
+    from en4dvar.plumbing.files import write_text
 
     if out is None:
         click.echo(text, nl=False)
@@ -206,7 +206,7 @@ def deliver(text: str, out: Path | None, what: str) -> None:
 
 
 def command_line(without: tuple[str, ...] = (), also: tuple[str, ...] = ()) -> str:
-    """What the user typed, with the program's name as it is installed; some words left out, others added."""
+    """The command as typed, with the program's name as it is installed; some words left out, others added."""
     return shlex.join(["en4dvar", *(word for word in sys.argv[1:] if word not in without), *also])
 
 
@@ -218,6 +218,12 @@ def note_beginning(run_dir: Path, resume: bool) -> None:
         click.echo(f"note: {run_dir} holds no run yet; this one begins", err=True)
 
 
+def to_continue(kept: object) -> Failed:
+    """The last words of a command that was stopped: what is kept of its run, if one has begun, and what to type."""
+    again = command_line(without=("--force", "--resume"), also=("--resume",))
+    return Failed(f"{kept}\nto continue: {again}" if kept else "interrupted", 130)
+
+
 @contextmanager
 def continuable() -> Iterator[None]:
     """Within, an interrupt says what is kept of the run and what to type next."""
@@ -226,7 +232,6 @@ def continuable() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as interrupt:
-        if told := begun(interrupt):
-            again = command_line(without=("--force", "--resume"), also=("--resume",))
-            raise Failed(f"{told}\nto continue: {again}", 130) from None
+        if kept := begun(interrupt):
+            raise to_continue(kept) from None
         raise Failed(f"interrupted before the run began\nto run it: {command_line()}", 130) from None

@@ -8,22 +8,22 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from en4dvar.config import Config
+from en4dvar.data.series import Part
 from en4dvar.descent.preview import Preview
-from en4dvar.field_prior import FieldPrior
+from en4dvar.model.state import Parameter
+from en4dvar.plumbing.tables import table
+from en4dvar.plumbing.units import convert
+from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.modes import ENOUGH
 from en4dvar.sampling.refine import may_sample
-from en4dvar.series import Part
-from en4dvar.state import Parameter
-from en4dvar.tables import table
-from en4dvar.units import convert
 
 RUNS_A_DRAW = 10 / 3  # that counts, of a posterior that is sampled, typically
 MOST_PAIRS, MOST_NAMED, LEAST_SHOWN = 15, 100, 0.005  # of correlations: rows, parameters of a block, size
 
 
 def problem_summary(config: Config, problems: Sequence[InverseProblem]) -> str:
-    """What ``validate`` prints: data sets, priors (centre and 5–95 %), fixed values, scheme."""
+    """The lines that ``validate`` prints: data sets, priors (centre and 5–95 %), fixed values, scheme."""
     first = problems[0]
     settings, rows = config.assimilation, [row for problem in problems for row in _data_rows(problem)]
     parts = [
@@ -54,39 +54,41 @@ def _together(
     problems: Sequence[InverseProblem], header: tuple[str, ...], rows: Callable[[InverseProblem], list[tuple[str, ...]]]
 ) -> str:
     """One table for all data sets: a row a parameter, or a row each where a value comes from the data."""
-    found: dict[str, dict[str, tuple[str, ...]]] = {}
+    groups: dict[str, dict[str, tuple[str, ...]]] = {}
     for problem in problems:
         for name, *row in rows(problem):
-            found.setdefault(name, {})[problem.observations.name] = tuple(row)
+            groups.setdefault(name, {})[problem.observations.name] = tuple(row)
     if len(problems) == 1:
         return table([header, *rows(problems[0])])
     lines: list[tuple[str, ...]] = []
-    for name, each in found.items():
+    for name, each in groups.items():
         same = len(each) == len(problems) and len(set(each.values())) == 1
         shown = {"all": next(iter(each.values()))} if same else each
         lines += [(name, dataset, *row) for dataset, row in shown.items()]
     return table([(header[0], "data set", *header[1:]), *lines])
 
 
-def _field_row(one: FieldPrior) -> tuple[str, ...]:
-    std = f"{100 * one.std:g} %" if one.relative else f"{one.std:g} {one.field.unit}"
-    return one.field.name, str(one.field.size), std, f"{one.kernel}, length {one.length:g} {one.field.coordinate_unit}"
+def _field_row(prior: FieldPrior) -> tuple[str, ...]:
+    std = f"{100 * prior.std:g} %" if prior.relative else f"{prior.std:g} {prior.field.unit}"
+    kernel = f"{prior.kernel}, length {prior.length:g} {prior.field.coordinate_unit}"
+    return prior.field.name, str(prior.field.size), std, kernel
 
 
 def _and_cells(problem: InverseProblem) -> str:
-    cells = sum(one.field.size for one in problem.fields)
+    cells = sum(prior.field.size for prior in problem.fields)
     return f" and {cells} cells of fields" if cells else ""
 
 
-def cost_summary(config: Config, one: Preview, count: int) -> str:
-    """What an estimate costs: forward runs of a data set and of all ``count``, and the time on one thread."""
-    total = one.runs * count
-    runs = f"about {one.runs} forward runs" + (f" a data set, {total} in all" if count > 1 else "")
+def cost_summary(config: Config, preview: Preview, count: int) -> str:
+    """The cost of an estimate: forward runs of a data set and of all ``count``, and the time on one thread."""
+    total = preview.runs * count
+    runs = f"about {preview.runs} forward runs" + (f" a data set, {total} in all" if count > 1 else "")
     more = "; the Markov chain comes on top" if config.assimilation.refine == "mcmc" else ""
-    if may_sample(one.problem, config.assimilation):
+    if may_sample(preview.problem, config.assimilation):
         sampled = round(RUNS_A_DRAW * (config.assimilation.draws or ENOUGH))
-        more = f"; a posterior that leaves a doubt is sampled by some {sampled} more, {_seconds(sampled * one.seconds)}"
-    took = f"{_seconds(one.seconds)} each: {_seconds(total * one.seconds)} on one thread"
+        took = _seconds(sampled * preview.seconds)
+        more = f"; a posterior that leaves a doubt is sampled by some {sampled} more, {took}"
+    took = f"{_seconds(preview.seconds)} each: {_seconds(total * preview.seconds)} on one thread"
     return f"cost: {runs}, {took}, plus some seconds for files and report{more}"
 
 
@@ -114,7 +116,10 @@ def _series_row(problem: InverseProblem, part: Part, name: str) -> tuple[str, ..
     also += y.noise.words
     unit = observable.display_unit
     window = f"{start:.4g} to {end:.4g} {model.time_display_unit}"
-    return name, str(part.end - part.begin), window, f"{top:.4g} {unit}", f"{std:.3g} {unit}{also}"
+    count = str(part.end - part.begin)
+    if y.continued is not None:
+        count += f", then {len(y.continued) - len(y)} to predict"
+    return name, count, window, f"{top:.4g} {unit}", f"{std:.3g} {unit}{also}"
 
 
 def _prior_rows(problem: InverseProblem) -> list[tuple[str, ...]]:

@@ -33,11 +33,11 @@ def design(source: Source, after: Path | None, out: Path | None, force: bool, re
     from en4dvar.runs.progress import counted
 
     with continuable(), counted("designs") as on_design:
-        found, directory = run_design(
+        plan, directory = run_design(
             source.path, overrides=source.overrides(), after=after, out=out, force=force, resume=resume,
             on_design=on_design, command=command_line(),
         )  # fmt: skip
-    click.echo(design_table(found))
-    for remark in remarks(found):
+    click.echo(design_table(plan))
+    for remark in remarks(plan):
         click.echo(f"note: {remark}", err=True)
     click.echo(f"report: {directory / 'design.html'}")

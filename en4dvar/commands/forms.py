@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from en4dvar.commands.plugin_commands import first_sentence
-from en4dvar.errors import En4dvarError
+from en4dvar.plumbing.errors import En4dvarError
 
 if TYPE_CHECKING:
     from en4dvar.config import Config
-    from en4dvar.state import Array
+    from en4dvar.model.state import Array
 
 GROUP = "en4dvar.simulate"
 
@@ -28,8 +28,8 @@ class WithForms(click.Command):
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         own = super().get_params(ctx)
-        given = {option for parameter in own for option in parameter.opts}
-        added = [o for entry in forms().values() for o in _options(entry) if not given.intersection(o.opts)]
+        options = {option for parameter in own for option in parameter.opts}
+        added = [o for entry in forms().values() for o in _options(entry) if not options.intersection(o.opts)]
         return [*own[:-1], *added, own[-1]]  # --help stays the last
 
 
@@ -48,14 +48,14 @@ def _options(entry: EntryPoint) -> list[click.Option]:
 
 def asked(options: Mapping[str, Any]) -> dict[str, tuple[Path, dict[str, str]]]:
     """Form → file and settings. Raises :class:`click.UsageError`: settings without a file, or not KEY=VALUE."""
-    found = {}
+    answers = {}
     for name in forms():
         out, texts = options.get(name), options.get(f"{name}_set", ())
         if texts and out is None:
             raise click.UsageError(f"--{name}-set needs --{name} FILE")
         if out is not None:
-            found[name] = out, dict(_setting(name, text) for text in texts)
-    return found
+            answers[name] = out, dict(_setting(name, text) for text in texts)
+    return answers
 
 
 def _setting(name: str, text: str) -> tuple[str, str]:
@@ -68,7 +68,9 @@ def _setting(name: str, text: str) -> tuple[str, str]:
 def write_form(
     name: str, config: Config, times: Array | None, out: Path, settings: Mapping[str, str], seed: int
 ) -> str:
-    """What is said of the file written. Raises :class:`En4dvarError`: the form cannot be loaded, or refuses."""
+    """Write a form and return the sentence about its file. Raises :class:`En4dvarError`: the form cannot be loaded, or
+    refuses.
+    """
     entry = forms()[name]
     try:
         function = entry.load()

@@ -27,5 +27,5 @@ def joint(runs: Together, names: tuple[str, ...]) -> None:
     from en4dvar.report.joint import joint_table
     from en4dvar.runs.joint_run import join
 
-    found, page = join(runs.run_dirs, names, runs.out, **runs.options)
-    runs.conclude(joint_table(found), found.cautions, page)
+    result, page = join(runs.run_dirs, names, runs.out, **runs.options)
+    runs.conclude(joint_table(result), result.cautions, page)

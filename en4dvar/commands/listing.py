@@ -6,9 +6,9 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from en4dvar.config.models import GROUP, build_model, find_model, settings_of
-from en4dvar.errors import En4dvarError
-from en4dvar.state import Parameter
-from en4dvar.tables import table
+from en4dvar.model.state import Parameter
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.tables import table
 
 
 def model_listing() -> str:

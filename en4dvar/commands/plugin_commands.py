@@ -14,7 +14,7 @@ from typing import Any
 
 import click
 
-from en4dvar.errors import En4dvarError
+from en4dvar.plumbing.errors import En4dvarError
 
 GROUP = "en4dvar.commands"
 

@@ -20,20 +20,25 @@ from en4dvar.commands.common import Together, several_runs
     "--spread", type=click.FloatRange(min=0, min_open=True), default=0.5, show_default=True,
     help="Hyperprior of the spread: half-normal; its std as a multiple of the prior's.",
 )  # fmt: skip
+@click.option(
+    "--odd", type=click.FloatRange(min=0, max=1, max_open=True), default=0.05, show_default=True,
+    help="Probability that a data set is odd: drawn from the prior and not from the population.",
+)  # fmt: skip
 @several_runs("population")
-def population(runs: Together, names: tuple[str, ...], mean_std: float, spread: float) -> None:
+def population(runs: Together, names: tuple[str, ...], mean_std: float, spread: float, odd: float) -> None:
     """Estimate the mean of parameters over data sets and how much they vary: the gel behind its bubbles.
 
-    Takes finished runs of the same parameters, with at least three data sets together. Unlike stacked posteriors it
-    counts the prior once. Writes population.nc, .csv, .tex and a page.
+    Takes finished runs of the same parameters, with at least three data sets together, whatever their errors. Unlike
+    stacked posteriors it counts the prior once. Constants of the medium and of the camera that are estimated have one
+    value in all data sets. Writes population.nc, .csv, .tex and a page.
 
     \b
     Example:
       en4dvar population runs/twelve_bubbles --of G --of mu
     """
-    from en4dvar.population import HyperPrior
+    from en4dvar.estimation.population import HyperPrior
     from en4dvar.report.population import population_lines
     from en4dvar.runs.population_run import population as estimate
 
-    found, page = estimate(runs.run_dirs, names, runs.out, hyper=HyperPrior(mean_std, spread), **runs.options)
-    runs.conclude("\n".join(population_lines(found)), found.cautions, page)
+    result, page = estimate(runs.run_dirs, names, runs.out, hyper=HyperPrior(mean_std, spread, odd), **runs.options)
+    runs.conclude("\n".join(population_lines(result)), result.cautions, page)

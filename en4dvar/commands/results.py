@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Literal
 
 import click
 
@@ -38,7 +39,7 @@ def report(run_dir: Path, datasets: tuple[str, ...], figures: bool) -> None:
       en4dvar report runs/quickstart --figures
     """
     from en4dvar.executor import available_cores
-    from en4dvar.runs.runner import write_report
+    from en4dvar.runs.engine import write_report
 
     click.echo(f"report: {write_report(run_dir, datasets, available_cores(), figures)}")
 
@@ -68,9 +69,9 @@ def compare(
       en4dvar compare runs/neo_hookean runs/quadratic
     """
     from en4dvar.report.compare import compare_runs, comparison_table, estimates_table, with_evidences
-    from en4dvar.storage.cycles_file import cycles_file
+    from en4dvar.results.series_file import series_file
 
-    if any(map(cycles_file, run_dirs)):
+    if any(map(series_file, run_dirs)):
         from en4dvar.report.compare_cycles import compare_sequences, sequences_table
 
         click.echo(sequences_table(compare_sequences(run_dirs)))
@@ -101,7 +102,7 @@ def compare(
 @click.option("--netcdf", "kind", flag_value="netcdf", help="Say where posterior.nc is, which needs no export.")
 @click.option("--out", type=click.Path(path_type=Path), help="File to write; default standard output.")
 @click.option("--force", is_flag=True, help="Replace that file.")
-def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
+def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], out: Path | None, force: bool) -> None:
     """Write a table of a run as CSV or LaTeX, in display units.
 
     For a sequence or a twin experiment, --csv holds the state in time and --latex the last analysis.
@@ -111,9 +112,9 @@ def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
       en4dvar export runs/quickstart --latex --out table.tex
     """
     from en4dvar.report.export import export_table, posterior_file
-    from en4dvar.storage.cycles_file import cycles_file
+    from en4dvar.results.series_file import series_file
 
-    cycles = cycles_file(run_dir)
+    cycles = series_file(run_dir)
     if kind == "netcdf" and cycles:
         click.echo(f"{cycles} is netCDF as it is: xarray.open_dataset({str(cycles)!r}); nothing to export")
         return
@@ -124,9 +125,9 @@ def export(run_dir: Path, kind: str, out: Path | None, force: bool) -> None:
     if cycles:
         from en4dvar.report.export_cycles import cycles_table
 
-        text = cycles_table(cycles, kind)  # type: ignore[arg-type]
+        text = cycles_table(cycles, kind)
     else:
-        text = export_table(run_dir, kind)  # type: ignore[arg-type]
+        text = export_table(run_dir, kind)
     refuse_to_replace(out, force)
     deliver(text, out, "table")
 
@@ -149,7 +150,7 @@ def rerun(run_dir: Path, workers: int | None, trust: bool) -> None:
     """
     from en4dvar.runs.rerun import rerun as repeat
 
-    found = repeat(run_dir, workers, trust=trust, ask=ask)
-    click.echo(str(found))
-    if not found.same:
+    repeated = repeat(run_dir, workers, trust=trust, ask=ask)
+    click.echo(str(repeated))
+    if not repeated.same:
         raise Failed("the run is not reproduced", 1)

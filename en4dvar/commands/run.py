@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import chdir
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,13 +13,14 @@ import click
 from en4dvar.commands.common import Failed, Source, command_line, config_options, continuable, note_beginning
 
 if TYPE_CHECKING:
-    from en4dvar.caution import Caution
     from en4dvar.config import Config, SequenceConfig, TwinConfig
-    from en4dvar.cycling.problem import SeriesResult
-    from en4dvar.cycling.twin import TwinResult
+    from en4dvar.plumbing.caution import Caution
     from en4dvar.runs.campaign import Campaign
+    from en4dvar.series.problem import SeriesResult
+    from en4dvar.series.twin import TwinResult
 
-MOST_TOLD = 30  # data sets, warnings and failures on the terminal; all of them are in the run directory
+MOST_TOLD = 30  # data sets and failures on the terminal; all of them are in the run directory
+MOST_NAMED = 3  # data sets of a warning
 
 
 @click.command()
@@ -89,42 +91,27 @@ def _estimate(config: Config, force: bool, resume: bool) -> None:
 
 
 def _tell(campaign: Campaign, with_report: bool) -> None:
-    """The posterior on standard output, warnings on standard error. Raises :class:`Failed` where a data set has."""
-    from en4dvar.storage.joint_file import FILE, load_joint
-    from en4dvar.storage.population_file import FILE as POPULATION
-    from en4dvar.storage.population_file import load_population
-    from en4dvar.summary import results_table
+    """The posterior on standard output, warnings on standard error. Raises :class:`Failed` where a data set has.
 
-    few = len(campaign) <= MOST_TOLD
-    summaries, remarks, warnings = {}, [], _Warnings()
-    for i, outcome in enumerate(campaign.outcomes):  # once: each is read from the disk
+    Of a campaign: the table of its data sets, of many that of its parameters, and its warnings counted by kind.
+    """
+    from en4dvar.estimation.summary import Estimates, results_table
+
+    few, warnings, spread = len(campaign) <= MOST_TOLD, _Warnings(), Estimates()
+    shown = {}
+    for outcome in campaign.outcomes:  # once: each is read from the disk
         if few and not outcome.failure:
-            summaries[outcome.name] = outcome.summary
-        if i < MOST_TOLD:
-            remarks += [f"{outcome.name}: {remark}" for remark in outcome.remarks]
+            shown[outcome.name] = outcome.summary
+        spread.add(outcome.summary)
         warnings.add(outcome.name, outcome.warnings)
-    if few:
-        click.echo(results_table(summaries))
-    for remark in remarks:
-        click.echo(remark)
-    together = load_joint(campaign.directory / FILE) if (campaign.directory / FILE).exists() else None
-    if together:
-        from en4dvar.report.joint import joint_table
-
-        click.echo(f"\n{joint_table(together)}")
-    behind = load_population(campaign.directory / POPULATION) if (campaign.directory / POPULATION).exists() else None
-    if behind:
-        from en4dvar.report.population import population_lines
-
-        click.echo("\n" + "\n".join(population_lines(behind)))
+    click.echo(results_table(shown) if few else str(spread))
+    for remark in campaign.outcomes[0].remarks if len(campaign.outcomes) == 1 else ():
+        click.echo(f"{campaign.outcomes[0].name}: {remark}")
+    _tell_what_sets_share(campaign.directory, warnings)
     for notice in campaign.notices:
         click.echo(f"warning: {notice}", err=True)
-    warnings.add("all together", together.cautions if together else ())
-    warnings.add("population", behind.cautions if behind else ())
-    for name, warning in warnings.worst:
-        click.echo(f"{warning.kind}: {name}: {warning}", err=True)
-    if warnings.count > MOST_TOLD:
-        click.echo(f"and {warnings.count - MOST_TOLD} more warnings and notes; see run.log", err=True)
+    for line in warnings.lines():
+        click.echo(line, err=True)
     if len(campaign) and with_report:
         click.echo(f"report: {campaign.directory / 'report.html'}")
     if campaign.failures:
@@ -134,22 +121,60 @@ def _tell(campaign: Campaign, with_report: bool) -> None:
         raise Failed("\n".join([head, *reasons[:MOST_TOLD], *more]), campaign.exit_code)
 
 
+def _tell_what_sets_share(directory: Path, warnings: _Warnings) -> None:
+    """The joint estimate and the population of a run on standard output, where there are; their warnings are added."""
+    from en4dvar.results import joint_file, population_file
+
+    if (directory / joint_file.FILE).exists():
+        from en4dvar.report.joint import joint_table
+
+        together = joint_file.load_joint(directory / joint_file.FILE)
+        click.echo(f"\n{joint_table(together)}")
+        warnings.add("all together", together.cautions)
+    if (directory / population_file.FILE).exists():
+        from en4dvar.report.population import population_lines
+
+        population = population_file.load_population(directory / population_file.FILE)
+        click.echo("\n" + "\n".join(population_lines(population)))
+        warnings.add("population", population.cautions)
+
+
 class _Warnings:
-    """``worst``: those that are told, each with its data set, the worst first. The others are only counted."""
+    """Warnings by their kind: how many data sets have one, and those where most is wrong."""
 
     def __init__(self) -> None:
-        self.worst: list[tuple[str, Caution]] = []
-        self.count = 0
+        self.of: dict[str, list[tuple[float, str, Caution]]] = {}  # code → the worst: place, data set, warning
+        self.counts = Counter[str]()  # of data sets
+        self.sets = 0
 
     def add(self, name: str, cautions: Sequence[Caution]) -> None:
-        self.count += len(cautions)
-        known = [*self.worst, *((name, caution) for caution in cautions)]
-        self.worst = sorted(known, key=lambda one: one[1].rank)[:MOST_TOLD]
+        from en4dvar.plumbing.caution import codes, gravity
+
+        self.sets += 1
+        self.counts.update(codes(cautions))
+        for caution in cautions:
+            told = [*self.of.get(caution.code, []), (caution.rank - 1e-3 * gravity(cautions), name, caution)]
+            self.of[caution.code] = sorted(told, key=lambda entry: entry[0])[:MOST_TOLD]
+
+    def lines(self) -> Iterator[str]:
+        """One for each kind, the worst first; of a single data set one for each warning."""
+        for told in sorted(self.of.values(), key=lambda entries: entries[0][2].rank):
+            _, name, worst = told[0]
+            count = self.counts[worst.code]
+            if count == 1:
+                yield from (f"{caution.kind}: {name}: {caution}" for _, _, caution in told)
+                continue
+            named = ", ".join(list(dict.fromkeys(entry[1] for entry in told))[:MOST_NAMED])
+            which = f"{count} of {self.sets} data sets, worst {named}" if count > MOST_NAMED else named
+            yield f"{worst.kind}: {which}: {worst.code}; {worst.advice}"
+        if self.sets > 1 and self.of:
+            yield "what was found in each of them: run.log and the report"
 
 
 def _conduct(config: TwinConfig, force: bool, resume: bool) -> None:
+    from en4dvar.report.outcomes import scores_table
     from en4dvar.runs.progress import cycle_progress
-    from en4dvar.runs.twin_run import run_twin, scores_table
+    from en4dvar.runs.twin_run import run_twin
 
     with continuable(), cycle_progress(config.experiment.cycles) as on_cycle:
         result = run_twin(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())
@@ -158,9 +183,10 @@ def _conduct(config: TwinConfig, force: bool, resume: bool) -> None:
 
 
 def _follow(config: SequenceConfig, force: bool, resume: bool) -> None:
-    from en4dvar.config.build_sequence import build_sequence
+    from en4dvar.assembly.build_sequence import build_sequence
+    from en4dvar.report.outcomes import estimates_table
     from en4dvar.runs.progress import cycle_progress
-    from en4dvar.runs.sequence_run import estimates_table, run_sequence
+    from en4dvar.runs.sequence_run import run_sequence
 
     with continuable(), cycle_progress(len(build_sequence(config).series.times)) as on_cycle:
         result = run_sequence(config, force=force, resume=resume, on_cycle=on_cycle, command=command_line())

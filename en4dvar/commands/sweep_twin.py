@@ -47,11 +47,11 @@ def sweep_twin(
     if out is not None:
         note_beginning(out, resume)
     with continuable():
-        found = sweep(
+        result = sweep(
             source.path, vary, seeds, overrides=source.overrides(), out=out, workers=workers, force=force,
             resume=resume, progress=tell, command=command_line(),
         )  # fmt: skip
-    click.echo(str(found))
-    for reason in dict.fromkeys(run.failure for runs in found.runs for run in runs if run.failure):
+    click.echo(str(result))
+    for reason in dict.fromkeys(run.failure for runs in result.runs for run in runs if run.failure):
         click.echo(f"failed: {reason}", err=True)
-    click.echo(f"averages: {found.directory / 'sweep.csv'}")
+    click.echo(f"averages: {result.directory / 'sweep.csv'}")

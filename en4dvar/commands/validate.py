@@ -40,17 +40,17 @@ def validate(source: Source, plot: bool) -> None:
         click.echo(twin_summary(loaded))
         return
     if isinstance(loaded, SequenceConfig):
-        from en4dvar.config.build_sequence import build_sequence
+        from en4dvar.assembly.build_sequence import build_sequence
         from en4dvar.runs.sequence_run import sequence_summary
 
         if plot:
             raise click.UsageError("--plot is for estimations; the report of a sequence shows its forecasts")
         click.echo(sequence_summary(loaded, build_sequence(loaded)))
         return
+    from en4dvar.assembly.build import build
     from en4dvar.commands.describe import cost_summary, problem_summary
-    from en4dvar.config.build import build
     from en4dvar.descent.preview import preview
-    from en4dvar.prior import own_seed
+    from en4dvar.priors.prior import own_seed
 
     problems = build(loaded)
     click.echo(problem_summary(loaded, problems))
@@ -58,8 +58,8 @@ def validate(source: Source, plot: bool) -> None:
     seeds = [own_seed(loaded.seed, problem.observations.name) for problem in chosen]
     previews = [preview(p, loaded.assimilation, seed, whole=plot) for p, seed in zip(chosen, seeds, strict=True)]
     click.echo(cost_summary(loaded, previews[0], len(problems)))
-    for one in previews:
-        _warn(one)
+    for shown in previews:
+        _warn(shown)
     if plot:
         click.echo(f"prior predictive: {_draw(loaded, previews, problems)}")
 
@@ -70,29 +70,28 @@ def _panels() -> int:
     return PANELS
 
 
-def _warn(one: Preview) -> None:
-    """What the prior ensemble shows that a run would stumble over."""
-    from en4dvar.honesty import doubts
+def _warn(preview: Preview) -> None:
+    """Print the problems of a run that the prior ensemble already shows."""
+    from en4dvar.diagnosis.honesty import doubts
 
-    name, reasons = one.problem.observations.name, [reason for reason in one.run.failures if reason]
+    name, reasons = preview.problem.observations.name, [reason for reason in preview.run.failures if reason]
     if reasons:
-        lost = f"{len(reasons)} of {len(one.run.failures)} prior members cannot be run"
+        lost = f"{len(reasons)} of {len(preview.run.failures)} prior members cannot be run"
         click.echo(f"warning: {name}: {lost}, e.g.: {reasons[0]}", err=True)
-    for one_doubt in one.problem.observations.doubts:
-        click.echo(f"warning: {name}: {one_doubt.words}", err=True)
-    for words in doubts(one.problem, one.members, one.run.predictions):
-        click.echo(f"warning: {name}: {words}", err=True)
-    if one.outside > 0.1:
-        share = f"{100 * one.outside:.0f} % of the observations lie outside everything the prior expects"
+    of_model = doubts(preview.problem, preview.members, preview.run.predictions)
+    for doubt in (*preview.problem.observations.doubts, *of_model):
+        click.echo(f"warning: {name}: {doubt.words}", err=True)
+    if preview.outside > 0.1:
+        share = f"{100 * preview.outside:.0f} % of the observations lie outside everything the prior expects"
         click.echo(f"warning: {name}: {share}; check units, clock and window (--plot shows them)", err=True)
 
 
 def _draw(config: Config, previews: Sequence[Preview], problems: Sequence[InverseProblem]) -> str:
-    from en4dvar.files import make_folder
+    from en4dvar.plumbing.files import make_folder
+    from en4dvar.report.drawing import keep
     from en4dvar.report.predictive import prior_predictive
-    from en4dvar.report.style import save_figure
 
     folder, name = make_folder(config.directory.parent), f"{config.directory.name}_prior"
-    save_figure(prior_predictive(previews), folder, name)
+    keep(prior_predictive(previews), folder, name)
     left = f" ({len(previews)} of {len(problems)} data sets)" if len(previews) < len(problems) else ""
     return f"{Path(folder) / name}.png and .pdf{left}"

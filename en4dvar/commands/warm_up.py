@@ -23,7 +23,7 @@ def warm_up() -> None:
     Example:
       en4dvar warm-up  # in an image, or before a batch of jobs
     """
-    from en4dvar.compiled import KERNELS, compilations
+    from en4dvar.plumbing.compiled import KERNELS, compilations
 
     for what, call in examples():
         before, start = compilations(), time.perf_counter()
@@ -34,12 +34,12 @@ def warm_up() -> None:
 
 
 def examples() -> Iterator[tuple[str, Callable[[], object]]]:
-    """What is compiled, in words, and a call that does. Raises :class:`En4dvarError` for a package at fault."""
-    from en4dvar.errors import En4dvarError
+    """Names of kernels, each with a call that compiles it. Raises :class:`En4dvarError`: a package is at fault."""
+    from en4dvar.plumbing.errors import En4dvarError
 
     for entry in sorted(entry_points(group=GROUP)):
         try:
-            found = entry.load()()
+            examples_of_package = entry.load()()
         except (ImportError, AttributeError) as error:
             raise En4dvarError(f"warm-up of {entry.name!r} ({entry.value}) cannot be loaded: {error}") from error
-        yield from found.items()
+        yield from examples_of_package.items()

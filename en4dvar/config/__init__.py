@@ -11,7 +11,7 @@ from en4dvar.config.load import Config, load_config, resolve
 from en4dvar.config.sequence import SequenceConfig, resolve_sequence
 from en4dvar.config.times import time_grid
 from en4dvar.config.twin import TwinConfig, resolve_twin
-from en4dvar.errors import ConfigError, Fault
+from en4dvar.plumbing.errors import ConfigError, Fault
 
 __all__ = [
     "AnyConfig", "Config", "SequenceConfig", "TwinConfig", "load_any", "load_config", "load_sequence", "load_twin",
@@ -28,14 +28,16 @@ def load_any(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any
 
 
 def resolve_any(document: Document, base: Path) -> AnyConfig:
-    """As :func:`load_any`, of a document that has been read; ``base`` is where its relative paths start."""
+    """The counterpart of :func:`load_any` for a document that has been read; ``base`` is where its relative paths
+    start.
+    """
     if "sequence" in document.data and "twin" not in document.data:
         return resolve_sequence(document, base)
     return resolve_twin(document, base) if "twin" in document.data else resolve(document, base)
 
 
 def load_twin(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> TwinConfig:
-    """As :func:`load_config`, for a twin experiment. Raises :class:`ConfigError`."""
+    """The counterpart of :func:`load_config` for a twin experiment. Raises :class:`ConfigError`."""
     config = load_any(source, overrides)
     if not isinstance(config, TwinConfig):
         raise ConfigError([Fault("not a twin experiment: it has no twin: section", file=config.document.file)])
@@ -43,7 +45,7 @@ def load_twin(source: str | Path | Mapping[str, Any], overrides: Mapping[str, An
 
 
 def load_sequence(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> SequenceConfig:
-    """As :func:`load_config`, for a sequence. Raises :class:`ConfigError`."""
+    """The counterpart of :func:`load_config` for a sequence. Raises :class:`ConfigError`."""
     config = load_any(source, overrides)
     if not isinstance(config, SequenceConfig):
         raise ConfigError([Fault("not a sequence: it has no sequence: section", file=config.document.file)])

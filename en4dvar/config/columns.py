@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, cast
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from en4dvar.config.context import PLACEHOLDER, Context, Made, observable_unit, require_sign, time_unit, unit_of
 from en4dvar.config.schema import QuantityText, Section
 from en4dvar.config.validate import Faults
-from en4dvar.errors import ConfigError, Fault
 from en4dvar.inputs.asked import Column, TimeStep
-from en4dvar.units import UnitError, parse_quantity
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.units import UnitError, as_unit, parse_quantity
 
 
 class Pixel(Section):
@@ -22,13 +22,12 @@ class Pixel(Section):
     """What one is long, e.g. 2.76 um."""
 
 
-def _unit_text(given: Any) -> Any:
-    if not isinstance(given, Mapping):
-        return given
-    number, _, unit = str(given.get("pixel", "")).strip().partition(" ")
-    if given.keys() != {"pixel"} or not unit:
+def _unit_text(written: Any) -> Any:
+    if not isinstance(written, Mapping):
+        return written
+    if written.keys() != {"pixel"}:
         raise ValueError("write a unit such as um, or {pixel: 2.76 um}")
-    return f"{number}*{unit}"
+    return as_unit(str(written["pixel"]), "m")
 
 
 class ValueColumn(Section):
@@ -69,16 +68,16 @@ class TimeColumn(Section):
         return self
 
 
-def _times(given: TimeColumn, context: Context) -> Column | TimeStep:
+def _times(section: TimeColumn, context: Context) -> Column | TimeStep:
     unit = time_unit(context)
-    rate = None if given.rate is None else _rate(given.rate, unit)
-    if given.unit is not None:
-        named = Column(str(given.name or given.step), given.unit, unit, rate=rate)
-        return named if given.name else TimeStep(named)
+    rate = None if section.rate is None else _rate(section.rate, unit)
+    if section.unit is not None:
+        named = Column(str(section.name or section.step), section.unit, unit, rate=rate)
+        return named if section.name else TimeStep(named)
     try:
-        return TimeStep(value=parse_quantity(given.step or 0, unit))
+        return TimeStep(value=parse_quantity(section.step or 0, unit))
     except UnitError as error:
-        raise ConfigError([Fault(str(error), "step")]) from None
+        raise ConfigError(str(error), "step") from None
 
 
 def _rate(text: Any, unit: str) -> float:
@@ -86,13 +85,13 @@ def _rate(text: Any, unit: str) -> float:
         value = parse_quantity(text, f"1/({unit})")
         require_sign(value, "positive", text)
     except ValueError as error:
-        raise ConfigError([Fault(str(error), "rate")]) from None
+        raise ConfigError(str(error), "rate") from None
     return value
 
 
-def _values(given: ValueColumn, context: Context) -> Column:
+def _values(section: ValueColumn, context: Context) -> Column:
     positive = context.observed is not None and context.observed.positive
-    return Column(given.name, given.unit, observable_unit(context), positive)
+    return Column(section.name, section.unit, observable_unit(context), positive)
 
 
 _VALUES = Made(_values, ValueColumn)
@@ -102,13 +101,13 @@ class Columns(Section):
     """Which columns hold the time and the observable, each with its unit."""
 
     model_config = ConfigDict(json_schema_extra={"required": ["time"]}, populate_by_name=False)
-    time: Annotated[Column | TimeStep, Made(_times, TimeColumn)] = None  # type: ignore[assignment]  # told by a rule
+    time: Annotated[Column | TimeStep, Made(_times, TimeColumn)] = cast(Any, None)  # a rule says what is missing
     """Observation times."""
-    observable: Annotated[Column, _VALUES, Field(alias=PLACEHOLDER)] = None  # type: ignore[assignment]  # the same
+    observable: Annotated[Column, _VALUES, Field(alias=PLACEHOLDER)] = cast(Any, None)
     """The observable."""
 
     @classmethod
-    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        if given.get("time") is None:
+    def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        if keys.get("time") is None:
             unit = time_unit(context)
             faults.add(("time",), f"required: {{name: <column>, unit: {unit}}}, or {{step: <quantity>}}")

@@ -16,10 +16,10 @@ from pydantic import AfterValidator, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from en4dvar.config.validate import Faults
-from en4dvar.errors import ConfigError
-from en4dvar.forward import ForwardModel, Observable
-from en4dvar.hints import brief, shown, suggest
-from en4dvar.units import convert, parse_quantity, parse_unit
+from en4dvar.model.forward import ForwardModel, Observable
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.hints import brief, shown, suggest
+from en4dvar.plumbing.units import convert, parse_quantity, parse_unit
 
 T = TypeVar("T")
 PLACEHOLDER = "<observable>"
@@ -55,7 +55,7 @@ class Context:
 
     @property
     def observable(self) -> Observable:
-        """What the data hold. Raises :class:`Unknown`."""
+        """The observable that the data hold. Raises :class:`Unknown`."""
         return _known(self.observed)
 
 
@@ -82,23 +82,24 @@ def subject_unit(context: Context) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """Pydantic annotation: the file gives a ``given``, and the field holds ``make(it, context)``, None if unknown.
+    """Pydantic annotation: the file gives an ``entry`` of this type, and the field holds ``make(it, context)``, or
+    None where what that needs is unknown.
 
     A :class:`ConfigError` of ``make`` is told at the path that its faults have below the field. In the JSON schema the
-    field is ``json``; by default what is given, or a quantity.
+    field is ``json``; by default that of the entry, or of a quantity.
     """
 
     make: Callable[[Any, Context], Any]
-    given: Any = Any
+    entry: Any = Any
     json: Mapping[str, Any] | None = None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.with_info_after_validator_function(self._make, handler.generate_schema(self.given))
+        return core_schema.with_info_after_validator_function(self._make, handler.generate_schema(self.entry))
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         if self.json is not None:
             return dict(self.json)
-        return dict(TEXT) if self.given is Any else handler(schema)
+        return dict(TEXT) if self.entry is Any else handler(schema)
 
     def _make(self, value: Any, info: Any) -> Any:
         with Faults() as faults, faults.at(), suppress(Unknown):
@@ -161,27 +162,27 @@ def unit_of(target: Unit) -> Made:
 
 
 def read_each(
-    given: Mapping[str, Any],
+    section: Mapping[str, Any],
     known: Mapping[str, Any],
     context: Context,
     faults: Faults,
     read: Callable[[Any, Context], T],
     unknown: Callable[[str], str] | None = None,
 ) -> dict[str, T]:
-    """What ``read`` makes of each entry of a section whose keys are the names of ``known`` things, its subjects.
+    """The result of ``read`` for each entry of a section whose keys are the names of ``known`` things, its subjects.
 
     ``unknown`` words what is wrong with another name.
     """
-    found: dict[str, T] = {}
-    for name, value in given.items():
+    values: dict[str, T] = {}
+    for name, value in section.items():
         if name not in known:
             words = unknown(name) if unknown else f"unknown key {shown(name)}{suggest(name, known)}"
             faults.add((name,), words, at_key=True)
             continue
         context.subject = known[name]
         with faults.at(name):
-            found[name] = read(value, context)
-    return found
+            values[name] = read(value, context)
+    return values
 
 
 @dataclass(frozen=True)
@@ -193,29 +194,29 @@ class OfObservable:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         declared = [field.alias or name for name, field in source.model_fields.items()]
 
-        def read(given: Any, validate: Callable[[Any], Any], info: Any) -> Any:
+        def read(section: Any, validate: Callable[[Any], Any], info: Any) -> Any:
             observable = info.context.observed
-            if not isinstance(given, dict):
-                return validate(given)
+            if not isinstance(section, dict):
+                return validate(section)
             if observable is None:  # told elsewhere
-                return validate({key: value for key, value in given.items() if key in declared})
+                return validate({key: value for key, value in section.items() if key in declared})
             names = {key: key.replace(PLACEHOLDER, observable.name) for key in declared}
             keys = {written: key for key, written in names.items()}
             with Faults(names) as faults:
-                for key in given:
+                for key in section:
                     if key not in keys:
                         faults.add((key,), f"unknown {self.what} {shown(key)}{suggest(key, keys)}", at_key=True)
                 with faults.at(schema=source):
-                    return validate({keys[key]: value for key, value in given.items() if key in keys})
+                    return validate({keys[key]: value for key, value in section.items() if key in keys})
 
         return core_schema.with_info_wrap_validator_function(read, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        found = handler.resolve_ref_schema(handler(schema))
-        fixed = "|".join(key for key in found["properties"] if PLACEHOLDER not in key)
-        found["patternProperties"] = {
-            f"^(?!({fixed})$){key.replace(PLACEHOLDER, '.*')}$": found["properties"].pop(key)
-            for key in list(found["properties"])
+        resolved = handler.resolve_ref_schema(handler(schema))
+        fixed = "|".join(key for key in resolved["properties"] if PLACEHOLDER not in key)
+        resolved["patternProperties"] = {
+            f"^(?!({fixed})$){key.replace(PLACEHOLDER, '.*')}$": resolved["properties"].pop(key)
+            for key in list(resolved["properties"])
             if PLACEHOLDER in key
         }
-        return found
+        return resolved

@@ -1,4 +1,4 @@
-"""The ``data:`` section of one observable: which files, columns and window, and how well the observations are known."""
+"""The ``data:`` section: which files, how they are read, which observations are used, and how well they are known."""
 
 from __future__ import annotations
 
@@ -10,17 +10,51 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from en4dvar.config.columns import Columns
-from en4dvar.config.context import Context, Made, OfObservable
+from en4dvar.config.context import Context, Made, OfObservable, time_unit
 from en4dvar.config.error import Error
 from en4dvar.config.places import PLACES, Placing
 from en4dvar.config.schema import Name, Section
 from en4dvar.config.validate import Faults
 from en4dvar.config.weights import WEIGHTS, Weighing
-from en4dvar.config.window import WindowSection, read_time_zero
-from en4dvar.forward import field_of
-from en4dvar.hints import shown, suggest
 from en4dvar.inputs.asked import Disorder, Format, Layout, Repeated
 from en4dvar.inputs.text_table import Decimal
+from en4dvar.inputs.window import Instant, parse_instant
+from en4dvar.model.forward import field_of
+from en4dvar.plumbing.hints import shown, suggest
+from en4dvar.plumbing.units import UnitError, parse_quantity
+
+
+def _instant(text: Any, context: Context) -> Instant:
+    possible = (context.observed,) if context.observed else context.units.observables
+    symbols = {word for observable in possible for word in (observable.symbol.strip("$"), observable.name)}
+    return parse_instant(text, time_unit(context), symbols)
+
+
+def _prominence(text: Any, context: Context) -> float:
+    value = parse_quantity(text, "1")
+    if not 0 < value < 1:
+        raise ValueError("must lie between 0 and 100 %")
+    return value
+
+
+class WindowSection(Section):
+    """First and last observation used: ``maximum``, ``minimum 2``, a time, or ``start``/``end`` of the file."""
+
+    start: Annotated[Instant, Made(_instant)] = Field("start", alias="from", validate_default=True)
+    """First observation: start, maximum (for the bubble also R_max), minimum N, or a time on the file's clock."""
+    end: Annotated[Instant, Made(_instant)] = Field("end", alias="to", validate_default=True)
+    """Last observation: end, maximum, minimum N (counted from the window's start), or a time on the file's clock."""
+    prominence: Annotated[float, Made(_prominence)] = Field("10 %", validate_default=True)
+    """How deep a minimum must be to count, relative to the range of the series."""
+
+
+def read_time_zero(text: Any, context: Context) -> Literal["file", "window"] | float:
+    if text in ("file", "window"):
+        return "file" if text == "file" else "window"
+    try:
+        return parse_quantity(text, time_unit(context))
+    except UnitError as error:
+        raise UnitError(f"write file, window or a time: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -37,8 +71,8 @@ def _not_empty(path: str | tuple[str, ...]) -> str | tuple[str, ...]:
     return path
 
 
-def _files(given: str | tuple[str, ...], context: Context) -> Files:
-    return Files(context.base, (given,) if isinstance(given, str) else given)
+def _files(written: str | tuple[str, ...], context: Context) -> Files:
+    return Files(context.base, (written,) if isinstance(written, str) else written)
 
 
 class Data(Section):
@@ -82,13 +116,13 @@ class Data(Section):
         return Layout(self.format, self.decimal, self.by, self.sheet, self.unsorted, self.repeated)
 
     @classmethod
-    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        if given.get("repeated") == "average" and "places" in given:
+    def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        if keys.get("repeated") == "average" and "places" in keys:
             faults.add(("repeated",), "not together with places, of which each has a reading of its own", at_key=True)
         block = field_of(context.units, context.observed) if context.observed else None
-        if block is not None and block.size > 1 and "places" not in given:
+        if block is not None and block.size > 1 and "places" not in keys:
             faults.add(("places",), f"required: {block.name!r} is a field of {block.size} values; say which were read")
-        columns = given.get("columns")
+        columns = keys.get("columns")
         if context.observed:
             if not isinstance(columns, dict) or context.observed.name not in columns:
                 name = context.observed.name
@@ -103,9 +137,9 @@ class Data(Section):
         if columns.keys() <= set(roles):
             faults.add(("columns",), f"name the column of one observable of: {', '.join(roles[1:])}")
 
-    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """As given, with absolute paths."""
-        written = super().as_written(given)
+    def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
+        """The section as it was written, with absolute paths."""
+        written = super().as_written(source)
         paths = [str(self.path.base / text) for text in self.path.texts]
         written["path"] = paths[0] if len(paths) == 1 else paths
         if self.error.covariance is not None:

@@ -17,14 +17,14 @@ from en4dvar.config.document import Document
 from en4dvar.config.parameters import Entry, Uncertain
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
-from en4dvar.dependence import Dependence, KernelName, correlation_of_places
-from en4dvar.errors import ConfigError, DataError, Fault
-from en4dvar.files import expanded
-from en4dvar.hints import suggest
 from en4dvar.inputs.members import read_members
 from en4dvar.inputs.square import read_square
-from en4dvar.prior import PriorTerm
-from en4dvar.state import Array, Parameter, TransformName
+from en4dvar.model.state import Array, Parameter, TransformName
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault
+from en4dvar.plumbing.files import expanded
+from en4dvar.plumbing.hints import suggest
+from en4dvar.priors.dependence import Dependence, KernelName, correlation_of_places
+from en4dvar.priors.prior import PriorTerm
 
 KINDS = ("correlation", "matrix", "file", "kernel")
 
@@ -48,23 +48,23 @@ class PriorCorrelation(Section):
     file: Annotated[Path | None, Made(_path, Annotated[str, Field(min_length=1)], {"type": "string"})] = None
     """CSV file of the correlation matrix, without header, relative to the configuration's folder."""
     kernel: KernelName | None = None
-    """PriorCorrelation as a function of distance, for parameters with places: needs ``at`` and ``length``."""
+    """Correlation as a function of distance, for parameters with places: needs ``at`` and ``length``."""
     at: tuple[Position, ...] | None = None
     """Place of each parameter: a number, or a list of coordinates."""
     length: Annotated[float, Field(gt=0)] | None = None
-    """PriorCorrelation length of the kernel, in the unit of the places."""
+    """Correlation length of the kernel, in the unit of the places."""
 
     @classmethod
-    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        if sum(key in given for key in KINDS) != 1:
+    def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        if sum(key in keys for key in KINDS) != 1:
             faults.add((), f"give one of {', '.join(KINDS)}")
         for key in ("at", "length"):
-            if (key in given) != ("kernel" in given):
-                faults.add((key,) if key in given else (), "at and length belong to a kernel, and a kernel needs both")
+            if (key in keys) != ("kernel" in keys):
+                faults.add((key,) if key in keys else (), "at and length belong to a kernel, and a kernel needs both")
 
-    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """As given, with an absolute path."""
-        return {**super().as_written(given), **({"file": str(self.file)} if self.file else {})}
+    def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
+        """The section as it was written, with an absolute path."""
+        return {**super().as_written(source), **({"file": str(self.file)} if self.file else {})}
 
     def of_all(self, read: Callable[[Path], Array]) -> Array:
         """The matrix (m, m). Raises :class:`ConfigError`, :class:`DataError`."""
@@ -96,12 +96,12 @@ class PriorFile(Section):
     ensemble: Annotated[Path, Made(_path, Annotated[str, Field(min_length=1)], {"type": "string"})]
     """posterior.nc of an earlier run, other netCDF with a variable a parameter, or a CSV file with a column each."""
 
-    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """As given, with an absolute path."""
-        return {**super().as_written(given), "ensemble": str(self.ensemble)}
+    def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
+        """The section as it was written, with an absolute path."""
+        return {**super().as_written(source), "ensemble": str(self.ensemble)}
 
 
-def joined(found: Sequence[tuple[tuple[str, ...], Array]]) -> tuple[Dependence, ...]:
+def joined(blocks: Sequence[tuple[tuple[str, ...], Array]]) -> tuple[Dependence, ...]:
     """Blocks of correlations between some names each; what shares a name is one block, zero where nothing is said.
 
     Raises
@@ -109,11 +109,11 @@ def joined(found: Sequence[tuple[tuple[str, ...], Array]]) -> tuple[Dependence, 
     ConfigError: a pair of which two say something, or no correlation matrix.
     """
     groups: list[list[int]] = []
-    for k, (names, _) in enumerate(found):
-        touching = [group for group in groups if any({*names} & {*found[i][0]} for i in group)]
+    for k, (names, _) in enumerate(blocks):
+        touching = [group for group in groups if any({*names} & {*blocks[i][0]} for i in group)]
         merged = [*itertools.chain.from_iterable(touching), k]
         groups = [*(group for group in groups if group not in touching), merged]
-    return tuple(_one_block([found[k] for k in sorted(group)]) for group in groups)
+    return tuple(_one_block([blocks[k] for k in sorted(group)]) for group in groups)
 
 
 def _one_block(parts: Sequence[tuple[tuple[str, ...], Array]]) -> Dependence:
@@ -153,27 +153,27 @@ def resolved(
     """
     faults: list[Fault] = []
     asking = [e for e in entries if isinstance(e, Uncertain) and e.from_ensemble]
-    found: tuple[Dependence, ...] = ()
+    dependence: tuple[Dependence, ...] = ()
     made: dict[str, Entry] = {}
     if asking or ensemble is not None:
         try:
-            found, made = _of_ensemble(asking, ensemble, apart)
+            dependence, made = _of_ensemble(asking, ensemble, apart)
         except ConfigError as error:
-            faults += [document.fault(tuple(f.path.split(".")), f.message) for f in error.problems]
+            faults += document.placed(error)
     estimated = [e.parameter.name for e in entries if isinstance(e, Uncertain)] + list(others)
     alone = {**apart, **{e.parameter.name: "its correlations are those of the ensemble" for e in asking}}
     parts = []
-    for k, one in enumerate(correlations):
+    for k, section in enumerate(correlations):
         place = ("prior_correlation", k)
         try:
-            _check_names(one.between, estimated, alone)
-            parts.append((one.between, one.of_all(read_square)))
+            _check_names(section.between, estimated, alone)
+            parts.append((section.between, section.of_all(read_square)))
             Dependence(*parts[-1])
         except (ConfigError, DataError) as error:
             faults.append(document.fault(place, str(error)))
     if not faults:
         try:
-            return tuple(made.get(e.parameter.name, e) for e in entries), (*found, *joined(parts))
+            return tuple(made.get(e.parameter.name, e) for e in entries), (*dependence, *joined(parts))
         except ConfigError as error:
             faults.append(document.fault(("prior_correlation",), str(error)))
     raise ConfigError(faults)
@@ -250,4 +250,4 @@ def term_of_members(parameter: Parameter, values: Array, kind: str | None) -> tu
 
 
 def _at(path: str, message: str) -> ConfigError:
-    return ConfigError([Fault(message, path)])
+    return ConfigError(message, path)

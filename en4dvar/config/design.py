@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from itertools import product
 from math import prod
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -15,8 +15,8 @@ from en4dvar.config.context import Context, Made, quantity, time_unit
 from en4dvar.config.schema import QuantityText, Section, section_of
 from en4dvar.config.times import Times, read_times, time_grid
 from en4dvar.config.validate import Faults
-from en4dvar.design.evaluate import SampleSizes
-from en4dvar.state import Array
+from en4dvar.estimation.design.evaluate import SampleSizes
+from en4dvar.model.state import Array
 
 MOST = 2000  # designs
 Value = QuantityText | bool
@@ -24,7 +24,7 @@ OF_A_LAW = ("model", "parameters", "prior", "prior_correlation")
 
 
 class Knob(Section):
-    """What the experimenter can turn: a key of this file, and the values that are tried."""
+    """A knob that the experimenter can turn: a key of this file, and the values that are tried."""
 
     key: Annotated[str, Field(pattern=r"^[\w-]+(\.[\w-]+)*$")]
     """The key, its sections before it: ``model.pulse.amplitude``, ``design.times.step``, ``data.error.radius_std``."""
@@ -66,7 +66,7 @@ class Choice(Section):
 
 
 class Price(Section):
-    """What an experiment costs, in any unit."""
+    """The price of an experiment, in any unit."""
 
     reading: Annotated[float, Field(ge=0)] = 1.0
     """Of a reading."""
@@ -74,12 +74,12 @@ class Price(Section):
     """Of an experiment, beside its readings."""
 
     def of(self, experiments: int, readings: int) -> float:
-        """Of so many experiments of so many readings each."""
+        """The price of so many experiments of so many readings each."""
         return experiments * (self.experiment + self.reading * readings)
 
 
 class Within(Section):
-    """What a design must keep to; one that does not is left out, and named."""
+    """Limits that a design must keep to; one that does not is left out, and named."""
 
     readings: Annotated[int, Field(ge=1)] | None = None
     """Largest number of readings of an experiment: the frames that the camera can hold."""
@@ -89,7 +89,7 @@ class Within(Section):
     """Largest share of the prior for which the model may leave its validity (for a bubble: its wall Mach number)."""
 
     def broken(self, readings: int, price: float, beyond: float) -> str:
-        """What a design does not keep to; nothing: it does."""
+        """The limits that a design exceeds, in words; empty where it keeps to all."""
         told = (
             ("readings", readings, f"{readings} readings"),
             ("price", price, f"a price of {price:g}"),
@@ -100,7 +100,12 @@ class Within(Section):
         return "; ".join(f"{text}: more than design.within.{key} = {most:g}" for key, most, text in over)
 
 
-_SampleSizes: Any = section_of(SampleSizes)
+if TYPE_CHECKING:
+
+    class _SampleSizes(SampleSizes, Section): ...
+
+else:
+    _SampleSizes = section_of(SampleSizes)
 
 
 class Design(_SampleSizes):
@@ -129,13 +134,13 @@ class Design(_SampleSizes):
     auto: laplace, checked by nested on the first and the best designs and replaced by it where they disagree."""
 
     @classmethod
-    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        laws = given.get("laws")
+    def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        laws = keys.get("laws")
         if isinstance(laws, dict) and laws:
             _check_laws(laws, faults)
-            if given.get("experiments", [1]) != [1]:
+            if keys.get("experiments", [1]) != [1]:
                 faults.add(("experiments",), "not with laws: which law holds is asked of one experiment", at_key=True)
-        knobs = given.get("knobs")
+        knobs = keys.get("knobs")
         if not isinstance(knobs, dict):
             return
         sizes = [len(k["values"]) for k in knobs.values() if isinstance(k, dict) and isinstance(k.get("values"), list)]

@@ -10,16 +10,18 @@ import math
 import os
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import yaml
 
-from en4dvar.errors import ConfigError, Fault
-from en4dvar.hints import brief, no_such_file, shown
 from en4dvar.inputs.asked import SUFFIXES
+from en4dvar.plumbing.errors import ConfigError, Fault
+from en4dvar.plumbing.files import open_plain
+from en4dvar.plumbing.hints import brief, no_such_file, shown
 
 Key = tuple[str | int, ...]
 Mark = tuple[int, int]  # line and column, from 1
@@ -64,8 +66,21 @@ class Document:
                 return Fault(message, dotted, self.file, *marks[key])
         return Fault(message, dotted, self.file)
 
+    def placed(self, error: ConfigError, *above: str | int) -> list[Fault]:
+        """The faults of an error, each at its path in this file, below ``above``."""
+        paths = [((*above, *(f.path.split(".") if f.path else ())), f) for f in error.problems]
+        return [self.fault(path, f.message) if path else f for path, f in paths]
+
+    @contextmanager
+    def placing(self, *above: str | int) -> Iterator[None]:
+        """Within, the faults of a :class:`ConfigError` are :meth:`placed`."""
+        try:
+            yield
+        except ConfigError as error:
+            raise ConfigError(self.placed(error, *above)) from None
+
     def has(self, path: Sequence[str | int]) -> bool:
-        """Whether the data contains ``path``."""
+        """True if the data contains ``path``."""
         node: Any = self.data
         for part in path:
             try:
@@ -78,7 +93,7 @@ class Document:
 def read_document(path: Path) -> Document:
     """Read and parse a YAML file. Raises :class:`ConfigError` listing every fault found."""
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             content = file.read(LONGEST + 1)
         if len(content) > LONGEST:
             words = f"longer than {LONGEST / 1e6:g} MB, which no configuration is; numbers belong into data files"
@@ -86,24 +101,24 @@ def read_document(path: Path) -> Document:
         text = content.decode("utf-8-sig")
         return parse_document(text, str(path))
     except OSError as error:
-        raise ConfigError([Fault(_unreadable(path, error))]) from None
+        raise ConfigError(_unreadable(path, error)) from None
     except UnicodeDecodeError as error:
         fault = ConfigError([Fault(f"not UTF-8 text ({error.reason} at byte {error.start})", file=str(path))])
     except ConfigError as error:
         fault = error
     if path.suffix.lower() in SUFFIXES:
-        raise ConfigError([Fault(_propose("a data file", path))]) from None
+        raise ConfigError(_propose("a data file", path)) from None
     raise fault from None
 
 
-def document_of(given: Mapping[Any, Any]) -> Document:
+def document_of(content: Mapping[Any, Any]) -> Document:
     """Plain data of Python as if it had been read from a file.
 
     Numbers of numpy become numbers, arrays, tuples and sets lists, paths text. Raises :class:`ConfigError`: every value
     that a YAML file could not hold.
     """
     document, faults = Document({}), list[Fault]()
-    data = _plain(given, (), document, faults)
+    data = _plain(content, (), document, faults)
     if faults:
         raise ConfigError(faults)
     return replace(document, data=data, text=yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=120))
@@ -183,8 +198,9 @@ def _unreadable(path: Path, error: OSError) -> str:
 
 
 def _propose(what: str, path: Path) -> str:
-    given = shlex.quote(str(path))
-    return f"{path}: {what}, not a configuration; 'en4dvar init --data {given}' looks at the readings and proposes one"
+    shell_path = shlex.quote(str(path))
+    proposal = f"'en4dvar init --data {shell_path}' looks at the readings and proposes one"
+    return f"{path}: {what}, not a configuration; {proposal}"
 
 
 def _copy(node: Any) -> Any:
@@ -199,7 +215,7 @@ class _Loader(yaml.SafeLoader):
     """Composes the node graph; scalars are resolved by :func:`_scalar`."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        event: Any = self.peek_event()
+        event: Any = cast(Any, self).peek_event()
         if isinstance(event, yaml.AliasEvent):
             raise _Refused("aliases are not used here; repeat the value", event.start_mark)
         if getattr(event, "tag", None) is not None:

@@ -1,20 +1,160 @@
-"""``data.error``: how well the observations are known."""
+"""``data.error``: how well the observations are known, and what the model misses."""
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
-from en4dvar.config.context import PLACEHOLDER, Context, Made, Spread, observable_unit, quantity, time_unit, unit_of
-from en4dvar.config.discrepancy import DiscrepancySection, estimated
-from en4dvar.config.error_std import QUANTITY_OR_COLUMN, read_error_std, read_spread, read_time_std
+from en4dvar.config.context import (
+    PLACEHOLDER,
+    TEXT,
+    Context,
+    Made,
+    Spread,
+    observable_unit,
+    quantity,
+    require_sign,
+    time_unit,
+    unit_of,
+)
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
-from en4dvar.files import expanded
+from en4dvar.data.noise import SMOOTHNESS, Kernel
 from en4dvar.inputs.asked import Column, Matrix
+from en4dvar.model.state import Array, Parameter
+from en4dvar.plumbing.files import expanded
+from en4dvar.plumbing.units import UnitError, convert, parse_quantity
+from en4dvar.priors.prior import PriorTerm
+
+_RELATIVE = re.compile(r"(.*%)\s+of\s+(?:the\s+)?maximum")
+
+
+def parse_error_std(text: Any, unit: str) -> Spread:
+    """``"1.4 um"`` or ``"1 % of maximum"``. Raises :class:`UnitError`."""
+    word = str(text).strip()
+    relative = _RELATIVE.fullmatch(word)
+    if relative:
+        return Spread(parse_quantity(relative[1], "1"), relative=True)
+    try:
+        return Spread(parse_quantity(text, unit))
+    except UnitError as error:
+        hint = f"; write '{word} of maximum'" if word.endswith("%") else ""
+        raise UnitError(f"{error}{hint}") from None
+
+
+class ErrorColumn(Section):
+    """A column of standard deviations, one per reading."""
+
+    column: Annotated[str, Field(min_length=1)]
+    """Header of the column (CSV) or name of the field (.mat)."""
+    unit: str | None = None
+    """Unit of the numbers in it; default: that of the readings' own column."""
+
+
+def error_column(written: Any, context: Context, target: str) -> Column:
+    chosen = ErrorColumn.model_validate(written, context=context)
+    if chosen.unit is not None:
+        convert(1.0, chosen.unit, target)
+    return Column(chosen.column, chosen.unit or "", target)
+
+
+def read_error_std(text: Any, context: Context) -> Spread | Column:
+    if isinstance(text, Mapping):
+        return error_column(text, context, observable_unit(context))
+    return read_spread(text, context)
+
+
+def read_spread(text: Any, context: Context) -> Spread:
+    spread = parse_error_std(text, observable_unit(context))
+    require_sign(spread.value, "positive", text)
+    return spread
+
+
+def read_time_std(text: Any, context: Context) -> float | Column:
+    if isinstance(text, Mapping):
+        return error_column(text, context, time_unit(context))
+    value = parse_quantity(text, time_unit(context))
+    require_sign(value, "not negative", text)
+    return value
+
+
+QUANTITY_OR_COLUMN = {"anyOf": [TEXT, ErrorColumn.model_json_schema()]}
+
+
+_OF_WINDOW = re.compile(r"(.*%)\s+of\s+(?:the\s+)?window")
+
+
+def _length(text: Any, context: Context) -> Spread:
+    relative = _OF_WINDOW.fullmatch(str(text).strip())
+    spread = Spread(
+        parse_quantity(relative[1] if relative else text, "1" if relative else time_unit(context)), bool(relative)
+    )
+    require_sign(spread.value, "positive", text)
+    return spread
+
+
+def _rate_unit(context: Context) -> str:
+    return f"({observable_unit(context)})/({time_unit(context)})"
+
+
+LogStd = Annotated[float, Field(gt=0)]
+
+
+class AmplitudeSection(Section):
+    """Lognormal prior of the discrepancy's standard deviation."""
+
+    median: Annotated[Spread, Made(read_spread)] = Field("0.5 % of maximum", validate_default=True)
+    """A quantity in the observable's unit, or e.g. '2 % of maximum'."""
+    log_std: LogStd = 1.5
+    """Standard deviation of the natural logarithm."""
+
+
+class LengthSection(Section):
+    """Lognormal prior of the time over which the discrepancy forgets itself."""
+
+    median: Annotated[Spread, Made(_length)] = Field("10 % of window", validate_default=True)
+    """A time, or e.g. '10 % of window'."""
+    log_std: LogStd = 0.7
+    """Standard deviation of the natural logarithm."""
+
+
+class DiscrepancySection(Section):
+    """The discrepancy of the model: a Gaussian process beside the errors whose amplitude and length are estimated."""
+
+    amplitude: AmplitudeSection = Field({}, validate_default=True)
+    """Prior of ``discrepancy_amplitude``, its standard deviation."""
+    length: LengthSection = Field({}, validate_default=True)
+    """Prior of ``discrepancy_length``, its correlation time."""
+    kernel: Literal["exponential", "matern-3/2", "matern-5/2"] = "exponential"
+    """Correlation in time: exponential (rough paths), or Matérn's with one or two derivatives."""
+    grows_beyond: Annotated[float | None, quantity(_rate_unit, "positive")] = None
+    """Rate of the observable beyond which the amplitude grows in proportion to it, e.g. 20 m/s; default: constant."""
+
+    def kernel_at(self, times: Array) -> Kernel:
+        """The kernel at observation times (K,)."""
+        return Kernel(times, SMOOTHNESS[self.kernel], self.grows_beyond or math.inf)
+
+    def terms(self, parameters: tuple[Parameter, Parameter], maximum: float, window: float) -> tuple[PriorTerm, ...]:
+        """Priors of amplitude and length, from the largest observation and the duration of the window."""
+        amplitude, length = parameters
+        return (
+            PriorTerm.lognormal(amplitude, self.amplitude.median.absolute(maximum), self.amplitude.log_std),
+            PriorTerm.lognormal(length, self.length.median.absolute(window), self.length.log_std),
+        )
+
+
+def estimated(written: Any) -> Any:
+    if written == "estimated":
+        return {}
+    if written is not None and not isinstance(written, dict):
+        raise ValueError("write estimated, or the priors of its amplitude and length")
+    return written
+
 
 HUBER = 1.345  # 95 % efficiency where the errors are Gaussian after all: Huber (1981), Robust Statistics
 
@@ -33,8 +173,8 @@ class CovarianceFile(Section):
     """Unit of the covariances, the observable's squared, e.g. um^2."""
 
 
-def _matrix(given: CovarianceFile, context: Context) -> Matrix:
-    return Matrix(context.base / expanded(given.path), given.unit, _square(context))
+def _matrix(section: CovarianceFile, context: Context) -> Matrix:
+    return Matrix(context.base / expanded(section.path), section.unit, _square(context))
 
 
 class Error(Section):
@@ -64,7 +204,7 @@ class Error(Section):
     """What the model misses: ``estimated``, or priors. Adds ``discrepancy_amplitude`` and ``discrepancy_length``."""
 
     @classmethod
-    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+    def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
         std = f"{PLACEHOLDER}_std"
         for name, other, reason in (
             ("covariance", std, "the file holds the variances"),
@@ -73,17 +213,22 @@ class Error(Section):
             ("robust", "correlation_time", "a robust cost needs independent observation errors"),
             ("robust", "covariance", "a robust cost needs independent observation errors"),
         ):
-            if name in given and other in given:
+            if name in keys and other in keys:
                 faults.add((name,), f"not together with {other}: {reason}", at_key=True)
-        if "threshold" in given and "robust" not in given:
+        if "threshold" in keys and "robust" not in keys:
             faults.add(("threshold",), "is that of the robust cost; write robust: huber as well", at_key=True)
-        if context.observed and not given.keys() & {std, "covariance"}:
+        if context.observed and not keys.keys() & {std, "covariance"}:
             faults.add((std,), "required: the standard deviation of the observation error")
 
     def column(self, which: Literal["std", "time_std"], readings: str) -> Column | None:
         """The column of errors, in the unit ``readings`` where it has none of its own; None: no column."""
         chosen = getattr(self, which)
         return replace(chosen, unit=chosen.unit or readings) if isinstance(chosen, Column) else None
+
+    @property
+    def separate(self) -> bool:
+        """True if the errors of one reading say nothing of those of another."""
+        return self.covariance is None and self.correlation_time is None
 
     @property
     def huber(self) -> float | None:

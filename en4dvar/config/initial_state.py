@@ -8,19 +8,19 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 from en4dvar.config.context import Context, Made, Spread, parse_spread, quantity, read_each
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
-from en4dvar.dependence import KernelName
-from en4dvar.field_prior import FieldPrior
-from en4dvar.forward import ForwardModel
-from en4dvar.hints import shown, suggest
-from en4dvar.prior import PriorTerm
+from en4dvar.model.forward import ForwardModel
+from en4dvar.model.state import Field, Parameter
+from en4dvar.plumbing.hints import shown, suggest
+from en4dvar.priors.dependence import KernelName
+from en4dvar.priors.field_prior import FieldPrior
+from en4dvar.priors.prior import PriorTerm
 from en4dvar.problem import StatePerturbation
-from en4dvar.state import Field, Parameter
 
 T = TypeVar("T")
 
 
 class Perturbed(NamedTuple):
-    """What is estimated of a field as one number, and what it does to the initial state."""
+    """A field estimated as a single number, and the effect of that number on the initial state."""
 
     term: PriorTerm
     perturbation: StatePerturbation
@@ -61,11 +61,11 @@ class InitialSpread(Section):
     """Correlation length of the kernel, in the unit of the field's coordinates."""
 
     @classmethod
-    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+    def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
         for key, other in (("kernel", "length"), ("length", "kernel")):
-            if key in given and other not in given:
+            if key in keys and other not in keys:
                 faults.add((key,), f"kernel and length go together; give {other} as well", at_key=True)
-        if "kernel" in given and context.subject.coordinates is None:
+        if "kernel" in keys and context.subject.coordinates is None:
             name = context.subject.name
             faults.add(("kernel",), f"the model gives no coordinates for {name}, so that no distance is known")
 
@@ -77,9 +77,9 @@ def dynamic_fields(model: ForwardModel) -> dict[str, Field]:
 
 
 def read_fields(
-    given: Mapping[str, Any], context: Context, instead: str, read: Callable[[Any, Context], T]
+    section: Mapping[str, Any], context: Context, instead: str, read: Callable[[Any, Context], T]
 ) -> tuple[T, ...]:
-    """What is said of fields of the state, in the order of the file; ``instead`` is what to do for a parameter."""
+    """The entries about fields of the state, in the order of the file; ``instead`` is what to do for a parameter."""
     fields = dynamic_fields(context.model)
 
     def unknown(name: str) -> str:
@@ -88,17 +88,17 @@ def read_fields(
         return f"unknown field {shown(name)} of the state{suggest(name, fields)}"
 
     with Faults() as faults:
-        return tuple(read_each(given, fields, context, faults, read, unknown).values())
+        return tuple(read_each(section, fields, context, faults, read, unknown).values())
 
 
-def _perturbed(given: Mapping[str, Any], context: Context) -> tuple[Initial, ...]:
+def _perturbed(fields: Mapping[str, Any], context: Context) -> tuple[Initial, ...]:
     def read(entry: Any, context: Context) -> Initial:
         section, field = InitialSpread.model_validate(entry, context=context), context.subject
         if section.kernel is None or section.length is None:
             return perturbation(field, entry["std"])
         return FieldPrior(field, section.std.value, section.kernel, section.length, section.std.relative)
 
-    return read_fields(given, context, "give it a prior in parameters", read)
+    return read_fields(fields, context, "give it a prior in parameters", read)
 
 
 PERTURBED = Made(

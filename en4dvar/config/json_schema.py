@@ -22,8 +22,8 @@ from en4dvar.config.sequence import SequenceFile
 from en4dvar.config.series import SeriesData
 from en4dvar.config.synthetic import CampaignFile
 from en4dvar.config.twin import TwinFile
-from en4dvar.errors import En4dvarError
-from en4dvar.state import OF_READINGS, Parameter
+from en4dvar.model.state import OF_READINGS, Parameter
+from en4dvar.plumbing.errors import En4dvarError
 
 Json = dict[str, Any]
 KINDS = "en4dvar.schemas"
@@ -71,9 +71,10 @@ def schema_text() -> str:
     return json.dumps(json_schema(), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _of(found: Json) -> Json:
-    """What pydantic gives, references inside it resolved in place, defaults as a file would write them."""
-    return _tidy(_resolve(found, found.pop("$defs", {})))
+def _of(schema: Json) -> Json:
+    """The schema of pydantic, references inside it resolved in place, defaults as a file would write them."""
+    tidied: Json = _tidy(_resolve(schema, schema.pop("$defs", {})))
+    return tidied
 
 
 def _resolve(node: Any, inner: Json) -> Any:

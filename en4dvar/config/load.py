@@ -13,22 +13,21 @@ from en4dvar.config.context import Context, Made
 from en4dvar.config.data import Data
 from en4dvar.config.dependence import PriorCorrelation, PriorFile, resolved
 from en4dvar.config.design import Design
-from en4dvar.config.document import Document, document_from, override
+from en4dvar.config.document import Document, document_from, override, parse_document
 from en4dvar.config.initial_state import PERTURBED, Initial, Perturbed
 from en4dvar.config.models import read_model
 from en4dvar.config.parameters import Entry, Fixed, entries
-from en4dvar.config.population import PopulationSection, check_population
 from en4dvar.config.schema import Assimilation, Execution, File, Output, Section
 from en4dvar.config.series import DATA, DataPlan
-from en4dvar.config.sharing import Groups, Sharing, sharing_of
+from en4dvar.config.sharing import Groups, PopulationSection, Sharing, check_population, sharing_of
 from en4dvar.config.times import Times, read_times
 from en4dvar.config.validate import check
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
-from en4dvar.dependence import Dependence
-from en4dvar.errors import ConfigError, Fault
-from en4dvar.forward import ForwardModel, Observable
-from en4dvar.problem import AssimilationSettings
-from en4dvar.state import NOISE_SCALE, Array
+from en4dvar.model.forward import ForwardModel, Observable
+from en4dvar.model.state import NOISE_SCALE, Array
+from en4dvar.plumbing.errors import ConfigError, Fault
+from en4dvar.priors.dependence import Dependence
+from en4dvar.schemes.settings import AssimilationSettings
 
 KINDS = {"twin": "a twin experiment", "sequence": "a sequence"}  # sections that mark other kinds of files
 
@@ -72,22 +71,37 @@ class Estimation(File):
     design: Design | None = None
     """Which experiments ``en4dvar design`` compares, and about what."""
 
-    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """As given, with absolute paths."""
-        written = super().as_written(given)
+    def as_written(self, section: Mapping[str, Any]) -> dict[str, Any]:
+        """The section as it was written, with absolute paths."""
+        written = super().as_written(section)
         if self.prior_correlation:
-            each = zip(self.prior_correlation, given["prior_correlation"], strict=True)
-            written["prior_correlation"] = [one.as_written(text) for one, text in each]
+            each = zip(self.prior_correlation, section["prior_correlation"], strict=True)
+            written["prior_correlation"] = [correlation.as_written(text) for correlation, text in each]
         return written
 
 
-@dataclass(frozen=True)
-class Config:
-    """A validated configuration. Nothing of the data files has been read yet."""
+@dataclass(frozen=True, kw_only=True)
+class Validated:
+    """What every validated file says: where results go, and as which text it is recorded."""
 
     document: Document
     name: str
     seed: int
+    directory: Path
+    report: bool
+    figures: bool
+    resolved: str
+
+    @property
+    def text(self) -> str:
+        """The file, verbatim."""
+        return self.document.text
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(Validated):
+    """A validated configuration. Nothing of the data files has been read yet."""
+
     model: ForwardModel
     observable: Observable
     parameters: tuple[Entry, ...]
@@ -95,22 +109,13 @@ class Config:
     assimilation: AssimilationSettings
     weights: Literal["sum", "mean", "balanced"]
     execution: Execution
-    report: bool
-    figures: bool
-    directory: Path
     simulate_times: Array | None
-    resolved: str
     sharing: Sharing
     initial_state: tuple[Initial, ...] = ()
     model_error: tuple[ErrorOf, ...] = ()
     dependence: tuple[Dependence, ...] = ()
     design: Design = field(default_factory=Design)
     population: PopulationSection | None = None
-
-    @property
-    def text(self) -> str:
-        """The file, verbatim."""
-        return self.document.text
 
 
 def load_config(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> Config:
@@ -129,6 +134,19 @@ def load_config(source: str | Path | Mapping[str, Any], overrides: Mapping[str, 
     return resolve(override(document, overrides or {}), base)
 
 
+def recorded(text: str, file: str) -> Document:
+    """The resolved configuration that a result holds. Raises :class:`ConfigError`.
+
+    Version 1.0 also wrote the defaults of keys that the scheme does not read; these are left out.
+    """
+    document = parse_document(text, file)
+    section = document.data.get("assimilation")
+    if isinstance(section, dict):
+        for key in Assimilation.unread(section):
+            del section[key]
+    return document
+
+
 def resolve(document: Document, base: Path, model: ForwardModel | None = None) -> Config:
     """Validate a document whose relative paths start at ``base``. Raises :class:`ConfigError`.
 
@@ -141,14 +159,12 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
     file = read.file
     own = {p.name for p in read.model.parameters}
     apart = {} if NOISE_SCALE.name in own else {NOISE_SCALE.name: "it is the scale of the errors"}
-    others = [one.term.parameter.name for one in file.initial_state or () if isinstance(one, Perturbed)]
+    others = [initial.term.parameter.name for initial in file.initial_state or () if isinstance(initial, Perturbed)]
     parameters, blocks = resolved(file.parameters, file.prior, file.prior_correlation or (), others, apart, document)
     if file.population is not None:
         check_population(file.population, parameters, document)
     return Config(
-        document=document,
-        name=file.name,
-        seed=file.seed,
+        **read.common(file.parameters),
         model=read.model,
         observable=observed_in(file.data, read),
         parameters=parameters,
@@ -156,11 +172,7 @@ def resolve(document: Document, base: Path, model: ForwardModel | None = None) -
         assimilation=file.assimilation.settings,
         weights=file.assimilation.weights,
         execution=file.execution,
-        report=file.output.report,
-        figures=file.output.figures,
-        directory=file.output.directory or Path("runs") / file.name,
         simulate_times=file.simulate.times if file.simulate else None,
-        resolved=read.resolved(file.parameters),
         sharing=sharing_of(parameters, file.groups or {}, bool(blocks), _of_several_series(file.data), document),
         initial_state=file.initial_state or (),
         model_error=file.model_error or (),
@@ -194,6 +206,14 @@ class Read(Generic[S]):
     context: Context
     model_section: dict[str, Any]
 
+    def common(self, parameters: Iterable[Entry]) -> dict[str, Any]:
+        """The fields of :class:`Validated`, of a file with a section ``output``."""
+        file: Any = self.file
+        where = file.output.directory or Path("runs") / file.name
+        said = {"directory": where, "report": file.output.report, "figures": file.output.figures}
+        resolved = self.resolved(parameters)
+        return {"document": self.document, "name": file.name, "seed": file.seed, "resolved": resolved, **said}
+
     def resolved(self, parameters: Iterable[Entry]) -> str:
         """The file with overrides and defaults written out and paths absolute, as YAML that loads again."""
         content = self.file.as_written(self.document.data)
@@ -212,19 +232,19 @@ def read_file(kind: type[S], document: Document, base: Path, model: ForwardModel
     """
     faults: list[Fault] = []
     section = document.data.get("model")
-    found = (model, dict(section or {})) if model else read_model(section, base, document, faults)
-    model = found[0].with_parameters(_named(document)) if found else None
+    built = (model, dict(section or {})) if model else read_model(section, base, document, faults)
+    model = built[0].with_parameters(_named(document)) if built else None
     context = context_of(document, base, model)
     file = check(kind, document.data, (), document, faults, context)
-    if file is None or found is None or model is None:
+    if file is None or built is None or model is None:
         raise ConfigError(in_order(faults))
-    return Read(file, model, document, context, found[1])
+    return Read(file, model, document, context, built[1])
 
 
 def _named(document: Document) -> Collection[str]:
     """Names in the ``parameters:`` section."""
-    given = document.data.get("parameters")
-    return given.keys() if isinstance(given, dict) else ()
+    parameters = document.data.get("parameters")
+    return parameters.keys() if isinstance(parameters, dict) else ()
 
 
 def context_of(document: Document, base: Path, model: ForwardModel | None) -> Context:
@@ -232,8 +252,8 @@ def context_of(document: Document, base: Path, model: ForwardModel | None) -> Co
     section, data = document.data.get("model"), document.data.get("data")
     context = Context(base, model)
     if model is None and isinstance(section, dict):
-        found = read_model({"name": section.get("name")}, base, document, [])
-        context.default = found[0] if found else None
+        built = read_model({"name": section.get("name")}, base, document, [])
+        context.default = built[0] if built else None
     columns = data.get("columns") if isinstance(data, dict) else None
     if isinstance(columns, dict) and (units := context.built or context.default):
         named = [observable for observable in units.observables if observable.name in columns]

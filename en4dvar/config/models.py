@@ -1,23 +1,67 @@
-"""From the ``model:`` section to a forward model: registered (``en4dvar.models``), in a package or in a file."""
+"""From the ``model:`` section to a forward model: registered (``en4dvar.models``), in a package or in a file.
+
+Its labels and symbols are tried before any work: matplotlib reads them when everything else is done.
+"""
 
 from __future__ import annotations
 
-from importlib import import_module
+import re
+from collections.abc import Iterable
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from en4dvar import user_file
 from en4dvar.config.document import Document
-from en4dvar.config.symbols import check_symbols
 from en4dvar.config.validate import check
-from en4dvar.errors import ConfigError, En4dvarError, Fault
-from en4dvar.files import PathError
-from en4dvar.forward import ForwardModel, StateField
-from en4dvar.hints import shown, suggest
-from en4dvar.user_code import RefusedError, file_of, loading, require_permission
+from en4dvar.model.forward import ForwardModel, Observable, StateField
+from en4dvar.model.state import Parameter
+from en4dvar.plumbing import user_file
+from en4dvar.plumbing.errors import ConfigError, En4dvarError, Fault
+from en4dvar.plumbing.files import PathError
+from en4dvar.plumbing.hints import shown, suggest
+from en4dvar.plumbing.user_code import RefusedError, imported, loading
+
+GREEK = (
+    "alpha|beta|gamma|delta|epsilon|varepsilon|zeta|eta|theta|vartheta|iota|kappa|lambda|mu|nu|xi|pi|rho|sigma|tau|"
+    "upsilon|phi|varphi|chi|psi|omega|Gamma|Delta|Theta|Lambda|Xi|Pi|Sigma|Phi|Psi|Omega|infty|ell"
+)
+FUNCTIONS = "exp|ln|log|max|min"
+_LETTER = rf"(?:[A-Za-z0-9]|\\(?:{GREEK})(?![A-Za-z]))"
+_ROMAN = r"\\mathrm\{[A-Za-z0-9]+\}"
+_GROUP = rf"\{{(?:[A-Za-z0-9](?:[, ]*[A-Za-z0-9])*|{_ROMAN}|\\(?:{FUNCTIONS}))\}}"
+_BESIDE = rf"[_^](?:{_LETTER}|{_ROMAN}|{_GROUP})"
+_ATOM = rf"(?:{_LETTER}(?:{_BESIDE})?|\\dot\{{[A-Za-z]\}}|\\(?:{FUNCTIONS})(?![A-Za-z])|[|/()+=,-])"
+FORMULA = rf"\$(?:{_ATOM} ?)+\$"
+_SIMPLE = re.compile(rf"[^$\\]*|{FORMULA}", re.ASCII)
+
+
+def check_symbols(things: Iterable[Parameter | Observable]) -> None:
+    """Raises :class:`ConfigError`: a label or symbol that cannot be written in a figure."""
+    for thing in things:
+        for what, text in (("symbol", thing.symbol), ("label", thing.label)):
+            if reason := symbol_fault(text):
+                raise ConfigError(f"the {what} {shown(text)} of {thing.name} cannot be written in a figure: {reason}")
+
+
+def symbol_fault(text: str) -> str:
+    """The reason why ``text`` cannot be written in a figure, "" where it can."""
+    if not text.isprintable():
+        return "it holds characters that are not printed"
+    if _SIMPLE.fullmatch(text):  # matplotlib takes time to import
+        return ""
+    if len(re.findall(r"(?<!\\)\$", text)) % 2:
+        return r"a $ is left over; write \$ for the sign itself"
+    from matplotlib.mathtext import MathTextParser
+
+    try:
+        MathTextParser("path").parse(text)
+    except (ValueError, RuntimeError) as error:  # Unknown symbol: \x, found '\'  (at char 0), (line:1, col:1)
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        return re.sub(r"\s+\(at char.*", "", lines[-1]) if lines else "matplotlib cannot read it"
+    return ""
+
 
 GROUP = "en4dvar.models"
 COMMAND = "command"  # the model that a section with this key means where it names none
@@ -36,35 +80,33 @@ def find_model(name: str) -> type[ForwardModel]:
 
     Raises :class:`ConfigError`.
     """
-    found: Any
+    model: Any
     try:
         with loading(f"model {shown(name)} cannot be loaded"):
             if user_file.is_file_reference(name):
-                require_permission(f"model {shown(name)}", Path(name.rpartition(":")[0]))
-                found = user_file.load(name)
+                model = user_file.load(name, f"model {shown(name)}")
             elif ":" in name:
                 module, _, attribute = name.partition(":")
-                require_permission(f"model {shown(name)}", file_of(module))
-                found = getattr(import_module(module), attribute)
+                model = getattr(imported(f"model {shown(name)}", module), attribute)
             else:
                 registered = {e.name: e for e in entry_points(group=GROUP)}
                 if name not in registered:
                     raise ConfigError(f"unknown model {shown(name)}{suggest(name, registered)}; or write {OWN}")
-                found = registered[name].load()
+                model = registered[name].load()
     except ValueError as error:
         raise ConfigError(f"model {shown(name)} cannot be loaded: {error}") from error
-    if not (isinstance(found, type) and issubclass(found, ForwardModel)):
+    if not (isinstance(model, type) and issubclass(model, ForwardModel)):
         raise ConfigError(f"{shown(name)} is not a subclass of en4dvar.ForwardModel")
-    if hasattr(found, "Settings") != hasattr(found, "from_settings"):
-        lacking = "from_settings" if hasattr(found, "Settings") else "Settings"
+    if hasattr(model, "Settings") != hasattr(model, "from_settings"):
+        lacking = "from_settings" if hasattr(model, "Settings") else "Settings"
         raise ConfigError(
             f"{name!r} cannot be used from YAML: Settings and from_settings go together, it lacks {lacking}"
         )
-    return found
+    return model
 
 
 def settings_of(kind: type[ForwardModel]) -> type[BaseModel]:
-    """What the ``model:`` section of a class may say besides its name."""
+    """The settings that the ``model:`` section of a class may hold besides its name."""
     settings: type[BaseModel] = getattr(kind, "Settings", NoSettings)
     return settings
 

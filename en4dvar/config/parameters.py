@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -21,18 +21,18 @@ from en4dvar.config.context import (
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import VariesSection
-from en4dvar.errors import ConfigError, Fault
-from en4dvar.forward import ForwardModel
-from en4dvar.hints import brief, shown, suggest
-from en4dvar.prior import PriorTerm
-from en4dvar.state import OF_READINGS, READING_OFFSET, TIME_SHIFT, Array, Parameter
-from en4dvar.units import parse_quantity
-from en4dvar.varying import RandomWalk
-from en4dvar.varying.model import can_vary
+from en4dvar.model.forward import ForwardModel
+from en4dvar.model.state import OF_READINGS, READING_OFFSET, TIME_SHIFT, Array, Parameter
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.hints import brief, shown, suggest
+from en4dvar.plumbing.units import parse_quantity
+from en4dvar.priors.prior import PriorTerm
+from en4dvar.priors.varying import RandomWalk
+from en4dvar.priors.varying.model import can_vary
 
 _RECIPES = {
-    "normal": "mean and std",
-    "lognormal": "median and log_std, or mean and std",
+    "normal": "mean and std, and may have lower and upper",
+    "lognormal": "median and log_std, which may have lower and upper, or mean and std",
     "logit": "lower, upper, median and logit_std",
     "uniform": "lower and upper",
     "half-normal": "std, and lower where it does not start at zero",
@@ -66,7 +66,8 @@ class PriorSection(Section):
     """A prior by name; locations and spreads carry the parameter's unit, a ``%`` spread is relative to the location."""
 
     prior: Literal["normal", "lognormal", "logit", "uniform", "half-normal", "beta", "ensemble"]
-    """Shape: normal (mean, std), lognormal (median and log_std, or mean and std), logit (lower, upper, median, …),
+    """Shape: normal (mean, std), lognormal (median and log_std, or mean and std), each also cut off at lower and upper,
+    logit (lower, upper, median, …),
     uniform (lower, upper), half-normal (std, and lower, by default 0), beta (lower, upper, alpha, beta), or ensemble:
     mean, spread and correlations are those of the members in the file of ``prior: {ensemble: FILE}``."""
     mean: Location = None
@@ -125,27 +126,21 @@ class Tied:
     to: str
     factor: float
 
-    def check(self, found: Mapping[str, Entry], own: Sequence[str]) -> None:
+    def check(self, parameters: Mapping[str, Entry], own: Sequence[str]) -> None:
         """Raise :class:`ConfigError` where it cannot follow; ``own`` are the names of the model's parameters."""
-        name, other = self.parameter.name, found.get(self.to)
+        name, other = self.parameter.name, parameters.get(self.to)
         if name not in own:
             raise ConfigError(f"{name} is not a parameter of the model and cannot be tied")
         if other is None or self.to not in own or self.to == name:
-            names = [one for one in found if one in own and one != name]
-            raise ConfigError(
-                [Fault(f"{self.to!r} is not another parameter of the model{suggest(self.to, names)}", "tied")]
-            )
+            names = [candidate for candidate in parameters if candidate in own and candidate != name]
+            raise ConfigError(f"{self.to!r} is not another parameter of the model{suggest(self.to, names)}", "tied")
         if isinstance(other, Tied):
-            raise ConfigError(
-                [Fault(f"{self.to} is tied itself; tie {name} to a parameter with a prior or a value", "tied")]
-            )
+            raise ConfigError(f"{self.to} is tied itself; tie {name} to a parameter with a prior or a value", "tied")
         if isinstance(other, Uncertain) and other.spec.varies is not None:
-            raise ConfigError(
-                [Fault(f"{self.to} varies in time, and another parameter cannot be tied to that", "tied")]
-            )
+            raise ConfigError(f"{self.to} varies in time, and another parameter cannot be tied to that", "tied")
         if other.parameter.unit != self.parameter.unit:
             units = f"{other.parameter.unit}, {name} in {self.parameter.unit}"
-            raise ConfigError([Fault(f"{self.to} is in {units}", "tied")])
+            raise ConfigError(f"{self.to} is in {units}", "tied")
 
 
 @dataclass(frozen=True)
@@ -188,7 +183,7 @@ class Uncertain:
 
     @property
     def from_ensemble(self) -> bool:
-        """Whether the prior is that of the members in a file."""
+        """True if the prior is that of the members in a file."""
         return self.spec.prior == "ensemble"
 
     @property
@@ -204,25 +199,26 @@ class Uncertain:
             raise ConfigError([replace(f, message=f.message.removeprefix(own)) for f in error.problems]) from None
 
     def _term(self, mean: float, median: float) -> PriorTerm:
-        spec, parameter = self.spec, self.parameter
-        given = self._given
+        spec, p, bounds = self.spec, self.parameter, self._bounds
         if self.of_members is not None:
             return self.of_members
-        if spec.prior == "normal" and given == {"mean", "std"}:
-            return PriorTerm.normal(parameter, mean, self._std(mean))
-        if spec.prior == "lognormal" and given == {"mean", "std"}:
-            return PriorTerm.lognormal_moments(parameter, mean, self._std(mean))
-        if spec.prior == "lognormal" and given == {"median", "log_std"} and spec.log_std is not None:
-            return PriorTerm.lognormal(parameter, median, spec.log_std)
-        if spec.prior == "logit" and given == {"lower", "upper", "median", "logit_std"} and spec.logit_std is not None:
-            return PriorTerm.logit(parameter, self._bounds, median, spec.logit_std)
-        if spec.prior == "uniform" and given == {"lower", "upper"}:
-            return PriorTerm.uniform(parameter, self._bounds)
-        if spec.prior == "half-normal" and given - {"lower"} == {"std"}:
-            return PriorTerm.half_normal(parameter, self._std(0.0), spec.lower or 0.0)
-        if spec.prior == "beta" and given == {"lower", "upper", "alpha", "beta"} and spec.alpha and spec.beta:
-            return PriorTerm.beta(parameter, self._bounds, spec.alpha, spec.beta)
-        raise self._recipe()
+        log_std, logit_std = spec.log_std or 0.0, spec.logit_std or 0.0  # each is there where it is read
+        makers: dict[str, Callable[[], PriorTerm]] = {
+            "normal mean std": lambda: PriorTerm.normal(p, mean, self._std(mean)),
+            "normal lower mean std upper": lambda: PriorTerm.bounded(p, "normal", mean, self._std(mean), bounds),
+            "lognormal mean std": lambda: PriorTerm.lognormal_moments(p, mean, self._std(mean)),
+            "lognormal log_std median": lambda: PriorTerm.lognormal(p, median, log_std),
+            "lognormal log_std lower median upper": lambda: PriorTerm.bounded(p, "lognormal", median, log_std, bounds),
+            "logit logit_std lower median upper": lambda: PriorTerm.logit(p, bounds, median, logit_std),
+            "uniform lower upper": lambda: PriorTerm.uniform(p, bounds),
+            "half-normal std": lambda: PriorTerm.half_normal(p, self._std(0.0)),
+            "half-normal lower std": lambda: PriorTerm.half_normal(p, self._std(0.0), bounds[0]),
+            "beta alpha beta lower upper": lambda: PriorTerm.beta(p, bounds, spec.alpha or 0.0, spec.beta or 0.0),
+        }
+        make = makers.get(" ".join([spec.prior, *sorted(self._given)]))
+        if make is None:
+            raise self._recipe()
+        return make()
 
     @property
     def _given(self) -> set[str]:
@@ -257,7 +253,7 @@ class Uncertain:
         centre = float(term.to_physical(np.array(term.mean)))
         if varies.std.relative and centre == 0:
             message = f"relative to the mean, which is zero; give it in {self.parameter.unit}"
-            raise ConfigError([Fault(message, "varies.std")])
+            raise ConfigError(message, "varies.std")
         try:
             std = varies.std.absolute(centre) / term.slope(term.mean)
             return RandomWalk.of(model, term, varies.knots(times), std, varies.estimated)
@@ -271,7 +267,7 @@ class Uncertain:
         if value != "maximum":
             return value or 0.0
         if maximum is None:
-            raise ConfigError([Fault("'maximum' is known only from the data, and there are none", key)])
+            raise ConfigError("'maximum' is known only from the data, and there are none", key)
         return maximum
 
     def _std(self, mean: float) -> float:
@@ -280,27 +276,27 @@ class Uncertain:
             return 0.0
         if std.relative and mean == 0:
             message = f"{100 * std.value:g} % is relative to the mean, which is zero; give it in {self.parameter.unit}"
-            raise ConfigError([Fault(message, "std")])
+            raise ConfigError(message, "std")
         return std.absolute(mean)
 
 
 Entry = Fixed | Scalar | Uncertain | Tied
 
 
-def _entry(given: Any, context: Context) -> Entry:
+def _entry(written: Any, context: Context) -> Entry:
     """A quantity, a scalar of the data file, or a prior. Raises :class:`ConfigError`, ``ValueError``."""
     parameter = context.subject
-    if not isinstance(given, dict):
-        return Fixed(parameter, _bounded(given, parameter))
-    if "from_file" in given:
-        scalar = FromFile.model_validate(given, context=context)
+    if not isinstance(written, dict):
+        return Fixed(parameter, _bounded(written, parameter))
+    if "from_file" in written:
+        scalar = FromFile.model_validate(written, context=context)
         return Scalar(parameter, scalar.from_file, scalar.unit)
-    if "tied" in given:
-        tied = TiedSection.model_validate(given, context=context)
+    if "tied" in written:
+        tied = TiedSection.model_validate(written, context=context)
         return Tied(parameter, tied.tied, tied.factor)
-    entry = Uncertain(parameter, PriorSection.model_validate(given, context=context))
+    entry = Uncertain(parameter, PriorSection.model_validate(written, context=context))
     if entry.spec.varies is not None and not can_vary(context.model, parameter.name):
-        raise ConfigError([Fault(f"{parameter.name} cannot vary: {_why_not(context.model, parameter)}", "varies")])
+        raise ConfigError(f"{parameter.name} cannot vary: {_why_not(context.model, parameter)}", "varies")
     entry.check()
     return entry
 
@@ -324,13 +320,28 @@ def _missing(parameter: Parameter) -> str:
     )
 
 
+def _needs_of_a_data_set(entry: Entry) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Keys of an entry that need the data of one set, each with what a file without such data lacks."""
+    if entry.needs_data:
+        yield (), "has no data file to take a value from"
+    if isinstance(entry, Tied):
+        yield ("tied",), "has no tied parameters; give a value or a prior"
+    if isinstance(entry, Uncertain):
+        if entry.from_ensemble:
+            yield ("prior",), "has no ensemble of its own; give it another prior"
+        if entry.spec.varies is not None:
+            yield ("varies",), "has constant parameters"
+        if entry.spec.shared is not None:
+            yield ("shared",), "estimates no data sets together"
+
+
 def entries(kind: str = "") -> Made:
     """One entry for every parameter of the model, in its order, then those of the readings if given.
 
     ``kind``: what the file is, where it names no data from which a value could come.
     """
 
-    def read(given: Mapping[str, Any], context: Context) -> tuple[Entry, ...]:
+    def read(section: Mapping[str, Any], context: Context) -> tuple[Entry, ...]:
         model = context.model
         shift = replace(TIME_SHIFT, unit=model.time_unit, display_unit=model.time_display_unit)
         seen = context.observed
@@ -339,34 +350,25 @@ def entries(kind: str = "") -> Made:
         of_readings = {p.name: p for p in (*OF_READINGS, shift, offset) if p.name not in known}  # a model's own first
         known |= {} if kind else of_readings
         labels = {p.name: p.label for p in (*known.values(), *model.optional_parameters)}
-        defaults: Mapping[str, float] = getattr(model, "defaults", {})
 
         def unknown(name: str) -> str:
             if kind and name in of_readings:
                 return f"{kind} makes its own readings: keys of their own say when and with which errors"
             return f"unknown parameter {shown(name)}{suggest(name, labels)}"
 
-        found: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in defaults.items()}
+        parameters: dict[str, Entry] = {name: Fixed(known[name], value) for name, value in model.defaults.items()}
         with Faults() as faults:
-            found |= read_each(given, known, context, faults, _entry, unknown)
-            for name, entry in found.items():
-                if kind and entry.needs_data:
-                    faults.add((name,), f"{kind} has no data file to take a value from")
-                if isinstance(entry, Tied) and (entry.to in found or entry.to not in given):  # else that is told
+            parameters |= read_each(section, known, context, faults, _entry, unknown)
+            for name, entry in parameters.items():
+                if isinstance(entry, Tied) and (entry.to in parameters or entry.to not in section):  # else that is told
                     with faults.at(name):
-                        entry.check(found, [p.name for p in model.parameters])
-                if kind and isinstance(entry, Tied):
-                    faults.add((name, "tied"), f"{kind} has no tied parameters; give a value or a prior")
-                if kind and isinstance(entry, Uncertain) and entry.from_ensemble:
-                    faults.add((name, "prior"), f"{kind} has no ensemble of its own; give it another prior")
-                if kind and isinstance(entry, Uncertain) and entry.spec.varies is not None:
-                    faults.add((name, "varies"), f"{kind} has constant parameters")
-                if kind and isinstance(entry, Uncertain) and entry.spec.shared is not None:
-                    faults.add((name, "shared"), f"{kind} estimates no data sets together")
+                        entry.check(parameters, [p.name for p in model.parameters])
+                for key, lacking in _needs_of_a_data_set(entry) if kind else ():
+                    faults.add((name, *key), f"{kind} {lacking}")
             for parameter in model.parameters:
-                if parameter.name not in {**given, **defaults}:
+                if parameter.name not in {**section, **model.defaults}:
                     faults.add((parameter.name,), _missing(parameter))
-        return tuple(found[name] for name in known if name in found)
+        return tuple(parameters[name] for name in known if name in parameters)
 
     json = {"type": "object", "additionalProperties": {"x-definition": "parameter"}}
     return Made(read, dict[str, Any], json)

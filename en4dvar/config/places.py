@@ -11,13 +11,13 @@ from pydantic import BeforeValidator, Discriminator, Field, StrictInt, Tag
 
 from en4dvar.config.context import Context, Made
 from en4dvar.config.schema import Section
-from en4dvar.errors import ConfigError, DataError, Fault
-from en4dvar.forward import field_of
+from en4dvar.data.series import Places
 from en4dvar.inputs.asked import Column
-from en4dvar.series import Places
-from en4dvar.state import Array
-from en4dvar.state import Field as StateBlock
-from en4dvar.units import UnitError, convert, parse_quantity
+from en4dvar.model.forward import field_of
+from en4dvar.model.state import Array
+from en4dvar.model.state import Field as StateBlock
+from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.units import UnitError, convert, parse_quantity
 
 
 class PlaceColumn(Section):
@@ -42,7 +42,7 @@ class Placing:
     size: int | None = None
 
     def places(self, count: int, read: Array | None) -> Places:
-        """Of ``count`` observations; ``read`` (count,) is what the column holds. Raises :class:`DataError`."""
+        """Places of ``count`` observations; ``read`` (count,) is what the column holds. Raises :class:`DataError`."""
         stated = read if self.positions is None else self.positions
         assert stated is not None
         if len(stated) not in (1, count):
@@ -57,20 +57,20 @@ class Placing:
         return Places.at_indices(positions.astype(int))
 
 
-def placing(given: Any, context: Context) -> Placing:
+def placing(written: Any, context: Context) -> Placing:
     """Raises :class:`ConfigError`, its path the faulty key."""
     block = field_of(context.units, context.observable)
     size = block.size if block else None
-    if isinstance(given, PlaceColumn):
-        if given.unit is None:
-            return Placing(Column(given.column, "1", "1", kind="place"), size=size)
+    if isinstance(written, PlaceColumn):
+        if written.unit is None:
+            return Placing(Column(written.column, "1", "1", kind="place"), size=size)
         target = _coordinates(block, "unit")
         try:
-            convert(1.0, given.unit, target.coordinate_unit)
+            convert(1.0, written.unit, target.coordinate_unit)
         except UnitError as error:
-            raise ConfigError([Fault(str(error), "unit")]) from None
-        return Placing(Column(given.column, given.unit, target.coordinate_unit, kind="place"), of=target)
-    entries = given if isinstance(given, list) else [given]
+            raise ConfigError(str(error), "unit") from None
+        return Placing(Column(written.column, written.unit, target.coordinate_unit, kind="place"), of=target)
+    entries = written if isinstance(written, list) else [written]
     if all(isinstance(entry, int) for entry in entries):
         return Placing(positions=np.array(entries, dtype=float), size=size)
     target = _coordinates(block, "")
@@ -80,23 +80,23 @@ def placing(given: Any, context: Context) -> Placing:
 def _coordinates(block: StateBlock | None, key: str) -> StateBlock:
     if block is None or block.coordinates is None:
         message = "the model gives no coordinates for what is observed; write indices, counted from 0, without a unit"
-        raise ConfigError([Fault(message, key)])
+        raise ConfigError(message, key)
     if np.ndim(block.coordinates) > 1:
         message = f"{block.name} has several coordinates a place; write indices, counted from 0, without a unit"
-        raise ConfigError([Fault(message, key)])
+        raise ConfigError(message, key)
     return block
 
 
-def _kind(given: Any) -> str:
-    return "a column" if isinstance(given, Mapping | PlaceColumn) else "places"
+def _kind(written: Any) -> str:
+    return "a column" if isinstance(written, Mapping | PlaceColumn) else "places"
 
 
-def _known(given: Any) -> Any:
-    entries = given if isinstance(given, list) else [given]
-    column = isinstance(given, Mapping) and "column" in given
-    if not column and not all(isinstance(one, int | str) and not isinstance(one, bool) for one in entries):
+def _known(written: Any) -> Any:
+    entries = written if isinstance(written, list) else [written]
+    column = isinstance(written, Mapping) and "column" in written
+    if not column and not all(isinstance(entry, int | str) and not isinstance(entry, bool) for entry in entries):
         raise ValueError("write an index, a coordinate such as '3 m', a list of either, or {column: NAME}")
-    return given
+    return written
 
 
 PLACES = Made(

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_type_hints
 
 from pydantic import (
     AfterValidator,
@@ -25,11 +25,12 @@ from pydantic_core import from_json, to_json
 
 from en4dvar.config.context import Context, Made, Unknown, quantity
 from en4dvar.config.validate import Faults
-from en4dvar.described import Described
 from en4dvar.executor.limits import Limits, parse_bytes
-from en4dvar.problem import AssimilationSettings, Localising
-from en4dvar.schemes import ON_A_WINDOW
-from en4dvar.units import Quantity, parse_quantity
+from en4dvar.plumbing.described import Described
+from en4dvar.plumbing.units import Quantity, parse_quantity
+from en4dvar.schemes import DEFAULT, ON_A_WINDOW, keys_of, unread
+from en4dvar.schemes.base import Scheme
+from en4dvar.schemes.settings import AssimilationSettings, Localisation, beside_localisation
 
 QuantityText = str | int | float
 Name = Annotated[str, Field(pattern=r"^\w[\w.+ -]*$", max_length=100)]
@@ -44,28 +45,29 @@ class Section(Described):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
 
     @classmethod
-    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
+    def rules(cls, section: Mapping[str, Any], context: Context, faults: Faults) -> None:
         """Add what does not go together in a section as given; it is told beside the faults of single keys."""
 
     @model_validator(mode="wrap")
     @classmethod
-    def _with_rules(cls, given: Any, validate: ModelWrapValidatorHandler[Self], info: Any) -> Self:
+    def _with_rules(cls, section: Any, validate: ModelWrapValidatorHandler[Self], info: Any) -> Self:
         with Faults() as faults:
-            if isinstance(given, dict):
+            if isinstance(section, dict):
                 with suppress(Unknown):
-                    cls.rules(given, info.context, faults)
+                    cls.rules(section, info.context, faults)
             with faults.at(schema=cls):
-                return validate(given)
+                return validate(section)
 
-    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
+    def as_written(self, section: Mapping[str, Any]) -> dict[str, Any]:
         """The section as it was given, what was left out filled in with defaults; plain data."""
         keys = {field.alias or name: (name, field) for name, field in type(self).model_fields.items()}
-        if not keys.keys() >= given.keys():  # keys named after something of the model
-            return _plain(given)
+        if not keys.keys() >= section.keys():  # keys named after something of the model
+            plain: dict[str, Any] = _plain(section)
+            return plain
         written: dict[str, Any] = {}
         for key, (name, field) in keys.items():
             value = getattr(self, name)
-            text = given[key] if key in given else field.get_default(call_default_factory=True)
+            text = section[key] if key in section else field.get_default(call_default_factory=True)
             if isinstance(value, Section) or hasattr(value, "as_written"):
                 written[key] = value.as_written(text if isinstance(text, dict) else {})
             elif text is not None:
@@ -84,6 +86,8 @@ def section_of(*kinds: Any, base: type[Section] = Section) -> Any:
     for kind in kinds:
         hints = get_type_hints(kind, include_extras=True)
         for field in fields(kind):
+            if field.name == "own":  # the scheme, whose keys are a section's as well
+                continue
             words = [text for text in getattr(hints[field.name], "__metadata__", ()) if isinstance(text, str)]
             declared[field.name] = (hints[field.name], Field(field.default, description=" ".join(words) or None))
     return create_model(f"{base.__name__}Of", __base__=base, **declared)
@@ -158,12 +162,12 @@ def _of_coordinates(context: Context) -> str:
     return next((f.coordinate_unit for f in context.units.layout if f.coordinates is not None), "1")
 
 
-class Localise(Section):
+class LocalisationSection(Section):
     """Which readings act on what: by distance, or by correlation for what has no place."""
 
     by: Literal["distance", "correlation"] = "distance"
     """distance: covariances are tapered (Gaspari and Cohn); correlation: a reading acts on what the ensemble correlates
-    it with by more than chance (es-mda)."""
+    it with by more than chance, which takes a scheme that minimises no J."""
     radius: Annotated[float, quantity(_of_coordinates, "positive")] | None = None
     """Radius of the taper, in the unit of the model's coordinates; no influence from twice this distance on."""
     at: dict[str, QuantityText | tuple[QuantityText, ...]] | None = None
@@ -172,43 +176,94 @@ class Localise(Section):
     """Correlations below this size are taken for chance; default 3/√N."""
 
     @classmethod
-    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        by = given.get("by", "distance")
-        if by == "distance" and not {"radius", "threshold"} & given.keys():
+    def rules(cls, section: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        by = section.get("by", "distance")
+        if by == "distance" and not {"radius", "threshold"} & section.keys():
             faults.add(("radius",), "required: how far a reading acts, or write by: correlation")
         for key in {"distance": ("threshold",), "correlation": ("radius", "at")}.get(str(by), ()):
-            if key in given:
+            if key in section:
                 faults.add((key,), f"not with by: {by}", at_key=True)
 
 
-def _localising(section: Localise, context: Context) -> Localising:
+def _localisation_of(section: LocalisationSection, context: Context) -> Localisation:
     unit = _of_coordinates(context)
     places = {name: where if isinstance(where, tuple) else (where,) for name, where in (section.at or {}).items()}
     at = {name: tuple(parse_quantity(text, unit) for text in where) for name, where in places.items()}
-    return Localising(section.radius, at, section.threshold)
+    return Localisation(section.radius, at, section.threshold)
 
 
-_Settings: Any = section_of(AssimilationSettings)
+class OfScheme(Section):
+    """A section that names a scheme. Its keys are its own and those of the scheme; those of others are errors."""
+
+    kinds: ClassVar[Mapping[str, type[Scheme]]]
+
+    @classmethod
+    def rules(cls, section: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        for key, message in cls.unread(section).items():
+            faults.add((key,), message, at_key=True)
+
+    @classmethod
+    def unread(cls, section: Mapping[str, Any]) -> dict[str, str]:
+        """The keys that the scheme does not read, each with a message."""
+        name = section.get("scheme", cls.model_fields["scheme"].default)
+        return unread(name, cls.kinds, section) if isinstance(name, str) and name in cls.kinds else {}
+
+    @property
+    def own(self) -> dict[str, Any]:
+        """The keys of the scheme that were given, with their values."""
+        keys = keys_of(self.kinds[getattr(self, "scheme")]) & self.model_fields_set  # noqa: B009
+        return {key: getattr(self, key) for key in keys}
+
+    def as_written(self, section: Mapping[str, Any]) -> dict[str, Any]:
+        """As given, without what the scheme does not read."""
+        written = super().as_written(section)
+        return {key: value for key, value in written.items() if key not in type(self).unread(written)}
+
+
+def listed(kinds: Mapping[str, type[Scheme]]) -> str:
+    """The schemes, with what each is."""
+    return f"The scheme: {', '.join(f'{name} ({kind.words})' for name, kind in kinds.items())}."
+
+
+def keys_of_schemes(of: Mapping[str, type[Scheme]], *others: Any, base: type[OfScheme] = OfScheme) -> Any:
+    """``base`` with the keys of the schemes ``of`` a kind, which are told, and with those of other dataclasses."""
+    section = section_of(*others, *of.values(), base=base)
+    for name, field in section.model_fields.items():
+        readers = [scheme for scheme, kind in of.items() if name in keys_of(kind)]
+        if 0 < len(readers) < len(of):
+            field.description = f"{field.description} ({', '.join(readers)})"
+    section.kinds = of
+    return section
+
+
 if TYPE_CHECKING:
     OnAWindow = str
+    _Settings = OfScheme
 else:
     OnAWindow = Literal[tuple(ON_A_WINDOW)]
+    _Settings = keys_of_schemes(ON_A_WINDOW, AssimilationSettings)
 
 
 class Assimilation(_Settings):
     """The settings of the scheme, declared at :class:`AssimilationSettings`, and how observations count."""
 
-    scheme: OnAWindow = AssimilationSettings.scheme
-    """en4dvar (iterative ensemble smoother), es-mda (multiple data assimilation), or the one analysis of a filter:
-    etkf, denkf (deterministic), enkf-n (finite size)."""
+    scheme: Annotated[OnAWindow, Field(description=listed(ON_A_WINDOW))] = AssimilationSettings.scheme
     weights: Literal["sum", "mean", "balanced"] = "sum"
     """sum: every observation counts (the Bayesian posterior); mean: β = 1/K, as in the published code; balanced: every
     series, or group of series, counts as if it had as many readings as the others. The latter two are not Bayesian."""
-    localisation: Annotated[Localising, Made(_localising, Localise)] | None = None
-    """Which readings act on what, for fields and for many parameters; schemes en4dvar and es-mda. Default: all readings
-    on everything."""
+    localisation: Annotated[Localisation, Made(_localisation_of, LocalisationSection)] | None = None
+    """Which readings act on what, for fields and for many parameters. Default: all readings on everything."""
+
+    @classmethod
+    def unread(cls, section: Mapping[str, Any]) -> dict[str, str]:
+        faults: dict[str, str] = super().unread(section)
+        name = section.get("scheme", DEFAULT)
+        if section.get("localisation") is not None and name in ON_A_WINDOW:
+            faults |= beside_localisation(name, section)
+        return faults
 
     @property
     def settings(self) -> AssimilationSettings:
         """What the scheme takes."""
-        return AssimilationSettings(**{field.name: getattr(self, field.name) for field in fields(AssimilationSettings)})
+        common = {f.name: getattr(self, f.name) for f in fields(AssimilationSettings) if f.name != "own"}
+        return AssimilationSettings(**common, **self.own)

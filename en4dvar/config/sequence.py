@@ -13,16 +13,16 @@ from en4dvar.config.context import Context, Made, Spread
 from en4dvar.config.data import Data
 from en4dvar.config.document import Document
 from en4dvar.config.initial_state import dynamic_fields
-from en4dvar.config.load import Read, observed_in, read_file
+from en4dvar.config.load import Read, Validated, observed_in, read_file
 from en4dvar.config.parameters import Entry, Tied, Uncertain, entries
 from en4dvar.config.schema import File, Output, Section
 from en4dvar.config.sequential import Sequential, Workers, spreads
 from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
-from en4dvar.errors import ConfigError, Fault
-from en4dvar.forward import ForwardModel, Observable
-from en4dvar.hints import shown, suggest
+from en4dvar.model.forward import ForwardModel, Observable
+from en4dvar.plumbing.errors import ConfigError, Fault
+from en4dvar.plumbing.hints import shown, suggest
 
 APART = ("time_std", "correlation_time", "covariance", "robust", "discrepancy")  # keys of data.error
 
@@ -39,7 +39,7 @@ def _known_fields(names: tuple[str, ...], context: Context) -> tuple[str, ...]:
 
 
 class Sequence(Section):
-    """What is known of the state at time zero, and what is kept."""
+    """The prior of the state at time zero, and the results that are kept."""
 
     initial_std: Annotated[dict[str, Spread], spreads(dynamic_fields)] = Field({}, validate_default=True)
     """Spread of the model's initial state, by field, each of its values for itself: in the field's unit, or in % of a
@@ -70,8 +70,8 @@ class SequenceFile(File):
     """Where results go."""
 
     @classmethod
-    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        for place, error in _errors(given.get("data")):
+    def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        for place, error in _errors(keys.get("data")):
             for key in APART:
                 if key in error and (key != "discrepancy" or "series" not in place):  # which several series never have
                     message = "not in a sequence, where the errors of every instant are Gaussian and for themselves"
@@ -85,19 +85,16 @@ def _errors(data: Any) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
     if not isinstance(data, dict):
         return
     series = data.get("series")
-    each = [(("series", name), one) for name, one in series.items()] if isinstance(series, dict) else []
-    for place, one in [((), data), *each]:
-        if isinstance(one, dict) and isinstance(one.get("error"), dict):
-            yield ("data", *place, "error"), one["error"]
+    each = [(("series", name), section) for name, section in series.items()] if isinstance(series, dict) else []
+    for place, section in [((), data), *each]:
+        if isinstance(section, dict) and isinstance(section.get("error"), dict):
+            yield ("data", *place, "error"), section["error"]
 
 
-@dataclass(frozen=True)
-class SequenceConfig:
+@dataclass(frozen=True, kw_only=True)
+class SequenceConfig(Validated):
     """A validated configuration of a sequence. Nothing of the data file has been read yet."""
 
-    document: Document
-    name: str
-    seed: int
     model: ForwardModel
     observable: Observable
     data: Data | DataPlan
@@ -106,15 +103,6 @@ class SequenceConfig:
     model_error: tuple[ErrorOf, ...]
     assimilation: Sequential
     execution: Workers
-    directory: Path
-    report: bool
-    figures: bool
-    resolved: str
-
-    @property
-    def text(self) -> str:
-        """The file, verbatim."""
-        return self.document.text
 
 
 def resolve_sequence(document: Document, base: Path, model: ForwardModel | None = None) -> SequenceConfig:
@@ -137,9 +125,7 @@ def resolve_sequence(document: Document, base: Path, model: ForwardModel | None 
     if faults:
         raise ConfigError(faults)
     return SequenceConfig(
-        document=document,
-        name=file.name,
-        seed=file.seed,
+        **read.common(file.parameters),
         model=read.model,
         observable=observed_in(file.data, read),
         data=file.data,
@@ -148,10 +134,6 @@ def resolve_sequence(document: Document, base: Path, model: ForwardModel | None 
         model_error=file.model_error or (),
         assimilation=file.assimilation,
         execution=file.execution,
-        directory=file.output.directory or Path("runs") / file.name,
-        report=file.output.report,
-        figures=file.output.figures,
-        resolved=read.resolved(file.parameters),
     )
 
 

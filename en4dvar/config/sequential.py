@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence, Set
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -12,19 +12,19 @@ from pydantic import Field, model_validator
 
 from en4dvar.config.context import TEXT, Context, Made, Spread, parse_spread, quantity, read_each, subject_unit
 from en4dvar.config.initial_state import dynamic_fields
-from en4dvar.config.schema import Section, section_of
+from en4dvar.config.schema import OfScheme, Section, keys_of_schemes, listed
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import ErrorOf, Knots
-from en4dvar.cycling.coordinates import EnsembleCoordinates
-from en4dvar.cycling.model_error import ModelError
-from en4dvar.cycling.settings import SequentialSettings
-from en4dvar.cycling.smoothers import EnKS, EnRTS
-from en4dvar.errors import ConfigError, Fault
-from en4dvar.forward import ForwardModel
+from en4dvar.model.forward import ForwardModel
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.schemes import ON_A_SERIES
 from en4dvar.schemes.inflation import Inflation
-from en4dvar.schemes.localisation import Localisation
-from en4dvar.state import Array
+from en4dvar.schemes.localisation import BlockLocalisation
+from en4dvar.series.coordinates import EnsembleCoordinates
+from en4dvar.series.model_error import ModelError
+from en4dvar.series.settings import SequentialSettings
+from en4dvar.series.smoothers import EnKS, EnRTS
 
 
 def stds(known: Callable[[ForwardModel], Mapping[str, Any]]) -> Made:
@@ -32,18 +32,18 @@ def stds(known: Callable[[ForwardModel], Mapping[str, Any]]) -> Made:
 
     positive = quantity(subject_unit, "positive")
 
-    def read(given: Mapping[str, Any], context: Context) -> dict[str, float]:
+    def read(section: Mapping[str, Any], context: Context) -> dict[str, float]:
         things = known(context.model)
         with Faults() as faults:
-            if not given:
+            if not section:
                 faults.add((), f"give at least one of: {', '.join(things)}")
-            return read_each(given, things, context, faults, positive.make)
+            return read_each(section, things, context, faults, positive.make)
 
     json = {"type": "object", "minProperties": 1, "additionalProperties": TEXT}
     return Made(read, dict[str, Any], json)
 
 
-class Local(Section):
+class SeriesLocalisation(Section):
     """Gaspari–Cohn taper over the indices of the observed field; it vanishes from ``2 radius`` on."""
 
     radius: Annotated[float, Field(gt=0)]
@@ -57,7 +57,7 @@ class Local(Section):
     cells of this grid. Default: the indices lie on a line."""
 
     @model_validator(mode="after")
-    def _one_cell_each(self) -> Local:
+    def _one_cell_each(self) -> SeriesLocalisation:
         if self.shape and self.block_size > 1:
             raise ValueError("block_size: only without shape")
         return self
@@ -83,31 +83,32 @@ class Smoothing(Section):
         """The smoother."""
         return EnKS(self.lag) if self.method == "enks" else EnRTS()
 
-    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
+    def as_written(self, section: Mapping[str, Any]) -> dict[str, Any]:
         """As given, without what the method does not take."""
-        return {key: value for key, value in super().as_written(given).items() if self.method == "enks" or key != "lag"}
+        return {
+            key: value for key, value in super().as_written(section).items() if self.method == "enks" or key != "lag"
+        }
 
 
-_KINDS = ON_A_SERIES
-_KEYS = {name: {field.name for field in fields(kind)} for name, kind in _KINDS.items()}
-_FOREIGN = {name: set().union(*_KEYS.values()) - keys for name, keys in _KEYS.items()}  # keys of other schemes
 if TYPE_CHECKING:
     OnASeries = str
 else:
     OnASeries = Literal[tuple(ON_A_SERIES)]
 
 
-class _Scheme(Section):
-    scheme: OnASeries
-    """A filter (one analysis per cycle), ienks (sliding-window smoother), or a baseline to judge them by."""
+class _Scheme(OfScheme):
+    scheme: Annotated[OnASeries, Field(description=listed(ON_A_SERIES))]
     members: Annotated[int, Field(ge=3)]
     """Ensemble size N."""
 
 
-_Iterations: Any = section_of(*_KINDS.values(), base=_Scheme)
+if TYPE_CHECKING:
+    _OnASeries = _Scheme
+else:
+    _OnASeries = keys_of_schemes(ON_A_SERIES, base=_Scheme)
 
 
-class Sequential(_Iterations):
+class Sequential(_OnASeries):
     """The scheme and what it does to the ensemble."""
 
     inflation: Annotated[float, Field(gt=0)] = 1.0
@@ -118,7 +119,7 @@ class Sequential(_Iterations):
     """Rotate the ensemble at random after each analysis, mean and covariance kept."""
     additive: Literal["drawn", "square-root"] = "drawn"
     """How a model error enters the ensemble of a filter: drawn, or by a square root in the space of the ensemble."""
-    localisation: Local | None = None
+    localisation: SeriesLocalisation | None = None
     """Gaspari–Cohn taper over the indices of the observed field."""
     smoother: Smoothing | None = None
     """What smooths the states behind a filter."""
@@ -127,16 +128,16 @@ class Sequential(_Iterations):
 
     @model_validator(mode="after")
     def _belongs_together(self) -> Sequential:
-        others = self.model_fields_set & _FOREIGN[self.scheme]
-        if others:
-            takers = [name for name, keys in _KEYS.items() if keys >= others]
-            raise ValueError(f"{', '.join(sorted(others))}: only with scheme {' or '.join(takers)}")
+        if type(self).unread({key: getattr(self, key) for key in self.model_fields_set}):
+            return self  # told already
         made = self.made
         if self.additive == "square-root" and made.lag:
             raise ValueError("additive: square-root is for filters; a smoother estimates the model error")
-        anywhere = Localisation((), np.empty((0, 0)))  # settings that do not go together are told here, in their place
+        anywhere = BlockLocalisation(
+            (), np.empty((0, 0))
+        )  # settings that do not go together are told here, in their place
         SequentialSettings(
-            self.made, localisation=anywhere if self.localisation else None,
+            made, localisation=anywhere if self.localisation else None,
             smoother=self.smoother.made if self.smoother else None,
         )  # fmt: skip
         return self
@@ -144,10 +145,10 @@ class Sequential(_Iterations):
     @property
     def made(self) -> Any:
         """The scheme. Raises ValueError where its keys do not suit each other."""
-        return _KINDS[self.scheme](**{key: getattr(self, key) for key in _KEYS[self.scheme]})
+        return ON_A_SERIES[self.scheme](**self.own)
 
     def built(
-        self, localisation: Localisation | None, rate: Array, coordinates: EnsembleCoordinates
+        self, localisation: BlockLocalisation | None, rate: Array, coordinates: EnsembleCoordinates
     ) -> SequentialSettings:
         """What the loop needs; ``rate`` (n,) is the model error's variance per unit of time."""
         return SequentialSettings(
@@ -162,11 +163,6 @@ class Sequential(_Iterations):
             smoother=self.smoother.made if self.smoother else None,
         )
 
-    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """As given, without what the scheme does not take."""
-        written = super().as_written(given)
-        return {key: value for key, value in written.items() if key not in _FOREIGN[self.scheme]}
-
 
 class Workers(Section):
     """Where members are integrated; never changes the numbers. A cycle is short: one worker is the default."""
@@ -180,10 +176,10 @@ class Workers(Section):
 def spreads(known: Callable[[ForwardModel], Mapping[str, Any]]) -> Made:
     """Standard deviations, some in %, by the name of a thing that the model knows."""
 
-    def read(given: Mapping[str, Any], context: Context) -> dict[str, Spread]:
+    def read(section: Mapping[str, Any], context: Context) -> dict[str, Spread]:
         with Faults() as faults:
             return read_each(
-                given, known(context.model), context, faults, lambda text, at: parse_spread(text, at.subject.unit)
+                section, known(context.model), context, faults, lambda text, at: parse_spread(text, at.subject.unit)
             )
 
     return Made(read, dict[str, Any], {"type": "object", "additionalProperties": TEXT})
@@ -195,12 +191,12 @@ def error_rates(model: ForwardModel, errors: Sequence[ErrorOf], positive: Collec
     ``positive``: fields whose coordinate is their logarithm. Raises :class:`ConfigError`, its path the faulty key.
     """
     rate = np.zeros(model.layout.size)
-    for one in errors:
-        name, std = one.field.name, one.spec.std
+    for error in errors:
+        name, std = error.field.name, error.spec.std
         if std.relative != (name in positive):
             other = "in %, for it is positive" if name in positive else "in its unit, or its initial_std in % as well"
-            raise ConfigError([Fault(f"give the std of {name} {other}", f"model_error.{name}.std")])
-        rate[model.layout[name]] = per_time(one.spec, std.value, f"model_error.{name}")
+            raise ConfigError(f"give the std of {name} {other}", f"model_error.{name}.std")
+        rate[model.layout[name]] = per_time(error.spec, std.value, f"model_error.{name}")
     return rate
 
 
@@ -208,17 +204,17 @@ def per_time(spec: Knots, std: float, path: str) -> float:
     """Variance per unit of time. Raises :class:`ConfigError`."""
     if spec.every is None:
         raise ConfigError(
-            [Fault("give every, the time in which the model error reaches std: in a series it grows with time", path)]
+            "give every, the time in which the model error reaches std: in a series it grows with time", path
         )
     try:
         return std**2 / spec.every
     except OverflowError:
-        raise ConfigError([Fault("too large: its square is not a number", f"{path}.std")]) from None
+        raise ConfigError("too large: its square is not a number", f"{path}.std") from None
 
 
 def localisation_of(
-    settings: Local, model: ForwardModel, observed: Set[str], cells: Array | None = None
-) -> Localisation:
+    settings: SeriesLocalisation, model: ForwardModel, observed: Set[str], cells: Array | None = None
+) -> BlockLocalisation:
     """Positions are indices of the one observed field, which fills the state but for the parameters.
 
     ``cells`` (p,) are the indices of the observations, by default all. Raises :class:`ConfigError`.
@@ -230,13 +226,13 @@ def localisation_of(
     if settings.shape:
         if math.prod(settings.shape) != field.size:
             grid_cells = " x ".join(map(str, settings.shape))
-            raise ConfigError([Fault(f"{grid_cells} cells, but {field.name} has {field.size}", "shape")])
+            raise ConfigError(f"{grid_cells} cells, but {field.name} has {field.size}", "shape")
         where = np.arange(model.layout.size)[model.layout[field.name]]
-        grid = Localisation.on_grid(where, settings.shape, settings.radius, settings.periodic)
+        grid = BlockLocalisation.on_grid(where, settings.shape, settings.radius, settings.periodic)
         return grid if cells is None else replace(grid, taper=grid.taper[:, np.rint(cells).astype(int)])
     positions = np.arange(field.size, dtype=float)
     state = np.full(model.layout.size, np.nan)
     state[model.layout[field.name]] = positions
     period = float(field.size) if settings.periodic else None
     at = positions if cells is None else cells
-    return Localisation.on_line(state, at, settings.radius, period, settings.block_size)
+    return BlockLocalisation.on_line(state, at, settings.radius, period, settings.block_size)

@@ -12,9 +12,9 @@ from en4dvar.config.context import Context, Made
 from en4dvar.config.data import Data
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults, Place
-from en4dvar.errors import ConfigError, Fault
-from en4dvar.forward import Observable
-from en4dvar.hints import shown, suggest
+from en4dvar.model.forward import Observable
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.hints import shown, suggest
 
 RESERVED = ("time", "path_time", "reading", "parameter", "chain", "draw", "correlation", "mode", "active", "dfs")
 EACH = {"type": "object", "minProperties": 1, "additionalProperties": {"x-definition": "series"}}
@@ -49,23 +49,23 @@ class DataPlan:
 
     @classmethod
     def of(cls, data: Data | DataPlan, observable: Observable) -> DataPlan:
-        """Of either kind of section; ``observable`` is that of a single series."""
+        """The plan of either kind of section; ``observable`` is that of a single series."""
         if isinstance(data, DataPlan):
             return data
         return cls((SeriesPlan(observable.name, observable, data),), {})
 
     @property
     def alone(self) -> bool:
-        """Whether there is one series."""
+        """True if there is one series."""
         return len(self.series) == 1
 
-    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """As given, each series complete, with absolute paths."""
-        common, written = _common(given), dict[str, Any]()
-        for one in self.series:
-            section = one.data.as_written(_merged(common, given["series"][one.name]))
-            written[one.name] = {key: value for key, value in section.items() if value is not None and key != "name"}
-        rest = {key: given[key] for key in ("name", "correlation") if given.get(key)}
+    def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
+        """The section as it was written, each series complete, with absolute paths."""
+        common, written = _common(source), dict[str, Any]()
+        for series in self.series:
+            section = series.data.as_written(_merged(common, source["series"][series.name]))
+            written[series.name] = {key: value for key, value in section.items() if value is not None and key != "name"}
+        rest = {key: source[key] for key in ("name", "correlation") if source.get(key)}
         return {"series": written, **rest}
 
 
@@ -85,12 +85,12 @@ class DataOfSeries(Section):
     """Correlation of the errors of two series at equal times: ``prey: {predator: 0.5}``."""
 
 
-def _common(given: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in given.items() if key not in ("series", "correlation")}
+def _common(keys: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in keys.items() if key not in ("series", "correlation")}
 
 
 def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """What a series says, and below it what holds for all; sections are merged key by key."""
+    """The keys of a series over those that hold for all; sections are merged key by key."""
     return {
         **common,
         **{
@@ -101,8 +101,8 @@ def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _plan(section: DataOfSeries, context: Context) -> DataPlan:
-    given = {"series": section.series, **(section.model_extra or {})}
-    common, plans = _common(given), dict[str, SeriesPlan]()
+    keys = {"series": section.series, **(section.model_extra or {})}
+    common, plans = _common(keys), dict[str, SeriesPlan]()
     with Faults() as faults:
         for name, own in section.series.items():
             if not isinstance(own, dict):
@@ -124,7 +124,7 @@ def _plan(section: DataOfSeries, context: Context) -> DataPlan:
                 plans[name] = _series(name, _merged(common, own), context)
                 if plans[name].data.error is not None and plans[name].data.error.discrepancy is not None:
                     words = "a discrepancy is that of a single series; leave it out, or estimate this series by itself"
-                    raise ConfigError([Fault(words, "error.discrepancy")])
+                    raise ConfigError(words, "error.discrepancy")
         for name, others in (section.correlation or {}).items():
             for other in others:
                 _check_pair(name, other, section, faults)
@@ -133,35 +133,33 @@ def _plan(section: DataOfSeries, context: Context) -> DataPlan:
     return DataPlan(tuple(plans.values()), pairs)
 
 
-def _has(given: Any, where: Place) -> bool:
-    """Whether the section says something at a place, or above it."""
+def _has(keys: Any, where: Place) -> bool:
+    """True if the section says something at a place, or above it."""
     return (
         bool(where)
-        and isinstance(given, dict)
-        and where[0] in given
-        and (len(where) == 1 or not isinstance(given[where[0]], dict) or _has(given[where[0]], where[1:]))
+        and isinstance(keys, dict)
+        and where[0] in keys
+        and (len(where) == 1 or not isinstance(keys[where[0]], dict) or _has(keys[where[0]], where[1:]))
     )
 
 
-def _name_fault(name: str, given: Mapping[str, Any], context: Context) -> str:
-    """What is wrong with the name of a series, after which variables of the result are called; "" where nothing is."""
+def _name_fault(name: str, keys: Mapping[str, Any], context: Context) -> str:
+    """The fault of a series' name, after which variables of the result are called; "" where there is none."""
     if not name.isidentifier() or name in RESERVED:
         return f"{shown(name)} cannot be the name of a series; use letters, digits and _, as in well_3"
     known = [observable.name for observable in context.units.observables]
-    if "observable" in given or name in known:
+    if "observable" in keys or name in known:
         return ""
     return f"unknown observable {shown(name)}{suggest(name, known)}; of another name, it has to say observable: NAME"
 
 
-def _series(name: str, given: dict[str, Any], context: Context) -> SeriesPlan:
+def _series(name: str, keys: dict[str, Any], context: Context) -> SeriesPlan:
     known = {observable.name: observable for observable in context.units.observables}
-    chosen = str(given.get("observable", name))
+    chosen = str(keys.get("observable", name))
     if chosen not in known:
-        raise ConfigError(
-            [Fault(f"unknown observable {shown(str(chosen))}{suggest(str(chosen), known)}", "observable")]
-        )
+        raise ConfigError(f"unknown observable {shown(str(chosen))}{suggest(str(chosen), known)}", "observable")
     context.observed = known[chosen]
-    data = SeriesData.model_validate(given, context=context)
+    data = SeriesData.model_validate(keys, context=context)
     return SeriesPlan(name, known[chosen], data, data.group or name)
 
 
@@ -169,15 +167,15 @@ def _check_pair(name: str, other: str, section: DataOfSeries, faults: Faults) ->
     if name not in section.series:
         faults.add(("correlation", name), f"no series {shown(name)}{suggest(name, section.series)}", at_key=True)
     elif other not in section.series or other == name:
-        others = [one for one in section.series if one != name]
+        others = [candidate for candidate in section.series if candidate != name]
         message = f"no other series {shown(other)}{suggest(other, others)}"
         faults.add(("correlation", name, other), message, at_key=True)
     elif name in ((section.correlation or {}).get(other) or {}) and name > other:
         faults.add(("correlation", name, other), f"given as {other}: {{{name}: …}} as well", at_key=True)
 
 
-def _kind(given: Any) -> str:
-    several = (isinstance(given, dict) and "series" in given) or isinstance(given, DataPlan)
+def _kind(written: Any) -> str:
+    several = (isinstance(written, dict) and "series" in written) or isinstance(written, DataPlan)
     return "of several series" if several else "of one series"
 
 

@@ -1,19 +1,56 @@
-"""Which parameters have one value in several data sets: ``shared:`` of a prior, and the ``groups:`` of data sets."""
+"""Parameters of several data sets: ``shared:`` of a prior with the ``groups:``, and the ``population:`` section."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
 from en4dvar.config.document import Document
 from en4dvar.config.parameters import Entry, Uncertain
-from en4dvar.config.schema import Name
-from en4dvar.errors import ConfigError, Fault
-from en4dvar.hints import shown, suggest
+from en4dvar.config.schema import Name, Section, section_of
+from en4dvar.estimation.population import HyperPrior
+from en4dvar.plumbing.errors import ConfigError, Fault
+from en4dvar.plumbing.hints import shown, suggest
+
+if TYPE_CHECKING:
+
+    class _HyperPrior(HyperPrior, Section): ...
+
+else:
+    _HyperPrior = section_of(HyperPrior)
+
+
+class PopulationSection(_HyperPrior):
+    """Mean and spread of parameters over the data sets of the run, estimated at its end."""
+
+    of: Annotated[tuple[str, ...], Field(min_length=1)]
+    """Parameters that vary from data set to data set about a common mean, e.g. [G, mu]."""
+
+    @property
+    def hyper(self) -> HyperPrior:
+        """The prior of mean and spread."""
+        return HyperPrior(**{field.name: getattr(self, field.name) for field in fields(HyperPrior)})
+
+
+def check_population(section: PopulationSection, entries: Sequence[Entry], document: Document) -> None:
+    """Raises :class:`ConfigError`: every parameter that is not estimated, or whose prior depends on the data set."""
+    if faults := list(_unfit(section, entries, document)):
+        raise ConfigError(faults)
+
+
+def _unfit(section: PopulationSection, entries: Sequence[Entry], document: Document) -> Iterator[Fault]:
+    estimated = {e.parameter.name: e for e in entries if isinstance(e, Uncertain)}
+    for i, name in enumerate(section.of):
+        where = ("population", "of", i)
+        if name not in estimated:
+            yield document.fault(where, f"{name}: not estimated, it has no prior{suggest(name, estimated)}")
+        elif estimated[name].needs_data:
+            yield document.fault(where, f"{name}: its prior depends on the data set ('maximum'), a population has one")
+
 
 ALL = "all"
 Patterns = str | tuple[str, ...]
@@ -36,14 +73,14 @@ class Sharing:
         return {parameter: "" if kind == ALL else self._group(kind, name) for parameter, kind in self.kinds.items()}
 
     def _group(self, kind: str, name: str) -> str:
-        found = [
+        groups = [
             group
             for group, patterns in self.groups[kind].items()
-            if any(fnmatchcase(name, one) for one in ([patterns] if isinstance(patterns, str) else patterns))
+            if any(fnmatchcase(name, pattern) for pattern in ([patterns] if isinstance(patterns, str) else patterns))
         ]
-        if len(found) == 1:
-            return found[0]
-        where = f"in several of them: {', '.join(found)}" if found else "in none of them"
+        if len(groups) == 1:
+            return groups[0]
+        where = f"in several of them: {', '.join(groups)}" if groups else "in none of them"
         raise ConfigError([self.document.fault(("groups", kind), f"data set {name!r} is {where}")])
 
 
@@ -54,7 +91,7 @@ def sharing_of(
     several_series: bool,
     document: Document,
 ) -> Sharing:
-    """What a file asks to be shared. Raises :class:`ConfigError`: every entry that cannot be."""
+    """The parameters that a file asks to be shared. Raises :class:`ConfigError`: every entry that cannot be."""
     asked = {e.parameter.name: e for e in entries if isinstance(e, Uncertain) and e.spec.shared is not None}
     kinds = {name: str(entry.spec.shared) for name, entry in asked.items()}
     faults = [fault for name, entry in asked.items() for fault in _faults(name, entry, groups, document)]

@@ -15,9 +15,9 @@ from en4dvar.config.load import read_file
 from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.schema import File, Name, Section
 from en4dvar.config.validate import Faults
-from en4dvar.forward import ForwardModel, Observable
-from en4dvar.prior import PriorTerm
-from en4dvar.units import parse_quantity
+from en4dvar.model.forward import ForwardModel, Observable
+from en4dvar.plumbing.units import parse_quantity
+from en4dvar.priors.prior import PriorTerm
 
 
 class GroupSection(Section):
@@ -30,12 +30,12 @@ class GroupSection(Section):
 
     @property
     def terms(self) -> tuple[PriorTerm, ...]:
-        """What is drawn for each data set."""
+        """Priors of the parameters that are drawn for each data set."""
         return tuple(entry.term() for entry in self.parameters if isinstance(entry, Uncertain))
 
     @property
     def fixed(self) -> dict[str, float]:
-        """What is common to all."""
+        """Values that are common to all data sets."""
         return {entry.parameter.name: entry.value for entry in self.parameters if isinstance(entry, Fixed)}
 
 
@@ -43,10 +43,10 @@ def _end(text: Any, context: Context) -> float:
     return 0.0 if text == 0 and text is not False else parse_quantity(text, time_unit(context))
 
 
-def _ascending(given: Any, validate: ValidatorFunctionWrapHandler) -> tuple[float, float]:
-    low, high = validate(given)
+def _ascending(written: Any, validate: ValidatorFunctionWrapHandler) -> tuple[float, float]:
+    low, high = validate(written)
     if low is not None and low > high:
-        raise ValueError(f"{given[0]} is larger than {given[1]}")
+        raise ValueError(f"{written[0]} is larger than {written[1]}")
     return low, high
 
 
@@ -119,7 +119,7 @@ class CampaignPlan:
 
     @property
     def observable(self) -> Observable:
-        """What is read."""
+        """The observable that is read."""
         return self.model.observables[0]
 
 

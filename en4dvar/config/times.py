@@ -9,8 +9,8 @@ from pydantic import Field
 
 from en4dvar.config.context import Context, time_unit
 from en4dvar.config.schema import QuantityText, Section
-from en4dvar.state import Array
-from en4dvar.units import UnitError, parse_quantity
+from en4dvar.model.state import Array
+from en4dvar.plumbing.units import UnitError, parse_quantity
 
 
 def time_grid(start: str | float, end: str | float, step: str | float, unit: str) -> Array:

@@ -12,21 +12,21 @@ from pydantic import Field, model_validator
 from en4dvar.config.context import Context, Made, quantity, time_unit
 from en4dvar.config.document import Document
 from en4dvar.config.initial_state import dynamic_fields
-from en4dvar.config.load import read_file
+from en4dvar.config.load import Validated, read_file
 from en4dvar.config.parameters import Entry, Fixed, Uncertain, entries
 from en4dvar.config.schema import File, Output, Section
 from en4dvar.config.sequential import Sequential, Workers, error_rates, localisation_of, stds
 from en4dvar.config.validate import Faults
 from en4dvar.config.varies import MODEL_ERROR, ErrorOf
-from en4dvar.cycling.coordinates import EnsembleCoordinates
-from en4dvar.cycling.twin import TwinExperiment
-from en4dvar.errors import ConfigError, DataError
-from en4dvar.files import expanded
-from en4dvar.forward import ForwardModel, Observable
+from en4dvar.data.noise import Correlation
 from en4dvar.inputs.asked import Matrix
 from en4dvar.inputs.square import read_covariance
-from en4dvar.noise import Correlation
-from en4dvar.prior import Prior
+from en4dvar.model.forward import ForwardModel, Observable
+from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.files import expanded
+from en4dvar.priors.prior import Prior
+from en4dvar.series.coordinates import EnsembleCoordinates
+from en4dvar.series.twin import TwinExperiment
 
 
 def _errors(model: ForwardModel) -> dict[str, Observable]:
@@ -67,9 +67,9 @@ class Twin(Section):
             raise ValueError(f"burn_in ({self.burn_in}) leaves none of {self.cycles} cycles")
         return self
 
-    def as_written(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """As given, with an absolute path."""
-        written = super().as_written(given)
+    def as_written(self, source: Mapping[str, Any]) -> dict[str, Any]:
+        """The section as it was written, with an absolute path."""
+        written = super().as_written(source)
         return written | ({"error_correlation": self.error_correlation[0]} if self.error_correlation else {})
 
 
@@ -91,8 +91,8 @@ class TwinFile(File):
     """Where results go."""
 
     @classmethod
-    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        twin, assimilation = given.get("twin"), given.get("assimilation")
+    def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        twin, assimilation = keys.get("twin"), keys.get("assimilation")
         correlated = isinstance(twin, dict) and twin.get("error_correlation") is not None
         if correlated and isinstance(assimilation, dict) and assimilation.get("localisation"):
             message = "needs observations with independent errors, but twin.error_correlation is given"
@@ -102,25 +102,13 @@ class TwinFile(File):
             faults.add(("model",), f"RMSE and spread need one unit, but the state has {', '.join(sorted(units))}")
 
 
-@dataclass(frozen=True)
-class TwinConfig:
+@dataclass(frozen=True, kw_only=True)
+class TwinConfig(Validated):
     """A validated twin experiment."""
 
-    document: Document
-    name: str
-    seed: int
     experiment: TwinExperiment
     scheme: str
     execution: Workers
-    directory: Path
-    report: bool
-    figures: bool
-    resolved: str
-
-    @property
-    def text(self) -> str:
-        """The file, verbatim."""
-        return self.document.text
 
 
 def resolve_twin(document: Document, base: Path) -> TwinConfig:
@@ -130,18 +118,12 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
     observed = {name.removesuffix("_std"): std for name, std in twin.error.items()}
     local = None
     if file.assimilation.localisation:
-        try:
+        with document.placing("assimilation", "localisation"):
             local = localisation_of(file.assimilation.localisation, model, observed.keys())
-        except ConfigError as error:
-            where = ("assimilation", "localisation")
-            raise ConfigError([document.fault((*where, f.path) if f.path else where, f.message)
-                               for f in error.problems]) from None  # fmt: skip
     terms = tuple(entry.term() for entry in file.parameters if isinstance(entry, Uncertain))
     prior = Prior(terms) if terms else None
-    try:
+    with document.placing():
         rate = error_rates(model, file.model_error or ())
-    except ConfigError as error:
-        raise ConfigError([document.fault(tuple(f.path.split(".")), f.message) for f in error.problems]) from None
     experiment = TwinExperiment(
         model=model,
         sequential=file.assimilation.built(local, rate, EnsembleCoordinates.of(model, prior)),
@@ -155,15 +137,5 @@ def resolve_twin(document: Document, base: Path) -> TwinConfig:
         prior=prior,
         fixed={entry.parameter.name: entry.value for entry in file.parameters if isinstance(entry, Fixed)},
     )
-    return TwinConfig(
-        document=document,
-        name=file.name,
-        seed=file.seed,
-        experiment=experiment,
-        scheme=file.assimilation.scheme,
-        execution=file.execution,
-        directory=file.output.directory or Path("runs") / file.name,
-        report=file.output.report,
-        figures=file.output.figures,
-        resolved=read.resolved(()),
-    )
+    common = read.common(())
+    return TwinConfig(**common, experiment=experiment, scheme=file.assimilation.scheme, execution=file.execution)

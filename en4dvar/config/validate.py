@@ -12,8 +12,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from en4dvar.config.document import Document
-from en4dvar.errors import ConfigError, Fault
-from en4dvar.hints import shown, suggest
+from en4dvar.plumbing.errors import ConfigError, Fault
+from en4dvar.plumbing.hints import shown, suggest
 
 M = TypeVar("M", bound=BaseModel)
 Place = tuple[str | int, ...]
@@ -56,7 +56,7 @@ def check(
 
 @dataclass(frozen=True)
 class _Finding:
-    """What is wrong at ``place``; ``absent``: its last key may be one that the file lacks; ``kind``: the value is of no
+    """A fault at ``place``; ``absent``: its last key may be one that the file lacks; ``kind``: the value is of no
     kind that can stand there, of which there may be several."""
 
     place: Place
@@ -166,11 +166,11 @@ def _message(item: Any) -> str:
     return message if kind == "missing" else f"{message}{_NOT}{shown(item['input'])}"
 
 
-def _not_one_of(given: object, expected: str) -> str:
+def _not_one_of(written: object, expected: str) -> str:
     choices = [choice.strip("' ") for choice in expected.split(", ")]
-    hint = suggest(given, choices)
+    hint = suggest(written, choices)
     few = f"one of {', '.join(choices)}" if len(choices) > 1 else choices[0]
-    return f"{shown(given)} is not {few}" + (hint if hint.startswith("; did") else "")
+    return f"{shown(written)} is not {few}" + (hint if hint.startswith("; did") else "")
 
 
 def _known(schema: type[BaseModel], place: Place) -> set[str]:

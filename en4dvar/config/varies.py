@@ -13,10 +13,10 @@ from en4dvar.config.context import Context, Made, Spread, parse_spread, quantity
 from en4dvar.config.initial_state import read_fields
 from en4dvar.config.schema import Section
 from en4dvar.config.validate import Faults
-from en4dvar.errors import ConfigError, Fault
-from en4dvar.forward import ForwardModel
-from en4dvar.state import Array, Field
-from en4dvar.varying import StateChanges
+from en4dvar.model.forward import ForwardModel
+from en4dvar.model.state import Array, Field
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.varying import StateChanges
 
 MOST_KNOTS = 1000
 
@@ -34,8 +34,8 @@ class Knots(Section):
     """The knots, in increasing order, from the model's time zero; instead of ``every``."""
 
     @classmethod
-    def rules(cls, given: Mapping[str, Any], context: Context, faults: Faults) -> None:
-        if ("every" in given) == ("at" in given):
+    def rules(cls, keys: Mapping[str, Any], context: Context, faults: Faults) -> None:
+        if ("every" in keys) == ("at" in keys):
             faults.add((), "give either every (length of a piece) or at (list of knots)")
 
     @model_validator(mode="after")
@@ -51,15 +51,15 @@ class Knots(Section):
         last = float(times[-1])
         if self.at is not None:
             if not self.at[0] < last:
-                raise ConfigError([Fault("all knots lie after the last observation", "at")])
+                raise ConfigError("all knots lie after the last observation", "at")
             return self.at
         count, width = int(min(last // self.every, MOST_KNOTS + 1)) if self.every else 0, self.every or 1.0
         if count > MOST_KNOTS:
-            raise ConfigError([Fault(f"more than {MOST_KNOTS} pieces in the window", "every")])
-        found = tuple(k * width for k in range(1, count + 1) if k * width < last)
-        if not found:
-            raise ConfigError([Fault("the last observation comes before the end of the first piece", "every")])
-        return found
+            raise ConfigError(f"more than {MOST_KNOTS} pieces in the window", "every")
+        instants = tuple(k * width for k in range(1, count + 1) if k * width < last)
+        if not instants:
+            raise ConfigError("the last observation comes before the end of the first piece", "every")
+        return instants
 
 
 def _change_std(text: Any, context: Context) -> Spread:
@@ -77,7 +77,7 @@ class VariesSection(Knots):
 
     @property
     def estimated(self) -> bool:
-        """Whether ``std`` is that of the prior of the changes' standard deviation."""
+        """True if ``std`` is that of the prior of the changes' standard deviation."""
         return isinstance(self.std, Estimated)
 
 
@@ -90,7 +90,7 @@ class ModelErrorSection(Knots):
 
 @dataclass(frozen=True)
 class ErrorOf:
-    """What a file says of the model error of a field of the state."""
+    """The model error of a field of the state, as a file states it."""
 
     field: Field
     spec: ModelErrorSection
@@ -101,11 +101,11 @@ class ErrorOf:
         return StateChanges.of(model, self.field, self.spec.knots(times), std.value, std.relative)
 
 
-def _model_error(given: Mapping[str, Any], context: Context) -> tuple[ErrorOf, ...]:
+def _model_error(section: Mapping[str, Any], context: Context) -> tuple[ErrorOf, ...]:
     def read(entry: Any, context: Context) -> ErrorOf:
         return ErrorOf(context.subject, ModelErrorSection.model_validate(entry, context=context))
 
-    return read_fields(given, context, "write varies behind its prior", read)
+    return read_fields(section, context, "write varies behind its prior", read)
 
 
 MODEL_ERROR = Made(

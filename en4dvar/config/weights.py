@@ -10,16 +10,16 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
-from en4dvar import user_file
 from en4dvar.config.context import Context, Made, quantity, time_unit
 from en4dvar.config.schema import Section
-from en4dvar.errors import ConfigError, DataError, Fault
-from en4dvar.files import PathError
-from en4dvar.hints import shown
 from en4dvar.inputs.asked import Column
 from en4dvar.inputs.window import minima
-from en4dvar.state import Array
-from en4dvar.user_code import loading, reason_of, require_permission
+from en4dvar.model.state import Array
+from en4dvar.plumbing import user_file
+from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.files import PathError
+from en4dvar.plumbing.hints import shown
+from en4dvar.plumbing.user_code import loading, reason_of
 
 Number = Annotated[float, Field(ge=0)]
 
@@ -61,35 +61,37 @@ class Weighing:
 
         Raises :class:`DataError` where they are not as many as the observations, negative or not finite.
         """
-        found = read if read is not None else np.ones(len(times))
+        weights = read if read is not None else np.ones(len(times))
         if self.of is not None:
-            found = np.asarray(self.of(times, values, prominence))
-        if found.shape != times.shape or found.dtype.kind not in "fiub":
-            raise DataError(f"{_count(found)} for {len(times)} observations of the window")
-        found = found.astype(float)
-        if not (np.all(np.isfinite(found)) and np.all(found >= 0)):
-            worst = found[~(np.isfinite(found) & (found >= 0))][0]
+            weights = np.asarray(self.of(times, values, prominence))
+        if weights.shape != times.shape or weights.dtype.kind not in "fiub":
+            raise DataError(f"{_count(weights)} for {len(times)} observations of the window")
+        weights = weights.astype(float)
+        if not (np.all(np.isfinite(weights)) and np.all(weights >= 0)):
+            worst = weights[~(np.isfinite(weights) & (weights >= 0))][0]
             raise DataError(f"a weight is {worst:g}; weights must be finite and not negative")
-        if not np.any(found > 0):
+        if not np.any(weights > 0):
             raise DataError("all weights are zero; no observation counts")
-        return found
+        return weights
 
 
-def _count(found: np.ndarray[Any, Any]) -> str:
-    return f"{len(found)} weights" if found.ndim == 1 and found.dtype.kind in "fiub" else f"weights {found.shape}"
+def _count(weights: np.ndarray[Any, Any]) -> str:
+    return (
+        f"{len(weights)} weights" if weights.ndim == 1 and weights.dtype.kind in "fiub" else f"weights {weights.shape}"
+    )
 
 
-def weighing(given: Any, context: Context) -> Weighing:
+def weighing(written: Any, context: Context) -> Weighing:
     """Raises :class:`ConfigError` where a function is not to be had."""
-    if isinstance(given, list):
-        numbers = np.array(given, dtype=float)
+    if isinstance(written, list):
+        numbers = np.array(written, dtype=float)
         return Weighing(of=lambda times, values, prominence: numbers)
-    if isinstance(given, WeightColumn):
-        return Weighing(column=Column(given.column, "1", "1", kind="weight"))
-    if isinstance(given, AwayFromMinima):
-        reach = given.zero_near_minima
+    if isinstance(written, WeightColumn):
+        return Weighing(column=Column(written.column, "1", "1", kind="weight"))
+    if isinstance(written, AwayFromMinima):
+        reach = written.zero_near_minima
         return Weighing(of=lambda times, values, prominence: away_from_minima(times, values, reach, prominence))
-    return _of_function(given.function, context.base)
+    return _of_function(written.function, context.base)
 
 
 def away_from_minima(times: Array, values: Array, reach: float, prominence: float) -> Array:
@@ -105,16 +107,15 @@ def away_from_minima(times: Array, values: Array, reach: float, prominence: floa
 
 def _of_function(name: str, base: Path) -> Weighing:
     if not user_file.is_file_reference(name):
-        raise ConfigError([Fault(f"{shown(name)} is not a function in a file; write ./weights.py:name", "function")])
+        raise ConfigError(f"{shown(name)} is not a function in a file; write ./weights.py:name", "function")
     try:
         reference = user_file.absolute(name, base)
         with loading(f"{shown(name)} cannot be loaded"):
-            require_permission(f"function {shown(name)}", Path(reference.rpartition(":")[0]))
-            function = user_file.load(reference)
+            function = user_file.load(reference, f"function {shown(name)}")
     except (ConfigError, PathError, ValueError) as error:
-        raise ConfigError([Fault(str(error), "function")]) from None
+        raise ConfigError(str(error), "function") from None
     if not callable(function):
-        raise ConfigError([Fault(f"{shown(name)} is not a function", "function")])
+        raise ConfigError(f"{shown(name)} is not a function", "function")
 
     def of(times: Array, values: Array, prominence: float) -> Array:
         try:
@@ -128,17 +129,17 @@ def _of_function(name: str, base: Path) -> Weighing:
 _KINDS = ("column", "zero_near_minima", "function")
 
 
-def _kind(given: Any) -> str | None:
+def _kind(written: Any) -> str | None:
     """Which of the ways to state weights it is; None: none of them."""
-    if isinstance(given, Mapping):
-        return next((f"a {key}" for key in _KINDS if key in given), None)
-    return "a list" if isinstance(given, list) else None
+    if isinstance(written, Mapping):
+        return next((f"a {key}" for key in _KINDS if key in written), None)
+    return "a list" if isinstance(written, list) else None
 
 
-def _known(given: Any) -> Any:
-    if _kind(given) is None:
+def _known(written: Any) -> Any:
+    if _kind(written) is None:
         raise ValueError("write a list, {column: NAME}, {zero_near_minima: 2 us} or {function: ./weights.py:name}")
-    return given
+    return written
 
 
 WEIGHTS = Made(

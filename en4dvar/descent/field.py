@@ -22,14 +22,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from en4dvar.descent.field_data import FieldData, Members, Pass, mean_of, silent
-from en4dvar.errors import En4dvarError
-from en4dvar.schemes.esmda import ESMDA
+from en4dvar.descent.loop import Objective, minimise
+from en4dvar.descent.step_control import Move, Search
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.schemes.base import mda_inflations
 from en4dvar.schemes.local_gain import ByDistance, Gain, Update, parts
-from en4dvar.state import Array
 
 TRIALS, SHORTER = 8, 0.3  # steps that are tried, each so much shorter than the one before
 
@@ -51,39 +54,125 @@ def field_esmda(
 
     Raises :class:`En4dvarError`: predictions that are not finite.
     """
-    alive = np.arange(len(ensemble))
-    for a, alpha in enumerate(ESMDA(tuple(coefficients)).inflations):
-        predictions = _of_some(ensemble, alive, data, fewest) if a or first is None else first
-        found = np.isfinite(predictions).all(axis=1)
-        alive, predictions = alive[found], predictions[found]
-        errors = np.sqrt(alpha) * data.perturbations(seed, f"ES-MDA {a}", alive)
-        mean = predictions.mean(axis=0)
-        tell(Pass(mean_of(ensemble, alive), mean, partial(_part_of, ensemble, alive)))
-        update = gain.update(predictions - mean, alpha * data.std**2, data.values + errors - predictions)
-        for part in parts(ensemble.shape[1], data.width(len(ensemble))):
-            here = ensemble[alive, part]
-            ensemble[alive, part] = here + update(part, here - here.mean(axis=0))
-    return alive
+    return field_passes(ensemble, data, gain, mda_inflations(coefficients), seed, fewest, first, tell)
 
 
-def _of_some(ensemble: Array, alive: Members, data: FieldData, fewest: int | None) -> Array:
-    return data.predict(lambda some: ensemble[alive[some]], len(alive), fewest)
+def field_passes(
+    ensemble: Array, data: FieldData, gain: Gain, inflations: Array, seed: int, fewest: int | None = None,
+    first: Array | None = None, tell: Callable[[Pass], None] = silent,
+) -> Members:  # fmt: skip
+    """The same, R multiplied by each of the ``inflations``, whose inverses sum to one."""
+    passes = Passes(ensemble, data, gain, inflations, seed, fewest, first, tell)
+    minimise(passes, [passes])
+    return passes.alive
+
+
+@dataclass(frozen=True)
+class GainSystem:
+    """The predictions of members, and the covariances with them: what the gain makes of it is the step."""
+
+    gain: Gain
+    predictions: Array
+    variance: Array
+    values: Array  # with a draw of their errors for each member
+
+    def step(self) -> Update:
+        """What changes a part of the ensemble."""
+        anomalies = self.predictions - self.predictions.mean(axis=0)
+        return self.gain.update(anomalies, self.variance, self.values - self.predictions)
+
+
+class Passes(Objective["Passes"]):
+    """The passes of ES-MDA over an ensemble, which is their only descent."""
+
+    def __init__(
+        self, ensemble: Array, data: FieldData, gain: Gain, inflations: Array, seed: int, fewest: int | None,
+        first: Array | None, tell: Callable[[Pass], None],
+    ):  # fmt: skip
+        self.ensemble, self.data, self.gain, self.inflations, self.seed = ensemble, data, gain, inflations, seed
+        self.fewest, self.first, self.tell = fewest, first, tell
+        self.alive = np.arange(len(ensemble))
+        self.iteration, self.stop, self.ended = 0, "", False
+        self.step: Any = None
+
+    def linearise(self, going: Sequence[Passes]) -> list[GainSystem]:
+        a, alpha, first = self.iteration, self.inflations[self.iteration], self.first
+        predictions = self._predicted() if a or first is None else first
+        finite = np.isfinite(predictions).all(axis=1)
+        self.alive, predictions = self.alive[finite], predictions[finite]
+        errors = np.sqrt(alpha) * self.data.perturbations(self.seed, f"ES-MDA {a}", self.alive)
+        here = partial(_part_of, self.ensemble, self.alive)
+        self.tell(Pass(mean_of(self.ensemble, self.alive), predictions.mean(axis=0), here))
+        return [GainSystem(self.gain, predictions, alpha * self.data.std**2, self.data.values + errors)]
+
+    def move(self, going: Sequence[Passes], moves: Sequence[Move | None]) -> None:
+        for part in parts(self.ensemble.shape[1], self.data.width(len(self.ensemble))):
+            here = self.ensemble[self.alive, part]
+            self.ensemble[self.alive, part] = here + self.step(part, here - here.mean(axis=0))
+        self.iteration += 1
+        self.ended = self.iteration == len(self.inflations)
+
+    def _predicted(self) -> Array:
+        return self.data.predict(lambda some: self.ensemble[self.alive[some]], len(self.alive), self.fewest)
 
 
 def _part_of(ensemble: Array, alive: Members, part: slice) -> Array:
     return np.asarray(ensemble[alive, part])
 
 
+@dataclass(frozen=True)
+class DualSystem:
+    """About an iterate: Y (N, K), H B Hᵀ (K, K), H (x − x̄0) (K,), innovation y − H(x) (K,), error variance (K,)."""
+
+    tangent: Array
+    covariance: Array
+    moved: Array
+    innovation: Array
+    variance: Array
+
+    def step(self) -> DualSystem:
+        """The steps from there, of any length: see :meth:`dual`."""
+        return self
+
+    def dual(self, a: float = 1.0) -> Array:
+        """λ (K,) of the step x̄0 + (1 − a)(x − x̄0) + a L λ, which minimises J plus (1/a − 1)/2 δxᵀB⁻¹δx, linearised."""
+        system = a * self.covariance + np.diag(self.variance)
+        return np.asarray(np.linalg.solve(system, self.innovation + a * self.moved), dtype=np.float64)
+
+    @property
+    def dfs(self) -> float:
+        """The trace of H B Hᵀ (H B Hᵀ + R)⁻¹."""
+        return float(np.trace(np.linalg.solve(self.covariance + np.diag(self.variance), self.covariance)))
+
+    @property
+    def length(self) -> float:
+        """Of the full step: the largest change of a prediction, in its posterior standard deviations."""
+        C = self.covariance
+        variance = np.diag(C) - np.sum(C * np.linalg.solve(C + np.diag(self.variance), C), axis=0)
+        return float(np.max(np.abs(C @ self.dual() - self.moved) / np.sqrt(np.maximum(variance, 1e-300))))
+
+
 @dataclass
 class FieldDescent:
-    """Where a descent ended: the ``centre`` (n,), ``costs`` J of each iterate, whether it ``converged``, and why it
-    stopped."""
+    """Where a descent stands: the ``centre`` x̄0 + Σ_k L_k λ_k (n,) and its ``prediction`` (K,), ``costs`` J of each
+    iterate, the ``tangents`` Y_k (N, K) and ``duals`` λ_k (K,) so far, whether it ``converged``, and why it stopped."""
 
     centre: Array
+    prediction: Array
     costs: list[float] = field(default_factory=list)
+    tangents: tuple[Array, ...] = ()
+    duals: tuple[Array, ...] = ()
     converged: bool = False
     stop: str = ""
+    ended: bool = False
+    step: DualSystem | None = None
     forward_runs: int = 0
+
+    @property
+    def system(self) -> DualSystem:
+        """That of the iterate."""
+        assert self.step is not None
+        return self.step
 
 
 def field_en4dvar(
@@ -107,110 +196,108 @@ def field_en4dvar(
     """
     if not isinstance(gain, ByDistance):
         raise ValueError("En4D-Var is localised by distance; without places use field_esmda(…, ByCorrelation())")
-    return _Descent(ensemble, data, gain, epsilon, seed, tell).run(max_iterations, tolerance, cost_tolerance)
+    mean = ensemble.mean(axis=0)
+    ensemble -= mean  # in place: these are anomalies until :meth:`FieldObjective.spread` ends it
+    objective = FieldObjective(
+        ensemble, mean, data, gain, epsilon, (max_iterations, tolerance, cost_tolerance), seed, tell
+    )
+    try:
+        descent = objective.start()
+        minimise(objective, [descent])
+        objective.spread(descent)
+    except BaseException:
+        ensemble += mean  # the prior, as it was
+        raise
+    return descent
 
 
-@dataclass(frozen=True)
-class _Local:
-    """About an iterate: Y (N, K), H B Hᵀ (K, K), H (x − x̄0) (K,), innovation y − H(x) (K,), error variance (K,)."""
+class FieldObjective(Objective[FieldDescent]):
+    """J of fields with prior ``anomalies`` (N, n) about the ``mean`` (n,), in the space of the observations."""
 
-    tangent: Array
-    covariance: Array
-    moved: Array
-    innovation: Array
-    variance: Array
-
-    def dual(self, a: float = 1.0) -> Array:
-        """λ (K,) of the step x̄0 + (1 − a)(x − x̄0) + a L λ, which minimises J plus (1/a − 1)/2 δxᵀB⁻¹δx, linearised."""
-        system = a * self.covariance + np.diag(self.variance)
-        return np.asarray(np.linalg.solve(system, self.innovation + a * self.moved), dtype=np.float64)
-
-    @property
-    def dfs(self) -> float:
-        """The trace of H B Hᵀ (H B Hᵀ + R)⁻¹."""
-        return float(np.trace(np.linalg.solve(self.covariance + np.diag(self.variance), self.covariance)))
-
-    @property
-    def length(self) -> float:
-        """Of the full step: the largest change of a prediction, in its posterior standard deviations."""
-        C = self.covariance
-        variance = np.diag(C) - np.sum(C * np.linalg.solve(C + np.diag(self.variance), C), axis=0)
-        return float(np.max(np.abs(C @ self.dual() - self.moved) / np.sqrt(np.maximum(variance, 1e-300))))
-
-
-class _Descent:
     def __init__(
-        self,
-        ensemble: Array,
-        data: FieldData,
-        gain: ByDistance,
-        epsilon: float,
-        seed: int,
-        tell: Callable[[Pass], None],
-    ):
-        self.data, self.gain, self.epsilon, self.tell = data, gain, epsilon, tell
-        self.errors = data.perturbations(seed, "En4D-Var field", range(len(ensemble)))
-        self.mean = ensemble.mean(axis=0)
-        self.anomalies = ensemble
-        self.anomalies -= self.mean  # in place: this is the ensemble from now on, until :meth:`spread` ends it
-        self.tangents: list[Array] = []  # Y_k (N, K)
-        self.duals: list[Array] = []  # λ_k (K,)
-        self.at = FieldDescent(self.mean.copy())
+        self, anomalies: Array, mean: Array, data: FieldData, gain: ByDistance, epsilon: float,
+        limits: tuple[int, float, float], seed: int, tell: Callable[[Pass], None],
+    ):  # fmt: skip
+        self.anomalies, self.mean, self.data, self.gain = anomalies, mean, data, gain
+        self.epsilon, self.limits, self.tell = epsilon, limits, tell
+        self.errors = data.perturbations(seed, "En4D-Var field", range(len(anomalies)))
 
-    def run(self, max_iterations: int, tolerance: float, cost_tolerance: float) -> FieldDescent:
-        at = self.at
+    def start(self) -> FieldDescent:
+        """The descent at the prior mean."""
+        first = self.data.predict(lambda _: self.mean[None], 1)[0]
+        descent = FieldDescent(self.mean.copy(), first, forward_runs=1)
+        descent.costs.append(self.cost(descent.prediction, (), ()))
+        return descent
+
+    def linearise(self, going: Sequence[FieldDescent]) -> list[DualSystem]:
+        return [self._system(at) for at in going]
+
+    def _system(self, at: FieldDescent) -> DualSystem:
+        """By the derivatives of the predictions along the prior anomalies."""
+        count = len(self.anomalies)
+        at.forward_runs += count
+        runs = self.data.predict(lambda some: at.centre + self.epsilon * self.anomalies[some], count)
+        tangent = (runs - at.prediction) / self.epsilon
+        tangent = tangent - tangent.mean(axis=0)
+        between = self.gain.between
+        pairs = zip(at.tangents, at.duals, strict=True)
+        moved = sum((between(tangent, Y) @ dual for Y, dual in pairs), np.zeros(len(at.prediction)))
+        innovation = self.data.values - at.prediction
+        return DualSystem(tangent, between(tangent, tangent), moved, innovation, self.data.std**2)
+
+    def judge(self, going: Sequence[FieldDescent]) -> None:
+        most, tolerance, cost_tolerance = self.limits
+        for at in going:
+            costs, length = at.costs, at.system.length
+            if length <= tolerance:
+                at.stop = f"step of {length:.2g} posterior standard deviations"
+            elif len(costs) > 1 and costs[-2] - costs[-1] < cost_tolerance * costs[-1]:
+                at.stop = f"relative decrease of J below {cost_tolerance:g}"
+            at.converged = bool(at.stop)
+            if not at.stop and len(costs) > most:
+                at.stop = f"iteration limit ({most}) reached"
+
+    def search(self, descent: FieldDescent) -> Search:
+        """The longest step that lowers J."""
+        at, system = descent, descent.system
+        for k in range(TRIALS):
+            a = SHORTER**k
+            dual = a * system.dual(a)
+            x = self.mean + (1 - a) * (at.centre - self.mean)
+            for part in parts(len(x), self.data.width(len(self.anomalies))):
+                x[part] += self.gain.along(part, self.anomalies[:, part], system.tangent, dual[None])[0]
+            at.forward_runs += 1
+            prediction = yield x[None]
+            if prediction is None:  # the model does not run there: nearer
+                continue
+            ahead = replace(
+                at, centre=x, prediction=prediction, tangents=(*at.tangents, system.tangent),
+                duals=(*((1 - a) * old for old in at.duals), dual),
+            )  # fmt: skip
+            cost = self.cost(prediction, ahead.tangents, ahead.duals)
+            if cost < at.costs[-1]:
+                return Move(ahead, cost, a)
+        return None
+
+    def try_out(self, candidates: Array) -> Array | None:
+        """The prediction (K,) at a candidate (1, n); None where the model does not run there."""
         try:
-            prediction = self.predict_one(at.centre)
-            at.costs.append(self.cost(prediction, self.tangents, self.duals))
-            while True:
-                tangent = self.tangent(prediction)
-                here = self.local(prediction, tangent)
-                before, moved = self._pass(prediction, here), None
-                self._judge(here.length, max_iterations, tolerance, cost_tolerance)
-                if not at.stop and (moved := self.move(here)) is None:
-                    at.stop = "no decrease of J along the step"
-                share, prediction = moved or (0.0, prediction)
-                self.tell(replace(before, share=share))
-                if moved is None:
-                    break
-            self.spread(tangent)
-        except BaseException:
-            self.anomalies += self.mean  # the prior, as it was
-            raise
-        return at
+            return np.asarray(self.data.predict(lambda _: candidates, 1)[0])
+        except En4dvarError:
+            return None
 
-    def _judge(self, length: float, max_iterations: int, tolerance: float, cost_tolerance: float) -> None:
-        """Whether the descent ends here, and why."""
-        at, costs = self.at, self.at.costs
-        if length <= tolerance:
-            at.stop = f"step of {length:.2g} posterior standard deviations"
-        elif len(costs) > 1 and costs[-2] - costs[-1] < cost_tolerance * costs[-1]:
-            at.stop = f"relative decrease of J below {cost_tolerance:g}"
-        at.converged = bool(at.stop)
-        if not at.stop and len(costs) > max_iterations:
-            at.stop = f"iteration limit ({max_iterations}) reached"
-
-    def predict_one(self, x: Array) -> Array:
-        self.at.forward_runs += 1
-        return self.data.predict(lambda _: x[None], 1)[0]
-
-    def tangent(self, prediction: Array) -> Array:
-        """Y (N, K): derivatives of the predictions along the prior anomalies, at the centre."""
-        centre, epsilon, count = self.at.centre, self.epsilon, len(self.anomalies)
-        self.at.forward_runs += count
-        runs = self.data.predict(lambda some: centre + epsilon * self.anomalies[some], count)
-        tangent = (runs - prediction) / epsilon
-        return np.asarray(tangent - tangent.mean(axis=0))
-
-    def local(self, prediction: Array, tangent: Array) -> _Local:
-        """What the centre, its prediction and the tangent there say."""
-        covariance = self.gain.between(tangent, tangent)
-        moved = sum((self.gain.between(tangent, Y) @ dual for Y, dual in self._so_far), np.zeros(len(prediction)))
-        return _Local(tangent, covariance, moved, self.data.values - prediction, self.data.std**2)
-
-    @property
-    def _so_far(self) -> list[tuple[Array, Array]]:
-        return list(zip(self.tangents, self.duals, strict=True))
+    def move(self, going: Sequence[FieldDescent], moves: Sequence[Move | None]) -> None:
+        for at, move in zip(going, moves, strict=True):
+            here = self._pass(at)
+            if move is None:
+                at.stop = at.stop or "no decrease of J along the step"
+            else:
+                ahead: FieldDescent = move.w
+                at.centre, at.prediction = ahead.centre, ahead.prediction
+                at.tangents, at.duals = ahead.tangents, ahead.duals
+                at.costs.append(move.cost)
+            self.tell(replace(here, share=move.step_length if move else 0.0))
+            at.ended = bool(at.stop)
 
     def cost(self, prediction: Array, tangents: Sequence[Array], duals: Sequence[Array]) -> float:
         """J of the iterate x̄0 + Σ_k L_k λ_k."""
@@ -222,46 +309,25 @@ class _Descent:
         pairs = list(zip(tangents, duals, strict=True))
         return 0.5 * sum(float(a @ self.gain.between(Y, Z) @ b) for Y, a in pairs for Z, b in pairs)
 
-    def _pass(self, prediction: Array, here: _Local) -> Pass:
+    def _pass(self, at: FieldDescent) -> Pass:
         """The iterate as it is told, with the posterior ensemble of its tangent."""
-        centre, update = self.at.centre, self.update(here.tangent)
+        centre, update = at.centre, self.update(at.system.tangent)
 
         def members(part: slice) -> Array:
             anomalies = self.anomalies[:, part]
             return np.asarray(centre[part] + anomalies + update(part, anomalies))
 
-        background = self.background(self.tangents, self.duals)
-        return Pass(centre, prediction, members, background, here.length, dfs=here.dfs)
-
-    def move(self, here: _Local) -> tuple[float, Array] | None:
-        """Take the longest step that lowers J; its share of the full one and the prediction there, None where none
-        does."""
-        for k in range(TRIALS):
-            a = SHORTER**k
-            dual = a * here.dual(a)
-            x = self.mean + (1 - a) * (self.at.centre - self.mean)
-            for part in parts(len(x), self.data.width(len(self.anomalies))):
-                x[part] += self.gain.along(part, self.anomalies[:, part], here.tangent, dual[None])[0]
-            try:
-                prediction = self.predict_one(x)
-            except En4dvarError:  # the model does not run there: nearer
-                continue
-            tangents, duals = [*self.tangents, here.tangent], [*((1 - a) * old for old in self.duals), dual]
-            cost = self.cost(prediction, tangents, duals)
-            if cost < self.at.costs[-1]:
-                self.at.centre, self.tangents, self.duals = x, tangents, duals
-                self.at.costs.append(cost)
-                return a, prediction
-        return None
+        background = self.background(at.tangents, at.duals)
+        return Pass(centre, at.prediction, members, background, at.system.length, dfs=at.system.dfs)
 
     def update(self, tangent: Array) -> Update:
         """What turns prior anomalies into posterior ones."""
         return self.gain.update(tangent, self.data.std**2, self.errors - tangent)
 
-    def spread(self, tangent: Array) -> None:
+    def spread(self, at: FieldDescent) -> None:
         """The posterior ensemble about the centre, in place of the anomalies."""
-        update = self.update(tangent)
+        update = self.update(at.system.tangent)
         for part in parts(self.anomalies.shape[1], self.data.width(len(self.anomalies))):
             here = self.anomalies[:, part]
             here += update(part, here)
-            here += self.at.centre[part] - here.mean(axis=0)
+            here += at.centre[part] - here.mean(axis=0)

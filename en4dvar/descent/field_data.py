@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.errors import En4dvarError
-from en4dvar.prior import member_stream
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.priors.prior import member_stream
+from en4dvar.problem import InverseProblem
 from en4dvar.schemes.local_gain import parts
-from en4dvar.state import Array
+from en4dvar.schemes.settings import AssimilationSettings
 
 Members = npt.NDArray[np.intp]
 Forward = Callable[[Array], Array]  # members (M, n) → predictions (M, K)
@@ -36,14 +37,14 @@ class FieldData:
 
         Raises :class:`En4dvarError` where those of fewer than ``fewest``, by default all, are finite.
         """
-        found = np.empty((count, len(self.values)))
+        predictions = np.empty((count, len(self.values)))
         for first in range(0, count, self.at_once):
             some = slice(first, min(first + self.at_once, count))
-            found[some] = np.asarray(self.forward(members(some)), dtype=float)
-        lost = np.flatnonzero(~np.isfinite(found).all(axis=1))
+            predictions[some] = np.asarray(self.forward(members(some)), dtype=float)
+        lost = np.flatnonzero(~np.isfinite(predictions).all(axis=1))
         if count - len(lost) < (count if fewest is None else fewest):
             raise En4dvarError(f"{len(lost)} of {count} members have predictions that are not finite, first {lost[0]}")
-        return found
+        return predictions
 
     def width(self, members: int) -> int:
         """Numbers that a cell takes in an update."""
@@ -85,15 +86,15 @@ def mean_of(ensemble: Array, alive: Members) -> Array:
 def prior_members(problem: InverseProblem, settings: AssimilationSettings, seed: int) -> Array:
     """The prior ensemble (N, n + m): n parameters with names, m cells of fields; ``exact`` has the prior's mean."""
     prior, n = problem.prior, len(problem.prior.terms)
-    found = np.empty((settings.members, n + sum(one.field.size for one in problem.fields)))
+    ensemble = np.empty((settings.members, n + sum(field.field.size for field in problem.fields)))
     if n:
         exact = settings.sampling == "exact" and settings.members > n
-        found[:, :n] = prior.sample(settings.members, seed, "exact" if exact else "random")
-    for one, columns in problem.columns_of_fields:
-        for i, member in enumerate(found):
-            member[n + columns.start : n + columns.stop] = one.draw(seed, i)
+        ensemble[:, :n] = prior.sample(settings.members, seed, "exact" if exact else "random")
+    for field, columns in problem.columns_of_fields:
+        for i, member in enumerate(ensemble):
+            member[n + columns.start : n + columns.stop] = field.draw(seed, i)
     if settings.sampling == "exact":
-        mean = mean_of(found, np.arange(len(found)))
+        mean = mean_of(ensemble, np.arange(len(ensemble)))
         mean[:n] -= prior.mean
-        found -= mean
-    return found
+        ensemble -= mean
+    return ensemble

@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 
-from en4dvar.errors import ConfigError
-from en4dvar.field_prior import places_of
-from en4dvar.forward import field_of
-from en4dvar.problem import AssimilationSettings, InverseProblem, Localising
+from en4dvar.model.forward import field_of
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.field_prior import places_of
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes import LOCALISED, MINIMISERS
 from en4dvar.schemes.local_gain import ByCorrelation, ByDistance, Gain
-from en4dvar.state import Array
-
-SCHEMES = ("en4dvar", "es-mda")
+from en4dvar.schemes.settings import AssimilationSettings, Localisation
 
 
 def gain_of(problem: InverseProblem, settings: AssimilationSettings) -> Gain:
@@ -21,45 +21,45 @@ def gain_of(problem: InverseProblem, settings: AssimilationSettings) -> Gain:
     asked = settings.localisation
     if asked is None:
         raise ConfigError("a field estimated cell by cell needs a localised gain, e.g. {radius: 10}")
-    if settings.scheme not in SCHEMES or settings.mda_form != "perturbed":
-        form = " with perturbed observations" if settings.scheme == "es-mda" else ""
-        raise ConfigError(f"a scheme for data that can be localised is {' or '.join(SCHEMES)}{form}")
+    if settings.scheme not in LOCALISED:
+        raise ConfigError(f"a scheme for data that can be localised is {' or '.join(LOCALISED)}")
     if not problem.observations.noise.plain or problem.has_noise_scale:
         raise ConfigError(
             "takes independent Gaussian errors of known std: no covariance, correlation time, timing error, robust "
             "cost, discrepancy or sigma"
         )
+    others = f"scheme: {' or '.join(name for name in LOCALISED if name not in MINIMISERS)}"
     if asked.radius is None:
-        if settings.scheme != "es-mda":
-            raise ConfigError("by correlation there is no cost that en4dvar could minimise; use scheme: es-mda")
+        if settings.own.minimiser:
+            raise ConfigError(f"by correlation there is no cost that {settings.scheme} could minimise; use {others}")
         return ByCorrelation(asked.threshold)
     observed = _observed(problem, asked)
     places = _places(problem, asked, observed.shape[1])
     lost = [name for name, where in zip(problem.prior.names, places, strict=False) if np.isnan(where[0])]
-    if lost and settings.scheme != "es-mda":
-        raise ConfigError(f"{lost[0]} has no place; give it one, 'at: {{{lost[0]}: 0}}', or use scheme: es-mda")
+    if lost and settings.own.minimiser:
+        raise ConfigError(f"{lost[0]} has no place; give it one, 'at: {{{lost[0]}: 0}}', or use {others}")
     return ByDistance(places, observed[problem.observations.used], asked.radius)
 
 
-def _observed(problem: InverseProblem, asked: Localising) -> Array:
+def _observed(problem: InverseProblem, asked: Localisation) -> Array:
     """Coordinates (K, D) of the readings. Raises :class:`ConfigError`."""
-    found = []
+    coordinates = []
     for part in problem.parts:
         block = field_of(problem.model, part.observable)
         if part.name in asked.at:
-            found.append(np.broadcast_to(asked.at[part.name], (part.end - part.begin, len(asked.at[part.name]))))
+            coordinates.append(np.broadcast_to(asked.at[part.name], (part.end - part.begin, len(asked.at[part.name]))))
         elif part.places is not None and block is not None and block.coordinates is not None:
-            found.append(np.einsum("kj,kjd->kd", part.places.shares, places_of(block)[part.places.indices]))
+            coordinates.append(np.einsum("kj,kjd->kd", part.places.shares, places_of(block)[part.places.indices]))
         else:
             raise ConfigError(
                 f"{part.name} has no place: it is no part of a field with coordinates; write 'at: {{{part.name}: 0}}'"
             )
-    if len({where.shape[1] for where in found}) > 1:
+    if len({where.shape[1] for where in coordinates}) > 1:
         raise ConfigError("the places of the readings have different numbers of coordinates")
-    return np.concatenate(found)
+    return np.concatenate(coordinates)
 
 
-def _places(problem: InverseProblem, asked: Localising, dimensions: int) -> Array:
+def _places(problem: InverseProblem, asked: Localisation, dimensions: int) -> Array:
     """Coordinates (n + m, D) of what is estimated, NaN where there are none. Raises :class:`ConfigError`."""
     known = {*problem.prior.names, *(part.name for part in problem.parts)}
     for name, where in asked.at.items():
@@ -69,8 +69,8 @@ def _places(problem: InverseProblem, asked: Localising, dimensions: int) -> Arra
             raise ConfigError(f"at: {name} has {len(where)} coordinates, the readings have {dimensions}")
     unknown = (math.nan,) * dimensions
     named = np.array([asked.at.get(name, unknown) for name in problem.prior.names]).reshape(-1, dimensions)
-    of_fields = [one.places for one in problem.fields]
-    for one, own in zip(problem.fields, of_fields, strict=True):
+    of_fields = [field.places for field in problem.fields]
+    for field, own in zip(problem.fields, of_fields, strict=True):
         if own.shape[1] != dimensions:
-            raise ConfigError(f"{one.field.name} has {own.shape[1]} coordinates, the readings have {dimensions}")
+            raise ConfigError(f"{field.field.name} has {own.shape[1]} coordinates, the readings have {dimensions}")
     return np.concatenate([named, *of_fields])

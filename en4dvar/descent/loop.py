@@ -1,59 +1,86 @@
-"""The only loop: forecast → linearise → whiten → step → step control, until every descent has ended.
+"""The only loop: linearise → step → judge → search along the step → move on, until every descent has ended.
 
-What it goes through is a *window*: one data set with parameters to estimate (:mod:`en4dvar.descent.window`), or one
-cycle of a series (:mod:`en4dvar.cycling.sequential`). What is computed is the scheme's.
+What is minimised is an *objective*: J of one data set (:mod:`en4dvar.descent.window`), of one cycle of a series
+(:mod:`en4dvar.series.window`), of several data sets that share parameters (:mod:`en4dvar.estimation.joint.descent`), or
+of whole fields (:mod:`en4dvar.descent.field`). It makes a linear *system* of the runs at each iterate: an ensemble,
+from which the scheme takes its step; an arrow, of what is shared and what is own; or a dual one, in the space of the
+observations.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
 
-from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights
-from en4dvar.state import Array
+from en4dvar.descent.step_control import Move, Search, run_searches
+from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Scheme, Step, Weights
+
+
+class System(Protocol):
+    """What the runs at an iterate say, linearised."""
+
+    def step(self) -> Any:
+        """The step from there."""
 
 
 class Descends(Protocol):
-    """What the loop needs of a descent: where it stands, the step from there, and whether it has ended."""
+    """What the loop needs of a descent: the step from where it stands, why it stops, and whether it has ended."""
 
-    weights: Weights
-    step: Step | GaussNewtonStep | None
+    step: Any
+    stop: str
     ended: bool
 
-    @property
-    def iteration(self) -> int: ...
+
+D = TypeVar("D", bound=Descends)
 
 
-D = TypeVar("D", bound=Descends, contravariant=True)
+class Objective(Generic[D]):
+    """What the loop needs of what it minimises; without a search each step is taken as it is."""
+
+    def keep(self, going: Sequence[D]) -> None:
+        """Keep what an interrupted run needs to go on from here."""
+
+    def linearise(self, going: Sequence[D]) -> Sequence[System | None]:
+        """Run the members, of all descents in one call; None where too few of them survive."""
+        raise NotImplementedError
+
+    def judge(self, going: Sequence[D]) -> None:
+        """Say of which descents the step is not to be searched along: they ``stop``, or have ``ended``."""
+
+    def search(self, descent: D) -> Search | None:
+        """How far to go along the step; None: take it as it is, or not at all."""
+
+    def try_out(self, candidates: Any) -> Any:
+        """What the model says of the candidates of all searches."""
+
+    def move(self, going: Sequence[D], moves: Sequence[Move | None]) -> None:
+        """Record and tell where the descents stand, move them on, and end those that are done."""
+        raise NotImplementedError
 
 
-class Window(Protocol[D]):
-    """What the loop needs of a window."""
-
-    def begin(self, going: Sequence[D]) -> None:
-        """Called before each iteration: keep what an interrupted run needs."""
-
-    def run(self, scheme: Scheme, going: Sequence[D]) -> list[Runs | None]:
-        """The scheme's members through F and H, all descents in one call; None where too few of them survive."""
-
-    def whiten(self, scheme: Scheme, descent: D, reference: Array, anomalies: Array) -> Evaluation:
-        """R^{-1/2} applied to a linearisation."""
-
-    def draw(self, purpose: str, columns: int | None = None) -> Array:
-        """Random numbers for a scheme, see :class:`~en4dvar.schemes.base.Draw`."""
-
-    def move(self, scheme: Scheme, going: Sequence[D]) -> None:
-        """Take the steps, as far as they go; record, tell, and end the descents that are done."""
-
-
-def iterate(window: Window[D], scheme: Scheme, descents: Sequence[D]) -> None:
+def minimise(objective: Objective[D], descents: Sequence[D]) -> None:
     """Iterate descents side by side, usually one, until each has ended."""
     while going := [descent for descent in descents if not descent.ended]:
-        window.begin(going)
-        for descent, runs in zip(going, window.run(scheme, going), strict=True):
-            descent.step = None
-            if runs is not None:
-                reference, anomalies = scheme.linearise(descent.weights, runs)
-                evaluation = window.whiten(scheme, descent, reference, anomalies)
-                descent.step = scheme.advance(descent.weights, evaluation, descent.iteration, window.draw)
-        window.move(scheme, going)
+        objective.keep(going)
+        for descent, system in zip(going, objective.linearise(going), strict=True):
+            descent.step = None if system is None else system.step()
+        objective.judge(going)
+        going = [descent for descent in going if not descent.ended]
+        searches = [None if descent.stop else objective.search(descent) for descent in going]
+        objective.move(going, run_searches(searches, objective.try_out))
+
+
+@dataclass(frozen=True)
+class EnsembleSystem:
+    """A linearisation in weight space, of which a scheme makes a step."""
+
+    scheme: Scheme
+    weights: Weights
+    evaluation: Evaluation
+    iteration: int
+    draw: Draw
+
+    def step(self) -> Step | GaussNewtonStep:
+        """The step of the scheme."""
+        return self.scheme.advance(self.weights, self.evaluation, self.iteration, self.draw)

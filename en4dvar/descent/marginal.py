@@ -15,10 +15,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.data.noise import DiscrepancyNoise, Linearisation, Predicted
 from en4dvar.descent.weight_space import WeightSpace
-from en4dvar.noise import DiscrepancyNoise, Linearisation, Predicted
-from en4dvar.prior import member_stream
-from en4dvar.state import NOISE_SCALE, Array
+from en4dvar.model.state import NOISE_SCALE, Array
+from en4dvar.priors.prior import member_stream
 
 Mask = npt.NDArray[np.bool_]
 DRAWS, FREEDOM = 1500, 5.0  # of Student's t

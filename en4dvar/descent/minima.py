@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import Descent
-from en4dvar.prior import Prior
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.priors.prior import Prior
 
 REACHED = 2.0  # posterior standard deviations between a minimum and a descent that ended in it
 SLOPE = 4.0  # as many, within which one that ended early on the slope of a minimum is told from another minimum
@@ -44,7 +45,12 @@ class Minimum:
     def distance(self, x: Array) -> float:
         """Of a control vector (n,), in posterior standard deviations."""
         apart = x - self.x
-        return math.sqrt(max(0.0, float(apart @ np.linalg.lstsq(self.covariance, apart, rcond=None)[0])))
+        return math.sqrt(max(0.0, float(apart @ self._precision @ apart)))
+
+    @cached_property
+    def _precision(self) -> Array:
+        """(n, n); that of the directions that the covariance has, where some are lost to rounding."""
+        return np.asarray(np.linalg.pinv(self.covariance, rcond=np.finfo(float).eps * len(self.x), hermitian=True))
 
     def log_evidence(self, prior: Prior) -> float:
         """Laplace's approximation of ln ∫ exp(−J_o) N(x; prior) dx over this minimum alone."""
@@ -56,16 +62,16 @@ def merged(minima: Sequence[Minimum]) -> tuple[Minimum, ...]:
 
     So is one on its slope, where J exceeds that of the lower one by half of what the Gaussian about it has there.
     """
-    found: list[Minimum] = []
-    for one in sorted(minima, key=lambda minimum: minimum.cost):
-        for place, lower in enumerate(found):
-            distance = lower.distance(one.x)
-            on_slope = distance < SLOPE and one.cost - lower.cost > 0.25 * distance**2
+    distinct: list[Minimum] = []
+    for minimum in sorted(minima, key=lambda minimum: minimum.cost):
+        for place, lower in enumerate(distinct):
+            distance = lower.distance(minimum.x)
+            on_slope = distance < SLOPE and minimum.cost - lower.cost > 0.25 * distance**2
             if distance < REACHED or on_slope:
-                spread = max(lower.spread, one.cost + one.spread - lower.cost)
-                members = tuple(sorted({*lower.members, *one.members}))
-                found[place] = replace(lower, members=members, spread=spread)
+                spread = max(lower.spread, minimum.cost + minimum.spread - lower.cost)
+                members = tuple(sorted({*lower.members, *minimum.members}))
+                distinct[place] = replace(lower, members=members, spread=spread)
                 break
         else:
-            found.append(one)
-    return tuple(found)
+            distinct.append(minimum)
+    return tuple(distinct)

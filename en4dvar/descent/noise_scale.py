@@ -2,7 +2,7 @@ r"""How far the posterior mean lies beyond the mode where the noise scale σ is 
 
 With u = ln σ, v = (y − m)/s and ψ = ρ' the third derivatives of J_o with respect to u and any two directions do not
 vanish on average: a fit uses up degrees of freedom, so that J prefers too small a σ. In the notation of
-:mod:`en4dvar.noise`, with the information M = SᵀS of the predictions and U of ln σ, their expectations under
+:mod:`en4dvar.data.noise`, with the information M = SᵀS of the predictions and U of ln σ, their expectations under
 exp(−ρ) are
 
     ∂²_m ∂_u J = −r_m M,   r_m = E[2ψ' + vψ''] / E[ψ/v],
@@ -18,10 +18,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from en4dvar.parameter_map import QUANTILE_MAPS
-from en4dvar.prior import PriorTerm
+from en4dvar.model.state import NOISE_SCALE, Array
+from en4dvar.priors.parameter_map import QUANTILE_MAPS
+from en4dvar.priors.prior import PriorTerm
 from en4dvar.problem import InverseProblem
-from en4dvar.state import NOISE_SCALE, Array
 
 STENCIL = 0.02  # width of differences, in prior standard deviations
 

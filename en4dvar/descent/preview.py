@@ -11,10 +11,9 @@ from en4dvar.descent.field_data import prior_members
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.forecast import Forecast, forecast, plotting_times
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
-from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.schemes import window_scheme
-from en4dvar.schemes.en4dvar import En4DVar
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
 
 ENOUGH = 0.3  # seconds of forward runs that the time of one is taken from
 LONGEST = 20.0  # seconds that the forecast of the prior ensemble may take unasked
@@ -88,10 +87,10 @@ def _seconds_per_run(problem: InverseProblem, members: Array, executor: Executor
 
 def localised_runs(settings: AssimilationSettings) -> int:
     """Forward runs of a localised estimate, with a typical number of iterations."""
-    n_members = settings.members
-    if settings.scheme == "en4dvar":
-        return 2 * n_members + 2 + min(ITERATIONS, settings.max_iterations) * (n_members + SEARCH)
-    return (len(settings.mda_coefficients) + 1) * n_members + 1
+    n_members, scheme = settings.members, settings.own
+    if scheme.minimiser:
+        return 2 * n_members + 2 + min(ITERATIONS, scheme.minimiser.max_iterations) * (n_members + SEARCH)
+    return (scheme.passes + 1) * n_members + 1
 
 
 def expected_runs(space: WeightSpace) -> int:
@@ -101,13 +100,12 @@ def expected_runs(space: WeightSpace) -> int:
     search takes prior and posterior forecast, and for each iteration a tangent (of n runs, or N) and the trials of the
     step control, ``starts`` descents side by side, and a part of one more from a far member.
     """
-    settings, n_members = space.settings, len(space.members)
-    scheme = window_scheme(settings)
-    if not isinstance(scheme, En4DVar):
-        return (scheme.passes + 1) * (n_members + 1)
+    n_members, scheme = len(space.members), space.scheme.minimiser
+    if scheme is None:
+        return (space.scheme.passes + 1) * (n_members + 1)
     economical = scheme.economical(space.basis)
     tangent = 1 + (space.basis.shape[1] if economical else n_members)
-    starts = settings.starts if settings.start == "best-member" and economical else 1
-    challenger = CHALLENGER if settings.starts > 1 and economical else 0.0
-    iterations = (starts + challenger) * min(ITERATIONS, settings.max_iterations)
+    starts = scheme.starts if scheme.start == "best-member" and economical else 1
+    challenger = CHALLENGER if scheme.starts > 1 and economical else 0.0
+    iterations = (starts + challenger) * min(ITERATIONS, scheme.max_iterations)
     return 2 * (n_members + 1) + round(iterations * (tangent + SEARCH))

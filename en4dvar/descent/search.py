@@ -15,17 +15,16 @@ from functools import cached_property
 
 import numpy as np
 
-from en4dvar.analysis import Record, StartRecord
-from en4dvar.descent.loop import iterate
+from en4dvar.descent.loop import minimise
 from en4dvar.descent.minima import Minimum, merged
 from en4dvar.descent.start import AGREE, Rounds, StartState, affordable, descent_from, highest_plausible, side_by_side
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
+from en4dvar.diagnosis.analysis import Record, StartRecord
 from en4dvar.ensemble.forecast import Forecast
-from en4dvar.errors import TooFewMembersError
-from en4dvar.schemes.base import GaussNewtonStep
-from en4dvar.schemes.en4dvar import En4DVar
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import TooFewMembersError
+from en4dvar.schemes.base import GaussNewtonStep, Minimiser
 
 SAME_COST = 0.01  # of J, by which a descent must end lower to be another one
 WIDER = 20  # times the ensemble: draws of the prior beyond it
@@ -48,7 +47,7 @@ class SearchState:
 
 
 @dataclass(frozen=True)
-class Found:
+class Outcome:
     """The lowest ``descent``, converged, the same as it was ``before`` its last iteration, all minima, the lowest
     first, the members that were ``tried``, from which descents started (N: the prior mean; beyond it draws that
     are no members), and the forward ``runs`` of a search of so many ``rounds``.
@@ -67,7 +66,7 @@ class Found:
         return self.minima[0].descents >= AGREE
 
 
-Keep = Callable[[Callable[[], tuple[Found, SearchState]]], None]
+Keep = Callable[[Callable[[], tuple[Outcome, SearchState]]], None]
 
 
 class Search:
@@ -79,7 +78,7 @@ class Search:
     """
 
     def __init__(
-        self, space: WeightSpace, scheme: En4DVar, run: Forecast, seed: int, begun: SearchState, keep: Keep,
+        self, space: WeightSpace, scheme: Minimiser, run: Forecast, seed: int, begun: SearchState, keep: Keep,
         tell: Callable[[Record], None],
     ):  # fmt: skip
         self.space, self.scheme, self.run, self.seed = space, scheme, run, seed
@@ -87,25 +86,25 @@ class Search:
         self.over, self.began = 0, 0
         self.tell = lambda r: tell(replace(r, further=self.over) if isinstance(r, StartRecord) else r)
 
-    def challenged(self, found: Found) -> Found:
+    def challenged(self, outcome: Outcome) -> Outcome:
         """After a descent from the member farthest from the lowest minimum."""
-        return self.round(found, [challenger(self.space, self.run, found)])
+        return self.round(outcome, [challenger(self.space, self.run, outcome)])
 
-    def settled(self, found: Found) -> Found:
+    def settled(self, outcome: Outcome) -> Outcome:
         """After ``starts`` members more, and again while one descent alone ended lowest and the budget lasts."""
-        together = self.space.settings.starts
-        while not found.agreed and (rest := self.rest(found)):
-            found = self.round(found, rest[:together])
-        return found
+        together = self.scheme.starts
+        while not outcome.agreed and (rest := self.rest(outcome)):
+            outcome = self.round(outcome, rest[:together])
+        return outcome
 
-    def widened(self, found: Found) -> Found:
+    def widened(self, outcome: Outcome) -> Outcome:
         """After descents from the lowest of many draws beyond the ensemble, where J is higher than noise and prior
         explain and there were none yet.
         """
         n_members = len(self.space.members)
-        if found.descent.cost <= highest_plausible(self.space) or max(found.tried) > n_members:
-            return found
-        return self.round(found, [n_members + 1 + i for i in range(side_by_side(self.space))])
+        if outcome.descent.cost <= highest_plausible(self.space) or max(outcome.tried) > n_members:
+            return outcome
+        return self.round(outcome, [n_members + 1 + i for i in range(side_by_side(self.space))])
 
     @cached_property
     def lowest_draws(self) -> Array:
@@ -116,7 +115,7 @@ class Search:
         return np.asarray(draws[np.argsort(costs, kind="stable")[: side_by_side(space)]])
 
     def begin(self, number: int) -> Descent:
-        """From a member, the mean or one of :attr:`lowest_draws`, by its number in :attr:`Found.tried`."""
+        """From a member, the mean or one of :attr:`lowest_draws`, by its number in :attr:`Outcome.tried`."""
         beyond = number - len(self.space.members) - 1
         return (
             descent_from(self.space, number)
@@ -124,54 +123,54 @@ class Search:
             else descent_at(self.space, self.lowest_draws[beyond], number)
         )
 
-    def rest(self, found: Found) -> list[int]:
+    def rest(self, outcome: Outcome) -> list[int]:
         """The members for which a descent can be afforded and that were not tried."""
-        return [i for i in affordable(self.space, self.scheme, self.run) if i not in found.tried]
+        return [i for i in affordable(self.space, self.scheme, self.run) if i not in outcome.tried]
 
-    def round(self, found: Found, members: Sequence[int]) -> Found:
+    def round(self, outcome: Outcome, members: Sequence[int]) -> Outcome:
         """After descents from these members side by side; nothing is run again of a round that is over."""
         self.over += 1
         if self.begun.over >= self.over:
-            return found
-        after = self._after(found, members)
-        after = replace(after, runs=found.runs + self.space.forward_runs - self.began, rounds=self.over)
-        self.keep(lambda: (after, SearchState(self.over, after.descent is not found.descent, after.runs)))
+            return outcome
+        after = self._after(outcome, members)
+        after = replace(after, runs=outcome.runs + self.space.forward_runs - self.began, rounds=self.over)
+        self.keep(lambda: (after, SearchState(self.over, after.descent is not outcome.descent, after.runs)))
         return after
 
-    def _after(self, found: Found, members: Sequence[int]) -> Found:
+    def _after(self, outcome: Outcome, members: Sequence[int]) -> Outcome:
         begun = self.begun if self.begun.over == self.over - 1 else SearchState()
         if begun.comparison or begun.rival:
             self.space.forward_runs = self.forward_runs
         self.began = self.space.forward_runs - begun.spent
         if begun.rival is None:
-            rival, minima = self._compared(found, members, begun.comparison)
+            rival, minima = self._compared(outcome, members, begun.comparison)
         else:
             rival, minima = begun.rival.kept, begun.minima
-        after = replace(found, minima=merged([*found.minima, *minima]), tried=(*found.tried, *members))
-        if begun.rival is None and found.descent.cost <= rival.cost:
+        after = replace(outcome, minima=merged([*outcome.minima, *minima]), tried=(*outcome.tried, *members))
+        if begun.rival is None and outcome.descent.cost <= rival.cost:
             return after
         before = rival.kept
 
         def keep() -> None:
             nonlocal before
             before = rival.kept
-            self._keep(found, lambda: SearchState(minima=minima, rival=before))
+            self._keep(outcome, lambda: SearchState(minima=minima, rival=before))
 
-        lowered = lower(DataWindow(self.space, self.seed, keep, self.tell), self.scheme, rival, after)
+        lowered = lower(DataWindow(self.space, self.seed, keep, self.tell), rival, after)
         return after if lowered is after else replace(lowered, before=before)
 
     def _compared(
-        self, found: Found, members: Sequence[int], comparison: StartState | None
+        self, outcome: Outcome, members: Sequence[int], comparison: StartState | None
     ) -> tuple[Descent, tuple[Minimum, ...]]:
         """The lowest of the descents, and where they ended: at the latest where they reach a known minimum."""
 
         def keep(state: Callable[[], StartState]) -> None:
-            self._keep(found, lambda: SearchState(comparison=state()))
+            self._keep(outcome, lambda: SearchState(comparison=state()))
 
-        window = Rounds(self.space, self.seed, comparison or StartState(), keep, self.tell, found.minima)
+        window = Rounds(self.space, self.seed, comparison or StartState(), keep, self.tell, outcome.minima)
         if comparison is None:
             window.begin_round(list(map(self.begin, members)))
-        iterate(window, self.scheme, window.descents)
+        minimise(window, window.descents)
         window.end_round()
         lowest = window.lowest
         if lowest.members and isinstance(lowest.step, GaussNewtonStep):
@@ -179,39 +178,37 @@ class Search:
         lowest.ended = False
         return lowest, tuple(window.minima)
 
-    def _keep(self, found: Found, state: Callable[[], SearchState]) -> None:
+    def _keep(self, outcome: Outcome, state: Callable[[], SearchState]) -> None:
         spent = self.space.forward_runs - self.began
-        self.keep(lambda: (found, replace(state(), over=self.over - 1, runs=found.runs, spent=spent)))
+        self.keep(lambda: (outcome, replace(state(), over=self.over - 1, runs=outcome.runs, spent=spent)))
 
 
-def lower(window: DataWindow, scheme: En4DVar, rival: Descent, found: Found) -> Found:
+def lower(window: DataWindow, rival: Descent, outcome: Outcome) -> Outcome:
     """After the rest of the ``rival``, if it ends lower than the lowest minimum; else as before."""
     try:
-        iterate(window, scheme, [rival])
+        minimise(window, [rival])
     except TooFewMembersError:  # the model does not run about it
-        return found
-    if rival.cost > found.descent.cost - SAME_COST:
-        return found
-    return replace(found, descent=rival, minima=merged([Minimum.of(window.space, rival), *found.minima]))
+        return outcome
+    if rival.cost > outcome.descent.cost - SAME_COST:
+        return outcome
+    return replace(outcome, descent=rival, minima=merged([Minimum.of(window.space, rival), *outcome.minima]))
 
 
-def from_draw(
-    space: WeightSpace, scheme: En4DVar, found: Found, x: Array, seed: int, tell: Callable[[Record], None]
-) -> Found:
+def from_draw(space: WeightSpace, outcome: Outcome, x: Array, seed: int, tell: Callable[[Record], None]) -> Outcome:
     """After a descent from a draw x (n,) of the posterior, if it ends lower than the lowest minimum; else as before.
 
     Nothing is kept of it: a resumed run comes to the same draw and repeats it. ``tell``: see
     :func:`~en4dvar.descent.start.choose_start`.
     """
-    before, rounds = space.forward_runs, found.rounds + 1
-    draw = max(*found.tried, len(space.members)) + 1
+    before, rounds = space.forward_runs, outcome.rounds + 1
+    draw = max(*outcome.tried, len(space.members)) + 1
     rival = descent_at(space, x, draw)
     tell(StartRecord(1, (float(space.try_out(rival.weights.w[None]).costs[0]),), 1, rounds))
-    after = lower(DataWindow(space, seed, lambda: None, tell), scheme, rival, found)
-    if after is found:
-        return found
-    runs = found.runs + space.forward_runs - before
-    return replace(after, tried=(*found.tried, draw), runs=runs, rounds=rounds)
+    after = lower(DataWindow(space, seed, lambda: None, tell), rival, outcome)
+    if after is outcome:
+        return outcome
+    runs = outcome.runs + space.forward_runs - before
+    return replace(after, tried=(*outcome.tried, draw), runs=runs, rounds=rounds)
 
 
 def descent_at(space: WeightSpace, x: Array, number: int) -> Descent:
@@ -219,12 +216,12 @@ def descent_at(space: WeightSpace, x: Array, number: int) -> Descent:
     return Descent(space.start(space.weights_of(x)), members=(number,))
 
 
-def challenger(space: WeightSpace, run: Forecast, found: Found) -> int:
+def challenger(space: WeightSpace, run: Forecast, outcome: Outcome) -> int:
     """The member farthest from the lowest minimum, in standard deviations of the Gaussian about it, of those in the
     half of lower J that were not tried.
     """
     costs = (space.drawn.background_costs + space.observation_cost(run))[:-1]
-    order = np.argsort(costs, kind="stable").tolist()
-    better = order[: max(len(found.tried) + 1, int(np.isfinite(costs).sum()) // 2)]
-    lowest = found.minima[0]
-    return max((i for i in better if i not in found.tried), key=lambda i: lowest.distance(space.members[i]))
+    order: list[int] = np.argsort(costs, kind="stable").tolist()
+    better = order[: max(len(outcome.tried) + 1, int(np.isfinite(costs).sum()) // 2)]
+    lowest = outcome.minima[0]
+    return max((i for i in better if i not in outcome.tried), key=lambda i: lowest.distance(space.members[i]))

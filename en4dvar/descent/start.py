@@ -13,17 +13,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar import diagnostics as diag
-from en4dvar.analysis import Record, StartRecord
-from en4dvar.caution import Caution, caution
-from en4dvar.descent.loop import iterate
+from en4dvar.descent.loop import minimise
 from en4dvar.descent.minima import REACHED, Minimum, merged
-from en4dvar.descent.step_control import Move
+from en4dvar.descent.step_control import Move, Search
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.descent.window import DataWindow, Descent
+from en4dvar.diagnosis import diagnostics as diag
+from en4dvar.diagnosis.analysis import Record, StartRecord
 from en4dvar.ensemble.forecast import Forecast
-from en4dvar.schemes.base import Scheme
-from en4dvar.schemes.en4dvar import En4DVar
+from en4dvar.plumbing.caution import Caution, caution
+from en4dvar.schemes.base import Minimiser
 
 ROUGH = 1e-2  # relative decrease of J at which a descent stops that only has to tell basins apart
 SAME = 1.0  # posterior standard deviations between descents that have met
@@ -57,7 +56,7 @@ Keep = Callable[[Callable[[], StartState]], None]
 
 
 def choose_start(
-    space: WeightSpace, scheme: En4DVar, run: Forecast, seed: int, resume: StartState | None, keep: Keep,
+    space: WeightSpace, scheme: Minimiser, run: Forecast, seed: int, resume: StartState | None, keep: Keep,
     tell: Callable[[Record], None],
 ) -> Start:  # fmt: skip
     """``run``: forecast of the prior members and, last, of their mean.
@@ -68,14 +67,14 @@ def choose_start(
     resume from, ``tell`` after it.
     """
     warnings: tuple[Caution, ...] = ()
-    if space.settings.start == "prior-mean":
+    if scheme.start == "prior-mean":
         if np.isfinite(space.observation_cost(run)[-1]):
             mean = len(space.members)
             return Start(descent_from(space, mean), tried=(mean,))
         words = f"the prior mean cannot be run ({run.failures[-1]}); started from the best prior member"
         warnings = (caution("start-moved", words),)
     starts = affordable(space, scheme, run)
-    together = min(space.settings.starts, len(starts))
+    together = min(scheme.starts, len(starts))
     first = descent_from(space, starts[0])
     if together < 2:
         return Start(first, tried=(starts[0],), warnings=warnings)
@@ -83,7 +82,7 @@ def choose_start(
     while window.rank < len(starts):
         if not window.descents:
             window.begin_round([descent_from(space, i) for i in starts[window.rank : window.rank + together]])
-        iterate(window, scheme, window.descents)
+        minimise(window, window.descents)
         window.rank += together
         if window.end_round():
             break
@@ -97,7 +96,7 @@ def descent_from(space: WeightSpace, member: int) -> Descent:
     return Descent(space.start(space.drawn.at_member(member)), members=(member,))
 
 
-def affordable(space: WeightSpace, scheme: En4DVar, run: Forecast) -> list[int]:
+def affordable(space: WeightSpace, scheme: Minimiser, run: Forecast) -> list[int]:
     """Members of lowest J, as many as go :func:`side_by_side`; at least one."""
     costs = space.drawn.background_costs + space.observation_cost(run)
     best = np.argsort(costs, kind="stable").tolist()
@@ -107,7 +106,7 @@ def affordable(space: WeightSpace, scheme: En4DVar, run: Forecast) -> list[int]:
 
 def side_by_side(space: WeightSpace) -> int:
     """Descents for which a linearisation of each costs no more than one bundle of N together."""
-    return len(space.members) // (space.basis.shape[1] + 1)
+    return int(len(space.members) // (space.basis.shape[1] + 1))
 
 
 def highest_plausible(space: WeightSpace) -> float:
@@ -160,7 +159,7 @@ class Rounds(DataWindow):
         self.lowest.members, self.lowest.highest = minima[0].members, minima[0].cost + minima[0].spread
         return minima[1:]
 
-    def move(self, scheme: Scheme, going: Sequence[Descent]) -> None:
+    def judge(self, going: Sequence[Descent]) -> None:
         for descent in going:
             descent.ended = descent.step is None
         _end_those_that_met(going)
@@ -169,8 +168,12 @@ class Rounds(DataWindow):
             if not descent.ended and any(minimum.distance(x) < REACHED for minimum in self.known):
                 descent.ended = True
                 self.end_here(descent)
-        going = [descent for descent in going if not descent.ended]
-        for descent, move in zip(going, self.search(going), strict=True):
+
+    def search(self, descent: Descent) -> Search:
+        return self.searched(descent)
+
+    def move(self, going: Sequence[Descent], moves: Sequence[Move | None]) -> None:
+        for descent, move in zip(going, moves, strict=True):
             self._follow(descent, move)
         self.rounds += 1
         costs = tuple(descent.cost for descent in self.descents)
@@ -185,7 +188,7 @@ class Rounds(DataWindow):
             self.record(descent, step.hessian.economical_transform, move.step_length)
             descent.weights, descent.cost = self.space.onwards(move.w, step.hessian), move.cost
             rough = max(before - move.cost, step.predicted_decrease) <= ROUGH * max(1.0, move.cost)
-            descent.ended = rough or descent.iteration == self.settings.max_iterations
+            descent.ended = rough or descent.iteration == self.minimiser.max_iterations
         else:
             descent.ended = True
         if descent.ended:

@@ -1,4 +1,5 @@
-"""How far to go along a direction. Every rule judges by J of the central trajectory and none accepts a rise.
+"""How far to go along a direction. Every rule judges by J of the central trajectory and none accepts a rise; but a
+regression over the ensemble ends by :class:`Settling`.
 
 A rule is a generator: it yields candidate weights (B, N), receives their :class:`Trials`, and returns a :class:`Move`
 or None. So the loop can run the candidates of several descents in one call of the model (:func:`run_searches`), and a
@@ -7,13 +8,46 @@ model that integrates many members at once pays for one run.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from en4dvar.model.state import Array
 from en4dvar.schemes.base import GaussNewtonStep
-from en4dvar.state import Array
+
+NEAR = 0.5  # posterior standard deviations: a regression whose steps are shorter settles; longer ones are searched by J
+LEAST = 1 / 32  # share of a step
+
+
+@dataclass(frozen=True)
+class Settling:
+    """How a regression over the ensemble ends: where its own gradient vanishes, by damped steps.
+
+    That gradient is the one of J averaged over the ensemble, as Stein's identity has it of Gaussian members. It need
+    not vanish where J of the central run is smallest, so that close to there J cannot judge the steps any more: a
+    search by J stops with steps left. The length of the next step, in posterior standard deviations, can. Steps and
+    ensemble may also drive each other to and fro; then the transform of the ensemble is held, and the steps are damped.
+
+    ``share`` of the next step that is taken, and length of the step ``before``; ``held``: the transform stays.
+    """
+
+    share: float = 1.0
+    before: float = math.inf
+    held: bool = False
+
+    def after(self, norm: float) -> Settling:
+        """With a next step of length ``norm``.
+
+        Where a share s of the steps is taken, these should shrink by s of their length; half as much is asked for. At
+        the first step that does not shrink like that the transform is held, at each later one the share is halved.
+        """
+        if norm <= (1 - 0.5 * self.share) * self.before:
+            return Settling(self.share, norm, self.held)
+        return Settling(max(0.5 * self.share, LEAST) if self.held else self.share, norm, held=True)
+
 
 SUFFICIENT = 1e-4  # Armijo's constant: the fraction of the predicted decrease that must be realised
 LENGTHS = np.array([1.0, 0.5, 0.25, 0.125])
@@ -27,6 +61,9 @@ class Trials:
 
     costs: Array
     predictions: Array
+
+    def __getitem__(self, part: slice) -> Trials:
+        return Trials(self.costs[part], self.predictions[part])
 
 
 @dataclass(frozen=True)
@@ -55,14 +92,14 @@ class Point:
 
 @dataclass(frozen=True)
 class Move:
-    """An accepted move: new weights ``w`` (N,), their cost, and the length relative to the full step."""
+    """An accepted move: new weights ``w`` (N,), or what else a place is, J there, and the share of the full step."""
 
-    w: Array
+    w: Any
     cost: float
     step_length: float
 
 
-Search = Generator[Array, Trials, Move | None]
+Search = Generator[Any, Any, Move | None]
 StepControl = Callable[[Point], Search]
 
 
@@ -138,19 +175,20 @@ STEP_CONTROLS: dict[str, StepControl] = {
 }
 
 
-def run_searches(searches: Sequence[Search], try_out: Callable[[Array], Trials]) -> list[Move | None]:
+def run_searches(searches: Sequence[Search | None], try_out: Callable[[Any], Any]) -> list[Move | None]:
     """Run searches side by side: ``try_out`` (B, N) → trials is called with the candidates of all at once."""
     moves: list[Move | None] = [None] * len(searches)
-    waiting = {i: next(search) for i, search in enumerate(searches)}
+    waiting = {i: (search, next(search)) for i, search in enumerate(searches) if search is not None}
     while waiting:
-        trials = try_out(np.concatenate(list(waiting.values())))
+        every = [candidates for _, candidates in waiting.values()]
+        trials = try_out(every[0] if len(every) == 1 else np.concatenate(every))
         first, answered = 0, waiting
         waiting = {}
-        for i, candidates in answered.items():
+        for i, (search, candidates) in answered.items():
             part = slice(first, first + len(candidates))
             first = part.stop
             try:
-                waiting[i] = searches[i].send(Trials(trials.costs[part], trials.predictions[part]))
+                waiting[i] = search, search.send(trials if len(answered) == 1 else trials[part])
             except StopIteration as end:
                 moves[i] = end.value
     return moves

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from en4dvar.data.noise import DiscrepancyNoise, Linearisation
 from en4dvar.descent.weight_space import WeightSpace
-from en4dvar.noise import DiscrepancyNoise, Linearisation
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 
 
 def shares_of_variance(space: WeightSpace, linear: Linearisation) -> Array:

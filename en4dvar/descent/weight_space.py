@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from en4dvar import diagnostics as diag
 from en4dvar.descent.step_control import Trials
+from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
 from en4dvar.ensemble.linalg import FEW, Hessian, ThinTransform, anomaly_basis, centre
 from en4dvar.ensemble.repeat import check_repeats
-from en4dvar.errors import TooFewMembersError
 from en4dvar.executor import Executor
-from en4dvar.prior import Prior, Sampling
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import TooFewMembersError
+from en4dvar.priors.prior import Prior, Sampling
+from en4dvar.problem import InverseProblem
 from en4dvar.schemes.base import Weights
-from en4dvar.state import Array
+from en4dvar.schemes.settings import AssimilationSettings
 
 NOT_READ: Array = np.empty((0, 0))
 
@@ -65,7 +67,7 @@ class WeightSpace:
     """The ensemble of a problem, its model behind an executor, and the count of forward runs."""
 
     def __init__(self, problem: InverseProblem, settings: AssimilationSettings, seed: int, executor: Executor):
-        self.problem, self.settings, self.executor = problem, settings, executor
+        self.problem, self.settings, self.scheme, self.executor = problem, settings, settings.own, executor
         self.composite = Composite(problem, executor)
         self.drawn = drawn = prior_ensemble(problem.prior, settings.members, seed, settings.sampling)
         self.members, self.mean, self.anomalies = drawn.members, drawn.mean, drawn.anomalies
@@ -76,7 +78,7 @@ class WeightSpace:
     def needed_members(self) -> int:
         """The members that must survive for a regression on the control vector."""
         n_members, n = self.members.shape
-        return max(math.ceil(self.settings.min_active_fraction * n_members), min(n + 1, n_members))
+        return int(max(math.ceil(self.settings.min_active_fraction * n_members), min(n + 1, n_members)))
 
     def control(self, w: Array) -> Array:
         """Control vectors (…, n) of weights (…, N)."""
@@ -105,7 +107,7 @@ class WeightSpace:
     @property
     def _reads_transform(self) -> bool:
         """Few members take it along in any case; of many, only a regression over the ensemble asks for it."""
-        return len(self.members) <= FEW or self.settings.linearisation == "transform"
+        return len(self.members) <= FEW or (self.scheme.minimiser is not None and self.scheme.minimiser.regresses)
 
     def forecast(self, x: Array, extra_times: Array = NO_TIMES) -> Forecast:
         self.forward_runs += len(x)
@@ -138,11 +140,16 @@ class WeightSpace:
         run = self.forecast(self.control(w))
         return Trials(diag.background_cost(w) + self.observation_cost(run), run.predictions)
 
-    def require_members(self, failures: tuple[str, ...], stage: str) -> None:
+    def require_members(self, failures: Sequence[str], stage: str) -> None:
         """Raise :class:`TooFewMembersError` unless enough members are active for a regression on the control vector."""
-        lost, needed = sum(1 for reason in failures if reason), self.needed_members
-        if len(failures) - lost < needed:
-            raise TooFewMembersError(
-                f"{self.problem.observations.name}: {lost} of {len(failures)} members failed in the {stage}; "
-                f"at least {needed} must survive. Most frequent reasons: {diag.common_reasons(failures)}"
-            )
+        require_members(self.problem, failures, self.needed_members, stage)
+
+
+def require_members(problem: InverseProblem, failures: Sequence[str], needed: int, stage: str) -> None:
+    """Raise :class:`TooFewMembersError` where fewer than ``needed`` members survive a forecast."""
+    lost = sum(map(bool, failures))
+    if len(failures) - lost < needed:
+        raise TooFewMembersError(
+            f"{problem.observations.name}: {lost} of {len(failures)} members failed in the {stage}; at least {needed} "
+            f"must survive. Most frequent reasons: {diag.common_reasons(failures)}"
+        )

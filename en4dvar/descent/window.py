@@ -1,8 +1,9 @@
-"""One data set as a window of the loop: its runs, how far a step goes, records, and when a descent has ended.
+"""J of one data set, as the loop minimises it: its runs, how far a step goes, records, and when a descent has ended.
 
 A scheme that searches minimises J: steps are judged by J of the central run, and none that raises it is accepted. A
-regression over the ensemble settles in the end (:mod:`en4dvar.descent.settling`). Any other scheme takes its steps as
-they are; J and its Gauss–Newton step, from a regression over the ensemble, are then there for the record only.
+regression over the ensemble settles in the end (:class:`~en4dvar.descent.step_control.Settling`). Any other scheme
+takes its steps as they are; J and its Gauss–Newton step, from a regression over the ensemble, are then there for the
+record only.
 """
 
 from __future__ import annotations
@@ -13,20 +14,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar import diagnostics as diag
-from en4dvar.analysis import IterationRecord, Record
-from en4dvar.descent.settling import NEAR, Settling
-from en4dvar.descent.step_control import STEP_CONTROLS, Move, Point, Tangent, run_searches
+from en4dvar.data.noise import Linearisation, Predicted
+from en4dvar.descent.loop import EnsembleSystem, Objective
+from en4dvar.descent.step_control import NEAR, STEP_CONTROLS, Move, Point, Search, Settling, Tangent, Trials
 from en4dvar.descent.weight_space import WeightSpace
-from en4dvar.diagnostics import UNSEEN
+from en4dvar.diagnosis import diagnostics as diag
+from en4dvar.diagnosis.analysis import IterationRecord, Record
+from en4dvar.diagnosis.diagnostics import UNSEEN
 from en4dvar.ensemble.forecast import NO_TIMES, Forecast
 from en4dvar.ensemble.linalg import ThinTransform
-from en4dvar.errors import TooFewMembersError
-from en4dvar.noise import Linearisation, Predicted
-from en4dvar.prior import member_stream
-from en4dvar.schemes.base import Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights, gauss_newton
-from en4dvar.schemes.en4dvar import En4DVar
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import TooFewMembersError
+from en4dvar.priors.prior import member_stream
+from en4dvar.schemes.base import (
+    Evaluation,
+    GaussNewtonStep,
+    Minimiser,
+    Runs,
+    Step,
+    Weights,
+    gauss_newton,
+    regression,
+)  # fmt: skip
 
 WIDER, WIDEST = 5.0, 25.0  # factors of a bundle where J does not fall along the step: of each further look, in all
 FAKED = 3.0  # posterior standard deviations: a longer step does not come from the model's own error
@@ -98,7 +107,7 @@ class Descent:
         return replace(self, at=None, step=None)
 
 
-class DataWindow:
+class DataWindow(Objective[Descent]):
     """The window of an estimate: one descent, to the minimum of J or through the passes of a scheme.
 
     ``first`` is the forecast of the prior members and their mean, which a scheme that runs its whole ensemble does not
@@ -109,33 +118,49 @@ class DataWindow:
         self,
         space: WeightSpace,
         seed: int,
-        keep: Callable[[], None],
+        save: Callable[[], None],
         tell: Callable[[Record], None],
         first: Forecast | None = None,
         grid: Array = NO_TIMES,
     ):
-        self.space, self.seed, self.keep, self.tell, self.first, self.grid = space, seed, keep, tell, first, grid
-        self.settings, self.observations = space.settings, space.problem.observations
+        self.space, self.seed, self.save, self.tell, self.first, self.grid = space, seed, save, tell, first, grid
+        self.scheme, self.observations = space.scheme, space.problem.observations
 
-    def begin(self, going: Sequence[Descent]) -> None:
-        self.keep()
+    @property
+    def minimiser(self) -> Minimiser:
+        """The scheme, of descents to the minimum of J."""
+        assert self.space.scheme.minimiser is not None
+        return self.space.scheme.minimiser
 
-    def run(self, scheme: Scheme, going: Sequence[Descent]) -> list[Runs | None]:
-        space = self.space
-        if not scheme.searches:
-            return [self._run_ensemble(scheme, descent) for descent in going]
+    def keep(self, going: Sequence[Descent]) -> None:
+        self.save()
+
+    def linearise(self, going: Sequence[Descent]) -> list[EnsembleSystem | None]:
+        each = zip(going, self.run(going), strict=True)
+        return [None if runs is None else self._system(descent, runs) for descent, runs in each]
+
+    def _system(self, descent: Descent, runs: Runs) -> EnsembleSystem:
+        reference, anomalies = self.scheme.linearise(descent.weights, runs)
+        evaluation = self.whiten(descent, reference, anomalies)
+        return EnsembleSystem(self.scheme, descent.weights, evaluation, descent.iteration, self.draw)
+
+    def run(self, going: Sequence[Descent]) -> list[Runs | None]:
+        """The members of the scheme through F and H, all descents in one call; None where too few of them survive."""
+        space, scheme = self.space, self.scheme
+        if not scheme.minimiser:
+            return [self._run_ensemble(descent) for descent in going]
         rows = [[*scheme.members(d.weights, space.basis), d.weights.w] for d in going]
         whole = space.forecast(space.control(np.array([row for each in rows for row in each])))
         ends = np.cumsum([len(each) for each in rows]).tolist()
         return [
-            self._arrive(scheme, descent, whole[end - len(each) : end])
+            self._arrive(descent, whole[end - len(each) : end])
             for descent, each, end in zip(going, rows, ends, strict=True)
         ]
 
-    def whiten(self, scheme: Scheme, descent: Descent, reference: Array, anomalies: Array) -> Evaluation:
+    def whiten(self, descent: Descent, reference: Array, anomalies: Array) -> Evaluation:
         """By Fisher scoring; for a scheme that runs its whole ensemble with the R at its mean."""
         like = descent.iterate.central.predicted[0]
-        if scheme.searches:
+        if self.scheme.minimiser:
             return self._evaluation(descent, Linearisation.of_stacked(like, reference, anomalies))
         mean, k = like.unstacked(reference), like.values.shape[-1]
         linear = Linearisation(Predicted(mean.values), anomalies[:, :k])
@@ -146,19 +171,34 @@ class DataWindow:
         n_members, size = len(self.space.members), columns or len(self.observations)
         return np.stack([member_stream(self.seed, purpose, i).standard_normal(size) for i in range(n_members)])
 
-    def move(self, scheme: Scheme, going: Sequence[Descent]) -> None:
+    def judge(self, going: Sequence[Descent]) -> None:
         for descent in going:
             self._require_step(descent)
-            if scheme.searches:
-                self._minimise(scheme, descent)
-            else:
-                self._take(scheme, descent)
-            self.tell(descent.records[-1])
+            if self.scheme.minimiser is None or descent.stop:
+                continue
+            scheme, norm = self.minimiser, descent.newton.norm
+            if norm <= scheme.step_tolerance:
+                descent.stop, descent.converged = f"step of {norm:.2g} posterior standard deviations", True
+            elif descent.iteration == scheme.max_iterations:
+                descent.stop = f"iteration limit ({scheme.max_iterations}) reached"
 
-    def search(self, descents: Sequence[Descent]) -> list[Move | None]:
-        """One move of each, by the configured step control; None where no decrease of J is found."""
-        control = STEP_CONTROLS[self.settings.step_control]
-        return run_searches([control(self._point(descent)) for descent in descents], self.space.try_out)
+    def search(self, descent: Descent) -> Search | None:
+        return None if self.scheme.minimiser is None or self._settles(descent) else self.searched(descent)
+
+    def try_out(self, candidates: Array) -> Trials:
+        return self.space.try_out(candidates)
+
+    def searched(self, descent: Descent) -> Search:
+        """By the configured step control."""
+        return STEP_CONTROLS[self.minimiser.step_control](self._point(descent))
+
+    def move(self, going: Sequence[Descent], moves: Sequence[Move | None]) -> None:
+        for descent, move in zip(going, moves, strict=True):
+            if self.scheme.minimiser:
+                self._go_on(descent, move)
+            else:
+                self._take(descent)
+            self.tell(descent.records[-1])
 
     def record(self, descent: Descent, transform: Array | ThinTransform, step_length: float) -> None:
         """Add the record of an iterate: the ensemble of ``transform`` (N, N) there, and how far it is left."""
@@ -184,21 +224,14 @@ class DataWindow:
 
     def small(self, cost: float) -> float:
         """A decrease of J that counts as none; below J = 1 it is absolute, for there J has no more to tell."""
-        return self.settings.cost_tolerance * max(cost, 1.0)
+        return self.minimiser.cost_tolerance * max(cost, 1.0)
 
-    def _minimise(self, scheme: Scheme, descent: Descent) -> None:
-        settings, at, step = self.settings, descent.iterate, descent.newton
-        move, again = None, None
-        if not descent.stop:
-            if step.norm <= settings.step_tolerance:
-                descent.stop, descent.converged = f"step of {step.norm:.2g} posterior standard deviations", True
-            elif descent.iteration == settings.max_iterations:
-                descent.stop = f"iteration limit ({settings.max_iterations}) reached"
-            elif not self._settles(descent):
-                (move,) = self.search([descent])
-                again = None if move else self._look_again(scheme, descent)
-                if move is None and again is None:
-                    self._no_decrease(descent)
+    def _go_on(self, descent: Descent, move: Move | None) -> None:
+        at, step, again = descent.iterate, descent.newton, None
+        if move is None and not descent.stop and not self._settles(descent):
+            again = self._look_again(descent)
+            if again is None:
+                self._no_decrease(descent)
         if not descent.stop and move is None and again is None:
             self._settle(descent)
             return
@@ -210,12 +243,13 @@ class DataWindow:
             return
         if at.cost - move.cost <= self.small(at.cost) and step.predicted_decrease <= self.small(at.cost):
             # one more forecast, to linearise at the end point
-            descent.stop, descent.converged = f"relative decrease of J below {settings.cost_tolerance:g}", True
+            words = f"relative decrease of J below {self.minimiser.cost_tolerance:g}"
+            descent.stop, descent.converged = words, True
         descent.weights = self._onwards(descent, move.w)
 
     def _no_decrease(self, descent: Descent) -> None:
         """The search by J has ended; a regression goes on to settle."""
-        if self.settings.linearisation == "transform":
+        if self.minimiser.regresses:
             return
         descent.stop = "no decrease possible along the step"
         least = max(self.small(descent.iterate.cost), 0.5 * UNSEEN**2)
@@ -223,7 +257,7 @@ class DataWindow:
 
     def _settles(self, descent: Descent) -> bool:
         near = descent.settling is not None or descent.newton.norm <= NEAR
-        return self.settings.linearisation == "transform" and near
+        return self.minimiser.regresses and near
 
     def _settle(self, descent: Descent) -> None:
         """A share of the step, whatever J of the central run says."""
@@ -233,7 +267,7 @@ class DataWindow:
         w = descent.weights.w + settling.share * step.direction
         descent.weights = replace(descent.weights, w=w) if settling.held else self._onwards(descent, w)
 
-    def _look_again(self, scheme: Scheme, descent: Descent) -> Weights | None:
+    def _look_again(self, descent: Descent) -> Weights | None:
         """The same centre with members that may show the way down, where J does not fall along the step; else None.
 
         For a regression that is a narrower ensemble. Of finite differences the step may come from the model's own
@@ -241,16 +275,16 @@ class DataWindow:
         """
         weights = descent.weights
         onwards = self._onwards(descent, weights.w)
-        if self.settings.linearisation == "bundle":
+        if not self.minimiser.regresses:
             doubtful = UNSEEN < descent.newton.norm < FAKED and weights.wider < WIDEST
             return replace(onwards, wider=WIDER * weights.wider) if doubtful else None
-        return None if self._same_members(scheme, onwards, weights) else onwards
+        return None if self._same_members(onwards, weights) else onwards
 
     def _onwards(self, descent: Descent, w: Array) -> Weights:
         """Weights at w (N,), with the transform of where the descent comes from and a bundle as wide."""
         return replace(self.space.onwards(w, descent.newton.hessian), wider=descent.weights.wider)
 
-    def _take(self, scheme: Scheme, descent: Descent) -> None:
+    def _take(self, descent: Descent) -> None:
         """The whole step; the iterate after the last one is recorded, too."""
         taken, descent.step = descent.step, self._regression(descent)
         self.record(descent, descent.weights.T, 0.0 if descent.stop else 1.0)
@@ -259,35 +293,33 @@ class DataWindow:
             return
         assert taken is not None
         count = descent.iteration
-        if scheme.done(count - 1, taken):
+        if self.scheme.done(count - 1, taken):
             descent.stop, descent.converged = f"{count} assimilations", True
         basis = self.space.basis  # of the weights of the mean, those that move no parameter are no part of J_b
         descent.weights = Weights(basis @ (basis.T @ taken.weights.w), taken.weights.T)
 
-    def _run_ensemble(self, scheme: Scheme, descent: Descent) -> Runs | None:
+    def _run_ensemble(self, descent: Descent) -> Runs | None:
         space = self.space
         if descent.iteration == 0 and self.first is not None:
             run = self.first
         else:
-            rows = np.array([*scheme.members(descent.weights), descent.weights.w])
+            rows = np.array([*self.scheme.members(descent.weights), descent.weights.w])
             run = space.forecast(space.control(rows), self.grid if descent.stop else NO_TIMES)
-        runs = self._arrive(scheme, descent, run)
+        runs = self._arrive(descent, run)
         if descent.stop or runs is None or runs.active is None or runs.active.all():
             return None if descent.stop else runs
         # a failed member takes the prediction that the regression on the survivors gives it
         zeros = np.zeros(runs.predictions.shape[1])
-        reference, anomalies = En4DVar("transform").linearise(
-            descent.weights, Runs(runs.predictions, zeros, runs.active, space.basis)
-        )
+        reference, anomalies = self._regressed(descent.weights, Runs(runs.predictions, zeros, runs.active))
         regressed = reference + descent.weights.T @ space.basis @ anomalies
         return Runs(np.where(runs.active[:, None], runs.predictions, regressed))
 
-    def _arrive(self, scheme: Scheme, descent: Descent, run: Forecast) -> Runs | None:
+    def _arrive(self, descent: Descent, run: Forecast) -> Runs | None:
         """J at the new iterate; what its runs, members and centre, are to the scheme."""
         space, weights = self.space, descent.weights
         members, central = run[:-1], run[-1:]
         if len(members) < len(space.members) and any(members.failures):  # a direction is lost: run all members
-            members = space.forecast(space.control(scheme.members(weights)))
+            members = space.forecast(space.control(self.scheme.members(weights)))
         background = float(diag.background_cost(weights.w))
         descent.at = at = Iterate(members, central, background, float(space.observation_cost(central)[0]))
         descent.cost = at.cost
@@ -307,14 +339,17 @@ class DataWindow:
     def _regression(self, descent: Descent) -> GaussNewtonStep:
         """The Gauss–Newton step of J that an ensemble that was run as a whole tells."""
         at = descent.iterate
-        runs = Runs(at.members.predicted.stacked, at.central.predicted.stacked[0], at.members.active, self.space.basis)
-        reference, anomalies = En4DVar("transform").linearise(descent.weights, runs)
+        runs = Runs(at.members.predicted.stacked, at.central.predicted.stacked[0], at.members.active)
+        reference, anomalies = self._regressed(descent.weights, runs)
         linear = Linearisation.of_stacked(at.central.predicted[0], reference, anomalies)
         return gauss_newton(descent.weights.w, self._evaluation(descent, linear))
 
+    def _regressed(self, weights: Weights, runs: Runs) -> tuple[Array, Array]:
+        return regression((weights.rows - weights.w) @ self.space.basis, runs)
+
     def _point(self, descent: Descent) -> Point:
         at, tangent = descent.iterate, None
-        if (linear := at.linear) is not None and self.settings.linearisation == "bundle":
+        if (linear := at.linear) is not None and not self.minimiser.regresses:
 
             def precision_times(vectors: Array) -> Array:
                 return self.observations.precision_times(linear.prediction, vectors)
@@ -322,9 +357,9 @@ class DataWindow:
             tangent = Tangent(linear.prediction.values, linear.anomalies, precision_times, self.space.basis)
         return Point(descent.weights.w, at.cost, descent.newton, tangent)
 
-    def _same_members(self, scheme: Scheme, a: Weights, b: Weights) -> bool:
+    def _same_members(self, a: Weights, b: Weights) -> bool:
         """Whether the scheme would run the same members again, to the step tolerance."""
-        return bool(np.max(np.abs(scheme.members(a) - scheme.members(b))) <= self.settings.step_tolerance)
+        return bool(np.max(np.abs(self.scheme.members(a) - self.scheme.members(b))) <= self.minimiser.step_tolerance)
 
     def _require_step(self, descent: Descent) -> None:
         """Raise where the members lost do not allow a step."""

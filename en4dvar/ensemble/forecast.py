@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from en4dvar.data.noise import Predicted
 from en4dvar.ensemble.members import EVERYONE, Indices, InitialStates, Reading, out_of_bounds
 from en4dvar.ensemble.readout import Readout, batched, operators_of
-from en4dvar.errors import ConfigError, Fault
 from en4dvar.executor import Executor, SerialExecutor
-from en4dvar.noise import Predicted
+from en4dvar.model.state import NOISE_SCALE, OF_READINGS, READING_OFFSET, READING_SCALE, TIME_SHIFT, Array, Parameter
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.problem import InverseProblem
-from en4dvar.state import NOISE_SCALE, OF_READINGS, READING_OFFSET, READING_SCALE, TIME_SHIFT, Array, Parameter
 
 NO_TIMES: Array = np.empty(0)
 GRID_POINTS = 200  # of a plot
@@ -131,7 +131,9 @@ class Composite:
             quantities = tuple(of_parts[0] for of_parts in self._operators)
             return times, Reading(quantities, limits, self._batched), len(times), at_instants, at_extra
         rows = rows if isinstance(at_instants, slice) else at_instants[rows]
-        readouts = tuple(Readout(one, observations.parts, len(times), rows, at_extra) for one in self._operators)
+        readouts = tuple(
+            Readout(operator, observations.parts, len(times), rows, at_extra) for operator in self._operators
+        )
         k, curves = len(observations), sum(part.has_path for part in observations.parts)
         size = k + curves * len(extra_times)
         return times, Reading(readouts, limits, self._batched), size, slice(0, k), slice(k, size)
@@ -201,10 +203,13 @@ def check_problem(problem: InverseProblem) -> tuple[Parameter, ...]:
     ):
         if names:
             raise ConfigError(f"{', '.join(sorted(names))}: {message}")
-    for given, parameter in ((problem.has_reading_scale, READING_SCALE), (problem.has_reading_offset, READING_OFFSET)):
-        if given and problem.observations.parts:
+    for uncertain, parameter in (
+        (problem.has_reading_scale, READING_SCALE),
+        (problem.has_reading_offset, READING_OFFSET),
+    ):
+        if uncertain and problem.observations.parts:
             where = f"parameters.{parameter.name}"
-            raise ConfigError([Fault("cannot be one number for several series or for readings at places", where)])
+            raise ConfigError("cannot be one number for several series or for readings at places", where)
     _operators(problem)
     return tuple(known[name] for name in problem.fixed)
 
@@ -222,14 +227,14 @@ def time_shift(problem: InverseProblem, physical: Array) -> Array:
 
 
 def reading_scale(problem: InverseProblem, physical: Array) -> Array:
-    """What the predictions of physical control vectors (B, n) are multiplied by, (B,)."""
+    """Factor (B,) of the predictions of physical control vectors (B, n)."""
     if not problem.has_reading_scale:
         return np.ones(len(physical))
     return _of_framework(problem, physical, READING_SCALE, 1.0)
 
 
 def as_read(problem: InverseProblem, physical: Array, observed: Array) -> Array:
-    """What is read of an observable, and of its rates, (Q, B, M): times ``reading_scale``, plus ``reading_offset``."""
+    """Readings of an observable, and of its rates, (Q, B, M): times ``reading_scale``, plus ``reading_offset``."""
     if problem.has_reading_scale:
         observed = observed * reading_scale(problem, physical)[:, None]
     if problem.has_reading_offset:

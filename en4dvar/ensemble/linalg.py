@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 
 GRAM_LIMIT = 100.0
 FEW = 512  # members up to which a transform is a matrix (2 MB); beyond, time and memory grow with N, not N²

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.batch import Batch
 from en4dvar.executor import Outcome
-from en4dvar.forward import Failure, ValidityLimit
-from en4dvar.prior import Prior
+from en4dvar.model.batch import Batch
+from en4dvar.model.forward import Failure, ValidityLimit
+from en4dvar.model.state import Array, Field
+from en4dvar.plumbing.user_code import own_fault, reason_of
+from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem, Tie
-from en4dvar.state import Array, Field
-from en4dvar.user_code import own_fault, reason_of
 
 Indices = npt.NDArray[np.intp] | slice
 EVERYONE = slice(None)
@@ -111,10 +111,10 @@ def _require_inside(values: Array, block: Field) -> None:
 
 def _followed(tie: Tie, values: Array) -> Array:
     """Values (B,) of a tied parameter; ValueError outside its bounds."""
-    p, (low, high), found = tie.parameter, tie.parameter.bounds, tie.factor * values
-    if not np.all((found >= low) & (found <= high)):
+    p, (low, high), followed = tie.parameter, tie.parameter.bounds, tie.factor * values
+    if not np.all((followed >= low) & (followed <= high)):
         raise ValueError(f"{p.name} outside [{low:g}, {high:g}] {p.unit}")
-    return np.asarray(found)
+    return np.asarray(followed)
 
 
 class MisshapenError(ValueError):
@@ -127,10 +127,10 @@ def _without(failures: list[str]) -> Indices:
 
 @dataclass(frozen=True)
 class Reading:
-    """What is read from a path: ``quantities`` (T,) each, H and, where it is needed, its rate; what becomes of
+    """Quantities read from a path: ``quantities`` (T,) each, H and, where it is needed, its rate; what becomes of
     ``limits`` of the model.
 
-    ``batched``: the quantities take a :class:`~en4dvar.batch.Batch` as well and give (B, T).
+    ``batched``: the quantities take a :class:`~en4dvar.model.batch.Batch` as well and give (B, T).
     """
 
     quantities: tuple[Callable[[Any], Array], ...]
@@ -156,19 +156,19 @@ class Reading:
                 reasons[i] = outcome.reason
                 continue
             try:
-                one = self._all([outcome])
+                predictions = self._all([outcome])
             except MisshapenError:
                 reasons[i] = "misshapen prediction"
                 continue
             except BaseException as error:  # H belongs to the user as well
                 reasons[i] = reason_of(error)
                 continue
-            if one[0].shape[2:] != (n_times,):
+            if predictions[0].shape[2:] != (n_times,):
                 reasons[i] = "misshapen prediction"
-            elif not np.isfinite(one[0]).all():
+            elif not np.isfinite(predictions[0]).all():
                 reasons[i] = "non-finite prediction"
             else:
-                values[:, i], beyond[i] = one[0][:, 0], one[1][0]
+                values[:, i], beyond[i] = predictions[0][:, 0], predictions[1][0]
         return values, beyond, reasons
 
     def _all(self, outcomes: Sequence[Any]) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
 
 from en4dvar.ensemble.linalg import Hessian
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 
 LARGEST = 1.0  # bound (Σ λ⁴)^{1/4} of the eigenvalues of M
 SMALLEST_SIDE = 16  # of S: below, the decomposition of the smaller Gram matrix is as fast

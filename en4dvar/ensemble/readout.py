@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from en4dvar.data.series import Part
 from en4dvar.ensemble.members import MisshapenError
-from en4dvar.errors import ConfigError
-from en4dvar.forward import RateOperator
+from en4dvar.model.forward import RateOperator
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.problem import InverseProblem
-from en4dvar.series import Part
-from en4dvar.state import Array
 
 Indices = npt.NDArray[np.intp] | slice
 
@@ -34,20 +34,20 @@ class Readout:
     along: Indices
 
     def __call__(self, path: Any) -> Array:
-        found = []
+        predictions = []
         curves = []
         for operator, part in zip(self.operators, self.parts, strict=True):
             values = np.asarray(operator(path))
             self._check(values, part)
             rows = self.rows if isinstance(self.rows, slice) else self.rows[part.where]
             if part.places is None:
-                found.append(values[..., rows])
+                predictions.append(values[..., rows])
             else:
-                found.append(part.places.read(values, rows))
+                predictions.append(part.places.read(values, rows))
             if part.has_path:
                 at = values[..., self.along] if part.places is None else values[..., self.along, :]
                 curves.append(part.read_along(at))
-        return np.concatenate([*found, *curves], axis=-1)
+        return np.concatenate([*predictions, *curves], axis=-1)
 
     def _check(self, values: Array, part: Part) -> None:
         of_field = part.places is not None
@@ -69,5 +69,5 @@ def operators_of(parts: Sequence[Part], rates: bool = False, why: str = "") -> t
 
 
 def batched(problem: InverseProblem) -> bool:
-    """Whether all operators take a :class:`~en4dvar.batch.Batch`."""
+    """True if all operators take a :class:`~en4dvar.model.batch.Batch`."""
     return all(getattr(part.observable.operator, "batched", False) for part in problem.parts)

@@ -1,4 +1,5 @@
-"""Whether a model gives the same numbers again: two members of an ensemble are run a second time, in another order.
+"""A check that a model gives the same numbers again: two members of an ensemble are run a second time, in another
+order.
 
 Noise in a model is not part of the observation errors: differences of members that are close measure it instead of the
 slope, and the posterior is far too sure of itself. A state that a model keeps between members makes its numbers depend
@@ -11,9 +12,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from en4dvar.errors import ConfigError
-from en4dvar.forward import ForwardModel
-from en4dvar.state import Array
+from en4dvar.model.forward import ForwardModel
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError
 
 ROUNDING = 1e-9  # of the largest value: what members of a batch may owe to those beside them
 NOT_THE_MODEL = ("TimeLimitError: ", "MemoryError: ", "a worker process died")  # reasons that depend on the machine
@@ -63,7 +64,7 @@ def check_repeats(
 
 
 def _in_batches(model: ForwardModel) -> bool:
-    """Whether the model has its own way with many members, where rounding may depend on those beside a member."""
+    """True if the model has its own way with many members, where rounding may depend on those beside a member."""
     kind = type(model)
     own = (kind.trajectories, kind.initial_states)
     return own != (ForwardModel.trajectories, ForwardModel.initial_states)

@@ -9,7 +9,7 @@ from en4dvar.executor.chunks import Outcome, cut, run_chunk
 from en4dvar.executor.limits import NO_LIMITS, Limits, TimeLimitError
 from en4dvar.executor.local import SerialExecutor, ThreadsExecutor
 from en4dvar.executor.processes import ProcessesExecutor
-from en4dvar.forward import ForwardModel
+from en4dvar.model.forward import ForwardModel
 
 __all__ = [
     "Executor",
@@ -49,7 +49,8 @@ def choose_executor(
     address: str | None = None,
     limits: Limits = NO_LIMITS,
 ) -> Executor:
-    """As asked for; by default threads on every core for compiled models and programs, else this process alone.
+    """The executor that is asked for; by default threads on every core for compiled models and programs, else this
+    process alone.
 
     With ``limits`` the default are processes, the only workers of this machine that can be held to them.
 

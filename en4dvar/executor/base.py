@@ -1,4 +1,4 @@
-"""What every executor does: calls of a function as they end, and members of a forward model in order."""
+"""The tasks of every executor: calls of a function as they end, and members of a forward model in order."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any, Self, TypeVar
 
 import numpy as np
 
-from en4dvar.errors import En4dvarError
 from en4dvar.executor.chunks import Outcome, cut, run_chunk
-from en4dvar.forward import Failure, ForwardModel
-from en4dvar.state import Array
-from en4dvar.user_code import reason_of
+from en4dvar.model.forward import Failure, ForwardModel
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.user_code import reason_of
 
 T = TypeVar("T")
 Call = tuple[Any, ...]
@@ -63,10 +63,10 @@ class Executor(ABC):
         return self._chunks(model, x, times, cut(len(x), model.batch, self.workers))
 
     def _chunks(self, model: ForwardModel, x: Array, times: Array, chunks: list[slice]) -> list[Outcome]:
-        found = dict(self.map(run_chunk, ((model, x[part], times[part]) for part in chunks)))
+        outcomes = dict(self.map(run_chunk, ((model, x[part], times[part]) for part in chunks)))
         results: list[Outcome] = []
         for i, part in enumerate(chunks):
-            outcome, size = found[i], part.stop - part.start
+            outcome, size = outcomes[i], part.stop - part.start
             if not isinstance(outcome, Exception):
                 results += outcome
             elif size > model.batch:

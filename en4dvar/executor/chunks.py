@@ -1,18 +1,42 @@
-"""Members in chunks: the unit of work that is sent to a worker."""
+"""Members in chunks: the unit of work that is sent to a worker, and what many such units have in common."""
 
 from __future__ import annotations
 
+import functools
 import itertools
+import pickle
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from en4dvar.batch import Batch
 from en4dvar.executor.limits import TimeLimitError, has_time_limit, within_time_limit
-from en4dvar.forward import Failure, ForwardModel, Trajectory
-from en4dvar.state import Array
-from en4dvar.user_code import describe, reason_of
+from en4dvar.model.batch import Batch
+from en4dvar.model.forward import Failure, ForwardModel, Trajectory
+from en4dvar.model.state import Array
+from en4dvar.plumbing.user_code import describe, reason_of
+
+T = TypeVar("T")
+
+
+class CommonValue(Generic[T]):
+    """A value that is pickled once for all calls, and made again once in each worker process."""
+
+    def __init__(self, value: T):
+        self.value = value
+
+    @functools.cached_property
+    def _pickled(self) -> bytes:
+        return pickle.dumps(self.value)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _made_again, (self._pickled,)
+
+
+@functools.lru_cache(maxsize=2)
+def _made_again(pickled: bytes) -> CommonValue[Any]:
+    return CommonValue(pickle.loads(pickled))
+
 
 Outcome = Trajectory | Failure
 

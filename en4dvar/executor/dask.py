@@ -25,7 +25,7 @@ from en4dvar.executor.base import Call, ExecutorError, T, Tell, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
 from en4dvar.executor.futures import Events, FuturesExecutor
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
-from en4dvar.user_code import in_worker, own_fault
+from en4dvar.plumbing.user_code import in_worker, own_fault
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster
@@ -60,7 +60,7 @@ class DaskExecutor(FuturesExecutor):
             import dask.config
             import distributed
         except ImportError:
-            raise ExecutorError("the dask executor needs the extra: pip install 'en4dvar[distributed]'") from None
+            raise ExecutorError("the dask executor needs dask and distributed: pip install dask distributed") from None
         self._address, self._limits = address, limits
         self._cluster: LocalCluster | None = None
         self._client: Client | None = None
@@ -99,7 +99,7 @@ class DaskExecutor(FuturesExecutor):
             message = "has no worker; start some with: dask worker" if connected else "cannot be reached"
             raise ExecutorError(f"dask scheduler {address or ''}: {message} ({error})") from None
 
-    def _submit(self, function: Callable[..., T], call: Call, tell: Tell | None) -> Future:
+    def _submit(self, function: Callable[..., T], call: Call, tell: Tell | None) -> Future[Any]:
         if self._client is None or self._client.status != "running":
             raise self._lost()
         key = f"en4dvar-{self._client.id}-{next(self._calls)}"
@@ -123,12 +123,12 @@ class DaskExecutor(FuturesExecutor):
             except queue.Empty:
                 self._require_worker()
 
-    def _give_up(self, futures: Collection[Future]) -> None:
+    def _give_up(self, futures: Collection[Future[Any]]) -> None:
         for future in futures:
             self._listening.pop(str(future.key), None)
             future.release()
 
-    def _value(self, future: Future) -> Any:
+    def _value(self, future: Future[Any]) -> Any:
         """What the call gave or raised. Waits where the value was lost with its worker and is computed again.
 
         Raises :class:`ExecutorError` where the cluster is gone.

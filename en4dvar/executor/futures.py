@@ -1,9 +1,11 @@
-"""What executors have in common whose calls run elsewhere and end as futures: in threads, processes, a cluster."""
+"""Common parts of executors whose calls run elsewhere and end as futures: in threads, processes, a cluster."""
 
 from __future__ import annotations
 
 import itertools
 import queue
+import threading
+import time
 from abc import abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -11,8 +13,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from en4dvar.executor.base import Call, Executor, Hear, T, Tell, WorkerLostError
-from en4dvar.user_code import own_fault
+from en4dvar.plumbing.children import HaltedError, end_those_of, raise_in, starts_again
+from en4dvar.plumbing.user_code import own_fault
 
+MOMENT, PATIENCE = 0.05, 1.0  # s for threads to end by themselves, and once they are told to
 Events = queue.SimpleQueue[Any]  # futures that ended, and (index, message) of what calls tell
 
 
@@ -73,7 +77,7 @@ class FuturesExecutor(Executor):
 
     @abstractmethod
     def _value(self, future: Any) -> Any:
-        """What the call of a future that ended gave or raised."""
+        """The result, or the exception, of the call of a future that ended."""
 
     @abstractmethod
     def _give_up(self, futures: Collection[Any]) -> None:
@@ -108,3 +112,28 @@ class PoolExecutor(FuturesExecutor):
         if self._pool is not None:
             self._pool.shutdown(wait=True, cancel_futures=True)
             self._pool = None
+
+    def kill(self) -> None:
+        """Stop the threads, whatever they are doing: a program is ended, Python code raises, other code is left alone.
+
+        What is left alone is waited for :data:`PATIENCE` seconds, and ends this process no later than itself; the
+        command line does not wait for it (:func:`en4dvar.cli.main`).
+        """
+        pool, self._pool = self._pool, None
+        if pool is None:
+            return
+        pool.shutdown(wait=False, cancel_futures=True)
+        threads = {thread.ident: thread for thread in pool._threads if thread.ident is not None}
+        end_those_of(threads)
+        _join(threads.values(), MOMENT)
+        for number in [number for number, thread in threads.items() if thread.is_alive()]:
+            raise_in(number, HaltedError)
+        _join(threads.values(), PATIENCE)
+        starts_again([number for number, thread in threads.items() if not thread.is_alive()])
+
+
+def _join(threads: Collection[threading.Thread], seconds: float) -> None:
+    """Wait for threads to end, not longer than so many seconds for all of them."""
+    end = time.monotonic() + seconds
+    for thread in threads:
+        thread.join(max(0.0, end - time.monotonic()))

@@ -10,21 +10,19 @@ reason, and the run goes on. Other executors share the process of the run, which
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
 import functools
 import os
 import re
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeVar
 
-from en4dvar.user_code import Stop
+from en4dvar.plumbing.children import ThreadAlarm, limit_memory
+from en4dvar.plumbing.children import TimeLimitError as TimeLimitError
 
 T = TypeVar("T")
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30, "Ti": 2**40}
@@ -52,20 +50,16 @@ class Limits:
 NO_LIMITS = Limits()
 
 
-class TimeLimitError(Stop):
-    """A batch is past its time. Not an :class:`Exception`, so that no model takes it for one of its own."""
-
-
 def parse_bytes(text: object) -> int:
     """A size of memory. Raises :class:`ValueError`.
 
     >>> parse_bytes("1.5 GB"), parse_bytes("512 MiB")
     (1500000000, 536870912)
     """
-    found = _BYTES.fullmatch(text) if isinstance(text, str) else None
-    if found is None or float(found[1]) == 0:
+    match = _BYTES.fullmatch(text) if isinstance(text, str) else None
+    if match is None or float(match[1]) == 0:
         raise ValueError(f"{text!r} is not a size of memory; write e.g. 2 GB")
-    return int(float(found[1]) * _UNITS[found[2] or ""])
+    return int(float(match[1]) * _UNITS[match[2] or ""])
 
 
 MOMENT = 0.01  # s
@@ -80,18 +74,12 @@ def apply_limits(limits: Limits) -> None:
     if limits == _limits:
         return
     _limits = limits
-    if limits.memory is not None and sys.platform == "linux":
-        import resource
-
-        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
-        held = int(status.partition("VmData:")[2].split()[0]) * 1024
-        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-        allowed = held + limits.memory
-        resource.setrlimit(resource.RLIMIT_DATA, (allowed if hard < 0 else min(allowed, hard), hard))
+    if limits.memory is not None:
+        limit_memory(limits.memory)
 
 
 def has_time_limit() -> bool:
-    """Whether batches are timed in this process, and so have to be run one by one."""
+    """True if batches are timed in this process, and so have to be run one by one."""
     return _limits.seconds is not None
 
 
@@ -104,7 +92,7 @@ def within_time_limit(batch: Callable[[], T]) -> T:
     if seconds is None:
         return batch()
     by_signal = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
-    alarm = _Signal() if by_signal else _ThreadException()
+    alarm = _Signal() if by_signal else ThreadAlarm()
     _watch(_end_of(seconds))
     try:
         try:
@@ -148,27 +136,6 @@ class _Signal:
     def stop(self) -> None:
         self.armed = False
         signal.setitimer(signal.ITIMER_REAL, 0)
-
-
-class _ThreadException:
-    """Raises :class:`TimeLimitError` in the thread that starts it, as soon as that runs Python."""
-
-    def start(self, seconds: float) -> None:
-        self.armed, self.lock, self.thread = True, threading.Lock(), ctypes.c_ulong(threading.get_ident())
-        self.timer = threading.Timer(seconds, self._raise)
-        self.timer.daemon = True
-        self.timer.start()
-
-    def _raise(self) -> None:
-        with self.lock:
-            if self.armed:
-                ctypes.pythonapi.PyThreadState_SetAsyncExc(self.thread, ctypes.py_object(TimeLimitError))
-
-    def stop(self) -> None:
-        self.timer.cancel()
-        with self.lock:
-            self.armed = False
-        ctypes.pythonapi.PyThreadState_SetAsyncExc(self.thread, None)  # set, but not raised yet
 
 
 def _end_of(seconds: float) -> float:

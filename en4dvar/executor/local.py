@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from en4dvar.executor.base import Call, Executor, Hear, T
 from en4dvar.executor.chunks import Outcome, kept, run_chunk
 from en4dvar.executor.futures import PoolExecutor
-from en4dvar.forward import ForwardModel
-from en4dvar.state import Array
-from en4dvar.user_code import own_fault
+from en4dvar.model.forward import ForwardModel
+from en4dvar.model.state import Array
+from en4dvar.plumbing.user_code import own_fault
 
 
 class SerialExecutor(Executor):
@@ -27,7 +27,7 @@ class SerialExecutor(Executor):
             yield i, value
 
     def trajectories(self, model: ForwardModel, x: Array, times: Array) -> Sequence[Outcome]:
-        """As they come from the model: nothing is cut, nothing is collected."""
+        """The trajectories as they come from the model: nothing is cut, nothing is collected."""
         return run_chunk(model, x, times)
 
     def close(self) -> None:

@@ -16,7 +16,7 @@ import traceback
 import weakref
 from collections.abc import Callable, Collection
 from concurrent.futures import Future
-from multiprocessing import get_context, parent_process
+from multiprocessing import current_process, get_context, parent_process
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
 from typing import Any
@@ -25,8 +25,10 @@ from en4dvar.executor.base import Call, ExecutorError, T, Tell, WorkerLostError
 from en4dvar.executor.blas import one_blas_thread_for_good
 from en4dvar.executor.futures import PoolExecutor
 from en4dvar.executor.limits import NO_LIMITS, Limits, apply_limits
-from en4dvar.user_code import describe, in_worker, own_fault
+from en4dvar.plumbing.files import here
+from en4dvar.plumbing.user_code import describe, in_worker, own_fault
 
+UNGUARDED = 86  # exit code of a worker that was about to start workers of its own while it read the main script
 CLOSE_TIMEOUT = 10.0  # s for a worker to end by itself
 MOST_STILLBORN = 8  # workers in a row that end before they have begun
 ANSWER, TOLD = b"a", b"t"  # what a worker sends begins with one of them
@@ -42,7 +44,7 @@ class _Worker:
 
     def __init__(self, limits: Limits):
         self.pipe, theirs = _SPAWN.Pipe()
-        self.process = _SPAWN.Process(target=_serve, args=(theirs, limits, _here()), name="en4dvar-worker")
+        self.process = _SPAWN.Process(target=_serve, args=(theirs, limits, here()), name="en4dvar-worker")
         self.process.start()
         theirs.close()  # so that its end is closed when the process ends
 
@@ -138,11 +140,15 @@ class ProcessesExecutor(PoolExecutor):
                 worker.answer()
             except _DeadError:
                 self._bury(worker)
+                if worker.process.exitcode == UNGUARDED:
+                    raise UnguardedError(
+                        "worker processes read this script again as they start, and so its runs: put what it does "
+                        "below   if __name__ == '__main__':"
+                    ) from None
                 self._stillborn += 1
                 if self._stillborn > MOST_STILLBORN:
                     raise ExecutorError(
-                        f"worker processes end while they start (exit code {worker.process.exitcode}); a script that "
-                        "starts them needs: if __name__ == '__main__':"
+                        f"worker processes end while they start (exit code {worker.process.exitcode})"
                     ) from None
             else:
                 self._stillborn = 0
@@ -182,17 +188,19 @@ class ProcessesExecutor(PoolExecutor):
         self.close()
 
 
+class UnguardedError(ExecutorError):
+    """A script starts worker processes, which run it again."""
+
+
+def end_unguarded() -> None:
+    """End a worker that conducts the runs of the main script, which it should only read."""
+    if getattr(current_process(), "_inheriting", False):
+        os._exit(UNGUARDED)
+
+
 def _end(workers: list[_Worker]) -> None:
     while workers:
         workers.pop().end()
-
-
-def _here() -> str:
-    """The current folder, "" where it was removed."""
-    try:
-        return os.getcwd()
-    except OSError:
-        return ""
 
 
 def _serve(pipe: Connection, limits: Limits, folder: str) -> None:

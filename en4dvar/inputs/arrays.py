@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.errors import DataError
-from en4dvar.hints import listed, shown, suggest
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.hints import listed, shown, suggest
 
 TIME = "time"
 VALUE = "y"
@@ -37,11 +37,11 @@ def columns_of(data: Any, time: str = TIME, value: str = VALUE) -> dict[str, Arr
     times = columns.pop(time, None)
     if times is None:
         raise DataError(f"no column {time!r} of times{suggest(time, columns)}; say which it is: time='...'")
-    found = {name: _numbers(name, column) for name, column in {TIME: times, **columns}.items()}
-    for name, column in found.items():
-        if column.shape != found[TIME].shape:
-            raise DataError(f"{name!r} has shape {column.shape}, but there are {len(found[TIME])} times")
-    return found
+    numbers = {name: _numbers(name, column) for name, column in {TIME: times, **columns}.items()}
+    for name, column in numbers.items():
+        if column.shape != numbers[TIME].shape:
+            raise DataError(f"{name!r} has shape {column.shape}, but there are {len(numbers[TIME])} times")
+    return numbers
 
 
 def _columns(data: Any, time: str, value: str) -> dict[str, Any]:
@@ -115,11 +115,11 @@ def stacked(tables: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
     {'time': array([1. , 0.5]), 'u': array([ 2., nan]), 'v': array([nan,  3.])}
     """
     ends = np.cumsum([len(table[TIME]) for table in tables])
-    found = {name: np.full(ends[-1], np.nan) for table in tables for name in table}
+    joined = {name: np.full(ends[-1], np.nan) for table in tables for name in table}
     for table, end in zip(tables, ends, strict=True):
         for name, column in table.items():
-            found[name][end - len(column) : end] = column
-    return found
+            joined[name][end - len(column) : end] = column
+    return joined
 
 
 def csv_of(columns: Mapping[str, Array]) -> str:

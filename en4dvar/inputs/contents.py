@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from en4dvar.errors import DataError
 from en4dvar.inputs.asked import ANY, Layout
 from en4dvar.inputs.matfile import mat_variables
 from en4dvar.inputs.opened import opened
 from en4dvar.inputs.parts import table_of
 from en4dvar.inputs.text_table import Table, scalars_in
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import DataError
 
 
 @dataclass(frozen=True)
@@ -37,17 +37,17 @@ def read_contents(path: Path, layout: Layout = ANY) -> Contents:
 
 
 def _mat_contents(path: Path) -> Contents:
-    found = mat_variables(path).of_first()
-    columns = found.columns()
-    words = {name: f"{path}: {name} is {kind}; save what is in it as vectors" for name, kind in found.others.items()}
+    held = mat_variables(path).of_first()
+    columns = held.columns()
+    words = {name: f"{path}: {name} is {kind}; save what is in it as vectors" for name, kind in held.others.items()}
     words |= {
-        name: f"{path}: {name} is {found.others[name]}; its columns are {name}(:,1), {name}(:,2), …, its rows "
+        name: f"{path}: {name} is {held.others[name]}; its columns are {name}(:,1), {name}(:,2), …, its rows "
         f"{name}(1,:), …"
-        for name in found.matrices
+        for name in held.matrices
     }
     for name in columns:  # a struct of which something can be read is no fault
         words.pop(name.partition(".")[0], None)
-    return Contents(columns, found.scalars, words)
+    return Contents(columns, held.scalars, words)
 
 
 def _table_contents(table: Table, scalars: Mapping[str, float]) -> Contents:

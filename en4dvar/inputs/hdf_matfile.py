@@ -14,10 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.errors import DataError
 from en4dvar.inputs.variables import MOST, MOST_IN_MATRICES, Variables, array_words, gathered
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.decoding import Allowed, decoded_whole
+from en4dvar.plumbing.errors import DataError
 
+HDF = Allowed(seconds=60, memory=8_000_000_000, size=256_000_000_000)
 DEEPEST = 4  # structs inside structs
 MOST_OBJECTS = 100_000
 FILTERS = {1, 2, 3}  # deflate, shuffle, Fletcher's checksum
@@ -28,16 +30,24 @@ Found = Iterator[tuple[str, Array | str]]
 
 def hdf_variables(path: Path) -> Variables:
     """What a ``.mat`` file of version 7.3 holds. Raises :class:`DataError`."""
+    variables: Variables = decoded_whole(variables_of_hdf, path, allowed=HDF)
+    return variables
+
+
+def variables_of_hdf(path: Path) -> Iterator[Variables]:
+    """As :func:`hdf_variables`, in the child that decodes."""
     try:
         import h5py
     except ImportError:
         raise DataError(
-            f"{path}: a MATLAB v7.3 (HDF5) file, which needs: pip install 'en4dvar[tables]'; or save it again in "
+            f"{path}: a MATLAB v7.3 (HDF5) file, which needs: pip install h5py; or save it again in "
             "MATLAB with save(..., '-v7')"
         ) from None
     try:
         with h5py.File(path, "r") as file:
-            return gathered(_Reader(file).variables())
+            yield gathered(_Reader(file).variables())
+    except MemoryError:
+        raise
     except _Refused as error:
         raise DataError(f"{path}: {error}") from None
     except Exception as error:  # h5py tells damage by OSError, RuntimeError, KeyError, ValueError, …

@@ -18,11 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.errors import DataError
 from en4dvar.inputs.hdf_matfile import hdf_variables
 from en4dvar.inputs.variables import MOST, MOST_IN_MATRICES, Variables, array_words, gathered
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.files import open_plain, read_plain
 
+LONGEST = 4_000_000_000  # bytes of a file
 HEADER = 128  # bytes
 MATRIX, COMPRESSED = 14, 15  # kinds of elements
 HEAD = 4096  # bytes of a compressed variable that tell what it is
@@ -52,24 +54,26 @@ class _Variable:
 
 def mat_variables(path: Path) -> Variables:
     """What a ``.mat`` file holds. Raises :class:`DataError`."""
-    raw = path.read_bytes()
+    with open_plain(path) as file:
+        raw = file.read(HEADER)
     if not raw.startswith((b"MATLAB 5.0", b"MATLAB 7.3")):
         raise DataError(f"{path}: not a MATLAB v5 file (no such header); save it in MATLAB with save(..., '-v7')")
     order = {b"IM": "<", b"MI": ">"}.get(raw[126:HEADER], "")
     if raw.startswith(b"MATLAB 7.3") or (order and struct.unpack_from(f"{order}H", raw, 124)[0] == 0x0200):
         return hdf_variables(path)
+    raw = read_plain(path, LONGEST)
     try:
         if not order:
             raise _Damaged("its header does not say in which order bytes are")
-        found = _variables(memoryview(raw), order)
+        variables = _variables(memoryview(raw), order)
     except _Damaged as error:
         raise DataError(f"{path}: not a MATLAB v5 file ({error})") from None
-    return gathered((v.name, v.words if v.values is None else v.values) for v in found)
+    return gathered((v.name, v.words if v.values is None else v.values) for v in variables)
 
 
 def _variables(raw: memoryview, order: str) -> list[_Variable]:
     """Named variables of a file; of two with one name the last. Raises :class:`_Damaged`."""
-    elements, found, numbers, in_matrices = _Elements(raw[HEADER:], order), {}, 0, 0
+    elements, by_name, numbers, in_matrices = _Elements(raw[HEADER:], order), {}, 0, 0
     while elements.left >= 8:
         kind, content = elements.long()
         if kind == 0:
@@ -89,8 +93,8 @@ def _variables(raw: memoryview, order: str) -> list[_Variable]:
             if numbers > MOST:
                 raise _Damaged(f"more than {MOST} numbers in vectors")
             if variable.name and not variable.name.startswith("__"):
-                found[variable.name] = variable
-    return list(found.values())
+                by_name[variable.name] = variable
+    return list(by_name.values())
 
 
 def _unpacked(packed: memoryview, order: str) -> list[_Variable]:

@@ -8,15 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.errors import DataError
-from en4dvar.hints import listed, no_such_file, suggest
 from en4dvar.inputs.contents import read_contents
-from en4dvar.state import Array
-from en4dvar.units import UnitError, convert
+from en4dvar.inputs.opened import require_file
+from en4dvar.model.state import Array
+from en4dvar.plumbing.decoding import require_plain
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.hdf5 import ForeignDataError, require_whole
+from en4dvar.plumbing.hints import listed, suggest
+from en4dvar.plumbing.units import UnitError, convert
 
 NETCDF = (".nc", ".nc4", ".cdf")
 DRAWS = ("chain", "draw", "member", "sample", "realization", "ensemble")  # dimensions along which members lie
 MOST_MEMBERS = 1_000_000
+LARGEST = 256_000_000_000  # bytes of a file
 
 
 def read_members(path: Path, units: Mapping[str, tuple[str, str]]) -> dict[str, Array]:
@@ -30,14 +34,13 @@ def read_members(path: Path, units: Mapping[str, tuple[str, str]]) -> dict[str, 
     ------
     DataError: the file cannot be read, lacks a name or a unit, or holds numbers that are not finite.
     """
-    if not path.is_file():
-        raise DataError(no_such_file(path))
-    found = _of_netcdf(path, units) if path.suffix.lower() in NETCDF else _of_table(path, units)
-    lengths = {name: len(values) for name, (values, _) in found.items()}
+    require_file(path)
+    columns = _of_netcdf(path, units) if path.suffix.lower() in NETCDF else _of_table(path, units)
+    lengths = {name: len(values) for name, (values, _) in columns.items()}
     if len(set(lengths.values())) != 1:
         raise DataError(f"{path}: unequal numbers of members: {listed([f'{k} {n}' for k, n in lengths.items()])}")
     members = {}
-    for name, (values, unit) in found.items():
+    for name, (values, unit) in columns.items():
         if not np.all(np.isfinite(values)):
             raise DataError(
                 f"{path}: {name} has {int(np.sum(~np.isfinite(values)))} members that are not finite numbers"
@@ -68,23 +71,25 @@ def _of_table(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, st
 def _of_netcdf(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, str]]:
     import netCDF4  # a tenth of a second that other files do not need
 
+    require_plain(path, LARGEST)
     try:
+        require_whole(path)
         with netCDF4.Dataset(path) as file:
             group = file.groups.get("posterior", file)
             stats = file.groups.get("sample_stats") if group is not file else None
             alive = None
             if stats is not None and "active" in stats.variables:
                 alive = _numbers(path, stats.variables["active"]) > 0
-            found = {}
+            members = {}
             for name in names:
                 if name not in group.variables:
                     raise DataError(f"{path}: no variable {name!r}{suggest(name, group.variables)}")
                 variable = group.variables[name]
                 values = _numbers(path, variable)
                 values = values[alive] if alive is not None and len(alive) == len(values) else values
-                found[name] = values, str(getattr(variable, "units", ""))
-            return found
-    except (OSError, RuntimeError) as error:
+                members[name] = values, str(getattr(variable, "units", ""))
+            return members
+    except (OSError, RuntimeError, ForeignDataError) as error:
         raise DataError(f"{path}: cannot be read as netCDF: {error}") from None
 
 

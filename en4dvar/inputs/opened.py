@@ -5,13 +5,14 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import get_args
 
-from en4dvar.errors import DataError
-from en4dvar.hints import no_such_file
 from en4dvar.inputs.asked import SUFFIXES, Format, Layout
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.files import kind_of
+from en4dvar.plumbing.hints import no_such_file
 
 SHEETS = (".xls", ".xlsb", ".ods")
 
@@ -25,7 +26,7 @@ def opened(path: Path, layout: Layout) -> Iterator[Format]:
         hint = (
             "save the sheet as CSV"
             if path.suffix.lower() in SHEETS
-            else f"write format: {' or '.join(get_args(Format))}"
+            else f"say what it is (data.format: {', '.join(get_args(Format))})"
         )
         raise DataError(f"{path}: the format cannot be told from the suffix {path.suffix!r}; {hint}")
     with readable(path):
@@ -47,5 +48,8 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def require_file(path: Path) -> None:
+    """Raises :class:`DataError` where there is no plain file: nothing, a directory, a pipe, a device."""
     if not os.path.isfile(path):  # Path.is_file raises for a name that is too long, or in a closed folder
-        raise DataError(f"{path}: is a directory" if os.path.isdir(path) else no_such_file(path))
+        with suppress(OSError):
+            raise DataError(f"{path}: is {kind_of(os.stat(path).st_mode)}, not a file")
+        raise DataError(no_such_file(path))

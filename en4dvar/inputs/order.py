@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.errors import DataError
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import DataError
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ def _disorder(before: int, after: int, first: int, written: Written) -> str:
         hint = (
             f"; if another bubble begins here, give it a file of its own or say whose each row is (data.by); or {sort}"
         )
-    unit = written.unit
-    return f"{where}: times must increase, but {times[after]:g} {unit} follows {times[before]:g} {unit}{hint}"
+    unit = "" if "*" in written.unit else f" {written.unit}"
+    return f"{where}: times must increase, but {times[after]:g}{unit} follows {times[before]:g}{unit}{hint}"
 
 
 class Means:

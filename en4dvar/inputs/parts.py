@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.errors import DataError
-from en4dvar.hints import listed
 from en4dvar.inputs.asked import ANY, Column, Format, Layout
 from en4dvar.inputs.matfile import mat_variables
 from en4dvar.inputs.opened import format_of, opened
 from en4dvar.inputs.sheets import sheet_lines
 from en4dvar.inputs.text_table import Table, matches, scalars_in
 from en4dvar.inputs.variables import Variables, indexed
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.hints import listed
 
 
 def columns_of(
@@ -33,8 +33,8 @@ def columns_of(
             scalars = scalars_in(path) if kind == "csv" else {}
             return _of_table(table, wanted), scalars, [line for line, _ in table.rows]
         _refuse_by(path, layout)
-        found = mat_variables(path).of(part)
-        return {name: _of_mat(found, name, path) for name in wanted}, found.scalars, []
+        variables = mat_variables(path).of(part)
+        return {name: _of_mat(variables, name, path) for name in wanted}, variables.scalars, []
 
 
 def parts_of(path: Path, value: Column, layout: Layout = ANY, time: str | None = None) -> tuple[str, ...]:
@@ -49,19 +49,19 @@ def parts_of(path: Path, value: Column, layout: Layout = ANY, time: str | None =
         return ()  # whatever is in the file: of 10⁵ files each is opened where it is estimated
     with opened(path, layout) as kind:
         if kind != "mat":
-            table = table_of(path, kind, layout, [value.name, *(one for one in (time, layout.by) if one is not None)])
+            table = table_of(path, kind, layout, [value.name, *(c for c in (time, layout.by) if c is not None)])
             if layout.by is not None:
                 return _groups(table, layout.by)
             if value.name in table.names:
                 return ()
             return tuple(name for name in table.names if matches(name, value.name) and name != time)
         _refuse_by(path, layout)
-        found = mat_variables(path)
+        variables = mat_variables(path)
     if several:
-        return tuple(name for name in found.matching(value.name) if name != time)
-    if found.vector(value.name) is not None:
+        return tuple(name for name in variables.matching(value.name) if name != time)
+    if variables.vector(value.name) is not None:
         return ()
-    return tuple(i for name, i in map(indexed, found.vectors) if i and name == value.name)
+    return tuple(i for name, i in map(indexed, variables.vectors) if i and name == value.name)
 
 
 def table_of(path: Path, kind: Format, layout: Layout, wanted: Sequence[str] = ()) -> Table:
@@ -99,15 +99,15 @@ def _of_table(table: Table, wanted: Sequence[str]) -> dict[str, Array]:
     return columns
 
 
-def _of_mat(found: Variables, name: str, path: Path) -> Array:
+def _of_mat(variables: Variables, name: str, path: Path) -> Array:
     """A vector by its name. Raises :class:`DataError`."""
-    vector = found.vector(name)
+    vector = variables.vector(name)
     if vector is not None:
         return np.asarray(vector, dtype=float)
-    kind = found.others.get(name)
+    kind = variables.others.get(name)
     fault = f"is {kind}, not a row or column of real numbers" if kind else "is not in the file"
-    rest = [f"{k} ({what})" for k, what in found.others.items() if k != name]
-    there = f"{listed(sorted(found.vectors)) or 'none'}{'; no vectors: ' * bool(rest)}{listed(rest)}"
-    matrix = name if name in found.matrices else next(iter(found.matrices), None)
+    rest = [f"{k} ({what})" for k, what in variables.others.items() if k != name]
+    there = f"{listed(sorted(variables.vectors)) or 'none'}{'; no vectors: ' * bool(rest)}{listed(rest)}"
+    matrix = name if name in variables.matrices else next(iter(variables.matrices), None)
     hint = f"; columns of a matrix are {matrix}(:,1), {matrix}(:,2), …" if matrix else ""
     raise DataError(f"{path}: field {name!r} {fault}; the vectors are: {there}{hint}")

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.errors import DataError
-from en4dvar.hints import suggest
 from en4dvar.inputs.asked import ANY, Column, Layout, TimeStep
 from en4dvar.inputs.order import Means, Written, in_order
 from en4dvar.inputs.parts import columns_of
-from en4dvar.state import Array
-from en4dvar.units import convert
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.hints import suggest
+from en4dvar.plumbing.units import convert
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,10 @@ def read_series(
         raise DataError(f"{path}: {value.name!r} is empty")
     if len(times) != len(values):
         raise DataError(f"{path}: {len(times)} times but {len(values)} values of {value.name!r}")
-    first = 0 if lines and not value.positive else int(np.argmax(np.nan_to_num(values) != 0))
+    zero = bool(lines) and not value.positive
+    first = 0 if zero else int(np.argmax(np.nan_to_num(values) != 0))
     kept = np.arange(first, len(values))[~(np.isnan(times) | np.isnan(values))[first:]]
-    _check(times[kept], values[kept], value.name, path, fewest)
+    _check(times[kept], values[kept], value.name, path, fewest, zero)
     if repeats:
         kept = kept[np.argsort(times[kept], kind="stable")]
     stated = {column.name: _stds(columns[column.name], column, kept, len(values), path) for column in errors}
@@ -106,9 +107,12 @@ def _stds(written: Array, column: Column, kept: npt.NDArray[np.intp], count: int
     return stds
 
 
-def _check(times: Array, values: Array, name: str, path: Path, fewest: int) -> None:
-    if not len(values) or not np.any(values):
-        raise DataError(f"{path}: {name!r} holds no usable value (all NaN, blank or zero)")
+def _check(times: Array, values: Array, name: str, path: Path, fewest: int, zero: bool) -> None:
+    """Raise :class:`DataError` where readings are of no use; ``zero``: all of them may be."""
+    if not len(values) or not (zero or np.any(values)):
+        raise DataError(
+            f"{path}: {name!r} holds no usable value (all NaN{', or blank' if zero else ', blank or zero'})"
+        )
     if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values))):
         raise DataError(f"{path}: infinite values")
     if len(values) < fewest:

@@ -9,18 +9,22 @@ from __future__ import annotations
 import re
 import warnings
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from en4dvar.errors import DataError
-from en4dvar.hints import listed, suggest
 from en4dvar.inputs.text_table import WIDEST, Lines
+from en4dvar.plumbing.decoding import Allowed, decoded_whole
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.hints import listed, suggest
 
 if TYPE_CHECKING:
     from openpyxl.worksheet._read_only import ReadOnlyWorksheet
 
 LARGEST = 1 << 28  # bytes that the parts of a workbook unpack to
 MOST_PARTS = 2_000
+MOST_CELLS = 10_000_000
+WORKBOOK = Allowed(seconds=60, memory=4_000_000_000, size=LARGEST)
 MOST_ROWS = 1 << 20  # of a sheet: what Excel itself allows
 _RANGE = re.compile(r"\$?[A-Za-z]{1,3}\$?[1-9]\d{0,6}(:\$?[A-Za-z]{1,3}\$?[1-9]\d{0,6})?")
 
@@ -30,6 +34,12 @@ def sheet_lines(path: Path, asked: str) -> Lines:
 
     Raises :class:`DataError`.
     """
+    lines: Lines = decoded_whole(lines_of_workbook, path, asked, allowed=WORKBOOK)
+    return lines
+
+
+def lines_of_workbook(path: Path, asked: str) -> Iterator[Lines]:
+    """As :func:`sheet_lines`, in the child that decodes."""
     name, area = _parts(asked)
     _check(path)
     try:
@@ -38,11 +48,11 @@ def sheet_lines(path: Path, asked: str) -> Lines:
         blank = any(None in cells for _, cells in stored)
         if blank:
             _refuse_formulas(path, stored, _rows(path, name, area, formulas=True))
-    except DataError:
+    except (DataError, MemoryError):
         raise
     except Exception as error:  # whatever openpyxl stumbles over: it trusts what is in the archive
         raise DataError(f"{path}: not a workbook that can be read ({type(error).__name__}); save it as CSV") from None
-    return [(number, cells) for number, cells in rows if cells]
+    yield [(number, cells) for number, cells in rows if cells]
 
 
 def _parts(asked: str) -> tuple[str, str]:
@@ -79,7 +89,7 @@ def _rows(path: Path, name: str, area: str, formulas: bool) -> list[tuple[int, t
     try:
         from openpyxl import load_workbook
     except ImportError:
-        raise DataError(f"{path}: Excel needs: pip install 'en4dvar[tables]'; or save the sheet as CSV") from None
+        raise DataError(f"{path}: Excel needs: pip install openpyxl; or save the sheet as CSV") from None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of styles and extensions that openpyxl leaves out
         book = load_workbook(path, read_only=True, data_only=not formulas, keep_links=False)
@@ -87,12 +97,15 @@ def _rows(path: Path, name: str, area: str, formulas: bool) -> list[tuple[int, t
             sheet = _sheet(book, name, path)
             sheet.reset_dimensions()  # the stated ones may be wrong
             bounds = _bounds(area)
-            found = []
+            rows, count = [], 0
             for number, cells in enumerate(sheet.iter_rows(**bounds, values_only=True), bounds.get("min_row", 1)):
                 if number > MOST_ROWS or len(cells) > WIDEST:
                     raise DataError(f"{path}: more than {MOST_ROWS} rows or {WIDEST} columns in sheet {sheet.title!r}")
-                found.append((number, cells))
-            return found
+                count += len(cells) + 1
+                if count > MOST_CELLS:
+                    raise DataError(f"{path}: more than {MOST_CELLS} cells in sheet {sheet.title!r}, with blank ones")
+                rows.append((number, cells))
+            return rows
         finally:
             book.close()
 

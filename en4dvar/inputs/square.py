@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.errors import DataError
 from en4dvar.inputs.asked import Matrix
 from en4dvar.inputs.opened import readable, require_file
 from en4dvar.inputs.text_table import cells_of, check_width, delimiter_of, number_in, numbered_lines
-from en4dvar.state import Array
-from en4dvar.units import convert
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.units import convert
 
 
 def read_covariance(matrix: Matrix) -> Array:

@@ -11,9 +11,9 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from en4dvar.caution import Caution, caution
-from en4dvar.state import Array
-from en4dvar.units import convert
+from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution, caution
+from en4dvar.plumbing.units import convert
 
 MOSTLY = 0.8  # of the steps are whole frames: this is a film
 WHOLE = 0.1  # of a frame: times may be rounded

@@ -16,14 +16,16 @@ from typing import Literal
 
 import numpy as np
 
-from en4dvar.errors import DataError
-from en4dvar.hints import listed, short
-from en4dvar.state import Array
-from en4dvar.units import UnitError, parse_unit
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.files import read_plain
+from en4dvar.plumbing.hints import listed, short
+from en4dvar.plumbing.units import UnitError, parse_unit
 
 Lines = Sequence[tuple[int, str | Sequence[str]]]
 Decimal = Literal[".", ","]
 COMMENT = ("#", "%", "//")
+LONGEST = 1_000_000_000  # bytes of a file
 WIDEST = 10_000  # columns
 BLANK = ("", "nan", "na", "n/a", "-")
 PREAMBLE = 200  # lines among which the names of the columns are looked for
@@ -40,11 +42,11 @@ def numbered_lines(path: Path) -> list[tuple[int, str]]:
 def scalars_in(path: Path) -> dict[str, float]:
     """What comments such as ``# Req = 21.79`` say, by name."""
     said = filter(None, (_SCALAR.fullmatch(line.strip()) for line in _text(path).splitlines()))
-    return {found[1]: float(found[2]) for found in said if _is_number(found[2])}
+    return {match[1]: float(match[2]) for match in said if _is_number(match[2])}
 
 
 def _text(path: Path) -> str:
-    raw = path.read_bytes()
+    raw = read_plain(path, LONGEST)
     marked = raw.startswith((b"\xff\xfe", b"\xfe\xff"))
     for encoding in ("utf-16",) if marked else ("utf-8-sig", "cp1252"):
         try:

@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from en4dvar.inputs.text_table import WIDEST
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 
 T = TypeVar("T")
 MOST = 1 << 25  # numbers in all vectors of a file: 256 MiB, whatever a small compressed file may unpack to
@@ -39,11 +39,11 @@ class Variables:
 
     def vector(self, name: str) -> Array | None:
         """A vector by its name, also of a matrix; None where there is none."""
-        found = _OF_MATRIX.fullmatch(name)
-        if name in self.vectors or found is None or found[1] not in self.matrices:
+        match = _OF_MATRIX.fullmatch(name)
+        if name in self.vectors or match is None or match[1] not in self.matrices:
             return self.vectors.get(name)
-        matrix, index = self.matrices[found[1]], int(found[2] or found[3]) - 1
-        of = matrix.T if found[2] else matrix
+        matrix, index = self.matrices[match[1]], int(match[2] or match[3]) - 1
+        of = matrix.T if match[2] else matrix
         return of[index] if index < len(of) else None
 
     def matching(self, pattern: str) -> tuple[str, ...]:
@@ -72,11 +72,11 @@ class Variables:
 
     def columns(self) -> dict[str, Array]:
         """Vectors of more than one number, and the columns of narrow matrices."""
-        found = {name: vector for name, vector in self.vectors.items() if vector.size > 1}
+        columns = {name: vector for name, vector in self.vectors.items() if vector.size > 1}
         for name, matrix in self.matrices.items():
             if matrix.shape[1] <= SHOWN:
-                found |= {f"{name}(:,{k + 1})": column for k, column in enumerate(matrix.T)}
-        return found
+                columns |= {f"{name}(:,{k + 1})": column for k, column in enumerate(matrix.T)}
+        return columns
 
 
 def array_words(shape: Sequence[int]) -> str:
@@ -84,9 +84,9 @@ def array_words(shape: Sequence[int]) -> str:
     return f"an array of {' x '.join(map(str, shape))}"
 
 
-def gathered(found: Iterable[tuple[str, Array | str]]) -> Variables:
+def gathered(elements: Iterable[tuple[str, Array | str]]) -> Variables:
     """Variables of named vectors and matrices, or words in their place; of two with one name the last."""
-    every = dict(found)
+    every = dict(elements)
     numbers = {name: it for name, it in every.items() if not isinstance(it, str)}
     vectors = {name: it for name, it in numbers.items() if it.ndim == 1}
     matrices = {name: it for name, it in numbers.items() if it.ndim == 2}
@@ -97,17 +97,17 @@ def gathered(found: Iterable[tuple[str, Array | str]]) -> Variables:
 
 def indexed(name: str) -> tuple[str, str]:
     """``expts(2).R`` as ``expts.R`` and ``2``, ``C{3}`` as ``C`` and ``3``; by the first index, "" without one."""
-    found = _INDEX.search(name)
-    return (name[: found.start()] + name[found.end() :], found[1] or found[2]) if found else (name, "")
+    match = _INDEX.search(name)
+    return (name[: match.start()] + name[match.end() :], match[1] or match[2]) if match else (name, "")
 
 
-def _element(found: Mapping[str, T], part: str) -> dict[str, T]:
-    inside = {name: value for whole, value in found.items() for name, i in (indexed(whole),) if i and i == part}
-    return {**found, **inside}
+def _element(elements: Mapping[str, T], part: str) -> dict[str, T]:
+    inside = {name: value for whole, value in elements.items() for name, i in (indexed(whole),) if i and i == part}
+    return {**elements, **inside}
 
 
-def _first(found: Mapping[str, T]) -> dict[str, T]:
+def _first(elements: Mapping[str, T]) -> dict[str, T]:
     kept: dict[str, T] = {}
-    for whole, value in found.items():
+    for whole, value in elements.items():
         kept.setdefault(indexed(whole)[0], value)
     return kept

@@ -13,10 +13,10 @@ from typing import Literal
 
 import numpy as np
 
-from en4dvar.errors import DataError
-from en4dvar.hints import shown
-from en4dvar.state import Array
-from en4dvar.units import UnitError, parse_quantity
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.hints import shown
+from en4dvar.plumbing.units import UnitError, parse_quantity
 
 _MINIMUM = re.compile(r"minimum(?:\s+(\d+))?")
 
@@ -30,14 +30,17 @@ class Instant:
     time: float = 0.0
 
 
+BY_NAME: dict[str, Instant] = {kind: Instant(kind) for kind in ("start", "end", "maximum")}
+
+
 def parse_instant(text: str | float, time_unit: str, symbols: Collection[str] = ()) -> Instant:
     """``start``, ``end``, ``maximum`` (or ``R_max`` for R among ``symbols``), ``minimum 2``, or a time with its unit.
 
     Raises :class:`UnitError` (a ``ValueError``) for anything else.
     """
     word = str(text).strip()
-    if word in ("start", "end", "maximum"):
-        return Instant(word)  # type: ignore[arg-type]
+    if word in BY_NAME:
+        return BY_NAME[word]
     if word.endswith("_max") and word.removesuffix("_max") in symbols:
         return Instant("maximum")
     minimum = _MINIMUM.fullmatch(word)
@@ -73,13 +76,13 @@ def _index(times: Array, values: Array, instant: Instant, first: int, prominence
         return int(np.searchsorted(times, instant.time + (rounding if last else -rounding), side)) - last
     if instant.kind == "maximum":
         return first + int(np.argmax(values[first:]))
-    found = minima(values[first:], prominence)
-    if instant.number > len(found):
+    indices = minima(values[first:], prominence)
+    if instant.number > len(indices):
         raise DataError(
-            f"the window asks for minimum {instant.number}, but only {len(found)} minima with a prominence of "
+            f"the window asks for minimum {instant.number}, but only {len(indices)} minima with a prominence of "
             f"{prominence:.0%} of the range follow its start"
         )
-    return first + int(found[instant.number - 1])
+    return first + int(indices[instant.number - 1])
 
 
 def minima(values: Array, prominence: float = 0.1) -> Array:
@@ -88,5 +91,5 @@ def minima(values: Array, prominence: float = 0.1) -> Array:
 
     if len(values) < 3:
         return np.empty(0, dtype=int)
-    found, _ = find_peaks(-values, prominence=prominence * np.ptp(values))
-    return np.asarray(found)
+    indices, _ = find_peaks(-values, prominence=prominence * np.ptp(values))
+    return np.asarray(indices)

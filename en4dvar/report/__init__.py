@@ -11,27 +11,32 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from en4dvar.errors import OutputError
+from en4dvar.estimation.summary import summary_rows
 from en4dvar.executor import ProcessesExecutor, SerialExecutor, WorkerLostError
-from en4dvar.files import inside, make_folder, write_text
-from en4dvar.hints import suggest
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.files import inside, make_folder, write_text
+from en4dvar.plumbing.hints import suggest
+from en4dvar.plumbing.tables import write_csv
 from en4dvar.report.drawing import draw
 from en4dvar.report.figures import all_figures
 from en4dvar.report.overview import SetSummary, overview_figures, render_overview
 from en4dvar.report.page import IDENTIFIERS, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, Lines, response_lines
 from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
-from en4dvar.storage.campaign_file import failed_datasets
-from en4dvar.storage.joint_file import FILE
-from en4dvar.storage.pack import PACK
-from en4dvar.storage.population_file import FILE as POPULATION
-from en4dvar.storage.store import StoredResult, load_stored, result_files
-from en4dvar.summary import summary_rows
-from en4dvar.tables import write_csv
+from en4dvar.report.withheld import COLUMNS as WITHHELD_COLUMNS
+from en4dvar.report.withheld import withheld_lines
+from en4dvar.results.campaign_file import failed_datasets
+from en4dvar.results.joint_file import FILE
+from en4dvar.results.pack import PACK
+from en4dvar.results.population_file import FILE as POPULATION
+from en4dvar.results.store import StoredResult, load_stored, result_files
 
 PAGES = 40  # data sets of a campaign with a page from the start
 SHARE = 20  # pages that are worth the start of a process
-TABLES = {"what_if.csv": SHIFT_COLUMNS, "ledger.csv": ENTRY_COLUMNS, "varying.csv": PIECE_COLUMNS}
+TABLES = {
+    "what_if.csv": SHIFT_COLUMNS, "ledger.csv": ENTRY_COLUMNS, "varying.csv": PIECE_COLUMNS,
+    "withheld.csv": WITHHELD_COLUMNS,
+}  # fmt: skip
 JOINT_FILES = ("joint.html", "joint.csv")  # of a joint estimate
 POPULATION_FILES = ("population.html", "population.csv", "population.tex")
 
@@ -54,7 +59,7 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
     stored, whole = result_files(run_dir), run_dir / "posterior.nc"
     if stored == [whole]:
         result = load_stored(whole)
-        write_csv(run_dir / "summary.csv", summary_rows([(result.name, result.summary(), result.cautions)], {}))
+        write_csv(run_dir / "summary.csv", summary_rows([(result.name, result.rows, result.cautions)], {}))
         _write_tables(run_dir, [_lines(result)])
         figures = draw(all_figures(result), IDENTIFIERS, inside(run_dir, "figures") if files else None)
         return write_text(run_dir / "report.html", render_set(result, figures, copies=files))
@@ -71,7 +76,7 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
 
 def _lines(result: StoredResult) -> tuple[Lines, ...]:
     """Of each of :data:`TABLES`, the name of the data set first."""
-    return *response_lines(result), piece_lines(result)
+    return *response_lines(result), piece_lines(result), withheld_lines(result)
 
 
 def _write_tables(run_dir: Path, sets: Sequence[tuple[Lines, ...]]) -> None:
@@ -100,12 +105,12 @@ def _write_campaign(
     paged = [s for s in sets if s.stem in asked | first or (folder / f"{s.stem}.html").is_file()]
     workers = min(workers, len(paged) // SHARE)
     calls: list[tuple[Path, str, str | None, list[tuple[str, str]]]] = []
-    for before, one, after in zip([None, *paged[:-1]], paged, [*paged[1:], None], strict=True):
+    for before, listed, after in zip([None, *paged[:-1]], paged, [*paged[1:], None], strict=True):
         neighbours = (("← ", before), ("→ ", after))
         trail = [("All data sets", "../report.html")]
         trail += [(f"{arrow}{s.name}", quote(f"{s.stem}.html")) for arrow, s in neighbours if s is not None]
-        copies = f"{one.stem}_" if files and (one.stem in asked or not asked) else None
-        calls.append((run_dir, one.stem, copies, trail))
+        copies = f"{listed.stem}_" if files and (listed.stem in asked or not asked) else None
+        calls.append((run_dir, listed.stem, copies, trail))
     with ProcessesExecutor(workers) if workers > 1 else SerialExecutor() as executor:
         for i, value in executor.map(_write_page, calls):
             if isinstance(value, WorkerLostError):

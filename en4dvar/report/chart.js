@@ -11,8 +11,8 @@ for (const svg of document.querySelectorAll("figure svg")) {
       const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
       const box = panel.getBBox();
       const [across, up] = [(at.x - box.x) / box.width, 1 - (at.y - box.y) / box.height];
-      const y = "log" in panel.dataset ? (y0 * (y1 / y0) ** up).toPrecision(3) : short(y0 + (y1 - y0) * up, y1 - y0);
-      text.textContent = `${short(x0 + (x1 - x0) * across, x1 - x0)}, ${y}`;
+      const at_share = (low, high, share, log) => log ? (low * (high / low) ** share).toPrecision(3) : short(low + (high - low) * share, high - low);
+      text.textContent = `${at_share(x0, x1, across, "xlog" in panel.dataset)}, ${at_share(y0, y1, up, "log" in panel.dataset)}`;
       text.setAttribute("text-anchor", across > 0.5 ? "end" : "start");
       text.setAttribute("x", at.x + (across > 0.5 ? -3 : 3));
       text.setAttribute("y", at.y - 3);

@@ -2,21 +2,21 @@
 
 One description serves the page (:mod:`en4dvar.report.svg`, in milliseconds) and paper (:mod:`en4dvar.report.paper`,
 PDF and PNG by matplotlib, whose import and layout would take longer than the estimate). Colours are names of
-:data:`~en4dvar.report.palette.LIGHT`, lengths points (1/72 inch), labels text with mathtext symbols.
+:data:`~en4dvar.report.palette.LIGHT` or hexadecimal, lengths points (1/72 inch), labels text with mathtext symbols.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 
-Kind = Literal["line", "dots", "rings", "ticks", "dashes", "band", "bars", "rule", "upright", "span"]
+Kind = Literal["line", "dots", "rings", "ticks", "dashes", "band", "bars", "rule", "upright", "span", "tiles"]
 POINTS = 72 / 2.54  # a centimetre
 COLUMN, PAGE = 8.5 * POINTS, 17.5 * POINTS  # one journal column, and two
 Values = npt.ArrayLike
@@ -28,7 +28,7 @@ class Mark:
 
     ``size``: width of a line, diameter of a dot. ``dash``: "", "--" or ":". Marks of one ``label`` are one entry of the
     legend. A ``rule`` lies at ``y``, an ``upright`` at ``x`` up to 85 % of the height; a ``span`` reaches from ``y`` to
-    ``top``.
+    ``top``. ``tiles`` are rectangles about ``x`` and ``y``, whose width and height are ``top``.
     """
 
     kind: Kind
@@ -49,15 +49,16 @@ class Mark:
     @property
     def heights(self) -> Array:
         """What the panel must be high enough for."""
-        return np.concatenate([self.y, self.top])
+        return self.y if self.kind == "tiles" else np.concatenate([self.y, self.top])
 
 
 @dataclass
 class Panel:
     """Two axes and what is drawn between them.
 
-    ``xticks``, ``yticks``: how many intervals at most, or the ticks themselves; ``names``: words below ``xticks`` in
-    place of numbers. ``bare``: nothing but ``words``, in the middle; ``limits`` left None follow the marks.
+    ``xticks``, ``yticks``: how many intervals at most, or the ticks themselves; ``names``, ``y_names``: words in place
+    of their numbers. A ``title`` may have several lines. ``bare``: nothing but ``words``, in the middle. Limits
+    that are None follow the marks.
     """
 
     xlabel: str = ""
@@ -70,12 +71,14 @@ class Panel:
     yticks: int | Sequence[float] = 5
     whole: bool = False  # only whole numbers along x
     logarithmic: bool = False  # along y
+    x_logarithmic: bool = False
     x_numbers: bool = True
     y_numbers: bool = True
     left: bool = True  # an axis on the left
     grid: bool = False
     legend: bool = False
     names: Sequence[str] = ()
+    y_names: Sequence[str] = ()
     bare: bool = False
     words: str = ""
     marks: list[Mark] = field(default_factory=list)
@@ -118,15 +121,32 @@ class Panel:
             return
         bins = int(np.clip(np.ceil(2 * values.size ** (1 / 3)), 6, 30))  # Rice's rule
         counts, edges = np.histogram(values, bins)
-        x, y = np.repeat(edges, 2), np.concatenate([[0.0], np.repeat(counts / counts.max(), 2), [0.0]])
-        self.band(x, np.zeros(len(x)), y, colour, alpha)
-        self.line(x, y, colour, 0.8)
+        self.stairs(edges, counts / counts.max(), colour, alpha)
+
+    def stairs(
+        self, edges: Values, heights: Values, colour: str, alpha: float, size: float = 0.8, dash: str = "",
+        label: str = "",
+    ) -> None:  # fmt: skip
+        """Bars (m,) side by side between edges (m + 1,): their outline, filled where ``alpha`` is not zero."""
+        x, y = np.repeat(np.asarray(edges, dtype=float), 2), np.pad(np.repeat(np.asarray(heights, dtype=float), 2), 1)
+        if alpha:
+            self.band(x, np.zeros(len(x)), y, colour, alpha, label)
+        self.line(x, y, colour, size, dash, label)
+
+    def intervals(self, low: Values, high: Values, y: Values, colour: str, size: float = 1.1, label: str = "") -> None:
+        """A level line from ``low`` to ``high`` (n,) at each ``y`` (n,)."""
+        ends = np.column_stack([low, high, np.full(np.shape(low), np.nan)])
+        self.line(ends, np.repeat(np.asarray(y, dtype=float), 3), colour, size, label=label)
+
+    def tiles(self, x: Values, y: Values, size: tuple[float, float], colour: str) -> None:
+        """Rectangles about ``x`` and ``y`` (n,), ``size`` wide and high."""
+        self._add("tiles", x, y, size, colour, 0.0, 1.0, "", "")
 
     def limits(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Of both axes; where they are not given, those of the marks and 5 % around."""
         x = np.concatenate([np.empty(0), *(m.x for m in self.marks)])
         y = np.concatenate([np.empty(0), *(m.heights for m in self.marks)])
-        return self.xlim or _around(x), self.ylim or _around(y, self.logarithmic)
+        return self.xlim or _around(x, self.x_logarithmic), self.ylim or _around(y, self.logarithmic)
 
     def entries(self) -> list[str]:
         """Labels of the legend, each once."""
@@ -160,17 +180,42 @@ class Chart:
         return sum(row.height for row in self.rows)
 
 
-def in_columns(panels: Iterable[Panel], height: float, columns: int = 2) -> Chart:
+def in_columns(panels: Iterable[Panel], height: float, columns: int = 2, width: float = COLUMN) -> Chart:
     """Panels in rows of up to ``columns``; empty places are bare."""
     held = list(panels)
     columns = min(columns, len(held))
     held += [Panel(bare=True) for _ in range(-len(held) % columns)]
-    return Chart([Row(height, held[i : i + columns]) for i in range(0, len(held), columns)])
+    return Chart([Row(height, held[i : i + columns]) for i in range(0, len(held), columns)], width)
+
+
+def stacked(panels: Sequence[Panel], height: float, xlabel: str, width: float = COLUMN) -> Chart:
+    """Panels below each other with one axis along x, and a legend of all their marks above."""
+    *others, last = panels
+    for panel in others:
+        panel.x_numbers = False
+    last.xlabel, first = xlabel, panels[0]
+    first.legend = any(mark.label for panel in panels for mark in panel.marks)
+    for mark in [mark for panel in panels for mark in panel.marks if mark.label]:
+        if mark.label not in first.entries():
+            first.marks.append(replace(mark, x=mark.x[:0], y=mark.y[:0], top=mark.top[:0]))
+    heights = np.full(len(panels), height)
+    heights[0] += 0.5 * POINTS * first.legend
+    heights[-1] += 0.8 * POINTS
+    return Chart([Row(float(h), [panel]) for h, panel in zip(heights, panels, strict=True)], width)
 
 
 def steps(edges: Array, values: Array) -> tuple[Array, Array]:
     """A line (2 m,) through m values, each constant between two of the m + 1 ``edges``."""
     return np.repeat(edges, 2)[1:-1], np.repeat(values, 2)
+
+
+def interval(mean: Array, std: Array, reach: float, positive: bool) -> tuple[Array, Array]:
+    """Mean ± ``reach`` std, of what is positive by the lognormal of the same mean and standard deviation."""
+    if not positive:
+        return mean - reach * std, mean + reach * std
+    width = np.sqrt(np.log1p((std / mean) ** 2))
+    centre = np.log(mean) - width**2 / 2
+    return np.exp(centre - reach * width), np.exp(centre + reach * width)
 
 
 def _around(values: Array, logarithmic: bool = False) -> tuple[float, float]:

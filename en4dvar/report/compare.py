@@ -16,14 +16,14 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.caution import Caution, codes
-from en4dvar.errors import OutputError
-from en4dvar.observations import Observations
+from en4dvar.data.observations import Observations
+from en4dvar.estimation.summary import ParameterSummary, estimate_cells
+from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution, codes
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.tables import table
 from en4dvar.report.text import fixed
-from en4dvar.state import Array
-from en4dvar.storage.store import StoredResult, load_stored, result_files
-from en4dvar.summary import ParameterSummary, estimate_cells
-from en4dvar.tables import table
+from en4dvar.results.store import StoredResult, load_stored, result_files
 
 MOST_WARNINGS = 12  # on the terminal
 MEANINGLESS = (
@@ -155,10 +155,10 @@ def compare_runs(runs: Sequence[str | Path] | Mapping[str, str | Path | StoredRe
     estimates = tuple(
         ComparedEstimate(name, dataset, row, result.members("posterior", row.name))
         for name, dataset, result in pairs
-        for row in result.summary()
+        for row in result.rows
     )
-    found = [ComparedCaution(name, dataset, c) for name, dataset, result in pairs for c in result.cautions]
-    cautions = tuple(sorted(found, key=lambda one: one.caution.rank))
+    of_runs = [ComparedCaution(name, dataset, c) for name, dataset, result in pairs for c in result.cautions]
+    cautions = tuple(sorted(of_runs, key=lambda compared: compared.caution.rank))
     if reason := _difference(results):
         scores = [_score(name, dataset, result) for name, held in results.items() for dataset, result in held.items()]
         return Comparison(tuple(scores), estimates, reason, cautions)
@@ -180,7 +180,7 @@ def _judged(scores: Sequence[ModelScore], datasets: Sequence[str]) -> tuple[Mode
     ranked = list(map(_ranked, of_each.values()))
     if len(datasets) > 1:
         ranked.append(_ranked([_total(run) for run in zip(*ranked, strict=True)]))
-    return tuple(score for one in ranked for score in one)
+    return tuple(score for of_dataset in ranked for score in of_dataset)
 
 
 def _difference(results: Mapping[str, Mapping[str, StoredResult]]) -> str:
@@ -315,8 +315,8 @@ def _resampled(score: ModelScore, sampled: Mapping[str, float]) -> ModelScore:
 
 def _effective(likelihood: Array, n_parameters: int) -> float:
     """p_WAIC from log-likelihoods (N', K) of the members."""
-    found = float(np.sum(np.var(likelihood, axis=0, ddof=1)))
-    return found if found <= MEANINGLESS * n_parameters else float("nan")
+    parameters = float(np.sum(np.var(likelihood, axis=0, ddof=1)))
+    return parameters if parameters <= MEANINGLESS * n_parameters else float("nan")
 
 
 def _total(scores: Sequence[ModelScore]) -> ModelScore:
@@ -337,7 +337,7 @@ def _total(scores: Sequence[ModelScore]) -> ModelScore:
 
 def _joined(lists: Iterable[str]) -> str:
     """The codes of several lists, each once."""
-    return " ".join(dict.fromkeys(code for one in lists for code in one.split()))
+    return " ".join(dict.fromkeys(code for codes in lists for code in codes.split()))
 
 
 def _ranked(scores: Sequence[ModelScore]) -> list[ModelScore]:

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 
-from en4dvar.errors import OutputError
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.tables import table
 from en4dvar.report.compare import UNDECIDABLE, model_probabilities
-from en4dvar.storage.cycles_file import cycles_file, read_cycles
-from en4dvar.tables import table
+from en4dvar.results.netcdf import Group
+from en4dvar.results.series_file import read_series, series_file
 
 READINGS = ("time", "observation", "observations", "observation_std", "observation_correlation")
 
@@ -69,13 +69,13 @@ def sequences_table(scores: Sequence[SequenceScore]) -> str:
     return f"{table([header, *rows])}\n\n{words}"
 
 
-def _sequence(run_dir: Path) -> xr.Dataset:
-    file = cycles_file(run_dir)
+def _sequence(run_dir: Path) -> Group:
+    file = series_file(run_dir)
     if file is None:
         raise OutputError(f"{run_dir}: no sequence; sequences are compared with sequences of the same readings")
     if file.stem == "twin":
         raise OutputError(f"{run_dir}: a twin experiment has no evidence; RMSE and spread are in its summary.csv")
-    data = read_cycles(file)
+    data = read_series(file)
     if "log_evidence" not in data.attrs:
         raise OutputError(f"{run_dir}: written by an earlier version, without an evidence; run it again")
     if why := str(data.attrs["without_evidence"]):
@@ -85,18 +85,19 @@ def _sequence(run_dir: Path) -> xr.Dataset:
     return data
 
 
-def _require_same_readings(runs: Mapping[str, xr.Dataset]) -> None:
-    (first, one), *others = runs.items()
+def _require_same_readings(runs: Mapping[str, Group]) -> None:
+    (first, reference), *others = runs.items()
     for name, other in others:
-        if not all(_same(one, other, key) for key in READINGS):
+        if not all(_same(reference, other, key) for key in READINGS):
             raise OutputError(f"{name} and {first} hold other readings or errors: their evidences cannot be compared")
 
 
-def _same(one: xr.Dataset, other: xr.Dataset, key: str) -> bool:
-    if key not in one or key not in other:
-        return key not in one and key not in other
-    return one[key].variable.equals(other[key].variable)
+def _same(first: Group, other: Group, key: str) -> bool:
+    if key not in first or key not in other:
+        return key not in first and key not in other
+    a, b = first[key].values, other[key].values
+    return a.dtype.kind == b.dtype.kind and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
 
 
-def _size(data: xr.Dataset) -> float:
+def _size(data: Group) -> float:
     return float(np.sqrt(np.nanmean(data["normalised_innovation"].values ** 2)))

@@ -10,18 +10,18 @@ from textwrap import fill
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from en4dvar.design.evaluate import Evaluated
-from en4dvar.design.laws import Decision
-from en4dvar.files import write_text
+from en4dvar.estimation.design.evaluate import Evaluated
+from en4dvar.estimation.design.laws import Decision
+from en4dvar.model.state import Array
+from en4dvar.plumbing.files import write_text
+from en4dvar.plumbing.tables import csv_text, table
+from en4dvar.plumbing.units import convert
+from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, Row, in_columns
 from en4dvar.report.html import render
-from en4dvar.report.style import LIGHT, PAGE, inline_svg, panels, styled
+from en4dvar.report.svg import svg
 from en4dvar.report.text import figure_text, rough_number, with_unit
-from en4dvar.state import Array
-from en4dvar.storage.design_file import DECISION, DesignRow, Designs
-from en4dvar.tables import csv_text, table
-from en4dvar.units import convert
+from en4dvar.results.design_file import DECISION, DesignRow, Designs
 
 TOLD, DRAWN = 12, 6  # designs on the terminal, in the figure of what is seen
 WIDE = 46  # letters of a line above a figure
@@ -35,15 +35,15 @@ FRONT = "Expected information against price; joined: the designs that no other b
 FANS = "What would be seen: median, 50 % and 90 % of the prior; marks below: the readings that are taken."
 
 
-def ranked(found: Designs) -> list[DesignRow]:
+def ranked(designs: Designs) -> list[DesignRow]:
     """Those that could be evaluated, the most informative first."""
-    return sorted((row for row in found.rows if row.found), key=lambda row: -_worth(row))
+    return sorted((row for row in designs.rows if row.result), key=lambda row: -_worth(row))
 
 
-def front(found: Designs) -> list[DesignRow]:
+def front(designs: Designs) -> list[DesignRow]:
     """The designs that no other beats in both price and information (Pareto), the cheapest first."""
     kept: list[DesignRow] = []
-    for row in sorted(ranked(found), key=lambda row: (row.price, -_worth(row))):
+    for row in sorted(ranked(designs), key=lambda row: (row.price, -_worth(row))):
         if not kept or _worth(row) > _worth(kept[-1]):
             kept.append(row)
     return kept
@@ -54,10 +54,10 @@ def settings_text(row: DesignRow) -> str:
     return ", ".join(f"{name} {value}" for name, value in row.settings.items()) or "as in the file"
 
 
-def words(found: Designs, row: DesignRow) -> str:
+def words(designs: Designs, row: DesignRow) -> str:
     """What would be known: "G to ± 12 %, alpha hardly at all"."""
-    known = [_known(found, row, a) for a in range(len(found.asked.parameters))]
-    return ", ".join([*([_law(row.found.decision)] if row.found and row.found.decision else []), *known])
+    known = [_known(designs, row, a) for a in range(len(designs.asked.parameters))]
+    return ", ".join([*([_law(row.result.decision)] if row.result and row.result.decision else []), *known])
 
 
 def _law(decision: Decision) -> str:
@@ -67,189 +67,195 @@ def _law(decision: Decision) -> str:
     return f"the law in {100 * decision.decided:.0f} ± {100 * decision.decided_error:.0f} % of experiments"
 
 
-def _known(found: Designs, row: DesignRow, a: int) -> str:
-    name, one = found.asked.parameters[a], row.found
-    assert one is not None
-    if one.ratio[a] > NOTHING:
+def _known(designs: Designs, row: DesignRow, a: int) -> str:
+    name, result = designs.asked.parameters[a], row.result
+    assert result is not None
+    if result.ratio[a] > NOTHING:
         return f"{name} hardly at all"
-    if one.relative[a] < COARSE:
-        return f"{name} to ± {rough_number(100 * float(one.relative[a]))} %"
-    unit, shown = found.asked.units[a]
-    value = rough_number(float(convert(np.array(one.std[a]), unit, shown)))
+    if result.relative[a] < COARSE:
+        return f"{name} to ± {rough_number(100 * float(result.relative[a]))} %"
+    unit, shown = designs.asked.units[a]
+    value = rough_number(float(convert(np.array(result.std[a]), unit, shown)))
     return f"{name} to ± {value}{'' if shown == '1' else f' {shown}'}"
 
 
-def by(one: Evaluated) -> str:
+def by(result: Evaluated) -> str:
     """What the information that designs are ranked by was found by."""
-    return "nested" if one.decision else one.method
+    return "nested" if result.decision else result.method
 
 
-def _gain(found: Designs) -> str:
-    return "law [nats]" if found.asked.laws else "gain [nats]"
+def _gain(designs: Designs) -> str:
+    return "law [nats]" if designs.asked.laws else "gain [nats]"
 
 
-def design_table(found: Designs) -> str:
+def design_table(designs: Designs) -> str:
     """The best designs and the file's own, for the terminal."""
-    rows, own = ranked(found), [row for row in found.rows if not row.settings and row.found]
+    rows, own = ranked(designs), [row for row in designs.rows if not row.settings and row.result]
     told = list({id(row): row for row in (*rows[:TOLD], *own)}.values())
-    several = any(row.found.alike > 1 for row in rows if row.found)
-    head = ("design", *(["experiments"] if several else []), "readings", "price", _gain(found), "by", "what is known")
+    several = any(row.result.alike > 1 for row in rows if row.result)
+    head = ("design", *(["experiments"] if several else []), "readings", "price", _gain(designs), "by", "what is known")
     cells = [
         (
             settings_text(row),
-            *([str(row.found.alike)] if several else []),
-            str(len(row.found.readings)),
+            *([str(row.result.alike)] if several else []),
+            str(len(row.result.readings)),
             f"{row.price:g}",
-            f"{row.found.worth:.2f} ± {row.found.worth_error:.2f}",
-            by(row.found),
-            words(found, row),
+            f"{row.result.worth:.2f} ± {row.result.worth_error:.2f}",
+            by(row.result),
+            words(designs, row),
         )
         for row in told
-        if row.found
+        if row.result
     ]
     return table([head, *cells])
 
 
-def remarks(found: Designs) -> list[str]:
+def remarks(designs: Designs) -> list[str]:
     """What to know of the designs beside their worth."""
-    failed = [row for row in found.rows if row.failure]
-    beyond = [row for row in ranked(found)[:TOLD] if row.found and row.found.beyond > 0.1]
+    failed = [row for row in designs.rows if row.failure]
+    beyond = [row for row in ranked(designs)[:TOLD] if row.result and row.result.beyond > 0.1]
     told = []
-    if (rows := ranked(found)) and _worth(rows[0]) < found.asked.enough:
+    if (rows := ranked(designs)) and _worth(rows[0]) < designs.asked.enough:
         told.append(
             f"the best design is expected to tell {_worth(rows[0]):.2f} nats, less than design.enough = "
-            f"{found.asked.enough:g}: no experiment among these is worth making"
+            f"{designs.asked.enough:g}: no experiment among these is worth making"
         )
     for reason in dict.fromkeys(row.failure for row in failed):
         names = [settings_text(row) for row in failed if row.failure == reason]
         more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
         told.append(f"{'; '.join(names[:NAMED])}{more}: {reason}")
-    thin = sum(bool(row.found and row.found.decision and row.found.decision.thin > THIN) for row in found.rows)
+    thin = sum(bool(row.result and row.result.decision and row.result.decision.thin > THIN) for row in designs.rows)
     told += [f"of {thin} designs the evidences of many readings are rough; raise design.inner"] if thin else []
     told += [
-        f"{settings_text(row)}: {100 * row.found.beyond:.0f} % of the prior leaves what the model is valid for"
+        f"{settings_text(row)}: {100 * row.result.beyond:.0f} % of the prior leaves what the model is valid for"
         for row in beyond
-        if row.found
+        if row.result
     ]
     return told
 
 
-@styled
-def gains(found: Designs) -> Figure:
+def gains(designs: Designs) -> Chart:
     """Information against each knob."""
-    names = [*found.asked.knobs, *(["experiments"] if len({_alike(row) for row in ranked(found)}) > 1 else [])]
-    figure, axes = panels(len(names), PAGE, 2.2)
-    for ax, name in zip(axes, names, strict=True):
-        rows = [row for row in ranked(found) if name in row.settings or name == "experiments"]
+    names = [*designs.asked.knobs, *(["experiments"] if len({_alike(row) for row in ranked(designs)}) > 1 else [])]
+    panels = []
+    for name in names:
+        rows = [row for row in ranked(designs) if name in row.settings or name == "experiments"]
         values = [row.settings.get(name, _alike(row)) for row in rows]
         x, labels = _positions(values)
         worth = np.array([_worth(row) for row in rows])
-        errors = np.array([row.found.worth_error for row in rows if row.found])
-        ax.errorbar(x, worth, errors, fmt="o", ms=3, lw=0.6, color=LIGHT["posterior"], alpha=0.7)
+        errors = np.array([row.result.worth_error for row in rows if row.result])
+        panel = Panel(figure_text(name) + ("" if labels else _unit_of(values)), "information [nats]", names=labels)
         if labels:
-            ax.set_xticks(sorted(set(x)), labels)
-        ax.set(xlabel=figure_text(name) + ("" if labels else _unit_of(values)), ylabel="information [nats]")
-    return figure
+            panel.xticks = range(len(labels))
+        panel.bars(x, worth - errors, worth + errors, "posterior", 0.6, 0.7)
+        panel.dots(x, worth, "posterior", 3.0, 0.7)
+        panels.append(panel)
+    below = max((0.12 * len(label) for panel in panels for label in panel.names), default=0.0)
+    return in_columns(panels, (5.6 + below) * POINTS, width=PAGE)
 
 
-@styled
-def prices(found: Designs) -> Figure:
+def prices(designs: Designs) -> Chart:
     """Information against price, with the front."""
-    figure, (ax,) = panels(1, PAGE, 2.2)
-    rows, best = ranked(found), front(found)
-    ax.plot([row.price for row in rows], [_worth(row) for row in rows], "o", ms=3, color=LIGHT["prior"])
-    ax.plot([row.price for row in best], [_worth(row) for row in best], "o-", ms=4, color=LIGHT["posterior"])
-    ax.set(xlabel="price", ylabel="information [nats]")
-    return figure
+    rows, best = ranked(designs), front(designs)
+    panel = Panel("price", "information [nats]")
+    panel.dots([row.price for row in rows], [_worth(row) for row in rows], "prior", 3.0)
+    panel.line([row.price for row in best], [_worth(row) for row in best], "posterior")
+    panel.dots([row.price for row in best], [_worth(row) for row in best], "posterior", 4.0)
+    return Chart([Row(5.6 * POINTS, [panel])], PAGE)
 
 
-@styled
-def fans(found: Designs) -> Figure:
+def fans(designs: Designs) -> Chart:
     """What would be seen with the best designs, and the file's own."""
-    rows = {row.number: row for row in reversed([*ranked(found)[:DRAWN], *(r for r in found.rows if r.number == 0)])}
-    shown = [row for row in reversed(list(rows.values())) if row.found]
-    figure, axes = panels(len(shown), PAGE, 1.6)
-    time, value = found.asked.axes
-    for ax, row in zip(axes, shown, strict=True):
-        one = row.found
-        assert one is not None
-        t, taken = convert(one.grid, *time), convert(one.times, *time)
-        low, lower, middle, upper, high = convert(one.fan, *value)
-        ax.fill_between(t, low, high, color=LIGHT["posterior"], alpha=0.18, lw=0)
-        ax.fill_between(t, lower, upper, color=LIGHT["posterior"], alpha=0.3, lw=0)
-        ax.plot(t, middle, color=LIGHT["posterior"])
-        ax.plot(taken, np.full(len(taken), 0.03), "|", color=LIGHT["centre"], transform=ax.get_xaxis_transform())
-        told = ", ".join(figure_text(f"{name} {value}") for name, value in row.settings.items()) or "as in the file"
-        ax.set_title(fill(f"{told}: {_worth(row):.2f} nats", WIDE), fontsize="small")
-        ax.set(xlabel=with_unit("time", time[1]), ylabel=with_unit(found.asked.seen, value[1]))
-    return figure
+    rows = {
+        row.number: row for row in reversed([*ranked(designs)[:DRAWN], *(r for r in designs.rows if r.number == 0)])
+    }
+    time, value = designs.asked.axes
+    panels = []
+    for row in reversed(list(rows.values())):
+        result = row.result
+        if result is None:
+            continue
+        t, taken = convert(result.grid, *time), convert(result.times, *time)
+        low, lower, middle, upper, high = convert(result.fan, *value)
+        settings = ", ".join(figure_text(f"{name} {value}") for name, value in row.settings.items()) or "as in the file"
+        title = fill(f"{settings}: {_worth(row):.2f} nats", WIDE)
+        panel = Panel(with_unit("time", time[1]), with_unit(designs.asked.seen, value[1]), title=title)
+        panel.band(t, low, high, "posterior", 0.18)
+        panel.band(t, lower, upper, "posterior", 0.3)
+        panel.line(t, middle, "posterior")
+        bottom, top = panel.limits()[1]
+        panel.ylim = bottom - 0.06 * (top - bottom), top
+        panel.dots(taken, np.full(len(taken), bottom - 0.01 * (top - bottom)), "centre", 6.0, kind="ticks")
+        panels.append(panel)
+    return in_columns(panels, 4.4 * POINTS, width=PAGE)
 
 
-def write_design(found: Designs, folder: Path) -> Path:
+def write_design(designs: Designs, folder: Path) -> Path:
     """Write ``design.html`` and ``designs.csv``. Returns the path of the page. Raises :class:`OutputError`."""
-    write_text(folder / "designs.csv", csv_text(_cells(found)))
-    rows, best = ranked(found), {id(row) for row in front(found)}
-    drawings = [("fans", FANS, inline_svg(fans(found), "fans", FANS))]
+    write_text(folder / "designs.csv", csv_text(_cells(designs)))
+    rows, best = ranked(designs), {id(row) for row in front(designs)}
+    drawings = [("fans", FANS, svg(fans(designs), "fans", FANS))]
     if len({row.price for row in rows}) > 1:
-        drawings.insert(0, ("prices", FRONT, inline_svg(prices(found), "prices", FRONT)))
-    if found.asked.knobs or len({_alike(row) for row in rows}) > 1:
-        drawings.insert(0, ("gains", GAINS, inline_svg(gains(found), "gains", GAINS)))
+        drawings.insert(0, ("prices", FRONT, svg(prices(designs), "prices", FRONT)))
+    if designs.asked.knobs or len({_alike(row) for row in rows}) > 1:
+        drawings.insert(0, ("gains", GAINS, svg(gains(designs), "gains", GAINS)))
     page = render(
         "design.html.j2",
         title="Designs compared",
         sortable=True,
-        name=found.attributes.get("name", ""),
-        asked=", ".join(found.asked.parameters),
-        laws=found.asked.laws,
+        charts=True,
+        name=designs.attributes.get("name", ""),
+        asked=", ".join(designs.asked.parameters),
+        laws=designs.asked.laws,
         by=by,
-        rows=[(settings_text(row), row, words(found, row), id(row) in best) for row in rows],
-        lab=[(settings_text(row), readings_text(found, row), row, words(found, row)) for row in front(found)],
-        remarks=remarks(found),
+        rows=[(settings_text(row), row, words(designs, row), id(row) in best) for row in rows],
+        lab=[(settings_text(row), readings_text(designs, row), row, words(designs, row)) for row in front(designs)],
+        remarks=remarks(designs),
         drawings=drawings,
-        attributes=found.attributes,
+        attributes=designs.attributes,
     )
     return write_text(folder / "design.html", page)
 
 
-def readings_text(found: Designs, row: DesignRow) -> str:
+def readings_text(designs: Designs, row: DesignRow) -> str:
     """When readings are taken: "43 from 0.7 to 59.5 µs, every 1.4 µs", or each where they are not evenly spaced."""
-    assert row.found is not None
-    stored, shown = found.asked.axes[0]
-    t, unit = convert(row.found.times, stored, shown), "" if shown == "1" else f" {shown}"
+    assert row.result is not None
+    stored, shown = designs.asked.axes[0]
+    t, unit = convert(row.result.times, stored, shown), "" if shown == "1" else f" {shown}"
     gaps = np.diff(t)
     if len(t) > 2 and np.ptp(gaps) < 1e-6 * gaps.mean():
         return f"{len(t)} from {t[0]:.4g} to {t[-1]:.4g}{unit}, every {gaps.mean():.4g}{unit}"
-    return f"{len(t)}, at {', '.join(f'{one:.4g}' for one in t)}{unit}"
+    return f"{len(t)}, at {', '.join(f'{instant:.4g}' for instant in t)}{unit}"
 
 
-def _cells(found: Designs) -> list[list[Any]]:
+def _cells(designs: Designs) -> list[list[Any]]:
     """The table as CSV, parameters in their display units."""
-    shown = [unit for _, unit in found.asked.units]
+    shown = [unit for _, unit in designs.asked.units]
     stds = [
-        f"{name}_std" + ("" if u == "1" else f" [{u}]") for name, u in zip(found.asked.parameters, shown, strict=True)
+        f"{name}_std" + ("" if u == "1" else f" [{u}]") for name, u in zip(designs.asked.parameters, shown, strict=True)
     ]
-    head = [*found.asked.knobs, "experiments", "readings", "price", "gain_nats", "gain_error", "method"]
-    head += [*([name for name, _ in DECISION.values()] if found.asked.laws else []), *stds]
-    ratios = [f"{name}_std_ratio" for name in found.asked.parameters]
+    head = [*designs.asked.knobs, "experiments", "readings", "price", "gain_nats", "gain_error", "method"]
+    head += [*([name for name, _ in DECISION.values()] if designs.asked.laws else []), *stds]
+    ratios = [f"{name}_std_ratio" for name in designs.asked.parameters]
     cells = []
-    for row in ranked(found):
-        one = row.found
-        assert one is not None
-        units = zip(one.std, found.asked.units, strict=True)
+    for row in ranked(designs):
+        result = row.result
+        assert result is not None
+        units = zip(result.std, designs.asked.units, strict=True)
         std = [float(convert(np.array(value), *unit)) for value, unit in units]
-        knobs = [row.settings.get(name, "") for name in found.asked.knobs]
-        worth = [one.alike, len(one.readings), row.price, one.gain, one.error, one.method]
-        worth += [getattr(one.decision, field) for field in DECISION] if one.decision else []
-        cells.append([*knobs, *worth, *std, *map(float, one.ratio), one.lost, one.beyond])
+        knobs = [row.settings.get(name, "") for name in designs.asked.knobs]
+        worth = [result.alike, len(result.readings), row.price, result.gain, result.error, result.method]
+        worth += [getattr(result.decision, field) for field in DECISION] if result.decision else []
+        cells.append([*knobs, *worth, *std, *map(float, result.ratio), result.lost, result.beyond])
     return [[*head, *ratios, "lost", "beyond_validity"], *cells]
 
 
 def _worth(row: DesignRow) -> float:
-    return row.found.worth if row.found else math.nan
+    return row.result.worth if row.result else math.nan
 
 
 def _alike(row: DesignRow) -> int:
-    return row.found.alike if row.found else 1
+    return row.result.alike if row.result else 1
 
 
 def _positions(values: Sequence[Any]) -> tuple[Array, list[str]]:
@@ -263,8 +269,8 @@ def _positions(values: Sequence[Any]) -> tuple[Array, list[str]]:
 
 
 def _number(value: Any) -> float | None:
-    found = re.match(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)", str(value))
-    return float(found.group(1)) if found and not isinstance(value, bool) else None
+    match = re.match(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)", str(value))
+    return float(match.group(1)) if match and not isinstance(value, bool) else None
 
 
 def _unit_of(values: Sequence[Any]) -> str:

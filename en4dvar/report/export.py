@@ -14,13 +14,13 @@ from typing import Literal
 
 import numpy as np
 
-from en4dvar.caution import Caution, codes
-from en4dvar.config.symbols import GREEK
-from en4dvar.errors import OutputError
+from en4dvar.config.models import GREEK
+from en4dvar.estimation.summary import LITTLE, MODAL, ParameterSummary, summary_rows
+from en4dvar.plumbing.caution import Caution, codes
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.tables import csv_text
 from en4dvar.report.text import number_like, plain_number, untrusted_words
-from en4dvar.storage.store import StoredResult, load_stored, require_settled, result_files
-from en4dvar.summary import LITTLE, MODAL, ParameterSummary, summary_rows
-from en4dvar.tables import csv_text
+from en4dvar.results.store import StoredResult, load_stored, require_settled, result_files
 
 _COMMANDS = (
     f"{GREEK}|mathrm|mathit|mathbf|mathsf|mathcal|rm|it|text|frac|sqrt|hat|bar|tilde|dot|ddot|vec|overline|infty|partial|"
@@ -64,8 +64,8 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
     if kind == "members":
         return _members_csv(results)
     if kind == "latex":
-        return latex_table([(r.name, r.summary(), r.cautions) for r in results])
-    return csv_text(summary_rows(((r.name, r.summary(), r.cautions) for r in results), {}))
+        return latex_table([(r.name, r.rows, r.cautions) for r in results])
+    return csv_text(summary_rows(((r.name, r.rows, r.cautions) for r in results), {}))
 
 
 def posterior_file(run_dir: str | Path) -> Path:
@@ -82,7 +82,7 @@ def _members_csv(results: Iterable[StoredResult]) -> str:
     lines: list[tuple[object, object, dict[str, float], str]] = []
     header: dict[str, str] = {}
     for result in results:
-        for row in result.summary():
+        for row in result.rows:
             header.setdefault(row.name, f"{row.name} ({row.unit})" if row.unit != "1" else row.name)
         warned = " ".join(codes(result.cautions))
         values = {name: result.members("posterior", name) for name in result.parameters}
@@ -101,12 +101,12 @@ SKEWED = 2.0  # the sides of 48 Gaussian members rarely differ as much
 MODAL_NOTE = "5 to 95 % of a posterior of several modes, by their weights"
 
 
-def latex_table(found: Sequence[Found]) -> str:
-    """Mean ± std for a paper (package booktabs): a row a parameter, or of several ``found`` a row each."""
+def latex_table(sets: Sequence[Found]) -> str:
+    """Mean ± std for a paper (package booktabs): a row a parameter, or of several ``sets`` a row each."""
     header = "% en4dvar export: posterior mean and standard deviation; needs \\usepackage{booktabs}"
-    warned = [f"% {c.severity}: {name}: {c}" for name, _, cautions in found for c in cautions if c.kind == "note"]
+    warned = [f"% {c.severity}: {name}: {c}" for name, _, cautions in sets for c in cautions if c.kind == "note"]
     notes = Notes()
-    table = _one_set(found[0], notes) if len(found) == 1 else _many_sets(found, notes)
+    table = _one_set(sets[0], notes) if len(sets) == 1 else _many_sets(sets, notes)
     return "\n".join([header, *(_one_line(line) for line in warned), *table]) + "\n"
 
 
@@ -142,8 +142,8 @@ class Notes:
         ]
 
 
-def _one_set(found: Found, notes: Notes) -> list[str]:
-    _, rows, cautions = found
+def _one_set(dataset: Found, notes: Notes) -> list[str]:
+    _, rows, cautions = dataset
     head = f"parameter & unit & prior & posterior{notes.warn(cautions)} & 5--95\\,\\%"
     lines = [
         " & ".join(
@@ -160,15 +160,15 @@ def _one_set(found: Found, notes: Notes) -> list[str]:
     return tabular("llrrr", head, lines, notes)
 
 
-def _many_sets(found: Sequence[Found], notes: Notes) -> list[str]:
-    first = {row.name: row for _, rows, _ in found for row in reversed(rows)}
-    names = list(dict.fromkeys(row.name for _, rows, _ in found for row in rows))
+def _many_sets(sets: Sequence[Found], notes: Notes) -> list[str]:
+    first = {row.name: row for _, rows, _ in sets for row in reversed(rows)}
+    names = list(dict.fromkeys(row.name for _, rows, _ in sets for row in rows))
     units = {n: latex_unit(first[n].unit) for n in names}
     head = " & ".join(
         ["data set", *(f"{latex_symbol(first[n])}" + (f" ({units[n]})" if units[n] else "") for n in names)]
     )
     lines = []
-    for dataset, rows, cautions in found:
+    for dataset, rows, cautions in sets:
         own, named = {row.name: row for row in rows}, f"{escaped(dataset)}{notes.warn(cautions)}"
         lines.append(" & ".join([named, *(_estimate(own[n], cautions, notes) if n in own else "--" for n in names)]))
     return tabular("l" + "r" * len(names), head, lines, notes)

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import xarray as xr
 
-from en4dvar.errors import OutputError
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.tables import csv_text
+from en4dvar.plumbing.units import convert
 from en4dvar.report.export import Notes, escaped, latex_unit, plus_minus, tabular
-from en4dvar.state import Array
-from en4dvar.storage.cycles_file import read_cycles
-from en4dvar.tables import csv_text
-from en4dvar.units import convert
+from en4dvar.results.netcdf import Group, understood
+from en4dvar.results.series_file import read_series
 
 KINDS = ("forecast", "analysis", "smoothed")
 CERTAIN = 1e-9  # of its size: the spread of what is known
@@ -33,17 +33,18 @@ def cycles_table(file: Path, kind: Literal["csv", "latex", "members"]) -> str:
     ------
     OutputError: there is no result, it is damaged, or it holds no members (a twin experiment).
     """
-    data = read_cycles(file)
+    data = read_series(file)
     if kind == "members" and "members" not in data:
         raise OutputError(
             f"{file}: a twin experiment keeps no members; --csv has mean and std of each variable in time"
         )
-    if kind == "latex":
-        return _latex(data)
-    return csv_text(_members(data) if kind == "members" else _in_time(data))
+    with understood(file):
+        if kind == "latex":
+            return _latex(data)
+        return csv_text(_members(data) if kind == "members" else _in_time(data))
 
 
-def _shown(data: xr.Dataset) -> tuple[list[str], list[str], Array]:
+def _shown(data: Group) -> tuple[list[str], list[str], Array]:
     """Names of the variables, the units they are shown in, and the factors (n,) to these."""
     units = [str(unit) for unit in data["units"].values]
     shown = [str(unit) for unit in data["display_units"].values] if "display_units" in data else units
@@ -51,7 +52,7 @@ def _shown(data: xr.Dataset) -> tuple[list[str], list[str], Array]:
     return [str(name) for name in data["state"].values], shown, np.array(factors)
 
 
-def _in_time(data: xr.Dataset) -> Iterator[list[str]]:
+def _in_time(data: Group) -> Iterator[list[str]]:
     names, units, factors = _shown(data)
     columns = [f"{kind}_{what}" for kind in KINDS for what in ("mean", "std") if f"{kind}_{what}" in data]
     columns += ["truth"] * ("truth" in data)
@@ -62,7 +63,7 @@ def _in_time(data: xr.Dataset) -> Iterator[list[str]]:
             yield [repr(float(time)), name, unit, *(f"{x:.10g}" if np.isfinite(x) else "" for x in row)]
 
 
-def _members(data: xr.Dataset) -> Iterator[list[str]]:
+def _members(data: Group) -> Iterator[list[str]]:
     names, units, factors = _shown(data)
     header = [f"{name} ({unit})" if unit != "1" else name for name, unit in zip(names, units, strict=True)]
     yield ["time", "member", *header]
@@ -72,7 +73,7 @@ def _members(data: xr.Dataset) -> Iterator[list[str]]:
                 yield [repr(float(time)), str(i), *(f"{x:.10g}" for x in member)]
 
 
-def _latex(data: xr.Dataset) -> str:
+def _latex(data: Group) -> str:
     names, units, factors = _shown(data)
     last = zip(data["analysis_mean"].values[-1] * factors, data["analysis_std"].values[-1] * factors, strict=True)
     lines = [

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from en4dvar.report import readings, varying
+from en4dvar.model.state import Array
+from en4dvar.report import fields, readings, varying, withheld
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row, in_columns
 from en4dvar.report.drawing import Captioned
 from en4dvar.report.history import history
 from en4dvar.report.text import estimate, pretty_unit, shown, with_unit
-from en4dvar.state import Array
-from en4dvar.storage.store import StoredResult
+from en4dvar.results.store import StoredResult
 
 MAX_PAIRS = 6
 
@@ -21,7 +21,7 @@ MAX_PAIRS = 6
 def histograms(result: StoredResult) -> Chart:
     """Posterior over prior, one panel a parameter scaled to its peak. Bar: 5–95 %, ticks: members, line: centre."""
     panels = []
-    for row in result.summary():
+    for row in result.rows:
         prior, posterior = result.members("prior", row.name), result.members("posterior", row.name)
         value, doubt = f"{estimate(row, '')} {pretty_unit(row.unit)}".rstrip(), " (?)" if row.untrusted else ""
         panel = Panel(
@@ -86,7 +86,7 @@ def traces(result: StoredResult) -> Chart:
     held = result.group("iterations")
     steps = held["iteration"].values
     panels = []
-    for row in result.summary():
+    for row in result.rows:
         panel = Panel("iteration", with_unit(row.symbol, row.unit), whole=True, yticks=4)
         members, centre = (shown(held[key]) for key in (row.name, f"{row.name}_centre"))
         alive = np.isfinite(members).all(axis=0)
@@ -101,7 +101,7 @@ def traces(result: StoredResult) -> Chart:
 
 def pairs(result: StoredResult) -> Chart:
     """Posterior members of every pair of parameters; above the diagonal their correlation."""
-    rows = result.summary()
+    rows = result.rows
     side = max(COLUMN, min(PAGE, len(rows) * 2.7 * POINTS))
     values = {row.name: result.members("posterior", row.name) for row in rows}
     lines = []
@@ -128,8 +128,6 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
             histograms(result),
         )
     if "/fields" in result.groups:
-        from en4dvar.report import fields  # with matplotlib, whose import takes longer than all charts
-
         yield "fields", fields.CAPTION, fields.maps(result)
     yield (
         "history",
@@ -139,6 +137,8 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
         + (" Each series has its own panels." if len(result.axes) > 1 else ""),
         history(result),
     )
+    if "/withheld" in result.groups:
+        yield "withheld", withheld.CAPTION, withheld.expected(result)
     if varying.stored_walks(result):
         yield (
             "varying",

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from en4dvar.model.state import Array
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.text import shown, with_unit
-from en4dvar.state import Array
-from en4dvar.storage.axes import Axis
-from en4dvar.storage.store import StoredResult
+from en4dvar.results.axes import Axis
+from en4dvar.results.store import StoredResult
 
 MANY = 5000  # readings: beyond, their bars are one band
 FEW = 150  # readings whose marks are large
@@ -80,48 +80,48 @@ def history(result: StoredResult) -> Chart:
     high, low = (5.0, 2.3) if several else (6.8, 2.7)
     rows = []
     for i, axis in enumerate(result.axes):
-        one = SeriesShown.of(result, axis)
+        series = SeriesShown.of(result, axis)
         top = Panel(
-            ylabel=one.label, title=axis.name if several else "", xlim=one.reach, ylim=_data_range(one.data, one.std),
-            x_numbers=False, legend=i == 0,
+            ylabel=series.label, title=axis.name if several else "", xlim=series.reach,
+            ylim=_data_range(series.data, series.std), x_numbers=False, legend=i == 0,
         )  # fmt: skip
-        _data(top, result, one)
-        rows += [Row(high * POINTS, [top]), Row(low * POINTS, [_residuals(one)])]
+        _data(top, result, series)
+        rows += [Row(high * POINTS, [top]), Row(low * POINTS, [_residuals(series)])]
     return Chart(rows)
 
 
-def _data(panel: Panel, result: StoredResult, one: SeriesShown) -> None:
+def _data(panel: Panel, result: StoredResult, series: SeriesShown) -> None:
     """Data and predictions."""
-    curve = f"{one.axis.name}_path" in result.group("prior_predictive")
+    curve = f"{series.axis.name}_path" in result.group("prior_predictive")
     for band in BANDS:
-        (_along if curve else _bars)(panel, result, one, band)
+        (_along if curve else _bars)(panel, result, series, band)
     if curve:
-        panel.line(one.x, one.centre, "centre", 0.9, label="centre")
+        panel.line(series.x, series.centre, "centre", 0.9, label="centre")
     else:
-        panel.dots(one.x, one.centre, "centre", 5.0, label="centre", kind="dashes")
-    if len(one.x) > MANY:  # one outline instead of a bar for each
-        panel.band(one.x, one.data - one.std, one.data + one.std, "ink", 0.3, "data ± std")
+        panel.dots(series.x, series.centre, "centre", 5.0, label="centre", kind="dashes")
+    if len(series.x) > MANY:  # one outline instead of a bar for each
+        panel.band(series.x, series.data - series.std, series.data + series.std, "ink", 0.3, "data ± std")
     else:
-        panel.bars(one.x, one.data - one.std, one.data + one.std, "ink", 0.6, label="data ± std")
-    panel.dots(one.x, one.data, "ink", one.size, label="data ± std")
+        panel.bars(series.x, series.data - series.std, series.data + series.std, "ink", 0.6, label="data ± std")
+    panel.dots(series.x, series.data, "ink", series.size, label="data ± std")
 
 
-def _residuals(one: SeriesShown) -> Panel:
-    residual = (one.data - one.centre) / one.std
+def _residuals(series: SeriesShown) -> Panel:
+    residual = (series.data - series.centre) / series.std
     reach = 1.15 * max(3.0, float(np.max(np.abs(residual))))
-    panel = Panel(one.x_label, "residual / std", xlim=one.reach, ylim=(-reach, reach))
+    panel = Panel(series.x_label, "residual / std", xlim=series.reach, ylim=(-reach, reach))
     panel.yticks = (-2, 0, 2) if reach < 8 else 4
     for limit, alpha in ((2, 0.12), (1, 0.16)):
         panel.span(-limit, limit, "posterior", alpha)
     panel.rule(0)
-    panel.dots(one.x, residual, "ink", one.size)
+    panel.dots(series.x, residual, "ink", series.size)
     return panel
 
 
-def _along(panel: Panel, result: StoredResult, one: SeriesShown, band: Band) -> None:
+def _along(panel: Panel, result: StoredResult, series: SeriesShown, band: Band) -> None:
     """Quantiles of the members along the path."""
     held = result.group(band.group)
-    values = shown(held[f"{one.axis.name}_path"])[0]
+    values = shown(held[f"{series.axis.name}_path"])[0]
     seen = np.isfinite(values).any(axis=0)
     if not seen.any():
         return
@@ -134,14 +134,14 @@ def _along(panel: Panel, result: StoredResult, one: SeriesShown, band: Band) -> 
     panel.band(shown(held["path_time"])[seen], low, high, band.colour, band.alpha, band.label)
 
 
-def _bars(panel: Panel, result: StoredResult, one: SeriesShown, band: Band) -> None:
+def _bars(panel: Panel, result: StoredResult, series: SeriesShown, band: Band) -> None:
     """Quantiles of the members at each reading of a field."""
-    values = shown(result.group(band.group)[one.axis.name])[0]
+    values = shown(result.group(band.group)[series.axis.name])[0]
     alive = np.isfinite(values).all(axis=1)
     if not alive.any():
         return
     low, high = np.quantile(values[alive], band.levels, axis=0)
-    panel.bars(one.x, low, high, band.colour, 4.0 if len(one.x) <= FEW else 2.0, band.alpha, band.label)
+    panel.bars(series.x, low, high, band.colour, 4.0 if len(series.x) <= FEW else 2.0, band.alpha, band.label)
 
 
 def _data_range(data: Array, std: Array) -> tuple[float, float]:

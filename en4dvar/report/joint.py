@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from matplotlib.figure import Figure
 
-from en4dvar.caution import untrusted
-from en4dvar.files import write_text
+from en4dvar.plumbing.caution import untrusted
+from en4dvar.plumbing.files import write_text
+from en4dvar.plumbing.tables import csv_text, table
+from en4dvar.plumbing.units import convert
+from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import render
-from en4dvar.report.style import COLUMN, LIGHT, PAGE, inline_svg, panels, styled
+from en4dvar.report.svg import svg
 from en4dvar.report.text import figure_text, with_unit
-from en4dvar.storage.joint_file import QUANTILES, StoredGroups, StoredJoint
-from en4dvar.tables import csv_text, table
-from en4dvar.units import convert
+from en4dvar.results.joint_file import QUANTILES, StoredGroups, StoredJoint
 
 MOST_FITS = 12  # panels of the figure
 CAPTION = "Median and 5–95 % of what is shared, as each data set has it alone (grey) and as all have it together."
@@ -42,36 +42,36 @@ class JointRow:
     modal: bool = False
 
 
-def estimates(found: StoredJoint) -> tuple[JointRow, ...]:
+def estimates(joint: StoredJoint) -> tuple[JointRow, ...]:
     """What is shared, then what is each data set's own."""
-    posterior, rows = found.group("posterior"), []
+    posterior, rows = joint.group("posterior"), []
     for name, values in posterior.data_vars.items():
         if "dataset" not in values.dims:
-            rows.append(_estimate(found, str(name), values, ""))
+            rows.append(_estimate(joint, str(name), values, ""))
             continue
-        for dataset in found.datasets:
+        for dataset in joint.datasets:
             own = values.sel(dataset=dataset)
             if np.isfinite(own.values).any():
-                rows.append(_estimate(found, str(name), own, dataset))
+                rows.append(_estimate(joint, str(name), own, dataset))
     return tuple(sorted(rows, key=lambda row: bool(row.dataset)))
 
 
-def _estimate(found: StoredJoint, name: str, values: xr.DataArray, dataset: str) -> JointRow:
+def _estimate(joint: StoredJoint, name: str, values: xr.DataArray, dataset: str) -> JointRow:
     about = values.attrs
     unit, shown = str(about["units"]), str(about["display_units"])
     members = convert(values.values.ravel(), unit, shown)
     q05, q50, q95 = map(float, np.quantile(members, QUANTILES))
     mean, std = float(members.mean()), float(members.std(ddof=1))
-    doubted = untrusted(found.cautions, name)
+    doubted = untrusted(joint.cautions, name)
     label, symbol = str(about["long_name"]), str(about["symbol"])
     return JointRow(name, label, symbol, dataset, mean, std, q05, q50, q95, shown, doubted)
 
 
-def joint_table(found: StoredJoint) -> str:
+def joint_table(joint: StoredJoint) -> str:
     """What is shared, for the terminal."""
     rows = [
         (e.name, e.unit, f"{e.mean:.4g}", *(["–"] * 4 if e.untrusted else _numbers(e)))
-        for e in estimates(found)
+        for e in estimates(joint)
         if not e.dataset
     ]
     return table([("shared", "unit", "mean", "std", "5 %", "50 %", "95 %"), *rows])
@@ -81,76 +81,74 @@ def _numbers(e: JointRow) -> list[str]:
     return [f"{value:.4g}" for value in (e.std, e.q05, e.q50, e.q95)]
 
 
-@styled
-def forest(found: StoredGroups, datasets: Sequence[str], common: Mapping[str, xr.DataArray]) -> Figure:
+def forest(groups: StoredGroups, datasets: Sequence[str], common: Mapping[str, xr.DataArray]) -> Chart:
     """Each data set alone, and the draws of what is ``common``, one panel each.
 
     Where the posterior has the parameter for each data set too, that is drawn below what the data set says alone.
     """
-    count = len(datasets)
-    figure, axes = panels(len(common), COLUMN * (2 if len(common) > 1 else 1), 0.8 + 0.14 * min(count, 60))
-    alone, posterior = found.group("alone"), found.group("posterior")
-    for ax, (name, draws) in zip(axes, common.items(), strict=True):
+    alone, posterior, count = groups.group("alone"), groups.group("posterior"), len(datasets)
+    named = count <= 60
+    panels = []
+    for name, draws in common.items():
         about = draws.attrs
         units = str(about["units"]), str(about["display_units"])
         low, middle, high = convert(np.quantile(draws.values, QUANTILES), *units)
-        if not untrusted(found.cautions, name):
-            ax.axvspan(low, high, color=LIGHT["posterior"], alpha=0.2, lw=0)
-        ax.axvline(middle, color=LIGHT["posterior"])
+        panel = Panel(with_unit(str(about["symbol"]), units[1]), ylim=(-float(count), 1.0))
+        panel.yticks, panel.y_names = (range(0, -count, -1), [figure_text(d) for d in datasets]) if named else ((), ())
+        if not untrusted(groups.cautions, name):
+            panel.band([low, high], np.full(2, -count), np.ones(2), "posterior", 0.2)
+        panel.line([middle, middle], [-count, 1], "posterior")
         rows = convert(alone[name].values, *units)
         has = np.flatnonzero(np.isfinite(rows[:, 1]))
-        ax.hlines(-has, rows[has, 0], rows[has, 2], color=LIGHT["prior"])
-        ax.plot(rows[has, 1], -has, "o", ms=3, color=LIGHT["prior"])
+        panel.intervals(rows[has, 0], rows[has, 2], -has, "prior")
+        panel.dots(rows[has, 1], -has, "prior", 3.0)
         if "dataset" in posterior.get(name, draws).dims:
             low, middle, high = convert(posterior[name].quantile(QUANTILES, ("chain", "draw")).values, *units)
-            ax.hlines(-has - 0.3, low[has], high[has], color=LIGHT["posterior"])
-            ax.plot(middle[has], -has - 0.3, "o", ms=2, color=LIGHT["posterior"])
-        ax.set(xlabel=with_unit(str(about["symbol"]), units[1]), ylim=(-count, 1))
-        ax.set_yticks(-np.arange(count), [figure_text(d) for d in datasets] if count <= 60 else [""] * count)
-        ax.tick_params(axis="y", length=0, labelsize=6)
-        if np.all(rows[has] > 0) and rows[has].max() > 20 * rows[has].min():
-            ax.set_xscale("log")
-    return figure
+            panel.intervals(low[has], high[has], -has - 0.3, "posterior")
+            panel.dots(middle[has], -has - 0.3, "posterior", 2.0)
+        panel.x_logarithmic = bool(np.all(rows[has] > 0) and rows[has].max() > 20 * rows[has].min())
+        panels.append(panel)
+    height = (2.0 + 0.36 * min(count, 60)) * POINTS
+    return in_columns(panels, height, width=COLUMN * (2 if len(common) > 1 else 1))
 
 
-@styled
-def fits(found: StoredJoint) -> Figure:
+def fits(joint: StoredJoint) -> Chart:
     """Observations and bands of the first data sets."""
-    fit = found.group("fit")
-    shown = found.datasets[:MOST_FITS]
-    figure, axes = panels(len(shown), PAGE, 1.3)
-    for ax, name in zip(axes, shown, strict=True):
-        one = fit.sel(dataset=name)
-        times, low, middle, high = one["band"].values.T
-        ax.fill_between(times, low, high, color=LIGHT["posterior"], alpha=0.25, lw=0)
-        ax.plot(times, middle, color=LIGHT["posterior"])
-        ax.plot(one["time"], one["value"], ".", ms=3, color=LIGHT["ink"])
-        label = with_unit(str(one["observable"].item()), str(one["unit"].item()))
-        ax.set(title=figure_text(name), xlabel=with_unit("time", str(one["time_unit"].item())), ylabel=label)
-    return figure
+    fit, panels = joint.group("fit"), []
+    for name in joint.datasets[:MOST_FITS]:
+        curve = fit.sel(dataset=name)
+        times, low, middle, high = curve["band"].values.T
+        label = with_unit(str(curve["observable"].item()), str(curve["unit"].item()))
+        panel = Panel(with_unit("time", str(curve["time_unit"].item())), label, title=figure_text(name))
+        panel.band(times, low, high, "posterior", 0.25)
+        panel.line(times, middle, "posterior")
+        panel.dots(curve["time"].values, curve["value"].values, "ink", 1.8)
+        panels.append(panel)
+    return in_columns(panels, 3.6 * POINTS, width=PAGE)
 
 
-def write_joint(found: StoredJoint, folder: Path) -> Path:
+def write_joint(joint: StoredJoint, folder: Path) -> Path:
     """Write ``joint.html`` and ``joint.csv``. Returns the path of the page. Raises :class:`OutputError`."""
-    rows = estimates(found)
+    rows = estimates(joint)
     columns = ("name", "dataset", "mean", "std", "q05", "q50", "q95", "unit")
     cells = [[getattr(e, c) for c in columns] + [" ".join(e.untrusted)] for e in rows]
     write_text(folder / "joint.csv", csv_text([[*columns, "warnings"], *cells]))
-    fit, shared = found.group("fit"), {name: found.group("posterior")[name] for name in found.shared}
+    fit, shared = joint.group("fit"), {name: joint.group("posterior")[name] for name in joint.shared}
     page = render(
         "joint.html.j2",
         title="Joint estimate",
         sortable=True,
-        runs=str(found.tree.attrs["runs"]),
-        count=len(found.datasets),
+        charts=True,
+        runs=str(joint.tree.attrs["runs"]),
+        count=len(joint.datasets),
         shared=[e for e in rows if not e.dataset],
         own=[e for e in rows if e.dataset],
-        forest=inline_svg(forest(found, found.datasets, shared), "forest", CAPTION),
+        forest=svg(forest(joint, joint.datasets, shared), "forest", CAPTION),
         caption=CAPTION,
-        fits=inline_svg(fits(found), "fits", FITS),
-        fits_caption=FITS + (f" The first {MOST_FITS}." if len(found.datasets) > MOST_FITS else ""),
-        misfits=list(zip(found.datasets, map(float, fit["chi2_per_observation"].values), strict=True)),
-        attributes=found.tree.attrs,
-        cautions=[(c, "") for c in found.cautions],
+        fits=svg(fits(joint), "fits", FITS),
+        fits_caption=FITS + (f" The first {MOST_FITS}." if len(joint.datasets) > MOST_FITS else ""),
+        misfits=list(zip(joint.datasets, map(float, fit["chi2_per_observation"].values), strict=True)),
+        attributes=joint.tree.attrs,
+        cautions=[(c, "") for c in joint.cautions],
     )
     return write_text(folder / "joint.html", page)

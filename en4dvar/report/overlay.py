@@ -7,23 +7,22 @@ from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
-from en4dvar.errors import OutputError
-from en4dvar.files import make_folder, write_text
+from en4dvar.estimation.summary import CSV_COLUMNS, csv_cells
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.files import make_folder, write_text
+from en4dvar.plumbing.tables import csv_text
+from en4dvar.plumbing.units import UnitError, convert
+from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
 from en4dvar.report.compare import ComparedEstimate, Comparison, ModelScore
+from en4dvar.report.drawing import keep
 from en4dvar.report.html import render
 from en4dvar.report.page import DFS_WORDS
-from en4dvar.report.style import COLUMN, LIGHT, inline_svg, panels, save_figure, scaled_histogram, styled
+from en4dvar.report.svg import svg
 from en4dvar.report.text import figure_text, with_unit
-from en4dvar.state import Array
-from en4dvar.summary import CSV_COLUMNS, csv_cells
-from en4dvar.tables import csv_text
-from en4dvar.units import UnitError, convert
 
-COLOURS = (LIGHT["posterior"], LIGHT["centre"], LIGHT["background"], "#cc79a7", "#b58900", LIGHT["muted"])
+COLOURS = ("posterior", "centre", "background", "#cc79a7", "#b58900", "muted")
 CAPTION = (
     "Posterior of each run, scaled to its peak; bars hold 5–95 % of the members, where these are to be trusted. "
     "Where a run has several data sets, "
@@ -31,34 +30,29 @@ CAPTION = (
 )
 
 
-@styled
-def overlay(comparison: Comparison) -> Figure:
+def overlay(comparison: Comparison) -> Chart:
     """Posterior members of the runs over each other, one panel a parameter, in the display unit of the first run."""
     names = comparison.parameters
-    width = COLUMN * (2 if len(names) > 1 else 1)
-    figure, axes = panels(len(names), width, 4.0 / 2.54, above=0.14 * len(comparison.runs))
-    for ax, name in zip(axes, names, strict=True):
-        _panel(ax, [e for e in comparison.estimates if e.summary.name == name], comparison.runs)
-    labels = map(figure_text, comparison.runs)
-    handles = [axes[0].plot([], [], color=_colour(i), label=label)[0] for i, label in enumerate(labels)]
-    figure.legend(handles=handles, loc="outside upper center", ncols=min(3, len(handles)))
-    return figure
+    panels = [_panel([e for e in comparison.estimates if e.summary.name == name], comparison.runs) for name in names]
+    panels[0].legend = True
+    height = (4.0 + 0.15 * len(comparison.runs)) * POINTS
+    return in_columns(panels, height, width=COLUMN * (2 if len(names) > 1 else 1))
 
 
-def _panel(ax: Axes, estimates: Sequence[ComparedEstimate], runs: Sequence[str]) -> None:
+def _panel(estimates: Sequence[ComparedEstimate], runs: Sequence[str]) -> Panel:
     row = estimates[0].summary
+    panel = Panel(with_unit(row.symbol, row.unit), yticks=(), left=False, ylim=(0.0, 1.1 + 0.09 * len(runs)))
     for i, run in enumerate(runs):
+        label = figure_text(run)
+        panel.line([], [], _colour(i), label=label)
         values = _members([e for e in estimates if e.run == run], row.unit)
         if values.size < 2 or np.ptp(values) == 0:
             continue
-        scaled_histogram(ax, values, _colour(i), alpha=0.25, lw=1.0)
-        if any(e.summary.untrusted for e in estimates if e.run == run):
-            continue
-        bar = 1.08 + 0.09 * i
-        ax.plot(np.quantile(values, (0.05, 0.95)), [bar, bar], color=_colour(i), lw=2, solid_capstyle="butt")
-    ax.set(yticks=[], ylim=(0, 1.1 + 0.09 * len(runs)), xlabel=with_unit(row.symbol, row.unit))
-    ax.spines["left"].set_visible(False)
-    ax.xaxis.set_major_locator(MaxNLocator(5))
+        panel.histogram(values, _colour(i), alpha=0.25)
+        if not any(e.summary.untrusted for e in estimates if e.run == run):
+            low, high = np.quantile(values, (0.05, 0.95))
+            panel.line([low, high], np.full(2, 1.08 + 0.09 * i), _colour(i), 2.0)
+    return panel
 
 
 def _members(estimates: Sequence[ComparedEstimate], unit: str) -> Array:
@@ -80,15 +74,16 @@ def write_comparison(comparison: Comparison, out: str | Path) -> Path:
     Files of an earlier comparison there are replaced. Returns the path of the page. Raises :class:`OutputError`.
     """
     out = make_folder(out)
-    figure = overlay(comparison)
-    save_figure(figure, out, "posteriors")
+    chart = overlay(comparison)
+    keep(chart, out, "posteriors")
     write_text(out / "estimates.csv", _estimates_csv(comparison))
     write_text(out / "evidence.csv", _evidence_csv(comparison))
     page = render(
         "compare.html.j2",
         title=" – ".join(comparison.runs),
         sortable=True,
-        figure=inline_svg(figure, "posteriors", CAPTION),
+        charts=True,
+        figure=svg(chart, "posteriors", CAPTION),
         caption=CAPTION,
         incomparable=comparison.incomparable,
         verdicts=[(name, comparison.verdict(name)) for name in comparison.datasets],

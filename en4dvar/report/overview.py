@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.caution import Caution, codes, gravity, worst_first
+from en4dvar.estimation.summary import ParameterSummary
+from en4dvar.plumbing.caution import Caution, codes, gravity, worst_first
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row
 from en4dvar.report.drawing import Captioned, Drawing
 from en4dvar.report.html import render
 from en4dvar.report.text import figure_text, number_like, pretty_unit, symbol_html, with_unit
-from en4dvar.storage.store import StoredResult
-from en4dvar.summary import ParameterSummary
+from en4dvar.results.store import StoredResult
 
 NAMED = 40  # data sets whose names fit below a figure
 LISTED = 2000  # data sets in the table: a browser shows as many at once
@@ -41,7 +41,7 @@ class SetSummary:
         keys = ("n_observations", "chi2_per_observation", "nrmse", "dfs", "n_active", "n_members")
         about = {key: sys.intern(str(result.attributes.get(key, ""))) for key in ("date_created", "configuration")}
         scalars = {key: float(stats[key]) for key in keys}
-        rows = {row.name: row for row in result.summary()}
+        rows = {row.name: row for row in result.rows}
         return cls(result.name, stem, rows, result.cautions, scalars, about)
 
     @property
@@ -83,12 +83,12 @@ def render_overview(
         parameters=[_parameter(name, sets) for name in _parameters(sets)],
         failures=failures,
         sets=sets,
-        listed=[one for one in sets if id(one) in listed],
+        listed=[dataset for dataset in sets if id(dataset) in listed],
         pages=pages,
         joint=joint,
         population=population,
-        without_page=sum(1 for one in sets if one.stem not in pages),
-        warned=sum(1 for one in sets if one.cautions),
+        without_page=sum(1 for dataset in sets if dataset.stem not in pages),
+        warned=sum(1 for dataset in sets if dataset.cautions),
         tally=_tally(sets),
         figures=figures,
     )
@@ -100,14 +100,14 @@ def estimates(sets: Sequence[SetSummary]) -> Chart:
     panels = [_estimates(name, sets, few) for name in names]
     rows = [Row(3.0 * POINTS, [panel]) for panel in panels]
     if few:
-        labels = [figure_text(one.name) for one in sets]
+        labels = [figure_text(dataset.name) for dataset in sets]
         panels[-1].x_numbers, panels[-1].names = True, labels
         rows[-1] = Row((3.0 + 0.14 * max(map(len, labels))) * POINTS, [panels[-1]])
     return Chart(rows, PAGE if few else COLUMN)
 
 
 def _estimates(name: str, sets: Sequence[SetSummary], few: bool) -> Panel:
-    x = np.array([i for i, one in enumerate(sets) if name in one.rows])
+    x = np.array([i for i, dataset in enumerate(sets) if name in dataset.rows])
     rows = [sets[i].rows[name] for i in x]
     mean, low, high = (np.array([getattr(row, key) for row in rows]) for key in ("middle", "q05", "q95"))
     trusted = np.array([not row.untrusted for row in rows], dtype=bool)
@@ -144,11 +144,11 @@ def overview_figures(sets: Sequence[SetSummary]) -> list[Captioned]:
 
 
 def _parameters(sets: Sequence[SetSummary]) -> list[str]:
-    return list(dict.fromkeys(name for one in sets for name in one.rows))
+    return list(dict.fromkeys(name for dataset in sets for name in dataset.rows))
 
 
 def _parameter(name: str, sets: Sequence[SetSummary]) -> dict[str, Any]:
-    rows = [one.rows[name] for one in sets if name in one.rows]
+    rows = [dataset.rows[name] for dataset in sets if name in dataset.rows]
     means = np.array([row.mean for row in rows if math.isfinite(row.mean)])
     low, median, high = np.quantile(means, (0.25, 0.5, 0.75)) if means.size else (math.nan,) * 3
     precision = float(np.nanmedian([row.std for row in rows])) if means.size else math.nan
@@ -167,10 +167,10 @@ def _tally(sets: Sequence[SetSummary]) -> list[dict[str, Any]]:
     """One line a code: in how many data sets, with the words of the first of them."""
     count: Counter[tuple[str, str]] = Counter()
     first: dict[tuple[str, str], tuple[Caution, str]] = {}
-    for one in sets:
-        count.update({(c.severity, c.code) for c in one.cautions})
-        for c in one.cautions:
-            first.setdefault((c.severity, c.code), (c, one.name))
+    for dataset in sets:
+        count.update({(c.severity, c.code) for c in dataset.cautions})
+        for c in dataset.cautions:
+            first.setdefault((c.severity, c.code), (c, dataset.name))
     return [
         {
             "severity": c.severity,

@@ -7,16 +7,18 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from en4dvar.diagnostics import chi2_interval
+from en4dvar.diagnosis.diagnostics import chi2_interval
+from en4dvar.plumbing.units import convert
 from en4dvar.report.drawing import Drawing
 from en4dvar.report.html import render
 from en4dvar.report.readings import reading_words
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
 from en4dvar.report.text import number_like, plain_number
 from en4dvar.report.varying import stored_walks, verdict
-from en4dvar.storage.groups import ITERATION_SCALARS, SHARES
-from en4dvar.storage.store import StoredResult
-from en4dvar.units import convert
+from en4dvar.report.withheld import withheld_words
+from en4dvar.results.sample_stats import SHARES
+from en4dvar.results.store import StoredResult
+from en4dvar.results.variables import ITERATIONS
 
 PROVENANCE = (
     "history", "date_created", "seed", "data_source", "git_commit", "configuration_file", "configuration_git_commit",
@@ -46,7 +48,7 @@ def render_set(
         created=attributes.get("date_created", ""),
         configuration=str(attributes.get("configuration", "")),
         stats=judged.attrs,
-        rows=result.summary(),
+        rows=result.rows,
         dfs_words=DFS_WORDS,
         cautions=result.cautions,
         tiles=_tiles(result),
@@ -56,6 +58,7 @@ def render_set(
         exceeding=exceeding(what_if),
         entries=stored_ledger(result),
         readings=reading_words(result),
+        withheld=withheld_words(result),
         walks=stored_walks(result),
         verdict=verdict(result),
         identifiers=IDENTIFIERS,
@@ -76,7 +79,7 @@ def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
     chi2, dfs, nrmse = (float(s[key]) for key in ("chi2_per_observation", "dfs", "nrmse"))
     structured = any(c.code in ("residual-structure", "odd-residuals") for c in result.cautions)
     chi2_words, chi2_odd = judge_chi2(chi2, int(s["n_weighted"]), dfs, structured)
-    rows = result.summary()
+    rows = result.rows
     shares, doubted = sum(row.dfs for row in rows), any(row.untrusted for row in rows)  # of what is reported
     informed = f"numbers determined by the data, of {n_estimated} estimated: the sum of the shares below"
     if "/fields" in result.groups:
@@ -131,7 +134,7 @@ def _shares(result: StoredResult) -> list[tuple[str, str, str, list[str]]]:
     if "variance_from_errors" not in result.group("sample_stats"):
         return []
     rows = []
-    for row in result.summary():
+    for row in result.rows:
         shares = [result.of_parameter(f"variance_from_{source}", row.name) for source in SHARES]
         parts = [number_like(row.std * math.sqrt(max(0.0, share)), row.std) for share in shares]
         rows.append((row.symbol, number_like(row.std, row.std), row.unit, parts))
@@ -148,9 +151,7 @@ def _modes(result: StoredResult) -> list[tuple[str, ...]]:
         of = {key: float(stats[f"mode_{key}"].values[k]) for key in ("weight", "cost", "cost_spread", "descents")}
         centre = [
             number_like(convert(float(stats["mode_centre"].values[k, j]), a["units"], a["display_units"]), row.std)
-            for j, (row, a) in enumerate(
-                zip(result.summary(), (v.attrs for v in result.parameters.values()), strict=True)
-            )
+            for j, (row, a) in enumerate(zip(result.rows, (v.attrs for v in result.parameters.values()), strict=True))
         ]
         spread = f" (they were ended within {of['cost_spread']:.2g} of its J)" if of["cost_spread"] else ""
         rows.append((f"{of['weight']:.2f}", f"{of['cost']:.2f}", f"{of['descents']:.0f}{spread}", *centre))
@@ -170,7 +171,7 @@ def _fixed(result: StoredResult) -> list[tuple[str, str, float, str]]:
 def _iterations(result: StoredResult) -> list[tuple[str, ...]]:
     """One line an iteration: index, J, terms, step, χ²/Ky, DFS, spread, members."""
     table = result.group("iterations")
-    diagnostics = [key for key in ITERATION_SCALARS if key != "active"]
+    diagnostics = [d.name for d in ITERATIONS if not d.scope and d.name != "active"]
     columns = [
         [str(int(i)) for i in table["iteration"].values],
         *([plain_number(float(value)) for value in table[key].values] for key in diagnostics),
@@ -181,10 +182,10 @@ def _iterations(result: StoredResult) -> list[tuple[str, ...]]:
 
 def _settings(result: StoredResult) -> list[tuple[str, str]]:
     """The scheme's settings and how observations are weighted."""
-    given = json.loads(str(result.attributes["assimilation_settings"]))
+    recorded = json.loads(str(result.attributes["assimilation_settings"]))
     weights = result.of_readings("observed_data", "weights", shared=True)
     total = f"{len(weights)} observations, weights sum to {plain_number(float(weights.sum()))}"
-    return [*((key.replace("_", " "), str(value)) for key, value in given.items()), ("observations", total)]
+    return [*((key.replace("_", " "), str(value)) for key, value in recorded.items()), ("observations", total)]
 
 
 def provenance_rows(attributes: Mapping[Any, Any]) -> list[tuple[str, str]]:

@@ -1,36 +1,90 @@
-"""A chart as a matplotlib figure, for PDF and PNG and for whoever works on with it."""
+"""A chart as a matplotlib figure: PDF and PNG for a paper, and a figure for whoever works on with it.
+
+Only this module draws with matplotlib, whose import takes longer than all charts of a page.
+"""
 
 from __future__ import annotations
 
+import io
 import math
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib import style
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
+from en4dvar.plumbing.files import write_bytes
 from en4dvar.report.chart import Chart, Mark, Panel
 from en4dvar.report.palette import LIGHT
-from en4dvar.report.style import styled
+from en4dvar.report.ticks import labelled
 
 MANY = 5000  # points of a mark: beyond, they are drawn as pixels, for vectors would make a file of many megabytes
+LABEL = 110  # points that an entry of a legend takes
 MARKERS = {"dots": "o", "rings": "o", "ticks": "|", "dashes": "_"}
+RC: dict[str, Any] = {
+    "font.size": 8,
+    "axes.labelsize": 8,
+    "axes.titlesize": 8,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "text.color": LIGHT["ink"],
+    "axes.labelcolor": LIGHT["ink"],
+    "axes.titlecolor": LIGHT["ink"],
+    "axes.edgecolor": LIGHT["muted"],
+    "xtick.color": LIGHT["muted"],
+    "ytick.color": LIGHT["muted"],
+    "xtick.labelcolor": LIGHT["ink"],
+    "ytick.labelcolor": LIGHT["ink"],
+    "grid.color": LIGHT["grid"],
+    "pdf.fonttype": 42,
+}
+STYLE: list[str | Path | dict[str, Any]] = ["default", RC]  # whatever style the caller's process has
 
 
-@styled
 def on_paper(chart: Chart) -> Figure:
     """The figure, in the same size and colours as in the page."""
-    figure = Figure(figsize=(chart.width / 72, chart.height / 72), layout="constrained")
-    columns = math.lcm(*(len(row.panels) for row in chart.rows))
-    grid = figure.add_gridspec(len(chart.rows), columns, height_ratios=[row.height for row in chart.rows])
-    for i, row in enumerate(chart.rows):
-        each = columns // len(row.panels)
-        for j, panel in enumerate(row.panels):
-            if panel.bare and not panel.words:
-                continue
-            _panel(figure.add_subplot(grid[i, j * each : (j + 1) * each]), panel)
-    figure.align_labels()
-    return figure
+    with style.context(STYLE):
+        figure = Figure(figsize=(chart.width / 72, chart.height / 72), layout="constrained")
+        columns = math.lcm(*(len(row.panels) for row in chart.rows))
+        grid = figure.add_gridspec(len(chart.rows), columns, height_ratios=[row.height for row in chart.rows])
+        for i, row in enumerate(chart.rows):
+            each = columns // len(row.panels)
+            for j, panel in enumerate(row.panels):
+                if not panel.bare or panel.words:
+                    _panel(figure.add_subplot(grid[i, j * each : (j + 1) * each]), panel)
+        _legends(figure, chart)
+        figure.align_labels()
+        return figure
+
+
+def save_chart(chart: Chart, folder: Path, name: str) -> None:
+    """``folder/name.pdf`` (vectors) and ``folder/name.png`` (200 dots an inch), undated, each by atomic rename."""
+    figure = on_paper(chart)
+    with style.context(STYLE):
+        engine = figure.get_layout_engine()
+        assert engine is not None
+        engine.execute(figure)
+        figure.set_layout_engine("none")  # it would do it again for every format
+        # to the canvases directly: ``savefig`` would draw all of it once more, for a layout that is settled; and in
+        # memory: the PDF writer has no words for a disk that is full
+        pdf, png = io.BytesIO(), io.BytesIO()
+        FigureCanvasPdf(figure).print_pdf(pdf, metadata={"CreationDate": None})
+        figure.dpi = 200
+        FigureCanvasAgg(figure).print_png(png, metadata={"Software": None})
+    write_bytes(folder / f"{name}.pdf", pdf.getvalue())
+    write_bytes(folder / f"{name}.png", png.getvalue())
 
 
 def _panel(ax: Axes, panel: Panel) -> None:
@@ -40,32 +94,55 @@ def _panel(ax: Axes, panel: Panel) -> None:
         return
     if panel.logarithmic:
         ax.set_yscale("log", nonpositive="mask")
+    if panel.x_logarithmic:
+        ax.set_xscale("log", nonpositive="mask")
     for mark in panel.marks:
         _mark(ax, mark)
     xlim, ylim = panel.limits()
     ax.set(xlabel=panel.xlabel, ylabel=panel.ylabel, xlim=xlim, ylim=ylim)
     if panel.title:
-        ax.set_title(panel.title, color=LIGHT[panel.title_colour])
-    if not isinstance(panel.xticks, int):
-        ax.set_xticks(list(panel.xticks))
-        if panel.names:
-            ax.set_xticklabels(list(panel.names), rotation=90)
-    else:
-        ax.xaxis.set_major_locator(MaxNLocator(panel.xticks, integer=panel.whole))
-    if not isinstance(panel.yticks, int):
-        ax.set_yticks(list(panel.yticks))
-    elif not panel.logarithmic:
-        ax.yaxis.set_major_locator(MaxNLocator(panel.yticks))
+        ax.set_title(panel.title, color=_colour(panel.title_colour))
+    along = labelled(xlim, panel.xticks, panel.names, logarithmic=panel.x_logarithmic, whole=panel.whole)
+    _ticks(ax.xaxis, along, rotation=90 if panel.names else 0)
+    _ticks(ax.yaxis, labelled(ylim, panel.yticks, panel.y_names, logarithmic=panel.logarithmic))
     ax.tick_params(labelbottom=panel.x_numbers, labelleft=panel.y_numbers and panel.left, left=panel.left)
     ax.spines["left"].set_visible(panel.left)
     if panel.grid:
         ax.grid(axis="y", lw=0.5)
-    if panel.legend:
-        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, columnspacing=1.2, handlelength=1.4)
+
+
+def _legends(figure: Figure, chart: Chart) -> None:
+    """Each legend above its panel; where a row has several panels and one legend, above all of them, and where it has
+    several legends, in one column: one that is wider than its panel would leave the panels no room.
+    """
+    axes = iter(figure.axes)
+    for row in chart.rows:
+        drawn = [(next(axes), panel) for panel in row.panels if not panel.bare or panel.words]
+        shown = [(ax, panel) for ax, panel in drawn if panel.legend]
+        for ax, panel in shown:
+            entries = dict(reversed(list(zip(*reversed(ax.get_legend_handles_labels()), strict=True))))  # each once
+            labels, handles = list(entries)[::-1], list(entries.values())[::-1]
+            above = 1.0 + 0.12 * bool(panel.title)
+            how: dict[str, Any] = {"columnspacing": 1.2, "handlelength": 1.4}
+            if len(drawn) > 1 and len(shown) == 1 and row is chart.rows[0]:
+                columns = max(1, int(chart.width // LABEL))
+                figure.legend(handles, labels, loc="outside upper center", ncols=columns, **how)
+            else:
+                columns = 3 if len(drawn) == 1 else 1
+                ax.legend(handles, labels, loc="lower center", bbox_to_anchor=(0.5, above), ncols=columns, **how)
+
+
+def _ticks(axis: Axis, ticks: Sequence[tuple[float, str]], rotation: float = 0) -> None:
+    axis.set_ticks([value for value, _ in ticks], [text for _, text in ticks], rotation=rotation)
+    axis.set_ticks([], minor=True)
+
+
+def _colour(name: str) -> str:
+    return LIGHT.get(name, name)
 
 
 def _mark(ax: Axes, mark: Mark) -> None:
-    how: dict[str, Any] = {"color": LIGHT[mark.colour], "alpha": mark.alpha, "label": mark.label or None}
+    how: dict[str, Any] = {"color": _colour(mark.colour), "alpha": mark.alpha, "label": mark.label or None}
     many = len(mark.x) > MANY
     if mark.kind == "line":
         ax.plot(mark.x, mark.y, mark.dash or "-", lw=mark.size, rasterized=many, **how)
@@ -79,6 +156,10 @@ def _mark(ax: Axes, mark: Mark) -> None:
         ax.axvline(mark.x[0], ymax=0.85, lw=mark.size, ls=mark.dash or "-", **how)
     elif mark.kind == "span":
         ax.axhspan(mark.y[0], mark.top[0], lw=0, **how)
+    elif mark.kind == "tiles":
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * mark.top / 2
+        rectangles: Any = np.column_stack([mark.x, mark.y])[:, None] + corners
+        ax.add_collection(PolyCollection(rectangles, lw=0.1, **how))
     else:
         edge = 0.0 if mark.kind == "dots" else mark.stroke
         look: dict[str, Any] = {"mew": edge, "mfc": "none"} if mark.kind == "rings" else {"mew": edge}

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import escape
 
+from en4dvar.model.state import Array
 from en4dvar.report.chart import Mark
-from en4dvar.state import Array
+from en4dvar.report.palette import ink
 
 SHOWN = 2000  # points of a line
 
@@ -29,25 +30,30 @@ class Frame:
     height: float
     xlim: tuple[float, float]
     ylim: tuple[float, float]
-    logarithmic: bool
+    logarithmic: bool = False
+    x_logarithmic: bool = False
 
     def across(self, values: Array) -> Array:
-        low, high = self.xlim
-        return self.x + self.width * (np.asarray(values, dtype=float) - low) / (high - low)
+        return np.asarray(self.x + self.width * _share(np.asarray(values, dtype=float), self.xlim, self.x_logarithmic))
 
     def up(self, values: Array) -> Array:
-        low, high = self.ylim
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share = np.log(values / low) / math.log(high / low) if self.logarithmic else (values - low) / (high - low)
-        return np.asarray(self.y + self.height * (1 - share))
+        return np.asarray(self.y + self.height * (1 - _share(values, self.ylim, self.logarithmic)))
+
+
+def _share(values: Array, limits: tuple[float, float], logarithmic: bool) -> Array:
+    """The share of the way between two limits."""
+    low, high = limits
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.log(values / low) / math.log(high / low) if logarithmic else (values - low) / (high - low)
+    return np.asarray(share)
 
 
 def path_of(mark: Mark, place: Frame) -> str:
-    colour, edges = f"var(--{mark.colour})", ""
+    colour, edges = ink(mark.colour), ""
     alpha = f' opacity="{mark.alpha:g}"' if mark.alpha < 1 else ""
     x, y, top = place.across(mark.x), place.up(mark.y), place.up(mark.top)
     far, base = place.x + place.width, place.y + place.height
-    filled = mark.kind in ("band", "span")
+    filled = mark.kind in ("band", "span", "tiles")
     if mark.kind == "line":
         edges = _line(*_thinned(x, y))
     elif mark.kind == "band":
@@ -56,6 +62,8 @@ def path_of(mark: Mark, place: Frame) -> str:
         edges = _line(np.concatenate([u, w[::-1]]), np.concatenate([v, z[::-1]])) + "z" if len(u) else ""
     elif mark.kind == "span":
         edges = f"M{place.x:.1f} {y[0]:.1f}H{far:.1f}V{top[0]:.1f}H{place.x:.1f}z"
+    elif mark.kind == "tiles":
+        edges = _tiles(x, y, mark, place)
     elif mark.kind == "bars":
         seen = np.isfinite(x) & np.isfinite(y) & np.isfinite(top)
         edges = _each(x[seen], y[seen], [f"V{t:.1f}" for t in top[seen]])
@@ -68,8 +76,9 @@ def path_of(mark: Mark, place: Frame) -> str:
     if not edges:
         return ""
     label = f' data-label="{escape(mark.label)}"' if mark.label else ""
-    ink = f'fill="{colour}"' if filled else f'stroke="{colour}" stroke-width="{mark.stroke:g}"{_ends(mark)}'
-    return f'<path d="{edges}" {ink}{alpha}{label}/>'
+    how = f'fill="{colour}"' if filled else f'stroke="{colour}" stroke-width="{mark.stroke:g}"{_ends(mark)}'
+    crisp = ' shape-rendering="crispEdges"' if mark.kind == "tiles" else ""
+    return f'<path d="{edges}" {how}{alpha}{label}{crisp}/>'
 
 
 def _ends(mark: Mark) -> str:
@@ -87,6 +96,14 @@ def _spots(x: Array, y: Array, mark: Mark) -> tuple[Array, Array, list[str]]:
         mark.kind, f"m-{r:g} 0{arc} {mark.size:g} 0{arc}-{mark.size:g} 0"
     )
     return spots[:, 0], spots[:, 1], [stroke] * len(spots)
+
+
+def _tiles(x: Array, y: Array, mark: Mark, place: Frame) -> str:
+    """Rectangles, a little larger than they are, so that no line shows between them."""
+    width = place.width * mark.top[0] / abs(place.xlim[1] - place.xlim[0]) + 0.1
+    height = place.height * mark.top[1] / abs(place.ylim[1] - place.ylim[0]) + 0.1
+    stroke = f"h{width:.2f}v{height:.2f}h-{width:.2f}z"
+    return _each(x - width / 2, y - height / 2, [stroke] * len(x))
 
 
 def _each(x: Array, y: Array, strokes: Sequence[str]) -> str:

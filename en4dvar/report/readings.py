@@ -6,12 +6,12 @@ import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup
 
-from en4dvar.influence import UNKNOWN
+from en4dvar.diagnosis.influence import UNKNOWN
+from en4dvar.model.state import Array
+from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.text import fixed, plain_number, pretty_unit, shown, signed, symbol_html, with_unit
-from en4dvar.state import Array
-from en4dvar.storage.store import StoredResult
-from en4dvar.units import convert
+from en4dvar.results.store import StoredResult
 
 CAPTION = (
     "What each reading does. Above, one panel a parameter: change of the posterior mean, in posterior standard "
@@ -51,7 +51,7 @@ def each_series(result: StoredResult, alone: str = "ink") -> list[tuple[npt.NDAr
 
 def influence(result: StoredResult) -> Chart:
     """Change of each parameter without each reading, and the distance of the readings from the prior, over time."""
-    rows = result.summary() if has_influence(result) else ()
+    rows = result.rows if has_influence(result) else ()
     in_std = result.of_readings("sample_stats", "influence_in_std", shared=True) if rows else np.empty(0)
     panels = []
     for row, change in zip(rows, in_std, strict=False):
@@ -81,8 +81,8 @@ def _stems(panel: Panel, result: StoredResult, values: Array, alone: str) -> Non
 
 def reading_words(result: StoredResult) -> list[Markup]:
     """The reading that moves a parameter most, the one farthest from the prior; or why that is not told."""
-    found = [_most_moving(result) if has_influence(result) else _why_not(result), _farthest(result)]
-    return [words for words in found if words]
+    sentences = [_most_moving(result) if has_influence(result) else _why_not(result), _farthest(result)]
+    return [words for words in sentences if words]
 
 
 def _most_moving(result: StoredResult) -> Markup:
@@ -92,7 +92,7 @@ def _most_moving(result: StoredResult) -> Markup:
     if not np.isfinite(in_std).any():
         return Markup("What leaving out a reading would change only another fit tells: each of them decides too much.")
     j, k = np.unravel_index(int(np.nanargmax(np.abs(in_std))), in_std.shape)
-    row = result.summary()[int(j)]
+    row = result.rows[int(j)]
     about = result.parameters[row.name].attrs
     size = convert(float(change[j, k]), about["units"], about["display_units"])
     words = Markup(

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
+from en4dvar.plumbing.units import convert
 from en4dvar.report.text import fixed, number_like, pretty_unit, symbol_html
-from en4dvar.storage.store import StoredResult
-from en4dvar.units import convert
+from en4dvar.results.store import StoredResult
 
 Lines = list[tuple[object, ...]]
 SHIFT_COLUMNS = (

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from en4dvar.errors import OutputError
-from en4dvar.files import write_text
+import numpy as np
+
+from en4dvar.estimation.summary import frame
+from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.plumbing.files import write_text
+from en4dvar.plumbing.units import convert
 from en4dvar.report import figures
 from en4dvar.report.drawing import draw
+from en4dvar.report.history import history
 from en4dvar.report.notebook import cell_html
 from en4dvar.report.page import IDENTIFIERS, render_set
-from en4dvar.storage.netcdf import to_bytes
-from en4dvar.storage.readings import MEMBER
-from en4dvar.storage.store import StoredResult, load_stored
-from en4dvar.storage.xarrays import dataset_of, tree_of
+from en4dvar.results.complete import of_members
+from en4dvar.results.netcdf import to_bytes
+from en4dvar.results.store import StoredResult, load_stored
+from en4dvar.results.xarrays import dataset_of, tree_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,6 +28,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from en4dvar.report.chart import Chart
+
+
+FEWEST_DRAWS = 4  # of a chain: ArviZ's diagnostics need as many
 
 
 class Result(StoredResult):
@@ -44,12 +52,12 @@ class Result(StoredResult):
     @property
     def prior(self) -> xr.Dataset:
         """Parameters (chain, draw) before the data."""
-        return _of_members(self.dataset("prior"))
+        return self.dataset("prior")[list(of_members(self.groups["/prior"]))]
 
     @property
     def posterior(self) -> xr.Dataset:
         """Parameters (chain, draw) given the data."""
-        return _of_members(self.dataset("posterior"))
+        return self.dataset("posterior")[list(of_members(self.groups["/posterior"]))]
 
     @property
     def observed_data(self) -> xr.Dataset:
@@ -66,9 +74,17 @@ class Result(StoredResult):
         """J and its terms (iteration), parameters (iteration, draw)."""
         return self.dataset("iterations")
 
+    def summary(self) -> pd.DataFrame:
+        """The posterior in a few numbers, a row a parameter, in display units; NaN where one is not to be quoted."""
+        return frame({self.name: self.rows}).droplevel("dataset")
+
     def to_dataframe(self) -> pd.DataFrame:
         """Posterior members as rows (index ``draw``), parameters as columns, SI; NaN where a member failed."""
         return self.posterior.isel(chain=0, drop=True).to_dataframe()
+
+    def plot(self) -> Figure:
+        """The fit, as :meth:`plot_history`."""
+        return self.plot_history()
 
     def plot_histograms(self) -> Figure:
         """Posterior over prior, one panel a parameter."""
@@ -76,7 +92,7 @@ class Result(StoredResult):
 
     def plot_history(self) -> Figure:
         """Data, prior and posterior predictive bands and the residuals of the centre."""
-        return _on_paper(figures.history(self))
+        return _on_paper(history(self))
 
     def plot_pairs(self) -> Figure:
         """Posterior members of every pair of parameters with their correlation."""
@@ -95,21 +111,55 @@ class Result(StoredResult):
         drawn = draw(figures.all_figures(self), IDENTIFIERS)
         return write_text(Path(path), render_set(self, drawn, copies=False))
 
-    def to_inference_data(self) -> Any:
+    def to_inference_data(self, units: Literal["SI", "display"] = "SI", chains: int = 1) -> Any:
         """What ArviZ works with: the groups as its ``InferenceData``; from version 1 on that is a DataTree.
 
-        Raises ImportError where ArviZ is not installed.
+        ``units``: those of parameters and readings. ``chains``: the members that are alive, which have no order, are
+        dealt out to so many, for plots and diagnostics that compare chains; what is left over is left out.
+
+        Raises ImportError where ArviZ is not installed, :class:`ConfigError` where members are too few for the chains.
         """
         import arviz
 
         groups = {path.strip("/"): node.to_dataset() for path, node in self.tree.children.items()}
+        if units == "display":
+            groups = {name: _in_display_units(group) for name, group in groups.items()}
+        if chains != 1:
+            groups = {name: self._dealt(group, chains) for name, group in groups.items()}
         known = getattr(arviz, "InferenceData", None)
-        return (
-            self.tree if known is None or isinstance(self.tree, known) else known(attrs=dict(self.attributes), **groups)
-        )
+        if known is None or isinstance(self.tree, known):
+            from xarray import DataTree
+
+            return DataTree.from_dict({"/": self.tree.to_dataset(), **groups})
+        return known(attrs=dict(self.attributes), **groups)
+
+    def _dealt(self, group: xr.Dataset, chains: int) -> xr.Dataset:
+        """The living members of a group as ``chains`` of equal length."""
+        import xarray as xr
+
+        if not {"chain", "draw"} <= {*group.dims}:
+            return group
+        each = int(self.alive.sum()) // max(chains, 1)
+        if each < FEWEST_DRAWS:
+            raise ConfigError(f"{self.alive.sum()} members are too few for {chains} chains of {FEWEST_DRAWS} draws")
+        living = np.flatnonzero(self.alive)[: each * chains].reshape(chains, each)
+        chosen = group.isel(chain=0, draw=xr.DataArray(living, dims=("own", "among")))
+        dealt = chosen.drop_vars(["chain", "draw"], errors="ignore").rename(own="chain", among="draw")
+        return dealt.transpose("chain", "draw", ...)
 
     def _repr_html_(self) -> str:
         return cell_html(self)
+
+
+def _in_display_units(group: xr.Dataset) -> xr.Dataset:
+    """With the variables that have one in their display unit."""
+    shown = {}
+    for name, variable in group.data_vars.items():
+        unit, display = variable.attrs.get("units"), variable.attrs.get("display_units")
+        if unit and display and unit != display:
+            shown[name] = variable.copy(data=convert(variable.values, unit, display))
+            shown[name].attrs["units"] = display
+    return group.assign(shown)
 
 
 def _on_paper(chart: Chart) -> Figure:
@@ -119,10 +169,8 @@ def _on_paper(chart: Chart) -> Figure:
 
 
 def load_result(path: str | Path) -> Result:
-    """Read a result file. Raises :class:`~en4dvar.errors.OutputError` as :func:`~en4dvar.storage.store.load_stored`."""
+    """Read a result file.
+
+    Raises :class:`~en4dvar.plumbing.errors.OutputError` as :func:`~en4dvar.results.store.load_stored`.
+    """
     return Result(load_stored(path).groups)
-
-
-def _of_members(dataset: xr.Dataset) -> xr.Dataset:
-    """A group of parameters without the values of pieces of time: what has one number a member."""
-    return dataset[[name for name, variable in dataset.data_vars.items() if variable.dims == MEMBER]]

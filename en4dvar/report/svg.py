@@ -6,16 +6,16 @@ says where the pointer is.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 from markupsafe import Markup, escape
 
+from en4dvar.model.state import Array
 from en4dvar.report.chart import Chart, Mark, Panel, Row
 from en4dvar.report.paths import Frame, path_of
-from en4dvar.report.text import plain_number
-from en4dvar.report.ticks import numbers, powers, ticks
+from en4dvar.report.ticks import labelled
 from en4dvar.report.words import EM, FONT, SMALL, WIDEST, width_of, written
 
 GAP = 6.0  # between panels
@@ -36,35 +36,27 @@ def svg(chart: Chart, name: str, description: str) -> Markup:
     return Markup(f"{head}{''.join(parts)}</svg>")
 
 
-def _y_ticks(panel: Panel) -> list[float]:
-    low, high = panel.limits()[1]
-    wanted = panel.yticks
-    found = powers(low, high) if panel.logarithmic and isinstance(wanted, int) else ticks(low, high, wanted)
-    return [t for t in found if low <= t <= high or math.isclose(t, low) or math.isclose(t, high)]
-
-
-def _y_labels(panel: Panel) -> list[str]:
-    found = _y_ticks(panel)
-    return [plain_number(t, 3) for t in found] if panel.logarithmic else numbers(found)
+def _y_ticks(panel: Panel) -> list[tuple[float, str]]:
+    return labelled(panel.limits()[1], panel.yticks, panel.y_names, logarithmic=panel.logarithmic)
 
 
 def _left(panel: Panel) -> float:
     """Points that the labels on the left need."""
     if panel.bare or not panel.left:
         return 8.0 if panel.x_numbers and not panel.bare else 2.0  # half a number below the corner
-    labels = _y_labels(panel) if panel.y_numbers else []
-    widest = max((len(t) for t in labels), default=0) * EM * SMALL
+    labels = [text for _, text in _y_ticks(panel)] if panel.y_numbers else []
+    widest = max(map(len, labels), default=0) * EM * SMALL
     return widest + 4.5 + (FONT + 5 if panel.ylabel else 0)
 
 
 def _left_margins(chart: Chart) -> dict[tuple[int, int], float]:
     """(panels of the row, place in it) → margin; the first places of all rows have one."""
-    found: dict[tuple[int, int], float] = {}
+    margins: dict[tuple[int, int], float] = {}
     for row in chart.rows:
         for j, panel in enumerate(row.panels):
             key = (len(row.panels) if j else 0, j)
-            found[key] = max(found.get(key, 0.0), _left(panel))
-    return found
+            margins[key] = max(margins.get(key, 0.0), _left(panel))
+    return margins
 
 
 def _columns(row: Row, margins: dict[tuple[int, int], float], width: float) -> Iterator[tuple[Panel, float, float]]:
@@ -79,22 +71,27 @@ def _columns(row: Row, margins: dict[tuple[int, int], float], width: float) -> I
 
 def _panel(panel: Panel, row: Row, top: float, x: float, width: float, name: str) -> list[str]:
     legend, above = _legend(panel, x, top, width)
-    above += FONT + 4 if any(p.title for p in row.panels) else 4
+    above += max((len(p.title.splitlines()) for p in row.panels), default=0) * (FONT + 2) + 4
     below = max((_below(p) for p in row.panels), default=0.0)
-    place = Frame(x, top + above, width, row.height - above - below, *panel.limits(), panel.logarithmic)
+    place = Frame(x, top + above, width, row.height - above - below, *panel.limits())
+    place = replace(place, logarithmic=panel.logarithmic, x_logarithmic=panel.x_logarithmic)
     if panel.bare:
         return [written(panel.words, x + width / 2, place.y + place.height / 2 + 3, size=FONT)] if panel.words else []
     box = f'x="{place.x:.1f}" y="{place.y:.1f}" width="{place.width:.1f}" height="{place.height:.1f}"'
     drawn = "".join(path_of(mark, place) for mark in panel.marks)
     (x0, x1), (y0, y1) = place.xlim, place.ylim
-    reading = f'data-x="{x0:.7g} {x1:.7g}" data-y="{y0:.7g} {y1:.7g}"{" data-log" if panel.logarithmic else ""}'
+    scales = f"{' data-log' * panel.logarithmic}{' data-xlog' * panel.x_logarithmic}"
+    reading = f'data-x="{x0:.7g} {x1:.7g}" data-y="{y0:.7g} {y1:.7g}"{scales}'
     return [
         *legend,
         f'<clipPath id="{name}"><rect {box}/></clipPath>',
         *(_grid(panel, place) if panel.grid else ()),
         f'<g clip-path="url(#{name})" fill="none">{drawn}</g>',
         *_axes(panel, place, below),
-        written(panel.title, x + width / 2, place.y - 4, size=FONT, colour=panel.title_colour),
+        *(
+            written(line, x + width / 2, place.y - 4 - i * (FONT + 2), size=FONT, colour=panel.title_colour)
+            for i, line in enumerate(reversed(panel.title.splitlines()))
+        ),
         f'<rect class="read" {box} fill="none" pointer-events="all" {reading}/>',
     ]
 
@@ -110,11 +107,9 @@ def _below(panel: Panel) -> float:
 def _axes(panel: Panel, place: Frame, below: float) -> Iterator[str]:
     """Lines, ticks, numbers and labels."""
     base, left, far = place.y + place.height, place.x, place.x + place.width
-    low, high = place.xlim
-    along = [t for t in ticks(low, high, panel.xticks, panel.whole) if low <= t <= high]
+    along = labelled(place.xlim, panel.xticks, panel.names, logarithmic=panel.x_logarithmic, whole=panel.whole)
     lines, words = [f"M{left:.1f} {base:.1f}H{far:.1f}"], []
-    texts = panel.names or numbers(along)
-    for x, text in zip(place.across(np.array(along)), texts, strict=True):
+    for x, text in _placed(along, place.across):
         lines.append(f"M{x:.1f} {base:.1f}v2.5")
         if panel.names:
             words.append(written(text, 0, 0, "end", turned=(x + 2.3, base + 4)))
@@ -122,7 +117,7 @@ def _axes(panel: Panel, place: Frame, below: float) -> Iterator[str]:
             words.append(written(text, x, base + SMALL + 3))
     if panel.left:
         lines.append(f"M{left:.1f} {place.y:.1f}V{base:.1f}")
-        for y, text in zip(place.up(np.array(_y_ticks(panel))), _y_labels(panel), strict=True):
+        for y, text in _placed(_y_ticks(panel), place.up):
             lines.append(f"M{left:.1f} {y:.1f}h-2.5")
             words.append(written(text, left - 4, y + 2.5, "end") if panel.y_numbers else "")
     yield f'<path d="{"".join(lines)}" stroke="var(--muted)" stroke-width="0.6" fill="none"/>'
@@ -132,8 +127,14 @@ def _axes(panel: Panel, place: Frame, below: float) -> Iterator[str]:
     yield written(panel.ylabel, 0, 0, size=FONT, turned=(across, place.y + place.height / 2))
 
 
+def _placed(ticks: list[tuple[float, str]], along: Callable[[Array], Array]) -> Iterator[tuple[float, str]]:
+    """Ticks at their places in the drawing."""
+    places = along(np.array([value for value, _ in ticks]))
+    return zip(places.tolist(), (text for _, text in ticks), strict=True)
+
+
 def _grid(panel: Panel, place: Frame) -> Iterator[str]:
-    lines = "".join(f"M{place.x:.1f} {y:.1f}h{place.width:.1f}" for y in place.up(np.array(_y_ticks(panel))))
+    lines = "".join(f"M{place.x:.1f} {y:.1f}h{place.width:.1f}" for y, _ in _placed(_y_ticks(panel), place.up))
     yield f'<path d="{lines}" stroke="var(--grid)" stroke-width="0.5"/>'
 
 
@@ -145,7 +146,7 @@ def _legend(panel: Panel, x: float, top: float, width: float) -> tuple[list[str]
         length = 15 + width_of(label)
         if at > x and at + length > x + width:
             at, line = x, line + SMALL + 4
-        sample = Frame(at, line + 2, 11, SMALL, (0, 1), (0, 1), False)
+        sample = Frame(at, line + 2, 11, SMALL, (0, 1), (0, 1))
         drawn = "".join(path_of(_sample(m), sample) for m in marks)
         parts.append(
             f'<g class="entry" data-label="{escape(label)}"><g fill="none">{drawn}</g>'

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from markupsafe import Markup, escape
 
-from en4dvar.state import Array
-from en4dvar.summary import ParameterSummary
-from en4dvar.units import convert
+from en4dvar.estimation.summary import ParameterSummary
+from en4dvar.model.state import Array
+from en4dvar.plumbing.units import convert
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from en4dvar.storage.netcdf import Variable
+    from en4dvar.results.netcdf import Variable
 
 _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _NAMES = (

@@ -23,14 +23,27 @@ def ticks(low: float, high: float, wanted: int | Sequence[float], whole: bool = 
     return [k * step for k in range(first, last + 1)]
 
 
+def labelled(
+    limits: tuple[float, float], wanted: int | Sequence[float], names: Sequence[str] = (), *, logarithmic: bool = False,
+    whole: bool = False,
+) -> list[tuple[float, str]]:  # fmt: skip
+    """The ticks of an axis within its limits, each with its number or its name."""
+    low, high = sorted(limits)
+    powers_of_ten = logarithmic and isinstance(wanted, int)
+    chosen = powers(low, high) if powers_of_ten else ticks(low, high, wanted, whole)
+    held = [t for t in chosen if low <= t <= high or math.isclose(t, low) or math.isclose(t, high)]
+    texts = names or ([plain_number(t, 3) for t in held] if logarithmic else numbers(held))
+    return list(zip(held, texts, strict=True))
+
+
 def powers(low: float, high: float) -> list[float]:
     """Ticks of a logarithmic axis."""
     exponents = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     for factors in ((1,), (1, 3), (1, 2, 5)):
-        found = [f * 10.0**k for k in exponents for f in factors if low <= f * 10.0**k <= high]
-        if len(found) > 2:
+        values = [f * 10.0**k for k in exponents for f in factors if low <= f * 10.0**k <= high]
+        if len(values) > 2:
             break
-    return found[:: max(1, len(found) // 6)]
+    return values[:: max(1, len(values) // 6)]
 
 
 def numbers(values: Sequence[float]) -> list[str]:

@@ -9,15 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
-from matplotlib.figure import Figure
 
-from en4dvar.report.cycles import RANKS, labelled, ranks, stacked_axes, write_cycles_page
+from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, Row, stacked
+from en4dvar.report.cycles import RANKS, ranks, span_of, write_cycles_page
 from en4dvar.report.drawing import Captioned
-from en4dvar.report.style import COLUMN, LIGHT, styled
 from en4dvar.report.text import plain_number, pretty_unit, with_unit
-from en4dvar.storage.cycles_file import read_cycles
-from en4dvar.storage.twin_file import MEAN
+from en4dvar.results.netcdf import Group
+from en4dvar.results.series_file import MEAN, read_series
 
 COLOURS = {"forecast": "prior", "analysis": "posterior", "smoothed": "background"}
 SHOWN = 4  # variables of the state in the second figure
@@ -29,9 +27,10 @@ GROUPS = 12  # of spreads
 def write_twin_report(run_dir: Path, files: bool = False) -> Path:
     """Write ``report.html`` from ``twin.nc``, with ``files`` also its figures as PDF and PNG; returns its path.
 
-    Raises :class:`~en4dvar.errors.OutputError` where there is nothing to read or the directory cannot be written.
+    Raises :class:`~en4dvar.plumbing.errors.OutputError` where there is nothing to read or the directory cannot
+    be written.
     """
-    data = read_cycles(run_dir / "twin.nc")
+    data = read_series(run_dir / "twin.nc")
     columns = ["estimate", with_unit("RMSE", _unit(data)), with_unit("spread", _unit(data)), "spread / RMSE"]
     words = "Averages over the cycles after the burn-in. The spread of a reliable ensemble is about its RMSE."
     return write_cycles_page(
@@ -46,7 +45,7 @@ def write_twin_report(run_dir: Path, files: bool = False) -> Path:
     )
 
 
-def twin_figures(data: xr.Dataset) -> Iterator[Captioned]:
+def twin_figures(data: Group) -> Iterator[Captioned]:
     """Each figure with its caption."""
     burn_in = int(data.attrs["burn_in"])
     words = " The first cycles, shaded, do not count in the averages." if burn_in else ""
@@ -64,100 +63,95 @@ def twin_figures(data: xr.Dataset) -> Iterator[Captioned]:
         "ensemble lies on the diagonal: where it is spread wide, its error is large.",
         reliability(data),
     )
-    yield "ranks", RANKS, ranks(data.isel(time=slice(burn_in, None)))
+    yield "ranks", RANKS, ranks(data["rank"].values[burn_in:], int(data.attrs["members"]))
 
 
-@styled
-def scores(data: xr.Dataset) -> Figure:
+def scores(data: Group) -> Chart:
     """RMSE and spread in time, one panel an estimate, averages after the burn-in as thin lines."""
-    kinds, time = _kinds(data), data["time"].values
-    figure, stack = stacked_axes(len(kinds), 3.0)
-    for ax, kind in zip(stack, kinds, strict=True):
-        colour = LIGHT[COLOURS[kind]]
+    time, panels = data["time"].values, []
+    for kind, colour in _kinds(data):
         rmse, spread = data[f"{kind}_rmse"], data[f"{kind}_spread"]
-        ax.plot(time, rmse, color=colour, lw=0.7, label="RMSE")
-        ax.plot(time, spread, color=LIGHT["centre"], lw=0.7, ls="--", label="spread")
-        ax.axhline(float(rmse.attrs[MEAN]), color=colour, lw=0.6)
+        average, top = float(rmse.attrs[MEAN]), _upper(rmse.values, spread.values)
+        title = f"{kind}: RMSE {plain_number(average, 3)}"
+        panel = Panel(ylabel=with_unit("error", _unit(data)), title=title, xlim=span_of(time), ylim=(0.0, top))
         if burn_in := int(data.attrs["burn_in"]):
-            ax.axvspan(time[0], time[burn_in - 1], color=LIGHT["grid"], alpha=0.5, lw=0)
-        ax.set_title(f"{kind}: RMSE {plain_number(float(rmse.attrs[MEAN]), 3)}", loc="left")
-        ax.set_ylim(0, _upper(rmse.values, spread.values))
-        ax.set_ylabel(with_unit("error", _unit(data)))
-    return labelled(figure, stack, str(data["time"].attrs["units"]))
+            panel.band(time[[0, burn_in - 1]], [0, 0], [top, top], "grid", 0.5)
+        panel.line(time, rmse.values, colour, 0.7, label="RMSE")
+        panel.line(time, spread.values, "centre", 0.7, "--", label="spread")
+        panel.rule(average, colour)
+        panels.append(panel)
+    return stacked(panels, 3.0 * POINTS, _time_label(data))
 
 
-@styled
-def errors(data: xr.Dataset) -> Figure:
+def errors(data: Group) -> Chart:
     """Error of the analysis within ± 2 std, in the last cycles; titles say how often over all that count."""
-    burn_in = int(data.attrs["burn_in"])
-    error, std = (data["analysis_mean"] - data["truth"]).values, data["analysis_std"].values
+    burn_in, truth = int(data.attrs["burn_in"]), data["truth"].values
+    error, std = data["analysis_mean"].values - truth, data["analysis_std"].values
     inside = np.mean(np.abs(error[burn_in:]) <= 2 * std[burn_in:], axis=0)
-    varied = np.flatnonzero(std.max(axis=0) > 1e-9 * np.abs(data["truth"].values).max(axis=0))  # not what is held fixed
+    varied = np.flatnonzero(std.max(axis=0) > 1e-9 * np.abs(truth).max(axis=0))  # not what is held fixed
     chosen = np.unique([*varied[: SHOWN - 1], varied[-1]])  # the last is an estimated parameter, if there is one
-    figure, stack = stacked_axes(len(chosen), 2.6)
-    time = data["time"].values[-LAST:]
-    for i, ax in zip(chosen, stack, strict=True):
+    time, panels = data["time"].values[-LAST:], []
+    for i in chosen:
         width = 2 * std[-LAST:, i]
-        ax.fill_between(time, -width, width, color=LIGHT["posterior"], alpha=0.25, lw=0, label="± 2 std")
-        ax.axhline(0, color=LIGHT["muted"], lw=0.5)
-        ax.plot(time, error[-LAST:, i], color=LIGHT["ink"], lw=0.8, label="analysis − truth")
-        name = str(data["state"].values[i])
-        ax.set_title(f"{name}: {100 * inside[i]:.0f} % within 2 std", loc="left")
-        ax.set_ylabel(with_unit("error", str(data["units"].values[i])))
-    return labelled(figure, stack, str(data["time"].attrs["units"]))
+        title = f"{data['state'].values[i]}: {100 * inside[i]:.0f} % within 2 std"
+        panel = Panel(ylabel=with_unit("error", str(data["units"].values[i])), title=title, xlim=span_of(time))
+        panel.band(time, -width, width, "posterior", 0.25, "± 2 std")
+        panel.rule(0, size=0.5)
+        panel.line(time, error[-LAST:, i], "ink", 0.8, label="analysis − truth")
+        panels.append(panel)
+    return stacked(panels, 2.8 * POINTS, _time_label(data))
 
 
-@styled
-def truth_ranks(data: xr.Dataset) -> Figure:
+def truth_ranks(data: Group) -> Chart:
     """Histogram of the rank of the truth, one panel an estimate; 1 is what a flat one has."""
-    kinds = _kinds(data)
-    figure, stack = stacked_axes(len(kinds), 2.6)
     size = int(data.attrs["members"]) - int(data.attrs["members_lost"]) + 1
     edges = np.round(np.linspace(0, size, min(size, MOST_BARS) + 1)) / size  # whole ranks in a bar
-    for ax, kind in zip(stack, kinds, strict=True):
-        found = _counted(data, data[f"{kind}_rank"].values)
-        count, _ = np.histogram(found, edges)
-        relative = count / (np.diff(edges) * max(1, len(found)))
-        ax.stairs(relative, edges, fill=True, color=LIGHT[COLOURS[kind]], alpha=0.6)
-        ax.axhline(1, color=LIGHT["ink"], lw=0.8, ls="--")
-        ax.set_title(kind, loc="left")
-        ax.set_ylabel("frequency")
-        ax.set_xlim(0, 1)
-    stack[-1].set_xlabel("share of the members below the truth")
-    return figure
+    panels = []
+    for kind, colour in _kinds(data):
+        ranked = _counted(data, data[f"{kind}_rank"].values)
+        count, _ = np.histogram(ranked, edges)
+        relative = count / (np.diff(edges) * max(1, len(ranked)))
+        panel = Panel(
+            ylabel="frequency", title=kind, xlim=(0.0, 1.0), ylim=(0.0, 1.05 * max(1.0, float(relative.max())))
+        )
+        panel.stairs(edges, relative, colour, 0.6)
+        panel.line([0, 1], [1, 1], "ink", 0.8, "--")
+        panels.append(panel)
+    return stacked(panels, 2.8 * POINTS, "share of the members below the truth")
 
 
-@styled
-def reliability(data: xr.Dataset) -> Figure:
+def reliability(data: Group) -> Chart:
     """RMSE against spread, in groups of the same size, one line an estimate."""
-    figure = Figure(figsize=(COLUMN, COLUMN), layout="constrained")
-    ax = figure.subplots()
+    panel = Panel(with_unit("spread", _unit(data)), with_unit("RMSE", _unit(data)), legend=True)
     largest = 0.0
-    for kind in _kinds(data):
+    for kind, colour in _kinds(data):
         spread = _counted(data, data[f"{kind}_std"].values)
-        error = _counted(data, (data[f"{kind}_mean"] - data["truth"]).values)
+        error = _counted(data, data[f"{kind}_mean"].values - data["truth"].values)
         groups = np.array_split(np.argsort(spread, kind="stable"), min(GROUPS, max(1, len(spread))))
         x, y = (np.array([np.sqrt(np.mean(v[g] ** 2)) for g in groups]) for v in (spread, error))
-        ax.plot(x, y, color=LIGHT[COLOURS[kind]], lw=1, marker="o", ms=3, label=kind)
+        panel.line(x, y, colour, 1.0, label=kind)
+        panel.dots(x, y, colour, 3.0, label=kind)
         largest = max(largest, float(x.max(initial=0)), float(y.max(initial=0)))
-    ax.plot([0, largest], [0, largest], color=LIGHT["ink"], lw=0.8, ls="--")
-    ax.set_xlabel(with_unit("spread", _unit(data)))
-    ax.set_ylabel(with_unit("RMSE", _unit(data)))
-    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper right", ncols=3)
-    return figure
+    panel.line([0, largest], [0, largest], "ink", 0.8, "--")
+    return Chart([Row(COLUMN, [panel])])
 
 
-def _counted(data: xr.Dataset, values: np.ndarray) -> np.ndarray:
+def _time_label(data: Group) -> str:
+    return with_unit("time", str(data["time"].attrs["units"]))
+
+
+def _counted(data: Group, values: np.ndarray) -> np.ndarray:
     """Values (K, n) that are there, after the burn-in, of the variables that scores count, as one row."""
     wanted = values[int(data.attrs["burn_in"]) :, data["dynamic"].values.astype(bool)].ravel()
     return np.asarray(wanted[np.isfinite(wanted)])
 
 
-def _kinds(data: xr.Dataset) -> list[str]:
-    return [kind for kind in COLOURS if f"{kind}_rmse" in data]
+def _kinds(data: Group) -> list[tuple[str, str]]:
+    """Each kind of estimate and its colour."""
+    return [(kind, colour) for kind, colour in COLOURS.items() if f"{kind}_rmse" in data]
 
 
-def _unit(data: xr.Dataset) -> str:
+def _unit(data: Group) -> str:
     return pretty_unit(str(data["analysis_rmse"].attrs["units"]))
 
 
@@ -167,16 +161,16 @@ def _upper(*series: Any) -> float:
     return float(min(1.05 * values.max(), 2 * np.quantile(values, 0.98))) if len(values) else 1.0
 
 
-def _scores(data: xr.Dataset) -> list[tuple[str, str, str, str]]:
+def _scores(data: Group) -> list[tuple[str, str, str, str]]:
     """(estimate, RMSE, spread, spread over RMSE) after the burn-in."""
     rows = []
-    for kind in _kinds(data):
+    for kind, _ in _kinds(data):
         rmse, spread = (float(data[f"{kind}_{what}"].attrs[MEAN]) for what in ("rmse", "spread"))
         rows.append((kind, plain_number(rmse, 4), plain_number(spread, 4), plain_number(spread / rmse, 3)))
     return rows
 
 
-def _facts(data: xr.Dataset) -> list[tuple[str, str, str]]:
+def _facts(data: Group) -> list[tuple[str, str, str]]:
     """(quantity, value, in words) for the tiles on top."""
     a = data.attrs
     cycles, burn_in, members, lost = data.sizes["time"], int(a["burn_in"]), int(a["members"]), int(a["members_lost"])

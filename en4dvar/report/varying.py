@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.caution import untrusted
-from en4dvar.diagnostics import change_words
+from en4dvar.diagnosis.diagnostics import change_words
+from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import untrusted
+from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import POINTS, Chart, Panel, Row, steps
 from en4dvar.report.text import with_unit
-from en4dvar.state import Array
-from en4dvar.storage.store import StoredResult
-from en4dvar.storage.varying import PIECE, PIECES
-from en4dvar.units import convert
+from en4dvar.results.store import StoredResult
 
 LEVELS = (0.05, 0.5, 0.95)
+PIECES, PIECE = "_pieces", "_piece"  # end the names of the values and of their dimension
 PIECE_COLUMNS = ("parameter", "time_unit", "begin", "end", "unit", "q05", "q50", "q95", "prior_q05", "prior_q95")
 
 
@@ -67,8 +67,8 @@ def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
         values = np.asarray(result.groups[f"/{group}"].variables[name + PIECES].values[0], dtype=float)
         values = values[result.alive] if group == "posterior" else values
         values = values[np.isfinite(values).all(axis=1)]
-        found = np.quantile(values, LEVELS, axis=0) if len(values) else np.full((3, len(begins)), np.nan)
-        return convert(found, about["units"], shown)
+        levels = np.quantile(values, LEVELS, axis=0) if len(values) else np.full((3, len(begins)), np.nan)
+        return convert(levels, about["units"], shown)
 
     after = quantiles("posterior")
     if untrusted(result.cautions, name):

@@ -10,11 +10,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from en4dvar.caution import Caution
-from en4dvar.errors import TooFewMembersError
-from en4dvar.summary import ParameterSummary
+from en4dvar.estimation.summary import ParameterSummary, frame, results_table
+from en4dvar.plumbing.caution import Caution
+from en4dvar.plumbing.errors import TooFewMembersError
 
 if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
     from en4dvar.report.result import Result
 
 _RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")  # names of devices on Windows
@@ -66,6 +69,25 @@ class Campaign:
             return max(codes, default=0)
         return 1
 
+    def __repr__(self) -> str:
+        failed = f", {len(self.failures)} without a posterior" if self.failures else ""
+        return f"<Campaign of {len(self.outcomes)} data sets in {self.directory}{failed}>"
+
+    def __str__(self) -> str:
+        """The table of all data sets."""
+        return results_table({o.name: o.summary for o in self.outcomes if not o.failure})
+
+    def summary(self) -> pd.DataFrame:
+        """A row a data set and parameter, in display units; NaN where a number is not to be quoted."""
+        return frame({o.name: o.summary for o in self.outcomes if not o.failure})
+
+    def plot(self) -> Figure:
+        """The estimates of all data sets side by side."""
+        from en4dvar.report.overview import SetSummary, estimates
+        from en4dvar.report.paper import on_paper
+
+        return on_paper(estimates([SetSummary.of(result, result.name) for result in self]))
+
     def __len__(self) -> int:
         return len(self.outcomes) - len(self.failures)
 
@@ -95,7 +117,7 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
     {'gel 1': 'gel_1', 'gel/1': 'gel_1_2', 'Gel_1': 'Gel_1_3', 'ゲル': 'ゲル'}
     """
     used: set[str] = set()
-    found = {}
+    chosen = {}
     for name in names:
         base = re.sub(r"[^\w.+-]", "_", unicodedata.normalize("NFC", name)).lstrip(".") or "_"
         base = base.encode("utf-8")[:_LONGEST].decode("utf-8", "ignore").rstrip(".")
@@ -105,5 +127,5 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
             number += 1
             candidate = f"{base}_{number}"
         used.add(candidate.casefold())
-        found[name] = candidate
-    return found
+        chosen[name] = candidate
+    return chosen

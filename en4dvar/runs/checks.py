@@ -7,17 +7,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from en4dvar.assembly.build import build_one, data_files, inverse_plan
+from en4dvar.assembly.build_sequence import build_sequence
+from en4dvar.assembly.reading import read_observations
 from en4dvar.config import AnyConfig, Config, SequenceConfig, resolve_any
-from en4dvar.config.build import build_one, data_files, inverse_plan
-from en4dvar.config.build_sequence import build_sequence
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.load import context_of, in_order
-from en4dvar.config.reading import read_observations
 from en4dvar.config.schema import Section
 from en4dvar.config.series import DATA, DataPlan
 from en4dvar.config.validate import check
-from en4dvar.errors import ConfigError, DataError, Fault
 from en4dvar.inputs.asked import DataFile
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault
 
 
 def validate(source: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> AnyConfig:
@@ -64,10 +64,10 @@ def _data_faults(document: Document, base: Path) -> Iterator[Fault]:
     """Faults of the data files, for a configuration that has faults elsewhere than in its data section."""
     context = context_of(document, base, None)
     observed = context.observed
-    found = check(_DataSection, {"data": document.data.get("data")}, (), document, [], context)
-    if found is None or context.default is None:
+    section = check(_DataSection, {"data": document.data.get("data")}, (), document, [], context)
+    if section is None or context.default is None:
         return
-    plan = DataPlan.of(found.data, observed or context.default.observables[0])
+    plan = DataPlan.of(section.data, observed or context.default.observables[0])
     yield from _file_faults(document, plan, lambda name, file: read_observations(plan, file, name))
 
 

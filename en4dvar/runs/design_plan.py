@@ -8,20 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
+from en4dvar.assembly.build import data_files, inverse_plan, problem_of
+from en4dvar.assembly.reading import errors_of, read_observations
 from en4dvar.config import Config, resolve
-from en4dvar.config.build import data_files, inverse_plan, problem_of
 from en4dvar.config.design import Value
 from en4dvar.config.document import Document, override
-from en4dvar.config.reading import errors_of, read_observations
 from en4dvar.config.series import SeriesPlan
+from en4dvar.data.noise import Noise, noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.data.series import Series
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.inputs.asked import DataFile
-from en4dvar.noise import Noise, noise_of
-from en4dvar.observations import Observations
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError, En4dvarError
 from en4dvar.problem import InverseProblem
-from en4dvar.series import Series
-from en4dvar.state import Array
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ def planned_problem(config: Config) -> InverseProblem:
     if times is None and measured is not None:
         return problem_of(config, measured)
     assert times is not None
-    for one in plan.series:
-        _require_plannable(one)
+    for series in plan.series:
+        _require_plannable(series)
     blank = _observations(config, [np.full(len(times), _scale(measured))] * len(plan.series), times, measured)
     problem = problem_of(config, blank)
     run = forecast(problem, problem.prior.mean[None])
@@ -116,33 +116,33 @@ def _observations(
     plan = inverse_plan(config)
     series = [
         Series(
-            observable=one.observable,
+            observable=planned.observable,
             times=times,
             values=own,
-            noise=_noise(one, times, own) if stated else noise_of(np.ones(len(times)), np.zeros(len(times))),
-            name=one.name,
-            group=one.group,
+            noise=_noise(planned, times, own) if stated else noise_of(np.ones(len(times)), np.zeros(len(times))),
+            name=planned.name,
+            group=planned.group,
             scalars=measured.scalars if measured else {},
             source=measured.source if measured else "",
         )
-        for one, own in zip(plan.series, values, strict=True)
+        for planned, own in zip(plan.series, values, strict=True)
     ]
     return Observations.of_series(series, plan.correlation if stated else {}, config.name)
 
 
-def _noise(one: SeriesPlan, times: Array, values: Array) -> Noise:
-    return errors_of(one.data, times, values, np.arange(len(times)), {})
+def _noise(series: SeriesPlan, times: Array, values: Array) -> Noise:
+    return errors_of(series.data, times, values, np.arange(len(times)), {})
 
 
-def _require_plannable(one: SeriesPlan) -> None:
+def _require_plannable(series: SeriesPlan) -> None:
     """Raise :class:`ConfigError` for what a planned series cannot have."""
-    error = one.data.error
+    error = series.data.error
     in_columns = error.column("std", ""), error.column("time_std", "")
     for present, what in (
         (any(in_columns), "errors in a column of the file"),
         (error.covariance is not None, "a covariance of readings"),
-        (one.data.weights is not None, "weights of readings"),
-        (one.data.places is not None, "places on a field"),
+        (series.data.weights is not None, "weights of readings"),
+        (series.data.places is not None, "places on a field"),
     ):
         if present:
             raise ConfigError(f"data: {what} cannot be planned at design.times; leave design.times out, or state a std")

@@ -1,27 +1,28 @@
-"""``en4dvar design``: every design of a file evaluated, kept as it ends, and reported."""
+"""The kind of run that plans experiments: every design of a file evaluated, kept as it ends, and reported."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from en4dvar.config import Config, resolve
 from en4dvar.config.document import Document, document_from, override
 from en4dvar.config.parameters import Uncertain
-from en4dvar.design.evaluate import Evaluated, Method, evaluate
-from en4dvar.design.planned import Planned
-from en4dvar.errors import ConfigError, En4dvarError
-from en4dvar.executor import Executor, choose_executor, one_blas_thread
-from en4dvar.report.design import write_design
+from en4dvar.estimation.design.evaluate import Evaluated, Method, evaluate
+from en4dvar.estimation.design.planned import Planned
+from en4dvar.executor import Executor
+from en4dvar.inputs.asked import DataFile
+from en4dvar.plumbing.errors import ConfigError, En4dvarError
+from en4dvar.plumbing.user_code import reason_of
+from en4dvar.results.checkpoint import FOLDER, Keeper, digest
+from en4dvar.results.design_file import Asked, DesignRow, Designs, load_designs, save_designs
 from en4dvar.runs.design_plan import Candidate, candidates, files_needed, planned_problem
-from en4dvar.runs.interrupt import terminate_as_interrupt
-from en4dvar.runs.rundir import RunDirectory
-from en4dvar.runs.session import Session, directory_mode, session
-from en4dvar.storage.checkpoint import FOLDER, Keeper, digest
-from en4dvar.storage.design_file import Asked, DesignRow, Designs, load_designs, save_designs
-from en4dvar.user_code import reason_of
+from en4dvar.runs.engine import conduct_run
+from en4dvar.runs.kind import RunKind
+from en4dvar.runs.session import Session
 
 STATE = f"{FOLDER}/designs"
 CHECKED = 3  # best designs whose linearised information is checked
@@ -34,7 +35,7 @@ class Done:
 
     number: int
     method: str
-    found: tuple[Evaluated, ...]
+    results: tuple[Evaluated, ...]
     failure: str = ""
 
 
@@ -72,25 +73,51 @@ def run_design(
     every = list(candidates(document, base))
     config = every[0].config
     config = replace(config, directory=out or config.directory.with_name(f"{config.directory.name}_design"))
-    about = _asked(config)
-    kept = f"the designs that are done are kept in {config.directory}"
-    with (
-        one_blas_thread(),
-        terminate_as_interrupt(),
-        RunDirectory.open(config.directory, directory_mode(force, resume)) as directory,
-        session(config, files_needed(config), directory, command, lambda: kept) as run,
-    ):
-        run.begin("design.nc", "designs.csv", "design.html", STATE)
-        work = _Work(config, every, run, on_design)
-        asked = config.execution
-        with choose_executor(config.model, asked.executor, asked.workers, asked.address, asked.limits) as executor:
-            work.everything(executor)
-        file = directory.at("design.nc")
-        save_designs(file, work.rows(), about, {**run.attributes, "name": config.name})
-        found = load_designs(file)
-        if config.report:
-            write_design(found, directory.work)
-    return found, config.directory
+    return conduct_run(DesignKind(config, every, on_design), force, resume, command), config.directory
+
+
+@dataclass(frozen=True)
+class DesignKind(RunKind[Designs]):
+    """A configuration whose experiments are yet to be made: ``every`` design is a unit of work."""
+
+    name = "design"
+    result = "design.nc"
+    files = (result, STATE)
+    pages = ("designs.csv", "design.html")
+
+    config: Config
+    every: Sequence[Candidate]
+    tell: Callable[[int, int], None] | None = None
+
+    @cached_property
+    def data(self) -> Mapping[str, DataFile]:
+        return files_needed(self.config)
+
+    @cached_property
+    def asked(self) -> Asked:
+        """What is asked. Raises :class:`ConfigError`, :class:`DataError`."""
+        return _asked(self.config)
+
+    def check(self) -> None:
+        _ = self.asked
+
+    def kept(self) -> str:
+        return f"the designs that are done are kept in {self.directory}"
+
+    def conduct(self, run: Session, executor: Executor) -> Designs:
+        work = _Work(self.config, self.every, run, self.tell)
+        work.everything(executor)
+        file = run.directory.at(self.result)
+        save_designs(file, work.rows(), self.asked, {**run.attributes, "name": self.config.name})
+        if self.config.report:
+            self.page(run.directory.work)
+        return load_designs(file)
+
+    @classmethod
+    def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
+        from en4dvar.report.design import write_design  # with matplotlib
+
+        return write_design(load_designs(folder / cls.result), folder)
 
 
 def _known(document: Document, base: Path, after: Path) -> dict[str, Any]:
@@ -141,7 +168,7 @@ class _Work:
             self._evaluate(executor, range(len(self.every)), method)
             return
         self._evaluate(executor, range(len(self.every)), "laplace")
-        gains = {d.number: d.found[0].gain for d in self._latest() if d.found}
+        gains = {d.number: d.results[0].gain for d in self._latest() if d.results}
         best = sorted(gains, key=lambda number: -gains[number])[:CHECKED]
         checked = [number for number in dict.fromkeys([0, *best]) if number in gains]
         self._evaluate(executor, checked, "nested")
@@ -149,20 +176,20 @@ class _Work:
             self._evaluate(executor, list(gains), "nested")
 
     def _off(self, gains: Mapping[int, float], checked: Sequence[int]) -> bool:
-        exact = {d.number: d.found[0] for d in self._latest() if d.method == "nested" and d.found}
+        exact = {d.number: d.results[0] for d in self._latest() if d.method == "nested" and d.results}
         return any(abs(exact[n].gain - gains[n]) > AGREE + 2 * exact[n].error for n in checked if n in exact)
 
     def rows(self) -> list[DesignRow]:
         """Every candidate, or number of experiments alike, in the order of the file."""
-        found = []
+        rows = []
         for done in sorted(self._latest(), key=lambda d: d.number):
             candidate = self.every[done.number]
-            for one in done.found:
-                cost = candidate.config.design.price.of(one.alike, len(one.readings))
-                found.append(DesignRow(done.number, dict(candidate.settings), one, cost))
+            for result in done.results:
+                cost = candidate.config.design.price.of(result.alike, len(result.readings))
+                rows.append(DesignRow(done.number, dict(candidate.settings), result, cost))
             if done.failure:
-                found.append(DesignRow(done.number, dict(candidate.settings), None, float("nan"), done.failure))
-        return found
+                rows.append(DesignRow(done.number, dict(candidate.settings), None, float("nan"), done.failure))
+        return rows
 
     def _latest(self) -> list[Done]:
         """Of each candidate what came last: nested after laplace."""
@@ -185,7 +212,7 @@ class _Work:
             if self.tell:
                 self.tell(len(numbers) - len(left) + i + 1, len(numbers))
         self.keeper.write(self.state)
-        if not any(d.found for d in self.state.done):
+        if not any(d.results for d in self.state.done):
             raise ConfigError(f"none of the designs can be evaluated: {self.state.done[0].failure}")
 
 
@@ -197,9 +224,9 @@ def _one(candidate: Candidate, method: Method, seed: int) -> tuple[Evaluated, ..
         problem, laws = planned_problem(config), [planned_problem(law) for law in candidate.laws]
         sizes, alike = design.sizes, design.experiments
         every = evaluate(problem, design.about, sizes, method, seed, alike, candidate.readings, laws)
-        costs = (design.price.of(one.alike, len(one.readings)) for one in every)
+        costs = (design.price.of(planned.alike, len(planned.readings)) for planned in every)
         broken = [design.within.broken(len(o.readings), cost, o.beyond) for o, cost in zip(every, costs, strict=True)]
-        kept = tuple(one for one, reason in zip(every, broken, strict=True) if not reason)
+        kept = tuple(planned for planned, reason in zip(every, broken, strict=True) if not reason)
         return kept or broken[0]
     except En4dvarError as error:
         return str(error)
@@ -208,6 +235,7 @@ def _one(candidate: Candidate, method: Method, seed: int) -> tuple[Evaluated, ..
 def _line(done: Done) -> str:
     if done.failure:
         return f"design {done.number}: {done.failure}"
-    one = done.found[0]
-    worth = f"{one.worth:.4g} nats ± {one.worth_error:.2g}{' of the law' if one.decision else f' ({one.method})'}"
-    return f"design {done.number}: {worth}, {one.forward_runs} runs"
+    result = done.results[0]
+    of = " of the law" if result.decision else f" ({result.method})"
+    worth = f"{result.worth:.4g} nats ± {result.worth_error:.2g}{of}"
+    return f"design {done.number}: {worth}, {result.forward_runs} runs"

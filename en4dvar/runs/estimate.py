@@ -6,7 +6,6 @@ directory, so that everything a configuration can say can be said here, in the s
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -16,18 +15,19 @@ from typing import Any, TypeVar
 from en4dvar.config.document import Document, document_of
 from en4dvar.config.load import Config, resolve
 from en4dvar.config.sequence import SequenceConfig, resolve_sequence
-from en4dvar.cycling.problem import SeriesResult
-from en4dvar.errors import ConfigError, OutputError
-from en4dvar.files import make_folder, write_text
-from en4dvar.forward import ForwardModel
+from en4dvar.diagnosis.analysis import Progress
 from en4dvar.inputs.arrays import TIME
+from en4dvar.model.forward import ForwardModel
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.plumbing.files import make_folder, temporary_folder, write_text
+from en4dvar.report.outcomes import SequenceOutcome
 from en4dvar.report.result import Result
 from en4dvar.runs.given import Given
 from en4dvar.runs.progress import terminal_progress
 from en4dvar.runs.rundir import GIVEN, holds_run
 from en4dvar.runs.runner import run_campaign
 from en4dvar.runs.sequence_run import run_sequence
-from en4dvar.state import Array
 
 ARGUMENTS = {
     ("data", "error"): "error",
@@ -58,15 +58,15 @@ def estimate(
     force: bool = False,
     resume: bool = False,
     report: bool = True,
-    progress: bool = True,
+    progress: bool | Progress = True,
     **sections: Any,
 ) -> Result:
     """Estimate parameters of a model from readings that a script holds.
 
     Parameters
     ----------
-    model: a function ``f(parameters, times) -> values`` (see :class:`~en4dvar.function_model.FunctionModel`), a
-        :class:`~en4dvar.forward.ForwardModel`, its class, or what the ``model:`` section of a file says.
+    model: a function ``f(parameters, times) -> values`` (see :class:`~en4dvar.model.function_model.FunctionModel`), a
+        :class:`~en4dvar.model.forward.ForwardModel`, its class, or what the ``model:`` section of a file says.
     data: (times, values), a dict of columns, a pandas Series or DataFrame, an xarray DataArray or Dataset, in the units
         of the model. NaN is no reading. Or a dict of several series, name → one of these, each with its own times; its
         name is that of its observable, and ``error`` is then a dict name → error. A function is asked for all times
@@ -85,29 +85,30 @@ def estimate(
     window: as ``data.window`` of a file.
     directory: of the run, with files and report as of :func:`en4dvar.run`; by default nothing is kept on disk.
     force, resume: replace or continue the run in the directory.
-    progress: show it on a terminal or in a notebook.
+    progress: show it on a terminal or in a notebook; or a function that is called as that of :func:`en4dvar.run`, with
+        the name of the data set and the record of each iteration.
     sections: further sections of a file by name: ``assimilation``, ``execution``, ``initial_state``, ``model_error``.
 
     Raises
     ------
     ConfigError, DataError: says which argument, and what to do. Others as of :func:`en4dvar.run`.
     """
-    given = Given(model, data, time, observable, error, units or {}, priors, series or {}, correlation)
-    ready, model_section = given.model(model)
+    call = Given(model, data, time, observable, error, units or {}, priors, series or {}, correlation)
+    ready, model_section = call.model(model)
     content = {
         "name": name,
         "seed": seed,
         "model": model_section,
-        "data": {**given.data(ready), **({"window": window} if window else {})},
+        "data": {**call.data(ready), **({"window": window} if window else {})},
         "parameters": priors,
         "output": {"report": report and directory is not None},
         **sections,
     }
     with ExitStack() as held:
-        where = Path(directory or Path(held.enter_context(tempfile.TemporaryDirectory())) / "run")
+        where = Path(directory or Path(held.enter_context(temporary_folder())) / "run")
         config = replace(_checked(content, where, ready, resolve), directory=where)
-        _keep_data(where / GIVEN, given.csv, resume or force)
-        shown = held.enter_context(terminal_progress()) if progress else None
+        _keep_data(where / GIVEN, call.csv, resume or force)
+        shown = progress if callable(progress) else held.enter_context(terminal_progress()) if progress else None
         campaign = run_campaign(config, force=force, resume=resume, progress=shown, command="en4dvar.estimate")
         (result,) = campaign
     if directory is None:
@@ -134,7 +135,7 @@ def estimate_sequence(
     resume: bool = False,
     report: bool = True,
     **sections: Any,
-) -> SeriesResult:
+) -> SequenceOutcome:
     """Follow a series of readings that a script holds, by a filter or a sliding-window smoother.
 
     Parameters
@@ -148,22 +149,22 @@ def estimate_sequence(
     ------
     ConfigError, DataError: says which argument, and what to do. Others as of :func:`run_sequence`.
     """
-    given = Given(model, data, time, observable, error, {}, priors or {}, series or {}, correlation)
-    ready, model_section = given.model(model)
+    call = Given(model, data, time, observable, error, {}, priors or {}, series or {}, correlation)
+    ready, model_section = call.model(model)
     content = {
         "name": name,
         "seed": seed,
         "model": model_section,
-        "data": given.data(ready),
+        "data": call.data(ready),
         "parameters": priors or {},
         "sequence": {"initial_std": initial_std or {}},
         "output": {"report": report and directory is not None},
         **sections,
     }
     with ExitStack() as held:
-        where = Path(directory or Path(held.enter_context(tempfile.TemporaryDirectory())) / "run")
+        where = Path(directory or Path(held.enter_context(temporary_folder())) / "run")
         config = replace(_checked(content, where, ready, resolve_sequence), directory=where)
-        _keep_data(where / GIVEN, given.csv, resume or force)
+        _keep_data(where / GIVEN, call.csv, resume or force)
         return run_sequence(config, force=force, resume=resume, command="en4dvar.estimate_sequence")
 
 

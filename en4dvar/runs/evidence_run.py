@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from en4dvar.errors import ConfigError, OutputError
+from en4dvar.estimation.population.campaign import white_prior
 from en4dvar.executor import choose_executor, one_blas_thread
-from en4dvar.population.campaign import white_prior
+from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.plumbing.user_code import RefusedError
 from en4dvar.runs.finished import finished
 from en4dvar.runs.trust import Ask
 from en4dvar.sampling.evidence import TOO_FEW, sampled_evidence
 from en4dvar.sampling.forward_runs import ForwardRuns
-from en4dvar.user_code import RefusedError
 
 
 def sampled_evidences(
@@ -25,13 +25,13 @@ def sampled_evidences(
     """
     try:
         config, sets = finished([run_dir], trust, ask)
-        if not all(one.problem.model.cheap for one in sets):
+        if not all(s.problem.model.cheap for s in sets):
             raise ConfigError("its model is not cheap")
         with choose_executor(config.model, None, workers) as executor, one_blas_thread():
-            runs = ForwardRuns([one.problem for one in sets], executor, white=True)
-            found = sampled_evidence(runs, white_prior(sets[0].problem.prior), config.seed)
+            runs = ForwardRuns([s.problem for s in sets], executor, white=True)
+            evidence = sampled_evidence(runs, white_prior(sets[0].problem.prior.names), config.seed)
     except (ConfigError, OutputError, RefusedError) as error:
         tell(f"{run_dir}: evidence by Laplace's approximation, as stored: {error}")
         return {}
-    logs = found.log - [one.problem.observations.log_normalisation() for one in sets]
-    return {one.name: float(log) for one, log, n in zip(sets, logs, found.effective, strict=True) if n >= TOO_FEW}
+    logs = evidence.log - [s.problem.observations.log_normalisation() for s in sets]
+    return {s.name: float(log) for s, log, n in zip(sets, logs, evidence.effective, strict=True) if n >= TOO_FEW}

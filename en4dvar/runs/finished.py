@@ -8,16 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.caution import Caution, caution
+from en4dvar.assembly.build import problem_of
 from en4dvar.config import Config
-from en4dvar.config.build import problem_of
-from en4dvar.config.document import parse_document
-from en4dvar.config.load import resolve
-from en4dvar.errors import ConfigError, OutputError
+from en4dvar.config.load import recorded, resolve
+from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution, Severity, caution
+from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.problem import InverseProblem
+from en4dvar.results.store import StoredResult, load_stored, result_files
 from en4dvar.runs.trust import Ask, of_strangers
-from en4dvar.state import Array
-from en4dvar.storage.store import StoredResult, load_stored, result_files
 
 CARRIED = ("implausible-data", "misfit", "residual-structure", "model-validity")
 MOST_NAMES = 4
@@ -52,26 +51,30 @@ def finished(run_dirs: Sequence[Path], trust: bool, ask: Ask | None) -> tuple[Co
         damaged. ConfigError: a data set of several series, or with parameters that vary in time.
     """
     first: Config | None = None
-    found: list[Finished] = []
+    sets: list[Finished] = []
     for run_dir in run_dirs:
         files = result_files(run_dir)
         config = _recorded(run_dir, load_stored(files[0]), trust, ask)
         first = first or config
-        found += [finished_set(config, load_stored(file), run_dir) for file in files]
+        sets += [finished_set(config, load_stored(file), run_dir) for file in files]
     if first is None:
         raise ConfigError("no run is given")
-    return first, list(_named_apart(found))
+    return first, list(_named_apart(sets))
 
 
-def carried(sets: Sequence[Finished]) -> Iterator[Caution]:
-    """Warnings of single data sets that hold for an estimate of all of them too, each code once."""
+def carried(sets: Sequence[Finished], severity: Severity = "serious") -> Iterator[Caution]:
+    """Serious warnings of single data sets that hold for an estimate of all of them too, each code once.
+
+    ``severity``: what they are there. An estimate that sees the scatter between data sets, and lets odd ones be odd, is
+    not spoilt by what spoils a single interval.
+    """
     for code in CARRIED:
-        of_it = [(s.name, one) for s in sets for one in s.cautions if one.code == code and one.severity == "serious"]
+        of_it = [(s.name, c) for s in sets for c in s.cautions if c.code == code and c.severity == "serious"]
         if of_it:
             names = [name for name, _ in of_it]
             others = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
             told = f"{', '.join(names[:MOST_NAMES])}{others}: {of_it[0][1].words}"
-            yield caution(code, f"of single data sets, {told}", "serious")
+            yield caution(code, f"of single data sets, {told}", severity)
 
 
 def _recorded(run_dir: Path, result: StoredResult, trust: bool, ask: Ask | None) -> Config:
@@ -79,7 +82,7 @@ def _recorded(run_dir: Path, result: StoredResult, trust: bool, ask: Ask | None)
     attributes = result.attributes
     if "configuration_resolved" not in attributes:
         raise OutputError(f"{run_dir}: its results do not record a configuration; they were written by a program")
-    document = parse_document(str(attributes["configuration_resolved"]), f"{run_dir}: configuration_resolved")
+    document = recorded(str(attributes["configuration_resolved"]), f"{run_dir}: configuration_resolved")
     with of_strangers(run_dir, ask, trust):
         return resolve(document, run_dir.absolute())
 
@@ -106,10 +109,10 @@ def finished_set(config: Config, result: StoredResult, run_dir: Path) -> Finishe
 
 def _named_apart(sets: Sequence[Finished]) -> Iterator[Finished]:
     seen: dict[str, int] = {}
-    for one in sets:
-        seen[one.name] = seen.get(one.name, 0) + 1
-        if seen[one.name] > 1:
-            o = one.problem.observations
-            problem = replace(one.problem, observations=replace(o, name=f"{one.name}_{seen[one.name]}"))
-            one = replace(one, problem=problem)
-        yield one
+    for s in sets:
+        seen[s.name] = seen.get(s.name, 0) + 1
+        if seen[s.name] > 1:
+            o = s.problem.observations
+            problem = replace(s.problem, observations=replace(o, name=f"{s.name}_{seen[s.name]}"))
+            s = replace(s, problem=problem)
+        yield s

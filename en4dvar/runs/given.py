@@ -12,14 +12,14 @@ import numpy as np
 
 from en4dvar.config.document import document_of
 from en4dvar.config.models import HANDED, read_model
-from en4dvar.errors import ConfigError, DataError, Fault
-from en4dvar.forward import ForwardModel, Observable
-from en4dvar.function_model import FunctionModel, digest_of, name_of
-from en4dvar.hints import listed, suggest
 from en4dvar.inputs.arrays import TIME, VALUE, columns_of, csv_of, require_columns, stacked, tables_of
+from en4dvar.model.forward import ForwardModel, Observable
+from en4dvar.model.function_model import FunctionModel, digest_of, name_of
+from en4dvar.model.state import OF_READINGS, Array, Parameter
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault
+from en4dvar.plumbing.hints import listed, suggest
+from en4dvar.results.checkpoint import digest
 from en4dvar.runs.rundir import GIVEN
-from en4dvar.state import OF_READINGS, Array, Parameter
-from en4dvar.storage.checkpoint import digest
 
 MODELS = "give f(parameters, times), a ForwardModel, or a dict such as {'name': 'bubble'}"
 
@@ -54,7 +54,7 @@ class GivenSeries:
 
     def section(self, model: ForwardModel) -> dict[str, Any]:
         """What ``data:`` says of it, apart from the path. Raises :class:`DataError`, :class:`ConfigError`."""
-        named = {one.name: one for one in model.observables}
+        named = {observable.name: observable for observable in model.observables}
         name = self.observed(list(named))
         if name not in named:
             where = f"data: {self.name}" if self.name else "observable"
@@ -153,24 +153,24 @@ class Given:
     @property
     def csv(self) -> str:
         """The text of the data file."""
-        return csv_of(stacked([one.used for one in self.series]))
+        return csv_of(stacked([series.used for series in self.series]))
 
     def data(self, model: ForwardModel) -> dict[str, Any]:
         """The ``data:`` section, apart from the window. Raises :class:`DataError`, :class:`ConfigError`."""
         if self.alone:
             return {"path": GIVEN, **self.series[0].section(model)}
         correlation = {"correlation": self.correlation} if self.correlation else {}
-        return {"path": GIVEN, "series": {one.name: one.section(model) for one in self.series}, **correlation}
+        return {"path": GIVEN, "series": {series.name: series.section(model) for series in self.series}, **correlation}
 
     def model(self, model: Any) -> tuple[ForwardModel, dict[str, Any]]:
         """The model, and what a configuration records of it. Raises :class:`ConfigError`."""
         if isinstance(model, str | Mapping):
             section = {"name": model} if isinstance(model, str) else dict(model)
             faults: list[Fault] = []
-            found = read_model(section, Path.cwd(), document_of({"model": section}), faults)
-            if found is None:
+            built = read_model(section, Path.cwd(), document_of({"model": section}), faults)
+            if built is None:
                 raise ConfigError(faults)
-            return found
+            return built
         if isinstance(model, type) and issubclass(model, ForwardModel):
             model = model()
         if isinstance(model, ForwardModel):
@@ -184,8 +184,8 @@ class Given:
         names = [name for name in self.priors if name not in {p.name for p in OF_READINGS}]
         if wrong := [name for name in names if not str(name).isidentifier()]:
             raise ConfigError(f"priors: {wrong[0]!r} cannot be the name of a parameter; use letters, digits and _")
-        columns = {name for one in self.series for name in one.columns}
-        observed = [one.observed([name for name in one.columns if name != TIME]) for one in self.series]
+        columns = {name for series in self.series for name in series.columns}
+        observed = [series.observed([name for name in series.columns if name != TIME]) for series in self.series]
         unknown = self.units.keys() - self.priors.keys() - columns - set(observed)
         if unknown:
             raise ConfigError(
@@ -196,15 +196,15 @@ class Given:
         return FunctionModel(function, parameters, observables, self.units.get(TIME, "1"))
 
 
-def _check_keys(argument: str, given: Any, series: Mapping[str, Any], whole: bool = False) -> None:
+def _check_keys(argument: str, keys: Any, series: Mapping[str, Any], whole: bool = False) -> None:
     """Raise :class:`ConfigError` unless it is a dict with one entry a series, each of them where it shall be whole."""
-    if not isinstance(given, Mapping):
+    if not isinstance(keys, Mapping):
         raise ConfigError(f"{argument}: give a dict with one for each series: {listed(series)}")
-    if unknown := [str(name) for name in given if name not in series]:
+    if unknown := [str(name) for name in keys if name not in series]:
         raise ConfigError(f"{argument}: no series {unknown[0]!r} in data{suggest(unknown[0], series)}")
-    if missing := [name for name in series if whole and name not in given]:
+    if missing := [name for name in series if whole and name not in keys]:
         raise ConfigError(f"{argument}: none for {missing[0]!r}; give one for each series: {listed(series)}")
-    if wrong := [name for name, own in given.items() if not (whole or isinstance(own, Mapping))]:
+    if wrong := [name for name, own in keys.items() if not (whole or isinstance(own, Mapping))]:
         raise ConfigError(f"{argument}: {wrong[0]}: give a dict such as {{'observable': 'y'}}")
 
 

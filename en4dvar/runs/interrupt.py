@@ -1,12 +1,22 @@
-"""Ctrl-C, SIGTERM and SIGHUP: the run stops, keeps what it has, and says how to go on."""
+"""Ctrl-C, SIGTERM and SIGHUP: the run stops, keeps what it has, and says how to go on.
+
+Python answers a signal between two of its instructions, and a forecast of compiled code may be one of them. On the
+command line a thread therefore waits for signals as well (:func:`heeded`): what is done is on the disk at any moment,
+so that the process may end wherever it stands.
+"""
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
+
+PATIENCE = 1.0  # s for the program to answer a signal by itself
+_answered = threading.Event()
+_kept: list[Callable[[], str]] = []  # what a stop has to say of the runs under way
 
 
 class Interrupted(KeyboardInterrupt):
@@ -24,6 +34,7 @@ def terminate_as_interrupt() -> Iterator[None]:
         return
 
     def stop(*_: Any) -> None:
+        _answered.set()
         raise KeyboardInterrupt("terminated")
 
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -38,12 +49,57 @@ def terminate_as_interrupt() -> Iterator[None]:
 @contextmanager
 def tell_interrupt(kept: Callable[[], str]) -> Iterator[None]:
     """Within, an interrupt that nobody has put into words becomes :class:`Interrupted`, with what is ``kept`` then."""
+    _kept.append(kept)
     try:
         yield
     except Interrupted:
         raise
     except KeyboardInterrupt:
         raise Interrupted(f"interrupted; {kept()}") from None
+    finally:
+        _kept.remove(kept)
+
+
+@contextmanager
+def heeded(end: Callable[[str], object]) -> Iterator[None]:
+    """Within, in the main thread: a stop that compiled code keeps the program from answering ends in ``end(words)``.
+
+    That is called in a thread of its own, :data:`PATIENCE` after the signal, with what is kept, "" before a run has
+    begun; it is to end the process.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or handler is not signal.default_int_handler:
+        yield
+        return
+
+    def interrupt(*_: Any) -> None:
+        _answered.set()
+        raise KeyboardInterrupt
+
+    _answered.clear()
+    come, written = os.pipe()
+    os.set_blocking(written, False)
+    threading.Thread(target=_listen, args=(come, end), daemon=True).start()
+    before = signal.set_wakeup_fd(written, warn_on_full_buffer=False)
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        signal.set_wakeup_fd(before)
+        os.close(written)
+
+
+def _listen(come: int, end: Callable[[str], object]) -> None:
+    """Wait for signals, whose numbers are written into a pipe as they come, until it is closed."""
+    stops = {getattr(signal, name, None) for name in ("SIGINT", "SIGTERM", "SIGHUP")}
+    with os.fdopen(come, "rb", buffering=0) as pipe:
+        while number := pipe.read(1):
+            if number[0] in stops and not _answered.wait(PATIENCE):
+                words = ""
+                with suppress(Exception):  # it is asked while the run goes on
+                    words = f"interrupted; {_kept[-1]()}"
+                end(words)
 
 
 def begun(error: BaseException | None) -> Interrupted | None:

@@ -10,25 +10,26 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-from en4dvar.analysis import IterationRecord, Progress, Record
-from en4dvar.assimilate import LoopState, assimilate
+from en4dvar.assembly.build import build_one
 from en4dvar.config import Config
-from en4dvar.config.build import build_one
+from en4dvar.diagnosis.analysis import IterationRecord, Progress, Record
+from en4dvar.estimation.assimilate import LoopState, assimilate
+from en4dvar.estimation.summary import dataset_rows, remarks, summarise
 from en4dvar.executor import Executor
-from en4dvar.executor.shared import CommonValue
+from en4dvar.executor.chunks import CommonValue
 from en4dvar.inputs.asked import DataFile
-from en4dvar.prior import own_seed
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.plumbing.tables import csv_text
+from en4dvar.priors.prior import own_seed
+from en4dvar.problem import InverseProblem
+from en4dvar.results.checkpoint import Keeper, digest
+from en4dvar.results.codec import encode_text
+from en4dvar.results.groups import build_groups
+from en4dvar.results.netcdf import to_bytes
+from en4dvar.results.packed import packed
+from en4dvar.results.seal import SealedBytes
 from en4dvar.runs.campaign import DatasetOutcome
 from en4dvar.runs.progress import describe
-from en4dvar.storage.checkpoint import Keeper, digest
-from en4dvar.storage.codec import encode_text
-from en4dvar.storage.groups import build_groups
-from en4dvar.storage.netcdf import to_bytes
-from en4dvar.storage.packed import packed
-from en4dvar.storage.seal import SealedBytes
-from en4dvar.summary import dataset_rows, remarks, summarise
-from en4dvar.tables import csv_text
+from en4dvar.schemes.settings import AssimilationSettings
 
 SEND_EVERY = 0.1  # s; a worker sends the records of its iterations no more often, whatever data sets they are of
 Told = tuple[str, Record, str]  # name of a data set, one of its records, and what the log says of it
@@ -83,7 +84,7 @@ class FileJob:
     resume: LoopState | None
 
     def made(self) -> Job:
-        """Raises what :func:`~en4dvar.config.build.build_one` does."""
+        """Raises what :func:`~en4dvar.assembly.build.build_one` does."""
         config, attributes = self.common.value.config, {**self.common.value.attributes, **self.attributes}
         problem, seed = build_one(config, self.name, self.source), own_seed(config.seed, self.name)
         return Job(problem, config.assimilation, seed, attributes, self.keeper, self.resume)
@@ -141,11 +142,11 @@ def estimate_and_tell(job: Job | FileJob, tell: Callable[[tuple[Told, ...]], Non
     """
     sender = _Sender(tell)
     try:
-        found = estimate(job, None, sender)
+        outcome = estimate(job, None, sender)
     except BaseException:
         sender.close()
         raise
-    return replace(found, records=sender.rest())
+    return replace(outcome, records=sender.rest())
 
 
 class _Sender:

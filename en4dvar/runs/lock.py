@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from en4dvar.errors import OutputError
-from en4dvar.files import inside, own_file
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.files import inside, own_file
 
 LOCK = ".en4dvar-lock"
 PATIENCE = 3.0  # s for the lock of a dead process to go

@@ -8,12 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import overload
 
-from en4dvar.errors import OutputError
+from en4dvar.estimation.summary import dataset_rows
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.tables import csv_text
+from en4dvar.results.codec import decode_text
+from en4dvar.results.pack import Entry, read_outcome
 from en4dvar.runs.campaign import DatasetOutcome
-from en4dvar.storage.codec import decode_text
-from en4dvar.storage.pack import Entry, read_outcome
-from en4dvar.summary import dataset_rows
-from en4dvar.tables import csv_text
 
 LINES = b'"lines": '  # which outcomes of earlier versions do not have
 
@@ -41,8 +41,8 @@ class Outcomes(Sequence[DatasetOutcome]):
     def __getitem__(self, index: slice) -> tuple[DatasetOutcome, ...]: ...
 
     def __getitem__(self, index: int | slice) -> DatasetOutcome | tuple[DatasetOutcome, ...]:
-        found = self._stems[index]
-        return self._read(found) if isinstance(found, str) else tuple(map(self._read, found))
+        stems = self._stems[index]
+        return self._read(stems) if isinstance(stems, str) else tuple(map(self._read, stems))
 
     def lines(self) -> Iterator[str]:
         """Those of ``summary.csv`` of each data set; the rest is looked at only where an earlier version wrote none."""

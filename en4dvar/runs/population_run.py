@@ -1,29 +1,30 @@
-"""Mean and spread of parameters over data sets: those of a run whose configuration has ``population:``, or of several
-finished runs (``en4dvar population``).
+"""The kind of run that estimates mean and spread of parameters over data sets: those of a run whose configuration has
+``population:``, or of several finished runs (``en4dvar population``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from en4dvar.caution import Caution, caution
 from en4dvar.config import Config
-from en4dvar.diagnostics import HARDLY_INFORMED
-from en4dvar.errors import ConfigError, TooFewMembersError
-from en4dvar.executor import Executor, choose_executor
-from en4dvar.files import make_folder
-from en4dvar.population import Effort, HyperPrior
-from en4dvar.population.campaign import FEWEST_SETS, CampaignPopulation, population_of, runs_of
+from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED
+from en4dvar.estimation.population import Effort, HyperPrior
+from en4dvar.estimation.population import campaign as of_campaign
+from en4dvar.estimation.population.campaign import FEWEST_SETS, CampaignPopulation, population_of
+from en4dvar.executor import Executor
+from en4dvar.plumbing.caution import Caution, caution
+from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
 from en4dvar.problem import InverseProblem
-from en4dvar.runs.finished import Finished, carried, finished
-from en4dvar.runs.together import once_together
+from en4dvar.results.checkpoint import FOLDER
+from en4dvar.results.population_file import FILE, StoredPopulation, load_population, save_population
+from en4dvar.runs.finished import Finished, carried
+from en4dvar.runs.together import Tell, TogetherKind
 from en4dvar.runs.trust import Ask
-from en4dvar.runs.worklist import Worklist
-from en4dvar.storage.population_file import FILE, StoredPopulation, load_population, save_population
-from en4dvar.storage.provenance import provenance
+
+ODD = 0.5  # probability from which a data set is named as odd
 
 
 def population(
@@ -36,7 +37,7 @@ def population(
     workers: int | None = None,
     trust: bool = False,
     ask: Ask | None = None,
-    tell: Callable[[str], None] = lambda words: None,
+    tell: Tell = lambda words: None,
 ) -> tuple[StoredPopulation, Path]:
     """Estimate the population of the parameters ``names`` behind the data sets of finished runs; writes
     ``population.nc``, ``.csv``, ``.tex`` and ``.html`` to ``out``. Returns what was found and the path of the page.
@@ -45,37 +46,54 @@ def population(
 
     Raises
     ------
-    RefusedError: code of a stranger, see :func:`~en4dvar.runs.rerun.rerun`. OutputError: there is no result, or it is
-        damaged. ConfigError: there is no population of these data sets, as
-        :func:`~en4dvar.population.campaign.population_of` says. TooFewMembersError: too many forward runs failed.
+    RefusedError, OutputError: as of :meth:`~en4dvar.runs.together.TogetherKind.of_runs`. ConfigError: there is no
+        population of these data sets, as :func:`~en4dvar.estimation.population.campaign.population_of` says.
+        TooFewMembersError: too many forward runs failed.
     """
-    from en4dvar.report.population import write_population  # what draws pages is slow to import
-
-    first, sets = finished(run_dirs, trust, ask)
-    attributes = {**provenance("", None), "runs": ", ".join(run_dir.name for run_dir in run_dirs)}
-    path = out / FILE
-    with choose_executor(first.model, None, workers) as executor:
-        _save(
-            sets, attributes, path, tell, names=names, seed=first.seed, hyper=hyper, effort=effort,
-            workers=workers or 1, executor=executor,
-        )  # fmt: skip
-    stored = load_population(path)
-    return stored, write_population(stored, out)
+    kind = PopulationKind(tuple(names), hyper, effort)
+    file, page = kind.of_runs(run_dirs, out, workers, trust, ask, tell)
+    return load_population(file), page
 
 
-def population_within(work: Worklist, executor: Executor) -> None:
-    """The population that the configuration of a run asks for: ``population.nc`` in its directory.
+@dataclass(frozen=True)
+class PopulationKind(TogetherKind):
+    """Of the parameters ``names``; without, of what the configuration says."""
 
-    Raises :class:`ConfigError`, :class:`TooFewMembersError`, :class:`OutputError`.
-    """
-    config, asked = work.config, work.config.population
-    if asked is None:
-        return
-    estimate = partial(
-        _save, names=asked.of, seed=config.seed, hyper=asked.hyper, workers=config.execution.workers or 1,
-        executor=executor,
-    )  # fmt: skip
-    once_together(work, FILE, "population", FEWEST_SETS, estimate)
+    name = "population"
+    what = "population"
+    fewest = FEWEST_SETS
+    result = FILE
+    files = (FILE,)
+    records = (f"{FOLDER}/population",)
+    pages = ("population.html", "population.csv", "population.tex")
+
+    names: Sequence[str] = ()
+    hyper: HyperPrior | None = None
+    effort: Effort | None = None
+
+    def estimate(
+        self, sets: Sequence[Finished], config: Config, executor: Executor, attributes: Mapping[str, Any], path: Path,
+        tell: Tell,
+    ) -> None:  # fmt: skip
+        tell(f"population of {', '.join(self.names)} behind {len(sets)} data sets")
+        problems, white = [s.problem for s in sets], [s.white for s in sets]
+        try:
+            population = population_of(
+                problems, white, self.names, config.seed, hyper=self.hyper, effort=self.effort, executor=executor,
+                tell=tell,
+            )  # fmt: skip
+        except ValueError as error:  # of forward runs that failed
+            raise TooFewMembersError(f"no population: {error}") from None
+        tell(f"{population.estimate.forward_runs} forward runs, {population.estimate.size:.0f} effective draws")
+        used = [s for s in sets if s.name not in population.left_out]
+        cautions = (*_cautions(population), *carried(used, "caution"))
+        save_population(path, population, [s.members for s in used], cautions, {**attributes, "seed": config.seed})
+
+    @classmethod
+    def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
+        from en4dvar.report.population import write_population  # with matplotlib
+
+        return write_population(load_population(folder / FILE), folder)
 
 
 def require_population(config: Config, problem: InverseProblem, count: int) -> None:
@@ -88,32 +106,30 @@ def require_population(config: Config, problem: InverseProblem, count: int) -> N
     try:
         if count < FEWEST_SETS:
             raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets, not {count}")
-        runs_of([problem], config.population.of)
+        of_campaign.require_population([problem], config.population.of)
     except ConfigError as error:
         raise ConfigError([config.document.fault(("population",), str(error), at_key=True)]) from None
 
 
-def _save(
-    sets: Sequence[Finished], attributes: Mapping[str, Any], path: Path, tell: Callable[[str], None], *,
-    names: Sequence[str], seed: int, **options: Any,
-) -> None:  # fmt: skip
-    """Estimate it and write the file."""
-    tell(f"population of {', '.join(names)} behind {len(sets)} data sets")
-    try:
-        found = population_of([one.problem for one in sets], [one.white for one in sets], names, seed, **options)
-    except ValueError as error:  # of forward runs that failed
-        raise TooFewMembersError(f"no population: {error}") from None
-    tell(f"{found.estimate.forward_runs} forward runs, {found.estimate.size:.0f} effective draws")
-    cautions = (*_cautions(found), *carried(sets))
-    make_folder(path.parent)
-    save_population(path, found, [one.members for one in sets], cautions, {**attributes, "seed": seed})
-
-
-def _cautions(found: CampaignPopulation) -> Iterator[Caution]:
-    if not found.estimate.converged:
-        words = f"only {found.estimate.size:.0f} effective draws stand behind the population"
+def _cautions(population: CampaignPopulation) -> Iterator[Caution]:
+    if not population.estimate.converged:
+        words = (
+            f"only {population.estimate.size:.0f} effective draws stand behind the population; the median of the data "
+        )
+        words += "sets one by one needs none"
         yield caution("chain-not-converged", words)
-    for name, share in zip(found.names, found.learned[0], strict=True):
+    odd = [
+        f"{problem.observations.name} (with probability {share:.2g})"
+        for problem, share in zip(population.problems, 1 - population.belongs, strict=True)
+        if share > ODD
+    ]
+    if odd:
+        yield caution(
+            "odd-data-set", f"not of the population: {', '.join(odd)}; mean and spread are those of the others"
+        )
+    for name, reason in population.left_out.items():
+        yield caution("odd-data-set", f"{name} is left out: {reason}")
+    for name, share in zip(population.names, population.learned[0], strict=True):
         if share < HARDLY_INFORMED:
             words = f"the data say little about the population's {name}: its interval is that of the hyperprior"
             yield caution("not-informed", words, parameters=(name,))

@@ -13,10 +13,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from en4dvar.analysis import ChainRecord, Descents, IterationRecord, Record, StartRecord
-from en4dvar.compiled import watch_compilation
-from en4dvar.errors import OutputError
-from en4dvar.files import own_file
+from en4dvar.diagnosis.analysis import ChainRecord, Descents, IterationRecord, Record, StartRecord
+from en4dvar.plumbing.compiled import watch_compilation
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.files import own_file
+from en4dvar.plumbing.tables import without_control
 from en4dvar.runs.interrupt import Interrupted
 
 TYPICAL_ITERATIONS = 8.0
@@ -69,7 +70,7 @@ class RunLog:
         """Append every line of ``message`` with the time of day."""
         now = datetime.now().astimezone().isoformat(timespec="milliseconds")
         try:
-            self._file.write("".join(f"{now} {line}\n" for line in message.splitlines()))
+            self._file.write("".join(f"{now} {without_control(line)}\n" for line in message.splitlines()))
         except OSError as error:
             raise OutputError(f"{self._path}: cannot be written: {error.strerror}") from None
 
@@ -116,8 +117,10 @@ class LiveProgress:
         self._before, self._done, self._total = done, done, total
         self._show(None)
 
-    def ended(self, name: str, done: int) -> None:
-        """A data set has ended; ``done`` are done now."""
+    def ended(self, name: str, done: int, words: str = "") -> None:
+        """A data set has ended, of several with one line of ``words``; ``done`` are done now."""
+        if words and self._total > 1:
+            self._bar.console.print(f"{name}: {words}", markup=False, highlight=False, soft_wrap=True)
         if name in self._open:
             self._lengths.append(self._open.pop(name))
         self._done = done

@@ -1,23 +1,25 @@
 """The files of a run directory: the list of what a run wrote, and a new run's taking the place of an earlier one's.
 
-The directory may be a stranger's: every name, of the list or of ours, goes through :func:`en4dvar.files.inside`.
+The directory may be a stranger's: every name, of the list or of ours, goes through
+:func:`en4dvar.plumbing.files.inside`.
 """
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
-from en4dvar.errors import OutputError
-from en4dvar.files import inside, open_plain, write_text
-from en4dvar.storage.store import COMPLETE, NEXT
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.files import inside, open_plain, write_text
+from en4dvar.results.store import COMPLETE, NEXT
 
 LISTING = ".en4dvar-files"
 OLD = ".en4dvar-old"
 FOLDERS = ("datasets", "figures", "pages", "checkpoints")
-PARTIAL = re.compile(r"\..+\.\d+\.tmp")  # of en4dvar.files, left by a process that was killed
+PARTIAL = re.compile(r"\..+\.\d+\.tmp")  # of en4dvar.plumbing.files, left by a process that was killed
 
 
 def finish_replacement(path: Path) -> None:
@@ -80,10 +82,17 @@ def listed_files(work: Path) -> tuple[str, ...]:
 
 def _named(work: Path, line: str) -> list[str]:
     """What a line of the list stands for: a file, or with ``*`` those of a folder that are there."""
-    place = inside(work, line)
-    if "*" not in place.name:
-        return [line]
-    return sorted(found.relative_to(work).as_posix() for found in place.parent.glob(place.name))
+    inside(work, line)
+    return matching(work, line) if "*" in line else [line]
+
+
+def matching(work: Path, name: str) -> list[str]:
+    """The files in ``work`` that a name of a list stands for, ``*`` for any text. Raises :class:`OutputError`."""
+    place = inside(work, name)
+    if "*" not in name:
+        return [place.relative_to(work).as_posix()] * os.path.lexists(place)
+    there = (file for file in work.glob(name) if file.is_symlink() or not file.is_dir())
+    return sorted(file.relative_to(work).as_posix() for file in there)
 
 
 def lines_of_list(work: Path) -> tuple[str, ...]:

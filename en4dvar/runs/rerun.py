@@ -13,22 +13,23 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.assimilate import assimilate
+from en4dvar.assembly.build import inverse_plan, problem_of
 from en4dvar.config import AnyConfig, Config, TwinConfig, resolve_any
-from en4dvar.config.build import inverse_plan, problem_of
-from en4dvar.config.document import parse_document
-from en4dvar.errors import OutputError
+from en4dvar.config.load import recorded as recorded_configuration
+from en4dvar.data.observations import SEVERAL
+from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import choose_executor, make_executor, one_blas_thread
-from en4dvar.forward import ForwardModel
-from en4dvar.observations import SEVERAL
-from en4dvar.runs.sequence_run import sequence_work
+from en4dvar.model.forward import ForwardModel
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.results.campaign_file import failed_datasets
+from en4dvar.results.fingerprint import Identity, digest_of, identity
+from en4dvar.results.provenance import provenance
+from en4dvar.results.series_file import read_series, series_file
+from en4dvar.results.store import StoredResult, load_stored, result_files
+from en4dvar.runs.cycles import Cycles
+from en4dvar.runs.sequence_run import SequenceKind
 from en4dvar.runs.trust import Ask, of_strangers
-from en4dvar.runs.twin_run import twin_work
-from en4dvar.storage.campaign_file import failed_datasets
-from en4dvar.storage.cycles_file import cycles_file, read_cycles
-from en4dvar.storage.fingerprint import Identity, digest_of, identity
-from en4dvar.storage.provenance import provenance
-from en4dvar.storage.store import StoredResult, load_stored, result_files
+from en4dvar.runs.twin_run import TwinKind
 
 SURROUNDINGS = ("python_version", "package_versions", "platform", "cpu", "git_commit")
 
@@ -56,13 +57,13 @@ class Rerun:
     @property
     def same(self) -> bool:
         """Whether every bit is."""
-        return not any(one.differ for one in self.sets)
+        return not any(dataset.differ for dataset in self.sets)
 
     def __str__(self) -> str:
         lines = []
-        for one in self.sets:
-            told = "; ".join(one.differ) if one.differ else f"the same bits ({one.variables} variables)"
-            lines.append(f"{one.name}: {told}{f'; {one.data}' if one.data else ''}")
+        for dataset in self.sets:
+            told = "; ".join(dataset.differ) if dataset.differ else f"the same bits ({dataset.variables} variables)"
+            lines.append(f"{dataset.name}: {told}{f'; {dataset.data}' if dataset.data else ''}")
         if self.failures:
             lines.append(f"not repeated, for they have no result: {', '.join(self.failures)}")
         if self.changed:
@@ -86,7 +87,7 @@ def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = Fals
         for instance because the file of a user's own model is gone. TooFewMembersError: the ensemble is lost.
     """
     run_dir = Path(run_dir)
-    if cycles := cycles_file(run_dir):
+    if cycles := series_file(run_dir):
         return _of_cycles(cycles, workers, trust, ask)
     campaign = run_dir / "posterior.nc"
     files = result_files(run_dir)
@@ -97,7 +98,7 @@ def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = Fals
     with one_blas_thread(), choose_executor(config.model, None, workers) as executor:
         for file in files:
             recorded = load_stored(file)
-            observables = {one.name: one.observable for one in inverse_plan(config).series}
+            observables = {series.name: series.observable for series in inverse_plan(config).series}
             problem = problem_of(config, recorded.observations(observables))
             analysis = assimilate(problem, config.assimilation, int(recorded.attributes["seed"]), executor)
             again = StoredResult.from_analysis(analysis, {})
@@ -110,23 +111,24 @@ def rerun(run_dir: str | Path, workers: int | None = None, *, trust: bool = Fals
 
 def _of_cycles(file: Path, workers: int | None, trust: bool, ask: Ask | None) -> Rerun:
     """Of a twin experiment or a sequence, whose data are read again. Raises as :func:`rerun`, :class:`DataError`."""
-    recorded = read_cycles(file)
+    recorded = read_series(file)
     config = _configuration(file, recorded.attrs, trust, ask)
     assert not isinstance(config, Config)
+    kind: Cycles[Any] = TwinKind(config) if isinstance(config, TwinConfig) else SequenceKind(config)
     with of_strangers(file.parent, ask, trust):  # data may have weights by a function
-        work = twin_work(config) if isinstance(config, TwinConfig) else sequence_work(config)
-    with make_executor(work.model, workers or 1) as executor:
-        again = work.again(executor)
-    was, now = ({f"/{name}": v.values for name, v in one.variables.items()} for one in (recorded, again))
+        kind.check()
+    with make_executor(kind.model, workers or 1) as executor:
+        again = kind.again(executor)
+    was, now = ({f"/{name}": v.values for name, v in result.every.items()} for result in (recorded, again))
     repeated = Repeated(config.name, len(was), differences(was, now), "")
-    return _found([repeated], config.resolved, work.model, recorded.attrs, {})
+    return _found([repeated], config.resolved, kind.model, recorded.attrs, {})
 
 
 def _configuration(file: Path, attributes: Mapping[Any, Any], trust: bool, ask: Ask | None) -> AnyConfig:
     """What a result file was made of."""
     if "identity" not in attributes:
         raise OutputError(f"{file}: does not record all that a run is made of; it was written by a program")
-    document = parse_document(str(attributes["configuration_resolved"]), f"{file}: configuration_resolved")
+    document = recorded_configuration(str(attributes["configuration_resolved"]), f"{file}: configuration_resolved")
     with of_strangers(file.parent, ask, trust):
         return resolve_any(document, file.parent.absolute())
 

@@ -8,7 +8,6 @@ next run there finishes it, and commands that read say so and read nothing.
 from __future__ import annotations
 
 import itertools
-import os
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -17,8 +16,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
-from en4dvar.errors import OutputError
-from en4dvar.files import inside, make_folder, remove_file, write_text
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.files import inside, make_folder, remove_file, write_text
+from en4dvar.results.store import COMPLETE, NEXT, require_settled
 from en4dvar.runs.interrupt import begun
 from en4dvar.runs.lock import LOCK, locked
 from en4dvar.runs.replacement import (
@@ -27,21 +27,17 @@ from en4dvar.runs.replacement import (
     finish_replacement,
     lines_of_list,
     listed_files,
+    matching,
     remove_folder,
     remove_partial,
     replace_earlier_run,
     write_list,
 )
-from en4dvar.storage.pack import PACK
-from en4dvar.storage.store import COMPLETE, NEXT, require_settled
 
-FIXED = (
-    "config.yaml", "config.resolved.yaml", "posterior.nc", PACK, "twin.nc", "run.log", "report.html", "summary.csv",
-    "what_if.csv", "ledger.csv", "varying.csv", "joint.nc", "joint.csv", "joint.html",
-    "population.nc", "population.csv", "population.tex", "population.html",
-)  # fmt: skip
+LOG = "run.log"
+OF_EVERY_RUN = ("config.yaml", "config.resolved.yaml", LOG)
 GIVEN = "data.csv"  # readings that a script handed over, written before its run begins
-Mode = Literal["new", "force", "resume", "report"]
+Mode = Literal["new", "force", "resume", "report", "beside"]
 
 
 @dataclass(frozen=True)
@@ -58,11 +54,13 @@ class RunDirectory:
 
     @classmethod
     @contextmanager
-    def open(cls, path: str | Path, mode: Mode = "new") -> Iterator[RunDirectory]:
-        """Lock ``path`` for a new run, one that replaces an earlier run, the rest of one, or its report.
+    def open(cls, path: str | Path, mode: Mode = "new", files: Sequence[str] = ()) -> Iterator[RunDirectory]:
+        """Lock ``path`` for a new run, one that replaces an earlier run, the rest of one, or its report; ``beside`` for
+        files that stand beside whatever is there, such as the result of an estimate of several runs.
 
-        ``resume`` of what is missing or empty is a new run: that of a batch job which was killed before it began. A new
-        run that fails before it has claimed a file leaves nothing behind, unless it was interrupted and can be resumed.
+        ``files``: what the run will write (relative names, ``*`` stands for any text). ``resume`` of what is missing or
+        empty is a new run: that of a batch job which was killed before it began. A new run that fails before it has
+        written a file leaves nothing behind, unless it was interrupted and can be resumed.
 
         Raises
         ------
@@ -79,9 +77,13 @@ class RunDirectory:
                     home.mkdir(parents=True)
                     held.callback(_remove_if_empty, home)
                 held.enter_context(locked(home))
-                resumed = mode == "report" or (mode == "resume" and holds_run(home))
-                work = _opened(home, mode) if resumed else _prepare(home, mode)
-                directory = cls(path, home, work, resumed)
+                resumed = mode in ("report", "beside") or (mode == "resume" and holds_run(home))
+                directory = cls(path, home, _opened(home, mode) if resumed else _prepare(home, mode), resumed)
+                if mode == "beside":
+                    directory._refuse_foreign(files)
+                elif not resumed:
+                    directory._refuse_foreign((*OF_EVERY_RUN, *files))
+                    write_list(directory.work, ())
             except OSError as error:
                 raise OutputError(f"{path}: cannot be used as run directory: {error.strerror or error}") from None
             try:
@@ -92,34 +94,37 @@ class RunDirectory:
                 raise
 
     def at(self, name: str) -> Path:
-        """Where the run writes the file ``name``. Raises :class:`OutputError` as :func:`~en4dvar.files.inside`."""
+        """Where the run writes the file ``name``.
+
+        Raises :class:`OutputError` as :func:`~en4dvar.plumbing.files.inside`.
+        """
         return inside(self.work, name)
 
     def claim(self, *names: str) -> Path:
         """List files (relative names) as written by this run; returns the path of the last one.
 
-        ``*`` in a name stands for any: of 10⁵ checkpoints a few are there at a time.
+        ``*`` in a name stands for any text: of 10⁵ checkpoints a few are there at a time. Raises :class:`OutputError`
+        where there is such a file that no run wrote.
         """
         known, paths = lines_of_list(self.work), [self.at(name) for name in names]
-        if set(names) - set(known):
-            write_list(self.work, dict.fromkeys([*known, *names]))
+        if new := [name for name in names if name not in known]:
+            self._refuse_foreign([name for name in new if name != LOG])  # which is open by then
+            write_list(self.work, [*known, *dict.fromkeys(new)])
         return paths[-1] if paths else self.work
+
+    def _refuse_foreign(self, names: Iterable[str]) -> None:
+        """Raise :class:`OutputError` where a run would replace a file that none wrote."""
+        listed = set(listed_files(self.home))
+        for name in names:
+            for file in matching(self.home, name):
+                if file not in listed:
+                    raise OutputError(
+                        f"{self.path}: {file} was not written by a run and would be replaced; move it away"
+                    )
 
     def folder(self, name: str) -> Path:
         """Make the folder ``name``. Raises :class:`OutputError`."""
         return make_folder(self.at(name))
-
-    @contextmanager
-    def claiming(self, *folders: str) -> Iterator[None]:
-        """List the files that appear in ``folders`` within, also where that fails."""
-        before = self._inside(folders)
-        try:
-            yield
-        finally:
-            self.claim(*sorted(p.relative_to(self.work).as_posix() for p in self._inside(folders) - before))
-
-    def _inside(self, folders: Iterable[str]) -> set[Path]:
-        return {p for folder in folders for p in self.at(folder).glob("*") if p.is_file()}
 
     def remove(self, name: str) -> None:
         """Remove a file if it is there. Raises :class:`OutputError`."""
@@ -127,7 +132,10 @@ class RunDirectory:
 
     def publish(self) -> None:
         """The run is complete: where it replaces an earlier one, take its place. Raises :class:`OutputError`."""
-        write_list(self.work, [name for name in listed_files(self.work) if self.at(name).exists()])
+        if names := [name for name in listed_files(self.work) if self.at(name).exists()]:
+            write_list(self.work, names)
+        else:
+            self.remove(LISTING)
         if self.work != self.home:
             write_text(self.at(COMPLETE), "")
             try:
@@ -138,9 +146,9 @@ class RunDirectory:
     def _withdraw(self) -> None:
         """Take back what :meth:`open` made, where the run has claimed nothing."""
         with suppress(OSError, OutputError):
-            if self.resumed or listed_files(self.work):
+            if self.resumed or any(self.at(name).exists() for name in listed_files(self.work)):
                 return
-            for name in (LISTING, "run.log"):
+            for name in (LISTING, LOG):
                 self.at(name).unlink(missing_ok=True)
             if self.work != self.home:
                 remove_folder(self.work)
@@ -153,13 +161,13 @@ def holds_run(path: Path) -> bool:
 
 def _opened(path: Path, mode: Mode) -> Path:
     """The folder of the run that is there, to write to. Raises :class:`OutputError`."""
-    if mode == "report":
+    if mode in ("report", "beside"):
         require_settled(path)
         work = path
     else:
         finish_replacement(path)
         work = inside(path, NEXT) if (path / NEXT / LISTING).exists() else path
-    if not (work / LISTING).exists():
+    if mode != "beside" and not (work / LISTING).exists():
         raise OutputError(f"{path}: holds no run")
     remove_partial(work)
     return work
@@ -174,9 +182,6 @@ def _prepare(path: Path, mode: Mode) -> Path:
         raise OutputError(f"{path}: holds no run")
     if mode == "new" and (listed or others - {LISTING}):  # an empty list is of a run that was killed before it began
         raise OutputError(_occupied(path, listed))
-    foreign = [name for name in FIXED if os.path.lexists(path / name) and name not in listed]
-    if foreign:
-        raise OutputError(f"{path}: {foreign[0]} was not written by a run and would be replaced; move it away")
     following = inside(path, NEXT)
     remove_folder(following)  # of a run that was given up
     remove_partial(path)
@@ -184,7 +189,6 @@ def _prepare(path: Path, mode: Mode) -> Path:
     if any((path / name).exists() for name in listed):
         work = following
         work.mkdir()
-    write_list(work, ())
     return work
 
 

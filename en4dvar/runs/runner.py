@@ -1,33 +1,28 @@
-"""The straight line: configuration → inverse problems → analyses → netCDF → report. Resumable at any moment."""
+"""The kind of run that estimates data sets: configuration → inverse problems → analyses → netCDF → page."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from en4dvar.analysis import Progress
+from en4dvar.assembly.build import build_one, data_files, inverse_plan
 from en4dvar.config import Config, load_config
-from en4dvar.config.build import build_one, data_files, inverse_plan
-from en4dvar.errors import ConfigError, DataError, Fault
-from en4dvar.executor import Executor, choose_executor, one_blas_thread
-from en4dvar.files import atomic_path
+from en4dvar.diagnosis.analysis import Progress
+from en4dvar.executor import Executor
 from en4dvar.inputs.asked import DataFile
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault
+from en4dvar.results.campaign_file import DamagedError, save_campaign
+from en4dvar.results.pack import PACK
 from en4dvar.runs.campaign import Campaign
-from en4dvar.runs.interrupt import terminate_as_interrupt
-from en4dvar.runs.joint_run import join_within
-from en4dvar.runs.population_run import population_within, require_population
-from en4dvar.runs.rundir import RunDirectory
-from en4dvar.runs.session import directory_mode, session
-from en4dvar.runs.together import checkpoint_of
-from en4dvar.runs.worklist import ITERATIONS, SUMMARY, Worklist, datasets
-from en4dvar.storage.campaign_file import DamagedError, save_campaign
-from en4dvar.storage.joint_file import FILE, load_joint
-from en4dvar.storage.population_file import FILE as POPULATION
-from en4dvar.storage.population_file import load_population
-from en4dvar.summary import summary_rows
-from en4dvar.tables import csv_text
+from en4dvar.runs.engine import conduct_run
+from en4dvar.runs.joint_run import JointKind
+from en4dvar.runs.kind import FIGURES, REPORT, RunKind
+from en4dvar.runs.population_run import PopulationKind, require_population
+from en4dvar.runs.session import Session
+from en4dvar.runs.worklist import ENDED, ITERATIONS, SUMMARY, Worklist, datasets
 
 if TYPE_CHECKING:
     from en4dvar.report.result import Result
@@ -60,9 +55,9 @@ def run(
     TooFewMembersError: the ensemble is lost. ExecutorError: the workers are gone. Interrupted: Ctrl-C or SIGTERM.
     """
     config = _loaded(config, overrides)
-    found = len(data_files(inverse_plan(config)))
-    if found != 1:
-        raise ConfigError(f"data.path names {found} data sets; use run_campaign, or name one")
+    count = len(data_files(inverse_plan(config)))
+    if count != 1:
+        raise ConfigError(f"data.path names {count} data sets; use run_campaign, or name one")
     (result,) = run_campaign(config, force=force, resume=resume, progress=progress, command=command)
     return result
 
@@ -86,50 +81,76 @@ def run_campaign(
 
     ``report_workers``: processes that draw the report. They import the main script, which must guard what it does then.
     """
-    config = _loaded(config, overrides)
-    mode = directory_mode(force, resume)
-    files = data_files(inverse_plan(config))
-    ended: dict[str, str] = {}
-
-    def kept() -> str:
-        if resume and not ended:  # stopped, perhaps, before it was read what had been done
-            return f"what {config.directory} holds is kept"
-        return f"{len(ended)} of {len(files)} data sets are done and kept in {config.directory}"
-
-    with (
-        one_blas_thread(),
-        terminate_as_interrupt(),
-        RunDirectory.open(config.directory, mode) as directory,  # first: what follows may compile the model
-    ):
-        _require_one_usable(config, files)
-        with _executor(config) as executor, session(config, files, directory, command, kept) as run:
-            work = Worklist(config, run, datasets(files), progress, ended)
-            try:
-                _begin(work)
-                _estimate(work, executor)
-                if config.sharing:
-                    join_within(work, executor)
-                population_within(work, executor)
-                _finish(work, report_workers)
-            except BaseException:  # no worker writes once the directory is free for others
-                work.stop.set()
-                with suppress(KeyboardInterrupt):  # of an impatient user: on to the next step
-                    executor.kill()
-                raise
-    return work.campaign()
+    kind = EstimateKind(_loaded(config, overrides), resume, progress, report_workers)
+    return conduct_run(kind, force, resume, command)
 
 
-def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
-    """Write (again) the report of a run from its netCDF; ``datasets`` of a campaign get a page in any case.
+@dataclass
+class EstimateKind(RunKind[Campaign]):
+    """A configuration whose data sets are estimated, each by itself, and then perhaps together."""
 
-    ``workers``: processes that draw it. ``figures``: also keep those of ``datasets``, or of all pages, as PDF and PNG.
+    name = "estimate"
+    result = "posterior.nc"
+    files = (
+        result, PACK, ENDED, ITERATIONS, JointKind.result, PopulationKind.result, *JointKind.records,
+        *PopulationKind.records,
+    )  # fmt: skip
+    pages = (
+        REPORT, SUMMARY, "what_if.csv", "ledger.csv", "varying.csv", "withheld.csv", *JointKind.pages,
+        *PopulationKind.pages, *FIGURES, "pages/*.html",
+    )  # fmt: skip
 
-    Raises :class:`OutputError`.
-    """
-    from en4dvar.runs.cycles import report_cycles
+    config: Config
+    resume: bool = False
+    progress: Progress | None = None
+    report_workers: int = 1
+    work: Worklist | None = field(default=None, init=False)
 
-    with RunDirectory.open(path, "report") as directory:
-        return report_cycles(directory, figures) or _report(directory, datasets, workers, figures)
+    @cached_property
+    def data(self) -> Mapping[str, DataFile]:
+        return data_files(inverse_plan(self.config))
+
+    def check(self) -> None:
+        _require_one_usable(self.config, self.data)
+
+    def kept(self) -> str:
+        ended = self.work.ended if self.work else {}
+        if self.resume and not ended:  # stopped, perhaps, before it was read what had been done
+            return f"what {self.directory} holds is kept"
+        return f"{len(ended)} of {len(self.data)} data sets are done and kept in {self.directory}"
+
+    def opened(self, run: Session) -> frozenset[str]:
+        self.work = Worklist(self.config, run, datasets(self.data), self.progress)
+        return self.work.failed_earlier()
+
+    def conduct(self, run: Session, executor: Executor) -> Campaign:
+        work = self.work
+        assert work is not None
+        if run.resumed:
+            work.recall()
+        _estimate(work, executor)
+        if self.config.sharing:
+            JointKind().within(work, executor)
+        if asked := self.config.population:
+            PopulationKind(asked.of, asked.hyper).within(work, executor)
+        if work.good() and self.config.report:
+            self.page(run.directory.work, workers=self.report_workers, figures=self.config.figures)
+        elif not run.directory.at(SUMMARY).exists():  # it is there where there was nothing left to estimate
+            work.summarise()
+        return work.campaign()
+
+    def stop(self) -> None:
+        if self.work:
+            self.work.stop.set()
+
+    @classmethod
+    def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
+        from en4dvar.report import write_pages  # what draws pages is slow to import
+
+        for kind in (JointKind, PopulationKind):
+            if (folder / kind.result).exists():
+                kind.page(folder)
+        return write_pages(folder, datasets, workers, figures)
 
 
 def _require_one_usable(config: Config, files: Mapping[str, DataFile]) -> None:
@@ -154,21 +175,6 @@ def _require_one_usable(config: Config, files: Mapping[str, DataFile]) -> None:
     raise DataError("\n".join(map(str, unusable)))
 
 
-def _executor(config: Config) -> Executor:
-    asked = config.execution
-    return choose_executor(config.model, asked.executor, asked.workers, asked.address, asked.limits)
-
-
-def _begin(work: Worklist) -> None:
-    """Write what the run is; of one that is resumed, take over what is done. What has failed is tried again."""
-    run = work.run
-    together = [FILE] * bool(work.config.sharing) + [POPULATION] * (work.config.population is not None)
-    files = (*together, *map(checkpoint_of, together), ITERATIONS)
-    run.begin("posterior.nc", work.record, *files, retried=work.failed_earlier())
-    if run.resumed:
-        work.recall()
-
-
 def _estimate(work: Worklist, executor: Executor) -> None:
     """Every data set, and the campaign's file; a result that was damaged since it was written is estimated again, once.
 
@@ -191,37 +197,6 @@ def _estimate(work: Worklist, executor: Executor) -> None:
                 raise
             repeated.update(error.names)
             work.estimate_again(error.names)
-
-
-def _finish(work: Worklist, report_workers: int) -> None:
-    """The report, or the table alone, which is there already where there was nothing left to estimate."""
-    directory = work.run.directory
-    if work.good() and work.config.report:
-        _report(directory, workers=report_workers, figures=work.config.figures)
-    elif not (path := directory.claim(SUMMARY)).exists():
-        header, *failures = summary_rows((), work.failures())
-        with atomic_path(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
-            file.write(csv_text([header]))
-            file.writelines(work.outcomes(directory.work).lines())
-            file.write(csv_text(failures))
-
-
-def _report(directory: RunDirectory, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
-    from en4dvar.report import JOINT_FILES, POPULATION_FILES, TABLES, write_pages  # what draws pages is slow to import
-
-    directory.claim("report.html", SUMMARY, *TABLES)
-    if (directory.work / FILE).exists():
-        from en4dvar.report.joint import write_joint  # with matplotlib, whose import takes longer than a page
-
-        directory.claim(*JOINT_FILES)
-        write_joint(load_joint(directory.work / FILE), directory.work)
-    if (directory.work / POPULATION).exists():
-        from en4dvar.report.population import write_population
-
-        directory.claim(*POPULATION_FILES)
-        write_population(load_population(directory.work / POPULATION), directory.work)
-    with directory.claiming("figures", "pages"):
-        return write_pages(directory.work, datasets, workers, figures)
 
 
 def _loaded(config: Config | str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None) -> Config:

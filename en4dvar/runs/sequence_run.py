@@ -1,22 +1,28 @@
-"""A sequence from YAML to a run directory: ``sequence.nc``, ``summary.csv``, report."""
+"""The kind of run that follows a series of readings: ``sequence.nc``, ``summary.csv``, page."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from en4dvar.assembly.build_sequence import build_sequence, sequence_data
 from en4dvar.config import SequenceConfig, load_sequence
-from en4dvar.config.build_sequence import build_sequence, sequence_data
-from en4dvar.cycling.outcome import SequentialState
-from en4dvar.cycling.problem import SeriesProblem, SeriesResult, assimilate_series
-from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor
-from en4dvar.runs.cycles import Keep, Work, run_cycles
-from en4dvar.storage.sequence_file import dataset, estimates, summary_csv
-from en4dvar.tables import table
+from en4dvar.inputs.asked import DataFile
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.report.outcomes import SequenceOutcome
+from en4dvar.results.checkpoint import FOLDER
+from en4dvar.results.netcdf import Group
+from en4dvar.results.series_file import sequence_csv, sequence_group
+from en4dvar.runs.cycles import Cycles, Keep
+from en4dvar.runs.engine import conduct_run
+from en4dvar.runs.kind import FIGURES, REPORT
+from en4dvar.series.moments import SequentialState
+from en4dvar.series.problem import SeriesProblem, SeriesResult, assimilate_series
 
 
 def run_sequence(
@@ -27,7 +33,7 @@ def run_sequence(
     resume: bool = False,
     on_cycle: Callable[[int], None] | None = None,
     command: str = "",
-) -> SeriesResult:
+) -> SequenceOutcome:
     """Assimilate a series of data and write its run directory; arguments and errors as of :func:`en4dvar.run`.
 
     ``on_cycle`` is called with the index of the last observation time of each cycle, from 0.
@@ -38,24 +44,51 @@ def run_sequence(
         config = load_sequence(config, overrides)
     elif overrides:
         raise ConfigError("overrides apply to a file or dict; give them to load_sequence instead")
-    return run_cycles(config, sequence_work(config, on_cycle), force, resume, command)
+    return SequenceOutcome(**vars(conduct_run(SequenceKind(config, on_cycle), force, resume, command)))
 
 
-def sequence_work(config: SequenceConfig, on_cycle: Callable[[int], None] | None = None) -> Work[SeriesResult]:
-    """The work of a sequence; its data are read. Raises :class:`ConfigError`, :class:`DataError`."""
-    problem = build_sequence(config)
+class SequenceKind(Cycles[SeriesResult]):
+    """A configuration with a ``sequence:`` section."""
 
-    def conduct(executor: Executor, resume: SequentialState | None, keep: Keep | None) -> SeriesResult:
-        return assimilate_series(problem, config.seed, executor, on_cycle, resume, keep)
+    name = "sequence"
+    result = "sequence.nc"
+    files = (result, "summary.csv", f"{FOLDER}/sequence.cycle")
+    pages = (REPORT, *FIGURES)
 
-    cycles, scheme = len(problem.series.times), config.assimilation.scheme
-    return Work("sequence", config.model, scheme, cycles, sequence_data(config), conduct, dataset, summary_csv)
+    @cached_property
+    def problem(self) -> SeriesProblem:
+        """With the data read. Raises :class:`ConfigError`, :class:`DataError`."""
+        return build_sequence(self.config)
 
+    @cached_property
+    def data(self) -> Mapping[str, DataFile]:
+        return sequence_data(self.config)
 
-def estimates_table(result: SeriesResult) -> str:
-    """State and parameters at the last time as an aligned table."""
-    rows = [(name, f"{mean:.5g}", f"{std:.3g}", unit) for name, mean, std, unit in estimates(result)]
-    return table([("at the end", "mean", "std", "unit"), *rows])
+    def check(self) -> None:
+        _ = self.problem
+
+    @property
+    def scheme(self) -> str:
+        return str(self.config.assimilation.scheme)
+
+    @property
+    def cycles(self) -> int:
+        return len(self.problem.series.times)
+
+    def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> SeriesResult:
+        return assimilate_series(self.problem, self.config.seed, executor, self.on_cycle, resume, keep)
+
+    def laid_out(self, result: SeriesResult, attributes: Mapping[str, Any]) -> Group:
+        return sequence_group(result, attributes)
+
+    def summary(self, result: SeriesResult) -> str:
+        return sequence_csv(result)
+
+    @classmethod
+    def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
+        from en4dvar.report.sequence import write_sequence_report
+
+        return write_sequence_report(folder, figures)
 
 
 def sequence_summary(config: SequenceConfig, problem: SeriesProblem) -> str:

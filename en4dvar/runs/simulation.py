@@ -7,20 +7,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from en4dvar.assembly.build import data_files, resolve_parameters
+from en4dvar.assembly.reading import read_observations
 from en4dvar.config import Config, time_grid
-from en4dvar.config.build import data_files, resolve_parameters
-from en4dvar.config.error_std import parse_error_std
+from en4dvar.config.error import parse_error_std
 from en4dvar.config.parameters import Tied
-from en4dvar.config.reading import read_observations
 from en4dvar.config.series import DataPlan, SeriesPlan
-from en4dvar.errors import ConfigError, En4dvarError
+from en4dvar.data.series import Places
 from en4dvar.executor import run_chunk
-from en4dvar.forward import Failure, Observable
 from en4dvar.inputs.asked import Column
-from en4dvar.series import Places
-from en4dvar.state import READING_OFFSET, READING_SCALE, TIME_SHIFT, Array
-from en4dvar.units import UnitError, convert
-from en4dvar.user_code import reason_of
+from en4dvar.model.forward import Failure, Observable
+from en4dvar.model.state import READING_OFFSET, READING_SCALE, TIME_SHIFT, Array
+from en4dvar.plumbing.errors import ConfigError, En4dvarError
+from en4dvar.plumbing.units import UnitError, convert
+from en4dvar.plumbing.user_code import reason_of
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,10 @@ class Simulation:
     times: Array
     series: Mapping[str, Array]
     theta: Mapping[str, float]
+
+    def __repr__(self) -> str:
+        series = ", ".join(f"{name} {np.nanmin(v):.4g} to {np.nanmax(v):.4g}" for name, v in self.series.items())
+        return f"<Simulation at {len(self.times)} times: {series}, units of the model>"
 
     @property
     def values(self) -> Array:
@@ -58,8 +62,8 @@ def simulate(config: Config, times: Array | None = None) -> Simulation:
     ------
     ConfigError, DataError: no times, or a value that only the data know. En4dvarError: the model fails.
     """
-    for one in _plan(config).series if config.data is not None else ():
-        _places(one, 1)
+    for series in _plan(config).series if config.data is not None else ():
+        _places(series, 1)
     times = config.simulate_times if times is None else times
     observations = None
     if config.data is not None and (times is None or any(entry.needs_data for entry in config.parameters)):
@@ -86,13 +90,13 @@ def _plan(config: Config) -> DataPlan:
     return DataPlan.of(config.data, config.observable)
 
 
-def _places(one: SeriesPlan, count: int) -> Places | None:
+def _places(plan: SeriesPlan, count: int) -> Places | None:
     """Where on a field it is read, the same at ``count`` instants. Raises :class:`ConfigError` of several places."""
-    places = one.data.places
+    places = plan.data.places
     if places is None:
         return None
     if places.positions is None or len(places.positions) != 1:
-        raise ConfigError(f"{one.name} is read at many places; a table has one value of it at a time: give one place")
+        raise ConfigError(f"{plan.name} is read at many places; a table has one value of it at a time: give one place")
     return places.places(count, None)
 
 
@@ -107,20 +111,20 @@ def parse_times(text: str, unit: str) -> Array:
 
 def noise_level(text: str, config: Config, simulation: Simulation) -> dict[str, float]:
     """``"1.4 um"`` or ``"1 % of maximum"`` in the unit of each series. Raises :class:`UnitError`."""
-    found = {}
+    levels = {}
     for name, observable in _observables(config).items():
         spread = parse_error_std(text, observable.unit)
         if not spread.value > 0:
             raise UnitError(f"the noise must be positive, not {text}")
-        found[name] = spread.absolute(float(simulation.series[name].max()))
-    return found
+        levels[name] = spread.absolute(float(simulation.series[name].max()))
+    return levels
 
 
 def _observables(config: Config) -> dict[str, Observable]:
     """By the name of the series."""
     if config.data is None:
         return {config.observable.name: config.observable}
-    return {one.name: one.observable for one in _plan(config).series}
+    return {series.name: series.observable for series in _plan(config).series}
 
 
 def _forward(config: Config, theta: Mapping[str, float], times: Array) -> dict[str, Array]:
@@ -136,8 +140,8 @@ def _forward(config: Config, theta: Mapping[str, float], times: Array) -> dict[s
     (path,) = run_chunk(model, state[None], times + shift)
     if isinstance(path, Failure):
         raise En4dvarError(f"the model failed: {path.reason}")
-    where = {one.name: _places(one, len(times)) for one in _plan(config).series} if config.data is not None else {}
-    found = {}
+    where = {s.name: _places(s, len(times)) for s in _plan(config).series} if config.data is not None else {}
+    predictions = {}
     for name, observable in _observables(config).items():
         try:
             values = np.asarray(observable.operator(path), dtype=float)
@@ -145,8 +149,8 @@ def _forward(config: Config, theta: Mapping[str, float], times: Array) -> dict[s
             raise En4dvarError(f"{observable.name} cannot be read from the run: {reason_of(error)}") from None
         places = where.get(name)
         values = values if places is None else places.read(values)
-        found[name] = read.get(READING_SCALE.name, 1.0) * values + read.get(READING_OFFSET.name, 0.0)
-    return found
+        predictions[name] = read.get(READING_SCALE.name, 1.0) * values + read.get(READING_OFFSET.name, 0.0)
+    return predictions
 
 
 def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:
@@ -159,9 +163,9 @@ def to_csv(simulation: Simulation, config: Config, comment: str = "") -> str:
         series = _plan(config).series
         stated = series[0].data.columns.time
         time = stated if isinstance(stated, Column) else time
-        columns = [one.data.columns.observable for one in series]
+        columns = [plan.data.columns.observable for plan in series]
         if len({column.name for column in columns}) < len(columns):  # series of several files
-            columns = [replace(column, name=one.name) for column, one in zip(columns, series, strict=True)]
+            columns = [replace(column, name=plan.name) for column, plan in zip(columns, series, strict=True)]
     units = {entry.parameter.name: entry.parameter.unit for entry in config.parameters}
     truth = ", ".join(f"{name} = {v:.9g} {units[name]}" for name, v in simulation.theta.items())
     times = convert(simulation.times, time.target, time.unit)

@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 
 from en4dvar.config.synthetic import CampaignPlan, GroupSection
-from en4dvar.diagnostics import nrmse
-from en4dvar.errors import En4dvarError, OutputError
+from en4dvar.diagnosis.diagnostics import nrmse
 from en4dvar.executor import run_chunk
-from en4dvar.files import make_folder, write_text
-from en4dvar.forward import Failure
-from en4dvar.prior import member_stream
-from en4dvar.state import TIME_SHIFT, Array
-from en4dvar.units import convert
-from en4dvar.user_code import reason_of
+from en4dvar.model.forward import Failure
+from en4dvar.model.state import TIME_SHIFT, Array
+from en4dvar.plumbing.errors import En4dvarError, OutputError
+from en4dvar.plumbing.files import make_folder, write_text
+from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.user_code import reason_of
+from en4dvar.priors.prior import member_stream
 
 ATTEMPTS = 100  # truths that cannot be integrated, or yield too few readings, are drawn again so often
 TRUTH = "truth.csv"

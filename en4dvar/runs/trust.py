@@ -1,9 +1,13 @@
-"""Whose code a result file may run: of this project and of installed packages; for other code the user is asked."""
+"""Whose code a result file may run: what is installed, and what a configuration of the user's own has named.
+
+A result file is never the user's own, wherever it lies and wherever its code lies: both come in one archive. So a path
+is known only if this user has run or checked a configuration that names it, with the content that it has now
+(:class:`~en4dvar.plumbing.user_code.Code`).
+"""
 
 from __future__ import annotations
 
 import json
-import sysconfig
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -11,29 +15,28 @@ from importlib.metadata import distributions
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from en4dvar.user_code import RefusedError, permission
+from en4dvar.plumbing.user_code import Code, RefusedError, is_installed, permission
 
 Ask = Callable[[str], bool]  # question → whether the user says yes
 
 
 @contextmanager
 def of_strangers(source: Path, ask: Ask | None, trust: bool) -> Iterator[None]:
-    """Within, code that the result files of ``source`` name is loaded where the user may be supposed to know it.
+    """Within, code that the result files of ``source`` name is loaded where the user is known to know it.
 
-    That is code below the working directory and in installed packages. Anything else, any command, and whatever is
-    named by a relative path (a run records absolute ones), is loaded with ``trust`` or where ``ask`` says yes.
+    That is code of installed packages, and code that a configuration of the user's has named before. Anything else,
+    and any command, is loaded with ``trust`` or where ``ask`` says yes.
 
     Raises :class:`RefusedError` inside.
     """
     answers: dict[str, bool] = {}
 
-    def require(what: str, file: Path | None, anything: bool) -> None:
-        if file is None or trust or (_known(file) and not anything):
+    def require(code: Code) -> None:
+        if trust or not code.places or _is_known(code):
             return
-        where = (source.absolute() / file.expanduser()).resolve()
-        told = f"{source}: its {what} is code outside of this project, {where}"
-        if anything:
-            told = f"{source}: its {what} runs a program, {where}"
+        where = ", ".join(map(str, code.places))
+        does = "is code that no configuration of yours has named as it is now" if code.digest else "runs a program"
+        told = f"{source}: its {code.what} {does}, {where}"
         if told not in answers:
             answers[told] = ask is not None and ask(f"{told}; run it?")
         if not answers[told]:
@@ -43,24 +46,25 @@ def of_strangers(source: Path, ask: Ask | None, trust: bool) -> Iterator[None]:
         yield
 
 
-def _known(file: Path) -> bool:
-    """Whether a file or package is of this project, or installed."""
-    if not file.is_absolute():
-        return False
-    where = file.resolve()
-    return where.is_relative_to(Path.cwd()) or any(where.is_relative_to(folder) for folder in _installed())
+def _is_known(code: Code) -> bool:
+    """Whether code is installed, or was named by a configuration of the user's."""
+    folders = _edited().get(code.package, ())
+    if code.package and all(is_installed(at) or any(at.is_relative_to(to) for to in folders) for at in code.places):
+        return True
+    return code.was_named()
 
 
 @cache
-def _installed() -> tuple[Path, ...]:
-    """Folders of the standard library, of installed packages and of those that are installed to be edited."""
+def _edited() -> dict[str, tuple[Path, ...]]:
+    """Name of a package that is installed to be edited → the folders of the projects that hold it."""
     from urllib.request import url2pathname  # with it come HTTP, TLS and mail
 
-    folders = {Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
-    for found in distributions():
-        folders.add(Path(str(found.locate_file(""))))
+    folders: dict[str, tuple[Path, ...]] = {}
+    for package in distributions():
         with suppress(TypeError, ValueError, AttributeError):
-            origin = json.loads(found.read_text("direct_url.json") or "{}")
+            origin = json.loads(package.read_text("direct_url.json") or "{}")
             if origin.get("dir_info", {}).get("editable"):
-                folders.add(Path(url2pathname(urlsplit(origin["url"]).path)))
-    return tuple(folder.resolve() for folder in folders)
+                folder = Path(url2pathname(urlsplit(origin["url"]).path)).resolve()
+                for name in (package.read_text("top_level.txt") or "").split():
+                    folders[name] = (*folders.get(name, ()), folder)
+    return folders

@@ -1,18 +1,23 @@
-"""A twin experiment from YAML to a run directory: ``twin.nc``, ``summary.csv``, report."""
+"""The kind of run that is a twin experiment: ``twin.nc``, ``summary.csv``, page."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from en4dvar.config import TwinConfig, load_twin
-from en4dvar.cycling.outcome import SequentialState
-from en4dvar.cycling.twin import TwinResult, conduct
 from en4dvar.executor import Executor
-from en4dvar.runs.cycles import Keep, Work, run_cycles
-from en4dvar.storage.twin_file import dataset, summary_csv
-from en4dvar.tables import table
+from en4dvar.model.forward import ForwardModel
+from en4dvar.report.outcomes import TwinOutcome
+from en4dvar.results.checkpoint import FOLDER
+from en4dvar.results.netcdf import Group
+from en4dvar.results.series_file import twin_csv, twin_group
+from en4dvar.runs.cycles import Cycles, Keep
+from en4dvar.runs.engine import conduct_run
+from en4dvar.runs.kind import FIGURES, REPORT
+from en4dvar.series.moments import SequentialState
+from en4dvar.series.twin import TwinResult, conduct
 
 
 def run_twin(
@@ -23,30 +28,51 @@ def run_twin(
     resume: bool = False,
     on_cycle: Callable[[int], None] | None = None,
     command: str = "",
-) -> TwinResult:
+) -> TwinOutcome:
     """Conduct a twin experiment and write its run directory; arguments and errors as of :func:`en4dvar.run`.
 
     ``on_cycle`` is called with the number of each cycle, from 0.
     """
     if not isinstance(config, TwinConfig):
         config = load_twin(config, overrides)
-    return run_cycles(config, twin_work(config, on_cycle), force, resume, command)
+    return TwinOutcome(**vars(conduct_run(TwinKind(config, on_cycle), force, resume, command)))
 
 
-def twin_work(config: TwinConfig, on_cycle: Callable[[int], None] | None = None) -> Work[TwinResult]:
-    """The work of a twin experiment."""
-    experiment = config.experiment
+class TwinKind(Cycles[TwinResult]):
+    """A configuration with a ``twin:`` section."""
 
-    def conducted(executor: Executor, resume: SequentialState | None, keep: Keep | None) -> TwinResult:
-        return conduct(experiment, config.seed, executor, on_cycle, resume, keep)
+    name = "twin"
+    result = "twin.nc"
+    files = (result, "summary.csv", f"{FOLDER}/twin.cycle")
+    pages = (REPORT, *FIGURES)
 
-    return Work("twin", experiment.model, config.scheme, experiment.cycles, {}, conducted, dataset, summary_csv)
+    @property
+    def model(self) -> ForwardModel:
+        model: ForwardModel = self.config.experiment.model
+        return model
 
+    @property
+    def scheme(self) -> str:
+        return str(self.config.scheme)
 
-def scores_table(result: TwinResult) -> str:
-    """RMSE and spread after the burn-in as an aligned table."""
-    rows = [(name, f"{s.mean_rmse:.4g}", f"{s.mean_spread:.4g}") for name, s in result.scores.items()]
-    return table([("estimate", "RMSE", "spread"), *rows])
+    @property
+    def cycles(self) -> int:
+        return int(self.config.experiment.cycles)
+
+    def assimilated(self, executor: Executor, resume: SequentialState | None, keep: Keep | None) -> TwinResult:
+        return conduct(self.config.experiment, self.config.seed, executor, self.on_cycle, resume, keep)
+
+    def laid_out(self, result: TwinResult, attributes: Mapping[str, Any]) -> Group:
+        return twin_group(result, attributes)
+
+    def summary(self, result: TwinResult) -> str:
+        return twin_csv(result)
+
+    @classmethod
+    def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
+        from en4dvar.report.twin import write_twin_report
+
+        return write_twin_report(folder, figures)
 
 
 def twin_summary(config: TwinConfig) -> str:

@@ -6,27 +6,34 @@ Every run is kept as it ends, under what it depends on: more seeds or values fin
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from en4dvar.config import TwinConfig, load_twin
 from en4dvar.config.document import parse_document
-from en4dvar.cycling.twin import TwinExperiment, conduct
-from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import Executor, ProcessesExecutor, SerialExecutor, available_cores
-from en4dvar.files import readable, write_text
-from en4dvar.runs.interrupt import terminate_as_interrupt
-from en4dvar.runs.rundir import RunDirectory
-from en4dvar.runs.session import Session, directory_mode, session
-from en4dvar.storage.checkpoint import FOLDER, digest, write_checkpoint
-from en4dvar.storage.fingerprint import identity
-from en4dvar.tables import csv_text, table
+from en4dvar.model.forward import ForwardModel
+from en4dvar.plumbing.errors import ConfigError, En4dvarError
+from en4dvar.plumbing.files import readable, write_text
+from en4dvar.plumbing.tables import csv_text, table
+from en4dvar.report.chart import POINTS, Chart, Panel, Row
+from en4dvar.results.checkpoint import FOLDER, digest, write_checkpoint
+from en4dvar.results.fingerprint import identity
+from en4dvar.runs.engine import conduct_run
+from en4dvar.runs.kind import RunKind
+from en4dvar.runs.session import Session
+from en4dvar.series.twin import TwinExperiment, conduct
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+COLOURS = ("prior", "posterior", "background")  # of the estimates
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,29 @@ class TwinSweep:
             for name, average in averages(runs).items()
         ]  # fmt: skip
 
+    def __repr__(self) -> str:
+        return f"<TwinSweep of {len(self.values)} settings, {len(self.seeds)} seeds each, in {self.directory}>"
+
+    def summary(self) -> pd.DataFrame:
+        """:attr:`rows` as a table."""
+        import pandas as pd
+
+        return pd.DataFrame(self.rows)
+
+    def plot(self) -> Figure:
+        """RMSE of each estimate, with its standard error, over the settings."""
+        from en4dvar.report.paper import on_paper  # matplotlib takes time to import
+
+        names = [", ".join(map(_text, values)) for values in self.values]
+        panel = Panel(", ".join(self.keys), "RMSE", xticks=range(len(names)), names=names, legend=True)
+        for estimate, colour in zip(dict.fromkeys(row["estimate"] for row in self.rows), COLOURS, strict=False):
+            at = [i for i, runs in enumerate(self.runs) if estimate in averages(runs)]
+            means = [averages(self.runs[i])[estimate] for i in at]
+            rmse, error = (np.array([getattr(m, key) for m in means]) for key in ("rmse", "rmse_error"))
+            panel.bars(at, rmse - np.nan_to_num(error), rmse + np.nan_to_num(error), colour)
+            panel.dots(at, rmse, colour, 3.0, label=estimate)
+        return on_paper(Chart([Row(7 * POINTS, [panel])]))
+
     def __str__(self) -> str:
         head = [*(key.rpartition(".")[2] for key in self.keys), "estimate", "runs", "RMSE", "spread"]
         lines = [
@@ -82,14 +112,14 @@ class TwinSweep:
 def averages(runs: Sequence[TwinRun]) -> dict[str, Average]:
     """Of each estimate, over the runs that did not fail; of a setting whose runs all did, an empty analysis."""
     names = dict.fromkeys(name for run in runs for name, _, _ in run.scores) or {"analysis": None}
-    found = {}
+    means = {}
     for name in names:
         both = np.array([numbers for run in runs for own, *numbers in run.scores if own == name]).reshape(-1, 2)
         n = len(both)
         mean = both.mean(axis=0) if n else np.full(2, np.nan)
         error = both.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else np.full(2, np.nan)
-        found[name] = Average(n, float(mean[0]), float(error[0]), float(mean[1]), float(error[1]))
-    return found
+        means[name] = Average(n, float(mean[0]), float(error[0]), float(mean[1]), float(error[1]))
+    return means
 
 
 def sweep_twin(
@@ -120,7 +150,7 @@ def sweep_twin(
     ------
     ConfigError: a setting is at fault, before any run. OutputError: ``out`` cannot be used.
     """
-    values = {key: _values(key, given) for key, given in vary.items()}
+    values = {key: _values(key, choices) for key, choices in vary.items()}
     if not values or seeds < 1:
         raise ConfigError("a sweep takes at least one key to vary, with its values, and at least one seed")
     combinations = tuple(product(*values.values()))
@@ -128,18 +158,49 @@ def sweep_twin(
     first = configs[0]
     all_seeds = tuple(range(first.seed, first.seed + seeds))
     path = Path(out) if out else first.directory.with_name(f"{first.directory.name}_sweep")
-    with (
-        terminate_as_interrupt(),
-        RunDirectory.open(path, directory_mode(force, resume)) as directory,
-        session(first, {}, directory, command, lambda: f"the finished runs are kept in {path}") as run,
-        _executor(workers or available_cores()) as executor,
-    ):
-        run.begin("sweep.csv", "runs.csv")
-        done = _Runs(run, configs, all_seeds, progress).all(executor)
-        found = TwinSweep(tuple(values), combinations, all_seeds, done, path)
-        write_text(directory.at("sweep.csv"), sweep_csv(found))
-        write_text(directory.at("runs.csv"), runs_csv(found))
-    return found
+    kind = SweepKind(first, path, configs, tuple(values), combinations, all_seeds, workers, progress)
+    return conduct_run(kind, force, resume, command)
+
+
+@dataclass(frozen=True)
+class SweepKind(RunKind[TwinSweep]):
+    """A twin experiment in several settings (``configs``), each for several ``seeds``: a unit of work each."""
+
+    name = "sweep-twin"
+    result = "sweep.csv"
+    files = (result, "runs.csv", f"{FOLDER}/*.run")
+
+    config: TwinConfig
+    out: Path
+    configs: Sequence[TwinConfig]
+    keys: tuple[str, ...]
+    values: tuple[tuple[Any, ...], ...]
+    seeds: tuple[int, ...]
+    workers: int | None
+    progress: Callable[[int, int], None] | None
+
+    @property
+    def directory(self) -> Path:
+        return self.out
+
+    @property
+    def model(self) -> ForwardModel:
+        return self.config.experiment.model
+
+    def executor(self) -> Executor:
+        """Processes: a cycle is more of the interpreter than of the model, also where that is compiled."""
+        workers = self.workers or available_cores()
+        return SerialExecutor() if workers == 1 else ProcessesExecutor(workers)
+
+    def kept(self) -> str:
+        return f"the finished runs are kept in {self.directory}"
+
+    def conduct(self, run: Session, executor: Executor) -> TwinSweep:
+        done = _Runs(run, self.configs, self.seeds, self.progress).all(executor)
+        sweep = TwinSweep(self.keys, self.values, self.seeds, done, self.directory)
+        write_text(run.directory.at("sweep.csv"), sweep_csv(sweep))
+        write_text(run.directory.at("runs.csv"), runs_csv(sweep))
+        return sweep
 
 
 class _Runs:
@@ -162,16 +223,16 @@ class _Runs:
         self.seeds = len(seeds)
 
     def all(self, executor: Executor) -> tuple[tuple[TwinRun, ...], ...]:
-        found = {i: run for i, job in enumerate(self.jobs) if (run := self._restored(job[2])) is not None}
-        left = [i for i in range(len(self.jobs)) if i not in found]
-        self._tell(len(found))
+        done = {i: run for i, job in enumerate(self.jobs) if (run := self._restored(job[2])) is not None}
+        left = [i for i in range(len(self.jobs)) if i not in done]
+        self._tell(len(done))
         for n, value in executor.map(_one, (self.jobs[i][:2] for i in left)):
             if isinstance(value, Exception):
                 raise value
-            found[left[n]], fingerprint = value, self.jobs[left[n]][2]
-            write_checkpoint(self.session.directory.claim(self._file(fingerprint)), fingerprint, value)
-            self._tell(len(found))
-        runs = [found[i] for i in range(len(self.jobs))]
+            done[left[n]], fingerprint = value, self.jobs[left[n]][2]
+            write_checkpoint(self.session.directory.at(self._file(fingerprint)), fingerprint, value)
+            self._tell(len(done))
+        runs = [done[i] for i in range(len(self.jobs))]
         return tuple(tuple(runs[i : i + self.seeds]) for i in range(0, len(runs), self.seeds))
 
     def _restored(self, fingerprint: str) -> TwinRun | None:
@@ -193,20 +254,13 @@ def _one(experiment: TwinExperiment, seed: int) -> TwinRun:
     return TwinRun(tuple((name, score.mean_rmse, score.mean_spread) for name, score in scores.items()))
 
 
-@contextmanager
-def _executor(workers: int) -> Iterator[Executor]:
-    """Processes: a cycle is more of the interpreter than of the model, also where that is compiled."""
-    with SerialExecutor() if workers == 1 else ProcessesExecutor(workers) as executor:
-        yield executor
-
-
-def _values(key: str, given: Sequence[Any] | str) -> tuple[Any, ...]:
+def _values(key: str, choices: Sequence[Any] | str) -> tuple[Any, ...]:
     """The values of a key. Raises :class:`ConfigError`."""
-    if isinstance(given, str):
-        given = parse_document(f"values: {given}", f"--vary {key}").data["values"]
-    if not isinstance(given, list | tuple) or not given:
+    if isinstance(choices, str):
+        choices = parse_document(f"values: {choices}", f"--vary {key}").data["values"]
+    if not isinstance(choices, list | tuple) or not choices:
         raise ConfigError(f"--vary {key}: give a list of values, e.g. --vary '{key}=[1.01, 1.05]'")
-    return tuple(given)
+    return tuple(choices)
 
 
 def sweep_csv(sweep: TwinSweep) -> str:

@@ -8,25 +8,28 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from en4dvar.analysis import IterationRecord, Progress, Record, StartRecord
-from en4dvar.assimilate import LoopState
 from en4dvar.config import Config
-from en4dvar.errors import En4dvarError, OutputError
+from en4dvar.diagnosis.analysis import IterationRecord, Progress, Record, StartRecord
+from en4dvar.estimation.assimilate import LoopState
+from en4dvar.estimation.summary import brief, summary_rows
 from en4dvar.executor import Executor, ExecutorError, SerialExecutor, ThreadsExecutor
-from en4dvar.executor.shared import CommonValue
-from en4dvar.files import readable, remove_file
+from en4dvar.executor.chunks import CommonValue
 from en4dvar.inputs.asked import DataFile
+from en4dvar.plumbing.errors import En4dvarError, OutputError
+from en4dvar.plumbing.files import atomic_path, readable, remove_file
+from en4dvar.plumbing.tables import csv_text
+from en4dvar.results.checkpoint import FOLDER, Keeper, file_digest
+from en4dvar.results.codec import decode_text, encode_text
+from en4dvar.results.pack import PACK, Entry, Pack, read_outcome
+from en4dvar.results.seal import SealedBytes
 from en4dvar.runs.campaign import Campaign, DatasetOutcome, file_names
 from en4dvar.runs.jobs import Common, Estimate, FileJob, Job, Told, estimate, estimate_and_tell
 from en4dvar.runs.outcomes import Outcomes
 from en4dvar.runs.progress import LiveProgress, describe
 from en4dvar.runs.session import Session
-from en4dvar.storage.checkpoint import FOLDER, Keeper, file_digest
-from en4dvar.storage.codec import encode_text
-from en4dvar.storage.pack import PACK, Entry, Pack, read_outcome
-from en4dvar.storage.seal import SealedBytes
 
 SUMMARY = "summary.csv"
+ENDED = f"{FOLDER}/ended"  # how a single data set ended
 ITERATIONS = f"{FOLDER}/*.iteration"  # checkpoints of data sets at work
 
 
@@ -74,9 +77,9 @@ class Worklist:
         run: Session,
         sets: tuple[Dataset, ...],
         progress: Progress | None,
-        ended: dict[str, str],
     ):
-        self.config, self.run, self.sets, self.progress, self.ended = config, run, sets, progress, ended
+        self.config, self.run, self.sets, self.progress = config, run, sets, progress
+        self.ended: dict[str, str] = {}
         self.stop = threading.Event()
         self.alone = len(sets) == 1
         self.pack = Pack(run.directory.at(self.record))
@@ -103,10 +106,19 @@ class Worklist:
         in_order = tuple(failed[d.name] for d in self.sets if d.name in failed)
         return Campaign(self.config.directory, self.outcomes(directory.home), tuple(self.run.notices), in_order)
 
+    def summarise(self) -> None:
+        """Write the table of all data sets. Raises :class:`OutputError`."""
+        directory = self.run.directory
+        header, *failures = summary_rows((), self.failures())
+        with atomic_path(directory.at(SUMMARY)) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+            file.write(csv_text([header]))
+            file.writelines(self.outcomes(directory.work).lines())
+            file.write(csv_text(failures))
+
     @property
     def record(self) -> str:
         """The file that records how data sets ended."""
-        return f"{FOLDER}/ended" if self.alone else PACK
+        return ENDED if self.alone else PACK
 
     def failed_earlier(self) -> frozenset[str]:
         """The data sets that have failed in the run that is resumed."""
@@ -178,12 +190,12 @@ class Worklist:
             for d in todo:
                 try:
                     job = self._job(d)
-                    one = job if made_there else replace(job.made(), stop=stop, alone=self.alone)
+                    unit = job if made_there else replace(job.made(), stop=stop, alone=self.alone)
                 except Exception as error:
                     self._fail(d, error)
                 else:
                     sent.append(d)
-                    yield (one,)
+                    yield (unit,)
 
         if len(todo) > 1 and len(todo) >= executor.workers > 1:
             stop = self.stop if isinstance(executor, ThreadsExecutor) else None
@@ -222,7 +234,7 @@ class Worklist:
 
     def _tell(self, records: Sequence[Told], *lines: str) -> None:
         """Records, and further lines of the log: all of them at once, for each time it is written to takes as long."""
-        self.run.log.write("\n".join([*(line for one in records for line in self._lines(*one)), *lines]))
+        self.run.log.write("\n".join([*(line for told in records for line in self._lines(*told)), *lines]))
         if self.progress is not None:
             for name, record, _ in records:
                 self.progress(name, record)
@@ -269,4 +281,12 @@ class Worklist:
         self.ended[d.name] = failure
         self._reached.pop(d.name, None)
         if isinstance(self.progress, LiveProgress):
-            self.progress.ended(d.name, len(self.ended))
+            self.progress.ended(d.name, len(self.ended), _in_one_line(decode_text(outcome, DatasetOutcome)))
+
+
+def _in_one_line(outcome: DatasetOutcome) -> str:
+    """What came of a data set."""
+    if outcome.failure:
+        return f"failed: {outcome.failure.splitlines()[0]}"
+    doubts = [c.code for c in outcome.warnings if c.kind == "warning"]
+    return brief(outcome.summary) + (f"; {', '.join(dict.fromkeys(doubts))}" if doubts else "")

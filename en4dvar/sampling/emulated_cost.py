@@ -14,14 +14,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from en4dvar.diagnostics import effective_share
+from en4dvar.data.noise import Predicted
+from en4dvar.data.observations import Observations
+from en4dvar.diagnosis.diagnostics import effective_share
 from en4dvar.ensemble.forecast import Forecast
-from en4dvar.noise import Predicted
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior
+from en4dvar.model.state import Array
+from en4dvar.priors.prior import Prior
 from en4dvar.sampling.emulator import Coordinates, Emulator
 from en4dvar.sampling.walkers import advance
-from en4dvar.state import Array
 
 DEGREES = (3, 2)  # tried in this order
 RUNS_PER_TERM = 4
@@ -146,10 +146,10 @@ def emulate(
 
 def _run(run: Run, prior: Prior, observations: Observations, x: Array) -> _Runs:
     """Run control vectors (B, n); the survivors."""
-    found = run(x)
-    costs = _prior_cost(prior, x) + observations.cost(found.predicted)
-    alive = found.active & np.isfinite(costs)
-    return _Runs(x[alive], found.predicted.stacked[alive], costs[alive], found.predicted[:0])
+    outcome = run(x)
+    costs = _prior_cost(prior, x) + observations.cost(outcome.predicted)
+    alive = outcome.active & np.isfinite(costs)
+    return _Runs(x[alive], outcome.predicted.stacked[alive], costs[alive], outcome.predicted[:0])
 
 
 def _prior_cost(prior: Prior, x: Array) -> Array:

@@ -4,7 +4,7 @@ r"""The emulator: what a forward model predicts, as polynomials of the control v
 
 Within a posterior predictions bend little, so that a few hundred runs tell them to a small part of the observation
 error, and to evaluate them costs nothing. :mod:`~en4dvar.sampling.emulated_cost` makes J of one data set of them,
-:mod:`en4dvar.population` the likelihoods of many.
+:mod:`en4dvar.estimation.population` the likelihoods of many.
 
 Sources: polynomial surrogates of posteriors, Marzouk & Xiu (2009), Commun. Comput. Phys. 6, 826; sampling where the
 surrogate says, Li & Marzouk (2014), SIAM J. Sci. Comput. 36, A1163.
@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 
 
 class Coordinates(NamedTuple):

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.prior import Prior, member_stream
+from en4dvar.model.state import Array
+from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.sampling.forward_runs import CampaignRuns, log_likelihood
 from en4dvar.sampling.importance import Importance, standard
-from en4dvar.state import Array
 
 DRAWS, MOST_ROUNDS = 400, 40
 ENOUGH = 400.0  # effective draws that end the rounds of a set
@@ -26,7 +26,9 @@ TOO_FEW, MORE = 100.0, 3  # below so many after all rounds: once more with as ma
 
 @dataclass(frozen=True)
 class Evidence:
-    """Of S sets: ``log`` ln ∫ L N dx (S,), without Σ ln(std √2π), and the ``effective`` numbers of draws behind it."""
+    """Evidence of S sets: ``log`` ln ∫ L N dx (S,), without Σ ln(std √2π), and the ``effective`` numbers of draws
+    behind it.
+    """
 
     log: Array
     effective: Array
@@ -38,13 +40,15 @@ def sampled_evidence(runs: CampaignRuns, prior: Prior, seed: int) -> Evidence:
     Deterministic in ``seed``. A set no draw of which can be run gets −inf.
     """
     every, first = range(len(runs.values)), standard(len(prior.names))
-    found = {s: Importance(first, member_stream(seed, "evidence", s), DRAWS) for s in every}
-    sample_sets(runs, prior.from_white, found)
-    again = {s: member_stream(seed, "evidence again", s) for s, one in found.items() if one.effective < TOO_FEW}
+    estimates = {s: Importance(first, member_stream(seed, "evidence", s), DRAWS) for s in every}
+    sample_sets(runs, prior.from_white, estimates)
+    again = {
+        s: member_stream(seed, "evidence again", s) for s, estimate in estimates.items() if estimate.effective < TOO_FEW
+    }
     second = {s: Importance(first, stream, MORE * DRAWS) for s, stream in again.items()}
     sample_sets(runs, prior.from_white, second)
-    found |= {s: one for s, one in second.items() if one.effective > found[s].effective}
-    return Evidence(np.array([found[s].log for s in every]), np.array([found[s].effective for s in every]))
+    estimates |= {s: estimate for s, estimate in second.items() if estimate.effective > estimates[s].effective}
+    return Evidence(np.array([estimates[s].log for s in every]), np.array([estimates[s].effective for s in every]))
 
 
 def sample_sets(runs: CampaignRuns, control: Callable[[Array], Array], samplers: Mapping[int, Importance]) -> None:
@@ -52,7 +56,7 @@ def sample_sets(runs: CampaignRuns, control: Callable[[Array], Array], samplers:
     (B, n) → control vectors.
     """
     for _ in range(MOST_ROUNDS):
-        going = np.array([s for s, one in samplers.items() if one.effective < ENOUGH], dtype=int)
+        going = np.array([s for s, sampler in samplers.items() if sampler.effective < ENOUGH], dtype=int)
         if not len(going):
             break
         z = np.stack([samplers[s].draw() for s in going])  # in units of the prior

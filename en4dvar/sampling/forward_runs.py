@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from en4dvar.ensemble.forecast import as_read, time_shift
 from en4dvar.ensemble.members import InitialStates, Reading, out_of_bounds
-from en4dvar.errors import ConfigError
 from en4dvar.executor import Executor, SerialExecutor
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.problem import InverseProblem
-from en4dvar.state import Array
 
 Sets = npt.NDArray[np.intp] | None  # numbers of the data sets meant; all of them by default
 
@@ -45,7 +45,8 @@ class Predictor:
         if len(states):
             outcomes = self.executor.trajectories(self.problem.model, states, times[alive])
             observed[alive] = self._reading.observe(outcomes, times.shape[1])[0][0]
-        return as_read(self.problem, physical, observed[None])[0]
+        read: Array = as_read(self.problem, physical, observed[None])[0]
+        return read
 
     def time_shifts(self, x: Array) -> Array:
         """t_s (B,) of control vectors (B, n)."""

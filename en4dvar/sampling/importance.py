@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from en4dvar.model.state import Array
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
-from en4dvar.state import Array
 
 FEWEST = 60.0  # effective draws that a proposal is fitted to: with fewer, to tempered weights
 COMPONENTS = 4
@@ -77,7 +77,7 @@ class Importance:
         logs, power = self.log_weights - self.log_weights.max(), 1.0
         weights = np.exp(logs)
         singular = 2.0 * (self.z.shape[1] + 1)  # draws behind a covariance, however little power is left to the weights
-        while (found := effective_number(weights)) < singular or (found < FEWEST and power > 1e-4):
+        while (effective := effective_number(weights)) < singular or (effective < FEWEST and power > 1e-4):
             power *= 0.8
             weights = np.exp(power * logs)
         where = resampled(weights / weights.sum(), self.count, self.stream)

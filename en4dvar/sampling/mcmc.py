@@ -24,12 +24,12 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.analysis import ChainRecord
+from en4dvar.diagnosis.analysis import ChainRecord
 from en4dvar.ensemble.linalg import with_moments
-from en4dvar.errors import En4dvarError
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import En4dvarError
 from en4dvar.sampling.mixture import StudentMixture
 from en4dvar.sampling.walkers import Emulated, advance
-from en4dvar.state import Array
 
 DE_SHARE = 0.8  # of the moves, the rest are stretches
 JUMPS = 0.5  # share of the steps where there is a mixture to draw from
@@ -194,7 +194,7 @@ def _moves(emcee: Any, emulated: Emulated | None, proposal: StudentMixture | Non
 
 @dataclass(frozen=True)
 class _Mixing:
-    """What the part of a chain after burn-in says of its convergence."""
+    """Convergence of a chain, judged by its part after burn-in."""
 
     samples: Array
     r_hat: Array

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.compiled import kernel
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.compiled import kernel
 
 DEGREES = 5.0  # of freedom of a proposal: heavier tails than any part of the density has
 SMALLEST = 1e-4  # variance that a component keeps in every direction, relative to that of all points
@@ -53,7 +53,7 @@ def resampled(shares: Array, count: int, stream: np.random.Generator) -> npt.NDA
 
 
 def effective_number(weights: Array) -> float:
-    """Of equally likely draws that are worth as much as draws of these weights, (Σ w)²/Σ w²."""
+    """Number of equally likely draws that are worth as much as draws of these weights, (Σ w)²/Σ w²."""
     return float(weights.sum() ** 2 / np.sum(weights**2))
 
 
@@ -76,7 +76,7 @@ def fit_gaussians(x: Array, rng: np.random.Generator, components: int, rounds: i
 
 
 @kernel
-def _expect(z, share, centre, covariance, of_part):  # type: ignore[no-untyped-def]
+def _expect(z: Array, share: Array, centre: Array, covariance: Array, of_part: Array) -> None:
     """Probability ``of_part`` (D, M) of the components for points (D, n)."""
     count, parts = of_part.shape
     apart = np.empty(z.shape[1])
@@ -104,7 +104,7 @@ def _expect(z, share, centre, covariance, of_part):  # type: ignore[no-untyped-d
 
 
 @kernel
-def _maximise(z, of_part, share, centre, covariance):  # type: ignore[no-untyped-def]
+def _maximise(z: Array, of_part: Array, share: Array, centre: Array, covariance: Array) -> None:
     """Share, centre and covariance of the components are overwritten with what their points say."""
     count, parts = of_part.shape
     apart = np.empty(z.shape[1])

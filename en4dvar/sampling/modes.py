@@ -15,14 +15,16 @@ import numpy.typing as npt
 
 from en4dvar.descent.minima import Minimum
 from en4dvar.ensemble.linalg import with_moments
-from en4dvar.prior import Prior, member_stream
+from en4dvar.model.state import Array
+from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.sampling.importance import Importance
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
-from en4dvar.state import Array
 
 DRAWS = 400  # of a round
 ENOUGH, MOST_RUNS = 1500.0, 8.0  # effective draws that end the rounds, and runs for each of them
+LAST_RUNS = 30.0  # for each, as long as too few are effective
 WIDER = 1.8  # at 1 the tail of a bent posterior is not found: standard deviations were up to 30 % too small
+FEW = 6  # directions up to which that is the factor of each; of more it is smaller, and their volume grows no further
 TOO_FEW = 200.0  # below so many the draws stand for nothing
 OF_PRIOR = 0.2  # share of the first draws that come from the prior: what no descent found is not excluded
 
@@ -47,7 +49,7 @@ class WeightedDraws:
 
     @property
     def effective(self) -> float:
-        """Of equally likely draws that are worth as much."""
+        """Number of equally likely draws that are worth as much."""
         return effective_number(self.shares)
 
     @property
@@ -62,7 +64,7 @@ class WeightedDraws:
         return np.asarray((self.shares[:, None] * apart).T @ apart)
 
     def weights(self, count: int) -> Array:
-        """Of so many modes."""
+        """Weights of so many modes."""
         return np.asarray(np.bincount(self.mode, self.shares, minlength=count), dtype=float)
 
     def members(self, count: int, stream: np.random.Generator, exact: bool) -> Array:
@@ -86,18 +88,20 @@ def sample_modes(
     enough: float | None = None,
     below: float = -np.inf,
 ) -> WeightedDraws:
-    """Draws of exp(−J) until ``enough`` of them (default: :data:`ENOUGH`) are effective, by at most eight runs each, or
-    until J of one is ``below`` a value.
+    """Draws of exp(−J) until ``enough`` of them (default: :data:`ENOUGH`) are effective, by eight runs each, or more as
+    long as these are :data:`TOO_FEW`, or until J of one is ``below`` a value.
 
     ``cost``: J (B,) of control vectors (B, n), with the prior's own mean and covariance, +inf where the model fails.
     Deterministic in ``seed``.
     """
-    sampler = Importance(_about(prior, minima), member_stream(seed, "modes"), DRAWS, WIDER)
+    wider = WIDER ** min(1.0, FEW / len(prior.names))
+    sampler = Importance(_about(prior, minima), member_stream(seed, "modes"), DRAWS, wider)
     enough = ENOUGH if enough is None else enough
-    for _ in range(math.ceil(MOST_RUNS * enough / DRAWS)):
+    for _ in range(math.ceil(LAST_RUNS * enough / DRAWS)):
         z = sampler.draw()
         sampler.add(z, 0.5 * np.sum(z**2, axis=1) - cost(prior.from_white(z)))
-        if sampler.effective >= enough or _lowest(sampler) < below:
+        wanted = enough if len(sampler.z) < MOST_RUNS * enough else min(TOO_FEW, enough)
+        if sampler.effective >= wanted or _lowest(sampler) < below:
             break
     if not np.isfinite(sampler.log):
         raise ValueError("no draw about a minimum of J can be run")
@@ -131,7 +135,7 @@ def _about(prior: Prior, minima: Sequence[Minimum]) -> StudentMixture:
 
 
 def _of_columns(change: Callable[[Array], Array], roots: Array) -> Array:
-    """What a change of coordinates makes of the columns of matrices (M, n, n)."""
+    """The columns of matrices (M, n, n) after a change of coordinates."""
     return np.ascontiguousarray(change(roots.transpose(0, 2, 1)).transpose(0, 2, 1))
 
 

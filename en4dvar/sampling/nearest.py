@@ -12,10 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
-from en4dvar.compiled import kernel
-from en4dvar.observations import Observations
-from en4dvar.state import Array
+from en4dvar.data.observations import Observations
+from en4dvar.model.state import Array
+from en4dvar.plumbing.compiled import kernel
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,15 @@ def best_over_shifts(traces: Array, aims: Targets) -> tuple[Array, Array]:
 
 
 @kernel
-def _least_squares(traces, values, nearest, offsets, reach, squares, steps):  # type: ignore[no-untyped-def]
+def _least_squares(
+    traces: Array,
+    values: Array,
+    nearest: npt.NDArray[np.int64],
+    offsets: npt.NDArray[np.int64],
+    reach: int,
+    squares: Array,
+    steps: npt.NDArray[np.int64],
+) -> None:
     last = traces.shape[1] - 1
     for b in range(traces.shape[0]):
         trace = traces[b]

@@ -8,19 +8,20 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from en4dvar import diagnostics as diag
-from en4dvar.analysis import ChainRecord
-from en4dvar.caution import Caution, caution
 from en4dvar.descent.minima import Minimum
 from en4dvar.descent.weight_space import WeightSpace
-from en4dvar.prior import Prior, member_stream
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.diagnosis import diagnostics as diag
+from en4dvar.diagnosis.analysis import ChainRecord
+from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution, caution
+from en4dvar.plumbing.units import convert
+from en4dvar.priors.prior import Prior, member_stream
+from en4dvar.problem import InverseProblem
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.emulated_cost import needed_runs
 from en4dvar.sampling.modes import TOO_FEW, WeightedDraws, nearest, sample_modes
 from en4dvar.sampling.shape import doubtful, guide
-from en4dvar.state import Array
-from en4dvar.units import convert
+from en4dvar.schemes.settings import AssimilationSettings
 
 COUNTS = math.log(1e-3)  # evidence of a minimum relative to that of the lowest, by Laplace, from which it may matter
 
@@ -56,7 +57,7 @@ def that_count(minima: Sequence[Minimum], prior: Prior) -> tuple[Minimum, ...]:
 def mode_cautions(
     prior: Prior, minima: Sequence[Minimum], weights: Array, agree: bool, result: Refined | None
 ) -> Iterator[Caution]:
-    """What there is to say of the minima that count, of these weights; ``result`` is there where sampled."""
+    """Warnings about the minima that count, of these weights; ``result`` is there where sampled."""
     lowest = minima[0].cost
     if result is not None and result.lowest < lowest - MISSED:
         words = f"a draw has J = {result.lowest:.1f}, lower than the lowest minimum that descents found, {lowest:.1f}"
@@ -94,19 +95,19 @@ def _apart(minima: Sequence[Minimum]) -> Array:
 
 
 def samples(space: WeightSpace) -> bool:
-    """Whether a doubt is settled by sampling."""
+    """True if a doubt is settled by sampling."""
     return may_sample(space.problem, space.settings) and space.basis.shape[1] == len(space.mean)
 
 
 def may_sample(problem: InverseProblem, settings: AssimilationSettings) -> bool:
-    """Whether there is ``refine: auto`` with a cheap model of few parameters, constant or on an estimated walk."""
+    """True if there is ``refine: auto`` with a cheap model of few parameters, constant or on an estimated walk."""
     gaussian = problem.varying and not any(walk.spread for walk in problem.walks)
     few = needed_runs(len(problem.prior.names)) is not None and not gaussian
     return settings.refine == "auto" and problem.model.cheap and few and not settings.stochastic_model
 
 
 def in_doubt(minima: Sequence[Minimum], agree: bool, shape: Mapping[str, float]) -> bool:
-    """Whether the Gaussian about the lowest of the minima that count may not be the posterior.
+    """True if the Gaussian about the lowest of the minima that count may not be the posterior.
 
     ``agree``: whether descents from different members ended there. ``shape`` is that of
     :func:`~en4dvar.sampling.shape.examine_shape`.

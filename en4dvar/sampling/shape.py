@@ -12,11 +12,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from en4dvar import diagnostics as diag
 from en4dvar.descent.weight_space import WeightSpace
-from en4dvar.prior import Prior, member_stream
+from en4dvar.diagnosis import diagnostics as diag
+from en4dvar.model.state import Array
+from en4dvar.priors.prior import Prior, member_stream
 from en4dvar.sampling.emulated_cost import EmulatedCost, emulate
-from en4dvar.state import Array
 
 CHAIN_FITS = 4  # of an emulator that has to guide a chain into the tails; two tell mean and spread
 SHIFT, SPREAD = 0.25, 0.15  # of the ensemble, by the emulator, that leave a doubt: half of what is warned of
@@ -26,7 +26,7 @@ CLEARED = 0.85  # effective share of the members above which no run was found th
 def examine_shape(
     space: WeightSpace, ensemble: Array, mode: Array, costs: Array, seed: int, settle: bool = True
 ) -> dict[str, float]:
-    """Numbers for :func:`~en4dvar.diagnostics.is_non_gaussian`, and its answer.
+    """Numbers for :func:`~en4dvar.diagnosis.diagnostics.is_non_gaussian`, and its answer.
 
     ``ensemble`` (N, n) and its centre ``mode`` (n,), transformed; ``costs`` J (N,) of its members. Deterministic in
     ``seed``. ``settle``: a doubt of the emulator's is looked into with more moves of its walkers.
@@ -39,16 +39,16 @@ def examine_shape(
     if shape["gaussian_fit"] < CLEARED:
         emulator = guide(space, ensemble, seed, fits=2)
         if emulator is not None:
-            found = _off(emulator, ensemble)
-            if settle and doubtful(found):  # by walkers that have not settled, as often as not
+            off = _off(emulator, ensemble)
+            if settle and doubtful(off):  # by walkers that have not settled, as often as not
                 emulator = emulator.settled(member_stream(seed, "emulator, settled"))
-                found = _off(emulator, ensemble)
-            shape |= {**found, "emulator_fit": emulator.share, **_displayed(space.problem.prior, emulator.draws)}
+                off = _off(emulator, ensemble)
+            shape |= {**off, "emulator_fit": emulator.share, **_displayed(space.problem.prior, emulator.draws)}
     return {**shape, "non_gaussian": diag.is_non_gaussian(shape)}
 
 
 def doubtful(shape: Mapping[str, float]) -> bool:
-    """Whether mean or spread of the ensemble are off, by the emulator, by half of what is warned of."""
+    """True if mean or spread of the ensemble are off, by the emulator, by half of what is warned of."""
     return shape.get("mean_shift", 0.0) > SHIFT or abs(shape.get("spread_ratio", 1.0) - 1) > SPREAD
 
 

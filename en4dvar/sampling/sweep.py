@@ -18,14 +18,14 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from en4dvar.errors import ConfigError, DataError
 from en4dvar.executor import Executor, SerialExecutor
-from en4dvar.files import atomic_path, inside, open_plain
-from en4dvar.prior import member_stream
+from en4dvar.model.state import TIME_SHIFT, Array, Parameter
+from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.files import atomic_path, inside, open_plain
+from en4dvar.priors.prior import member_stream
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.forward_runs import Predictor
 from en4dvar.sampling.nearest import Targets, best_over_shifts, targets
-from en4dvar.state import TIME_SHIFT, Array, Parameter
 
 BATCH = 128  # trajectories whose full solution is in memory at once, a worker
 T = TypeVar("T")
@@ -77,7 +77,7 @@ class SweepResult:
     trajectories: int
 
     def part(self, rows: slice) -> SweepResult:
-        """Of some of the data sets."""
+        """The same of some of the data sets."""
         return replace(
             self, names=self.names[rows], theta=self.theta[rows], shift=self.shift[rows], nrmse=self.nrmse[rows]
         )
@@ -128,15 +128,15 @@ def run_sweep(
     design = sobol_box((low + high) / 2, (high - low) / 2, settings.trajectories, seed)
     parts = [design[i : i + settings.chunk] for i in range(0, len(design), settings.chunk)]
     total, done = settings.trajectories + refinement_size(settings, len(problems)), 0
-    found: dict[int, Best] = {}
+    best_of_set: dict[int, Best] = {}
     for i, best in _results(executor, score.chunk, [(x, _file(folder, i)) for i, x in enumerate(parts)]):
-        found[i] = best
+        best_of_set[i] = best
         done += len(parts[i])
         if progress is not None:
             progress(done, total)
-    best = found[0]
+    best = best_of_set[0]
     for i in range(1, len(parts)):
-        best = best.merged(found[i])
+        best = best.merged(best_of_set[i])
     for count, refined in _refined(score, best, settings, seed, executor):
         best = refined
         done += count
@@ -164,7 +164,7 @@ def sobol_box(centre: Array, half: Array, count: int, seed: int) -> Array:
 
 
 def _searched(problem: InverseProblem) -> tuple[object, ...]:
-    """What data sets of one design have in common besides the model."""
+    """The settings that data sets of one design have in common besides the model."""
     terms = [(t.parameter.name, t.transform, t.bounds, t.shape) for t in problem.prior.terms]
     return terms, problem.fixed, problem.perturbations, problem.tied, problem.observable.name
 
@@ -180,7 +180,9 @@ def _without_shift(problem: InverseProblem) -> InverseProblem:
 
 @dataclass(frozen=True)
 class _Ranges:
-    """What is searched for each set, ``low`` to ``high`` (S, n), transformed, and the prior's ``std`` (S, n)."""
+    """The ranges that are searched for each set, ``low`` to ``high`` (S, n), transformed, and the prior's ``std`` (S,
+    n).
+    """
 
     low: Array
     high: Array
@@ -203,7 +205,7 @@ class _Ranges:
 
 @dataclass(frozen=True)
 class _Score:
-    """What all chunks share; workers of any kind can have it."""
+    """The data that all chunks share; it can be sent to workers of any kind."""
 
     problem: InverseProblem
     ranges: _Ranges
@@ -271,8 +273,8 @@ def _own(score: _Score, x: Array, executor: Executor) -> tuple[Array, Array]:
     """NRMSE and shift (S, L) of coordinates (S, L, n), each against its own set."""
     n_sets, count, n = x.shape
     flat = x.reshape(-1, n)
-    found = dict(_results(executor, score.of, [(flat[i : i + BATCH],) for i in range(0, len(flat), BATCH)]))
-    parts = zip(*(found[i] for i in range(len(found))), strict=True)
+    scores = dict(_results(executor, score.of, [(flat[i : i + BATCH],) for i in range(0, len(flat), BATCH)]))
+    parts = zip(*(scores[i] for i in range(len(scores))), strict=True)
     nrmse, shift = (np.concatenate(p).reshape(n_sets, count, n_sets) for p in parts)
     sets = np.arange(n_sets)
     return nrmse[sets, :, sets], shift[sets, :, sets]
@@ -293,7 +295,7 @@ def _file(folder: Path | None, number: int) -> Path | None:
 
 
 def _kept(file: Path) -> Best | None:
-    """What a chunk holds; None where it is missing, or damaged as by a loss of power: it is computed again."""
+    """The content of a chunk; None where it is missing, or damaged as by a loss of power: it is computed again."""
     try:
         with open_plain(file) as stream, np.load(stream) as stored:
             return Best(**stored)

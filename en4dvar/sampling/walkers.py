@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 
 STRETCHES = 0.3  # share of the moves, the others are differential evolution
 LEAPS = 0.1  # share of the latter of length 1, which takes walkers from one mode to another

@@ -6,15 +6,21 @@ from collections.abc import Callable
 
 import numpy as np
 
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
+from en4dvar.data.noise import noise_of
+from en4dvar.data.noise.state_space import innovations
+from en4dvar.data.observations import Observations
 from en4dvar.sampling.mixture import fit_gaussians
 from en4dvar.sampling.nearest import best_over_shifts, targets
 
 
 def examples() -> dict[str, Callable[[], object]]:
-    """What is compiled, in words, and a call that does; for ``en4dvar warm-up``."""
-    return {"sampling, mixtures": _mixture, "sweep, nearest neighbours": _nearest}
+    """Name of each kernel, in words, and a call that compiles it; for ``en4dvar warm-up``."""
+    return {"sampling, mixtures": _mixture, "sweep, nearest neighbours": _nearest, "discrepancy": _discrepancy}
+
+
+def _discrepancy() -> None:
+    unit = np.ones((1, 3))
+    innovations(unit, unit, unit, np.ones(1), np.ones(2), 1.5)
 
 
 def _mixture() -> None:

@@ -1,11 +1,17 @@
-"""Assimilation schemes, one a file: what is computed, nothing else. A new one is a file and a line below."""
+"""Assimilation schemes, one a file: what is computed, and the keys read. A new one is a file and a line below.
+
+Another package brings schemes of its own by entry points of the group ``en4dvar.schemes``: a name for ``scheme:`` and a
+subclass of :class:`Scheme`. One that cannot be loaded is left out with a warning; a name of ours is not replaced.
+"""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
-from typing import Any
+from importlib.metadata import entry_points
 
-from en4dvar.schemes.base import Scheme
+from en4dvar.schemes.base import Minimiser, Scheme
 from en4dvar.schemes.baselines import Climatology, OptimalInterpolation
 from en4dvar.schemes.bootstrap_filter import BootstrapFilter
 from en4dvar.schemes.denkf import DEnKF
@@ -18,7 +24,7 @@ from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
 
 # name in a configuration → class; its fields are keys of the section ``assimilation:``
-SCHEMES: dict[str, Any] = {
+SCHEMES: dict[str, type[Scheme]] = {
     "en4dvar": En4DVar,
     "es-mda": ESMDA,
     "etkf": ETKF,
@@ -31,11 +37,49 @@ SCHEMES: dict[str, Any] = {
     "optimal-interpolation": OptimalInterpolation,
     "climatology": Climatology,
 }
+
+
+def _installed() -> dict[str, type[Scheme]]:
+    """The schemes of other packages."""
+    kinds = {}
+    for entry in entry_points(group="en4dvar.schemes"):
+        try:
+            kind = entry.load()
+            if not (isinstance(kind, type) and issubclass(kind, Scheme)):
+                raise TypeError("it is not a subclass of en4dvar.schemes.Scheme")
+        except Exception as error:  # code of another package must not end every command
+            words = f"scheme {entry.name!r} ({entry.value}) cannot be loaded: {type(error).__name__}: {error}"
+            warnings.warn(words, RuntimeWarning, stacklevel=2)
+        else:
+            kinds[entry.name] = kind
+    return kinds
+
+
+SCHEMES |= {name: kind for name, kind in _installed().items() if name not in SCHEMES}
 ON_A_WINDOW, ON_A_SERIES = ({n: kind for n, kind in SCHEMES.items() if on in kind.on} for on in ("window", "series"))
+DEFAULT = "en4dvar"
+MINIMISERS = tuple(name for name, kind in ON_A_WINDOW.items() if issubclass(kind, Minimiser))
+LOCALISED = tuple(name for name, kind in ON_A_WINDOW.items() if kind.localised_keys is not None)
 
 
-def window_scheme(settings: Any) -> Scheme:
-    """The scheme that the settings of an estimate name, with those of their values that are its fields."""
-    kind = ON_A_WINDOW[settings.scheme]
-    scheme: Scheme = kind(**{f.name: getattr(settings, f.name) for f in fields(kind)})
-    return scheme
+def keys_of(kind: type[Scheme], localised: bool = False) -> frozenset[str]:
+    """The keys that a scheme reads, or that it reads where its gain is localised."""
+    keys = frozenset(f.name for f in fields(kind))
+    return keys & (kind.localised_keys or frozenset()) if localised else keys
+
+
+def unread(
+    name: str, kinds: Mapping[str, type[Scheme]], keys: Iterable[str], localised: bool = False
+) -> dict[str, str]:
+    """Those of ``keys`` that schemes of ``kinds`` have and the one of this ``name`` does not read, with a message each.
+
+    ``localised``: where the gain of an ensemble is localised.
+    """
+    messages = {}
+    for key in keys:
+        if key in keys_of(kinds[name], localised) or not any(key in keys_of(kind) for kind in kinds.values()):
+            continue
+        readers = [other for other, kind in kinds.items() if key in keys_of(kind, localised)]
+        who = f"; it is a key of {' and '.join(readers)}" if readers else ""
+        messages[key] = f"scheme {name} does not read it{' beside a localisation' if localised else ''}{who}"
+    return messages

@@ -1,4 +1,4 @@
-"""What a scheme is: a pure function of whitened ensemble arrays.
+"""What a scheme is: a pure function of whitened ensemble arrays, and the keys that it reads.
 
 A scheme never sees x, F, H or a truth. It says with which weights to run the members, turns their predictions into a
 linearisation in weight space, and turns the whitened linearisation into a step. The loop (:mod:`en4dvar.descent.loop`)
@@ -11,14 +11,16 @@ centre and row i of the ensemble transform T.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, cast
+from typing import Annotated, ClassVar, Literal, Protocol, cast
 
 import numpy as np
+from annotated_types import Ge, Gt, Le
 
-from en4dvar.ensemble.linalg import Hessian
+from en4dvar.ensemble.linalg import Hessian, centre, min_norm_fit
 from en4dvar.ensemble.near_prior import NearPrior
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 
 
 class Draw(Protocol):
@@ -125,6 +127,20 @@ class GaussNewtonStep:
         return 0.5 * self.norm**2
 
 
+def mda_inflations(coefficients: Sequence[float]) -> Array:
+    """α_a of multiple data assimilation, scaled so that Σ 1/α_a = 1."""
+    alpha = np.array(coefficients)
+    return np.asarray(alpha * np.sum(1 / alpha))
+
+
+def regression(coordinates: Array, runs: Runs) -> tuple[Array, Array]:
+    """Prediction (Ky,) at the centre and slopes (r, Ky), by regression of the survivors' on ``coordinates`` (M, r)."""
+    assert runs.active is not None
+    alive = coordinates[runs.active]
+    fit = min_norm_fit(np.column_stack([np.ones(len(alive)), alive]), runs.predictions[runs.active] - runs.central)
+    return runs.central + fit[0], fit[1:]
+
+
 def gauss_newton(w: Array, evaluation: Evaluation) -> GaussNewtonStep:
     """g = (N−1) w − Sᵀd, A = (N−1) I + SᵀS, δw = −A⁻¹ g, in the coordinates of a basis where there is one."""
     basis = evaluation.basis
@@ -135,46 +151,112 @@ def gauss_newton(w: Array, evaluation: Evaluation) -> GaussNewtonStep:
     return GaussNewtonStep(w, gradient, hessian, -hessian.solve(gradient))
 
 
-class Scheme(Protocol):
-    """The author of a scheme writes these.
+@dataclass(frozen=True)
+class Scheme:
+    """The author of a scheme writes a subclass; its fields are the keys of ``assimilation:`` that it reads, each with
+    type, bounds, description and default. What it can do is said by the class:
 
-    ``on``: what it can be run on, ``window`` (the data of one set, for parameters), ``series``, or both.
-    ``searches``: steps are Gauss–Newton steps of J, and how far to go is found by J of the central run
-    (:mod:`en4dvar.descent.step_control`). Other schemes take their step as it is; their ensemble is run as a whole, and
-    R is that at its mean, ``passes`` times. ``lag``: cycles of a series that the window is long; 0 is a filter.
+    ``words``: what it is, in two or three of them. ``on``: what it can be run on, ``window`` (the data of one set, for
+    parameters), ``series``, or both. ``filters``: it analyses its members once, where they stand. ``resamples``:
+    members survive as a whole, so that no part of the state can be analysed by itself, and its forecast is not
+    Gaussian. ``cycled``: the next forecast of a series starts from the analysis; a baseline's from the forecast, as if
+    nothing was observed. ``localised_keys``: the fields that it reads where its gain is localised; None: it cannot be.
     """
 
+    words: ClassVar[str] = ""
+    on: ClassVar[tuple[str, ...]] = ("window",)
+    filters: ClassVar[bool] = False
+    resamples: ClassVar[bool] = False
+    cycled: ClassVar[bool] = True
+    localised_keys: ClassVar[frozenset[str] | None] = None
+
     @property
-    def on(self) -> tuple[str, ...]: ...
+    def minimiser(self) -> Minimiser | None:
+        """The scheme itself where its steps are Gauss–Newton steps of J, judged by J of the central run.
+
+        Other schemes take their step as it is; their ensemble is run as a whole, and R is that at its mean.
+        """
+        return None
+
     @property
-    def searches(self) -> bool: ...
+    def passes(self) -> int:
+        """How often a scheme without a minimiser assimilates the same observations."""
+        return 1
+
     @property
-    def passes(self) -> int: ...
+    def inflations(self) -> Array:
+        """By what R is multiplied in each pass."""
+        return np.ones(self.passes)
+
     @property
-    def lag(self) -> int: ...
+    def lag(self) -> int:
+        """Cycles of a series that the window is long; 0 is a filter."""
+        return 0
+
+    @property
+    def shift(self) -> int:
+        """Cycles of a series by which the window moves on."""
+        return 1
+
+    @property
+    def mda_weights(self) -> tuple[float, ...]:
+        """The shares by which an observation is assimilated in one window of a series after the other."""
+        return (1.0,)
 
     def members(self, weights: Weights, basis: Array | None = None) -> Array:
         """Weights (M, N) of the members to be run next, as rows."""
+        return weights.rows
 
     def linearise(self, weights: Weights, runs: Runs) -> tuple[Array, Array]:
         """Reference prediction (Ky,) and anomalies (N, Ky) per unit weight, or (r, Ky) per unit of the basis."""
+        return centre(runs.predictions)
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         """The step from there; ``iteration`` counts from 0, ``draw`` gives random numbers by name."""
+        return gauss_newton(weights.w, evaluation)
 
     def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
-        """Whether iterations end with this step, which is taken (a scheme that searches is not asked)."""
+        """Whether iterations end with this step, which is taken (a minimiser is not asked)."""
+        return iteration + 1 == self.passes
 
 
-class SeriesScheme(Scheme, Protocol):
-    """A scheme on a series: ``shift``, by how many cycles its window moves on, and ``mda_weights``, the shares by which
-    an observation is assimilated in one window after the other. ``cycled``: the next forecast starts from the analysis;
-    a baseline's from the forecast, as if nothing was observed.
-    """
+@dataclass(frozen=True)
+class Minimiser(Scheme):
+    """A scheme whose descents :mod:`en4dvar.descent` takes to the minimum of J, and the keys that these read."""
+
+    linearisation: Annotated[
+        Literal["bundle", "transform"],
+        "Tangent from runs close to the iterate (bundle), or regression over the ensemble (transform).",
+    ] = "bundle"
+    epsilon: Annotated[float, Gt(0), Le(1), "Size of the bundle, in prior standard deviations."] = 1e-3
+    step_control: Annotated[
+        Literal["line-search", "levenberg-marquardt", "full"],
+        "What keeps J from rising along the iterations; full takes the whole step or, where that raises J, none.",
+    ] = "line-search"
+    start: Annotated[
+        Literal["best-member", "prior-mean"],
+        "Where the iterations start: the prior members of lowest J, or the prior mean.",
+    ] = "best-member"
+    starts: Annotated[
+        int, Ge(1), "How many prior members of lowest J start a descent; others follow while none explains the data."
+    ] = 2
+    max_iterations: Annotated[int, Ge(1), "Iteration limit."] = 30
+    step_tolerance: Annotated[
+        float, Gt(0), "Converged where the step is shorter than this, in posterior standard deviations, √(δwᵀAδw)."
+    ] = 1e-3
+    cost_tolerance: Annotated[
+        float, Gt(0), "Converged where J falls by less than this, relative to J (absolute below J = 1)."
+    ] = 1e-4
 
     @property
-    def cycled(self) -> bool: ...
+    def minimiser(self) -> Minimiser:
+        return self
+
     @property
-    def shift(self) -> int: ...
-    @property
-    def mda_weights(self) -> tuple[float, ...]: ...
+    def regresses(self) -> bool:
+        """Whether it linearises by regression over the ensemble, at posterior spread."""
+        return self.linearisation == "transform"
+
+    def economical(self, basis: Array) -> bool:
+        """Whether a linearisation takes fewer runs than members."""
+        return False

@@ -23,6 +23,7 @@ from en4dvar.schemes.etkf import ETKF
 class OptimalInterpolation(ETKF):
     """The ETKF's analysis, which is not cycled."""
 
+    words: ClassVar[str] = "one analysis of the free members"
     on: ClassVar[tuple[str, ...]] = ("series",)
     cycled: ClassVar[bool] = False
 
@@ -30,6 +31,8 @@ class OptimalInterpolation(ETKF):
 @dataclass(frozen=True)
 class Climatology(OptimalInterpolation):
     """The free members themselves."""
+
+    words: ClassVar[str] = "the free members"
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         """The weights as they are."""

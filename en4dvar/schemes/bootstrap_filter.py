@@ -23,20 +23,23 @@ from annotated_types import Ge
 from scipy.special import ndtr
 
 from en4dvar.ensemble.linalg import centre
+from en4dvar.model.state import Array
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights
 from en4dvar.schemes.etkf import ETKF
-from en4dvar.state import Array
 
 
 @dataclass(frozen=True)
 class BootstrapFilter(ETKF):
     """The filter; it takes no localisation."""
 
-    jitter: Annotated[
-        float, Ge(0), "Particle filter: what a resampled member is moved by, in standard deviations of the posterior."
-    ] = 0.2
+    words: ClassVar[str] = "weighed and resampled members"
+
+    jitter: Annotated[float, Ge(0), "What a resampled member is moved by, in standard deviations of the posterior."] = (
+        0.2
+    )
 
     on: ClassVar[tuple[str, ...]] = ("series",)
+    resamples: ClassVar[bool] = True
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         """Resampled members as rows of weights: a member is x̄ + X_a(i), one that has survived."""

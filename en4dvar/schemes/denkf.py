@@ -11,6 +11,7 @@ Source: Sakov & Oke (2008), Tellus A 60, 361.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -21,6 +22,8 @@ from en4dvar.schemes.etkf import ETKF
 @dataclass(frozen=True)
 class DEnKF(ETKF):
     """The filter."""
+
+    words: ClassVar[str] = "deterministic"
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         """Weights of the analysis."""

@@ -11,17 +11,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 
 from en4dvar.ensemble.linalg import min_norm_fit
-from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.schemes.base import Minimiser, Runs, Weights, regression
 
 
 @dataclass(frozen=True)
-class En4DVar:
+class En4DVar(Minimiser):
     """The scheme; ``linearisation`` says where its members are run.
 
     ``bundle``: ε away from w, for finite differences about the central prediction (a tangent linearisation). It needs
@@ -31,13 +31,10 @@ class En4DVar:
     ``transform``: at the rows of 1wᵀ + T, regression about the ensemble mean at posterior spread.
     """
 
-    linearisation: Literal["bundle", "transform"] = "bundle"
-    epsilon: float = 1e-3
-
-    on: ClassVar[tuple[str, ...]] = ("window",)
-    passes: ClassVar[int] = 1
-    searches: ClassVar[bool] = True
-    lag: ClassVar[int] = 0
+    words: ClassVar[str] = "iterative ensemble smoother"
+    localised_keys: ClassVar[frozenset[str] | None] = frozenset(
+        ("epsilon", "max_iterations", "step_tolerance", "cost_tolerance")
+    )
 
     def economical(self, basis: Array) -> bool:
         """Whether a tangent takes fewer runs than members."""
@@ -49,7 +46,7 @@ class En4DVar:
         if basis is not None and self.economical(basis):
             rows = self._short(weights) * basis.T
             return np.asarray(weights.w + (np.vstack([rows, -rows]) if self._on_both_sides(weights, basis) else rows))
-        if self.linearisation == "transform":
+        if self.regresses:
             return weights.rows
         return np.asarray(weights.w + self.epsilon * weights.wider * np.eye(len(weights.w)))
 
@@ -69,21 +66,10 @@ class En4DVar:
                 ahead, behind = np.split(runs.predictions, 2)
                 return central, (ahead - behind) / (2 * self._short(weights))
             return central, (runs.predictions - central) / self._short(weights)
-        coordinates = ((self.members(weights) - weights.w) @ basis)[active]
-        survivors = runs.predictions[active]
-        if self.linearisation == "bundle":
-            return central, min_norm_fit(coordinates, survivors - central)
-        design = np.column_stack([np.ones(len(coordinates)), coordinates])
-        fit = min_norm_fit(design, survivors - central)
-        return central + fit[0], fit[1:]
-
-    def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> GaussNewtonStep:
-        """Gauss–Newton direction and symmetric transform."""
-        return gauss_newton(weights.w, evaluation)
-
-    def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
-        """Not asked: J tells (:mod:`en4dvar.descent.loop`)."""
-        return False
+        coordinates = (self.members(weights) - weights.w) @ basis
+        if self.regresses:
+            return regression(coordinates, runs)
+        return central, min_norm_fit(coordinates[active], runs.predictions[active] - central)
 
     def _on_both_sides(self, weights: Weights, basis: Array) -> bool:
         return weights.wider > 1 and 2 * basis.shape[1] < len(basis)

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from en4dvar.ensemble.linalg import Hessian
+from en4dvar.model.state import Array
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights
 from en4dvar.schemes.etkf import ETKF
-from en4dvar.state import Array
 
 
 def perturbed_transform(hessian: Hessian, S: Array, noise: Array, T: Array) -> Array:
@@ -33,6 +34,8 @@ def perturbed_transform(hessian: Hessian, S: Array, noise: Array, T: Array) -> A
 @dataclass(frozen=True)
 class EnKF(ETKF):
     """The filter."""
+
+    words: ClassVar[str] = "perturbed observations"
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         """Weights of the analysis."""

@@ -19,18 +19,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from en4dvar.ensemble.linalg import Hessian
+from en4dvar.model.state import Array
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights
 from en4dvar.schemes.etkf import ETKF
-from en4dvar.state import Array
 
 
 @dataclass(frozen=True)
 class EnKFN(ETKF):
     """The filter; it needs no inflation where the model is right."""
+
+    words: ClassVar[str] = "finite size"
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         """Weights of the analysis."""
@@ -62,8 +65,8 @@ def transform(hessian: Hessian, zeta: float, w: Array) -> Array:
     c = 2 * zeta**2 / (len(w) + 1)
     kept = math.sqrt(max(1 - c * square, np.finfo(float).eps))  # positive at a minimum but for rounding
     stretch = c / (kept * (1 + kept))  # (1/kept − 1) / |z|²
-    found = inverse_root + np.outer(stretch * z, z @ inverse_root)
-    return np.asarray(math.sqrt(hessian.prior_precision) * found)
+    scaled = inverse_root + np.outer(stretch * z, z @ inverse_root)
+    return np.asarray(math.sqrt(hessian.prior_precision) * scaled)
 
 
 def prior_precision(projected: Array, squares: Array, n_members: int) -> float:

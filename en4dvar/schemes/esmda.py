@@ -16,15 +16,16 @@ Sources: Emerick & Reynolds (2013), Computers & Geosciences 55, 3; square root: 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from annotated_types import Gt, MinLen
 
 from en4dvar.ensemble.linalg import Hessian
-from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights
+from en4dvar.model.state import Array
+from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights, mda_inflations
 from en4dvar.schemes.enkf import perturbed_transform
 from en4dvar.schemes.etkf import ETKF
-from en4dvar.state import Array
 
 
 @dataclass(frozen=True)
@@ -35,25 +36,33 @@ class ESMDA(ETKF):
     [9.33, 7.0, 4.0, 2.0]
     """
 
-    mda_coefficients: tuple[float, ...] = (4.0, 4.0, 4.0, 4.0)
-    mda_form: Literal["perturbed", "square-root"] = "perturbed"
+    words: ClassVar[str] = "multiple data assimilation"
+
+    mda_coefficients: Annotated[
+        tuple[Annotated[float, Gt(0)], ...],
+        MinLen(1),
+        "Inflation of R in each assimilation, scaled so that the inverses sum to one.",
+    ] = (4.0, 4.0, 4.0, 4.0)
+    mda_form: Annotated[Literal["perturbed", "square-root"], "Analysis: perturbed observations, or a square root."] = (
+        "perturbed"
+    )
 
     on: ClassVar[tuple[str, ...]] = ("window",)
+    localised_keys: ClassVar[frozenset[str] | None] = frozenset(("mda_coefficients",))
 
     def __post_init__(self) -> None:
         if not self.mda_coefficients or not all(alpha > 0 for alpha in self.mda_coefficients):
             raise ValueError(f"MDA coefficients must be positive, not {self.mda_coefficients}")
 
     @property
-    def passes(self) -> int:  # type: ignore[override]
+    def passes(self) -> int:
         """One an inflation."""
         return len(self.mda_coefficients)
 
     @property
     def inflations(self) -> Array:
         """α_a, one an assimilation."""
-        alpha = np.array(self.mda_coefficients)
-        return np.asarray(alpha * np.sum(1 / alpha))
+        return mda_inflations(self.mda_coefficients)
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         """Assimilation number ``iteration``; d is that of the mean prediction, S per unit of the current anomalies."""

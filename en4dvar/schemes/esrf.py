@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,6 +26,8 @@ from en4dvar.schemes.etkf import ETKF
 @dataclass(frozen=True)
 class ESRF(ETKF):
     """The filter."""
+
+    words: ClassVar[str] = "serial square root"
 
     def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
         """Weights of the analysis."""

@@ -13,35 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from en4dvar.ensemble.linalg import centre
-from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton
-from en4dvar.state import Array
+from en4dvar.schemes.base import Scheme
 
 
 @dataclass(frozen=True)
-class ETKF:
+class ETKF(Scheme):
     """The filter: a window without length, analysed once. Filters with another analysis say so in :meth:`advance`."""
 
+    words: ClassVar[str] = "symmetric square root"
     on: ClassVar[tuple[str, ...]] = ("window", "series")
-    cycled: ClassVar[bool] = True
-    searches: ClassVar[bool] = False
-    passes: ClassVar[int] = 1
-    lag: ClassVar[int] = 0
-    shift: ClassVar[int] = 1
-    mda_weights: ClassVar[tuple[float, ...]] = (1.0,)
-
-    def members(self, weights: Weights, basis: Array | None = None) -> Array:
-        """I (N, N): the members are the forecast."""
-        return weights.rows
-
-    def linearise(self, weights: Weights, runs: Runs) -> tuple[Array, Array]:
-        """Mean (K',) and anomalies (N, K') of the members' predictions."""
-        return centre(runs.predictions)
-
-    def advance(self, weights: Weights, evaluation: Evaluation, iteration: int, draw: Draw) -> Step | GaussNewtonStep:
-        """Weights of the analysis, with the symmetric transform."""
-        return gauss_newton(weights.w, evaluation)
-
-    def done(self, iteration: int, step: Step | GaussNewtonStep) -> bool:
-        """After the last pass."""
-        return iteration + 1 == self.passes
+    filters: ClassVar[bool] = True

@@ -26,18 +26,20 @@ import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from en4dvar.ensemble.linalg import centre
-from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Runs, Step, Weights, gauss_newton
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Runs, Scheme, Step, Weights, gauss_newton
 
 
 @dataclass(frozen=True)
-class IEnKS:
+class IEnKS(Scheme):
     """The smoother. Iterations end with the step that is below ``tolerance`` posterior standard deviations, √(δwᵀAδw).
 
     That step is taken, so what is left is smaller by the square.
 
     ``transform``: members at the rows of 1wᵀ + T, Y = T⁻¹(P − p̄). ``bundle``: at 1wᵀ + εI, Y = (P − p̄)/ε.
     """
+
+    words: ClassVar[str] = "sliding-window smoother"
 
     lag: Annotated[int, Ge(0), "Length of the smoother's window in cycles; 0 is a filter."] = 1
     linearisation: Annotated[
@@ -57,9 +59,6 @@ class IEnKS:
     ] = (1.0,)
 
     on: ClassVar[tuple[str, ...]] = ("series",)
-    passes: ClassVar[int] = 1
-    cycled: ClassVar[bool] = True
-    searches: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if self.shift > max(1, self.lag):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 
 
 @dataclass(frozen=True)

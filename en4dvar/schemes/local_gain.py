@@ -26,8 +26,8 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from en4dvar.model.state import Array
 from en4dvar.schemes.localisation import gaspari_cohn
-from en4dvar.state import Array
 
 PART = 1 << 18  # cells times observations that are worked on at once
 CHANCE = 3.0  # correlations below this over √N are taken for chance
@@ -100,14 +100,14 @@ class ByCorrelation:
             cross = anomalies.T @ Y / (n_members - 1)
             size = np.sqrt(np.einsum("ij,ij->j", anomalies, anomalies) / (n_members - 1))
             kept = np.abs(cross) > least * np.outer(size, spread)
-            found = np.zeros((len(innovations), len(size)))
+            change = np.zeros((len(innovations), len(size)))
             patterns, which = np.unique(kept, axis=0, return_inverse=True)
             for k, near in enumerate(patterns):
                 if near.any():
                     of = which.ravel() == k
                     own = cho_factor(covariance[np.ix_(near, near)] + np.diag(variance[near]))
-                    found[:, of] = cho_solve(own, innovations[:, near].T).T @ cross[np.ix_(of, near)].T
-            return found
+                    change[:, of] = cho_solve(own, innovations[:, near].T).T @ cross[np.ix_(of, near)].T
+            return change
 
         return increments
 

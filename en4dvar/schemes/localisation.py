@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from en4dvar.ensemble.linalg import apply_weights
+from en4dvar.model.state import Array
 from en4dvar.schemes.base import Draw, Evaluation, Runs, Scheme, Weights
-from en4dvar.state import Array
 
 
 def gaspari_cohn(distance: Array, radius: float) -> Array:
@@ -28,7 +28,7 @@ def gaspari_cohn(distance: Array, radius: float) -> Array:
     near = 1 + z * z * (-5 / 3 + z * (5 / 8 + z * (1 / 2 - z / 4)))
     y = np.clip(z, 1, 2)
     far = 4 - 5 * y + y * y * (5 / 3 + y * (5 / 8 + y * (-1 / 2 + y / 12))) - 2 / (3 * y)
-    return np.where(z < 1, near, np.maximum(far, 0.0))
+    return np.asarray(np.where(z < 1, near, np.maximum(far, 0.0)))
 
 
 def distances(a: Array, b: Array, period: float | None = None) -> Array:
@@ -38,7 +38,7 @@ def distances(a: Array, b: Array, period: float | None = None) -> Array:
 
 
 @dataclass(frozen=True)
-class Localisation:
+class BlockLocalisation:
     """``blocks``: indices of the state variables analysed together; ``taper`` (blocks, K') weighs the observations.
 
     State variables in no block keep their forecast.
@@ -50,7 +50,7 @@ class Localisation:
     @classmethod
     def on_line(
         cls, state: Array, observed: Array, radius: float, period: float | None = None, block_size: int = 1
-    ) -> Localisation:
+    ) -> BlockLocalisation:
         """Blocks of ``block_size`` neighbours of a field at positions ``state`` (n,), NaN for variables not analysed.
 
         ``observed`` (K',) are the positions of the observations; distances are measured from the middle of a block.
@@ -61,7 +61,9 @@ class Localisation:
         return cls(blocks, gaspari_cohn(distances(middles, observed, period), radius))
 
     @classmethod
-    def on_grid(cls, where: npt.NDArray[np.intp], shape: Sequence[int], radius: float, periodic: bool) -> Localisation:
+    def on_grid(
+        cls, where: npt.NDArray[np.intp], shape: Sequence[int], radius: float, periodic: bool
+    ) -> BlockLocalisation:
         """Every cell by itself of a field on a grid of ``shape``, all cells observed, in C order.
 
         ``where`` (n,) are the places of the cells in the state; distances are Euclidean, in cells, and around the ends
@@ -84,14 +86,14 @@ class Localisation:
         return analysed
 
 
-class LocalDescent:
+class BlockDescents:
     """The blocks of a window's ensemble (N, n), each with weights of its own, through the iterations of a smoother.
 
     The taper is that of the observations' places, also where these are later than the ensemble: what moves far within a
     window asks for a larger radius. Source: Bocquet (2016), Q. J. R. Meteorol. Soc. 142, 1075, § 3.
     """
 
-    def __init__(self, localisation: Localisation, ensemble: Array):
+    def __init__(self, localisation: BlockLocalisation, ensemble: Array):
         self.ensemble = ensemble
         self.near = [(block, taper) for block, taper in zip(localisation.blocks, localisation.taper, strict=True)
                      if (taper > 0).any()]  # fmt: skip
@@ -99,10 +101,10 @@ class LocalDescent:
 
     def members(self, rows: Callable[[Weights], Array]) -> Array:
         """Members (N, n): ``rows`` (N, N) of each block's weights, and what is in no block as it was."""
-        found = self.ensemble.copy()
+        members = self.ensemble.copy()
         for (block, _), weights in zip(self.near, self.weights, strict=True):
-            found[:, block] = apply_weights(self.ensemble[:, block], rows(weights))
-        return found
+            members[:, block] = apply_weights(self.ensemble[:, block], rows(weights))
+        return members
 
     def advance(
         self, scheme: Scheme, runs: Runs, whiten: Callable[[Array, Array], Evaluation], iteration: int, draw: Draw

@@ -1,4 +1,4 @@
-"""What a study has computed so far, on disk, so that one that was killed continues to the same bits.
+"""The results that a study has computed so far, on disk, so that one that was killed continues to the same bits.
 
 Kept are the chunks of the sweeps, the populations and the fits of one gel; En4D-Var is quick and computed again. What
 decides the numbers is kept with them, and a study is continued only where that agrees.
@@ -7,19 +7,19 @@ decides the numbers is kept with them, and a study is continued only where that 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 
-from en4dvar.config.build import data_files, inverse_plan
-from en4dvar.errors import OutputError
-from en4dvar.files import inside, write_text
+from en4dvar.assembly.build import data_files, inverse_plan
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.files import inside, read_plain, write_text
+from en4dvar.results.checkpoint import FOLDER, CheckpointError, digest, read_checkpoint, write_checkpoint
+from en4dvar.results.fingerprint import Identity, identity, source_digest
 from en4dvar.runs.rundir import RunDirectory
-from en4dvar.storage.checkpoint import FOLDER, CheckpointError, digest, read_checkpoint, write_checkpoint
-from en4dvar.storage.fingerprint import Identity, identity, source_digest
 from en4dvar_agarose.settings import StudyPlan
 
 D = TypeVar("D")
@@ -33,21 +33,22 @@ class StudyCheckpoints:
         self.folder, self.key = folder, key
 
     @classmethod
-    def open(cls, directory: RunDirectory, plan: StudyPlan) -> StudyCheckpoints:
-        """For a new study in ``directory``, or the one that is there.
+    def open(cls, directory: RunDirectory, plan: StudyPlan, files: Sequence[str]) -> StudyCheckpoints:
+        """For a new study in ``directory``, which will write ``files``, or the one that is there.
 
         Raises
         ------
         OutputError: the one there would have other numbers; says what has changed. It cannot be written.
         """
         who = identity_of(plan)
-        folder = directory.folder(FOLDER)
         earlier = read_checkpoint(directory.at(IDENTITY), "study", Identity)
         if earlier is not None and (difference := who.difference(earlier, frozenset())):
             raise OutputError(
                 f"{directory.path}: the study cannot be resumed to the same result, for this has changed:\n{difference}"
                 "\ngive --force to compute everything again, or another --out"
             )
+        directory.claim(*files)
+        folder = directory.folder(FOLDER)
         write_checkpoint(directory.at(IDENTITY), "study", who)
         return cls(folder, digest(f"{who.settings}{who.data}".encode()))
 
@@ -59,17 +60,19 @@ class StudyCheckpoints:
         """The dataclass kept under ``words``, or what ``compute`` gives, then kept."""
         path = inside(self.folder, _file(kind.__name__, *words))
         try:
-            found = read_checkpoint(path, self.key, kind)
+            result = read_checkpoint(path, self.key, kind)
         except CheckpointError:  # damaged: computed again
-            found = None
-        if found is None:
-            found = compute()
-            write_checkpoint(path, self.key, found)
-        return found
+            result = None
+        if result is None:
+            result = compute()
+            write_checkpoint(path, self.key, result)
+        return result
 
 
 def identity_of(plan: StudyPlan) -> Identity:
-    """What decides the numbers of a study: its effort and seed, its configurations, readings, software and sources."""
+    """The inputs that decide the numbers of a study: its effort and seed, its configurations, readings, software and
+    sources.
+    """
     settings: dict[str, Any] = {"seed": plan.seed, "sweep": asdict(plan.sweep), "population": asdict(plan.population)}
     common: dict[str, Any] = {"software": {}, "sources": {"en4dvar_agarose": source_digest("en4dvar_agarose")}}
     gels: dict[str, dict[str, Any]] = {}
@@ -77,12 +80,12 @@ def identity_of(plan: StudyPlan) -> Identity:
     for gel, models in plan.configs.items():
         gels[gel] = {}
         for model, config in models.items():
-            one = identity(config.resolved, config.model, data_files(inverse_plan(config)))
-            content = yaml.safe_load(one.settings)
+            own = identity(config.resolved, config.model, data_files(inverse_plan(config)))
+            content = yaml.safe_load(own.settings)
             for key, values in common.items():
                 values.update(content.pop(key))
             gels[gel][model] = content
-            data += [(f"{gel}, {model}, {name}", found) for name, found in one.data]
+            data += [(f"{gel}, {model}, {name}", digest) for name, digest in own.data]
     text = yaml.safe_dump({**settings, "gels": gels, **common}, sort_keys=False, allow_unicode=True, width=120)
     return Identity(text, tuple(data))
 
@@ -101,7 +104,7 @@ def prepare_folder(folder: Path, key: str, mode: str) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         mark = inside(folder, "sweep.key")
-        stored = mark.read_bytes().decode("utf-8", "replace") if mark.exists() else ""
+        stored = read_plain(mark, 1000).decode("utf-8", "replace") if mark.exists() else ""
         if mode == "force":
             for file in (mark, *folder.glob("*.npz")):
                 file.unlink(missing_ok=True)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from pathlib import Path
-from typing import Any
 
 import click
 
-from en4dvar.commands.common import note_beginning
+from en4dvar.commands.common import Source, continuable, note_beginning
 
 
 @click.command()
@@ -45,20 +42,20 @@ def sweep(
     """
     import hashlib
 
-    from en4dvar.config import load_config
-    from en4dvar.config.build import build
+    from en4dvar.assembly.build import build
     from en4dvar.executor import available_cores, make_executor
-    from en4dvar.files import inside, write_text
+    from en4dvar.plumbing.files import inside, write_text
+    from en4dvar.plumbing.units import UnitError, parse_quantity
     from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
-    from en4dvar.sampling.sweep import SweepSettings, refinement_size, run_sweep
-    from en4dvar.units import UnitError, parse_quantity
+    from en4dvar.runs.progress import counted
+    from en4dvar.sampling.sweep import SweepSettings, run_sweep
     from en4dvar_agarose.checkpoints import prepare_folder
     from en4dvar_agarose.run import earliest_reading, one_model
     from en4dvar_agarose.summary import sweep_csv, sweep_text
 
     if force and resume:
         raise click.UsageError("--force and --resume exclude each other")
-    loaded = [load_config(config, _overrides(settings, data)) for config in configs]
+    loaded = [Source(Path(config), data, settings).load() for config in configs]
     problems = one_model([problem for config in loaded for problem in build(config)])
     try:
         within, grid = (parse_quantity(text, problems[0].model.time_unit) for text in (shift, step))
@@ -72,9 +69,10 @@ def sweep(
     key = hashlib.sha256(f"{[c.resolved for c in loaded]}{chosen}".encode() + readings).hexdigest()
     chunks = prepare_folder(inside(folder, "chunks"), key, "force" if force else "resume" if resume else "new")
     with (
+        continuable(),
         terminate_as_interrupt(),
-        tell_interrupt(lambda: _to_continue(f"finished chunks are kept in {chunks}")),
-        _bar(trajectories + refinement_size(chosen, len(problems))) as progress,
+        tell_interrupt(lambda: f"finished chunks are kept in {chunks}"),
+        counted("trajectories") as progress,
         make_executor(problems[0].model, workers or available_cores()) as executor,
     ):
         earliest = earliest_reading(problems[0].model)
@@ -105,73 +103,27 @@ def study(
     from en4dvar.executor import available_cores
     from en4dvar.runs.interrupt import tell_interrupt, terminate_as_interrupt
     from en4dvar.runs.rundir import RunDirectory
-    from en4dvar.storage.checkpoint import FOLDER
+    from en4dvar.runs.session import directory_mode
     from en4dvar_agarose.checkpoints import StudyCheckpoints
-    from en4dvar_agarose.report import write_study
+    from en4dvar_agarose.report import FILES, write_study
     from en4dvar_agarose.run import run_study
     from en4dvar_agarose.settings import load_study
 
     if force and resume:
         raise click.UsageError("--force and --resume exclude each other")
-    plan = load_study(config, _overrides(settings, None))
+    plan = load_study(config, Source(Path(config), None, settings).overrides())
     folder = out or Path("runs") / plan.name
     note_beginning(folder, resume)
     with (
+        continuable(),
         terminate_as_interrupt(),
-        RunDirectory.open(folder, "force" if force else "resume" if resume else "new") as directory,
-        tell_interrupt(lambda: _to_continue(f"finished parts are kept in {folder}")),
+        RunDirectory.open(folder, directory_mode(force, resume), FILES) as directory,
+        tell_interrupt(lambda: f"finished parts are kept in {folder}"),
     ):
-        before = _times(directory.work)
-        keep = StudyCheckpoints.open(directory, plan)
+        keep = StudyCheckpoints.open(directory, plan, FILES)
         result = run_study(plan, workers or available_cores(), lambda message: click.echo(message, err=True), keep)
         page = write_study(result, directory.work)
-        # What was there before and has not been written since is the user's, unless it is a checkpoint.
-        written = (name for name, time in _times(directory.work).items() if before.get(name) != time)
-        directory.claim(*sorted({*written, *(name for name in before if name.startswith(f"{FOLDER}/"))}))
         directory.publish()
     for gel, comparison in result.comparisons.items():
         click.echo(f"{gel}: {comparison.undecidable} of {len(comparison.single)} data sets cannot tell the laws apart")
     click.echo(f"report: {folder / page.name}" + (" (synthetic twin, no measurement)" if plan.synthetic else ""))
-
-
-def _times(folder: Path) -> dict[str, int]:
-    """When each file was last written, ns, by its name."""
-    files = (p for p in folder.rglob("*") if p.is_file() and not p.name.startswith("."))
-    return {p.relative_to(folder).as_posix(): p.stat().st_mtime_ns for p in files}
-
-
-def _to_continue(kept: str) -> str:
-    words = [word for word in sys.argv[1:] if word not in ("--force", "--resume")]
-    return f"{kept}\nto continue: {shlex.join(['en4dvar', *words, '--resume'])}"
-
-
-def _overrides(settings: tuple[str, ...], data: str | None) -> dict[str, Any]:
-    overrides: dict[str, Any] = {}
-    for item in settings:
-        key, equals, value = item.partition("=")
-        if not equals:
-            raise click.BadParameter(f"{item!r} is not KEY=VALUE", param_hint="--set")
-        overrides[key.strip()] = value
-    return overrides | ({"data.path": [str(Path(data).absolute())]} if data else {})
-
-
-def _bar(total: int) -> Any:
-    """A context that gives a progress callback on a terminal, else None."""
-    from contextlib import contextmanager
-
-    from rich.console import Console
-    from rich.progress import Progress
-
-    from en4dvar.runs.progress import shown as on_terminal
-
-    @contextmanager
-    def shown() -> Any:
-        console = Console(stderr=True)
-        if not console.is_terminal:
-            yield None
-            return
-        with on_terminal(Progress(console=console, transient=True)) as bar:
-            task = bar.add_task("trajectories", total=total)
-            yield lambda done, _: bar.update(task, completed=done)
-
-    return shown()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 
 DECISIVE = 3.0  # |Δ log-evidence|: odds of 20 to 1
 MISFIT = 2.0  # χ² per reading above which a model is not one of those to choose from
@@ -29,7 +29,7 @@ class Comparison:
 
     @property
     def independent(self) -> float:
-        """Of all data sets, every bubble in a gel of its own."""
+        """Evidence of all data sets, every bubble in a gel of its own."""
         return float(self.single.sum())
 
     @property

@@ -1,4 +1,4 @@
-"""What the study computes of each gel and model, and what can be said of it."""
+"""The fits of the study for each gel and model, and their summaries."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.analysis import Analysis
-from en4dvar.diagnostics import nrmse
-from en4dvar.errors import DataError
-from en4dvar.population import Population
-from en4dvar.prior import Prior
+from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.diagnosis.diagnostics import nrmse
+from en4dvar.estimation.population import Population
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.files import read_text
+from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.evidence import Evidence
 from en4dvar.sampling.sweep import SweepResult
-from en4dvar.state import Array
 from en4dvar_agarose.evidence import Comparison
 from en4dvar_agarose.paper import Model, Route
 from en4dvar_agarose.settings import StudyPlan
@@ -41,7 +42,8 @@ class Fit:
         """(S,) ln p(y); by Laplace's approximation where it was not computed."""
         if self.evidence is None:
             return self.laplace_evidence
-        return self.evidence.log - np.array([p.observations.log_normalisation() for p in self.problems])
+        constants: Array = np.array([p.observations.log_normalisation() for p in self.problems])
+        return self.evidence.log - constants
 
     @property
     def laplace_evidence(self) -> Array:
@@ -54,7 +56,7 @@ class Fit:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the data sets."""
+        """Names of the data sets."""
         return tuple(p.observations.name for p in self.problems)
 
     @property
@@ -100,7 +102,8 @@ class Fit:
         """(S·N,) posterior members of all sets, SI; failed ones left out."""
         j = self.prior.names.index(name)
         stacked = np.concatenate([a.posterior[:, j] for a in self.analyses])
-        return stacked[np.isfinite(stacked)]
+        finite: Array = stacked[np.isfinite(stacked)]
+        return finite
 
     def prior_members(self, name: str) -> Array:
         """(N,) members of the prior, SI."""
@@ -122,7 +125,7 @@ class Study:
     narrow: Mapping[str, Fit] = field(default_factory=dict)
 
     def any_fit(self, gel: str) -> Fit:
-        """Of some model; all have the same data sets."""
+        """The fit of some model; all have the same data sets."""
         return next(iter(self.fits[gel].values()))
 
     def true_values(self, gel: str, name: str) -> Array:
@@ -145,7 +148,7 @@ class Study:
 def read_truth(path: Path) -> dict[str, dict[str, float]]:
     """Data set → parameter → SI value, of a ``truth.csv`` of a synthetic campaign. Raises :class:`DataError`."""
     try:
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+        lines = [line for line in read_text(path).splitlines() if not line.startswith("#")]
         rows = list(csv.DictReader(lines))
         return {
             row["dataset"]: {name: factor * float(row[column]) for column, (name, factor) in _TRUTH_UNITS.items()}

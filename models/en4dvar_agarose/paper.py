@@ -1,4 +1,4 @@
-"""What Mancia et al. (2021), "Acoustic Cavitation Rheometry", prints: tables 1 and 2, in the units it prints them.
+"""Tables of Mancia et al. (2021), "Acoustic Cavitation Rheometry": tables 1 and 2, in the units it prints them.
 
 Its agarose measurements are not public; nothing here enters an inference.
 """

@@ -9,11 +9,13 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from en4dvar.files import inside, make_folder, write_text
-from en4dvar.population import HyperPrior
+from en4dvar.estimation.population import HyperPrior
+from en4dvar.plumbing.files import inside, make_folder, write_text
+from en4dvar.report.chart import COLUMN
+from en4dvar.report.drawing import keep
 from en4dvar.report.palette import DARK, LIGHT, css_variables
-from en4dvar.report.style import COLUMN, inline_svg, save_figure
-from en4dvar_agarose import measured, tables
+from en4dvar.report.svg import svg
+from en4dvar_agarose import measured, paper, tables
 from en4dvar_agarose.evidence import DECISIVE, MISFIT, probability, verdict
 from en4dvar_agarose.figures import all_figures
 from en4dvar_agarose.fits import Study
@@ -22,6 +24,11 @@ from en4dvar_agarose.store import study_netcdf
 
 ROUTE_KEYS: tuple[Route, ...] = ("sweep", "en4dvar")
 Rows = list[list[str]]
+TABLES = tuple(f"table{number}.{suffix}" for number in (1, 2) for suffix in ("csv", "md", "tex"))
+FILES = (  # of a study; ``*`` stands for any text
+    *TABLES, "sets.csv", "study.yaml", "study.nc", "study.html", "figures/*.png", "figures/*.pdf",
+    "checkpoints/*", "checkpoints/sweep_*/*",
+)  # fmt: skip
 
 
 def write_study(study: Study, directory: Path) -> Path:
@@ -36,11 +43,10 @@ def write_study(study: Study, directory: Path) -> Path:
     write_text(directory / "study.yaml", study.plan.text)
     study_netcdf(study).write(directory / "study.nc")
     figures = []
-    for drawn in all_figures(study):
-        save_figure(drawn.figure, figures_folder, drawn.name)
-        svg = Markup(inline_svg(drawn.figure, drawn.name, drawn.caption))
-        wide = drawn.figure.get_size_inches()[0] > 1.5 * COLUMN
-        figures.append({"name": drawn.name, "caption": drawn.caption, "svg": svg, "wide": wide})
+    for name, caption, chart in all_figures(study):
+        keep(chart, figures_folder, name)
+        wide = chart.width > 1.5 * COLUMN
+        figures.append({"name": name, "caption": caption, "svg": svg(chart, name, caption), "wide": wide})
     return write_text(directory / "study.html", _page(study, figures))
 
 
@@ -99,24 +105,24 @@ def _reliability() -> Rows:
 
 def findings(study: Study) -> list[str]:
     """The paper's qualitative findings, in numbers of this study."""
-    found = []
+    sentences = []
     for gel, models in study.fits.items():
         for route in ROUTE_KEYS:
             if {"nh", "qlkv"} <= set(models):
                 nh, general = (models[m].summary(route, "G")[0] for m in ("nh", "qlkv"))
                 mu = {m: models[m].summary(route, "mu")[0] for m in models}
                 viscosities = ", ".join(f"{LABELS[m]} {v:.3f}" for m, v in mu.items())
-                found.append(
+                sentences.append(
                     f"{gel}, {ROUTES[route]}: G of the neo-Hookean law is {nh / general:.1f} times that of the general "
                     f"quadratic law; μ hardly depends on the model ({viscosities} Pa s)."
                 )
-    found += [words_of for gel in study.fits if (words_of := _apparent_modulus(study, gel))]
+    sentences += [words_of for gel in study.fits if (words_of := _apparent_modulus(study, gel))]
     for route in ROUTE_KEYS:
         used = [m for m in NAMES if any(m in models for models in study.fits.values())]
         scores = {m: np.concatenate([f[m].nrmse(route) for f in study.fits.values() if m in f]) for m in used}
         words = ", ".join(f"{LABELS[m]} {v.min():.3f} to {v.max():.3f}, mean {v.mean():.3f}" for m, v in scores.items())
-        found.append(f"NRMSE, {ROUTES[route]}: {words}.")
-    return found
+        sentences.append(f"NRMSE, {ROUTES[route]}: {words}.")
+    return sentences
 
 
 def _apparent_modulus(study: Study, gel: str) -> str:
@@ -166,7 +172,7 @@ def _narrow(study: Study) -> Rows:
             j = fit.prior.names.index("R0")
             guess, spread = (np.exp(fit.prior.mean[j]) * 1e6, fit.prior.std[j])
             mean, std = (1e6 * v for v in fit.summary("en4dvar", "R0"))
-            printed = tables.plus_minus(tables.TABLES["en4dvar"][gel]["qlkv"]["R0"])
+            printed = tables.plus_minus(paper.TABLES["en4dvar"][gel]["qlkv"]["R0"])
             prior, dfs = f"{guess:.3g} µm, ± {100 * spread:.0f} %", f"{100 * fit.dfs()['R0']:.0f} %"
             estimates, lowest = tables.plus_minus((mean, std)), f"{fit.nrmse('en4dvar').min():.3f}"
             rows.append([gel, words, prior, estimates, printed, dfs, lowest])
@@ -183,13 +189,13 @@ def _coverage(study: Study) -> Rows:
 
 def _population(study: Study) -> Rows:
     rows = []
-    for gel, found in study.populations.items():
+    for gel, distribution in study.populations.items():
         fit = study.fits[gel]["qlkv"]
-        interval = found.interval()
+        interval = distribution.interval()
         for q in QUANTITIES:
-            j = found.names.index(q.name)
+            j = distribution.names.index(q.name)
             stacked, truth = fit.members(q.name) * q.factor, study.true_values(gel, q.name) * q.factor
-            mean, std = (np.median(values[:, j]) * q.factor for values in (found.mean, found.std))
+            mean, std = (np.median(values[:, j]) * q.factor for values in (distribution.mean, distribution.std))
             low, high = interval[:, j] * q.factor
             known = tables.plus_minus((truth.mean(), truth.std(ddof=1))) if len(truth) > 1 else "–"
             cells = [f"{mean:.3g} [{low:.3g}, {high:.3g}]", f"{std:.2g}"]
@@ -210,16 +216,22 @@ def _effective(study: Study) -> str:
 
 def _comparison(study: Study) -> Rows:
     rows = []
-    for gel, found in study.comparisons.items():
+    for gel, comparison in study.comparisons.items():
         compared = [
             (name, value, verdict(value))
-            for name, value in zip(study.fits[gel]["qlkv"].names, found.single, strict=True)
+            for name, value in zip(study.fits[gel]["qlkv"].names, comparison.single, strict=True)
         ]
-        misfit = f"no verdict: no single gel fits (χ² per reading {found.chi2[0]:.1f} and {found.chi2[1]:.1f})"
+        misfit = (
+            f"no verdict: no single gel fits (χ² per reading {comparison.chi2[0]:.1f} and {comparison.chi2[1]:.1f})"
+        )
         compared += [
-            ("all sets, a gel each", found.independent, verdict(found.independent)),
-            ("all sets, one population", found.population, verdict(found.population)),
-            ("all sets, one gel", found.shared, misfit if min(found.chi2) > MISFIT else verdict(found.shared)),
+            ("all sets, a gel each", comparison.independent, verdict(comparison.independent)),
+            ("all sets, one population", comparison.population, verdict(comparison.population)),
+            (
+                "all sets, one gel",
+                comparison.shared,
+                misfit if min(comparison.chi2) > MISFIT else verdict(comparison.shared),
+            ),
         ]
         for words, value, judgement in compared:
             rows.append([gel, words, f"{value:+.1f}", f"{float(probability(np.array(value))):.2f}", judgement])
@@ -227,7 +239,7 @@ def _comparison(study: Study) -> Rows:
 
 
 def _judged(study: Study) -> dict[str, Any]:
-    """What the evidences of single sets are worth, and how many decide."""
+    """Reliability of the evidences of single sets, and how many of them decide."""
     fits = [study.fits[gel][model] for gel in study.comparisons for model in ("nh", "qlkv")]
     return {
         "fewest": min((float(fit.evidence.effective.min()) for fit in fits if fit.evidence is not None), default=0.0),

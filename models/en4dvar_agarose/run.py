@@ -11,14 +11,14 @@ from functools import partial
 
 import numpy as np
 
-from en4dvar.assimilate import assimilate
-from en4dvar.config.build import build
+from en4dvar.assembly.build import build
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.joint import estimate_jointly, sharing
+from en4dvar.estimation.joint.estimate import Single
+from en4dvar.estimation.population import Population, estimate_population
 from en4dvar.executor import Executor, make_executor
-from en4dvar.forward import ForwardModel
-from en4dvar.joint import estimate_jointly, sharing
-from en4dvar.joint.estimate import Single
-from en4dvar.population import Population, estimate_population
-from en4dvar.prior import Prior, own_seed
+from en4dvar.model.forward import ForwardModel
+from en4dvar.priors.prior import Prior, own_seed
 from en4dvar.problem import InverseProblem
 from en4dvar.sampling.evidence import Evidence, sampled_evidence
 from en4dvar.sampling.forward_runs import ForwardRuns
@@ -82,7 +82,7 @@ class _Parts:
         self.seconds[part] = time.perf_counter() - start
 
     def kept(self, kind: type[D], compute: Callable[[], D], fit: Fit) -> D:
-        """What ``compute`` gives, or gave before the study was interrupted."""
+        """The result of ``compute``, of now or of before the study was interrupted."""
         return self.keep.of(kind, compute, fit.gel, fit.model) if self.keep else compute()
 
     def sweeps(
@@ -92,7 +92,7 @@ class _Parts:
         groups: dict[object, list[tuple[str, Model]]] = {}
         for (gel, model), sets in problems.items():
             groups.setdefault((model, tuple(sorted(sets[0].fixed.items()))), []).append((gel, model))
-        found = {}
+        sweeps = {}
         for keys in groups.values():
             every, began = one_model([p for key in keys for p in problems[key]]), time.perf_counter()
             folder = self.keep.sweep(*keys[0]) if self.keep else None
@@ -101,22 +101,22 @@ class _Parts:
             )
             first = 0
             for key in keys:
-                found[key] = result.part(slice(first, first + len(problems[key])))
+                sweeps[key] = result.part(slice(first, first + len(problems[key])))
                 first += len(problems[key])
             words = " and ".join(f"{gel} {model}" for gel, model in keys)
             spent = time.perf_counter() - began
             self.say(
                 f"{words}: sweep of {result.trajectories} trajectories against {len(every)} data sets in {spent:.1f} s"
             )
-        return found
+        return sweeps
 
     def en4dvar(self, fit: Fit) -> Fit:
         """With the analyses of its problems."""
         began = time.perf_counter()
-        found = self._analysed(fit)
+        analyses = self._analysed(fit)
         spent = time.perf_counter() - began
         self.say(f"{fit.gel} {fit.model}: En4D-Var of {len(fit.problems)} data sets in {spent:.1f} s")
-        return found
+        return analyses
 
     def _analysed(self, fit: Fit) -> Fit:
         config = self.plan.configs[fit.gel][fit.model]
@@ -141,11 +141,11 @@ class _Parts:
         for gel, models in fits.items():
             for m, fit in models.items():
                 models[m] = replace(fit, evidence=self.kept(Evidence, partial(self._evidence, fit), fit))
-            found = {m: self._population(models[m]) for m in COMPARED if m in models}
-            if (general := found.get("qlkv")) is not None:
+            estimates = {m: self._population(models[m]) for m in COMPARED if m in models}
+            if (general := estimates.get("qlkv")) is not None:
                 populations[gel] = general
-            if len(found) == len(COMPARED):
-                comparisons[gel] = self._comparison(models, found)
+            if len(estimates) == len(COMPARED):
+                comparisons[gel] = self._comparison(models, estimates)
         return populations, comparisons
 
     def _runs(self, fit: Fit) -> ForwardRuns:
@@ -170,7 +170,9 @@ class _Parts:
 
     def _comparison(self, models: Mapping[Model, Fit], populations: Mapping[Model, Population | None]) -> Comparison:
         nh, general = (models[m] for m in COMPARED)
-        pooled = {m: math.nan if found is None else found.log_evidence for m, found in populations.items()}
+        pooled = {
+            m: math.nan if population is None else population.log_evidence for m, population in populations.items()
+        }
         one_nh, one_general = (self.kept(OneGel, partial(self._one_gel, fit), fit) for fit in (nh, general))
         return Comparison(
             single=general.log_evidence - nh.log_evidence,
@@ -187,9 +189,9 @@ class _Parts:
             for a in fit.analyses
         ]
         settings = self.plan.configs[fit.gel][fit.model].assimilation
-        found = estimate_jointly(sharing(fit.problems, names), settings, self.plan.seed, self.executor, singles)
+        joint = estimate_jointly(sharing(fit.problems, names), settings, self.plan.seed, self.executor, singles)
         readings = np.array([len(p.observations) for p in fit.problems])
-        return OneGel(found.log_evidence, float(found.chi2 @ readings / readings.sum()))
+        return OneGel(joint.log_evidence, float(joint.chi2 @ readings / readings.sum()))
 
 
 def one_model(problems: Sequence[InverseProblem]) -> list[InverseProblem]:

@@ -12,10 +12,10 @@ from en4dvar.config import Config, load_config
 from en4dvar.config.document import Document, override, read_document
 from en4dvar.config.schema import Name, QuantityText, Section
 from en4dvar.config.validate import check
-from en4dvar.errors import ConfigError, Fault
-from en4dvar.population import Effort
+from en4dvar.estimation.population import Effort
+from en4dvar.plumbing.errors import ConfigError, Fault
+from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar.sampling.sweep import SweepSettings
-from en4dvar.units import UnitError, parse_quantity
 from en4dvar_agarose.paper import Model
 
 MODELS: tuple[Model, ...] = ("nh", "qs", "qlkv")
@@ -46,7 +46,7 @@ class Sweep(Section):
 
 
 class PopulationSection(Section):
-    """How much the population estimate computes; see :mod:`en4dvar.population`."""
+    """How much the population estimate computes; see :mod:`en4dvar.estimation.population`."""
 
     rounds: Annotated[int, Field(ge=30)] = Effort.rounds
     """Rounds of the walkers over each data set, from which its emulator is learnt."""
@@ -125,7 +125,7 @@ def load_study(path: str | Path, overrides: dict[str, Any] | None = None) -> Stu
 def _configs(
     gel: str, files: dict[str, str], base: Path, document: Document, faults: list[Fault]
 ) -> dict[Model, Config]:
-    found: dict[Model, Config] = {}
+    configs: dict[Model, Config] = {}
     for name in files:
         if name not in MODELS:
             faults.append(document.fault(("gels", gel, name), f"write one of {', '.join(MODELS)}", at_key=True))
@@ -133,7 +133,7 @@ def _configs(
         if model not in files:
             continue
         try:
-            found[model] = load_config(base / files[model])
+            configs[model] = load_config(base / files[model])
         except ConfigError as error:
             faults += error.problems
-    return found
+    return configs

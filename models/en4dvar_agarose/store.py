@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.population import Population
-from en4dvar.state import Parameter
-from en4dvar.storage.netcdf import Group, Variable, to_bytes
-from en4dvar.storage.seal import SealedBytes
+from en4dvar.estimation.population import Population
+from en4dvar.model.state import Parameter
+from en4dvar.results.netcdf import Group, Variable, to_bytes
+from en4dvar.results.seal import SealedBytes
 from en4dvar_agarose.fits import Fit, Study
+from en4dvar_agarose.paper import Route
 
 
 def study_netcdf(study: Study) -> SealedBytes:
@@ -52,8 +53,9 @@ def _fit(study: Study, fit: Fit) -> Group:
     for j, p in enumerate(fit.sweep.parameters):
         variables[f"sweep_{p.name}"] = Variable(("dataset",), fit.sweep.theta[:, j], _words(p))
     variables["sweep_t_s"] = Variable(("dataset",), fit.sweep.shift, {"units": "s", "long_name": "time shift"})
-    for route, words in (("sweep", "best fit of the sweep"), ("en4dvar", "centre of the posterior")):
-        variables[f"nrmse_{route}"] = _plain(fit.nrmse(route), f"NRMSE, {words}")  # type: ignore[arg-type]
+    of_routes: dict[Route, str] = {"sweep": "best fit of the sweep", "en4dvar": "centre of the posterior"}
+    for route, words in of_routes.items():
+        variables[f"nrmse_{route}"] = _plain(fit.nrmse(route), f"NRMSE, {words}")
     variables["log_evidence"] = _plain(fit.log_evidence, "log-evidence, adaptive importance sampling")
     if fit.evidence is not None:
         variables["evidence_draws"] = _plain(fit.evidence.effective, "effective number of draws of the log-evidence")
@@ -61,19 +63,19 @@ def _fit(study: Study, fit: Fit) -> Group:
     return Group(variables, coords)
 
 
-def _population(found: Population) -> Group:
-    terms = {t.parameter.name: t.parameter for t in found.prior.terms}
+def _population(population: Population) -> Group:
+    terms = {t.parameter.name: t.parameter for t in population.prior.terms}
     variables: dict[str, Variable] = {}
-    for j, name in enumerate(found.names):
+    for j, name in enumerate(population.names):
         about = _words(terms[name])
-        variables[f"mean_{name}"] = Variable(("draw",), found.mean[:, j], about)
-        variables[f"spread_{name}"] = Variable(("draw",), found.std[:, j], about)
+        variables[f"mean_{name}"] = Variable(("draw",), population.mean[:, j], about)
+        variables[f"spread_{name}"] = Variable(("draw",), population.std[:, j], about)
     judged = {
-        "effective_draws": found.size,
-        "effective_draws_emulators": found.weighed[0],
-        "effective_draws_forward_runs": found.weighed[1],
-        "log_evidence": found.log_evidence,
-        "forward_runs": found.forward_runs,
+        "effective_draws": population.size,
+        "effective_draws_emulators": population.weighed[0],
+        "effective_draws_forward_runs": population.weighed[1],
+        "log_evidence": population.log_evidence,
+        "forward_runs": population.forward_runs,
     }
     return Group(variables, attrs=judged)
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from en4dvar.plumbing.tables import csv_text
+from en4dvar.plumbing.units import convert
 from en4dvar.sampling.sweep import SweepResult
-from en4dvar.tables import csv_text
-from en4dvar.units import convert
 
 
 def sweep_csv(result: SweepResult) -> str:

@@ -77,10 +77,10 @@ def plus_minus(pair: Pair | None, sign: str = "±") -> str:
 
 
 def sources(study: Study) -> dict[Source, str]:
-    """What stands in a cell, with its heading."""
+    """The values of a cell, each with its heading."""
     mine = f"this work ({SYNTHETIC})" if study.plan.synthetic else "this work"
-    found: dict[Source, str] = {"paper": "paper", "computed": mine}
-    return {**found, "truth": "truth of the twin"} if study.truth else found
+    sources: dict[Source, str] = {"paper": "paper", "computed": mine}
+    return {**sources, "truth": "truth of the twin"} if study.truth else sources
 
 
 def as_csv(study: Study, rows: Sequence[Row], route: Route) -> str:

@@ -2,7 +2,8 @@
 
 Sizes: a hydrophone states the amplitude within 5 to 10 %; weather moves the ambient pressure by 2 % about its mean,
 1000 m of height by 11 %; the rheometry codes take 0.056 to 0.072 N/m for the surface tension of water in a gel; a
-calibration target gives the scale of the picture within about 1 %.
+calibration target gives the scale of the picture within about 1 %; the density of a gel is water's or up to 6 % more,
+its speed of sound that of water or 3 % more.
 """
 
 from __future__ import annotations
@@ -10,12 +11,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any, cast
 
-from en4dvar.forward import Alternative, ForwardModel
+from en4dvar.model.forward import Alternative, ForwardModel
 from en4dvar_bubble.dynamics import Dynamics
 from en4dvar_bubble.gas import saturated_vapour_pressure
 
 PULSE, AMBIENT, SURFACE, REST, SCALE, CLOCK = 1.05, 1.02, 0.8, 1.1, 1.01, 1.01
+DENSITY, SOUND = 1.03, 1.03
 
 
 @lru_cache(maxsize=4)  # the data sets of a campaign share their model; not in the model, which is sent to workers
@@ -24,7 +27,7 @@ def alternatives(model: ForwardModel) -> tuple[Alternative, ...]:
     step; none in whose equations a parameter of the model has no place.
     """
     assert isinstance(model, Dynamics)
-    return tuple(one for one in _alternatives(model) if one.model is None or _names(one.model) == _names(model))
+    return tuple(a for a in _alternatives(model) if a.model is None or _names(a.model) == _names(model))
 
 
 def _names(model: ForwardModel) -> list[str]:
@@ -32,8 +35,8 @@ def _names(model: ForwardModel) -> list[str]:
 
 
 def _alternatives(model: Dynamics) -> Iterator[Alternative]:
-    def changed(name: str, words: str, **options: object) -> Alternative:
-        return Alternative(name, words, replace(model, **options))  # type: ignore[arg-type]
+    def changed(name: str, words: str, **options: Any) -> Alternative:
+        return Alternative(name, words, replace(cast(Any, model), **options))
 
     medium, driving, rest = model.medium, model.driving, model.stress_free_radius
     saturated = replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))
@@ -43,6 +46,12 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
     if "p_inf" not in model.named:
         pressure = replace(medium, p_inf=AMBIENT * medium.p_inf)
         yield changed("ambient_pressure", "the ambient pressure were 2 % higher", medium=pressure)
+    if "rho" not in model.named:
+        denser = replace(medium, rho=DENSITY * medium.rho)
+        yield changed("density", "the medium were 3 % denser", medium=denser)
+    if "c" not in model.named:
+        faster = replace(medium, c=SOUND * medium.c)
+        yield changed("sound_speed", "sound were 3 % faster in the medium", medium=faster)
     if "surface_tension" not in model.named:
         tension = replace(medium, S=SURFACE * medium.S)
         yield changed("surface_tension", "the surface tension were 20 % lower", medium=tension)
@@ -52,7 +61,7 @@ def _alternatives(model: Dynamics) -> Iterator[Alternative]:
         cold = replace(model, medium_heat="cold")
         simple = replace(cold, vapour="none", medium=saturated) if model.vapour == "transport" else cold
         words = "the gas were polytropic (gas: polytropic)"
-        yield Alternative("gas_model", words, replace(simple, gas="polytropic"))  # type: ignore[arg-type]
+        yield Alternative("gas_model", words, replace(cast(Any, simple), gas="polytropic"))
     if model.medium_heat == "conducting":
         yield changed("medium_heat", "the gel stayed cold at the wall (medium_heat: cold)", medium_heat="cold")
     if "p_v" in model.named:

@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.errors import ConfigError
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar_bubble.driving import Driving, Reading
-from en4dvar_bubble.dynamics import Gas, Heat, Start, Vapour
+from en4dvar_bubble.dynamics import Gas, Heat, Start, Vapour, Wall
 from en4dvar_bubble.gas import from_kirchhoff
 from en4dvar_bubble.laws import ConstitutiveLaw, get_law
 from en4dvar_bubble.medium import WATER_25C, Medium
@@ -50,6 +50,7 @@ def simulate(
     radial: Radial = "keller-miksis",
     vapour: Vapour = "none",
     medium_heat: Heat = "cold",
+    wall: Wall | None = None,
     accuracy: AccuracyName | Accuracy = "standard",
     workers: int = 1,
 ) -> xr.Dataset:
@@ -63,7 +64,7 @@ def simulate(
         :mod:`en4dvar_bubble.numbers` (``p_A``, ``surface_tension``, ``c``, …) in place of the model's.
     times: output times (time,) in s, increasing; time zero is the start of the simulation (laser: the instant of
         R_max).
-    start, gas, driving, driving_read, medium, radial, vapour, medium_heat, accuracy: the model, see
+    start, gas, driving, driving_read, medium, radial, vapour, medium_heat, wall, accuracy: the model, see
         :class:`BubbleModel`; by default the acoustic start with the histotripsy pulse and the constants of water at
         25 °C, p_f read at t, heat equation in the gas with a cold wall.
     workers: threads at most (few members are integrated by one); the result does not depend on it.
@@ -88,12 +89,13 @@ def simulate(
             law=chosen,
             gas=gas,
             start=start,
-            driving=driving,  # type: ignore[arg-type]
+            driving=cast(Driving, driving),
             reading=driving_read,
             medium=medium,
             radial=radial,
             vapour=vapour,
             medium_heat=medium_heat,
+            wall=wall,
             accuracy=preset(accuracy, start) if isinstance(accuracy, str) else accuracy,
         )
     except ValueError as error:
@@ -187,24 +189,25 @@ def _dataset(model: BubbleModel, theta: Mapping[str, Array], t: Array, out: _Out
         "radial": model.radial,
         "vapour": model.vapour,
         "medium_heat": model.medium_heat,
+        "wall": f"{model.wall.kind}, {model.wall.distance:.6g} m" if model.wall else "none",
         "constants": medium.json,
     }
     return xr.Dataset(data, coords=coordinates, attrs=attributes)
 
 
-def _members(model: BubbleModel, given: dict[str, npt.ArrayLike]) -> dict[str, Array]:
+def _members(model: BubbleModel, values: dict[str, npt.ArrayLike]) -> dict[str, Array]:
     """Parameters as arrays of one length. Raises :class:`ConfigError`."""
-    if model.start == "laser" and "R0" in given and "R_eq" not in given:
-        given["R_eq"] = given.pop("R0")
+    if model.start == "laser" and "R0" in values and "R_eq" not in values:
+        values["R_eq"] = values.pop("R0")
     wanted = {p.name: p for p in model.parameters}
-    missing = [f"{n} ({wanted[n].unit})" for n in wanted if n not in given]
-    unknown = [n for n in given if n not in wanted]
+    missing = [f"{n} ({wanted[n].unit})" for n in wanted if n not in values]
+    unknown = [n for n in values if n not in wanted]
     if missing or unknown:
         parts = [f"missing {', '.join(missing)}"] * bool(missing) + [f"unknown {', '.join(unknown)}"] * bool(unknown)
         raise ConfigError(
             f"parameters: {'; '.join(parts)} ({model.law.name}, {model.start} start, takes {', '.join(wanted)})"
         )
-    arrays = {n: np.atleast_1d(np.asarray(v, dtype=float)) for n, v in given.items()}
+    arrays = {n: np.atleast_1d(np.asarray(v, dtype=float)) for n, v in values.items()}
     lengths = {len(a) for a in arrays.values()} - {1}
     if len(lengths) > 1 or any(a.ndim != 1 for a in arrays.values()):
         raise ConfigError(f"parameters: lengths differ: { {n: a.shape for n, a in arrays.items()} }")

@@ -18,9 +18,10 @@ neo-Hookean spring adds G/2 (5 − 4/λ − 1/λ⁴) < 5/2 G to the pressure, su
 From above it is bounded by r < 1.1 + 2.2/(Re − 3), Re = R_max √(ρ p_∞)/μ (none below Re = 3), an envelope of forward
 runs (20 to 500 µm, R_max/R_eq of 5 to 12, G from 0.1 to 42 kPa; tests/bubble/test_collapse.py holds it to them).
 
-How stiff or thick a gel can be no formula says: :data:`STIFF` and :data:`THICK` are what is taken for granted, well
-above what has been published of gels that bubbles were used on. A prior that expects more is believed; so are prior
-members below both that come as far, for a law that stiffens, or a pulse, does what no neo-Hookean spring can.
+How stiff or thick a gel can be no formula says. :data:`COMMON` is what is taken for granted, well above what has been
+published of gels that bubbles were used on; beyond it a history is doubted and its estimate printed, beyond
+:data:`EXTREME` it cannot be right. A prior that expects more is believed; so are prior members within ``COMMON`` that
+come as far, for a law that stiffens, or a pulse, does what no neo-Hookean spring can.
 """
 
 from __future__ import annotations
@@ -28,25 +29,36 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import stdtrit
 
-from en4dvar.errors import DataError
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution, caution
+from en4dvar.plumbing.errors import DataError
 from en4dvar_bubble.medium import Medium
 
 RAYLEIGH = 0.914681  # of the empty bubble: Rayleigh (1917)
 LOWEST = 0.4  # of R_max: the part of the collapse that R^{5/2} is fitted to
 TOLD = 0.6  # of R_max: a window that ends above does not tell the collapse time
-STIFF = 20e3  # Pa; published: 7.7 kPa (Estrada et al. 2018), stiff polyacrylamide
-THICK = 0.3  # Pa s; published: 0.19 (Yang et al. 2020)
 SOFT = 1.02  # r of a large bubble in a soft gel, whose gas and viscosity prolong its collapse a little
 APART = 1.05  # noise and physics that the model lacks move r by less than this
 TAILS = 0.5  # of the range of the members' ln r: 48 of a Gaussian reach 2.2 standard deviations, with tails twice that
 SURE = 0.99  # one-sided probability, by the scatter of the samples
 SAME_FACTOR = 1.12  # a factor that is this close to that of a known mistake may be it
+
+
+class Gel(NamedTuple):
+    """Modulus (Pa) and viscosity (Pa s)."""
+
+    G: float
+    mu: float
+
+
+COMMON = Gel(20e3, 0.3)  # published: 7.7 kPa (Estrada et al. 2018), stiff polyacrylamide; 0.19 Pa s (Yang et al. 2020)
+EXTREME = Gel(100e3, 1.0)  # no bubble was used on more
 
 
 @dataclass(frozen=True)
@@ -103,15 +115,17 @@ def _falling(radius: Array) -> slice:
     top = first = last = int(np.argmax(radius))
     while first > 0 and radius[first - 1] > 0.95 * radius[top]:
         first -= 1
-    while last + 1 < len(radius) and LOWEST * radius[top] < radius[last + 1] <= radius[last] + 0.1 * radius[top]:
+    while last + 1 < len(radius) and LOWEST * radius[top] < radius[last + 1]:
+        if radius[last + 1 : last + 3].min() > radius[last] + 0.1 * radius[top]:  # one reading alone may be high
+            break
         last += 1
     return slice(first, last + 1)
 
 
-def bounds(R_max: float, medium: Medium) -> tuple[float, float]:
-    """Least and largest ratio of collapse time and Rayleigh time that are taken for granted; ``R_max`` in m."""
-    least = (1 + (2.5 * STIFF + 3 * medium.S / R_max) / medium.p_inf) ** -0.5
-    reynolds = R_max * math.sqrt(medium.rho * medium.p_inf) / THICK
+def bounds(R_max: float, medium: Medium, gel: Gel = COMMON) -> tuple[float, float]:
+    """Least and largest ratio of collapse time and Rayleigh time up to this ``gel``; ``R_max`` in m."""
+    least = (1 + (2.5 * gel.G + 3 * medium.S / R_max) / medium.p_inf) ** -0.5
+    reynolds = R_max * math.sqrt(medium.rho * medium.p_inf) / gel.mu
     return least, 1.1 + 2.2 / (reynolds - 3) if reynolds > 3 else math.inf
 
 
@@ -123,16 +137,20 @@ class Expected:
     common: npt.NDArray[np.bool_]
 
     def like(self, ratio: float, short: bool) -> bool:
-        """Whether a common gel comes as far to that side."""
+        """True if a common gel comes as far to that side."""
         r = self.ratios[self.common]
         return bool(np.any(r <= ratio) if short else np.any(r >= ratio))
 
     @property
     def range(self) -> tuple[float, float]:
-        """What the prior can bring about, members and the tails beyond them."""
+        """The range that the prior can bring about, members and the tails beyond them."""
         low, high = np.log([self.ratios.min(), self.ratios.max()])
         more = TAILS * (high - low)
         return math.exp(low - more), math.exp(high + more)
+
+    def reaches(self, ratio: float, apart: float) -> bool:
+        """True if a ratio lies within that range, up to the factor ``apart``."""
+        return self.range[0] / apart <= ratio <= self.range[1] * apart
 
 
 NOTHING = Expected(np.empty(0), np.empty(0, dtype=bool))
@@ -150,15 +168,23 @@ def doubt(view: Lobe, medium: Medium, expected: Expected = NOTHING) -> str:
     short, long = ratio * sure < least, ratio > largest * sure
     half = 2 * np.sum(ratios < least if short else ratios > largest) > len(ratios)
     if (short or long) and not half and not expected.like(ratio * apart if short else ratio / apart, short):
-        limit = f"{STIFF / 1e3:g} kPa allows no less than {least:.2f}"
+        limit = f"{COMMON.G / 1e3:g} kPa allows no less than {least:.2f}"
         if long:
-            limit = f"{THICK:g} Pa s allows no more than {largest:.2f}"
-        return f"{_measured(ratio)}; a gel of {limit}: {_explained(SOFT / ratio)}"
-    if len(ratios) and not expected.range[0] / apart <= ratio <= expected.range[1] * apart:
+            limit = f"{COMMON.mu:g} Pa s allows no more than {largest:.2f}"
+        more = f", or the gel is {'thicker' if long else 'stiffer'}" if conceivable(view, medium) else ""
+        return f"{_measured(ratio)}; a gel of {limit}: {_explained(SOFT / ratio)}{more}"
+    if len(ratios) and not expected.reaches(ratio, apart):
         usual = float(np.median(ratios))
         span = f"{min(ratios):.2f} to {max(ratios):.2f}"
         return f"{_measured(ratio)}; the prior expects {span}: {_explained(usual / ratio)}, or the prior is wrong"
     return ""
+
+
+def conceivable(view: Lobe, medium: Medium) -> bool:
+    """True if a gel up to :data:`EXTREME` collapses like this."""
+    least, largest = bounds(view.R_max, medium, EXTREME)
+    sure = 1 + view.margin
+    return least / sure <= view.rayleigh_ratio(medium) <= largest * sure
 
 
 def _measured(ratio: float) -> str:
@@ -177,8 +203,8 @@ def _explained(factor: float) -> str:
 
 def doubts(
     times: Array, radius: Array, predicted: Array, members: Mapping[str, Array], medium: Medium
-) -> tuple[str, ...]:
-    """:func:`doubt` of a window ``times`` (K,) s, ``radius`` (K,) m.
+) -> tuple[Caution, ...]:
+    """:func:`doubt` of a window ``times`` (K,) s, ``radius`` (K,) m; serious where only a wrong scale explains it.
 
     ``predicted`` (N, K) m are the prior members, ``members`` their parameters by name, (N,) each, SI.
     """
@@ -195,11 +221,18 @@ def doubts(
         except DataError:
             continue
         common.append(usual)
-    found = doubt(view, medium, Expected(np.array(ratios), np.array(common, dtype=bool)))
-    return (found,) if found else ()
+    expected = Expected(np.array(ratios), np.array(common, dtype=bool))
+    words = doubt(view, medium, expected)
+    if not words:
+        return ()
+    told = len(ratios) > 0 and expected.reaches(view.rayleigh_ratio(medium), max(APART, 1 + view.margin))
+    return (caution("implausible-data", words, "caution" if told and conceivable(view, medium) else None),)
 
 
 def _common(members: Mapping[str, Array], count: int) -> npt.NDArray[np.bool_]:
     """Of members, whether neither G nor μ, where the law has one, is beyond what is granted."""
-    limits = (("G", STIFF), ("mu", THICK))
-    return np.all([members[k] <= most for k, most in limits if k in members] or [np.ones(count, dtype=bool)], axis=0)
+    limits = COMMON._asdict().items()
+    within: npt.NDArray[np.bool_] = np.all(
+        [members[k] <= most for k, most in limits if k in members] or [np.ones(count, dtype=bool)], axis=0
+    )
+    return within

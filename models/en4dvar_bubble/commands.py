@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from en4dvar.errors import En4dvarError
-from en4dvar.user_file import is_from_file
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.user_file import is_from_file
 
 if TYPE_CHECKING:
     from en4dvar_bubble.laws import ConstitutiveLaw
@@ -44,11 +44,11 @@ def laws(names: tuple[str, ...], check: bool) -> None:
         chosen = [get_law(name) for name in names]
     else:
         chosen = []
-        for found in available().values():
-            if isinstance(found, En4dvarError):
-                broken.append(str(found))
+        for kind in available().values():
+            if isinstance(kind, En4dvarError):
+                broken.append(str(kind))
             else:
-                chosen.append(found())
+                chosen.append(kind())
     if check:
         broken += _check(chosen)
     else:
@@ -79,7 +79,7 @@ def _check(chosen: Sequence[ConstitutiveLaw]) -> list[str]:
 
 
 def _description(law: ConstitutiveLaw, in_full: bool) -> str:
-    from en4dvar.tables import table
+    from en4dvar.plumbing.tables import table
 
     rows = [
         (f"  {p.name}", p.unit, f"{p.bounds[0]:g} … {p.bounds[1]:g}", p.transform, p.label, p.source)

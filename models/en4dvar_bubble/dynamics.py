@@ -10,13 +10,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from en4dvar.state import Array, Field, Parameter, StateLayout
+from en4dvar.model.state import Array, Field, Parameter, StateLayout
 from en4dvar_bubble.driving import Driving, Reading, histotripsy, silence
 from en4dvar_bubble.gas import CRITICAL_TEMPERATURE, kirchhoff, mass_fraction, saturated_vapour_pressure
 from en4dvar_bubble.laws import ConstitutiveLaw, QuadraticKelvinVoigt
+from en4dvar_bubble.laws.exactness import refuse_inexact
 from en4dvar_bubble.laws.parameters import MANCIA, positive
 from en4dvar_bubble.medium import WATER_25C, Medium
-from en4dvar_bubble.numbers import ALL, GAS_CONTENT, OF_MEDIUM, P_A, R_START, RDOT_START
+from en4dvar_bubble.numbers import ALL, GAS_CONTENT, OF_MEDIUM, P_A, R_START, RDOT_START, WALL_DISTANCE
 from en4dvar_bubble.solver.driver import GAS_CLUSTERING, MEDIUM_LENGTHS, Accuracy, Radial, Solver, System, preset
 
 FIRST_ORDER = "an expansion to first order in the Mach number: Prosperetti & Lezzi (1986), J. Fluid Mech. 168, 457"
@@ -31,6 +32,14 @@ Gas = Literal["heat", "polytropic", "isothermal", "adiabatic"]
 Start = Literal["acoustic", "laser"]
 Vapour = Literal["none", "frozen", "transport"]
 Heat = Literal["cold", "conducting"]
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A plane at ``distance`` (m) from the centre of the bubble: ``rigid``, or the ``free`` surface of the medium."""
+
+    distance: float
+    kind: Literal["rigid", "free"] = "rigid"
 
 
 R0 = positive("R0", "m", "stress-free radius", "$R_0$", MANCIA, "um")
@@ -66,7 +75,7 @@ class Dynamics:
 
     Raises
     ------
-    ValueError: options that exclude each other.
+    ValueError: options that exclude each other; a law of a user's that the solver's table cannot hold.
     """
 
     law: ConstitutiveLaw = field(default_factory=QuadraticKelvinVoigt)
@@ -81,6 +90,8 @@ class Dynamics:
     medium_heat: Heat = "cold"
     hydrophone: float = 1.0
     """Its distance from the bubble, m (:mod:`emission`)."""
+    wall: Wall | None = None
+    """A plane whose image of the bubble, taken to move at the same instant, adds its pressure."""
     named: tuple[str, ...] = ()
     """Those of the :attr:`optional_parameters` that are parameters."""
 
@@ -89,6 +100,7 @@ class Dynamics:
             object.__setattr__(self, "driving", _usual_driving(self.start))
         if self.accuracy is None:
             object.__setattr__(self, "accuracy", preset("standard", self.start))
+        refuse_inexact(type(self.law))  # type: ignore[arg-type]  # mypy takes the class for unhashable
         if self.gas != "heat" and (self.vapour == "transport" or self.medium_heat != "cold"):
             raise ValueError("vapour transport and a conducting medium need gas: heat")
         if self.vapour != "none" and self.medium.p_v:
@@ -113,6 +125,7 @@ class Dynamics:
             shear=self.law.shear_dependent,
             clustering=GAS_CLUSTERING[self.start],
             medium_length=MEDIUM_LENGTHS[self.start],
+            image=self.wall is not None,
         )
 
     @cached_property
@@ -153,6 +166,7 @@ class Dynamics:
         # a constant vapour pressure would not follow the temperature
         acts |= {"p_v": self.vapour == "none", "T_inf": (heat or self.vapour != "none") and not self.medium.p_v}
         acts |= {"c": self.radial != "rayleigh-plesset", "kappa": self.gas != "isothermal"}
+        acts |= {WALL_DISTANCE.name: self.wall is not None}
         acts |= {P_A.name: not self.driving.silent}
         acts |= dict.fromkeys((R_START.name, RDOT_START.name), self.start == "acoustic")
         own = {p.name for p in self.law.parameters}
@@ -168,6 +182,13 @@ class Dynamics:
             if p.name in self.named
         }
         return replace(self.medium, **own) if own else self.medium
+
+    def image(self, values: Mapping[str, Array]) -> float | Array:
+        """±1/(2h) in 1/m for members with parameters name → (N,): + a rigid plane at the distance h, − a free one."""
+        if self.wall is None:
+            return 0.0
+        sign = 1.0 if self.wall.kind == "rigid" else -1.0
+        return sign / (2 * values.get(WALL_DISTANCE.name, np.float64(self.wall.distance)))
 
     @cached_property
     def layout(self) -> StateLayout:
@@ -194,6 +215,8 @@ class Dynamics:
         R = values.get(R_START.name, rest) if self.start == "acoustic" else values["R_max"]
         if np.any(rest <= 0) or np.any(R <= 0):
             raise ValueError("radii must be positive")
+        if self.wall is not None and np.all(values.get(WALL_DISTANCE.name, self.wall.distance) <= R):
+            raise ValueError("the bubble reaches the wall: R at time zero must be less than the distance of the wall")
         medium, layout, system = self.medium_of(values), self.layout, self.system
         p_v = medium.p_v if self.vapour == "none" else saturated_vapour_pressure(medium.T_inf)
         gas = (medium.p_inf + 2 * medium.S / rest - p_v) * (rest / R) ** 3 * values.get(GAS_CONTENT.name, 1.0)

@@ -1,4 +1,4 @@
-r"""What a hydrophone far from the bubble reads: the pressure of the wave that the bubble itself sends out.
+r"""The reading of a hydrophone far from the bubble: the pressure of the wave that the bubble itself sends out.
 
 Near the bubble the liquid is incompressible, far from it the wave is φ = −F(t − r/c)/r (Keller & Miksis 1980, J.
 Acoust. Soc. Am. 68, 628). Bernoulli's equation at the wall then gives
@@ -6,8 +6,9 @@ Acoust. Soc. Am. 68, 628). Bernoulli's equation at the wall then gives
     r p(r, t + r/c) = ρ F′ = R (p_L − p_∞ − p_f + ρ Ṙ²/2),        p_L = p_b − 2S/R + J − 4μ Ṙ/R,
 
 with the stress integral J of the medium: what the path knows, without a derivative of it. In an incompressible liquid
-this is ρ (R² R̈ + 2 R Ṙ²), the second derivative of the volume times ρ/4π. The pulse itself, which the hydrophone meets
-too, is not in it, nor are steepening and absorption on the way.
+this is ρ (R² R̈ + 2 R Ṙ²), the second derivative of the volume times ρ/4π. Near a plane the pressure of the image,
+±ρF′/(2h), belongs to the right-hand side; the wave that the plane reflects is left out. The pulse itself, which the
+hydrophone meets too, is not in it, nor are steepening and absorption on the way.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from en4dvar.forward import Observable
-from en4dvar.state import Array
+from en4dvar.model.forward import Observable
+from en4dvar.model.state import Array
 from en4dvar_bubble.paths import BubbleTrajectory, Paths
 
 
@@ -45,16 +46,18 @@ def emitted(paths: Paths) -> Array:
     if np.any(paths.start):
         raise ValueError("what the bubble sent out before is read from whole paths, which a resumed one is not")
     model: Any = paths.model
-    if "emitted" not in paths.found:
+    if "emitted" not in paths.derived:
         sent = paths.times - model.hydrophone / paths.medium(1).c
         if model.start == "acoustic":  # at rest before time zero
             sent = np.maximum(sent, 0.0)
         run = model.integrate(paths.initial, sent)
         medium, R, Rdot = run.medium(1), run["R"], run["Rdot"]
         excess = run["p_b"] - 2 * medium.S / R + run["S"] - medium.p_inf - _driving(run)
+        nearby = 1 + R * np.reshape(model.image(model.parameter_values(run.initial)), (-1, 1))  # the image's pressure
+        source = R * (excess + 0.5 * medium.rho * Rdot**2) / nearby
         lost = (run.solution.status != 0)[:, None]
-        paths.found["emitted"] = np.where(lost, np.nan, R * (excess + 0.5 * medium.rho * Rdot**2) / model.hydrophone)
-    return np.asarray(paths.found["emitted"])
+        paths.derived["emitted"] = np.where(lost, np.nan, source / model.hydrophone)
+    return np.asarray(paths.derived["emitted"])
 
 
 def _driving(run: Paths) -> Array:

@@ -1,4 +1,4 @@
-r"""What a bubble does at its turning points: largest radius, collapses, rebounds; observables that need no camera.
+r"""The turning points of a bubble: largest radius, collapses, rebounds; observables that need no camera.
 
 An event is where the wall stands still, Ṙ = 0: functionals of the path, the same whatever instant they are read at. The
 largest maximum comes first (a released bubble starts there), then collapses and rebounds in turn. The time of an event
@@ -17,8 +17,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from en4dvar.forward import Observable
-from en4dvar.state import Array
+from en4dvar.model.forward import Observable
+from en4dvar.model.state import Array
 from en4dvar_bubble.paths import BubbleTrajectory, Paths
 
 HORIZON = 2.0  # of the last reading
@@ -44,10 +44,10 @@ class Turning:
         return np.tile(self._of(trajectory)[:, None], (1, trajectory.times.shape[1]))
 
     def _of(self, paths: Paths) -> Array:
-        found = events(paths)
+        located = events(paths)
         if self.since is not None:
-            return np.asarray(found["time"][:, self.event] - found["time"][:, self.since])
-        return found[self.what][:, self.event]
+            return np.asarray(located["time"][:, self.event] - located["time"][:, self.since])
+        return located[self.what][:, self.event]
 
 
 def _observable(name: str, symbol: str, label: str, turning: Turning) -> Observable:
@@ -78,7 +78,7 @@ def events(paths: Paths) -> Mapping[str, Array]:
     if np.any(paths.start):
         raise ValueError("collapses and rebounds are read from whole paths, which a resumed one is not")
     model: Any = paths.model
-    if "events" not in paths.found:
+    if "events" not in paths.derived:
         until = HORIZON * np.max(paths.times, axis=1, keepdims=True)
         times = until * np.linspace(0, 1, GRID)
         low, high = _brackets(model.integrate(paths.initial, times), times)
@@ -94,11 +94,12 @@ def events(paths: Paths) -> Mapping[str, Array]:
             )
             lost = ~np.isfinite(low) | (run.solution.status != 0)[:, None]
         share = np.where(V0 == V1, 0.0, V0 / np.where(V0 == V1, 1.0, V0 - V1))
-        paths.found["events"] = {
+        paths.derived["events"] = {
             "time": np.where(lost, np.nan, low + share * (high - low)),
             "radius": np.where(lost, np.nan, R0 + 0.5 * share * V0 * (high - low)),
         }
-    return paths.found["events"]
+    events: Mapping[str, Array] = paths.derived["events"]
+    return events
 
 
 def _first_turn(V: Array) -> Any:

@@ -6,7 +6,7 @@ from typing import overload
 
 import numpy as np
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 from en4dvar_bubble.medium import Medium
 
 GAS_CONSTANT = 8.314462618

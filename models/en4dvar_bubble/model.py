@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from en4dvar.forward import (
+from en4dvar.model.forward import (
     Alternative,
     Failure,
     ForwardModel,
@@ -20,10 +20,11 @@ from en4dvar.forward import (
     Trajectory,
     ValidityLimit,
 )
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution
 from en4dvar_bubble.alternatives import alternatives
 from en4dvar_bubble.collapse import doubts
-from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics
+from en4dvar_bubble.dynamics import MACH_LIMITS, Dynamics, Wall
 from en4dvar_bubble.emission import OBSERVABLE
 from en4dvar_bubble.events import OBSERVABLES
 from en4dvar_bubble.numbers import NAMES
@@ -38,9 +39,9 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
     """A spherical gas bubble in a viscoelastic medium; what it assumes and its options: :class:`Dynamics`."""
 
     Settings: ClassVar[type[BubbleSettings]] = BubbleSettings
-    time_display_unit: ClassVar[str] = "us"
-    batch: ClassVar[int] = 8
-    compiled: ClassVar[bool] = True
+    time_display_unit = "us"
+    batch = 8
+    compiled = True
     observables = (
         Observable(
             "radius",
@@ -69,12 +70,13 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
             start=settings.start,
             driving=settings.driving.build(),
             reading=settings.driving_read,
-            medium=settings.medium,
+            medium=settings.liquid,
             accuracy=settings.solver_accuracy,
             radial=settings.radial,
             vapour=settings.vapour,
             medium_heat=settings.medium_heat,
             hydrophone=settings.hydrophone,
+            wall=None if settings.wall is None else Wall(settings.wall.distance, settings.wall.kind),
         )
 
     def with_parameters(self, names: Collection[str]) -> BubbleModel:
@@ -101,7 +103,7 @@ class BubbleModel(Dynamics, ForwardModel):  # type: ignore[override]
 
     def doubts(
         self, observable: str, times: Array, values: Array, predicted: Array, members: Mapping[str, Array]
-    ) -> Sequence[str]:
+    ) -> Sequence[Caution]:
         """Whether the collapse time can be right, see :mod:`en4dvar_bubble.collapse`."""
         return doubts(times, values, predicted, members, self.medium) if observable == "radius" else ()
 

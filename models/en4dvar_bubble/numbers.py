@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from en4dvar.state import Parameter
+from en4dvar.model.state import Parameter
 from en4dvar_bubble.driving.pulses import PULSES, numbers_of
 from en4dvar_bubble.driving.tabulated import OF_RECORD
 from en4dvar_bubble.medium import CONSTANTS
@@ -35,7 +35,7 @@ def _of(constant: Field[Any]) -> Parameter:
     least, most = bounds.get("gt", bounds.get("ge", 0.0)), bounds.get("le", np.inf)
     shown = "kPa" if about["unit"] == "Pa" else ""
     symbol = f"${_SYMBOLS.get(name, name)}$"
-    return Parameter(name, about["unit"], "lognormal", (least, most), label, symbol, shown, about["source"])
+    return Parameter(name, about["unit"], "lognormal", (least, most), label, symbol, shown, about["source"], True)
 
 
 def _of_medium() -> Iterator[tuple[str, Parameter]]:
@@ -43,7 +43,7 @@ def _of_medium() -> Iterator[tuple[str, Parameter]]:
         if constant.name not in _KNOWN:
             yield constant.name, _of(constant)
     label = "constant vapour pressure in the bubble"
-    yield "p_v", Parameter("p_v", "Pa", "lognormal", (0.0, np.inf), label, "$p_v$", "kPa")
+    yield "p_v", Parameter("p_v", "Pa", "lognormal", (0.0, np.inf), label, "$p_v$", "kPa", common=True)
 
 
 OF_MEDIUM: Mapping[str, Parameter] = MappingProxyType(dict(_of_medium()))
@@ -59,7 +59,17 @@ GAS_CONTENT = Parameter(
 )
 R_START = Parameter("R_start", "m", "lognormal", (0.0, np.inf), "radius at time zero", "$R(0)$", "um")
 RDOT_START = Parameter("Rdot_start", "m/s", "normal", label="velocity of the wall at time zero", symbol=r"$\dot{R}(0)$")
+WALL_DISTANCE = Parameter(
+    "wall_distance",
+    "m",
+    "lognormal",
+    (0.0, np.inf),
+    "distance of the wall from the centre of the bubble",
+    "$h$",
+    "um",
+    "Rattray (1951), PhD thesis, California Institute of Technology",
+)
 _OF_PULSES = {p.name: p for made in PULSES.values() for _, _, p in numbers_of(made)}
 _OF_PULSES |= {number.parameter.name: number.parameter for number in OF_RECORD}
-ALL = (*OF_MEDIUM.values(), P_A, GAS_CONTENT, R_START, RDOT_START, *_OF_PULSES.values())
+ALL = (*OF_MEDIUM.values(), P_A, GAS_CONTENT, R_START, RDOT_START, WALL_DISTANCE, *_OF_PULSES.values())
 NAMES = frozenset(p.name for p in ALL)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 from en4dvar_bubble.dynamics import Dynamics
 from en4dvar_bubble.gas import (
     GAS_CONSTANT,
@@ -70,8 +70,8 @@ def pack(model: Dynamics, x: Array, start: Array | float, times: Array) -> Packe
 
     def sampled(which: npt.NDArray[np.intp]) -> Array | None:
         """Of some members; the kernel divides by one density, those of their own are divided by here."""
-        found = law.samples({name: value[which] for name, value in values.items()})
-        return found * (1 / rho[which])[:, None] if found is not None and own_density else found  # type: ignore[index]
+        tabulated = law.samples({name: value[which] for name, value in values.items()})
+        return tabulated * (1 / np.asarray(rho)[which])[:, None] if tabulated is not None and own_density else tabulated
 
     some = sampled(first)
     if some is None:
@@ -156,7 +156,8 @@ def _memory(
         par[:, at], par[:, at + 1] = memory.relaxation_time[:, j] * 1e6, memory.convection[j]
         par[:, at + 2] = (member * system.memory + j) * (2 * GRID.cells * 8)
     tables = np.stack([memory.stiffness, memory.equilibrium], axis=2)
-    return (tables / np.reshape(rho, (-1, 1, 1, 1, 1))).reshape(-1, 1, 8)
+    packed: Array = (tables / np.reshape(rho, (-1, 1, 1, 1, 1))).reshape(-1, 1, 8)
+    return packed
 
 
 def _constants(model: Dynamics, medium: Medium, own: Mapping[str, Array], n_members: int) -> Array:
@@ -178,6 +179,7 @@ def _constants(model: Dynamics, medium: Medium, own: Mapping[str, Array], n_memb
     row[rows.DIFFUSION_T] = medium.D_T
     row[rows.SATURATION] = SATURATION / medium.rho
     row[rows.SATURATION_T] = SATURATION_TEMPERATURE / medium.T_inf
+    row[rows.IMAGE] = model.image(own) * 1e-6
     R_v = GAS_CONSTANT / medium.M_v
     row[rows.LATENT] = medium.L_v / (R_v * medium.T_inf) * medium.D_v * medium.rho / (medium.K_inf * medium.T_inf)
     row[rows.MEDIUM_K] = medium.K_m / medium.K_inf

@@ -7,9 +7,9 @@ from typing import Any, cast
 
 import numpy as np
 
-from en4dvar.batch import Batch
-from en4dvar.forward import Failure, Trajectory, ValidityLimit
-from en4dvar.state import Array, StateLayout
+from en4dvar.model.batch import Batch
+from en4dvar.model.forward import Failure, Trajectory, ValidityLimit
+from en4dvar.model.state import Array, StateLayout
 from en4dvar_bubble.dynamics import Dynamics
 from en4dvar_bubble.gas import from_kirchhoff, mass_fraction, saturated_vapour_pressure
 from en4dvar_bubble.laws.tabulate import GRID
@@ -24,7 +24,7 @@ from en4dvar_bubble.tables import evaluate
 class Paths(Batch):
     """Integrated members: ``initial`` states (N, n_state) at ``start`` (s), ``times`` (N, K) in s, the raw solution.
 
-    ``found``: what was computed from the paths as a whole (:mod:`en4dvar_bubble.events`).
+    ``derived``: what was computed from the paths as a whole (:mod:`en4dvar_bubble.events`).
     """
 
     model: Dynamics
@@ -33,12 +33,12 @@ class Paths(Batch):
     solution: Solution
     par: Array
     start: Array | float = 0.0
-    found: dict[str, Any] = field(default_factory=dict)
+    derived: dict[str, Any] = field(default_factory=dict)
     _fields: dict[str, Array] = field(default_factory=dict)
 
     @property
     def whole(self) -> bool:  # type: ignore[override]
-        """Whether no member failed."""
+        """True if no member failed."""
         return not self.solution.status.any()
 
     @property
@@ -66,7 +66,8 @@ class Paths(Batch):
     def largest(self, name: str) -> Array:
         """(N,) wall Mach numbers over all steps of the solver; with Rayleigh–Plesset over the stored instants."""
         if name != "wall_mach":
-            return np.abs(self[name]).max(axis=1)
+            largest: Array = np.abs(self[name]).max(axis=1)
+            return largest
         if self.model.radial == "rayleigh-plesset":  # its equations know no speed of sound
             return np.asarray(np.abs(self["Rdot"] / self.medium(1).c).max(axis=1))
         return self.solution.record[:, MAX_MACH]
@@ -89,7 +90,7 @@ class Paths(Batch):
     def last(self) -> Array:
         """States (N, n_state) at the last instant."""
         solution = replace(self.solution, states=self.solution.states[:, -1:])
-        return replace(self, times=self.times[:, -1:], solution=solution, found={}, _fields={}).states[:, 0]
+        return replace(self, times=self.times[:, -1:], solution=solution, derived={}, _fields={}).states[:, 0]
 
     def medium(self, axes: int) -> Medium:
         """See :meth:`Dynamics.medium_of`."""
@@ -102,7 +103,8 @@ class Paths(Batch):
         return np.exp(self.solution.states[:, :, -1]) * 1e-6
 
     def _Rdot(self) -> Array:
-        return self["R"] * self.solution.states[:, :, -2] * 1e6
+        radius: Array = self["R"]
+        return radius * self.solution.states[:, :, -2] * 1e6
 
     def _strain_rate(self) -> Array:
         return np.abs(self.solution.states[:, :, -2]) * 1e6
@@ -119,7 +121,8 @@ class Paths(Batch):
         return from_kirchhoff(tau, self.medium(2))
 
     def _T(self) -> Array:
-        return self["theta"] * self.medium(2).T_inf
+        theta: Array = self["theta"]
+        return theta * self.medium(2).T_inf
 
     def _chi(self) -> Array:
         system = self.model.system

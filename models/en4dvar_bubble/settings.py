@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
     Field,
+    ValidationError,
     ValidationInfo,
     WithJsonSchema,
     create_model,
@@ -16,21 +17,23 @@ from pydantic import (
     model_validator,
 )
 
-from en4dvar.errors import ConfigError
-from en4dvar.hints import suggest
-from en4dvar.state import Parameter
-from en4dvar.units import Quantity, parse_quantity
+from en4dvar.model.state import Parameter
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.hints import suggest
+from en4dvar.plumbing.units import Quantity, parse_quantity
 from en4dvar_bubble.driving import Reading
 from en4dvar_bubble.driving.settings import PULSE_SECTIONS, DrivingSettings, Section, with_kind
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX, Gas, Heat, Start, Vapour
 from en4dvar_bubble.gas import saturated_vapour_pressure
 from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, get_law
 from en4dvar_bubble.laws.loading import qualified
+from en4dvar_bubble.media import KnownMedium, known_medium
 from en4dvar_bubble.medium import CONSTANT_SETS, CONSTANTS, UNITS, WATER_25C, Medium
 from en4dvar_bubble.numbers import ALL
 from en4dvar_bubble.solver.driver import Accuracy, AccuracyName, Radial, preset
 
 SetName = Literal["water-25C", "imr-v1", "imr-v2"]
+MediumName = Literal["water", "polyacrylamide", "polyacrylamide-alginate", "agarose", "gelatin", "peg"]
 
 UNUSED = {"A_v", "B_v"}  # recorded by earlier versions, in no equation
 _GIVEN = "given in the configuration"
@@ -57,23 +60,23 @@ class _NamedSet(Section):
     @classmethod
     def _complete(cls, value: Any) -> Any:
         """A name stands for its set; what a set leaves open comes from it, with its source."""
-        given = {"set": value} if isinstance(value, str) else value
-        if not isinstance(given, dict):
-            return given
-        given = {name: value for name, value in given.items() if name not in UNUSED}
-        chosen = CONSTANT_SETS.get(str(given.get("set", "water-25C")))
+        section = {"set": value} if isinstance(value, str) else value
+        if not isinstance(section, dict):
+            return section
+        section = {name: value for name, value in section.items() if name not in UNUSED}
+        chosen = CONSTANT_SETS.get(str(section.get("set", "water-25C")))
         if chosen is None:
-            return {"set": given["set"]}  # the only fault worth telling
-        sources = given.get("sources", {})
+            return {"set": section["set"]}  # the only fault worth telling
+        sources = section.get("sources", {})
         if not isinstance(sources, dict):
-            return given
+            return section
         sources = {name: words for name, words in sources.items() if name not in UNUSED}
         inherited = {
             name: f"{number!r} {UNITS[name]}" if UNITS[name] != "1" else number
             for name, number in chosen.constants.items()
         }
-        told = {**chosen.sources, **{name: _GIVEN for name in given if name in UNITS}, **sources}
-        return {**inherited, **given, "sources": told}
+        told = {**chosen.sources, **{name: _GIVEN for name in section if name in UNITS}, **sources}
+        return {**inherited, **section, "sources": told}
 
     @field_validator("sources", check_fields=False)
     @classmethod
@@ -102,13 +105,45 @@ _SOURCES = Field(
     default_factory=lambda: dict(WATER_25C.sources),
     description="Where replaced values come from, by constant; recorded with the result.",
 )
+_CONSTANTS: dict[str, Any] = {**{f.name: _key(f) for f in CONSTANTS}, "sources": (dict[str, str], _SOURCES)}
 ConstantsSettings = create_model(
     "ConstantsSettings",
     __base__=_NamedSet,
     __doc__=_NamedSet.__doc__,
-    **{f.name: _key(f) for f in CONSTANTS},  # type: ignore[call-overload]
-    sources=(dict[str, str], _SOURCES),
+    **_CONSTANTS,
 )
+
+
+class MediumSettings(Section):
+    """A medium by name."""
+
+    name: MediumName
+    """Gels by their polymer; peg is poly(ethylene glycol) in water."""
+    concentration: Annotated[float, Quantity("1"), Field(ge=0, le=0.5)] | None = None
+    """Mass of polymer over that of the whole; default: the usual one."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
+        names = {"enum": list(get_args(MediumName)), "description": "Name of a medium at its usual concentration."}
+        return {"anyOf": [names, super().__get_pydantic_json_schema__(core_schema, handler)]}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_name(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @property
+    def known(self) -> KnownMedium:
+        return known_medium(self.name, self.concentration)
+
+
+class WallSettings(Section):
+    """A plane near the bubble."""
+
+    distance: Annotated[float, Quantity("m"), Field(gt=0)]
+    """From the centre of the bubble."""
+    kind: Literal["rigid", "free"] = "rigid"
+    """A rigid wall, or the free surface of the medium."""
 
 
 class BubbleSettings(Section):
@@ -132,8 +167,12 @@ class BubbleSettings(Section):
     """When p_f is evaluated: at t, at t + R/c without its derivative (retarded), or both (as-printed)."""
     vapour_pressure: Annotated[float | Literal["saturated"], WithJsonSchema(_VAPOUR_PRESSURE)] = 0.0
     """Constant vapour pressure in the bubble: a pressure, or saturated at the far-field temperature."""
+    medium: MediumSettings | None = None
+    """Density and speed of sound by the name of the medium, where ``constants`` does not give them."""
     constants: ConstantsSettings = ConstantsSettings()
     """Constants of medium and gas: the name of a set, or a section that replaces some of them."""
+    wall: WallSettings | None = None
+    """A plane near the bubble; with ``wall_distance`` under ``parameters`` its distance is estimated."""
     hydrophone: Annotated[float, Quantity("m"), Field(gt=0)] = 1.0
     """How far from the bubble acoustic_pressure is read."""
     accuracy: AccuracyName = "standard"
@@ -159,6 +198,23 @@ class BubbleSettings(Section):
             default = {"kind": "none" if value.get("start") == "laser" else "histotripsy"}
             return {**value, "driving": with_kind(value.get("driving", default))}
         return value
+
+    @model_validator(mode="before")
+    @classmethod
+    def _constants_of_the_medium(cls, value: Any) -> Any:
+        """What a named medium is known by becomes constants, with their source, where the section gives none."""
+        constants = value.get("constants", {}) if isinstance(value, dict) and value.get("medium") is not None else None
+        constants = {"set": constants} if isinstance(constants, str) else constants
+        if not isinstance(constants, dict) or not isinstance(constants.get("sources", {}), dict):
+            return value
+        try:
+            known = MediumSettings.model_validate(value["medium"]).known
+        except ValidationError:
+            return value  # told by the key itself
+        own = {"rho": f"{known.rho!r} kg/m^3", "c": f"{known.c!r} m/s"}
+        own = {name: words for name, words in own.items() if name not in constants}
+        sources = {**dict.fromkeys(own, known.source), **constants.get("sources", {})}
+        return {**value, "constants": {**own, **constants, "sources": sources}}
 
     @field_validator("law")
     @classmethod
@@ -189,7 +245,8 @@ class BubbleSettings(Section):
         return get_law(self.law)
 
     @property
-    def medium(self) -> Medium:
+    def liquid(self) -> Medium:
+        """All constants, with the vapour pressure."""
         medium = self.constants.medium
         if self.vapour_pressure == "saturated":
             return replace(medium, p_v=saturated_vapour_pressure(medium.T_inf))

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.compiled import called, kernel
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.compiled import called, kernel
 
 HALO = 4
 

@@ -16,7 +16,7 @@ OTHER = max(UNROLLED) + 1  # a number of nodes whose loops are not unrolled
 
 
 def examples() -> dict[str, Callable[[], object]]:
-    """What is compiled, in words, and a call that does; for ``en4dvar warm-up``."""
+    """Name of each kernel, in words, and a call that compiles it; for ``en4dvar warm-up``."""
     standard = preset("standard", "acoustic")
     models = {"polytropic or isothermal gas": BubbleModel(gas="polytropic")}
     for nodes, words in ((4, "4 nodes"), (8, "8 nodes"), (OTHER, "another number of nodes")):

@@ -18,7 +18,7 @@ from scipy.sparse import coo_matrix, csc_matrix, identity
 from scipy.sparse.linalg import splu
 
 from en4dvar import Failure, Field, ForwardModel, Observable, Parameter, StateField, StateLayout, Trajectory
-from en4dvar.described import Described
+from en4dvar.plumbing.described import Described
 
 Array = npt.NDArray[np.float64]
 Side = Annotated[int, Setting(ge=2)]
@@ -85,7 +85,7 @@ class Aquifer(ForwardModel):
     def _heads(self, state: Array, durations: Sequence[float] | Array) -> list[Array]:
         """Heads (n,) after each of the durations, one after the other."""
         head, (recharge, storage) = state[: self.size].copy(), state[-2:]
-        flow, solvers, found = (
+        flow, solvers, heads = (
             self.conductances(state[self.layout["ln_T"]]),
             dict[float, Callable[[Array], Array]](),
             [],
@@ -98,8 +98,8 @@ class Aquifer(ForwardModel):
                     system = (identity(self.size, format="csc") * rate + flow).tocsc()
                     solvers[rate] = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve
                 head = solvers[rate](head * rate + recharge)
-            found.append(head)
-        return found
+            heads.append(head)
+        return heads
 
     def conductances(self, field: Array) -> csc_matrix:
         """−∇·(T ∇·) (n, n): symmetric, with the boundary, half a cell away, at head 0."""
@@ -115,9 +115,9 @@ class Aquifer(ForwardModel):
             along[1:] += between
             along[0] += 2 * np.moveaxis(T, axis, 0)[0]
             along[-1] += 2 * np.moveaxis(T, axis, 0)[-1]
-            one, other = np.moveaxis(cells, axis, 0)[:-1].ravel(), np.moveaxis(cells, axis, 0)[1:].ravel()
-            rows += [one, other]
-            columns += [other, one]
+            nearer, farther = np.moveaxis(cells, axis, 0)[:-1].ravel(), np.moveaxis(cells, axis, 0)[1:].ravel()
+            rows += [nearer, farther]
+            columns += [farther, nearer]
             values += [-between.ravel()] * 2
         rows.append(cells.ravel())
         columns.append(cells.ravel())

@@ -11,18 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.field_prior import FieldPrior
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.priors.field_prior import FieldPrior
 from en4dvar_diffusion.aquifer import Aquifer
 
 SHAPE, WELLS, TIMES, SHARE, SEED = (100, 100), 200, (4.0, 12.0, 32.0), 0.02, 20261
-PRIOR = {"std": 1.0, "kernel": "gaussian", "length": 8.0}
 
 
 def truth() -> Array:
     """ln T (n,) that made the readings."""
     (field,) = (block for block in Aquifer(SHAPE).layout if block.name == "ln_T")
-    return FieldPrior(field, **PRIOR).draw(SEED, 0)  # type: ignore[arg-type]
+    return FieldPrior(field, std=1.0, kernel="gaussian", length=8.0).draw(SEED, 0)
 
 
 def readings() -> str:

@@ -1,9 +1,8 @@
-"""What the models share: a state of dynamic variables with the parameters appended, integrated in batches."""
+"""Common parts of the models: a state of dynamic variables with the parameters appended, integrated in batches."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import ClassVar
 
 import numpy as np
 
@@ -19,7 +18,7 @@ class Autonomous(ForwardModel):
     time_display_unit = "1"
     compiled = True
     autonomous = True
-    defaults: ClassVar[Mapping[str, float]] = {}
+    defaults: Mapping[str, float] = {}
     integrate: Integrate
 
     def __init__(self, fields: Sequence[Field], initial: Sequence[float], step: float):

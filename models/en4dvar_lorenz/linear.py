@@ -1,12 +1,14 @@
-r"""A linear model: uncoupled damped oscillators, \(\dot z_j = (iω_j − γ) z_j\) with \(ω_j = j\), solved exactly.
+r"""Linear models: a straight line in time, and uncoupled damped oscillators, \(\dot z_j = (iω_j − γ) z_j\) with
+\(ω_j = j\), solved exactly.
 
-The state is (Re z_1, Im z_1, Re z_2, …). With Gaussian errors the Kalman filter and smoother are exact here.
+What is expected of data on the line has a closed form. The state of the oscillators is (Re z_1, Im z_1, Re z_2, …);
+with Gaussian errors the Kalman filter and smoother are exact here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -14,6 +16,29 @@ from pydantic import Field as Setting
 
 from en4dvar import Field
 from en4dvar_lorenz.autonomous import Autonomous, dimensionless
+
+
+def advance(start: np.ndarray, times: np.ndarray, longest: float) -> np.ndarray:
+    """States (x, level, slope) (N, 3) at times (N, K) → (N, K, 3), in closed form; there is no step to choose."""
+    paths = np.repeat(start[:, None], times.shape[1], axis=1)
+    paths[..., 0] += start[:, 2:] * times
+    return paths
+
+
+class Trend(Autonomous):
+    """x = level + slope t."""
+
+    parameters = (
+        dimensionless("level", "value at time zero", "$x_0$", ""),
+        dimensionless("slope", "change per unit of time", "$s$", ""),
+    )
+    integrate = staticmethod(advance)
+
+    def __init__(self) -> None:
+        super().__init__((Field("x"),), [0.0], np.inf)
+
+    def initial_state(self, theta: Mapping[str, float]) -> np.ndarray:
+        return np.array([theta["level"], theta["level"], theta["slope"]])
 
 
 class LinearSettings(BaseModel):
@@ -38,7 +63,7 @@ class Linear(Autonomous):
 
     Settings = LinearSettings
     parameters = (dimensionless("gamma", "damping rate", r"$\gamma$", ""),)
-    defaults: ClassVar[Mapping[str, float]] = {"gamma": 0.0}
+    defaults: Mapping[str, float] = {"gamma": 0.0}
     integrate = staticmethod(oscillate)
 
     @classmethod

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
 
 @dataclass(frozen=True)
@@ -15,5 +16,6 @@ class Logarithm:
     name: str
     batched: ClassVar[bool] = True
 
-    def __call__(self, trajectory: Any) -> np.ndarray:
-        return np.log(trajectory[self.name])
+    def __call__(self, trajectory: Any) -> npt.NDArray[np.float64]:
+        logarithm: npt.NDArray[np.float64] = np.log(trajectory[self.name])
+        return logarithm

@@ -6,7 +6,7 @@ Source: Lorenz (1963), J. Atmos. Sci. 20, 130.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 from numba import njit
@@ -52,7 +52,7 @@ class Lorenz63(Autonomous):
         dimensionless("rho", "relative Rayleigh number", r"$\rho$", SOURCE),
         dimensionless("beta", "aspect parameter", r"$\beta$", SOURCE),
     )
-    defaults: ClassVar[Mapping[str, float]] = {"sigma": 10.0, "rho": 28.0, "beta": 8 / 3}
+    defaults: Mapping[str, float] = {"sigma": 10.0, "rho": 28.0, "beta": 8 / 3}
     integrate = staticmethod(integrate)
 
     @classmethod

@@ -6,7 +6,7 @@ Source: Lorenz (1996), Predictability: a problem partly solved, Proc. ECMWF Semi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 from numba import njit
@@ -49,7 +49,7 @@ class Lorenz96(Autonomous):
 
     Settings = Lorenz96Settings
     parameters = (dimensionless("F", "forcing", "$F$", "Lorenz (1996)"),)
-    defaults: ClassVar[Mapping[str, float]] = {"F": 8.0}
+    defaults: Mapping[str, float] = {"F": 8.0}
     integrate = staticmethod(integrate)
 
     @classmethod

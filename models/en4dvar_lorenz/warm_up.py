@@ -13,6 +13,6 @@ MODULES = {"Lorenz-63": lorenz63, "Lorenz-96": lorenz96, "Lotka–Volterra": lot
 
 
 def examples() -> dict[str, Callable[[], object]]:
-    """What is compiled, in words, and a call that does; for ``en4dvar warm-up``."""
+    """Name of each kernel, in words, and a call that compiles it; for ``en4dvar warm-up``."""
     start, times = np.ones((1, 6)), np.array([[0.01]])
     return {f"test-bed, {name}": partial(module.integrate, start, times, 0.01) for name, module in MODULES.items()}

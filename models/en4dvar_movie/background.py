@@ -1,7 +1,8 @@
-"""What a movie shows without the bubble, and what its frames share: sign, noise, contrast, sharpness."""
+"""The background of a movie, and the properties that its frames share: sign, noise, contrast, sharpness."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from en4dvar.errors import DataError
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.fitting import fit_outline
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.kernels import normalise
@@ -95,7 +96,7 @@ def _look(movie: Movie) -> tuple[list[Frame], list[Frame]]:
 
 def pixel_noise(image: Image) -> float:
     """Std of the noise of an image (H, W) or of numbers (n,): robust, of differences between neighbours."""
-    return max(1.4826 * float(np.median(np.abs(np.diff(image)))) / np.sqrt(2), 0.3)
+    return max(1.4826 * float(np.median(np.abs(np.diff(image)))) / math.sqrt(2), 0.3)
 
 
 def _is_white(frame: Frame) -> bool:
@@ -117,11 +118,12 @@ def smooth_surface(frames: Sequence[Frame]) -> Array:
         fitted = np.linalg.solve(chosen @ terms.T, chosen @ values)  # of terms within ±1, so that squares lose little
         off = values - fitted @ terms
         kept = np.abs(off) <= 3 * max(1.4826 * float(np.median(np.abs(off[kept]))), 0.5)
-    return (fitted @ terms).reshape(typical.shape).astype(np.float32)
+    surface: Array = (fitted @ terms).reshape(typical.shape).astype(np.float32)
+    return surface
 
 
 def _holds_a_blob(first: Image, noise: float) -> bool:
-    """Whether a frame differs from a smooth surface in one large patch."""
+    """True if a frame differs from a smooth surface in one large patch."""
     surface = smooth_surface([first])
     far = np.abs(ndimage.uniform_filter(first - surface, 5)) > max(4 * noise, 0.25 * float(np.median(np.abs(surface))))
     labels, count = ndimage.label(far)
@@ -160,10 +162,10 @@ def _refined(background: Background, samples: Sequence[Frame]) -> Background:
     y, x = np.mgrid[: total.shape[0], : total.shape[1]]
     for frame in samples:
         image, tiles = background.normalised(frame)
-        found = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
-        if found is None or share_changed(tiles, background.noise) > CHANGED:
+        circles = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
+        if circles is None or share_changed(tiles, background.noise) > CHANGED:
             continue
-        circle, _ = found
+        circle, _ = circles
         outside = np.hypot(x - circle.x, y - circle.y) > 1.3 * circle.R + 10
         quiet = outside & (np.abs(image) < 5 * background.noise)
         total[quiet] += frame[quiet]
@@ -178,7 +180,7 @@ def share_changed(tiles: Array, noise: float) -> float:
 
 def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circles: int) -> Optics:
     """Contrast and sharpness that the sampled frames share. Raises :class:`DataError` where none shows a bubble."""
-    found = []
+    optics = []
     for frame in samples:
         image, tiles = background.normalised(frame)
         place = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
@@ -187,13 +189,13 @@ def _optics(background: Background, samples: Sequence[Frame], movie: Movie, circ
         steady = background.steadied(image, tiles, place[0])
         outlines = fit_outline(steady, place[0], Optics(-place[1]), circles)
         if outlines is not None and outlines[0].seen > 0.15 and outlines[0].contrast < 0:
-            found.append(outlines[0])
-    if not found:
+            optics.append(outlines[0])
+    if not optics:
         raise DataError(f"{movie.path}: no frame shows a bubble that differs from the background")
-    large = sorted(found, key=lambda o: o.circle.R / o.width)[3 * len(found) // 4 :]  # they show the full contrast
+    large = sorted(optics, key=lambda o: o.circle.R / o.width)[3 * len(optics) // 4 :]  # they show the full contrast
     contrasts = np.array([o.contrast for o in large])
     contrast = float(np.median(contrasts))
     scatter = 1.2533 * float(np.std(contrasts)) / max(len(large) - 1, 1) ** 0.5  # of a median
-    width = float(np.percentile([o.width for o in found], SHARPEST))
+    width = float(np.percentile([o.width for o in optics], SHARPEST))
     scatter = min(scatter, NOISY * background.noise)  # more is not noise: bubbles differ in how bright their centre is
     return Optics(contrast, width, max(scatter / -contrast, LEAST_SPREAD))

@@ -46,7 +46,7 @@ def track(
     """
     from en4dvar.commands.common import command_line, refuse_to_replace
     from en4dvar.executor import available_cores
-    from en4dvar.files import write_text
+    from en4dvar.plumbing.files import write_text
     from en4dvar_movie.corrections import read_corrections
     from en4dvar_movie.frames import open_movie
     from en4dvar_movie.outlined import outlined as outlined_frames
@@ -64,18 +64,18 @@ def track(
         refuse_to_replace(target, force)
     fixed = read_corrections(corrections) if corrections else {}
     with _bar(opened.count) as progress:
-        found = track_movie(opened, workers or available_cores(), fixed, progress, scale.flashes)
+        track = track_movie(opened, workers or available_cores(), fixed, progress, scale.flashes)
     for note in opened.notes:
         click.echo(f"note: {note}", err=True)
     words = command_line()
-    write_text(table, to_csv(found.readings, scale, str(movie), words))
-    write_text(shown, page_text(opened, found, scale, words))
+    write_text(table, to_csv(track.readings, scale, str(movie), words))
+    write_text(shown, page_text(opened, track, scale, words))
     if outlined:
-        pictures = outlined_frames(opened, found)
-        write_movie(outlined, pictures, len({r.found.frame for r in found.readings}), scale.pixel, scale.rate)
-    used = [r for r in found.readings if r.used]
+        pictures = outlined_frames(opened, track)
+        write_movie(outlined, pictures, len({r.sighting.frame for r in track.readings}), scale.pixel, scale.rate)
+    used = [r for r in track.readings if r.used]
     what = "frames" if len(scale.flashes) == 1 else "circles"
-    click.echo(f"{len(used)} of {len(found.readings)} {what} read; the others and why: see the page")
+    click.echo(f"{len(used)} of {len(track.readings)} {what} read; the others and why: see the page")
     click.echo(f"readings: {table}\npage: {shown}\nnext: en4dvar init --data {table}")
 
 
@@ -83,19 +83,19 @@ def _scaled(
     movie: Movie, pixel: str | None, frame_rate: str | None, exposure: str | None, flashes: str | None
 ) -> tuple[Movie, Scale]:
     """The movie with its scale. Raises :class:`click.UsageError`, :class:`DataError` where the options cannot be."""
-    from en4dvar.units import parse_quantity
+    from en4dvar.plumbing.units import parse_quantity
     from en4dvar_movie.flashes import parse_flashes
     from en4dvar_movie.frames import with_scale
     from en4dvar_movie.table import Scale
 
-    def given(text: str | None, unit: str, option: str) -> float | None:
+    def quantity(text: str | None, unit: str, option: str) -> float | None:
         value = None if text is None else parse_quantity(text, unit)
         if value is not None and not value > 0:
             raise click.UsageError(f"{option} must be positive")
         return value
 
-    movie = with_scale(movie, given(pixel, "m", "--pixel"), given(frame_rate, "1/s", "--frame-rate"))
-    shutter = given(exposure, "s", "--exposure")
+    movie = with_scale(movie, quantity(pixel, "m", "--pixel"), quantity(frame_rate, "1/s", "--frame-rate"))
+    shutter = quantity(exposure, "s", "--exposure")
     instants = parse_flashes(flashes) if flashes else (0.0,)
     between = f"the {1e6 / movie.rate:g} us between two frames"
     if shutter is not None and shutter * movie.rate > 1.001:

@@ -10,8 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from en4dvar.errors import DataError
+from en4dvar.inputs.opened import readable, require_file
 from en4dvar.inputs.text_table import numbered_lines
+from en4dvar.plumbing.errors import DataError
 from en4dvar_movie.outline import Circle
 
 
@@ -26,18 +27,19 @@ class Correction:
 
 def read_corrections(path: Path) -> dict[int, Correction]:
     """Frame → correction. Raises :class:`DataError` that names the line."""
-    if not path.is_file():
-        raise DataError(f"{path}: no such file")
-    found: dict[int, Correction] = {}
-    for line, text in numbered_lines(path):
+    require_file(path)
+    with readable(path):
+        lines = numbered_lines(path)
+    corrections: dict[int, Correction] = {}
+    for line, text in lines:
         where = f"{path}:{line}"
         frame, *rest = text.split()
         if not frame.isdigit() or not rest:
             raise DataError(f"{where}: write FRAME out WORDS, or FRAME X Y RADIUS WORDS with numbers in pixels")
-        if int(frame) in found:
+        if int(frame) in corrections:
             raise DataError(f"{where}: frame {frame} was corrected before")
-        found[int(frame)] = _correction(rest, where)
-    return found
+        corrections[int(frame)] = _correction(rest, where)
+    return corrections
 
 
 def _correction(rest: list[str], where: str) -> Correction:

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import numpy as np
 
-from en4dvar.errors import ConfigError
-from en4dvar.hints import suggest
-from en4dvar.state import Array
-from en4dvar.units import UnitError, parse_quantity
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.hints import suggest
+from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar_movie.flashes import parse_flashes
 from en4dvar_movie.scene import Scene, render
 from en4dvar_movie.writing import require_suffix, write_movie
@@ -28,7 +28,7 @@ INSTANTS = 9  # of an exposure
 
 @dataclass(frozen=True)
 class Camera:
-    """What turns metres and seconds into pixels and frames."""
+    """The camera, which turns metres and seconds into pixels and frames."""
 
     pixel: Annotated[float, "m", "size of a pixel"] = 2e-6
     exposure: Annotated[float, "s", "how long light falls on a frame, or how long a flash is"] = 0.0
@@ -74,7 +74,8 @@ def film(config: Config, times: Array | None, out: Path, settings: Mapping[str, 
 def exposures(times: Array, camera: Camera) -> Array:
     """Instants (K, S) at which each frame is exposed: all of a flash or of the exposure, in equal parts."""
     within = camera.exposure * np.linspace(-0.5, 0.5, INSTANTS) if camera.exposure else np.zeros(1)
-    return times[:, None] + np.add.outer(np.array(camera.flashes), within).ravel()
+    instants: Array = times[:, None] + np.add.outer(np.array(camera.flashes), within).ravel()
+    return instants
 
 
 def parse_settings(settings: Mapping[str, str]) -> tuple[Camera, Scene]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 from en4dvar_movie.kernels import SHAPE, influence, normal_equations, residuals
 from en4dvar_movie.outline import MODES, Circle, Optics, Outline, share_inside
 
@@ -94,7 +94,7 @@ def _glare_is_far(p: Array, gaps: Array, ring: Array) -> bool:
 
 
 def _known(p: Array, gaps: Array, ring: Array, noise: float, optics: Optics) -> tuple[Array, Array]:
-    """Of what is known before: contrast; the bright centre, which may be missing. Centre (P,) and precision (P,)."""
+    """The prior knowledge: contrast; the bright centre, which may be missing. Centre (P,) and precision (P,)."""
     centre, precision = np.zeros(len(p)), np.zeros(len(p))
     inner = _innermost(p, gaps)
     centre[RIM], centre[CONTRAST] = RIM_SHARE * inner, optics.contrast
@@ -139,11 +139,11 @@ def _descend(
         if gone:
             damping *= 10
             continue
-        found = normal_equations(image, trial, modes, ring, cutoff)
-        better = found[4] + 0.5 * float(precision @ (trial - centre) ** 2)
-        if better <= cost and found[3] > 0:
+        equations = normal_equations(image, trial, modes, ring, cutoff)
+        better = equations[4] + 0.5 * float(precision @ (trial - centre) ** 2)
+        if better <= cost and equations[3] > 0:
             done = np.max(np.abs(step[:W])) < close and cost - better <= max(close**2, 1e-7) * cost
-            p, (A, g), cost, damping = trial, found[:2], better, max(damping / 10, 1e-7)
+            p, (A, g), cost, damping = trial, equations[:2], better, max(damping / 10, 1e-7)
             if done:
                 break
         else:
@@ -176,7 +176,7 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
         # the step of robust weights is the M-estimator's, its error that of Huber (1981): ψ' instead of the weights
         variance = spread / max(slope, 0.3) ** 2 * total / max(total - free, 1.0)
         common = noise**2 * weights[CONTRAST] ** 2 * precision[CONTRAST]  # of the contrast that all frames share
-        one = Outline(
+        outline = Outline(
             circle=circle,
             width=float(p[W]),
             contrast=float(p[CONTRAST]),
@@ -190,7 +190,7 @@ def _outlines(image: Array, p: Array, modes: int, noise: float, optics: Optics) 
             # as if evenly spread over the distance from which they are told apart
             joined=float(np.hypot(APART * p[W] / 12**0.5, np.std(inside))) if len(group) > 1 else 0.0,
         )
-        outlines += [one] * len(group)
+        outlines += [outline] * len(group)
     return outlines
 
 
@@ -206,7 +206,7 @@ def _groups(gaps: Array, near: float) -> list[list[int]]:
 
 
 def _left(fitted: Array, weights: Array, A: Array, inverse: Array) -> float:
-    """What a fit leaves of the scatter of sums over sectors, as a share of that of the sums themselves.
+    """The part that a fit leaves of the scatter of sums over sectors, as a share of that of the sums themselves.
 
     Residuals are (I − H) times the errors, H = J A⁻¹ Jᵀ; a sum over a sector is mᵀ(I − H)ε, of variance
     mᵀm − 2 gᵀA⁻¹g + gᵀA⁻¹(JᵀJ)A⁻¹g with g = Jᵀm: ``fitted`` (K, P) holds g of each sector, Σ mᵀm is g·weights.

@@ -7,9 +7,9 @@ from itertools import pairwise, permutations
 
 import numpy as np
 
-from en4dvar.errors import En4dvarError
-from en4dvar.state import Array
-from en4dvar.units import parse_quantity
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.units import parse_quantity
 
 MOST = 5
 

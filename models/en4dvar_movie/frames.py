@@ -5,24 +5,25 @@ Frames are (H, W) arrays of brightness, 8 or 16 bit. Nothing is held: a movie is
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from en4dvar.errors import DataError, En4dvarError
-from en4dvar.hints import no_such_file
+from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded, decoded_whole, require_plain
+from en4dvar.plumbing.errors import DataError, En4dvarError
+from en4dvar.plumbing.files import open_plain
+from en4dvar.plumbing.hints import no_such_file
+from en4dvar_movie.decoders import TiffAbout, check_size, image, tiff_about, tiff_frames, video_count, video_frames
 
 Frame = npt.NDArray[Any]
 TIFF, VIDEO, IMAGES = (".tif", ".tiff"), (".mp4", ".avi", ".mov", ".mkv"), (".png",)
 LEAST_SIDE = 16
+MOVIES = Allowed(seconds=20, memory=2_000_000_000, size=256_000_000_000)
 COLOUR = 0.08  # mean difference of the channels, as a share of the full scale, from which a frame is a coloured one
 
 
@@ -82,6 +83,7 @@ def open_movie(path: str | Path, raw: str | None = None) -> Movie:
         return _raw(path, raw)
     if path.is_dir():
         return _folder(path)
+    require_plain(path, MOVIES.size)
     if not path.stat().st_size:
         raise DataError(f"{path}: the file is empty")
     suffix = path.suffix.lower()
@@ -91,15 +93,6 @@ def open_movie(path: str | Path, raw: str | None = None) -> Movie:
         return _video(path)
     kinds = ", ".join((*TIFF, *VIDEO))
     raise DataError(f"{path}: not a movie by its suffix ({kinds}, or a folder of frames); for a raw file give --raw")
-
-
-def library(name: str) -> ModuleType:
-    from importlib import import_module
-
-    try:
-        return import_module(name)
-    except ImportError:
-        raise DataError(f"reading this movie needs {name}: pip install 'en4dvar[movie]'") from None
 
 
 def _grey(read: Any, channel: int, where: str) -> Frame:
@@ -134,58 +127,16 @@ def _size(shape: tuple[int, ...]) -> str:
     return " × ".join(map(str, shape[1::-1] + shape[2:]))
 
 
-@contextmanager
-def overheard(name: str) -> Iterator[list[str]]:
-    """Within, what a library logs is kept as a list instead of shown."""
-    faults: list[str] = []
-    logger = logging.getLogger(name)
-    keep = logging.Handler()
-    keep.emit = lambda record: faults.append(record.getMessage())  # type: ignore[method-assign]
-    before = logger.propagate
-    logger.addHandler(keep)
-    logger.propagate = False
-    try:
-        yield faults
-    finally:
-        logger.removeHandler(keep)
-        logger.propagate = before
-
-
 def _tiff(path: Path) -> Movie:
-    tifffile = library("tifffile")
-    try:
-        with overheard("tifffile") as faults, tifffile.TiffFile(path) as file:
-            pages = len(file.pages)
-            about = dict(file.imagej_metadata or {})
-            first = file.pages[0]
-            pixel = _tiff_pixel(about, first.tags.get("XResolution"))
-            start, frame, plain = first.dataoffsets[0], first.nbytes, first.compression == 1
-            kind, shape = np.dtype(first.dtype).newbyteorder(file.byteorder), first.shape
-        count = int(about.get("images", pages))
-        rate = 1 / float(about["finterval"]) if about.get("finterval") else float("nan")
-    except Exception as error:  # tifffile believes what a damaged file says of itself
-        raise DataError(f"{path}: cannot be read as TIFF, it is damaged: {error}") from None
-    if pages == 1 < count and plain and path.stat().st_size >= start + count * frame:  # ImageJ's way beyond 4 GB
-        return Movie(path, lambda: _blocks(path, start, count, kind, shape), count, pixel, rate)
-    if pages < count or any("invalid page offset" in fault for fault in faults):
+    about: TiffAbout = decoded_whole(tiff_about, path, allowed=MOVIES)
+    start, count, shape = about.start, about.count, about.shape
+    check_size(shape, path)
+    if about.pages == 1 < count and about.plain and path.stat().st_size >= start + count * about.frame:
+        kind = np.dtype(about.kind)  # ImageJ's way beyond 4 GB
+        return Movie(path, lambda: _blocks(path, start, count, kind, shape), count, about.pixel, about.rate)
+    if about.pages < count or about.broken:
         raise DataError(f"{path}: the file is damaged or cut off: not all of its frames are there")
-
-    def read() -> Iterator[Frame]:
-        with overheard("tifffile"), tifffile.TiffFile(path) as file:
-            for page in file.pages:
-                yield page.asarray()
-
-    return Movie(path, read, pages, pixel, rate)
-
-
-def _tiff_pixel(about: dict[str, Any], resolution: Any) -> float:
-    """Size of a pixel that ImageJ wrote, m."""
-    units = {"micron": 1e-6, "um": 1e-6, "µm": 1e-6, "\\u00B5m": 1e-6, "mm": 1e-3, "nm": 1e-9}
-    unit = units.get(str(about.get("unit", "")))
-    if unit is None or resolution is None:
-        return float("nan")
-    pixels, length = resolution.value
-    return unit * length / pixels if pixels else float("nan")
+    return Movie(path, lambda: decoded(tiff_frames, path, allowed=MOVIES), about.pages, about.pixel, about.rate)
 
 
 def _folder(path: Path) -> Movie:
@@ -196,54 +147,41 @@ def _folder(path: Path) -> Movie:
 
     def read() -> Iterator[Frame]:
         for file in files:
-            if file.suffix.lower() in TIFF:
-                yield from _tiff(file).open()
-            else:
-                with library("PIL.Image").open(file) as image:
-                    yield np.asarray(image)
+            yield from _tiff(file).open() if file.suffix.lower() in TIFF else decoded(image, file, allowed=MOVIES)
 
     return Movie(path, read, len(files))
 
 
 def _video(path: Path) -> Movie:
-    av = library("av")
-
     notes: list[str] = []
     damaged: set[int] = set()
 
     def read() -> Iterator[Frame]:
-        with av.open(str(path)) as file:
-            if not file.streams.video:
-                raise DataError(f"{path}: holds no video")
-            stream = file.streams.video[0]
-            stream.thread_type = "AUTO"
-            number = -1
-            for number, frame in enumerate(file.decode(stream)):
-                if frame.interlaced_frame:
-                    raise DataError(f"{path}: the movie is interlaced; save whole frames (ffmpeg -vf yadif)")
-                if frame.is_corrupt:
-                    damaged.add(number)
-                yield frame.to_ndarray(format="gray" if frame.format.name.startswith("gray") else "rgb24")
-            short = f"{path}: the file is cut off: it says that it holds {stream.frames} frames, {number + 1} are there"
-            if number + 1 < stream.frames and short not in notes:
-                notes.append(short)
+        for value in decoded(video_frames, path, allowed=MOVIES):
+            if isinstance(value, str):
+                notes[:] = [value]
+            elif isinstance(value, int):
+                damaged.add(value)
+            else:
+                yield value
 
     try:
-        with av.open(str(path)) as file:
-            count = file.streams.video[0].frames if file.streams.video else 0
-    except (OSError, ValueError) as error:
+        count = decoded_whole(video_count, path, allowed=MOVIES)
+    except DecodeError as error:
         raise DataError(f"{path}: cannot be read as a movie: {error}") from None
-    return Movie(path, read, int(count), notes=notes, damaged=damaged)
+    return Movie(path, read, count, notes=notes, damaged=damaged)
 
 
 def _raw(path: Path, raw: str) -> Movie:
     match = re.fullmatch(r"(\d+)x(\d+)x(8|10|12|14|16)", raw)
     if match is None:
         raise DataError(f"--raw {raw}: write WIDTHxHEIGHTxBITS, e.g. 512x128x8 (above 8 bit: two bytes, low one first)")
+    require_plain(path, MOVIES.size)
     width, height, bits = map(int, match.groups())
+    check_size((height, width), path)
     kind = np.dtype("u1" if bits == 8 else "<u2")
     frame = width * height * kind.itemsize
-    size = path.stat().st_size if path.is_file() else 0
+    size = path.stat().st_size
     if not frame or not size or size % frame:
         raise DataError(f"{path}: {size} bytes are not a whole number of frames of {raw} ({frame} bytes each)")
 
@@ -253,7 +191,7 @@ def _raw(path: Path, raw: str) -> Movie:
 
 def _blocks(path: Path, start: int, count: int, kind: np.dtype[Any], shape: tuple[int, ...]) -> Iterator[Frame]:
     """Frames that follow each other in a file, without anything between them."""
-    with path.open("rb") as file:
+    with open_plain(path) as file:
         file.seek(start)
         for _ in range(count):
             frame = np.frombuffer(file.read(int(np.prod(shape)) * kind.itemsize), kind).reshape(shape)

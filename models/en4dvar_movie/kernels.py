@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from en4dvar.compiled import kernel, summing_kernel
+from en4dvar.plumbing.compiled import kernel, summing_kernel
 
 NAMES = ("x", "y", "R", "w", "b", "c", "g", "rho_g")
 SHAPE = len(NAMES)  # the first mode's place
@@ -98,15 +98,15 @@ def residuals(image, p, modes, ring):
     """Residuals (n,) of the pixels whose distance from ``ring[:2]`` lies between ``ring[2]`` and ``ring[3]``."""
     row = np.zeros(len(p))
     top, bottom, left, right = _bounds(image.shape, ring[0], ring[1], ring[3])
-    found = np.empty(max(0, bottom - top) * max(0, right - left))
+    values = np.empty(max(0, bottom - top) * max(0, right - left))
     n = 0
     for j in range(top, bottom):
         for i in range(left, right):
             far = (i - ring[0]) ** 2 + (j - ring[1]) ** 2
             if ring[2] ** 2 <= far <= ring[3] ** 2:
-                found[n] = image[j, i] - _row(j, i, p, modes, row)
+                values[n] = image[j, i] - _row(j, i, p, modes, row)
                 n += 1
-    return found[:n]
+    return values[:n]
 
 
 @summing_kernel
@@ -166,7 +166,7 @@ def normal_equations(image, p, modes, ring, cutoff):
 
 @kernel
 def influence(image, p, modes, ring, cutoff, weights, sectors):
-    """What moves the radius, u_i = (weights·J_i) ψ_i of each pixel, in its sums.
+    """Influence of each pixel on the radius, u_i = (weights·J_i) ψ_i of each pixel, in its sums.
 
     Σ u_i by sector (K,), Σ u_i² over pixels, Σ ψ'_i / Σ w_i, and by sector JᵀWJ·weights (K, P): what a fit takes out.
     """

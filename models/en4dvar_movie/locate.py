@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 from en4dvar_movie.outline import Circle
 
 TILE = 2  # pixels are averaged over tiles of this side
@@ -56,32 +56,32 @@ def rim(inside: Array) -> Array:
 def circle_through(points: Array) -> Circle | None:
     """Kåsa's circle through points (K, 2), those far off left out by turns; None with too few."""
     kept = points
-    found = None
+    circle = None
     for _ in range(6):
         if len(kept) < 6:
-            return found
+            return circle
         middle = kept.mean(axis=0)  # about which the sums of squares lose no digits
         x, y = (kept - middle).T
         matrix = np.stack([x, y, np.ones(len(x))])
         try:
             a, b, c = np.linalg.solve(matrix @ matrix.T, matrix @ (x * x + y * y))
         except np.linalg.LinAlgError:  # all on one line
-            return found
+            return circle
         square = c + (a * a + b * b) / 4
         if square <= 0:
-            return found
-        found = Circle(float(a / 2 + middle[0]), float(b / 2 + middle[1]), float(np.sqrt(square)))
-        off = np.abs(np.hypot(points[:, 0] - found.x, points[:, 1] - found.y) - found.R)
+            return circle
+        circle = Circle(float(a / 2 + middle[0]), float(b / 2 + middle[1]), float(np.sqrt(square)))
+        off = np.abs(np.hypot(points[:, 0] - circle.x, points[:, 1] - circle.y) - circle.R)
         kept = points[off <= max(2.5 * float(np.median(off)), 0.75)]
-    return found
+    return circle
 
 
 def locate(tiles: Array, noise: float, least_contrast: float) -> tuple[Circle, float] | None:
     """A circle in pixels near the bubble's outline and the contrast inside; None where there is no patch."""
-    found = patch(tiles, noise, least_contrast)
-    if found is None:
+    bubble = patch(tiles, noise, least_contrast)
+    if bubble is None:
         return None
-    inside, contrast = found
+    inside, contrast = bubble
     circle = circle_through(rim(inside))
     if circle is None:
         return None

@@ -1,4 +1,4 @@
-"""What the outline of a bubble in one image is: a circle, its modes, what is known of the radius."""
+"""The outline of a bubble in one image: a circle, its modes, what is known of the radius."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 
 MODES = 6  # of the outline
 
@@ -22,7 +22,8 @@ class Circle:
 
 @dataclass(frozen=True)
 class Optics:
-    """What the frames of one movie share: contrast of a bubble against its background, width of a sharp edge (pixels).
+    """Optical properties that the frames of a movie share: contrast of a bubble against its background, width of a
+    sharp edge (pixels).
 
     ``spread`` is how well the contrast is known, as a share of it: 1 where it is not.
     """
@@ -34,7 +35,7 @@ class Optics:
 
 @dataclass(frozen=True)
 class Outline:
-    """What one image says; pixels.
+    """The outline of a bubble in one image; pixels.
 
     ``width`` is the std of the edge's blur, ``modes`` (2, M−1) are A_n and B_n, ``variance`` that of R if pixels were
     independent and ``ratio`` what sectors of the outline say in units of it, ``common`` the variance that comes from
@@ -56,7 +57,7 @@ class Outline:
     joined: float = 0.0
 
     def amplitude(self, n: int) -> float:
-        """Of mode n, in pixels; NaN where it was not fitted."""
+        """Amplitude of mode n, in pixels; NaN where it was not fitted."""
         return float(np.hypot(*self.modes[:, n - 2])) if n - 2 < self.modes.shape[1] else float("nan")
 
     @property

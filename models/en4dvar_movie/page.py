@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
+from en4dvar.report.chart import PAGE, Chart, Panel, Row
 from en4dvar.report.palette import DARK, LIGHT, css_variables
-from en4dvar.report.style import inline_svg, styled
+from en4dvar.report.svg import svg
 from en4dvar_movie.frames import Frame, Movie
 from en4dvar_movie.outline import MODES
 from en4dvar_movie.outlined import brightest, by_frame, grey
@@ -22,76 +22,66 @@ from en4dvar_movie.tracking import Reading, Track
 SHOWN = 60  # frames of the strip
 SIDE = 240  # pixels of a picture, at most
 TURN = np.linspace(0, 2 * np.pi, 121)
+COLOURS = ("centre", "posterior", "background", "ink", "muted")  # of the modes of the shape
+DASHES = ("", "--", ":", "", "--")
 
 
-def page_text(movie: Movie, found: Track, scale: Scale, command: str) -> str:
+def page_text(movie: Movie, track: Track, scale: Scale, command: str) -> str:
     """The page, one file without addresses."""
     environment = Environment(
         loader=PackageLoader("en4dvar_movie", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
-    used = [r for r in found.readings if r.used]
+    used = [r for r in track.readings if r.used]
     return environment.get_template("page.html.j2").render(
         light=Markup(css_variables(LIGHT)),
         dark=Markup(css_variables(DARK)),
         movie=movie.path.name,
         notes=movie.notes,
         command=command,
-        count=len(found.readings),
+        count=len(track.readings),
         used=len(used),
-        what="frames" if len(found.flashes) == 1 else "circles",
+        what="frames" if len(track.flashes) == 1 else "circles",
         scale=f"{1e6 * scale.pixel:.6g} µm a pixel, {scale.rate:.6g} frames a second",
-        background=found.background.frames,
+        background=track.background.frames,
         common=f"{float(np.median([r.errors.common for r in used])) * 1e6 * scale.pixel:.2g}" if used else "",
-        figures=[inline_svg(draw(used, scale), name, name) for name, draw in (("radius", _radius), ("shape", _shape))],
-        strip=_strip(movie, found),
-        left_out=[r for r in found.readings if not r.used],
+        figures=[svg(draw(used, scale), name, name) for name, draw in (("radius", _radius), ("shape", _shape))],
+        strip=_strip(movie, track),
+        left_out=[r for r in track.readings if not r.used],
         remarks=[r for r in used if r.reason],
     )  # fmt: skip
 
 
-@styled
-def _radius(used: list[Reading], scale: Scale) -> Figure:
-    figure = Figure(figsize=(6.8, 2.6), layout="constrained")
-    ax = figure.subplots()
+def _radius(used: list[Reading], scale: Scale) -> Chart:
     um = 1e6 * scale.pixel
-    ax.errorbar(
-        [1e6 * scale.time(r.found) for r in used], [um * r.radius for r in used],
-        yerr=[1.645 * um * r.errors.std for r in used],
-        fmt="o", ms=2.5, color=LIGHT["ink"], ecolor=LIGHT["centre"], elinewidth=1, capsize=1.5,
-    )  # fmt: skip
-    ax.set(xlabel="time (µs)", ylabel="radius (µm), 90 %")
-    return figure
-
-
-@styled
-def _shape(used: list[Reading], scale: Scale) -> Figure:
-    figure = Figure(figsize=(6.8, 2.4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    times = [1e6 * scale.time(r.found) for r in used]
-    outlines = [r.found.outline for r in used]
-    left.plot(times, [o.eccentricity if o else np.nan for o in outlines], ".", ms=3, color=LIGHT["ink"])
-    left.set(xlabel="time (µs)", ylabel="eccentricity")
-    for n in range(2, MODES + 1):
-        part = [o.amplitude(n) / o.circle.R if o else np.nan for o in outlines]
-        right.plot(
-            times,
-            part,
-            lw=0.9,
-            alpha=1 - 0.15 * (n - 2),
-            color=LIGHT["centre"],
-            ls=["-", "--", "-.", ":", "-"][n - 2],
-            label=f"{n}",
+    times, radius, reach = (
+        np.array(values)
+        for values in (
+            [1e6 * scale.time(r.sighting) for r in used], [um * r.radius for r in used],
+            [1.645 * um * r.errors.std for r in used],
         )
-    right.set(xlabel="time (µs)", ylabel="mode over radius")
-    right.legend(title="mode", ncols=2)
-    return figure
+    )  # fmt: skip
+    panel = Panel("time (µs)", "radius (µm), 90 %")
+    panel.bars(times, radius - reach, radius + reach, "centre", 1.0)
+    panel.dots(times, radius, "ink", 2.5)
+    return Chart([Row(187.0, [panel])], PAGE)
 
 
-def _strip(movie: Movie, found: Track) -> list[dict[str, Any]]:
+def _shape(used: list[Reading], scale: Scale) -> Chart:
+    times = [1e6 * scale.time(r.sighting) for r in used]
+    outlines = [r.sighting.outline for r in used]
+    left, right = Panel("time (µs)", "eccentricity"), Panel("time (µs)", "mode over radius", legend=True)
+    left.dots(times, [o.eccentricity if o else np.nan for o in outlines], "ink", 1.8)
+    for n, colour, dash in zip(range(2, MODES + 1), COLOURS, DASHES, strict=False):
+        part = [o.amplitude(n) / o.circle.R if o else np.nan for o in outlines]
+        right.line(times, part, colour, 0.9, dash, f"mode {n}")
+    return Chart([Row(173.0, [left, right])], PAGE)
+
+
+def _strip(movie: Movie, track: Track) -> list[dict[str, Any]]:
     """Evenly chosen frames as pictures, each with its outline as a path over it."""
-    circles = by_frame(found.readings)
+    circles = by_frame(track.readings)
     every = -(-len(circles) // SHOWN)
-    full = brightest(found)
+    full = brightest(track)
     return [
         _picture(number, frame, circles[number], full)
         for number, frame in enumerate(movie.frames())
@@ -102,7 +92,7 @@ def _strip(movie: Movie, found: Track) -> list[dict[str, Any]]:
 def _picture(number: int, frame: Frame, readings: list[Reading], full: float) -> dict[str, Any]:
     step = -(-max(frame.shape) // SIDE)
     small = grey(frame[::step, ::step], full)
-    outlines = [r.found.outline.points(TURN) / step for r in readings if r.found.outline is not None and r.used]
+    outlines = [r.sighting.outline.points(TURN) / step for r in readings if r.sighting.outline is not None and r.used]
     return {
         "frame": str(number),
         "png": png(small),

@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 from scipy import ndimage
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 from en4dvar_movie.frames import Frame
 
 FINE = 3  # sub-pixels to a side
@@ -24,7 +24,7 @@ TRUNCATE = 5.0  # std of the blur
 
 @dataclass(frozen=True)
 class Scene:
-    """What is filmed and with what; lengths in pixels. Each field's annotation says what it is."""
+    """The scene that is filmed, and the camera; lengths in pixels. Each field's annotation says what it is."""
 
     shape: Annotated[tuple[int, int], "WIDTHxHEIGHT of a frame"] = (128, 128)
     level: Annotated[float, "grey level of the background"] = 150.0
@@ -66,7 +66,7 @@ def _background(scene: Scene, rng: np.random.Generator) -> Array:
 
 
 def _specks(scene: Scene, rng: np.random.Generator, count: int) -> Array:
-    """What small dark discs anywhere leave of the light (H, W)."""
+    """The share of the light (H, W) that small dark discs leave."""
     y, x = np.indices(scene.shape)
     left = np.ones(scene.shape)
     for _ in range(count):
@@ -114,7 +114,8 @@ def _cover(r: Array, radii: Array) -> Array:
     """Mean over radii (S,) of how much of a sub-pixel at r the disc covers: linear between its edges."""
     edges = np.sort(np.concatenate([radii - 0.5 / FINE, radii + 0.5 / FINE]))
     values = np.clip((radii[:, None] - edges) * FINE + 0.5, 0, 1).mean(axis=0)
-    return np.interp(r, edges, values)
+    profile: Array = np.interp(r, edges, values)
+    return profile
 
 
 def _exposed(light: Array, scene: Scene, rng: np.random.Generator) -> Frame:

@@ -10,7 +10,7 @@ from importlib.metadata import version
 
 import numpy as np
 
-from en4dvar_movie.tracking import Found, Reading
+from en4dvar_movie.tracking import Reading, Sighting
 
 COLUMNS = ("frame", "t_us", "R_um", "R_std_um", "t_std_us", "x_um", "y_um", "eccentricity", "used", "reason")
 COMMON = "R_common_um"
@@ -27,9 +27,9 @@ class Scale:
     exposure: float = float("nan")
     flashes: tuple[float, ...] = (0.0,)
 
-    def time(self, found: Found) -> float:
+    def time(self, sighting: Sighting) -> float:
         """When a circle was seen, s."""
-        return found.frame / self.rate + self.flashes[found.flash]
+        return sighting.frame / self.rate + self.flashes[sighting.flash]
 
     @property
     def time_std(self) -> float:
@@ -58,8 +58,8 @@ def to_csv(readings: Sequence[Reading], scale: Scale, movie: str, command: str) 
 
 def _row(reading: Reading, scale: Scale) -> Iterable[str]:
     um = 1e6 * scale.pixel
-    first = [str(reading.found.frame), f"{1e6 * scale.time(reading.found):.9g}"]
-    outline = reading.found.outline
+    first = [str(reading.sighting.frame), f"{1e6 * scale.time(reading.sighting):.9g}"]
+    outline = reading.sighting.outline
     last = [str(int(reading.used)), reading.reason]
     if not reading.used or outline is None:
         return [*first, *[""] * 6, *last]

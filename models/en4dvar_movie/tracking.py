@@ -25,8 +25,8 @@ MOST_BLUR = 0.12  # of the radius, of an outline that the frame cuts
 
 
 @dataclass(frozen=True)
-class Found:
-    """What a frame shows at one of its flashes: its outline, or the ``reason`` why there is none."""
+class Sighting:
+    """The bubble in a frame at one of its flashes: its outline, or the ``reason`` why there is none."""
 
     frame: int
     outline: Outline | None
@@ -38,7 +38,7 @@ class Found:
 class Reading:
     """A frame's radius and its errors, in pixels, ready for the table; ``used`` False where ``reason`` says why."""
 
-    found: Found
+    sighting: Sighting
     radius: float
     errors: Errors
     used: bool
@@ -71,19 +71,19 @@ def track(
     background, optics = find_background(movie, len(flashes))
     fixed = corrections or {}
 
-    def look(numbered: tuple[int, Frame]) -> list[Found]:
+    def look(numbered: tuple[int, Frame]) -> list[Sighting]:
         number, frame = numbered
         if number in movie.damaged:
-            return [Found(number, None, "the file is damaged here")]
+            return [Sighting(number, None, "the file is damaged here")]
         return find_bubble(number, frame, background, optics, fixed.get(number), len(flashes))
 
-    found = []
-    for one in in_order(look, enumerate(movie.frames()), workers):
-        found.append(one)
-        progress(len(found))
+    sightings = []
+    for of_frame in in_order(look, enumerate(movie.frames()), workers):
+        sightings.append(of_frame)
+        progress(len(sightings))
     if len(flashes) > 1:
-        found = ordered(found, movie.rate, flashes)
-    flat = [circle for one in found for circle in one]
+        sightings = ordered(sightings, movie.rate, flashes)
+    flat = [circle for of_frame in sightings for circle in of_frame]
     return Track(tuple(readings_of(flat, optics, fixed)), background, optics, flashes)
 
 
@@ -94,33 +94,37 @@ def find_bubble(
     optics: Optics,
     correction: Correction | None = None,
     circles: int = 1,
-) -> list[Found]:
+) -> list[Sighting]:
     """The bubble's outline in one frame, or its nested ones, the largest first; one entry where there is none."""
     image, tiles = background.normalised(frame)
     if correction is not None and correction.start is not None:
         place: tuple[Circle, float] | None = (correction.start, -optics.contrast)
     elif number < background.frames:
-        return [Found(number, None, "no bubble: the frame is one of the background's")]
+        return [Sighting(number, None, "no bubble: the frame is one of the background's")]
     else:
         if share_changed(tiles, background.noise) > CHANGED:
-            return [Found(number, None, "flash: much of the frame is brighter than the background")]
+            return [Sighting(number, None, "flash: much of the frame is brighter than the background")]
         place = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
     if place is None:
-        return [Found(number, None, "no bubble: nothing differs from the background")]
+        return [Sighting(number, None, "no bubble: nothing differs from the background")]
     outlines = fit_outline(background.steadied(image, tiles, place[0]), place[0], optics, circles)
     if outlines is None:
-        return [Found(number, None, "no circle fits the outline")]
-    return [Found(number, o, _fault(o, optics, background.noise)) for o in outlines]
+        return [Sighting(number, None, "no circle fits the outline")]
+    return [Sighting(number, o, _fault(o, optics, background.noise)) for o in outlines]
 
 
-def ordered(found: list[list[Found]], rate: float, flashes: Sequence[float]) -> list[list[Found]]:
+def ordered(sightings: list[list[Sighting]], rate: float, flashes: Sequence[float]) -> list[list[Sighting]]:
     """The nested circles of each frame in the order of the flashes; frames without all of them keep theirs."""
-    whole = [k for k, one in enumerate(found) if len(one) == len(flashes) and not any(c.reason for c in one)]
-    radii = [np.array([c.outline.circle.R for c in found[k] if c.outline is not None]) for k in whole]
-    at = np.array([found[k][0].frame / rate for k in whole])
-    result = list(found)
+    whole = [
+        k
+        for k, of_frame in enumerate(sightings)
+        if len(of_frame) == len(flashes) and not any(c.reason for c in of_frame)
+    ]
+    radii = [np.array([c.outline.circle.R for c in sightings[k] if c.outline is not None]) for k in whole]
+    at = np.array([sightings[k][0].frame / rate for k in whole])
+    result = list(sightings)
     for k, order in zip(whole, in_time(radii, at, flashes), strict=True):
-        result[k] = [replace(found[k][circle], flash=flash) for flash, circle in enumerate(order)]
+        result[k] = [replace(sightings[k][circle], flash=flash) for flash, circle in enumerate(order)]
     return result
 
 
@@ -140,13 +144,13 @@ def _fault(outline: Outline, optics: Optics, noise: float) -> str:
 
 
 def in_order(
-    look: Callable[[tuple[int, Frame]], list[Found]], frames: Iterable[tuple[int, Frame]], workers: int
-) -> Iterator[list[Found]]:
+    look: Callable[[tuple[int, Frame]], list[Sighting]], frames: Iterable[tuple[int, Frame]], workers: int
+) -> Iterator[list[Sighting]]:
     """``look`` at each frame in threads; a few frames are held at a time."""
     if workers == 1:
         yield from map(look, frames)
         return
-    waiting: deque[Future[list[Found]]] = deque()
+    waiting: deque[Future[list[Sighting]]] = deque()
     with ThreadPoolExecutor(workers) as pool:
         for numbered in frames:
             waiting.append(pool.submit(look, numbered))
@@ -156,30 +160,30 @@ def in_order(
             yield waiting.popleft().result()
 
 
-def elsewhere(found: Sequence[Found]) -> list[Found]:
+def elsewhere(sightings: Sequence[Sighting]) -> list[Sighting]:
     """The same, with a reason for outlines that lie outside the bubble of the frames about them: specks of dirt."""
-    good = [k for k, one in enumerate(found) if one.outline is not None and not one.reason]
-    circles = np.array([(c.x, c.y, c.R) for k in good if (o := found[k].outline) is not None for c in [o.circle]])
-    result = list(found)
+    good = [k for k, sighting in enumerate(sightings) if sighting.outline is not None and not sighting.reason]
+    circles = np.array([(c.x, c.y, c.R) for k in good if (o := sightings[k].outline) is not None for c in [o.circle]])
+    result = list(sightings)
     for n, k in enumerate(good):
         near = circles[max(0, n - NEIGHBOURS) : n + NEIGHBOURS + 1]
         x, y = np.median(near[:, :2], axis=0)
         if np.hypot(circles[n, 0] - x, circles[n, 1] - y) > max(near[:, 2].max(), 2 * circles[n, 2]):
-            result[k] = replace(found[k], reason="elsewhere: the outline lies outside the bubble of other frames")
+            result[k] = replace(sightings[k], reason="elsewhere: the outline lies outside the bubble of other frames")
     return result
 
 
-def readings_of(found: list[Found], optics: Optics, corrections: Mapping[int, Correction]) -> Iterator[Reading]:
+def readings_of(sightings: list[Sighting], optics: Optics, corrections: Mapping[int, Correction]) -> Iterator[Reading]:
     """Radii with their errors, and what is left out by hand or for the neighbours' sake."""
-    found = elsewhere(found)
-    good = [one.outline if not one.reason else None for one in found]
+    sightings = elsewhere(sightings)
+    good = [sighting.outline if not sighting.reason else None for sighting in sightings]
     errors = errors_of(good, optics)
-    for one, outline, error in zip(found, good, errors, strict=True):
-        correction = corrections.get(one.frame)
+    for sighting, outline, error in zip(sightings, good, errors, strict=True):
+        correction = corrections.get(sighting.frame)
         if correction is not None and correction.out:
-            yield Reading(one, float("nan"), error, False, f"left out by hand: {correction.words}".rstrip(": "))
+            yield Reading(sighting, float("nan"), error, False, f"left out by hand: {correction.words}".rstrip(": "))
         elif outline is None:
-            yield Reading(one, float("nan"), error, False, one.reason)
+            yield Reading(sighting, float("nan"), error, False, sighting.reason)
         else:
             words = f"by hand: {correction.words}".rstrip(": ") if correction is not None else error.words
-            yield Reading(one, error.radius, error, True, words)
+            yield Reading(sighting, error.radius, error, True, words)

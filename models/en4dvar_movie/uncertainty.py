@@ -1,4 +1,4 @@
-"""What the readings are worth: errors of each frame, from its own outline and from what neighbouring frames say.
+"""The errors of readings: errors of each frame, from its own outline and from what neighbouring frames say.
 
 Independent part, per frame: pixel noise through the fit, times the factor by which sectors of the outline scatter more
 than pixels do (compression, jagged outlines), averaged over neighbouring frames of like sharpness.
@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 from en4dvar_movie.outline import Optics, Outline
 
 NEIGHBOURS = 10  # frames to each side
@@ -60,27 +60,27 @@ def errors_of(outlines: Sequence[Outline | None], optics: Optics) -> list[Errors
 
 
 def _turns(outlines: Sequence[Outline | None]) -> list[bool]:
-    """Whether the radius of a frame lies below, or above, those of both neighbours."""
+    """True if the radius of a frame lies below, or above, those of both neighbours."""
     where = [k for k, o in enumerate(outlines) if o is not None]
     radii = np.array([o.circle.R for o in outlines if o is not None])
-    found = [False] * len(outlines)
+    turns = [False] * len(outlines)
     for n in range(1, len(where) - 1):
-        found[where[n]] = bool((radii[n] - radii[n - 1]) * (radii[n + 1] - radii[n]) <= 0)
-    return found
+        turns[where[n]] = bool((radii[n] - radii[n - 1]) * (radii[n + 1] - radii[n]) <= 0)
+    return turns
 
 
 def _smoothed(outlines: Sequence[Outline | None]) -> Array:
     """Sector scatter over pixel scatter, averaged over neighbours whose edge is as sharp and as complete."""
     where = [k for k, o in enumerate(outlines) if o is not None]
     logs = {k: (np.log(o.width), o.seen, o.ratio) for k in where if (o := outlines[k]) is not None}
-    found = np.ones(len(outlines))
+    smoothed = np.ones(len(outlines))
     for k in where:
         near = [j for j in range(k - NEIGHBOURS, k + NEIGHBOURS + 1) if j in logs]
         alike = [
             np.exp(-(((logs[j][0] - logs[k][0]) / 0.2) ** 2) - ((logs[j][1] - logs[k][1]) / 0.1) ** 2) for j in near
         ]
-        found[k] = float(np.average([logs[j][2] for j in near], weights=alike))
-    return found
+        smoothed[k] = float(np.average([logs[j][2] for j in near], weights=alike))
+    return smoothed
 
 
 def _errors(outline: Outline, ratio: float, hidden: float, turned: bool, optics: Optics) -> Errors:
@@ -107,14 +107,14 @@ def _hidden(outlines: Sequence[Outline | None]) -> Array:
     radii = np.array([o.circle.R for o in known])
     noise = np.array([2 * o.mode_std**2 for o in known]) / radii**2  # mean and std of (a/R)² where there is no mode 2
     excess = np.array([o.amplitude(2) ** 2 for o in known]) / radii**2 - noise
-    found = np.zeros(len(outlines))
+    hidden = np.zeros(len(outlines))
     for n, k in enumerate(where):
         near = slice(max(0, n - NEIGHBOURS), n + NEIGHBOURS + 1)
         weights = 1 / noise[near] ** 2
         together = float(np.average(excess[near], weights=weights))
         if excess[n] > (SIGNIFICANT**2 / 2 - 1) * noise[n]:
-            found[k] = excess[n]
+            hidden[k] = excess[n]
         elif together > SIGNIFICANT / np.sqrt(weights.sum()):
-            found[k] = together
-        found[k] *= STUDENT**2 * radii[n] ** 2 / 6
-    return found
+            hidden[k] = together
+        hidden[k] *= STUDENT**2 * radii[n] ** 2 / 6
+    return hidden

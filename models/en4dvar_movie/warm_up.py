@@ -14,7 +14,7 @@ from en4dvar_movie.tracking import track
 
 
 def examples() -> dict[str, Callable[[], object]]:
-    """What is compiled, in words, and a call that does; for ``en4dvar warm-up``."""
+    """Name of each kernel, in words, and a call that compiles it; for ``en4dvar warm-up``."""
     return {f"movie of {bits} bit": partial(_track, bits) for bits in (8, 16)}
 
 

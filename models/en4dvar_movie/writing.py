@@ -6,8 +6,9 @@ from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
 
-from en4dvar.errors import DataError
-from en4dvar_movie.frames import TIFF, VIDEO, Frame, library
+from en4dvar.plumbing.errors import DataError
+from en4dvar_movie.decoders import library
+from en4dvar_movie.frames import TIFF, VIDEO, Frame
 
 PLAYED = 30  # frames a second, of a video
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from en4dvar.report.drawing import keep
+from en4dvar_agarose.figures import reliability_figure
 from en4dvar_agarose.measured import bins, coverage, reliability
 
 
@@ -43,3 +45,9 @@ def test_population_means_are_covered():
         assert c.of_first >= 18, c
         assert c.held / c.campaigns > 0.95 - 2.5 * c.error, c
         assert c.of_drawn / c.campaigns > 0.95 - 2.5 * c.error, c
+
+
+def test_its_figure_can_be_kept(tmp_path):
+    """Its two panels have different legends."""
+    keep(reliability_figure(), tmp_path, "reliability")
+    assert {file.name for file in tmp_path.iterdir()} == {"reliability.pdf", "reliability.png"}

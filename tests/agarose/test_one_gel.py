@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from en4dvar.assembly.build import build
 from en4dvar.config import load_config
-from en4dvar.config.build import build
-from en4dvar.joint import estimate_jointly, sharing
-from en4dvar.prior import member_stream
-from en4dvar.problem import AssimilationSettings
+from en4dvar.estimation.joint import estimate_jointly, sharing
+from en4dvar.priors.prior import member_stream
 from en4dvar.sampling.forward_runs import ForwardRuns
+from en4dvar.schemes.settings import AssimilationSettings
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 

@@ -17,7 +17,7 @@ import xarray as xr
 from click.testing import CliRunner
 from run_files import assert_same_results, command, environment, resumed_until_done, run_cli
 
-from en4dvar.errors import ConfigError, OutputError
+from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar_agarose import report, tables
 from en4dvar_agarose.checkpoints import identity_of
 from en4dvar_agarose.commands import study as study_command

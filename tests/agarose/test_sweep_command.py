@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from en4dvar.errors import OutputError
+from en4dvar.plumbing.errors import OutputError
 from en4dvar_agarose.checkpoints import prepare_folder
 from en4dvar_agarose.commands import sweep as sweep_command
 

@@ -31,6 +31,9 @@ FORBIDDEN = {
 }
 
 
+VAGUE = {"found", "one", "given"}  # of a variable or an argument: they say how it came to be, not what it is
+
+
 def words(name: str) -> list[str]:
     """The words of an identifier, lower case: of snake_case and CamelCase."""
     return [w.lower() for part in name.split("_") for w in re.findall(r"[A-Z]?[a-z0-9]+|[A-Z]+(?![a-z])", part)]
@@ -51,9 +54,28 @@ def odd(source: str) -> set[str]:
     return {name for name in names(source) if set(words(name)) & FORBIDDEN.keys()}
 
 
+def vague(source: str) -> list[int]:
+    """Lines on which a variable or an argument is bound to a vague name."""
+    return sorted(
+        node.lineno
+        for node in ast.walk(ast.parse(source))
+        if (isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id in VAGUE)
+        or (isinstance(node, ast.arg) and node.arg in VAGUE)
+    )
+
+
 def test_identifiers_use_the_words_of_the_glossary():
     found = {str(p.relative_to(ROOT)): sorted(names) for p in FILES if (names := odd(p.read_text(encoding="utf-8")))}
     assert found == {}
+
+
+def test_variables_say_what_they_hold():
+    assert {str(p.relative_to(ROOT)): n for p in FILES if (n := vague(p.read_text(encoding="utf-8")))} == {}
+
+
+@pytest.mark.parametrize("source", ["found = 1", "def f(given): pass", "[one for one in ()]", "with x as found: pass"])
+def test_a_vague_name_would_be_seen(source):
+    assert vague(source) == [1]
 
 
 @pytest.mark.parametrize(

@@ -19,12 +19,12 @@ import pytest
 from run_files import add_to_pack
 
 from en4dvar import report
-from en4dvar.caution import caution
-from en4dvar.report import overlay, style, write_pages
+from en4dvar.plumbing.caution import caution
+from en4dvar.report import overlay, write_pages
 from en4dvar.report.compare import compare_runs
 from en4dvar.report.figures import all_figures
 from en4dvar.report.result import Result
-from en4dvar.storage.provenance import provenance
+from en4dvar.results.provenance import provenance
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
@@ -89,8 +89,7 @@ def opened(browser: Any) -> Iterator[Any]:
 def pages(analysis: Any, renamed: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Kind of page → its file. One data set of the campaign has a name made to break out of the page."""
     with pytest.MonkeyPatch.context() as patch:  # the PDF and PNG copies of the figures are no part of a page
-        patch.setattr(style, "save_figure", lambda *_: None)
-        patch.setattr(overlay, "save_figure", lambda *_: None)
+        patch.setattr(overlay, "keep", lambda *_: None)
         return _write_pages(analysis, renamed, tmp_path_factory.mktemp("pages"))
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from en4dvar.report.drawing import draw
 from en4dvar.report.overview import LISTED, SetSummary, overview_figures, render_overview
-from en4dvar.storage.pack import PACK
-from en4dvar.storage.store import load_stored
+from en4dvar.results.pack import PACK
+from en4dvar.results.store import load_stored
 
 pytestmark = pytest.mark.slow  # a browser takes half a minute of the processor
 LOOK = (Path(__file__).parent / "look.js").read_text(encoding="utf-8")

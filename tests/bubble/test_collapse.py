@@ -10,7 +10,7 @@ import pytest
 from scipy.io import loadmat
 
 from en4dvar_bubble import BubbleModel, collapse
-from en4dvar_bubble.collapse import RAYLEIGH, Expected, Lobe, bounds, doubt, doubts, lobe
+from en4dvar_bubble.collapse import RAYLEIGH, Expected, Gel, Lobe, bounds, conceivable, doubt, doubts, lobe
 from en4dvar_bubble.medium import WATER_25C
 from en4dvar_bubble.settings import BubbleSettings
 
@@ -64,7 +64,7 @@ def test_correct_public_data_are_believed() -> None:
 
 
 @pytest.mark.parametrize("radius", [20e-6, 50e-6, 200e-6, 500e-6])
-def test_no_forward_run_of_a_gel_is_doubted(radius: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_forward_run_of_a_gel_is_doubted(radius: float) -> None:
     """The bounds are those of the model itself, for stiffnesses and viscosities in turn taken for the largest."""
     settings = {
         "start": "laser",
@@ -77,11 +77,18 @@ def test_no_forward_run_of_a_gel_is_doubted(radius: float, monkeypatch: pytest.M
     for G, mu, stretch in [(g, m, s) for g in (100.0, 2e4, 4.2e4) for m in (1e-3, 0.03, 0.1, 0.3) for s in (5.0, 12.0)]:
         theta = {"G": G, "mu": mu, "R_eq": radius / stretch, "R_max": radius}
         (path,) = model.trajectories(model.initial_states({k: np.array([v]) for k, v in theta.items()}), times)
-        monkeypatch.setattr(collapse, "STIFF", G)
-        monkeypatch.setattr(collapse, "THICK", mu)
-        low, high = bounds(radius, model.medium)
+        low, high = bounds(radius, model.medium, Gel(G, mu))
         if radius * np.sqrt(998 * 101325) / mu > 5:  # below, the bubble creeps back and does not collapse
             assert low < lobe(times, path["R"]).rayleigh_ratio(model.medium) < high, theta
+
+
+def test_gels_beyond_what_is_usual_are_conceivable() -> None:
+    """80 kPa shorten a collapse to 0.58 of Rayleigh's; a diameter taken for a radius halves it."""
+    stiff = bounds(400e-6, WATER_25C, Gel(80e3, 0.1))[0]
+    assert stiff == pytest.approx(0.58, abs=0.01)
+    assert conceivable(usual(stiff), WATER_25C)
+    assert not conceivable(usual(0.5), WATER_25C)
+    assert not conceivable(usual(3.0, 600e-6), WATER_25C)
 
 
 def expected(ratios: list[float], common: bool = False) -> Expected:
@@ -150,3 +157,22 @@ def test_a_window_that_ends_before_the_collapse_tells_nothing() -> None:
     assert doubts(t, R, predicted[:0], {}, medium)
     assert doubts(t[:20], R[:20], predicted[:0, :20], {}, medium) == ()
     assert doubts(t, R, predicted, {}, medium) == ()
+
+
+def test_a_gel_stiffer_than_usual_is_told_and_its_estimate_printed() -> None:
+    """A caution where the prior reaches the ratio; serious where it does not, or where no gel does."""
+
+    def path(ratio: float) -> np.ndarray:
+        view = usual(ratio)
+        return view.R_max * np.clip(1 - (t / view.t_c) ** 2, 0.05, None) ** 0.4
+
+    t = np.linspace(0, 0.95 * usual(0.7).t_c, 60)
+    members = {"G": np.array([1e3, 5e3, 6e4])}
+    wide = np.stack([path(ratio) for ratio in (0.98, 0.93, 0.68)])
+    narrow = np.stack([path(ratio) for ratio in (0.98, 0.97, 0.96)])
+    (doubt_of_wide,) = doubts(t, path(0.7), wide, members, WATER_25C)
+    (doubt_of_narrow,) = doubts(t, path(0.7), narrow, {"G": np.full(3, 1e3)}, WATER_25C)
+    assert (doubt_of_wide.severity, doubt_of_narrow.severity) == ("caution", "serious")
+    assert "a gel of 20 kPa allows no less than 0.82" in doubt_of_wide.words
+    (impossible,) = doubts(t, path(0.45), wide, members, WATER_25C)
+    assert impossible.severity == "serious"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from en4dvar.errors import DataError
+from en4dvar.plumbing.errors import DataError
 from en4dvar_bubble import Accuracy, Medium, simulate
 from en4dvar_bubble.driving import from_file, gaussian, histotripsy, pulses, silence, sine_burst, step, tabulated
 

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from en4dvar.assimilate import assimilate
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.series import Series
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.data.series import Series
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import Accuracy, BubbleModel, NeoHookeanKelvinVoigt
 from en4dvar_bubble.emission import OBSERVABLE, emitted
 

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from en4dvar.assimilate import assimilate
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.data.series import Series
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.errors import DataError
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.series import Series
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.plumbing.errors import DataError
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble import BubbleModel, NeoHookeanKelvinVoigt
 from en4dvar_bubble.events import events
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
-from en4dvar.errors import ConfigError
-from en4dvar.state import Parameter
+from en4dvar.model.state import Parameter
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar_bubble.battery import CHECKS, describe, run_battery
 from en4dvar_bubble.laws import REGISTRY, ConstitutiveLaw, Liquid, get_law
 from en4dvar_bubble.laws.loading import available

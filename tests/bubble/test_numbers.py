@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from en4dvar.config import load_config
-from en4dvar.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar_bubble import WATER_25C, BubbleModel, NeoHookeanKelvinVoigt, get_law, histotripsy, silence, simulate
 from en4dvar_bubble.numbers import ALL, OF_MEDIUM
 from en4dvar_bubble.packing import pack

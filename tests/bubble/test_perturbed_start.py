@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from en4dvar.assimilate import assimilate, forecast
 from en4dvar.config.initial_state import perturbation
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.estimation.assimilate import assimilate, forecast
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
 

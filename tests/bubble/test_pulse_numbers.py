@@ -7,7 +7,7 @@ import pytest
 from test_numbers import BASE, CONFIG
 
 from en4dvar.config import load_config
-from en4dvar.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar_bubble import Accuracy, BubbleModel, NeoHookeanKelvinVoigt, simulate
 from en4dvar_bubble.driving import gaussian, histotripsy, silence, sine_burst, step, tabulated
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
 from en4dvar.config import load_config
 from en4dvar.config.document import parse_document
 from en4dvar.config.load import resolve
-from en4dvar.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar_bubble import BubbleModel
+from en4dvar_bubble.media import MEDIA, known_medium
 from en4dvar_bubble.medium import CONSTANT_SETS, UNITS
-from en4dvar_bubble.settings import BubbleSettings, ConstantsSettings
+from en4dvar_bubble.settings import BubbleSettings, ConstantsSettings, MediumName
 
 HEAD = "name: x\nmodel:\n  name: bubble\n"
 TAIL = """parameters:
@@ -43,6 +46,8 @@ VARIANTS = {
     "saturated": "  vapour_pressure: saturated\n",
     "constant set": "  constants: imr-v2\n",
     "constants": "  constants: {set: imr-v1, S: 0.06 N/m, kappa: 1.3, sources: {S: pendant drop}}\n",
+    "medium": "  medium: polyacrylamide\n",
+    "medium at a concentration": "  medium: {name: peg, concentration: 30 %}\n  constants: {S: 0.06 N/m}\n",
     "accuracy": "  accuracy: fast\n  nodes: 6\n  rtol: 1e-6\n  mach_limit: 3\n",
 }
 
@@ -141,6 +146,8 @@ class TestFaults:
             ("  constants: {set: imr-v22}\n", "model.constants.set", "did you mean 'imr-v2'?", 4),
             ("  constants: {rho: 998}\n", "model.constants.rho", "998 has no unit", 4),
             ("  constants: {sources: {roh: me}}\n", "model.constants.sources", "did you mean 'rho'?", 4),
+            ("  medium: jelly\n", "model.medium", "'jelly' is not one of water, polyacrylamide", 4),
+            ("  medium: {name: peg, concentration: 30 m}\n", "model.medium.concentration", "converted", 4),
             ("  vapour_pressure: 3170\n", "model.vapour_pressure", "3170 has no unit", 4),
         ],
     )  # fmt: skip
@@ -164,7 +171,7 @@ class TestConstants:
 
     def test_replaced_constants_say_so(self):
         given = {"set": "imr-v1", "S": "0.06 N/m", "c": "1.5 km/s", "sources": {"c": "our own measurement"}}
-        medium = BubbleSettings.model_validate({"constants": given}).medium
+        medium = BubbleSettings.model_validate({"constants": given}).liquid
         assert (medium.rho, medium.S, medium.c) == (1060.0, 0.06, 1500.0)
         assert medium.sources["S"] == "given in the configuration"
         assert medium.sources["c"] == "our own measurement"
@@ -172,7 +179,42 @@ class TestConstants:
 
     def test_vapour_pressure_follows_the_temperature(self):
         warm = {"vapour_pressure": "saturated", "constants": {"T_inf": "310 K"}}
-        assert BubbleSettings.model_validate(warm).medium.p_v == pytest.approx(1.17e11 * np.exp(-5200 / 310))
+        assert BubbleSettings.model_validate(warm).liquid.p_v == pytest.approx(1.17e11 * np.exp(-5200 / 310))
+
+
+class TestMedium:
+    """Densities against measurements that the table was not made from."""
+
+    @pytest.mark.parametrize(
+        ("name", "fraction", "density", "within"),
+        [
+            ("peg", 0.05, 1005.7, 1e-3),  # PEG 3000, 298.15 K: J. Korean Chem. Soc. 63 (2019), supplement
+            ("peg", 0.20, 1029.7, 1e-3),
+            ("polyacrylamide", 0.16, 1.6e6 / 1544, 0.015),  # Lafon et al. (2005): impedance over speed
+        ],
+    )
+    def test_density(self, name, fraction, density, within):
+        known = known_medium(name, fraction)
+        assert known.rho == pytest.approx(density, rel=within)
+        assert known.rho_log_std >= abs(np.log(known.rho / density)) / 2
+
+    def test_a_name_is_all_there_is_to_say(self):
+        for name in MEDIA:
+            usual, known = known_medium(name), BubbleSettings.model_validate({"medium": name}).liquid
+            assert (known.rho, known.c) == (usual.rho, usual.c)
+            assert known.sources["rho"] == known.sources["c"] == usual.source
+            assert 990 < known.rho < 1080
+            assert usual.rho_log_std >= known_medium(name, 0.0).rho_log_std  # what is not said is not known
+        assert set(MEDIA) == set(get_args(MediumName))
+
+    def test_constants_go_before(self):
+        given = {
+            "medium": {"name": "peg", "concentration": "30 %"},
+            "constants": {"set": "imr-v1", "rho": "1040 kg/m^3"},
+        }
+        medium = BubbleSettings.model_validate(given).liquid
+        assert (medium.rho, medium.c, medium.S) == (1040.0, known_medium("peg", 0.3).c, 0.056)
+        assert "30" in medium.sources["c"] or "0.3" in medium.sources["c"]
 
 
 def test_constants_of_earlier_versions_are_left_out():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import en4dvar_bubble
-from en4dvar.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar_bubble import api
 from en4dvar_bubble.medium import UNITS, WATER_25C
 
@@ -28,7 +28,7 @@ def test_dataset_has_si_fields_with_units_and_the_parameters():
     assert set(constants) == set(UNITS)
     assert data.attrs == {
         "law": "quadratic-kelvin-voigt", "start": "acoustic", "gas": "heat", "driving_read": "instantaneous",
-        "radial": "keller-miksis", "vapour": "none", "medium_heat": "cold",
+        "radial": "keller-miksis", "vapour": "none", "medium_heat": "cold", "wall": "none",
     }  # fmt: skip
     assert (data.status == 0).all()
     assert list(data.reason.values) == ["", "", ""]

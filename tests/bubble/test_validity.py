@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from en4dvar.honesty.checks import validity
+from en4dvar.diagnosis.honesty.checks import validity
 from en4dvar_bubble import BubbleModel
 
 

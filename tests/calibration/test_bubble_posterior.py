@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from acoustic_twin import make_twin, prior
 
-from en4dvar.assimilate import assimilate
 from en4dvar.ensemble.forecast import log_posterior
-from en4dvar.problem import AssimilationSettings
+from en4dvar.estimation.assimilate import assimilate
 from en4dvar.sampling import mcmc
+from en4dvar.schemes.settings import AssimilationSettings
 
 SEEDS = (0, 1, 2)  # the first sets of the twin; benchmarks/calibration.py measures many more
 TIME_STD = (0.0, 0.1e-6)

@@ -7,10 +7,10 @@ import pytest
 from scipy.stats import chisquare
 from toys import Linear, make_problem
 
-from en4dvar.assimilate import assimilate
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings
-from en4dvar.state import NOISE_SCALE
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.model.state import NOISE_SCALE
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.schemes.settings import AssimilationSettings
 
 RUNS, K = 300, 40
 

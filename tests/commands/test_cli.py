@@ -13,13 +13,14 @@ import xarray as xr
 from click.testing import CliRunner, Result
 from toy_config import YAML, csv_text, write_toy
 
-from en4dvar.caution import caution
 from en4dvar.cli import main
 from en4dvar.commands.run import _tell
 from en4dvar.config import load_config
+from en4dvar.estimation.summary import ParameterSummary
+from en4dvar.plumbing.caution import caution
 from en4dvar.report.result import load_result
+from en4dvar.results.pack import PACK
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
-from en4dvar.storage.pack import PACK
 
 
 def call(*arguments: str | Path) -> Result:
@@ -53,7 +54,7 @@ def test_run_writes_the_run_directory(finished: tuple[Path, Result]) -> None:
 
 def test_run_recovers_the_truth_and_prints_it(finished: tuple[Path, Result]) -> None:
     directory, outcome = finished
-    stiffness = {row.name: row for row in load_result(directory / "posterior.nc").summary()}["k"]
+    stiffness = {row.name: row for row in load_result(directory / "posterior.nc").rows}["k"]
     assert abs(stiffness.mean - 2.0) < 4 * stiffness.std
     assert stiffness.std < 0.05
     assert re.search(rf"^toy +k +N/m +{stiffness.mean:.4g} +{stiffness.std:.4g} ", outcome.stdout, re.MULTILINE)
@@ -78,7 +79,7 @@ def test_campaign(tmp_path: Path) -> None:
     assert outcome.exit_code == 0, outcome.output
     results = [load_result(tmp_path / "run" / PACK / f"set{n}") for n in (1, 2)]
     assert [r.name for r in results] == ["set1", "set2"]
-    means = [r.summary()[1].mean for r in results]
+    means = [r.rows[1].mean for r in results]
     assert means == pytest.approx([1.75, 2.0], rel=0.02)
     with xr.open_datatree(tmp_path / "run" / "posterior.nc") as tree:
         assert tree["posterior"]["k"].sizes == {"dataset": 2, "chain": 1, "draw": 8}
@@ -239,11 +240,11 @@ def test_force_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None
     path, out = write_toy(tmp_path), tmp_path / "out"
     assert call("run", path, "--out", out, "--set", "output.figures=true").exit_code == 0
     (out / "notes.txt").write_text("mine")
-    (out / "figures" / "mine.png").write_text("mine")
+    (out / "figures" / "mine.txt").write_text("mine")
     (tmp_path / "other.csv").write_text(csv_text())
     outcome = call("run", path, "--out", out, "--force", "--data", tmp_path / "*.csv")
     assert outcome.exit_code == 0, outcome.output
-    assert (out / "notes.txt").read_text() == (out / "figures" / "mine.png").read_text() == "mine"
+    assert (out / "notes.txt").read_text() == (out / "figures" / "mine.txt").read_text() == "mine"
     assert (out / PACK).exists()
     assert not (out / "figures" / "posterior.png").exists()
     assert call("run", path, "--out", out, "--force").exit_code == 0
@@ -254,14 +255,20 @@ def test_force_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None
     assert "was not written by a run" in refused.stderr
 
 
-def test_many_warnings_are_told_before_notes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_warnings_of_a_campaign_are_counted_by_kind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = caution("not-informed", "k is hardly informed"), caution("misfit", "χ² is large")
-    outcomes = tuple(DatasetOutcome(f"set{n}", tmp_path / "none.nc", warnings=said) for n in range(40))
-    _tell(Campaign(tmp_path, outcomes), with_report=False)
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 31
-    assert all(re.match(r"warning: set\d+: χ² is large; .* \[misfit\]", line) for line in lines[:-1])
-    assert lines[-1] == "and 50 more warnings and notes; see run.log"
+    worst = *said, caution("not-converged", "stopped")
+    row = ParameterSummary("k", "k", "k", "N/m", *np.arange(1.0, 10.0))
+    outcomes = [DatasetOutcome(f"set{n}", tmp_path / "none.nc", warnings=said, summary=(row,)) for n in range(40)]
+    outcomes[7] = DatasetOutcome("set7", tmp_path / "none.nc", warnings=worst, summary=(row,), remarks=("what if",))
+    _tell(Campaign(tmp_path, tuple(outcomes)), with_report=False)
+    told = capsys.readouterr()
+    assert told.out.splitlines()[1].split() == ["k", "N/m", "40", "40", "3", "3", "3"]
+    lines = told.err.splitlines()
+    assert lines[0].startswith("warning: set7: stopped; raise assimilation.max_iterations")
+    assert lines[1].startswith("warning: 40 of 40 data sets, worst set7, set0, set1: misfit; look at")
+    assert lines[2].startswith("note: 40 of 40 data sets, worst set7, set0, set1: not-informed; ")
+    assert lines[3:] == ["what was found in each of them: run.log and the report"]
     _tell(Campaign(tmp_path, outcomes[:1]), with_report=False)
     assert [line.split(":")[0] for line in capsys.readouterr().err.splitlines()] == ["warning", "note"]
 

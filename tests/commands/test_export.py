@@ -13,9 +13,9 @@ import pytest
 from click.testing import CliRunner, Result
 from run_files import add_to_pack
 
-from en4dvar.analysis import Analysis
-from en4dvar.caution import caution
 from en4dvar.cli import main
+from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.plumbing.caution import caution
 from en4dvar.report.export import escaped, export_table, latex_table, latex_unit
 from en4dvar.report.result import Result as Posterior
 from en4dvar.report.result import load_result
@@ -47,7 +47,7 @@ def test_summary_as_csv_keeps_every_digit(one: Path) -> None:
     assert done.exit_code == 0, done.output
     assert call(one, "--csv").output == done.output
     rows = list(csv.DictReader(done.output.splitlines()))
-    for row, summary in zip(rows, load_result(one / "posterior.nc").summary(), strict=True):
+    for row, summary in zip(rows, load_result(one / "posterior.nc").rows, strict=True):
         assert (row["dataset"], row["name"], row["unit"]) == ("A_E2_synthetic", summary.name, summary.unit)
         assert [float(row[k]) for k in ("mean", "std", "q05", "q95")] == [
             summary.mean, summary.std, summary.q05, summary.q95,
@@ -84,7 +84,7 @@ def test_latex_of_one_data_set(one: Path) -> None:
     assert skew.endswith(r"\textsuperscript{b} median and 5 to 95 \%: the posterior is skewed} \\")
     assert (bottom, end) == (r"  \bottomrule", r"\end{tabular}")
     assert r"\textsuperscript{a} 1 of 24 members failed in the posterior forecast" in note
-    summaries = load_result(one / "posterior.nc").summary()
+    summaries = load_result(one / "posterior.nc").rows
     for line, summary, head in zip(
         lines[5:], summaries, (r"$G$ & kPa", r"$\mu$ & Pa\,s", r"$R_0$ & $\mu$m", r"$t_s$ & $\mu$s"), strict=True
     ):
@@ -110,7 +110,7 @@ def test_latex_of_a_campaign(two: Path) -> None:
 
 
 def test_a_skewed_posterior_stands_as_its_median_with_unequal_sides(analysis: Analysis) -> None:
-    row = Posterior.from_analysis(analysis, {}).summary()[0]
+    row = Posterior.from_analysis(analysis, {}).rows[0]
     even = replace(row, q05=0.9, q50=1.0, q95=1.1, mean=1.0, std=0.1)
     skew = replace(even, q95=1.5, mean=1.1)
     assert r"$1.00 \pm 0.10$" in latex_table([("x", (even,), ())])

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from en4dvar.config.find_files import find_files
-from en4dvar.hints import suggest
+from en4dvar.assembly.find_files import find_files
+from en4dvar.plumbing.hints import suggest
 
 LAWS = {
     "fung-kelvin-voigt": "Fung exponential Kelvin–Voigt",

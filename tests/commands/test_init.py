@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from init_files import UNITS, call, proposed, simulate, write
 
+from en4dvar.assembly.build import build
 from en4dvar.config import load_config
-from en4dvar.config.build import build
 from en4dvar.config.document import parse_document
 from en4dvar_bubble import commands_init
 from en4dvar_bubble.starter.page import quoted
@@ -21,9 +21,10 @@ pytestmark = pytest.mark.usefixtures("own_folder")
 def test_without_units_and_terminal_one_error_says_what_to_add(tmp_path: Path) -> None:
     done = call("init", "--data", write(tmp_path / "b.csv"))
     assert done.exit_code == 2
-    fault = done.stderr.splitlines()[-1]
+    fault, following = done.stderr.splitlines()[-2:]
     assert "columns with numbers: t_us, R_um; units are never guessed" in fault
     assert "add --time-unit UNIT (e.g. us), --radius-unit UNIT (e.g. um)" in fault
+    assert following.endswith("--time-unit UNIT --radius-unit UNIT")
     done = call("init", "--data", write(tmp_path / "b.csv", "a,b"), "--time-unit", "us")
     needed = "add --time-column NAME, --radius-column NAME, --radius-unit UNIT (e.g. um)"
     assert needed in done.stderr
@@ -156,3 +157,107 @@ def test_a_file_that_no_option_names_is_answered_with_the_option(words: list[str
     assert done.exit_code == 2
     assert words[-1] in done.stderr
     assert wanted in done.stderr
+
+
+def test_pixels_and_frame_numbers(tmp_path: Path) -> None:
+    """The configuration reads the same histories as one with the sizes multiplied in."""
+    t, R = np.loadtxt(write(tmp_path / "b.csv"), delimiter=",", skiprows=1).T
+    rows = zip(np.rint(t / 0.7), R / 2.5, strict=True)
+    Path("px.csv").write_text("\n".join(["frame,R_px", *(f"{n:g},{r:.17g}" for n, r in rows), ""]))
+    scales = ("--pixel", "2.5 um", "--frame-rate", "1.4285714285714286 MHz")
+    for more in ((), ("--time-unit", "frame", "--radius-unit", "px")):
+        done = call("init", "--data", "px.csv", *scales, *more, "--force")
+        assert done.exit_code == 0, done.output
+        assert "seems to" not in done.stderr
+        (read,) = build(proposed(Path("px.yaml")))
+        assert call("init", "--data", "b.csv", *UNITS, "--force").exit_code == 0
+        (known,) = build(proposed(Path("b.yaml")))
+        assert read.observations.values == pytest.approx(known.observations.values, rel=1e-12)
+        assert read.observations.times == pytest.approx(known.observations.times, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "needed", "following"),
+    [
+        ((), "--frame-rate RATE (e.g. '270 kHz', where frame", "--frame-rate RATE --pixel LENGTH"),
+        (("--time-unit", "frame", "--pixel", "2 um"), "add --frame-rate RATE", "--frame-rate RATE"),
+        (("--frame-rate", "270 kfps", "--radius-unit", "px"), "add --pixel LENGTH", "--pixel LENGTH"),
+    ],
+)
+def test_pixels_and_frames_without_their_size_end_with_the_next_command(
+    tmp_path: Path, options: tuple[str, ...], needed: str, following: str
+) -> None:
+    done = call("init", "--data", write(tmp_path / "b.csv", "frame,R_px"), *options)
+    assert done.exit_code == 2
+    assert needed in done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("next: en4dvar ")
+    assert last.endswith(following)
+
+
+def test_options_that_contradict_each_other(tmp_path: Path) -> None:
+    done = call("init", "--data", write(tmp_path / "b.csv"), *UNITS, "--pixel", "2 um")
+    assert (done.exit_code, done.stderr.splitlines()[-1][:37]) == (2, "--pixel makes pixels the unit of radi")
+    done = call("init", "--data", "b.csv", "--pixel", "-2 um", "--time-unit", "us")
+    assert "'-2 um' is not positive" in done.stderr
+
+
+def _workbook(path: Path) -> Path:
+    from openpyxl import Workbook
+
+    book = Workbook()
+    for title in ("Film 3", "Film 4"):
+        sheet = book.active if title == "Film 3" else book.create_sheet()
+        sheet.title = title
+        for row in [("t_us", "R_um"), (0, 9), (1, 8), (2, 7)]:
+            sheet.append(row)
+    book.save(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("rows", "words", "following"),
+    [
+        ("0,9 1,8 3,7 2,7", "sort the rows (--unsorted sort)", "--unsorted sort"),
+        ("0,9 1,8 1,7 2,7", "their mean (--repeated average)", "--repeated average"),
+        ("0,9 1,8 2,7 0,9", "say whose each row is (--by)", "--by NAME"),
+    ],
+)
+def test_disorder_is_answered_with_options_of_init(tmp_path: Path, rows: str, words: str, following: str) -> None:
+    (tmp_path / "b.csv").write_text("\n".join(["t_us,R_um", *rows.split()]))
+    done = call("init", "--data", "b.csv", *UNITS)
+    assert done.exit_code == 2
+    assert words in done.stderr
+    assert "data." not in done.stderr
+    assert done.stderr.splitlines()[-1].endswith(following)
+
+
+def test_sheets_movies_and_unknown_files_are_answered_with_options(tmp_path: Path) -> None:
+    done = call("init", "--data", _workbook(tmp_path / "b.xlsx"), *UNITS)
+    assert "say which (--sheet): Film 3, Film 4" in done.stderr
+    assert done.stderr.splitlines()[-1].endswith("--sheet SHEET")
+    (tmp_path / "b.abc").write_text((write(tmp_path / "b.csv")).read_text())
+    done = call("init", "--data", "b.abc", *UNITS)
+    assert "say what it is (--format csv" in done.stderr
+    assert call("init", "--data", "b.abc", "--format", "csv", *UNITS).exit_code == 0
+    assert len(build(proposed(Path("b.yaml")))) == 1
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for n in range(3):
+        (frames / f"{n}.tif").write_bytes(b"")
+    for movie in ("bubble.mp4", "frames"):
+        done = call("init", "--data", movie)
+        assert done.exit_code == 2
+        assert f"next: en4dvar init --movie {movie} --pixel LENGTH --frame-rate RATE" in done.stderr
+
+
+def test_columns_that_differ_by_a_number_are_proposed_as_bubbles(tmp_path: Path) -> None:
+    lines = write(tmp_path / "b.csv").read_text().split()[1:]
+    wide = "\n".join(["t_us,R_1,R_2", *(f"{line},{line.split(',')[1]}" for line in lines), ""])
+    Path("b.csv").write_text(wide)
+    done = call("init", "--data", "b.csv", *UNITS)
+    assert "add --radius-column R_* (each of these columns is a bubble)" in done.stderr
+    assert done.stderr.splitlines()[-1].endswith("--radius-column 'R_*'")
+    done = call("init", "--data", "b.csv", *UNITS, "--radius-column", "R_*")
+    assert done.exit_code == 0, done.output
+    assert [p.observations.name for p in build(proposed(Path("b.yaml")))] == ["b_R_1", "b_R_2"]

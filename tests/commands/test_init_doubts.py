@@ -9,8 +9,8 @@ import pytest
 from init_files import UNITS, call, proposed, simulate, write
 from scipy.io import savemat
 
+from en4dvar.assembly.build import build
 from en4dvar.config import load_config
-from en4dvar.config.build import build
 from en4dvar.inputs.asked import Column
 from en4dvar.inputs.readers import read_series
 from en4dvar_bubble.collapse import RAYLEIGH
@@ -32,10 +32,12 @@ def test_units_that_cannot_be_right_are_noticed(tmp_path: Path) -> None:
     [
         ("t_us,R [mm]", UNITS, ["the name of column 'R [mm]' says mm, but its unit is given as um"]),
         ("time (ms),R_um", UNITS, ["the name of column 'time (ms)' says ms, but its unit is given as us"]),
-        ("frame,R_um", UNITS, ["'frame' seems to count frames; then give --time-step"]),
-        ("t_us,D_um", UNITS, ["'D_um' seems to hold diameters"]),
-        ("t_us,radius_px", UNITS, ["'radius_px' seems to hold pixels"]),
-        ("t_us,radius_px", ("--time-unit", "us", "--radius-unit", "1.0*um"), []),
+        ("frame,R_um", UNITS, ["'frame' seems to count frames; then give, instead of a unit, --frame-rate"]),
+        ("t_us,D_um", UNITS, ["'D_um' seems to hold diameters; then give half of their unit, --radius-unit '0.5*um'"]),
+        ("t_us,D_um", ("--time-unit", "us", "--radius-unit", "0.5*um"), []),
+        ("t_us,radius_px", UNITS, ["'radius_px' seems to hold pixels; then give, instead of a unit, --pixel"]),
+        ("t_us,radius_px", ("--time-unit", "us", "--pixel", "1.0 um"), []),
+        ("t_us,R_um", ("--time-unit", "us", "--pixel", "1.1 um"), ["'R_um' says um, but its unit is given as 1.1*um"]),
         ("t_us,R_um", UNITS, []),
         ("Time (µs),R [µm]", UNITS, []),
         ("t,radius at equator", UNITS, []),
@@ -72,7 +74,7 @@ def test_vectors_that_a_mat_file_hides_are_told(tmp_path: Path) -> None:
     savemat("b.mat", {"t": np.arange(9.0), "R": np.ones((3, 9))})
     done = call("init", "--data", "b.mat", *UNITS)
     assert "b.mat: R is an array of 3 x 9; its columns are R(:,1), R(:,2), …, its rows R(1,:), …\n" in done.stderr
-    assert "R(:,9); units are never guessed: add --radius-column NAME" in done.stderr
+    assert "R(:,9); units are never guessed: add --radius-column R(:,*)" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -91,7 +93,9 @@ def test_without_a_column_of_numbers_the_reason_is_told(tmp_path: Path, text: st
 
 
 def test_a_scale_that_cannot_be_is_told_and_no_prior_is_taken_from_it(tmp_path: Path) -> None:
-    """At 0.7 of its collapse time a laser bubble is one in a very stiff gel: G is not guessed from it."""
+    """At 0.7 of its collapse time a laser bubble is one in a very stiff gel: the prior of G stays that of usual ones.
+    At 0.4 of it there is no such gel.
+    """
     data = simulate("laser", "0 us:70 us:0.63 us", "1 um", tmp_path / "bubble.csv")
     done = call("init", "--data", data, *UNITS)
     assert "Rayleigh time 0.915" not in done.stderr
@@ -105,8 +109,16 @@ def test_a_scale_that_cannot_be_is_told_and_no_prior_is_taken_from_it(tmp_path: 
     written = Path("fast.yaml").read_text()
     assert "first guess from collapse time" not in written
     assert "# MIND: the collapse takes 0.7" in written
+    assert "median: 10 kPa" in written
+    assert "within what gels usually are, for the collapse is doubted" in written
     done = call("validate", "fast.yaml")
     assert "warning: fast: the collapse takes 0.7" in done.stderr
+    rows = "".join(f"{a},{b}\n" for a, b in zip(0.4 * t, R, strict=True))
+    Path("none.csv").write_text(f"t_us,radius_um\n{rows}")
+    assert call("init", "--data", "none.csv", *UNITS).exit_code == 0
+    written = Path("none.yaml").read_text()
+    assert "# MIND: the collapse takes 0.4" in written
+    assert "doubted" not in written
 
 
 def test_a_rate_that_the_times_contradict_is_told(tmp_path: Path) -> None:
@@ -139,4 +151,4 @@ def test_rows_of_summaries_are_explained(tmp_path: Path) -> None:
 def test_a_pixel_that_the_file_holds_is_told(tmp_path: Path) -> None:
     savemat("b.mat", {"R": np.arange(9.0), "deltat": 3.7e-6, "deltax": 2.76e-6})
     done = call("init", "--data", "b.mat", "--time-unit", "s")
-    assert "deltax is the size of one in m, '2.76e-06*m')" in done.stderr
+    assert "add --pixel LENGTH (the size of one, e.g. '2.76e-06 m' if deltax is in m; or" in done.stderr

@@ -19,11 +19,11 @@ model: {name: lorenz96, size: 12}
 twin: {cycles: 5, burn_in: 1, interval: 0.05, error: {x_std: 1}, initial_std: {x: 0.1}}
 assimilation: {scheme: etkf, members: 15, inflation: 1.02}
 """
-EARLY = tuple(f"en4dvar.runs.runner.{step}" for step in ("data_files", "build_one", "choose_executor"))
+EARLY = tuple(f"en4dvar.runs.{step}" for step in ("runner.data_files", "runner.build_one", "kind.choose_executor"))
 BEGUN = (
-    *(f"en4dvar.runs.session.{step}" for step in ("identity", "provenance", "RunLog.write", "write_checkpoint")),
-    *(f"en4dvar.runs.runner.{step}" for step in ("datasets", "summary_rows", "RunDirectory.publish")),
-    *(f"en4dvar.runs.{step}" for step in ("twin_run.dataset", "twin_run.conduct", "cycles.RunDirectory.publish")),
+    *(f"en4dvar.runs.engine.{step}" for step in ("identity", "provenance", "RunLog.write", "RunDirectory.publish")),
+    *(f"en4dvar.runs.{step}" for step in ("session.write_checkpoint", "runner.datasets", "worklist.summary_rows")),
+    *(f"en4dvar.runs.twin_run.{step}" for step in ("twin_group", "conduct", "twin_csv")),
 )
 pytestmark = pytest.mark.parametrize("before", ["", "--force", "--resume"])  # a first run, or one after another
 
@@ -40,7 +40,7 @@ def told_at(
     step: str, before: str, folder: Path, monkeypatch: pytest.MonkeyPatch, *later: str
 ) -> tuple[str, list[str], list[str]]:
     """What is kept and what to type, as told after interrupts at ``step`` and ``later``, and what was typed."""
-    if ".twin_run." in step or ".cycles." in step:
+    if ".twin_run." in step:
         path = folder / "twin.yaml"
         path.write_text(TWIN)
     else:
@@ -81,7 +81,7 @@ def test_a_run_that_has_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, s
 
 @pytest.mark.fault("interrupt")
 def test_a_second_one_while_the_first_is_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str) -> None:
-    steps = "en4dvar.runs.runner.summary_rows", "en4dvar.executor.local.SerialExecutor.__exit__"
+    steps = "en4dvar.runs.worklist.summary_rows", "en4dvar.executor.local.SerialExecutor.__exit__"
     kept, advice, words = told_at(steps[0], before, tmp_path, monkeypatch, steps[1])
     assert kept.startswith("interrupted; ")
     assert advice == [*(w for w in words if w != before), "--resume"]

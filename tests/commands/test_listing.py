@@ -35,7 +35,7 @@ def test_a_model_without_default_settings_is_listed_with_the_reason(monkeypatch:
     import toy_config
     from pydantic import BaseModel
 
-    from en4dvar.forward import ForwardModel
+    from en4dvar.model.forward import ForwardModel
 
     class PickySettings(BaseModel):
         size: int

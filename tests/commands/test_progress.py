@@ -7,9 +7,9 @@ import pytest
 from numba.core.event import trigger_event
 from toy_config import csv_text, write_toy
 
-from en4dvar.analysis import Analysis, ChainRecord, StartRecord
 from en4dvar.config import load_config
-from en4dvar.errors import OutputError
+from en4dvar.diagnosis.analysis import Analysis, ChainRecord, StartRecord
+from en4dvar.plumbing.errors import OutputError
 from en4dvar.runs.progress import RunLog, describe, terminal_progress, time_left
 from en4dvar.runs.runner import run_campaign
 
@@ -71,10 +71,10 @@ def test_data_sets_are_counted_as_they_end(
         assert progress is not None
         progress.begin(1, 3)
         progress("a very long name of a data set", analysis.iterations[3])
-        progress.ended("a very long name of a data set", 2)
+        progress.ended("a very long name of a data set", 2, "G 0.42 ± 0.12 kPa")
         assert "a very long name of a d… iteration 3" in progress._bar.tasks[0].description
         assert progress._bar.tasks[0].completed == 2
-    capsys.readouterr()
+    assert "a very long name of a data set: G 0.42 ± 0.12 kPa" in capsys.readouterr().err
 
 
 def test_iterations_of_data_sets_side_by_side_are_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

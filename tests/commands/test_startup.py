@@ -15,7 +15,7 @@ from toy_config import write_toy
 import en4dvar
 from en4dvar.cli import main
 from en4dvar.config.schema import Output
-from en4dvar.described import Described
+from en4dvar.plumbing.described import Described
 
 HEAVY = ("numba", "scipy", "xarray", "matplotlib", "pydantic", "numpy", "yaml", "rich")
 
@@ -33,7 +33,9 @@ def test_cli_and_package_import_nothing_heavy() -> None:
 
 
 def test_units_and_errors_need_no_pydantic() -> None:
-    assert not loaded("import en4dvar.units, en4dvar.errors").intersection({"pydantic", "numba", "scipy"})
+    assert not loaded("import en4dvar.plumbing.units, en4dvar.plumbing.errors").intersection(
+        {"pydantic", "numba", "scipy"}
+    )
 
 
 def test_a_run_imports_nothing_that_takes_long(tmp_path: Path) -> None:

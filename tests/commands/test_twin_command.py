@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from en4dvar.cli import main
 from en4dvar.config import load_config, load_twin
-from en4dvar.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError
 
 YAML = """\
 name: twin
@@ -147,12 +147,12 @@ def test_validate(tmp_path):
         ("{x: 0.1}", "{x: 1 m}", r"twin\.yaml:9:\d+: twin\.initial_std\.x: "),
         ("interval: 0.05", "interval: -1", r"twin\.yaml:7:\d+: twin\.interval: must be positive"),
         ("burn_in: 10", "burn_in: 30", r"twin: burn_in \(30\) leaves none of 30 cycles"),
-        ("scheme: ienks", "scheme: etkf", r"assimilation: lag: only with scheme ienks"),
+        ("scheme: ienks", "scheme: etkf", r"assimilation\.lag: scheme etkf does not read it; it is a key of ienks"),
         ("scheme: ienks", "scheme: best", r"twin\.yaml:11:\d+: assimilation\.scheme: 'best' is not one of etkf, denkf"),
         (
             "inflation: 1.02",
             "smoother: {method: enks}",
-            r"twin\.yaml:11:\d+: assimilation: a smoother goes behind a filter that is cycled, not behind ienks",
+            r"twin\.yaml:11:\d+: assimilation: a smoother goes behind a filter that is cycled, not behind a smoother",
         ),
         ("inflation: 1.02", "smoother: {method: enrts, lag: 3}", r"twin\.yaml:14:\d+: .*lag: only with method enks"),
         ("inflation: 1.02", "smoother: {method: enks, lag: 0}", r"twin\.yaml:14:\d+: assimilation\.smoother\.lag: "),
@@ -164,12 +164,12 @@ def test_validate(tmp_path):
         (
             "inflation: 1.02",
             "jitter: 0.1",
-            r"twin\.yaml:11:\d+: assimilation: jitter: only with scheme particle-filter",
+            r"twin\.yaml:14:\d+: assimilation\.jitter: scheme ienks does not read it; it is a key of particle-filter",
         ),
         (
             "scheme: ienks\n  lag: 2",
             "scheme: particle-filter\n  localisation: {radius: 2}",
-            r"twin\.yaml:11:\d+: assimilation: .*the particle filter takes no localisation",
+            r"twin\.yaml:11:\d+: assimilation: .*it takes no localisation",
         ),
         (
             "scheme: ienks\n  lag: 2",

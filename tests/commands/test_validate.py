@@ -11,9 +11,9 @@ from click.testing import CliRunner, Result
 from toy_config import csv_text, write_toy
 
 import en4dvar
+from en4dvar.assembly.build import build
 from en4dvar.cli import main
 from en4dvar.config import load_config
-from en4dvar.config.build import build
 from en4dvar.descent.preview import preview
 from en4dvar.report.predictive import prior_predictive
 from en4dvar.runs.checks import validate
@@ -118,11 +118,11 @@ def test_what_the_figure_shows(tmp_path: Path) -> None:
     (problem,) = build(config)
     one = preview(problem, config.assimilation, config.seed)
     assert one.run.path.shape == (8, len(problem.observations))  # the model is not dense
-    (ax,) = prior_predictive([one]).axes
-    assert ax.get_ylabel() == "position $x$ (µm)"
-    band = ax.collections[0].get_paths()[0].vertices[:, 1]
-    assert band.max() == pytest.approx(1e6 * np.quantile(one.run.path, 0.95, axis=0).max(), rel=1e-9)
-    assert len(prior_predictive([one] * 9).axes) == 6
+    ((panel,),) = (row.panels for row in prior_predictive([one]).rows)
+    assert panel.ylabel == "position $x$ (µm)"
+    band = next(mark for mark in panel.marks if mark.kind == "band")
+    assert band.top.max() == pytest.approx(1e6 * np.quantile(one.run.path, 0.95, axis=0).max(), rel=1e-9)
+    assert sum(len(row.panels) for row in prior_predictive([one] * 9).rows) == 6
 
 
 def test_a_prior_far_from_the_data_and_lost_members_are_told(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ import json, sys
 import numpy as np
 from click.testing import CliRunner
 from en4dvar.cli import main
-from en4dvar.compiled import KERNELS
+from en4dvar.plumbing.compiled import KERNELS
 
 def used():
     return {f"{kernel.__name__}{signature}" for kernel in KERNELS for signature in kernel.signatures}

@@ -7,9 +7,9 @@ import pytest
 from scipy.io import savemat
 from toy_config import csv_text, write_toy
 
+from en4dvar.assembly.build import build, data_files, inverse_plan
 from en4dvar.config import load_config
-from en4dvar.config.build import build, data_files, inverse_plan
-from en4dvar.errors import ConfigError, DataError
+from en4dvar.plumbing.errors import ConfigError, DataError
 
 
 def test_one_problem(tmp_path: Path) -> None:

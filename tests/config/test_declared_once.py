@@ -13,8 +13,9 @@ from toy_config import write_toy
 
 from en4dvar.config import load_config
 from en4dvar.config.schema import Assimilation, section_of
-from en4dvar.errors import ConfigError
-from en4dvar.problem import AssimilationSettings
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.schemes import ON_A_WINDOW, keys_of
+from en4dvar.schemes.settings import AssimilationSettings
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,8 @@ def test_the_settings_of_the_scheme_are_a_plain_dataclass() -> None:
     assert replace(AssimilationSettings(), members=7).members == 7
     keys = Assimilation.model_json_schema()["properties"]
     words = [key.get("description") for name, key in keys.items() if name != "weights"]
-    assert len(words) == len(AssimilationSettings.__dataclass_fields__)
+    every = AssimilationSettings().keys.keys() | {key for kind in ON_A_WINDOW.values() for key in keys_of(kind)}
+    assert keys.keys() == every | {"weights"}
     assert all(words)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from en4dvar.config.document import override, parse_document, read_document
-from en4dvar.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError
 
 
 def test_scalars_of_the_core_schema() -> None:

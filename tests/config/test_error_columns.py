@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from en4dvar.assembly.build import build
 from en4dvar.config import load_config
-from en4dvar.config.build import build
-from en4dvar.errors import ConfigError, DataError
+from en4dvar.plumbing.errors import ConfigError, DataError
 
 ROWS = [(0, 100, 2, 0.1), (5, 80, 1, 0.2), (10, "", "", ""), (15, 60, 4, 0.3), (20, 50, 3, 0.1)]
 CONFIG = """

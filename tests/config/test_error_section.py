@@ -7,13 +7,13 @@ import pytest
 from click.testing import CliRunner
 from toy_config import csv_text, write_toy
 
+from en4dvar.assembly.build import build
 from en4dvar.cli import main
 from en4dvar.config import load_config
-from en4dvar.config.build import build
-from en4dvar.errors import ConfigError, DataError
-from en4dvar.noise import CorrelatedNoise
+from en4dvar.data.noise import CorrelatedNoise
+from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.report.result import load_result
-from en4dvar.storage.fingerprint import identity
+from en4dvar.results.fingerprint import identity
 
 ERROR = "position_std: 2 um"
 CORRELATED = (ERROR, "position_std: 2 um, correlation_time: 20 ms, time_std: 10 us")
@@ -204,7 +204,7 @@ def test_run_with_everything(tmp_path: Path) -> None:
     assert observed["position_huber_weight"].values[10] < 0.1
     assert observed.attrs["huber_threshold"] == 1.345
     assert any("0.05 s (weight 0.0" in words for words in result.warnings)
-    rows = {row.name: row for row in result.summary()}
+    rows = {row.name: row for row in result.rows}
     assert abs(rows["k"].mean - 2.0) < 4 * rows["k"].std
     assert abs(rows["initial_v"].mean) < 4 * rows["initial_v"].std < 0.2
     assert "robust beyond 1.345 std" in CliRunner().invoke(main, ["validate", str(config)]).output

@@ -9,8 +9,8 @@ from toy_config import YAML, write_toy
 
 from en4dvar.config import load_config
 from en4dvar.config.parameters import Fixed, Uncertain
-from en4dvar.errors import ConfigError
-from en4dvar.problem import AssimilationSettings
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.schemes.settings import AssimilationSettings
 
 
 def faults(tmp_path: Path, *replacements: tuple[str, str]) -> list[str]:

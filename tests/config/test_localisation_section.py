@@ -9,11 +9,11 @@ import pytest
 import yaml
 from field_models import write_line
 
+from en4dvar.assembly.build import build
 from en4dvar.commands.describe import problem_summary
 from en4dvar.config import load_config
-from en4dvar.config.build import build
 from en4dvar.descent.preview import preview
-from en4dvar.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.report.result import load_result
 from en4dvar.runs.checks import validate
 from en4dvar.runs.runner import run, run_campaign

@@ -10,9 +10,9 @@ import toy_models
 from pydantic import BaseModel
 
 from en4dvar.config import load_twin
-from en4dvar.errors import ConfigError
-from en4dvar.forward import ForwardModel, Observable, StateField
-from en4dvar.state import Field, StateLayout
+from en4dvar.model.forward import ForwardModel, Observable, StateField
+from en4dvar.model.state import Field, StateLayout
+from en4dvar.plumbing.errors import ConfigError
 
 TWIN = """\
 name: bare

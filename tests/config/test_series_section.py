@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from en4dvar.assembly.build import build
 from en4dvar.config import load_config
-from en4dvar.config.build import build
-from en4dvar.errors import ConfigError, DataError
-from en4dvar.noise import BlockNoise
+from en4dvar.data.noise import BlockNoise
+from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.runs.checks import validate
 
 YAML = """\

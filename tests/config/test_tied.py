@@ -8,14 +8,15 @@ import pytest
 from toy_config import write_toy
 from toys import Vectorised, make_problem
 
-from en4dvar.assimilate import assimilate
+from en4dvar.assembly.build import build
 from en4dvar.config import load_config
-from en4dvar.config.build import build
-from en4dvar.errors import ConfigError
-from en4dvar.prior import Prior
-from en4dvar.problem import AssimilationSettings, Tie
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.prior import Prior
+from en4dvar.problem import Tie
+from en4dvar.results.groups import build_groups
 from en4dvar.runs.simulation import simulate
-from en4dvar.storage.groups import build_groups
+from en4dvar.schemes.settings import AssimilationSettings
 
 FACTOR = -1.7
 

@@ -19,7 +19,7 @@ import yaml
 from field_models import write_line
 from toy_config import write_toy
 
-from en4dvar.errors import ConfigError, DataError
+from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.runs.checks import validate
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import en4dvar
+from en4dvar.results.joint_file import load_joint
 from en4dvar.runs.joint_run import join
 from en4dvar.runs.runner import run_campaign
-from en4dvar.storage.joint_file import load_joint
 from en4dvar_diffusion.synthetic import truth
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from en4dvar.assimilate import assimilate
+from en4dvar.assembly.build import build
 from en4dvar.config import load_config, load_twin
-from en4dvar.config.build import build
-from en4dvar.cycling.twin import conduct
+from en4dvar.estimation.assimilate import assimilate
 from en4dvar.schemes import ON_A_SERIES, ON_A_WINDOW, SCHEMES
+from en4dvar.series.twin import conduct
 
 # a baseline's members run freely: the std of the model, and about that of the observations
 EXPECTED = {"climatology": 3.8, "optimal-interpolation": 1.1}

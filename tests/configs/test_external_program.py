@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import en4dvar
-from en4dvar.config.build import build
+from en4dvar.assembly.build import build
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 

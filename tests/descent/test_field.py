@@ -11,8 +11,8 @@ from scipy.spatial.distance import cdist
 
 from en4dvar.descent.field import field_en4dvar, field_esmda
 from en4dvar.descent.field_data import FieldData
-from en4dvar.errors import En4dvarError
-from en4dvar.prior import member_stream
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.priors.prior import member_stream
 from en4dvar.schemes.local_gain import ByCorrelation, ByDistance
 from en4dvar.schemes.localisation import gaspari_cohn
 

@@ -7,14 +7,15 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from en4dvar.assimilate import assimilate
-from en4dvar.forward import Failure
-from en4dvar.function_model import FunctionModel
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.state import Parameter
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.model.forward import Failure
+from en4dvar.model.function_model import FunctionModel
+from en4dvar.model.state import Parameter
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
 
 TIMES = np.linspace(0.1, 6.0, 30)
 TRUTH = {"A": 1.2, "c": 0.3, "w": 2.2, "f": 0.3}

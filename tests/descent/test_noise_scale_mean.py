@@ -9,12 +9,12 @@ import pytest
 from scipy.integrate import quad
 from toys import Vectorised, make_problem, with_noise
 
-from en4dvar.assimilate import assimilate, log_posterior
+from en4dvar.data.noise import noise_of
 from en4dvar.descent.noise_scale import log_derivatives
-from en4dvar.noise import noise_of
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings
-from en4dvar.state import NOISE_SCALE
+from en4dvar.estimation.assimilate import assimilate, log_posterior
+from en4dvar.model.state import NOISE_SCALE
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.schemes.settings import AssimilationSettings
 
 TERMS = {
     "lognormal": PriorTerm.lognormal(NOISE_SCALE, 1.0, 0.4),

@@ -7,11 +7,11 @@ import pytest
 from scipy.optimize import minimize
 from toys import Decay, Vectorised, Wave, make_problem
 
-from en4dvar.analysis import StartRecord
-from en4dvar.assimilate import assimilate, cost, log_posterior
-from en4dvar.descent.settling import NEAR
-from en4dvar.prior import PriorTerm
-from en4dvar.problem import AssimilationSettings
+from en4dvar.descent.step_control import NEAR
+from en4dvar.diagnosis.analysis import StartRecord
+from en4dvar.estimation.assimilate import assimilate, cost, log_posterior
+from en4dvar.priors.prior import PriorTerm
+from en4dvar.schemes.settings import AssimilationSettings
 
 CONTROLS = ("line-search", "levenberg-marquardt", "full")
 
@@ -153,6 +153,10 @@ def test_warnings_speak_of_what_they_see():
     assert [w.split(" (")[0] for w in assimilate(vague, AssimilationSettings(), 1).warnings] == [
         "a is hardly informed by the data",
         "b is hardly informed by the data",
+    ]
+    vague.model.path_parameters = ("a",)  # b is then known from elsewhere, as a density is
+    assert [w.split(" (")[0] for w in assimilate(vague, AssimilationSettings(), 1).warnings] == [
+        "a is hardly informed by the data"
     ]
 
 

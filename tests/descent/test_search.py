@@ -6,14 +6,14 @@ from same_bits import assert_same_bits
 from toys import Decay, Wave, make_problem
 from wells import UnlikeWells, Wells, hidden_well, mass_of_positive, two_wells
 
-from en4dvar import stages
-from en4dvar.analysis import Descents, StartRecord
-from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.descent.search import Search
-from en4dvar.prior import PriorTerm
-from en4dvar.problem import AssimilationSettings
+from en4dvar.diagnosis.analysis import Descents, StartRecord
+from en4dvar.estimation import stages
+from en4dvar.estimation.assimilate import LoopState, assimilate
+from en4dvar.priors.prior import PriorTerm
+from en4dvar.results.codec import decode, encode
 from en4dvar.sampling import refine
-from en4dvar.storage.codec import decode, encode
+from en4dvar.schemes.settings import AssimilationSettings
 
 
 @pytest.mark.parametrize("settings", [{}, {"refine": "none"}, {"start": "prior-mean"}])
@@ -169,7 +169,7 @@ def test_from_a_draw_below_all_minima_another_descent_starts(monkeypatch):
     assert (told.members, told.minimum) == ((-1, -2), (1, 0))
     assert " from a draw, " in told.words
     assert [round(float(mode.centre[0])) for mode in analysis.modes] == [1, -3]
-    assert analysis.centre[0] == analysis.modes[0].centre[0]
+    assert analysis.centre[0] == pytest.approx(analysis.modes[0].centre[0], rel=1e-12)  # computed in two ways
     assert analysis.modes[0].weight == pytest.approx(mass_of_positive(problem), abs=0.03)
     assert "starts-disagree" not in {c.code for c in analysis.cautions}
     assert [record.further for record in heard if isinstance(record, StartRecord)] == [1]
@@ -180,7 +180,7 @@ def test_a_draw_that_leads_nowhere_is_told(monkeypatch):
     """Where the descent from it ends no lower, as that of a rough J may, what was found is sampled, once."""
     problem, settings = in_the_wrong_well(monkeypatch)
     tried = []
-    monkeypatch.setattr(stages, "from_draw", lambda space, scheme, found, *_: tried.append(found) or found)
+    monkeypatch.setattr(stages, "from_draw", lambda space, found, *_: tried.append(found) or found)
     analysis = assimilate(problem, settings, 1)
     assert len(tried) == 1
     assert analysis.descents.members == (-1,)

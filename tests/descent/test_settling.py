@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from en4dvar.assimilate import assimilate
-from en4dvar.descent.settling import LEAST, Settling
-from en4dvar.forward import ForwardModel, Observable, StateField, Trajectory
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.state import Field, Parameter, StateLayout
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.descent.step_control import LEAST, Settling
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.model.forward import ForwardModel, Observable, StateField, Trajectory
+from en4dvar.model.state import Field, Parameter, StateLayout
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
 
 RATES = {"growth": 1.1, "hunted": 0.4, "death": 0.4, "fed": 0.1}
 START, MOST_STEP = (10.0, 5.0), 0.05

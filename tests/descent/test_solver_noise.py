@@ -7,14 +7,15 @@ import pytest
 from same_bits import assert_same_bits
 from toys import Decay, Toy, make_problem
 
-from en4dvar.assimilate import LoopState, assimilate
 from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.estimation.assimilate import LoopState, assimilate
 from en4dvar.executor import SerialExecutor
-from en4dvar.prior import PriorTerm
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.priors.prior import PriorTerm
+from en4dvar.problem import InverseProblem
+from en4dvar.results.codec import decode, encode
 from en4dvar.schemes.base import Runs, Weights
 from en4dvar.schemes.en4dvar import En4DVar
-from en4dvar.storage.codec import decode, encode
+from en4dvar.schemes.settings import AssimilationSettings
 
 STD, JUMP, CELL = 0.05, 1e-4, 1e-3  # of the readings; of the predictions, 1e-4 of their size; in a parameter
 TRUTHS = np.random.default_rng(4).normal([1.2, 1.0], 0.2, (14, 2))

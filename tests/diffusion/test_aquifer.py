@@ -9,7 +9,7 @@ import pytest
 
 from en4dvar.descent.field import field_en4dvar
 from en4dvar.descent.field_data import FieldData
-from en4dvar.field_prior import FieldPrior
+from en4dvar.priors.field_prior import FieldPrior
 from en4dvar.schemes.local_gain import ByDistance
 from en4dvar_diffusion import Aquifer
 from en4dvar_diffusion.synthetic import readings

@@ -5,11 +5,17 @@ from __future__ import annotations
 import re
 
 import pytest
-from doc_pages import ROOT, blocks
+from doc_pages import ROOT, blocks, hook
 
 from en4dvar.report.result import Result
 
 PAGE = ROOT / "docs" / "reference_netcdf.md"
+
+
+@pytest.fixture(scope="module")
+def page():
+    """The page as the site shows it."""
+    return hook("result_files").with_tables(PAGE.read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +32,8 @@ def named(result, text):
     return f"radius_{rest}" if rest and stem == result.observable else "radius" if stem == result.observable else text
 
 
-def test_every_variable_and_attribute_is_on_the_page(result):
-    words = set(re.findall(r"`/?([\w]+)`", PAGE.read_text(encoding="utf-8")))
+def test_every_variable_and_attribute_is_on_the_page(result, page):
+    words = set(re.findall(r"`/?([\w]+)`", page))
     coordinates = {"chain", "draw", "time", "path_time", "iteration", "parameter", "time_column"}
     for node in result.tree.subtree:
         group = node.path.strip("/")
@@ -39,23 +45,25 @@ def test_every_variable_and_attribute_is_on_the_page(result):
     assert set(result.sample_stats.attrs) - words == set()
 
 
-def test_the_page_names_nothing_that_is_not_there(result):
-    rows = re.findall(r"^\| (`/[^|]*)?\| ([^|]+)\| ([^|]*)\|", PAGE.read_text(encoding="utf-8"), re.M)
+def test_the_page_names_nothing_that_is_not_there(result, page):
+    held = page[: page.index("| coordinates |")]
+    rows = re.findall(r"^\|\s*(`/[^|]*)?\| ([^|]+)\| ([^|]*)\|", held, re.M)
+    assert len(rows) > 60
     sometimes = {"radius_correlation", "radius_huber_weight", "R_eq", "G_pieces"}
     sometimes |= {f"radius_{word}" for word in ("whitened_residual", "studentised", "leverage")}
+    sometimes |= {"radius_place", "radius_place_index", "radius_place_share", "wall_mach_reached"}
     sometimes |= {"radius_discrepancy", "radius_discrepancy_std"}
     sometimes |= {f"variance_from_{source}" for source in ("errors", "discrepancy", "prior")}
     groups: list[str] = []
     for head, names, dims in rows:
         groups = re.findall(r"`/(\w+)`", head) or groups
-        for group in groups:
-            there = {named(result, v): set(map(str, d.dims)) for v, d in result.dataset(group).variables.items()}
+        for group in (g for g in groups if g not in ("fields", "withheld")):
+            there = {named(result, v): set(map(str, d.dims)) for v, d in result.dataset(group).data_vars.items()}
             for name in set(re.findall(r"`(\w+)`", names)) - sometimes:
-                if name.startswith(("what_if_", "ledger_", "influence_")):  # where they can be told
+                if name.startswith(("what_if_", "ledger_", "influence_", "ln_T")):  # where they can be told
                     continue
                 assert name in there, f"{group}: {name}"
-                if name != "G_centre":
-                    assert there[name] <= set(re.findall(r"\w+", dims)), f"{group}: {name} has {there[name]}"
+                assert there[name] == set(re.findall(r"\w+", dims)), f"{group}: {name} has {there[name]}"
 
 
 def test_the_example_reads_a_file(result, tmp_path, monkeypatch):

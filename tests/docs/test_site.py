@@ -10,12 +10,11 @@ import re
 import shutil
 import subprocess
 import sys
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import pytest
-from doc_pages import ROOT
+from doc_pages import ROOT, hook
 
 import en4dvar
 import en4dvar_bubble
@@ -86,15 +85,6 @@ def test_the_search_works_from_a_file(site):
     page = f"{(site / 'index.html').as_uri()}?q=Kirchhoff"
     shown = subprocess.run([*command, page], capture_output=True, text=True, timeout=120).stdout
     assert re.search(r"md-search-result__meta\">\s*\d+ matching", shown)
-
-
-def hook(name: str) -> ModuleType:
-    spec = spec_from_file_location(name, ROOT / "docs" / "hooks" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_docstrings_become_markdown():

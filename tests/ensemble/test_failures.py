@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from toys import Fragile, Linear, make_problem
 
-from en4dvar.assimilate import assimilate, cost, forecast
-from en4dvar.errors import TooFewMembersError
-from en4dvar.forward import Observable
-from en4dvar.prior import PriorTerm
-from en4dvar.problem import AssimilationSettings
-from en4dvar.state import Parameter
+from en4dvar.estimation.assimilate import assimilate, cost, forecast
+from en4dvar.model.forward import Observable
+from en4dvar.model.state import Parameter
+from en4dvar.plumbing.errors import TooFewMembersError
+from en4dvar.priors.prior import PriorTerm
+from en4dvar.schemes.settings import AssimilationSettings
 
 NAMES = ("a", "b", "c")
 TRUTH = (-1.0, 0.5, 0.7)  # the prior mean of a is -0.8, and the data pull it down, away from the limit

@@ -7,12 +7,13 @@ import pytest
 from toy_models import Oscillator, OscillatorSettings
 from toys import make_observations
 
-from en4dvar.assimilate import assimilate, forecast
 from en4dvar.config.initial_state import perturbation
 from en4dvar.ensemble.forecast import check_problem
-from en4dvar.errors import ConfigError
-from en4dvar.prior import Prior
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.estimation.assimilate import assimilate, forecast
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.prior import Prior
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
 
 FIXED = {"A": 1.0, "k": 2.0, "c": 0.3}
 TIMES = np.linspace(0.2, 5.0, 12)

@@ -8,10 +8,10 @@ from same_bits import assert_same_bits
 from toys import Vectorised, make_problem
 
 from en4dvar import Batch
-from en4dvar.assimilate import assimilate
 from en4dvar.ensemble.forecast import forecast
-from en4dvar.forward import Observable, ValidityLimit
-from en4dvar.problem import AssimilationSettings
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.model.forward import Observable, ValidityLimit
+from en4dvar.schemes.settings import AssimilationSettings
 
 NAMES, TRUTH = ("a", "b", "c"), (1.0, 0.5, 0.2)
 GRID = np.linspace(0.3, 1.9, 7)

@@ -4,9 +4,9 @@ import pytest
 from distributed import LocalCluster
 from run_files import assert_same_results, configuration, make_campaign
 
-from en4dvar.errors import ConfigError
 from en4dvar.executor import ExecutorError
 from en4dvar.executor import dask as dask_executor
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.runs.runner import run_campaign
 
 

@@ -5,10 +5,10 @@ import pytest
 from same_bits import assert_same_bits
 from toys import Decay, Dying, Fragile, Vectorised, make_problem
 
-from en4dvar.assimilate import assimilate
+from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import ProcessesExecutor, SerialExecutor, ThreadsExecutor, cut, make_executor
-from en4dvar.forward import Failure
-from en4dvar.problem import AssimilationSettings
+from en4dvar.model.forward import Failure
+from en4dvar.schemes.settings import AssimilationSettings
 
 SETTINGS = AssimilationSettings(members=13)
 

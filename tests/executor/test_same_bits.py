@@ -4,8 +4,8 @@ import pytest
 from run_files import add_to_pack, assert_same_results, configuration, make_campaign
 
 from en4dvar.report.result import load_result
+from en4dvar.results.pack import PACK, results_of
 from en4dvar.runs.runner import run_campaign
-from en4dvar.storage.pack import PACK, results_of
 
 EVERYWHERE = [
     ("serial", 2), ("threads", 2), ("processes", 2), ("dask", 2),

@@ -13,9 +13,12 @@ import os
 import pkgutil
 import resource
 import shutil
+import signal
 import subprocess
 import sys
+import tempfile
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
@@ -39,7 +42,9 @@ class Task:
 
     ``limit``: bytes that a file may have (the kernel's own refusal, EFBIG); ``fails``: a function of ``os`` that ends
     in ``error``; ``kill_at``: number of the operation on files at which the process is gone. Standard output is thrown
-    away, or on a ``full`` device: "output", or "both", standard error too.
+    away, or on a ``full`` device: "output", or "both", standard error too. After ``seconds`` the process is ended
+    (SIGALRM). ``stop``: number of a signal that it gets ``after`` seconds. ``mark``: its temporary folder, and a
+    variable of its environment, by which what it has started is known.
     """
 
     words: list[str]
@@ -50,15 +55,22 @@ class Task:
     error: str = ""
     kill_at: int = 0
     full: str = ""
+    seconds: int = 0
+    stop: int = 0
+    after: float = 0.0
+    mark: str = ""
 
 
 @dataclass
 class Outcome:
-    """``code``: exit code, negative for a signal; ``operations`` on files, where the end was reached."""
+    """``code``: exit code, negative for a signal; ``operations`` on files, where the end was reached; ``seconds`` that
+    it took, from the first signal on where it got one.
+    """
 
     code: int
     told: str
     operations: int
+    seconds: float = 0.0
 
 
 class Children:
@@ -103,6 +115,11 @@ def _child(task: Task, told: int) -> None:
     full = os.open("/dev/full", os.O_WRONLY)
     os.dup2(full if task.full == "both" else told, 2)
     os.dup2(full if task.full else os.open(os.devnull, os.O_WRONLY), 1)
+    signal.alarm(task.seconds)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if task.mark:
+        os.environ["EN4DVAR_TEST_MARK"] = os.environ["TMPDIR"] = task.mark
+        tempfile.tempdir = None
     if task.limit is not None:
         # Python takes the part of a module's bytecode that had room for the whole, here and in every later process
         sys.dont_write_bytecode = True
@@ -114,7 +131,13 @@ def _child(task: Task, told: int) -> None:
     sys.argv = ["en4dvar", *task.words]
     code = 99
     try:
-        main(task.words)
+        if task.words[0] == "python":  # a function of a module of the tests, of what follows
+            from importlib import import_module as module
+
+            getattr(module(task.words[1]), task.words[2])(*task.words[3:])
+            code = 0
+        else:
+            main(task.words)
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
     except BaseException:
@@ -123,6 +146,11 @@ def _child(task: Task, told: int) -> None:
         sys.stderr.flush()
     os.write(told, f"{len(boundary.seen)}\n".encode())
     os._exit(code)
+
+
+def _stop(pid: int, task: Task, ended: threading.Event) -> None:
+    if not ended.wait(task.after):
+        os.kill(pid, task.stop)
 
 
 def _break(name: str, number: int) -> None:
@@ -142,11 +170,17 @@ def _do(task: Task) -> Outcome:
     if pid == 0:
         _child(task, write)
     os.close(write)
-    with os.fdopen(read) as pipe:
+    began = time.monotonic() + task.after
+    ended = threading.Event()
+    if task.stop:
+        threading.Thread(target=_stop, args=(pid, task, ended), daemon=True).start()
+    with os.fdopen(read, errors="replace") as pipe:
         told = pipe.read()
+    ended.set()  # before its number can be that of another
     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    seconds = time.monotonic() - began
     told, _, operations = told.rstrip("\n").rpartition("\n") if code >= 0 else (told, "", "0")
-    return Outcome(code, told, int(operations))
+    return Outcome(code, told, int(operations), seconds)
 
 
 def _of_few(draw: Callable[..., Any]) -> Callable[..., Any]:
@@ -164,7 +198,7 @@ def _import_everything() -> None:
     import en4dvar_agarose
     import en4dvar_bubble
     import en4dvar_lorenz
-    from en4dvar.storage.fingerprint import source_digest
+    from en4dvar.results.fingerprint import source_digest
 
     for name in USED_LATER:
         import_module(name)

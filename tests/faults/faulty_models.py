@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from toy_models import Oscillator
 
-from en4dvar.forward import Failure, StateField
+from en4dvar.model.forward import Failure, StateField
 
 MEMBERS = 8
 STIFF = 4.0  # N/m; one of the eight prior members is stiffer, none near the minimum
@@ -137,12 +137,17 @@ class Fails(Oscillator):
 
 
 class Closes(Oscillator):
-    """Closes standard output as ``EN4DVAR_TEST_FAULT`` says: the file of Python, or that of the system."""
+    """Closes standard output as ``EN4DVAR_TEST_FAULT`` says: the file of Python, or that of the system, whose number
+    another file may have from then on.
+    """
 
     def step(self, x, t0, t1):
-        if t0 == 0:
+        if t0 == 0 and not sys.stdout.closed:
+            whose = os.environ["EN4DVAR_TEST_FAULT"]
             with suppress(OSError):
-                os.close(1) if os.environ["EN4DVAR_TEST_FAULT"] == "system" else sys.stdout.close()
+                sys.stdout.close() if whose == "python" else os.close(1)
+            if whose == "another":
+                os.open(os.devnull, os.O_RDONLY)
         return super().step(x, t0, t1)
 
 

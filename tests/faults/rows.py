@@ -53,6 +53,9 @@ ROWS = tuple(
         ("foreign", "a run directory that somebody else prepared: names that lead out of it, links, pipes, devices",
          "{file}: is a symbolic link, which a run neither follows nor replaces; remove it", "2",
          "everything outside the directory"),
+        ("own-files", "the run directory holds files of the user's, one under a name that the run would write",
+         "{run}: {file} was not written by a run and would be replaced; move it away", "2",
+         "the user's files; nothing is begun, and no page is written"),
         ("half-replaced", "report, export, compare or rerun where a run was killed while it replaced another",
          "{run}: a run was killed while its files took the place of an earlier run's; 'en4dvar run' with --resume "
          "finishes that", "2", "everything; who reads writes nothing"),
@@ -126,9 +129,25 @@ ROWS = tuple(
         ("model-varies", "a model gives other numbers when a member is run again: noise, or a state that it keeps",
          "the model gives other numbers when a member is run again", "2 (of many data sets: 1)",
          "nothing is estimated"),
-        ("rerun-stranger", "`rerun` of a result file that names code outside of the working directory and of "
-         "installed packages", "{run}: its {model} is code outside of this project, {path}; read it, then give --trust "
-         "to run it", "2", "nothing of that code has run; at a terminal the user is asked"),
+        ("rerun-stranger", "`rerun`, `joint`, `population` or `compare` of a result file that names code that is not "
+         "installed", "{run}: its {model} is code that no configuration of yours has named as it is now, {path}; read "
+         "it, then give --trust to run it", "2", "nothing of that code has run; at a terminal the user is asked"),
+        ("program-children", "a program (`command`) leaves processes behind, in its background or in a session of "
+         "their own", "", "0", "everything; they are ended with it"),
+        ("program-output", "a program's output is a pipe, a device or endless, or its template never ends", "{reason}",
+         "0", "all other members; the member is lost, a template within the `time_limit` of the program"),
+        ("program-stop", "a stop (Ctrl-C, SIGTERM) while programs are at work, or the run is killed",
+         "interrupted; {n} of {all} data sets are done and kept in {run}\nto continue: en4dvar run {words} --resume",
+         "130", "as above; the programs, their children and their scratch folders are gone within two seconds"),
+        ("no-file", "a pipe, a socket, a device or a folder where a file is read", "{file}: {what}", "2",
+         "nothing is waited for"),
+        ("sparse", "a file of a terabyte, sparse or not", "{file}: {size}; at most {most} are read", "2",
+         "its size is looked at before it is read"),
+        ("decoding", "a movie, workbook or MATLAB v7.3 file that takes its library down, or too much time or memory",
+         "{file}: {takes more than it may, or ends its process}; it is damaged, or not what it says it is",
+         "2", "everything; a process of its own reads it, and is ended"),
+        ("foreign-data", "a result with variables or groups in other files (external storage, virtual data, links)",
+         "{variable} {is} {in or into} another file, which is not opened", "2", "nothing of the other file is read"),
         ("clock", "the clock jumps backwards", "", "0", "everything; only monotonic clocks are used"),
         ("many-sets", "10 000 data sets in a folder", "", "0", "memory flat, the first estimate within seconds"),
         ("many-rows", "a data file of 1 000 000 rows", "", "0", "read within seconds; estimated in flat memory"),

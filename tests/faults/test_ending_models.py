@@ -17,13 +17,13 @@ from worker_calls import exits
 
 from en4dvar.cli import main
 from en4dvar.config import load_any, load_config
-from en4dvar.errors import ConfigError, En4dvarError
 from en4dvar.executor import ProcessesExecutor, SerialExecutor, ThreadsExecutor
+from en4dvar.plumbing.errors import ConfigError, En4dvarError
+from en4dvar.plumbing.user_code import EndedError
 from en4dvar.report.result import load_result
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.runner import run, run_campaign
 from en4dvar.runs.simulation import simulate
-from en4dvar.user_code import EndedError
 
 EXECUTORS = [
     {"executor": "serial"},
@@ -210,7 +210,7 @@ def test_whatever_else_ends_the_program(tmp_path, monkeypatch):
     assert done.stderr == "the code of a model ended the program: SystemExit: sys.exit(0)\n"
 
 
-@pytest.mark.parametrize("whose", ["system", "python"])
+@pytest.mark.parametrize("whose", ["system", "another", "python"])
 @pytest.mark.fault("output-closed")
 @pytest.mark.slow
 def test_a_model_that_closes_standard_output(tmp_path, whose):

@@ -11,13 +11,13 @@ from rows import row
 from run_files import make_campaign
 
 from en4dvar.cli import main
-from en4dvar.errors import OutputError
-from en4dvar.files import atomic_path, inside, write_text
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.files import atomic_path, inside, write_text
+from en4dvar.results.pack import PACK
+from en4dvar.results.store import COMPLETE, NEXT
 from en4dvar.runs.lock import LOCK
 from en4dvar.runs.replacement import LISTING, OLD
 from en4dvar.runs.rundir import RunDirectory
-from en4dvar.storage.pack import PACK
-from en4dvar.storage.store import COMPLETE, NEXT
 
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="links and pipes of POSIX"),
@@ -202,7 +202,7 @@ def test_a_result_that_is_a_pipe_is_refused(foreign: tuple[Path, Path, Path]) ->
     os.mkfifo(run / PACK)
     told = call("export", run)
     assert told.exit_code == 2
-    assert "datasets.pack: cannot be read: Not a plain file" in told.stderr
+    assert "datasets.pack: cannot be read: not a plain file but a pipe" in told.stderr
 
 
 def test_a_linked_folder_for_a_comparison_is_not_followed(foreign: tuple[Path, Path, Path]) -> None:

@@ -11,9 +11,9 @@ from faulty_models import STIFF, LosesAt
 from run_files import configuration
 from toy_config import write_toy
 
-from en4dvar.errors import ConfigError, TooFewMembersError
 from en4dvar.executor import limits
 from en4dvar.executor.limits import parse_bytes
+from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
 from en4dvar.runs.runner import run
 
 LIMITS = {  # far more time than a batch needs on a busy machine

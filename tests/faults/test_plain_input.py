@@ -19,22 +19,22 @@ from rows import row
 from toy_config import csv_text, write_toy
 from toys import Linear, make_problem
 
-from en4dvar.assimilate import assimilate
 from en4dvar.cli import main
 from en4dvar.commands.common import printable
-from en4dvar.errors import ConfigError, OutputError
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.summary import summary_rows
 from en4dvar.executor import run_chunk
-from en4dvar.forward import Failure
-from en4dvar.prior import PriorTerm
-from en4dvar.problem import AssimilationSettings
+from en4dvar.model.forward import Failure
+from en4dvar.model.state import Array, Parameter
+from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.plumbing.tables import csv_text as table_text
+from en4dvar.priors.prior import PriorTerm
 from en4dvar.report.export import latex_symbol
 from en4dvar.report.result import Result as Posterior
 from en4dvar.report.result import load_result
+from en4dvar.results.seal import seal_file
 from en4dvar.runs.lock import LOCK, locked
-from en4dvar.state import Array, Parameter
-from en4dvar.storage.seal import seal_file
-from en4dvar.summary import summary_rows
-from en4dvar.tables import csv_text as table_text
+from en4dvar.schemes.settings import AssimilationSettings
 
 MODEL = "from toy_models import Oscillator\nclass Own(Oscillator):\n    pass\n"
 
@@ -251,7 +251,7 @@ FORMULAS = ("=1+1", "+1 mm", "-a", "@SUM(A1)", "\t=1", "\r=1", " =1", "＝1")
 @pytest.mark.fault("formula")
 def test_a_name_is_no_formula_of_a_spreadsheet(stored: Path) -> None:
     result = load_result(stored)
-    text = table_text(summary_rows(((name, result.summary(), ()) for name in FORMULAS), {"=lost": "+because"}))
+    text = table_text(summary_rows(((name, result.rows, ()) for name in FORMULAS), {"=lost": "+because"}))
     rows = list(csv.reader(text.splitlines()[:1] + text.splitlines()[-1:]))
     assert (rows[1][0], rows[1][-2]) == ("'=lost", "'+because")
     table = io.StringIO(table_text([[name, -1.5, "-1.5", 1e-300] for name in FORMULAS]), newline="")
@@ -262,7 +262,7 @@ def test_a_name_is_no_formula_of_a_spreadsheet(stored: Path) -> None:
 
 @pytest.mark.fault("formula")
 def test_a_symbol_is_no_program_of_latex(stored: Path) -> None:
-    summary = load_result(stored).summary()[0]
+    summary = load_result(stored).rows[0]
     for symbol in (r"$\input{/etc/passwd}$", r"$\write18{ls}$", "$a}b{c$", r"$\def\x{}$", "$%$", "$\n\n$", "x\ny"):
         written = latex_symbol(replace(summary, symbol=symbol))
         assert "\n" not in written

@@ -12,16 +12,16 @@ from contextlib import contextmanager, suppress
 import numpy as np
 import pytest
 import xarray as xr
-from matplotlib.figure import Figure
 from rows import row
 from run_files import assert_same_results, configuration, interrupt, make_campaign, run_cli
 
-from en4dvar.errors import OutputError
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.report.chart import Chart, Panel, Row
+from en4dvar.report.drawing import keep
 from en4dvar.report.result import load_result
-from en4dvar.report.style import save_figure
+from en4dvar.results.netcdf import netcdf_file
+from en4dvar.results.pack import PACK, Pack, read_result, results_of
 from en4dvar.runs.runner import run_campaign
-from en4dvar.storage.netcdf import netcdf_file
-from en4dvar.storage.pack import PACK, Pack, read_result, results_of
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_no_room_for_a_figure(tmp_path, monkeypatch):
     resource.setrlimit(resource.RLIMIT_FSIZE, (300, limited[1]))
     try:
         with pytest.raises(OutputError, match=r"a\.pdf: cannot be written: File too large"):
-            save_figure(Figure(), tmp_path, "a")
+            keep(Chart([Row(90.0, [Panel()])]), tmp_path, "a")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limited)
     assert not list(tmp_path.iterdir())

@@ -40,7 +40,7 @@ def test_a_clock_that_jumps_backwards(tmp_path, monkeypatch):
     now = time.time()
     monkeypatch.setattr(time, "time", lambda: now + next(jumps))
     monkeypatch.setattr("en4dvar.runs.progress.datetime", Clock)
-    monkeypatch.setattr("en4dvar.storage.provenance.datetime", Clock)
+    monkeypatch.setattr("en4dvar.results.provenance.datetime", Clock)
     config = configuration(path, tmp_path / "run", **settings)
     campaign = run_campaign(config)
     assert campaign.exit_code == 0

@@ -16,6 +16,7 @@ import pytest
 from rows import row
 from run_files import assert_same_results, command, configuration, environment, make_campaign, run_cli
 
+from en4dvar.results.store import result_files
 from en4dvar.runs.interrupt import terminate_as_interrupt
 from en4dvar.runs.runner import run_campaign
 
@@ -122,6 +123,41 @@ def test_ctrl_c_at_a_terminal(quiet, tmp_path, kind, presses):
     else:
         go_on(path, out)
     assert_same_results(out, quiet)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.fault("interrupt")
+def test_compiled_code_that_answers_no_signal(tmp_path, number):
+    """Python would hear of it when that call returns, in hours; it is ended where it stands, and loses nothing."""
+    path, out, flag = make_campaign(tmp_path, 3, "execution_models:Deaf", large=2), tmp_path / "run", tmp_path / "flag"
+    again = ["run", path, "--out", out, "--no-report", "--set", "execution.executor=serial"]
+    code, told, seconds = stopped(number, flag, *again, EN4DVAR_TEST_FLAG=flag)
+    assert seconds < 10  # of a busy machine; 1 s is left to the program
+    assert code == int(row("interrupt").exit_code)
+    assert "2 of 3 data sets are done" in told
+    assert row("interrupt").told(told)
+    assert "Traceback" not in told
+    done = run_cli(*again, "--resume", EN4DVAR_TEST_FLAG=flag)
+    assert done.returncode == 0, done.stderr
+    assert len(result_files(out)) == 3
+
+
+def heed():
+    """A test run in the background of a shell has been told to ignore it, and its children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def stopped(number, flag, *words, **variables):
+    """Exit code, standard error, and seconds from a signal that is sent once a file is there to the end."""
+    process = subprocess.Popen(
+        command(*words), stderr=subprocess.PIPE, text=True, env=environment(**variables), preexec_fn=heed
+    )
+    while process.poll() is None and not (flag.exists() and flag.stat().st_size):
+        time.sleep(0.01)
+    begin = time.monotonic()
+    process.send_signal(number)
+    _, told = process.communicate(timeout=60)
+    return process.returncode, told, time.monotonic() - begin
 
 
 @pytest.mark.parametrize("kind", ["processes", "serial"])

@@ -1,7 +1,7 @@
 """What reads from outside, as functions of raw bytes: each must take anything without a traceback and without hanging.
 
 A target returns whether the input was accepted. Whatever escapes it is a finding: an exception that is not an
-:class:`~en4dvar.errors.En4dvarError`, an error that does not say where, or a Python detail in its words.
+:class:`~en4dvar.plumbing.errors.En4dvarError`, an error that does not say where, or a Python detail in its words.
 """
 
 from __future__ import annotations
@@ -10,20 +10,20 @@ import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from en4dvar.assembly.build import build
 from en4dvar.config import Config
-from en4dvar.config.build import build
 from en4dvar.config.document import read_document
 from en4dvar.config.synthetic import resolve_campaign
 from en4dvar.descent.weight_space import WeightSpace
-from en4dvar.errors import ConfigError, DataError, En4dvarError
 from en4dvar.executor import SerialExecutor
 from en4dvar.inputs.asked import Column, Matrix, TimeStep
 from en4dvar.inputs.contents import read_contents
 from en4dvar.inputs.readers import read_series
 from en4dvar.inputs.square import read_covariance
+from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError
+from en4dvar.plumbing.units import UnitError, parse_quantity
 from en4dvar.report.result import load_result
 from en4dvar.runs.checks import validate
-from en4dvar.units import UnitError, parse_quantity
 
 TIME, RADIUS = Column("t_us", "us", "s"), Column("R_um", "um", "m")
 LEAK = re.compile(r"Traceback|object at 0x|<class |NoneType|KeyError|AttributeError|not subscriptable")

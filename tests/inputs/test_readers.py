@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from en4dvar.errors import DataError
 from en4dvar.inputs.asked import Column, Layout, TimeStep
 from en4dvar.inputs.contents import read_contents
 from en4dvar.inputs.readers import Readings, read_series
+from en4dvar.plumbing.errors import DataError
 
 TIME, RADIUS = Column("t", "us", "s"), Column("R", "um", "m")
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from en4dvar.errors import DataError
 from en4dvar.inputs.window import Instant, minima, parse_instant, select
-from en4dvar.units import UnitError
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.units import UnitError
 
 T = np.linspace(0.0, 4.0, 161)
 BOUNCES = 1.0 + np.exp(-0.4 * T) * np.abs(np.cos(np.pi * (T - 0.5)))  # cusps at 1, 2, 3, 4

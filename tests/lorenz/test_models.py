@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import en4dvar_lorenz
-from en4dvar.forward import Failure
+from en4dvar.model.forward import Failure
 from en4dvar_lorenz import Linear, Lorenz63, Lorenz96
 from en4dvar_lorenz.linear import LinearSettings
 from en4dvar_lorenz.lorenz63 import Lorenz63Settings

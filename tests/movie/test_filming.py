@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from en4dvar.cli import main
-from en4dvar.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar_movie.filming import Camera, described, exposures, film, parse_settings
 from en4dvar_movie.frames import open_movie
 from en4dvar_movie.outlined import RED

@@ -7,9 +7,9 @@ import pytest
 import tifffile
 from click.testing import CliRunner
 
+from en4dvar.assembly.build import build
 from en4dvar.cli import main
 from en4dvar.config import load_config
-from en4dvar.config.build import build
 from en4dvar_movie.scene import Scene, render
 
 PIXEL, RATE = 2.5, 4e5  # µm, 1/s
@@ -45,8 +45,7 @@ def test_from_the_movie_to_observations(tmp_path, monkeypatch):
     readings = np.genfromtxt(lines[len(comment) + 1 :], delimiter=",", usecols=(2, 3))[3:] * 1e-6
     count = len(problem.observations.times)
     np.testing.assert_allclose(problem.observations.values, readings[:count, 0])
-    model = 0.01 * problem.observations.values.max()
-    np.testing.assert_allclose(problem.observations.noise.std, np.hypot(readings[:count, 1], model))
+    np.testing.assert_allclose(problem.observations.noise.std, readings[:count, 1])
     np.testing.assert_allclose(problem.observations.noise.time_std, 0.05 / RATE)
     (offset,) = (term for term in problem.prior.terms if term.parameter.name == "reading_offset")
     edge = 0.05 * np.sqrt(2 * np.pi) * 1.25  # px: 5 % of the contrast at the edge of this movie, 1.2 px and the pixel's

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from en4dvar.assembly.build import build
 from en4dvar.cli import main
 from en4dvar.config import load_config
-from en4dvar.config.build import build
-from en4dvar.errors import OutputError
+from en4dvar.plumbing.errors import OutputError
 from en4dvar_bubble.examples import EXAMPLES, write_example
 
 ROOT = Path(__file__).resolve().parents[2]

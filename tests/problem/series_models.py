@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from en4dvar.forward import ForwardModel, Observable, StateField
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.data.series import Places, Series
+from en4dvar.model.forward import ForwardModel, Observable, StateField
+from en4dvar.model.state import Field, Parameter, StateLayout
+from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.problem import InverseProblem
-from en4dvar.series import Places, Series
-from en4dvar.state import Field, Parameter, StateLayout
 
 CELLS = np.array([0.0, 1.0, 3.0, 4.0, 6.0])
 

@@ -8,15 +8,15 @@ import pytest
 from scipy import stats
 from toys import Vectorised, make_problem
 
-from en4dvar.assimilate import assimilate, log_posterior
 from en4dvar.config.dependence import term_of_members
-from en4dvar.dependence import Dependence
-from en4dvar.errors import ConfigError
-from en4dvar.population import estimate_population
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings
+from en4dvar.estimation.assimilate import assimilate, log_posterior
+from en4dvar.estimation.population import estimate_population
+from en4dvar.model.state import Parameter
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.dependence import Dependence
+from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.sampling.modes import sample_modes
-from en4dvar.state import Parameter
+from en4dvar.schemes.settings import AssimilationSettings
 
 NAMES = ("a", "b", "c", "d")
 MATRIX = np.array([[1.0, 0.7, -0.2], [0.7, 1.0, 0.3], [-0.2, 0.3, 1.0]])

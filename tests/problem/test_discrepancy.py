@@ -10,19 +10,19 @@ from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 from toys import Linear, Vectorised, Wave, make_problem, with_discrepancy
 
-from en4dvar.assimilate import assimilate, forecast, log_posterior
+from en4dvar.assembly.build import build
 from en4dvar.config import load_config
-from en4dvar.config.build import build
-from en4dvar.errors import ConfigError
+from en4dvar.data.noise import Kernel, Linearisation, Predicted, RobustDiscrepancyNoise, noise_of
+from en4dvar.data.noise.kernel import NUGGET
+from en4dvar.data.noise.robust_discrepancy import _reweighted, solve_boxed
+from en4dvar.diagnosis.response.linear import LinearResponse
+from en4dvar.diagnosis.response.what_if import what_if
+from en4dvar.estimation.assimilate import assimilate, forecast, log_posterior
 from en4dvar.executor import SerialExecutor
-from en4dvar.forward import Alternative
-from en4dvar.noise import Kernel, Linearisation, Predicted, RobustDiscrepancyNoise, noise_of
-from en4dvar.noise.kernel import NUGGET
-from en4dvar.noise.robust_discrepancy import _reweighted, solve_boxed
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings
-from en4dvar.response.linear import LinearResponse
-from en4dvar.response.what_if import what_if
+from en4dvar.model.forward import Alternative
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.schemes.settings import AssimilationSettings
 
 K = 9
 TIMES = np.linspace(0.2, 2.0, K)

@@ -8,15 +8,15 @@ import pytest
 from scipy.stats import multivariate_normal
 from toys import Decay, Linear, Wave, make_observations, make_problem, visit, with_noise
 
-from en4dvar.assimilate import assimilate, forecast, log_posterior
+from en4dvar.data.noise import Linearisation, Predicted
 from en4dvar.descent.weight_space import WeightSpace
 from en4dvar.ensemble.linalg import centre
-from en4dvar.errors import ConfigError, DataError
+from en4dvar.estimation.assimilate import assimilate, forecast, log_posterior
 from en4dvar.executor import SerialExecutor
-from en4dvar.noise import Linearisation, Predicted
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings
-from en4dvar.state import NOISE_SCALE
+from en4dvar.model.state import NOISE_SCALE
+from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.schemes.settings import AssimilationSettings
 
 NAMES = ("a", "b", "c")
 TRUTH = np.array([1.0, -0.5, 0.7])

@@ -7,10 +7,10 @@ import pytest
 from scipy.fft import irfftn
 from scipy.spatial.distance import cdist
 
-from en4dvar.dependence import KERNELS
-from en4dvar.errors import ConfigError
-from en4dvar.field_prior import FieldPrior, regular_grid
-from en4dvar.state import Field
+from en4dvar.model.state import Field
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.dependence import KERNELS
+from en4dvar.priors.field_prior import FieldPrior, regular_grid
 
 GRID = np.indices((12, 9)).reshape(2, -1).T * np.array([1.0, 2.0]) + [5.0, -3.0]
 

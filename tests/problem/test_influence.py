@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from toys import Decay, Vectorised, make_problem, with_noise
 
-from en4dvar.assimilate import assimilate
-from en4dvar.influence import (
+from en4dvar.data.noise import Kernel, Predicted, noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.diagnosis.influence import (
     LINEAR,
     UNKNOWN,
     WEIGHTED,
@@ -19,9 +20,8 @@ from en4dvar.influence import (
     pareto_smoothed,
     prior_distance,
 )
-from en4dvar.noise import Kernel, Predicted, noise_of
-from en4dvar.observations import Observations
-from en4dvar.problem import AssimilationSettings
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.schemes.settings import AssimilationSettings
 
 SETTINGS = AssimilationSettings()
 TIMES = np.linspace(0.0, 2.0, 7)
@@ -122,7 +122,7 @@ def test_members_that_do_not_differ_tell_nothing():
 
 def test_parts_of_readings_agree_with_all_of_them_at_once(monkeypatch):
     analysis = assimilate(make_problem(Vectorised(("a", "b")), [1.0, 0.5], k=11), SETTINGS, 1)
-    monkeypatch.setattr("en4dvar.influence.AT_ONCE", 3 * 48)
+    monkeypatch.setattr("en4dvar.diagnosis.influence.AT_ONCE", 3 * 48)
     again = assimilate(make_problem(Vectorised(("a", "b")), [1.0, 0.5], k=11), SETTINGS, 1)
     np.testing.assert_allclose(again.influence.in_std, analysis.influence.in_std, rtol=0, atol=1e-12)
 

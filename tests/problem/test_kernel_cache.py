@@ -7,7 +7,7 @@ import sys
 import pytest
 from run_files import environment
 
-from en4dvar import kernel_cache
+from en4dvar.plumbing import kernel_cache
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_a_kill_leaves_no_index_to_code_of_other_sources(processes, monkeypatch)
 
 FIRST_USE = """
 import time
-from en4dvar.compiled import compilations, kernel
+from en4dvar.plumbing.compiled import compilations, kernel
 
 @kernel
 def twice(x):

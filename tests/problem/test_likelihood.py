@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from toys import Decay, Linear, Wave, make_observations, make_problem
 
-from en4dvar.assimilate import cost, forecast, log_posterior
+from en4dvar.data.noise import Linearisation, Predicted
 from en4dvar.ensemble.forecast import check_problem
 from en4dvar.ensemble.linalg import anomaly_basis, centre
-from en4dvar.errors import ConfigError
-from en4dvar.forward import Observable, StateField
-from en4dvar.noise import Linearisation, Predicted
+from en4dvar.estimation.assimilate import cost, forecast, log_posterior
+from en4dvar.model.forward import Observable, StateField
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.schemes.base import Evaluation, Runs, Weights, gauss_newton
 from en4dvar.schemes.en4dvar import En4DVar
 

@@ -9,20 +9,21 @@ import pytest
 from field_models import PLACES, READ, TIMES, VALUES, Fragile, Line, Many
 from scipy.spatial.distance import cdist
 
-from en4dvar.assimilate import assimilate
-from en4dvar.errors import ConfigError, TooFewMembersError
-from en4dvar.field_prior import FieldPrior
-from en4dvar.joint.problem import sharing
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
-from en4dvar.prior import Prior, PriorTerm, member_stream
-from en4dvar.problem import AssimilationSettings, InverseProblem, Localising
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.data.series import Places, Series
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.joint.problem import sharing
+from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
+from en4dvar.priors.field_prior import FieldPrior
+from en4dvar.priors.prior import Prior, PriorTerm, member_stream
+from en4dvar.problem import InverseProblem
 from en4dvar.schemes.local_gain import ByCorrelation
 from en4dvar.schemes.localisation import gaspari_cohn
-from en4dvar.series import Places, Series
+from en4dvar.schemes.settings import AssimilationSettings, Localisation
 
 STD, SEED, N, RADIUS = 0.3, 4, 12, 3.0
-NEAR = Localising(RADIUS)
+NEAR = Localisation(RADIUS)
 
 
 def line(model=None, weights=None, estimated=False, level=False) -> InverseProblem:
@@ -38,7 +39,7 @@ def line(model=None, weights=None, estimated=False, level=False) -> InverseProbl
     )
 
 
-def settings(scheme="en4dvar", localisation: Localising | None = NEAR, **more) -> AssimilationSettings:
+def settings(scheme="en4dvar", localisation: Localisation | None = NEAR, **more) -> AssimilationSettings:
     return AssimilationSettings(scheme=scheme, members=N, localisation=localisation, **more)
 
 
@@ -114,8 +115,8 @@ def test_a_factor_is_that_of_the_logarithm():
 
 def test_a_parameter_with_a_place_beside_a_field():
     """Its covariances are tapered by its distance: far away it stays as it was."""
-    near = Localising(RADIUS, {"level": (0.5,), "offset": (0.5,)})
-    far = Localising(RADIUS, {"level": (0.5,), "offset": (100.0,)})
+    near = Localisation(RADIUS, {"level": (0.5,), "offset": (0.5,)})
+    far = Localisation(RADIUS, {"level": (0.5,), "offset": (100.0,)})
     found, kept = (assimilate(line(estimated=True, level=True), settings("es-mda", one), SEED) for one in (near, far))
     assert kept.posterior == pytest.approx(kept.prior, abs=1e-12)
     assert found.posterior.std() < 0.8 * found.prior.std()
@@ -123,7 +124,7 @@ def test_a_parameter_with_a_place_beside_a_field():
 
 
 def test_without_a_place_all_readings_act_on_a_parameter_and_en4dvar_refuses():
-    somewhere = Localising(RADIUS, {"level": (0.5,)})
+    somewhere = Localisation(RADIUS, {"level": (0.5,)})
     problem = line(estimated=True, level=True)
     found = assimilate(problem, settings("es-mda", somewhere), SEED)
     assert found.posterior.std() < 0.8 * found.prior.std()
@@ -133,7 +134,7 @@ def test_without_a_place_all_readings_act_on_a_parameter_and_en4dvar_refuses():
 
 def test_by_correlation_is_the_adaptive_gain_in_each_pass():
     problem = line(estimated=True)
-    adaptive = Localising(threshold=0.4)
+    adaptive = Localisation(threshold=0.4)
     found = assimilate(problem, settings("es-mda", adaptive, mda_coefficients=(1.0,)), SEED)
     cells = prior_of(problem)
     before = np.column_stack([problem.prior.sample(N, SEED, "exact"), cells])
@@ -153,7 +154,7 @@ def test_members_that_fail_are_left_where_they_failed_and_told():
     assert any(c.code == "members-lost" for c in found.cautions)
     alive = np.array([not reason for reason in found.posterior_failures])
     assert np.abs(found.posterior_predictions[alive].mean(axis=0) - VALUES).max() < 1
-    with pytest.raises(TooFewMembersError, match=r"failed; at least 12 must survive.*too hot"):
+    with pytest.raises(TooFewMembersError, match=r"failed in the prior forecast; at least 12 must survive.*too hot"):
         assimilate(line(Fragile()), settings("es-mda", min_active_fraction=1.0), SEED)
 
 
@@ -168,7 +169,7 @@ def test_spread_of_2000_named_parameters_by_correlation():
     )
     prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
     problem = InverseProblem(model, model.observables[0], Observations.of_series([series]), prior)
-    asked = AssimilationSettings("es-mda", members=100, localisation=Localising())
+    asked = AssimilationSettings("es-mda", members=100, localisation=Localisation())
     found = assimilate(problem, asked, 0)
     exact = np.ones(2000)
     exact[of] = 0.7 / np.sqrt(1 + 0.7**2)
@@ -190,7 +191,7 @@ def test_what_cannot_be_localised():
         assimilate(line(), settings(localisation=None), SEED)
     with pytest.raises(ConfigError, match="is en4dvar or es-mda"):
         assimilate(line(), settings("etkf"), SEED)
-    with pytest.raises(ConfigError, match="with perturbed observations"):
+    with pytest.raises(ConfigError, match="mda_form: scheme es-mda does not read it beside a localisation"):
         assimilate(line(), settings("es-mda", mda_form="square-root"), SEED)
     with pytest.raises(ConfigError, match="at least one parameter must be estimated"):
         assimilate(replace(line(), fields=()), settings(), SEED)

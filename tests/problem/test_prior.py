@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from en4dvar.errors import ConfigError
-from en4dvar.prior import Prior, PriorTerm, member_stream, own_seed, standard_normal
-from en4dvar.state import Parameter
+from en4dvar.model.state import Parameter
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.prior import Prior, PriorTerm, member_stream, own_seed, standard_normal
 
 A, B, C = Parameter("a", "Pa"), Parameter("b", "m"), Parameter("c", "1")
 TERMS = (PriorTerm.lognormal(A, 2e3, 0.5), PriorTerm.normal(B, 1e-4, 3e-6), PriorTerm.logit(C, (-1.0, 3.0), 0.5, 1.2))

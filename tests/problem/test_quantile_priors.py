@@ -1,4 +1,4 @@
-"""Uniform, half-normal and beta priors against scipy's distributions and against quadrature."""
+"""Uniform, half-normal, beta and bounded priors against scipy's distributions and against quadrature."""
 
 import math
 from pathlib import Path
@@ -10,21 +10,25 @@ from scipy.integrate import quad
 from toy_config import write_toy
 from toys import OBSERVABLE, Vectorised, make_observations
 
-from en4dvar.assimilate import assimilate, log_posterior
+from en4dvar.assembly.build import build
 from en4dvar.config import load_config
-from en4dvar.config.build import build
-from en4dvar.errors import ConfigError
-from en4dvar.honesty.checks import at_bound
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings, InverseProblem
-from en4dvar.state import Parameter
+from en4dvar.diagnosis.honesty.checks import at_bound
+from en4dvar.estimation.assimilate import assimilate, log_posterior
+from en4dvar.model.state import Parameter
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
 
 A = Parameter("a", "m")
+CUT = PriorTerm.bounded(A, "normal", 1.0, 0.5, (0.0, 2.0))
 NAMED = {
     "uniform": (PriorTerm.uniform(A, (-1.0, 3.0)), stats.uniform(-1, 4)),
     "half-normal": (PriorTerm.half_normal(A, 2.0, 0.5), stats.halfnorm(0.5, 2.0)),
     "half-normal from zero": (PriorTerm.half_normal(A, 2.0), stats.halfnorm(0, 2.0)),
     "beta": (PriorTerm.beta(A, (-1.0, 3.0), 2.0, 5.0), stats.beta(2, 5, -1, 4)),
+    "bounded normal": (PriorTerm.bounded(A, "normal", 0.5, 1.0, (-1.5, 2.0)), stats.truncnorm(-2, 1.5, 0.5, 1.0)),
+    "bounded at its mean": (PriorTerm.bounded(A, "normal", 1.0, 2.0, (1.0, 9.0)), stats.truncnorm(0, 4, 1.0, 2.0)),
     "beta with peaks at its bounds": (PriorTerm.beta(A, (0.0, 1.0), 0.5, 0.5), stats.beta(0.5, 0.5)),
 }
 
@@ -62,7 +66,12 @@ def test_moments_by_quadrature_and_of_draws(name):
 
 
 def test_tails_keep_their_distance_to_the_bound():
-    for term in (PriorTerm.uniform(A, (0.0, 2.0)), PriorTerm.half_normal(A, 1.0), PriorTerm.beta(A, (0.0, 2.0), 1, 1)):
+    for term in (
+        PriorTerm.uniform(A, (0.0, 2.0)),
+        PriorTerm.half_normal(A, 1.0),
+        PriorTerm.beta(A, (0.0, 2.0), 1, 1),
+        CUT,
+    ):
         far = float(term.to_physical(np.array(-20.0)))
         assert 0 < far < 1e-80
         assert float(term.from_physical(np.array(far))) == pytest.approx(-20, rel=1e-12)
@@ -71,7 +80,30 @@ def test_tails_keep_their_distance_to_the_bound():
         PriorTerm.uniform(A, (0.0, 2.0)).from_physical(np.array(2.0))
 
 
-@pytest.mark.parametrize("name", ["uniform", "half-normal", "beta"])
+def test_a_bounded_lognormal_is_the_exponential_of_a_bounded_normal():
+    of_log = PriorTerm.bounded(A, "normal", math.log(2.0), 0.8, (math.log(0.5), math.log(30.0)))
+    term = PriorTerm.bounded(A, "lognormal", 2.0, 0.8, (0.5, 30.0))
+    x = np.linspace(-9, 9, 37)
+    assert np.log(term.to_physical(x)) == pytest.approx(of_log.to_physical(x), rel=1e-9)
+    assert term.from_physical(term.to_physical(x)[4:-4]) == pytest.approx(x[4:-4], rel=1e-6)
+    for at in (-2.5, 0.0, 1.7):
+        assert term.slope(at) == pytest.approx(float(term.to_physical(np.array(at))) * of_log.slope(at), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("kind", "mean", "std", "bounds", "words"),
+    [
+        ("normal", 5.0, 1.0, (0.0, 4.0), "5 does not lie between the bounds"),
+        ("lognormal", 1.0, 1.0, (0.0, 4.0), "the bounds of a logarithm must be positive"),
+        ("normal", 0.0, 1e9, (-1.0, 1.0), "use a uniform prior"),
+    ],
+)
+def test_bounds_that_do_not_suit_a_gaussian(kind, mean, std, bounds, words):
+    with pytest.raises(ConfigError, match=words):
+        PriorTerm.bounded(A, kind, mean, std, bounds)
+
+
+@pytest.mark.parametrize("name", ["uniform", "half-normal", "beta", "bounded normal"])
 def test_posterior_and_evidence_of_a_linear_observation(name):
     """Sampled members, and exp(−J) summed over x, against quadrature over the parameter itself."""
     term, named = NAMED[name]

@@ -13,16 +13,17 @@ from series_models import all_series, problem_of
 from toy_config import csv_text, write_toy
 from toys import OBSERVABLE, Linear, make_observations, make_problem
 
-from en4dvar.assimilate import assimilate
 from en4dvar.cli import main
 from en4dvar.ensemble.forecast import check_problem, forecast
-from en4dvar.errors import ConfigError
-from en4dvar.forward import Alternative
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.model.forward import Alternative
+from en4dvar.model.state import READING_SCALE, Parameter
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
 from en4dvar.report.result import load_result
 from en4dvar.sampling.forward_runs import ForwardRuns
-from en4dvar.state import READING_SCALE, Parameter
+from en4dvar.schemes.settings import AssimilationSettings
 
 SETTINGS = AssimilationSettings(members=12)
 SCALED = PriorTerm.normal(READING_SCALE, 1.0, 0.2)
@@ -96,7 +97,7 @@ def test_an_offset_is_told_in_the_unit_of_what_is_read(tmp_path: Path) -> None:
     (tmp_path / "toy.csv").write_text("t_ms,x_um\n" + "".join(f"{t},{3 + float(x):.6g}\n" for t, x in lines))
     outcome = CliRunner().invoke(main, ["run", str(config), "--out", str(tmp_path / "run"), "--no-report"])
     assert outcome.exit_code == 0, outcome.output
-    row = {row.name: row for row in load_result(tmp_path / "run" / "posterior.nc").summary()}["reading_offset"]
+    row = {row.name: row for row in load_result(tmp_path / "run" / "posterior.nc").rows}["reading_offset"]
     assert row.unit == "um"
     assert abs(row.mean - 3) < 3 * row.std < 2
     shown = []
@@ -119,7 +120,7 @@ def test_from_yaml_to_the_result_and_the_simulation(tmp_path: Path) -> None:
     (tmp_path / "toy.csv").write_text("t_ms,x_um\n" + "".join(f"{t},{1.04 * float(x):.6g}\n" for t, x in lines))
     outcome = CliRunner().invoke(main, ["run", str(config), "--out", str(tmp_path / "run"), "--no-report"])
     assert outcome.exit_code == 0, outcome.output
-    row = {row.name: row for row in load_result(tmp_path / "run" / "posterior.nc").summary()}["reading_scale"]
+    row = {row.name: row for row in load_result(tmp_path / "run" / "posterior.nc").rows}["reading_scale"]
     assert abs(row.mean - 1.04) < 3 * row.std < 0.04
     simulated = []
     for factor in ("1", "1.5"):

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from honesty.provoked import bent, run, spiked
+from diagnosis.provoked import bent, run, spiked
 from toys import with_discrepancy
 
+from en4dvar.diagnosis.residuals import Residuals, positive_chance
 from en4dvar.report.page import judge_chi2
-from en4dvar.residuals import Residuals, positive_chance
 
 K = 20
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from problem.series_models import AT, CELLS, MODEL, TIMES, Q, all_series, closed_form, problem_of, rows
 
-from en4dvar.assimilate import assimilate
+from en4dvar.data.noise import BlockNoise, CorrelatedNoise, Noise, Predicted, joint_noise, noise_of, noise_of_readings
+from en4dvar.data.observations import Observations
+from en4dvar.data.series import Places, Series, balanced
 from en4dvar.ensemble.forecast import cost, forecast
-from en4dvar.errors import DataError
-from en4dvar.noise import BlockNoise, CorrelatedNoise, Noise, Predicted, joint_noise, noise_of, noise_of_readings
-from en4dvar.observations import Observations
-from en4dvar.problem import AssimilationSettings
-from en4dvar.series import Places, Series, balanced
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.plumbing.errors import DataError
+from en4dvar.schemes.settings import AssimilationSettings
 
 NAMES = ("p", "q", "f")
 G = np.vstack([rows(name) for name in NAMES])
@@ -182,7 +182,7 @@ def test_blocks_are_the_sum_of_their_series():
 
 def test_the_score_of_blocks_is_the_gradient_of_their_cost():
     """∇J_o = −Sᵀd for every kind at once, by central differences of J_o."""
-    from en4dvar.noise import Linearisation
+    from en4dvar.data.noise import Linearisation
 
     problem = problem_of(mixed())
     observations, x, h = problem.observations, np.array([0.8, 0.7]), 1e-6

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, Field, ValidationError
 
-from en4dvar.units import Quantity, UnitError, convert, parse_quantity, parse_unit
+from en4dvar.plumbing.units import Quantity, UnitError, as_unit, convert, parse_quantity, parse_unit
 
 
 @pytest.mark.parametrize(
@@ -91,6 +91,10 @@ def test_units_that_would_take_for_ever_are_refused(text: str) -> None:
 def test_a_multiple_is_a_unit() -> None:
     assert convert(2.0, "2.76*um", "m") == 5.52e-6
     assert convert(2.0, "1e-6 * m", "um") == 2.0
-    for wrong in ("0*um", "2.76um", "2.76 um", "-1*um", "1e99*um", "2*3*um*"):
+    assert convert(3.0, "1/(270*kHz)", "s") == pytest.approx(3 / 270e3, rel=1e-15)
+    assert as_unit("+500 kfps", "Hz") == "500*kfps"
+    assert convert(1.0, f"1/({as_unit('5e5 1/s', 'Hz')})", "us") == 2.0
+    huge = "9e29*(" * 9 + "m" + ")" * 9
+    for wrong in ("0*um", "2.76um", "2.76 um", "-1*um", "1e99*um", "2*3*um*", "m 2*s", "m/2*s", huge):
         with pytest.raises(UnitError):
             convert(1.0, wrong, "m")

@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pytest
 
-from en4dvar.report.chart import Chart, Panel, Row, steps
-from en4dvar.report.paper import on_paper
+from en4dvar.report.chart import PAGE, Chart, Panel, Row, stacked, steps
+from en4dvar.report.paper import on_paper, save_chart
 from en4dvar.report.paths import SHOWN
 from en4dvar.report.svg import svg
 from en4dvar.report.ticks import numbers, powers, ticks
@@ -26,14 +26,54 @@ def points(path):
     return np.array([[float(v) for v in pair] for pair in re.findall(r"[ML]([-\d.]+) ([-\d.]+)", path)])
 
 
+@pytest.mark.parametrize("x_logarithmic", [False, True])
 @pytest.mark.parametrize("logarithmic", [False, True])
-def test_marks_lie_where_the_axes_say(logarithmic):
-    panel = Panel(xlim=(0.0, 10.0), ylim=(1.0, 100.0), logarithmic=logarithmic)
-    panel.line([0, 5, 10], [1, 10, 100], "ink")
+def test_marks_lie_where_the_axes_say(logarithmic, x_logarithmic):
+    panel = Panel(xlim=(1.0, 100.0), ylim=(1.0, 100.0), logarithmic=logarithmic, x_logarithmic=x_logarithmic)
+    panel.line([1, 10, 100], [1, 10, 100], "ink")
     _, (x, y, width, height), (path,) = drawn(panel)
-    share = np.array([0, 0.5, 1]) if logarithmic else np.array([0, 9 / 99, 1])
-    expected = np.column_stack([x + width * np.array([0, 0.5, 1]), y + height * (1 - share)])
-    assert points(path) == pytest.approx(expected, abs=0.11)
+    across, up = (np.array([0, 0.5 if log else 9 / 99, 1]) for log in (x_logarithmic, logarithmic))
+    assert points(path) == pytest.approx(np.column_stack([x + width * across, y + height * (1 - up)]), abs=0.11)
+
+
+def test_an_axis_may_run_downwards_and_have_names():
+    panel = Panel(xlim=(0.0, 1.0), ylim=(2.0, 0.0), yticks=(0, 2), y_names=("first", "last"), title="one\ntwo")
+    text, (_, y, _, height), _ = drawn(panel)
+    heights = {word: float(at) for at, word in re.findall(r'y="([\d.]+)"[^>]*>(first|last|one|two)<', text)}
+    assert heights["last"] - heights["first"] == pytest.approx(height, abs=0.2)
+    assert heights["one"] < heights["two"] < y
+
+
+def test_level_lines_and_tiles_lie_at_their_values():
+    panel = Panel(xlim=(0.0, 10.0), ylim=(0.0, 4.0))
+    panel.intervals([1, 2], [3, 6], [1, 2], "ink")
+    panel.tiles([5.0], [2.0], (2.0, 1.0), "#ff0000")
+    text, (x, y, width, height), (lines, tile) = drawn(panel)
+    expected = [(0.1, 0.75), (0.3, 0.75), (0.2, 0.5), (0.6, 0.5)]
+    assert points(lines) == pytest.approx(np.array([(x + width * u, y + height * v) for u, v in expected]), abs=0.11)
+    assert points(tile)[0] == pytest.approx([x + 0.4 * width, y + height * 0.375], abs=0.2)
+    assert 'fill="#ff0000"' in text
+
+
+def test_stacked_panels_have_one_axis_and_one_legend():
+    panels = [Panel(xlim=(0.0, 1.0)), Panel(xlim=(0.0, 1.0))]
+    panels[0].line([0, 1], [0, 1], "ink", label="one")
+    panels[1].dots([0, 1], [0, 1], "posterior", label="other")
+    chart = stacked(panels, 80.0, "time")
+    assert [panel.x_numbers for panel in panels] == [False, True]
+    assert panels[0].entries() == ["one", "other"]
+    assert len(on_paper(chart).axes[0].get_legend().get_texts()) == 2
+
+
+@pytest.mark.parametrize("legends", [1, 3])
+def test_a_legend_leaves_its_panels_room(tmp_path, legends):
+    """Matplotlib's layout warns, which is an error here, where a legend is wider than its panel."""
+    panels = [Panel("G (kPa)", "density", title="(a)", legend=i < legends) for i in range(4)]
+    for panel in panels:
+        for k in range(4):
+            panel.line([0, 1], [0, k], "posterior", label=f"QS QLKV, 0.{k} % gel")
+    save_chart(Chart([Row(150.0, panels)], PAGE), tmp_path, "a")
+    assert {file.name for file in tmp_path.iterdir()} == {"a.pdf", "a.png"}
 
 
 def test_numbers_stand_at_their_ticks():

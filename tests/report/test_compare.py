@@ -10,11 +10,11 @@ from click.testing import CliRunner
 from run_files import add_to_pack
 from toys import Linear, make_problem
 
-from en4dvar.assimilate import assimilate
 from en4dvar.cli import main
-from en4dvar.errors import OutputError
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
 from en4dvar.report.compare import (
     ALL,
     _effective,
@@ -25,7 +25,8 @@ from en4dvar.report.compare import (
 )
 from en4dvar.report.overlay import overlay
 from en4dvar.report.result import Result
-from en4dvar.storage.store import load_stored
+from en4dvar.results.store import load_stored
+from en4dvar.schemes.settings import AssimilationSettings
 
 
 def run_dir(path, names, seeds=(1,), std=0.1, wide=1.0):
@@ -158,10 +159,10 @@ def test_page_figure_and_tables(tmp_path, monkeypatch):
         assert float(row["mean"]) == pytest.approx(estimate.members.mean(), rel=1e-12)
     with (out / "evidence.csv").open(encoding="utf-8") as file:
         assert [float(r["log_evidence"]) for r in csv.DictReader(file)] == [s.log_evidence for s in comparison.scores]
-    figure = overlay(comparison)
-    assert [ax.get_xlabel() for ax in figure.axes] == ["a (m)", "b (m)"]
-    assert [t.get_text() for t in figure.legends[0].get_texts()] == ["one", "two"]
-    bars = figure.axes[0].lines[0].get_xdata()
+    (row,) = overlay(comparison).rows
+    assert [panel.xlabel for panel in row.panels] == ["a (m)", "b (m)"]
+    assert row.panels[0].entries() == ["one", "two"]
+    bars = next(mark.x for mark in row.panels[0].marks if mark.size == 2.0)
     pooled = np.concatenate([e.members for e in comparison.estimates if (e.run, e.summary.name) == ("one", "a")])
     assert list(bars) == pytest.approx(list(np.quantile(pooled, (0.05, 0.95))))
     again = CliRunner().invoke(main, ["compare", *map(str, runs), "--out", str(out), "--no-report"])

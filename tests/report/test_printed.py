@@ -14,10 +14,11 @@ import pytest
 from click.testing import CliRunner
 from run_files import add_to_pack
 
-from en4dvar.caution import caution
 from en4dvar.cli import main
 from en4dvar.commands.run import _tell
-from en4dvar.influence import Influence
+from en4dvar.diagnosis.influence import Influence
+from en4dvar.estimation.summary import INTERVAL, results_table
+from en4dvar.plumbing.caution import caution
 from en4dvar.report import write_pages
 from en4dvar.report.compare import compare_runs, comparison_table, estimates_table
 from en4dvar.report.export import export_table
@@ -25,10 +26,9 @@ from en4dvar.report.overlay import write_comparison
 from en4dvar.report.readings import influence, reading_words
 from en4dvar.report.result import Result
 from en4dvar.report.text import number_like, plus_minus
+from en4dvar.results.provenance import provenance
+from en4dvar.results.store import load_stored
 from en4dvar.runs.campaign import Campaign, DatasetOutcome
-from en4dvar.storage.provenance import provenance
-from en4dvar.storage.store import load_stored
-from en4dvar.summary import INTERVAL, results_table
 
 AT_BOUND = caution("at-bound", "half of the members of G pile up", parameters=("G",))
 LITTLE = caution("not-informed", "R0 is hardly informed by the data", parameters=("R0",))
@@ -74,7 +74,7 @@ def test_of_several_modes_quantiles_are_printed_everywhere(tmp_path, one_figure,
     assert (row["mean"], row["std"]) == ("", "")
     assert float(row["q05"]) == pytest.approx(low)
     assert "several modes" in row["informed"]
-    table = results_table({"set": [r for r in load_stored(run / "posterior.nc").summary() if r.name == "G"]})
+    table = results_table({"set": [r for r in load_stored(run / "posterior.nc").rows if r.name == "G"]})
     assert table.splitlines()[-1].split()[3:5] == ["-", "-"]
 
 
@@ -135,7 +135,7 @@ def test_latex_compiles(bounded, tmp_path):
 
 
 def test_terminal_prints_a_value_without_interval(bounded):
-    table = results_table({"A": Result.summary(compare_result(bounded))})
+    table = results_table({"A": compare_result(bounded).rows})
     head, first, second = table.splitlines()[:3]
     assert head.endswith("not to be trusted")
     assert first.split()[3:] == ["2.8", "-", "-", "-", "-", "at-bound"]

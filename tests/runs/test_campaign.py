@@ -12,14 +12,15 @@ from toy_config import csv_text
 
 from en4dvar.commands.common import Failed
 from en4dvar.commands.run import _tell
-from en4dvar.errors import DataError, OutputError, TooFewMembersError
+from en4dvar.plumbing.errors import DataError, OutputError, TooFewMembersError
 from en4dvar.report.result import load_result
+from en4dvar.results.campaign_file import GROUPS, save_campaign
+from en4dvar.results.pack import PACK, Pack, read_outcome, results_of
 from en4dvar.runs import outcomes
 from en4dvar.runs.campaign import Campaign, DatasetOutcome, file_names
+from en4dvar.runs.engine import write_report
 from en4dvar.runs.outcomes import Outcomes
-from en4dvar.runs.runner import run_campaign, write_report
-from en4dvar.storage.campaign_file import GROUPS, save_campaign
-from en4dvar.storage.pack import PACK, Pack, read_outcome, results_of
+from en4dvar.runs.runner import run_campaign
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +112,7 @@ def test_one_file_for_all(campaign):
 def test_blocks_make_no_difference(campaign, tmp_path, monkeypatch):
     pack = Pack(campaign.directory / PACK)
     sources = {load_result(address).name: address.name for address in results_of(pack.path)}
-    monkeypatch.setattr("en4dvar.storage.campaign_file.BLOCK", 1)
+    monkeypatch.setattr("en4dvar.results.campaign_file.BLOCK", 1)
     one_by_one = xr.load_datatree(save_campaign(tmp_path / "posterior.nc", pack, sources, {}, {}))
     together = xr.load_datatree(campaign.directory / "posterior.nc")
     for group in GROUPS:

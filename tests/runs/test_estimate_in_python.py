@@ -237,3 +237,13 @@ def test_a_star_gives_the_public_names():
     exec("from en4dvar import *", names)
     assert [names[name] for name in ("estimate", "run", "Prior")] == [en4dvar.estimate, en4dvar.run, en4dvar.Prior]
     assert set(en4dvar.__all__) <= set(dir(en4dvar))
+
+
+def test_a_function_hears_of_each_iteration():
+    heard = []
+    result = fit(progress=lambda name, record: heard.append((name, record)))
+    assert {name for name, _ in heard} == {"data"}  # the file that the arrays are kept in
+    costs = [record.cost for _, record in heard if hasattr(record, "cost")]
+    assert len(costs) >= 2
+    assert costs[-1] < costs[0]
+    assert len(result.summary()) == 2

@@ -6,7 +6,7 @@ import pytest
 from run_files import assert_same_results, configuration, make_campaign
 from worker_calls import counts
 
-from en4dvar.analysis import Descents, StartRecord
+from en4dvar.diagnosis.analysis import Descents, StartRecord
 from en4dvar.executor import choose_executor
 from en4dvar.runs.runner import run_campaign
 

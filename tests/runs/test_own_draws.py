@@ -9,7 +9,7 @@ from run_files import configuration, make_campaign
 from scipy.stats import chisquare
 from toys import Vectorised
 
-from en4dvar.prior import own_seed
+from en4dvar.priors.prior import own_seed
 from en4dvar.report.result import load_result
 from en4dvar.runs.rerun import rerun
 from en4dvar.runs.runner import run, run_campaign

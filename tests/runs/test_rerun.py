@@ -4,11 +4,11 @@ import pytest
 from run_files import add_to_pack, configuration, make_campaign, run_cli
 from toy_config import write_toy
 
-from en4dvar.errors import OutputError
+from en4dvar.plumbing.errors import OutputError
 from en4dvar.report.result import load_result
+from en4dvar.results.pack import PACK
 from en4dvar.runs.rerun import rerun
 from en4dvar.runs.runner import run, run_campaign
-from en4dvar.storage.pack import PACK
 
 
 @pytest.fixture
@@ -57,8 +57,8 @@ def test_what_differs_is_named(campaign):
 
 
 def test_what_has_changed_is_told(campaign, monkeypatch):
-    monkeypatch.setattr("en4dvar.storage.fingerprint.source_digest", lambda module: f"another {module}")
-    monkeypatch.setattr("en4dvar.storage.provenance.cpu_model", lambda: "another processor")
+    monkeypatch.setattr("en4dvar.results.fingerprint.source_digest", lambda module: f"another {module}")
+    monkeypatch.setattr("en4dvar.results.provenance.cpu_model", lambda: "another processor")
     found = rerun(campaign / "run")
     assert found.same
     assert "+  toy_models: another toy_models" in found.changed

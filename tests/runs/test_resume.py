@@ -10,10 +10,10 @@ from execution_models import Stops
 from run_files import assert_same_results, configuration, interrupt, make_campaign, run_and_signal, run_cli
 from toy_config import write_toy
 
-from en4dvar.errors import OutputError
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.results.pack import PACK, Pack
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.runner import run_campaign
-from en4dvar.storage.pack import PACK, Pack
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def test_a_changed_run_is_refused_with_the_difference(tmp_path, change):
 def test_other_sources_are_refused(tmp_path, monkeypatch):
     path, out = make_campaign(tmp_path, 2, "execution_models:Stops"), tmp_path / "run"
     interrupt(path, out, 9)
-    monkeypatch.setattr("en4dvar.storage.fingerprint.source_digest", lambda module: f"another {module}")
+    monkeypatch.setattr("en4dvar.results.fingerprint.source_digest", lambda module: f"another {module}")
     with pytest.raises(OutputError, match=r"\+  toy_models: another toy_models") as refused:
         run_campaign(configuration(path, out), resume=True)
     assert "+  en4dvar: another en4dvar" in str(refused.value)

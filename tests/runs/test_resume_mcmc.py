@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 from run_files import assert_same_results, configuration, kill_after_writes, make_campaign, resumed_until_done, run_cli
 
-from en4dvar.assimilate import LoopState
+from en4dvar.estimation.assimilate import LoopState
 from en4dvar.inputs.asked import DataFile
+from en4dvar.results.checkpoint import read_checkpoint
+from en4dvar.results.fingerprint import identity
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.runner import run_campaign
 from en4dvar.sampling import mcmc
-from en4dvar.storage.checkpoint import read_checkpoint
-from en4dvar.storage.fingerprint import identity
 
 REFINED = ("members: 8", "members: 8\n  refine: mcmc")
 

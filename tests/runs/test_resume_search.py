@@ -7,10 +7,10 @@ import pytest
 from same_bits import assert_same_bits
 from wells import UnlikeWells, two_wells
 
-from en4dvar.analysis import StartRecord
-from en4dvar.assimilate import LoopState, assimilate
-from en4dvar.problem import AssimilationSettings
-from en4dvar.storage.checkpoint import Keeper, read_checkpoint
+from en4dvar.diagnosis.analysis import StartRecord
+from en4dvar.estimation.assimilate import LoopState, assimilate
+from en4dvar.results.checkpoint import Keeper, read_checkpoint
+from en4dvar.schemes.settings import AssimilationSettings
 
 SETTINGS, SEED = AssimilationSettings(start="prior-mean"), 3
 

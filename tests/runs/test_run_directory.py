@@ -13,12 +13,12 @@ from run_files import assert_same_results, command, configuration, environment, 
 from toy_config import write_toy
 
 from en4dvar.cli import main
-from en4dvar.errors import DataError, OutputError, TooFewMembersError
+from en4dvar.plumbing.errors import DataError, OutputError, TooFewMembersError
+from en4dvar.results.pack import PACK, results_of
 from en4dvar.runs import rundir
 from en4dvar.runs.lock import LOCK, locked
 from en4dvar.runs.rundir import NEXT, RunDirectory
 from en4dvar.runs.runner import run, run_campaign
-from en4dvar.storage.pack import PACK, results_of
 
 
 def contents(folder):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from copy import deepcopy
 from pathlib import Path
 
 import drift_series
@@ -14,17 +15,17 @@ from drift_series import STD, TIMES, VALUES
 from linear_drift import Drift
 
 import en4dvar
+from en4dvar.assembly.build_sequence import build_sequence
 from en4dvar.config import load_sequence, load_twin
-from en4dvar.config.build_sequence import build_sequence
-from en4dvar.cycling.problem import assimilate_series
-from en4dvar.cycling.twin import conduct
-from en4dvar.errors import ConfigError, DataError
-from en4dvar.noise import noise_of
-from en4dvar.prior import PriorTerm
+from en4dvar.data.noise import noise_of
+from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.priors.prior import PriorTerm
 from en4dvar.runs.checks import validate
 from en4dvar.runs.interrupt import Interrupted
 from en4dvar.runs.sequence_run import run_sequence
 from en4dvar.schemes.ienks import IEnKS
+from en4dvar.series.problem import assimilate_series
+from en4dvar.series.twin import conduct
 from en4dvar_lorenz import Lorenz96
 from en4dvar_lorenz.lorenz96 import Lorenz96Settings
 
@@ -74,6 +75,35 @@ def test_a_file_with_a_gap_is_the_kalman_filter(folder, additive):
         assert data["members"].shape == (1, 8, 2)
         assert np.cov(data["members"].values[0].T) == pytest.approx(kalman()[0][-1][1], abs=1e-10)
     assert "c,0." in Path("runs/drift/summary.csv").read_text()
+
+
+@pytest.mark.parametrize("rho", [0.5, -0.8])
+def test_two_series_with_correlated_errors_are_the_kalman_filter(folder, rho):
+    """R is [[σ², ρσσ'], [ρσσ', σ'²]] where both are read, σ² where one is."""
+    other = 0.25
+    twice = {"x": (VALUES, STD), "again": (0.9 * VALUES[::-1], other)}
+    for name, (values, _) in twice.items():
+        rows = "".join(f"{t},{v}\n" for t, v in zip(TIMES, values, strict=True) if np.isfinite(v))
+        Path(f"{name}.csv").write_text(f"t,x\n{rows}")
+    columns = BASE["data"]["columns"]
+    series = {
+        name: {"path": f"{name}.csv", "columns": deepcopy(columns), "observable": "x", "error": {"x_std": std}}
+        for name, (_, std) in twice.items()
+    }
+    data = {"name": "drift", "series": series, "correlation": {"x": {"again": rho}}}
+    result = run_sequence(written(folder, data=data, assimilation={"scheme": "etkf", "members": 8}))
+    r = np.array([[STD**2, rho * STD * other], [rho * STD * other, other**2]])
+    mean, cov, expected = np.array([0.0, 0.5]), np.diag([0.25, 0.09]), []
+    both = np.column_stack([values for values, _ in twice.values()])
+    for dt, y in zip(np.diff(TIMES, prepend=0.0), both, strict=True):
+        m = np.array([[1.0, dt], [0.0, 1.0]])
+        mean, cov = m @ mean, m @ cov @ m.T + np.diag(RATES) * dt
+        read = np.isfinite(y)
+        h = np.array([[1.0, 0.0], [1.0, 0.0]])[read]
+        gain = cov @ h.T @ np.linalg.inv(h @ cov @ h.T + r[np.ix_(read, read)])
+        mean, cov = mean + gain @ (y[read] - h @ mean), cov - gain @ h @ cov
+        expected.append((mean, cov))
+    check(result.run.analysis, expected)
 
 
 @pytest.mark.parametrize("more", [{"lag": 9}, {"lag": 9, "mda_weights": [1.0] * 9}, {"lag": 8, "shift": 3}], ids=str)
@@ -173,7 +203,7 @@ SCHEME = BASE["assimilation"]
         ({"assimilation": {**SCHEME, "scheme": "ienks", "shift": 0}}, "assimilation.shift", "greater than"),
         ({"assimilation": {**SCHEME, "scheme": "ienks", "lag": 3, "mda_weights": [1, 1]}}, "assimilation", "are 3"),
         ({"assimilation": {**SCHEME, "scheme": "ienks", "mda_weights": [0]}}, "assimilation.mda_weights", "than 0"),
-        ({"assimilation": {**SCHEME, "mda_weights": [1, 1]}}, "assimilation", "only with scheme ienks"),
+        ({"assimilation": {**SCHEME, "mda_weights": [1, 1]}}, "assimilation.mda_weights", "a key of ienks"),
         ({"sequence": {"initial_std": {"x": 0.5}, "positive": "x"}}, "sequence.positive", "expected a list"),
         ({"assimilation": {**SCHEME, "localisation": {"radius": 2}}}, "assimilation.localisation", "data.places"),
     ],

@@ -16,13 +16,13 @@ from drift_series import STD, TIMES, VALUES
 from run_files import kill_after_writes, resumed_until_done, run_cli
 from scipy.stats import multivariate_normal
 
-from en4dvar.cycling.moments import log_evidence
-from en4dvar.errors import DataError, OutputError
-from en4dvar.noise import Correlation
+from en4dvar.data.noise import Correlation
+from en4dvar.plumbing.errors import DataError, OutputError
 from en4dvar.report.compare_cycles import compare_sequences, sequences_table
 from en4dvar.report.export_cycles import cycles_table
 from en4dvar.runs.rerun import rerun
 from en4dvar.runs.sequence_run import run_sequence
+from en4dvar.series.moments import log_evidence
 
 folder = drift_series.folder
 RATE, START = 0.2**2 / 0.5, 0.5

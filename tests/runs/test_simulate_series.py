@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from problem.series_models import CELLS
 
+from en4dvar.assembly.build import build
 from en4dvar.config import load_config
-from en4dvar.config.build import build
-from en4dvar.errors import ConfigError
+from en4dvar.plumbing.errors import ConfigError
 from en4dvar.runs.simulation import noise_level, simulate, to_csv
 
 YAML = """\

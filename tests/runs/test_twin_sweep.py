@@ -12,9 +12,9 @@ from twin_models import Ring
 import en4dvar
 from en4dvar.cli import main
 from en4dvar.config import load_twin
-from en4dvar.cycling.twin import conduct
-from en4dvar.errors import ConfigError, OutputError, TooFewMembersError
+from en4dvar.plumbing.errors import ConfigError, OutputError, TooFewMembersError
 from en4dvar.runs.interrupt import Interrupted
+from en4dvar.series.twin import conduct
 
 CONFIG = {
     "name": "ring",

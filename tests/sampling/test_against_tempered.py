@@ -5,8 +5,8 @@ import pytest
 from tempered import tempered
 from wells import UnlikeWells, Wells, two_wells
 
-from en4dvar.assimilate import assimilate
-from en4dvar.problem import AssimilationSettings
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.schemes.settings import AssimilationSettings
 
 
 def population(problem, seed=3):

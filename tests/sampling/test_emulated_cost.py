@@ -8,18 +8,18 @@ import pytest
 from same_bits import assert_same_bits
 from toys import Decay, Fragile, Linear, Toy, make_problem
 
-from en4dvar.assimilate import assimilate, log_posterior
 from en4dvar.descent.weight_space import WeightSpace
-from en4dvar.diagnostics import effective_share, is_non_gaussian, shape_warnings
+from en4dvar.diagnosis.diagnostics import effective_share, is_non_gaussian, shape_warnings
 from en4dvar.ensemble.forecast import forecast
+from en4dvar.estimation.assimilate import assimilate, log_posterior
 from en4dvar.executor import SerialExecutor, ThreadsExecutor
-from en4dvar.prior import PriorTerm
-from en4dvar.problem import AssimilationSettings
+from en4dvar.model.state import NOISE_SCALE
+from en4dvar.priors.prior import PriorTerm
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.emulated_cost import emulate, needed_runs
 from en4dvar.sampling.shape import guide
 from en4dvar.sampling.walkers import advance
-from en4dvar.state import NOISE_SCALE
+from en4dvar.schemes.settings import AssimilationSettings
 
 LEVELS = {"plain": {}, "timing errors": {"time_std": 0.05}}
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, norm
 
-from en4dvar.prior import Prior, PriorTerm
+from en4dvar.model.state import Parameter
+from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.sampling import evidence as evidence_module
 from en4dvar.sampling.evidence import DRAWS, ENOUGH, MOST_ROUNDS, sampled_evidence
-from en4dvar.state import Parameter
 
 
 def prior_of(mean, std):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from toys import Linear, make_problem
 
-from en4dvar.assimilate import assimilate
-from en4dvar.diagnostics import gaussianity, is_non_gaussian, shape_warnings
-from en4dvar.problem import AssimilationSettings
+from en4dvar.diagnosis.diagnostics import gaussianity, is_non_gaussian, shape_warnings
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.schemes.settings import AssimilationSettings
 
 
 def ensemble(n_members=48, n=3, seed=0):

@@ -7,13 +7,13 @@ import pytest
 from same_bits import assert_same_bits
 from toys import Decay, make_problem
 
-from en4dvar.analysis import ChainRecord, IterationRecord
-from en4dvar.assimilate import assimilate, log_posterior
-from en4dvar.errors import En4dvarError
+from en4dvar.diagnosis.analysis import ChainRecord, IterationRecord
+from en4dvar.estimation.assimilate import assimilate, log_posterior
 from en4dvar.executor import ThreadsExecutor
-from en4dvar.prior import PriorTerm
-from en4dvar.problem import AssimilationSettings
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.priors.prior import PriorTerm
 from en4dvar.sampling import mcmc
+from en4dvar.schemes.settings import AssimilationSettings
 
 
 def autoregressive(steps, chains, phi, seed=0):

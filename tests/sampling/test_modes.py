@@ -7,15 +7,15 @@ import pytest
 from same_bits import assert_same_bits
 from wells import UnlikeWells, Wells, mass_of_positive, two_wells
 
-from en4dvar.assimilate import assimilate, log_posterior
 from en4dvar.descent.minima import Minimum
+from en4dvar.estimation.assimilate import assimilate, log_posterior
+from en4dvar.estimation.summary import summarise
 from en4dvar.executor import ThreadsExecutor
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings
+from en4dvar.model.state import Parameter
+from en4dvar.priors.prior import Prior, PriorTerm
 from en4dvar.sampling import mcmc
 from en4dvar.sampling.refine import Refined, mode_cautions, shares_of
-from en4dvar.state import Parameter
-from en4dvar.summary import summarise
+from en4dvar.schemes.settings import AssimilationSettings
 
 KEYWORDS = mcmc.sample.__kwdefaults__
 

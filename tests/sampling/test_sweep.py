@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from en4dvar.assembly.build import build
 from en4dvar.cli import main
 from en4dvar.config import load_config
-from en4dvar.config.build import build
-from en4dvar.errors import ConfigError, DataError
+from en4dvar.data.noise import noise_of
+from en4dvar.data.observations import Observations
 from en4dvar.executor import ThreadsExecutor
-from en4dvar.noise import noise_of
-from en4dvar.observations import Observations
+from en4dvar.plumbing.errors import ConfigError, DataError
 from en4dvar.sampling.nearest import best_over_shifts, targets
 from en4dvar.sampling.sweep import SweepSettings, run_sweep, sobol_box
 from en4dvar_agarose.run import one_model

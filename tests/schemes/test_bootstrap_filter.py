@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from en4dvar.cycling.sequential import CycleSeries, SequentialSettings, run_sequential
 from en4dvar.ensemble.linalg import centre
 from en4dvar.schemes.base import Evaluation, Weights
 from en4dvar.schemes.bootstrap_filter import BootstrapFilter, likelihood_shares, systematic
-from en4dvar.schemes.localisation import Localisation
+from en4dvar.schemes.localisation import BlockLocalisation
+from en4dvar.series.sequential import CycleSeries, SequentialSettings, run_sequential
 from en4dvar_lorenz import Linear
 from en4dvar_lorenz.linear import LinearSettings
 
@@ -88,6 +88,6 @@ def test_the_posterior_of_a_linear_model_within_sampling_error():
 
 
 def test_no_localisation():
-    local = Localisation([np.arange(2)], np.ones((1, 2)))
-    with pytest.raises(ValueError, match="particle filter takes no localisation"):
+    local = BlockLocalisation([np.arange(2)], np.ones((1, 2)))
+    with pytest.raises(ValueError, match="takes no localisation"):
         SequentialSettings(BootstrapFilter(), localisation=local)

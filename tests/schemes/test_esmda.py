@@ -9,9 +9,9 @@ import pytest
 from same_bits import assert_same_bits
 from toys import Decay, Fragile, Linear, Vectorised, Wave, make_problem
 
-from en4dvar.assimilate import assimilate, log_posterior
-from en4dvar.problem import AssimilationSettings
+from en4dvar.estimation.assimilate import assimilate, log_posterior
 from en4dvar.schemes.esmda import ESMDA
+from en4dvar.schemes.settings import AssimilationSettings
 
 NAMES, TRUTH = ("a", "b", "c"), np.array([1.0, -0.5, 0.7])
 COEFFICIENTS = [(1.0,), (4.0, 4.0, 4.0, 4.0), (9.333, 7.0, 4.0, 2.0), (1.0, 3.0)]

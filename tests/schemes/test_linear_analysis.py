@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from toys import OBSERVABLE, Linear, Vectorised, make_observations, make_problem
 
-from en4dvar import diagnostics as diag
-from en4dvar.assimilate import assimilate
+from en4dvar.diagnosis import diagnostics as diag
 from en4dvar.ensemble.linalg import Hessian, anomaly_basis, centre
-from en4dvar.prior import Prior, PriorTerm
-from en4dvar.problem import AssimilationSettings, InverseProblem
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.model.state import READING_OFFSET, TIME_SHIFT, Parameter
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
 from en4dvar.schemes.base import Evaluation, Runs, Weights, gauss_newton
 from en4dvar.schemes.en4dvar import En4DVar
-from en4dvar.state import READING_OFFSET, TIME_SHIFT, Parameter
+from en4dvar.schemes.settings import AssimilationSettings
 
 NAMES = ("a", "b", "c")
 TRUTH = np.array([1.0, -0.5, 0.7])

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 from en4dvar_agarose.evidence import probability
 
 FOLDER = Path(__file__).parent
@@ -51,20 +51,21 @@ def bins(difference: Array, quadratic: Array) -> tuple[Bin, ...]:
     """Stated probability of the favoured law against how often it is the right one; empty bins left out."""
     stated = np.maximum(probability(difference), probability(-difference))
     right = (difference > 0) == quadratic
-    found = []
+    shares = []
     for low, high in pairwise(EDGES):
         here = (stated >= low) & (stated < high)
         if here.any():
             # independent, not identical, trials
             error = float(np.sqrt(np.sum(stated[here] * (1 - stated[here])))) / int(here.sum())
-            found.append(Bin(float(stated[here].mean()), float(right[here].mean()), int(here.sum()), error))
-    return tuple(found)
+            shares.append(Bin(float(stated[here].mean()), float(right[here].mean()), int(here.sum()), error))
+    return tuple(shares)
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Of ``campaigns``, those whose 95 % interval of a population mean holds the mean of the lognormal that the truths
-    were drawn from (``held``; ``of_first`` among the first 20), and the mean of the truths drawn (``of_drawn``).
+    """The number of ``campaigns``, and those whose 95 % interval of a population mean holds the mean of the lognormal
+    that the truths were drawn from (``held``; ``of_first`` among the first 20), and the mean of the truths drawn
+    (``of_drawn``).
     """
 
     gel: str
@@ -81,18 +82,18 @@ class Coverage:
 
 
 def coverage() -> list[Coverage]:
-    """Of every gel and parameter."""
-    found: dict[tuple[str, str], list[tuple[bool, bool]]] = {}
+    """Coverage of every gel and parameter."""
+    covered: dict[tuple[str, str], list[tuple[bool, bool]]] = {}
     for row in sorted(_rows("population.csv"), key=lambda row: (row["gel"], int(row["seed"]))):
         low, high = float(row["low"]), float(row["high"])
         held = (low < float(row["true_mean"]) < high, low < float(row["mean_of_truths"]) < high)
-        found.setdefault((row["gel"], row["parameter"]), []).append(held)
+        covered.setdefault((row["gel"], row["parameter"]), []).append(held)
     return [
         Coverage(
             gel, name, sum(held for held, _ in rows[:FIRST]), sum(held for held, _ in rows), sum(h for _, h in rows),
             len(rows),
         )
-        for (gel, name), rows in found.items()
+        for (gel, name), rows in covered.items()
     ]  # fmt: skip
 
 

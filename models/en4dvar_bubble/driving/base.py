@@ -1,4 +1,4 @@
-"""What drives a bubble: a pressure in the far field that is zero outside a span of time."""
+"""The driving of a bubble: a pressure in the far field that is zero outside a span of time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from en4dvar.state import Array, Parameter
+from en4dvar.model.state import Array, Parameter
 from en4dvar_bubble.tables import Grid, evaluate
 
 Reading = Literal["instantaneous", "retarded", "as-printed"]
@@ -78,7 +78,7 @@ class Driving:
 
     @property
     def silent(self) -> bool:
-        """Whether nothing is driven."""
+        """True if nothing is driven."""
         return self.amplitude == 0.0
 
     @cached_property
@@ -119,9 +119,9 @@ class Driving:
         assert self.remade is not None
         different, which = np.unique(np.column_stack(list(shapes.values())), axis=0, return_inverse=True)
         each = [self.remade(**dict(zip(shapes, of, strict=True))) for of in different.tolist()]
-        table = np.concatenate([replace(one, cells=self.cells).table for one in each])
-        begin = np.array([1e6 * one.begin for one in each])[which]
-        stretch = ((self.end - self.begin) / np.array([one.end - one.begin for one in each]))[which]
+        table = np.concatenate([replace(shape, cells=self.cells).table for shape in each])
+        begin = np.array([1e6 * shape.begin for shape in each])[which]
+        stretch = ((self.end - self.begin) / np.array([shape.end - shape.begin for shape in each]))[which]
         shift = clocks.shift + (begin - 1e6 * self.begin / stretch) / clocks.rate
         return Clocks(shift, clocks.rate * stretch, np.asarray(8.0 * self.cells * which), table)
 

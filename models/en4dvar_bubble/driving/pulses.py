@@ -18,8 +18,8 @@ from typing import Annotated, Any, Literal, get_type_hints
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from en4dvar.state import Array, Parameter, TransformName
-from en4dvar.units import Quantity
+from en4dvar.model.state import Array, Parameter, TransformName
+from en4dvar.plumbing.units import Quantity
 from en4dvar_bubble.driving.base import Driving, PulseNumber, Role
 
 
@@ -68,16 +68,17 @@ def pulse(kind: str) -> Callable[[Pulse], Pulse]:
 
 def _remade(kind: str, **keys: Any) -> Driving:
     """A pulse with other keys, without its numbers, which take longer to find."""
-    return PULSES[kind].__wrapped__(**keys)  # type: ignore[attr-defined]
+    function: Pulse = vars(PULSES[kind])["__wrapped__"]
+    return function(**keys)
 
 
 def numbers_of(function: Pulse) -> Iterator[tuple[str, Role, Parameter]]:
     """Key, role and parameter of the numbers that the arguments of a pulse declare."""
     for key, hint in get_type_hints(function, include_extras=True).items():
         about = getattr(hint, "__metadata__", ())
-        for number in (one for one in about if isinstance(one, Number)):
-            unit = next((one.unit for one in about if isinstance(one, Quantity)), "1")
-            limits: dict[type, Any] = {type(one): one for one in about}
+        for number in (note for note in about if isinstance(note, Number)):
+            unit = next((note.unit for note in about if isinstance(note, Quantity)), "1")
+            limits: dict[type, Any] = {type(note): note for note in about}
             least = limits[Gt].gt if Gt in limits else limits[Ge].ge if Ge in limits else -np.inf
             most = limits[Le].le if Le in limits else np.inf
             words, shown = f"{key} of the pulse", number.display_unit

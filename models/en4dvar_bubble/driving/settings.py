@@ -9,10 +9,10 @@ from typing import Annotated, Any, ClassVar, Literal, Union, get_type_hints
 
 from pydantic import ConfigDict, Field, ValidationInfo, create_model, field_validator, model_validator
 
-from en4dvar.described import Described
-from en4dvar.errors import En4dvarError
 from en4dvar.inputs.asked import Format
-from en4dvar.units import Quantity, convert
+from en4dvar.plumbing.described import Described
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.units import Quantity, convert
 from en4dvar_bubble.driving.base import Driving
 from en4dvar_bubble.driving.pulses import PULSES
 from en4dvar_bubble.driving.tabulated import from_file

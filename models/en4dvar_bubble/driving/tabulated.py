@@ -10,7 +10,7 @@ import numpy as np
 
 from en4dvar.inputs.asked import Column, Format, Layout
 from en4dvar.inputs.readers import read_series
-from en4dvar.state import Array, Parameter
+from en4dvar.model.state import Array, Parameter
 from en4dvar_bubble.driving.base import Driving, PulseNumber
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def from_file(
 ) -> Driving:
     """:func:`tabulated` from a CSV or ``.mat`` file; ``time`` and ``pressure`` are (column, unit).
 
-    Raises :class:`~en4dvar.errors.DataError` for a file that cannot be read, ValueError as :func:`tabulated`.
+    Raises :class:`~en4dvar.plumbing.errors.DataError` for a file that cannot be read, ValueError as :func:`tabulated`.
     """
     series = read_series(path, Column(*time, "s"), Column(*pressure, "Pa"), Layout(format))
     try:

@@ -6,8 +6,8 @@ from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
-from en4dvar.errors import OutputError
-from en4dvar.files import write_text
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.files import write_text
 
 EXAMPLES = ("quickstart",)
 
@@ -19,11 +19,11 @@ def write_example(name: str, folder: Path, force: bool = False) -> Path:
     ------
     OutputError: a file is there already (unless ``force``) or cannot be written.
     """
-    found = dict(_walk(files(__name__) / name, Path()))
-    for path in found:
+    items = dict(_walk(files(__name__) / name, Path()))
+    for path in items:
         if (folder / path).exists() and not force:
             raise OutputError(f"{folder / path}: exists; give --force to replace it")
-    for path, source in found.items():
+    for path, source in items.items():
         try:
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -33,7 +33,7 @@ def write_example(name: str, folder: Path, force: bool = False) -> Path:
 
 
 def _walk(folder: Traversable, path: Path) -> list[tuple[Path, Traversable]]:
-    found: list[tuple[Path, Traversable]] = []
+    items: list[tuple[Path, Traversable]] = []
     for item in sorted(folder.iterdir(), key=lambda item: item.name):
-        found += _walk(item, path / item.name) if item.is_dir() else [(path / item.name, item)]
-    return found
+        items += _walk(item, path / item.name) if item.is_dir() else [(path / item.name, item)]
+    return items

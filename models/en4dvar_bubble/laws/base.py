@@ -1,4 +1,4 @@
-"""What a constitutive law is.
+"""Constitutive laws.
 
 An author writes one class: its ``name``, its ``parameters`` and its elastic part, either the closed form of the stress
 integral, :meth:`ConstitutiveLaw.stress`, or W′(λ), :meth:`ConstitutiveLaw.strain_energy_rate` (a :class:`Liquid` has
@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
 
-from en4dvar.errors import ConfigError
-from en4dvar.state import Array, Parameter
-from en4dvar.user_file import is_from_file
+from en4dvar.model.state import Array, Parameter
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.user_file import is_from_file
 from en4dvar_bubble.laws.memory import MemoryTables, MemoryVariable
 from en4dvar_bubble.laws.parameters import MU
 from en4dvar_bubble.laws.tabulate import (
@@ -37,6 +37,12 @@ _EXAMPLE_BY_UNIT = {"Pa": 5e3, "Pa s": 0.1, "s": 1e-6, "1": 0.5}
 
 
 Limits = tuple[tuple[type["ConstitutiveLaw"], Mapping[str, float]], ...]
+
+
+class Values(Protocol):
+    """The parameters of a law, each a column (N, 1) under its name: ``p.G``."""
+
+    def __getattr__(self, name: str) -> Array: ...
 
 
 class ConstitutiveLaw:
@@ -73,19 +79,19 @@ class ConstitutiveLaw:
                 raise ConfigError(f"two laws are called {cls.name!r}: {present.__module__} and {cls.__module__}")
             REGISTRY[cls.name] = cls
 
-    def stress(self, stretch: Array, p: Any) -> Array:
+    def stress(self, stretch: Array, p: Values) -> Array:
         """J_e(λ) (N, K) in Pa at stretches (K,): the elastic part of the stress integral; ``p.G`` is (N, 1)."""
         raise NotImplementedError
 
-    def strain_energy_rate(self, stretch: Array, p: Any) -> Array:
+    def strain_energy_rate(self, stretch: Array, p: Values) -> Array:
         """W′(λ) (N, K) in Pa at stretches (K,): derivative of the strain energy density in equibiaxial stretch."""
         raise NotImplementedError
 
-    def viscosity(self, shear_rate: Array, p: Any) -> Array:
+    def viscosity(self, shear_rate: Array, p: Values) -> Array:
         """μ(γ̇) (N, K) in Pa s at shear rates (K,) in 1/s: a generalised Newtonian liquid, instead of the dashpot."""
         raise NotImplementedError
 
-    def memory(self, p: Any) -> tuple[MemoryVariable, ...]:
+    def memory(self, p: Values) -> tuple[MemoryVariable, ...]:
         """Memory variables; none unless overridden."""
         return ()
 
@@ -100,12 +106,12 @@ class ConstitutiveLaw:
 
     @property
     def closed_form(self) -> bool:
-        """Whether the elastic part is the stress, not W′(λ)."""
+        """True if the elastic part is the stress, not W′(λ)."""
         return type(self).stress is not ConstitutiveLaw.stress
 
     @property
     def shear_dependent(self) -> bool:
-        """Whether the viscosity is the method, not the parameter ``mu``."""
+        """True if the viscosity is the method, not the parameter ``mu``."""
         return type(self).viscosity is not ConstitutiveLaw.viscosity
 
     @property
@@ -179,13 +185,14 @@ class ConstitutiveLaw:
 class Liquid(ConstitutiveLaw):
     """A law without a spring: J_e = 0."""
 
-    def stress(self, stretch: Array, p: Any) -> Array:
+    def stress(self, stretch: Array, p: Values) -> Array:
         return np.zeros_like(stretch)
 
 
-def columns(values: Mapping[str, Array]) -> SimpleNamespace:
+def columns(values: Mapping[str, Array]) -> Values:
     """The ``p`` of a law's methods: values as columns (N, 1), so that they broadcast against a row of stretches."""
-    return SimpleNamespace(**{name: np.asarray(v, dtype=float)[:, None] for name, v in values.items()})
+    columns = {name: np.asarray(v, dtype=float)[:, None] for name, v in values.items()}
+    return cast(Values, SimpleNamespace(**columns))
 
 
 def members(values: Mapping[str, Array]) -> int:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from en4dvar.state import Array, Parameter
-from en4dvar_bubble.laws.base import ConstitutiveLaw, Limits
+from en4dvar.model.state import Array, Parameter
+from en4dvar_bubble.laws.base import ConstitutiveLaw, Limits, Values
 from en4dvar_bubble.laws.parameters import ALPHA, MU, G, positive
 
 
@@ -18,7 +18,7 @@ class NeoHookeanKelvinVoigt(ConstitutiveLaw):
     title = "neo-Hookean Kelvin–Voigt (NHKV)"
     parameters: ClassVar[tuple[Parameter, ...]] = (G, MU)
 
-    def stress(self, stretch: Array, p: Any) -> Array:
+    def stress(self, stretch: Array, p: Values) -> Array:
         inverse = 1 / stretch
         return (-0.5 * p.G) * (5 - 4 * inverse - inverse**2 * inverse**2)
 
@@ -34,7 +34,7 @@ class QuadraticKelvinVoigt(ConstitutiveLaw):
     parameters: ClassVar[tuple[Parameter, ...]] = (G, ALPHA, MU)
     limits: ClassVar[Limits] = ((NeoHookeanKelvinVoigt, {"alpha": 0.0}),)
 
-    def stress(self, stretch: Array, p: Any) -> Array:
+    def stress(self, stretch: Array, p: Values) -> Array:
         inverse = 1 / stretch
         fourth = inverse**2 * inverse**2
         neo_hookean = 5 - 4 * inverse - fourth
@@ -51,7 +51,7 @@ class LinearKelvinVoigt(ConstitutiveLaw):
     title = "linear Kelvin–Voigt"
     parameters: ClassVar[tuple[Parameter, ...]] = (G, MU)
 
-    def stress(self, stretch: Array, p: Any) -> Array:
+    def stress(self, stretch: Array, p: Values) -> Array:
         return -4 / 3 * p.G * (1 - stretch**-3.0)
 
 
@@ -68,7 +68,7 @@ class MooneyRivlinKelvinVoigt(ConstitutiveLaw):
     parameters: ClassVar[tuple[Parameter, ...]] = (G, MIXING, MU)
     limits: ClassVar[Limits] = ((NeoHookeanKelvinVoigt, {"mixing": 0.0}),)
 
-    def stress(self, stretch: Array, p: Any) -> Array:
+    def stress(self, stretch: Array, p: Values) -> Array:
         first = 0.5 * (5 - 4 / stretch - stretch**-4.0)
         second = 2 * stretch - 1 - stretch**-2.0
         return -p.G * ((1 - p.mixing) * first + p.mixing * second)
@@ -85,7 +85,7 @@ class FungKelvinVoigt(ConstitutiveLaw):
     limits: ClassVar[Limits] = ((NeoHookeanKelvinVoigt, {"alpha": 0.0}),)
     stretch_range = (0.5, 9.0)  # beyond, the slope of the table loses its sixth digit
 
-    def strain_energy_rate(self, stretch: Array, p: Any) -> Array:
+    def strain_energy_rate(self, stretch: Array, p: Values) -> Array:
         I1 = stretch**-4.0 + 2 * stretch**2
         return 2 * p.G * np.exp(p.alpha * (I1 - 3)) * (stretch - stretch**-5.0)
 
@@ -104,7 +104,7 @@ class GentKelvinVoigt(ConstitutiveLaw):
     example: ClassVar = {"J_m": 1e6}
     limits: ClassVar[Limits] = ((NeoHookeanKelvinVoigt, {"J_m": np.inf}),)
 
-    def strain_energy_rate(self, stretch: Array, p: Any) -> Array:
+    def strain_energy_rate(self, stretch: Array, p: Values) -> Array:
         room = 1 - (stretch**-4.0 + 2 * stretch**2 - 3) / p.J_m
         return 2 * p.G * (stretch - stretch**-5.0) / np.where(room > 0, room, np.nan)
 
@@ -123,5 +123,5 @@ class OgdenKelvinVoigt(ConstitutiveLaw):
     example: ClassVar = {"a": 2.5}
     limits: ClassVar[Limits] = ((NeoHookeanKelvinVoigt, {"a": 2.0}),)
 
-    def strain_energy_rate(self, stretch: Array, p: Any) -> Array:
+    def strain_energy_rate(self, stretch: Array, p: Values) -> Array:
         return 4 * p.G / p.a * (stretch ** (p.a - 1) - stretch ** (-2 * p.a - 1))

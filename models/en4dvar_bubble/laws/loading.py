@@ -1,18 +1,119 @@
-"""Finding a law: built in, an entry point, a class of an installed package, or a class in a file of the user's own."""
+"""Finding a law: built in, an entry point, a class of an installed package, or a class in a file of
+the user's own, and whether that class can serve as one."""
 
 from __future__ import annotations
 
-from importlib import import_module
+import traceback
+from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
-from en4dvar import user_file
-from en4dvar.errors import ConfigError
-from en4dvar.hints import suggest
-from en4dvar.user_code import file_of, loading, require_permission
-from en4dvar_bubble.laws.base import REGISTRY, ConstitutiveLaw
-from en4dvar_bubble.laws.validity import check_law
+import numpy as np
+
+from en4dvar.model.state import Parameter
+from en4dvar.plumbing import user_file
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.hints import suggest
+from en4dvar.plumbing.user_code import imported, loading, reason_of
+from en4dvar_bubble.laws.base import REGISTRY, ConstitutiveLaw, columns
+from en4dvar_bubble.laws.memory import MemoryVariable
+
+RESERVED = ("R", "Rdot", "p_b", "S", "T", "C", "R0", "R_eq", "R_max", "t_s")
+"""Names of the state vector and of the model's own parameters."""
+_MEMBERS = 3
+
+
+def check_law(kind: Any, name: str) -> ConstitutiveLaw:
+    """An instance of the class ``kind``. Raises :class:`ConfigError` saying what is wrong with it."""
+    if not (isinstance(kind, type) and issubclass(kind, ConstitutiveLaw)):
+        raise ConfigError(f"{name}: not a subclass of en4dvar_bubble.ConstitutiveLaw")
+    _check_elastic(kind, name)
+    _check_parameters(kind, name)
+    try:
+        law = kind()
+    except TypeError as error:
+        raise ConfigError(f"{name}: cannot be created without arguments: {error}") from error
+    except BaseException as error:
+        raise ConfigError(f"{name}: cannot be created: {reason_of(error)}") from error
+    _probe(law, name)
+    return law
+
+
+def _check_elastic(kind: type[ConstitutiveLaw], name: str) -> None:
+    own = [m for m in ("stress", "strain_energy_rate") if getattr(kind, m) is not getattr(ConstitutiveLaw, m)]
+    if len(own) == 2:
+        raise ConfigError(f"{name}: defines both stress and strain_energy_rate; keep one (the other follows from it)")
+    if not own:
+        raise ConfigError(
+            f"{name}: defines neither stress(stretch, p) nor strain_energy_rate(stretch, p); "
+            "a law without a spring is a subclass of en4dvar_bubble.Liquid"
+        )
+
+
+def _check_parameters(kind: type[ConstitutiveLaw], name: str) -> None:
+    if not (isinstance(kind.parameters, tuple) and all(isinstance(p, Parameter) for p in kind.parameters)):
+        raise ConfigError(f"{name}: parameters must be a tuple of en4dvar.Parameter")
+    names = [p.name for p in kind.parameters]
+    if not names:
+        raise ConfigError(f"{name}: parameters is empty")
+    for n in names:
+        if names.count(n) > 1:
+            raise ConfigError(f"{name}: two parameters are called {n!r}")
+        if n in RESERVED:
+            raise ConfigError(f"{name}: the parameter name {n!r} is taken by the bubble model")
+
+
+def _probe(law: ConstitutiveLaw, name: str) -> None:
+    """Call every method once with three members."""
+    stretch, rate = np.array([0.9, 1.1, 2.0, 3.0]), np.array([1.0, 1e3, 1e6, 1e9])
+    p = columns(law.example_values(_MEMBERS))
+    elastic = "stress" if law.closed_form else "strain_energy_rate"
+    _call(getattr(law, elastic), (stretch, p), f"{name}: {elastic}(stretch, p)")
+    if law.shear_dependent:
+        _call(law.viscosity, (rate, p), f"{name}: viscosity(shear_rate, p)")
+    variables = _run(lambda: law.memory(p), f"{name}: memory(p)")
+    if not (isinstance(variables, tuple) and all(isinstance(v, MemoryVariable) for v in variables)):
+        raise ConfigError(f"{name}: memory(p) must return a tuple of MemoryVariable")
+    for i, variable in enumerate(variables):
+        for what, method in (("stiffness", variable.stiffness_at), ("equilibrium", variable.equilibrium_at)):
+            _call(method, (stretch,), f"{name}: {what} of memory variable {i + 1}")
+        times = np.asarray(variable.relaxation_time, dtype=float)
+        if times.shape not in ((), (_MEMBERS, 1)):
+            raise ConfigError(f"{name}: relaxation_time of memory variable {i + 1}: shape {times.shape}, not (N, 1)")
+        if not np.all(times > 0):
+            raise ConfigError(f"{name}: relaxation_time of memory variable {i + 1} must be positive")
+
+
+def _call(method: Callable[..., Any], arguments: tuple[Any, ...], where: str) -> None:
+    result = np.asarray(_run(lambda: method(*arguments), where))
+    x = arguments[0]
+    try:
+        fits = np.broadcast_shapes(result.shape, (_MEMBERS, len(x))) == (_MEMBERS, len(x))
+    except ValueError:
+        fits = False
+    if not fits or result.dtype.kind not in "fiu":
+        raise ConfigError(
+            f"{where}: returned {result.dtype} of shape {result.shape}; for a row ({len(x)},) and parameters of shape "
+            f"({_MEMBERS}, 1) it must be real and broadcast to ({_MEMBERS}, {len(x)})"
+        )
+
+
+def _run(call: Callable[[], Any], where: str) -> Any:
+    try:
+        with np.errstate(all="ignore"):
+            return call()
+    except BaseException as error:
+        reason = reason_of(error)
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        hint = ""
+        if isinstance(error, AttributeError) and isinstance(error.obj, SimpleNamespace):
+            hint = f"; p has no {error.name!r}{suggest(error.name, vars(error.obj))}"
+        elif isinstance(error, ValueError) and "truth value" in str(error):
+            hint = "; the arguments are arrays: write np.where instead of if, np.minimum instead of min"
+        raise ConfigError(f"{where}: {reason}{hint} ({frame.filename}:{frame.lineno})") from error
+
 
 GROUP = "en4dvar_bubble.laws"
 
@@ -30,14 +131,12 @@ def get_law(name: str, base: Path | None = None) -> ConstitutiveLaw:
         return REGISTRY[name]()
     where, colon, attribute = name.rpartition(":")
     if user_file.is_file_reference(name):
-        require_permission(f"law {name!r}", Path(where))
-        found = user_file.load(user_file.absolute(name, base))
+        law = user_file.load(user_file.absolute(name, base), f"law {name!r}")
     elif colon:
-        require_permission(f"law {name!r}", file_of(where))
-        found = _from_module(where, attribute)
+        law = _from_module(where, attribute)
     else:
-        found = _from_entry_point(name)
-    return check_law(found, name)
+        law = _from_entry_point(name)
+    return check_law(law, name)
 
 
 def qualified(name: str, base: Path | None = None) -> str:
@@ -57,8 +156,9 @@ def available() -> dict[str, type[ConstitutiveLaw] | ConfigError]:
 
 
 def _from_module(where: str, attribute: str) -> Any:
-    with loading(f"law '{where}:{attribute}' cannot be imported"):
-        return user_file.class_of(import_module(where), attribute, where)
+    name = f"law '{where}:{attribute}'"
+    with loading(f"{name} cannot be imported"):
+        return user_file.class_of(imported(name, where), attribute, where)
 
 
 def _from_entry_point(name: str) -> Any:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from en4dvar.state import Parameter
-from en4dvar_bubble.laws.base import Limits, Liquid
+from en4dvar.model.state import Parameter
+from en4dvar_bubble.laws.base import Limits, Liquid, Values
 from en4dvar_bubble.laws.memory import MemoryVariable, linear_maxwell, upper_convected_maxwell
 from en4dvar_bubble.laws.parameters import MU, MU_P, RELAXATION_TIME
 from en4dvar_bubble.laws.viscous import Newtonian
@@ -19,7 +19,7 @@ class Maxwell(Liquid):
     parameters: ClassVar[tuple[Parameter, ...]] = (MU_P, RELAXATION_TIME)
     limits: ClassVar[Limits] = ((Newtonian, {"mu_p": 0.0, "mu": 0.0}),)
 
-    def memory(self, p: Any) -> tuple[MemoryVariable, ...]:
+    def memory(self, p: Values) -> tuple[MemoryVariable, ...]:
         return linear_maxwell(p.mu_p, p.relaxation_time)
 
 
@@ -44,7 +44,7 @@ class UpperConvectedMaxwell(Liquid):
     parameters: ClassVar[tuple[Parameter, ...]] = (MU_P, RELAXATION_TIME)
     limits: ClassVar[Limits] = ((Newtonian, {"mu_p": 0.0, "mu": 0.0}),)
 
-    def memory(self, p: Any) -> tuple[MemoryVariable, ...]:
+    def memory(self, p: Values) -> tuple[MemoryVariable, ...]:
         return upper_convected_maxwell(p.mu_p, p.relaxation_time)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 
 Source = float | Array | Callable[[Array], Array]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from en4dvar.state import Parameter
+from en4dvar.model.state import Parameter
 
 
 def positive(

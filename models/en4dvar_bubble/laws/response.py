@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 from en4dvar_bubble.laws.base import ConstitutiveLaw, columns
 
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from en4dvar.compiled import kernel
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.compiled import kernel
 from en4dvar_bubble.tables import HALO, Grid, from_slopes, from_values, quintic
 
 Function = Callable[[Array], float | Array]
@@ -57,7 +57,7 @@ def from_strain_energy(rate: Function, n: int) -> Array:
 
 
 @kernel
-def _coarsen(fine, ratio, cells):  # type: ignore[no-untyped-def]
+def _coarsen(fine: Array, ratio: int, cells: int) -> Array:
     """Cells as wide as ``ratio`` fine ones, with value, slope and curvature of the fine table at their ends."""
     n = fine.shape[0]
     out = np.empty((n, cells, 8))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from en4dvar.state import Array, Parameter
-from en4dvar_bubble.laws.base import Limits, Liquid
+from en4dvar.model.state import Array, Parameter
+from en4dvar_bubble.laws.base import Limits, Liquid, Values
 from en4dvar_bubble.laws.parameters import MU, MU_0, MU_INF, SHEAR_TIME
 
 
@@ -31,7 +31,7 @@ class Carreau(Liquid):
     example: ClassVar = {"mu_0": 0.1, "mu_inf": 1e-3}
     limits: ClassVar[Limits] = ((Newtonian, {"n": 1.0, "mu_0": 0.1, "mu": 0.1}),)
 
-    def viscosity(self, shear_rate: Array, p: Any) -> Array:
+    def viscosity(self, shear_rate: Array, p: Values) -> Array:
         return p.mu_inf + (p.mu_0 - p.mu_inf) * (1 + (p.shear_time * shear_rate) ** 2) ** ((p.n - 1) / 2)
 
 
@@ -49,5 +49,5 @@ class Cross(Liquid):
     example: ClassVar = {"mu_0": 0.1, "mu_inf": 1e-3}
     limits: ClassVar[Limits] = ((Newtonian, {"mu_0": 0.1, "mu_inf": 0.1, "mu": 0.1}),)
 
-    def viscosity(self, shear_rate: Array, p: Any) -> Array:
+    def viscosity(self, shear_rate: Array, p: Values) -> Array:
         return p.mu_inf + (p.mu_0 - p.mu_inf) / (1 + (p.shear_time * shear_rate) ** p.m)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from en4dvar.state import Parameter
-from en4dvar_bubble.laws.base import Limits
+from en4dvar.model.state import Parameter
+from en4dvar_bubble.laws.base import Limits, Values
 from en4dvar_bubble.laws.kelvin_voigt import NeoHookeanKelvinVoigt, QuadraticKelvinVoigt
 from en4dvar_bubble.laws.maxwell import Jeffreys, Maxwell
 from en4dvar_bubble.laws.memory import MemoryVariable, linear_maxwell
@@ -22,7 +22,7 @@ class ZenerNeoHookean(NeoHookeanKelvinVoigt):
     parameters: ClassVar[tuple[Parameter, ...]] = (G, MU_P, RELAXATION_TIME)
     limits: ClassVar[Limits] = ((NeoHookeanKelvinVoigt, {"mu_p": 0.0, "mu": 0.0}), (Maxwell, {"G": 0.0}))
 
-    def memory(self, p: Any) -> tuple[MemoryVariable, ...]:
+    def memory(self, p: Values) -> tuple[MemoryVariable, ...]:
         return linear_maxwell(p.mu_p, p.relaxation_time)
 
 
@@ -36,7 +36,7 @@ class ZenerQuadratic(QuadraticKelvinVoigt):
     parameters: ClassVar[tuple[Parameter, ...]] = (G, ALPHA, MU_P, RELAXATION_TIME)
     limits: ClassVar[Limits] = ((ZenerNeoHookean, {"alpha": 0.0}), (QuadraticKelvinVoigt, {"mu_p": 0.0, "mu": 0.0}))
 
-    def memory(self, p: Any) -> tuple[MemoryVariable, ...]:
+    def memory(self, p: Values) -> tuple[MemoryVariable, ...]:
         return linear_maxwell(p.mu_p, p.relaxation_time)
 
 

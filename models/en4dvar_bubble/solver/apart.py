@@ -101,9 +101,9 @@ def call(typingctx, function, place):
         convention, kinds = context.call_conv, sig.args[1:]
         kind = convention.get_function_type(sig.return_type, kinds)
         callee = builder.inttoptr(args[0], kind.as_pointer())
-        status, found = convention.call_function(builder, callee, sig.return_type, kinds, args[1:])
+        status, result = convention.call_function(builder, callee, sig.return_type, kinds, args[1:])
         with cgutils.if_unlikely(builder, status.is_error):
             convention.return_status_propagate(builder, status)
-        return found
+        return result
 
     return types.int64(types.int64, place), codegen

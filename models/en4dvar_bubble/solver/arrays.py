@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.general import SHARED
 from en4dvar_bubble.solver.lanes import WIDTH

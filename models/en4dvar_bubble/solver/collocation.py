@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 from scipy.special import roots_jacobi
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 
 _MORE = 30  # points of the quadrature for the map, an entire function
 

@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from en4dvar.kernel_cache import stamp_with_sources
-from en4dvar.state import Array
+from en4dvar.model.state import Array
+from en4dvar.plumbing.kernel_cache import stamp_with_sources
 from en4dvar_bubble import tables as tables_module
 from en4dvar_bubble.driving import Driving, Reading
 from en4dvar_bubble.laws.tabulate import GRID, VISCOUS_GRID
@@ -96,7 +96,7 @@ class System:
     ``gas`` temperature nodes, ``vapour`` mole-fraction nodes (0 or ``gas``), ``medium`` temperature nodes, ``memory``
     variables; ``shear``: a viscosity that depends on the shear rate. ``clustering`` of the gas nodes at the wall, see
     :func:`collocation.ball`. ``medium_length``: of the medium's grid map in radii; half of its nodes lie within it of
-    the wall.
+    the wall. ``image``: whether a plane mirrors the bubble.
     """
 
     gas: int
@@ -107,6 +107,7 @@ class System:
     shear: bool = False
     clustering: float = 0.0
     medium_length: float = 0.5
+    image: bool = False
 
     @property
     def wall(self) -> int:
@@ -116,7 +117,8 @@ class System:
     @cached_property
     def general(self) -> bool:
         """Whether the general equations are needed."""
-        return bool(self.vapour or self.medium or self.memory or self.shear or RADIALS[self.radial] != rows.PRESSURE)
+        options = self.vapour, self.medium, self.memory, self.shear, self.image
+        return any(options) or RADIALS[self.radial] != rows.PRESSURE
 
     @cached_property
     def size(self) -> int:
@@ -164,8 +166,9 @@ _ELASTIC_SPAN, _VISCOUS_SPAN = GRID.span, VISCOUS_GRID.span
 class Solution:
     """Raw solver output. ``states`` (N, K, n) in the rows of :class:`System`, NaN where a member did not get.
 
-    ``status`` (N,) integers, ``record`` (N, 7): steps, rejected steps, largest wall Mach number, largest τ at the
-    innermost node, smallest ln(R/µm), end time (µs), since when (µs) the wall is faster than the equations bear.
+    ``status`` (N,) integers, ``record`` (N, 8): steps, rejected steps, largest wall Mach number, largest τ at the
+    innermost node, smallest ln(R/µm), end time (µs), since when (µs) the wall is faster than the equations bear,
+    numerical diffusivity of the vapour over R |Ṙ| (0 but for violent collapses).
     """
 
     states: Array

@@ -21,7 +21,7 @@ Radial motion (Keller & Miksis 1980; the paper's eq. 1), Mach number m = Ṙ/c:
 
 from __future__ import annotations
 
-from en4dvar.compiled import inlined
+from en4dvar.plumbing.compiled import inlined
 from en4dvar_bubble.solver.lanes import exp, load, maximum, splat, sqrt, store
 from en4dvar_bubble.solver.lookup import driving, lookup
 from en4dvar_bubble.solver.rows import (
@@ -176,25 +176,25 @@ def jacobian(y, t, eq, loaded, w):
     P_u = pressure_u + surface + Jx
     slope_u = pressure_u * rate + p * rate_u + (Jxx - surface) * V
     slope_V = p * rate_V + surface + Jx
-    one = mach + 1.0
-    numerator_t = -(one * g)
+    ahead = mach + 1.0
+    numerator_t = -(ahead * g)
     if reading == INSTANTANEOUS:
         slope = slope - g
         numerator_t = numerator_t - Ric * h
     elif reading == RETARDED:
         P_u = P_u - g * Ric
     else:
-        slope = slope - g * one
+        slope = slope - g * ahead
         P_u = P_u - g * Ric
-        slope_u = slope_u - h * Ric * one - g * mach
+        slope_u = slope_u - h * Ric * ahead - g * mach
         slope_V = slope_V - g * Ric
-        numerator_t = numerator_t - Ric * h * one
+        numerator_t = numerator_t - Ric * h * ahead
     Rdot2 = R * R * V * V
-    numerator = Rdot2 * (mach * 1.5 - 2.5) + one * P + Ric * slope
+    numerator = Rdot2 * (mach * 1.5 - 2.5) + ahead * P + Ric * slope
     inverse = 1.0 / (R * R * (1.0 - mach) + nu4 * Ric)
     acceleration = numerator * inverse
-    numerator_u = Rdot2 * (mach * 4.5 - 5.0) + mach * P + one * P_u + Ric * (slope + slope_u)
-    numerator_V = R * R * V * (mach * 4.5 - 5.0) + Ric * P - one * nu4 + Ric * slope_V
+    numerator_u = Rdot2 * (mach * 4.5 - 5.0) + mach * P + ahead * P_u + Ric * (slope + slope_u)
+    numerator_V = R * R * V * (mach * 4.5 - 5.0) + Ric * P - ahead * nu4 + Ric * slope_V
     denominator_u = R * R * (2.0 - mach * 3.0) + nu4 * Ric
     denominator_V = -(R * R * Ric)
     store(out, m, acceleration)
@@ -218,7 +218,7 @@ def jacobian(y, t, eq, loaded, w):
         theta = load(work, m + j)
         share = ops[2 * m + 2, j] / (k * theta * theta * mean)
         rate_j = heat * (ops[m, j] - share * wall)
-        store(jac, row_V + j, (one * p * share + Ric * p * (share * rate + rate_j)) * inverse)
+        store(jac, row_V + j, (ahead * p * share + Ric * p * (share * rate + rate_j)) * inverse)
         store(work, 4 * m + 2 + j, share)
         store(work, 5 * m + 2 + j, rate_j)
     for i in range(m):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numba as nb
 
-from en4dvar.compiled import called, inlined
+from en4dvar.plumbing.compiled import called, inlined
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.arrow import begins
 from en4dvar_bubble.solver.equations import products

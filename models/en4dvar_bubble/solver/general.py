@@ -20,6 +20,9 @@ Wall: K_m θ_m' = K_∞ τ'_w + latent heat of the evaporating flux.
 Radial: enthalpy form and Gilmore with the Tait liquid, ρ = ((p+B)/(p_∞+B))^{1/n}:
     H = ∫_{p_∞+p_f}^{p_w} dp/ρ,   Keller–Miksis: c constant;   Gilmore: C² = c² + (n−1)H and (R/C)(1−Ṙ/C) Ḣ.
 
+Plane at the distance h: the pressure of the image, ±ρ/(2h) d(R²Ṙ)/dt (+ rigid, − free), adds to that far away. In V and
+R it is ±ρ R/(2h) (R²V̇ + 3Ṙ²).
+
 The unknowns of the fields τ, Y and θ_m know of each other only through a few numbers: the *border*, which is τ_w, the
 memory, V, u, and three sums over the nodes (:data:`SUMS` at most): the interior's share in τ'_w, in ⟨Y/θ⟩ and in Y'_w.
 Here are the border's equations; those of the fields are in :mod:`fields`, and :mod:`arrow` solves both.
@@ -31,7 +34,7 @@ from __future__ import annotations
 
 import numba as nb
 
-from en4dvar.compiled import called
+from en4dvar.plumbing.compiled import called
 from en4dvar_bubble.solver import rows
 from en4dvar_bubble.solver.lanes import absolute, exp, load, log, maximum, splat, sqrt, store
 from en4dvar_bubble.solver.lookup import driving, lookup
@@ -83,6 +86,7 @@ def _contents(border, V, u, outward, eq, par, shared, out):
         dilution = exp(load(par, rows.DIFFUSION_P) * log(load(par, rows.AMBIENT) / p))
         diffusion = load(par, rows.DIFFUSION) * per_area
         at_T = exp(load(par, rows.DIFFUSION_T) * log(theta_w))
+        dilution = dilution + load(par, rows.SMEARED) * absolute(V) / diffusion
         flux = -((load(border, VAPOUR_SUM) + gas_w * ops[mT, mT]) / gas_w) * dilution * at_T
         rate = rate + kappa * diffusion * flux * 3.0
         store(shared, DIFFUSE, diffusion * dilution)
@@ -173,5 +177,7 @@ def border_rates(border, t, outward, eq, loaded, shared, out):
     mach = Rdot * ic
     Ric = R * ic * weight
     numerator = Rdot * Rdot * (mach * 1.5 - 2.5) + (mach + 1.0) * H + Ric * H_slope
-    store(out, oS + q, numerator / (R * R * (1.0 - mach) + dashpot_V * Ric * damping))
+    image = R * load(par, rows.IMAGE)
+    numerator = numerator - image * Rdot * Rdot * 3.0
+    store(out, oS + q, numerator / (R * R * (1.0 - mach + image) + dashpot_V * Ric * damping))
     store(out, oS + q + 1, V)

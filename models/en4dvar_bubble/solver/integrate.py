@@ -10,27 +10,28 @@ import numba as nb
 import numpy as np
 from numba.core import types
 
-from en4dvar.compiled import called, kernel_called_by_address, kernel_without_allocation
+from en4dvar.plumbing.compiled import called, kernel_called_by_address, kernel_without_allocation
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.apart import call, kept
 from en4dvar_bubble.solver.arrays import Lanes, Loaded, Workspace
 from en4dvar_bubble.solver.lanes import WIDTH, peek, take
 from en4dvar_bubble.solver.parts import parted
-from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, TABLE
+from en4dvar_bubble.solver.rows import AMPLITUDE, PULSE_RATE, PULSE_SHIFT, SMEARED, TABLE
 from en4dvar_bubble.solver.step import LEAST_ERROR, attempt, interpolant, judge
 from en4dvar_bubble.tables import fill_one
 
 # Status of a member; the reasons users read are made by ``driver.reason``.
 OK, STEP_LIMIT, NON_FINITE, STEP_UNDERFLOW, MACH_LIMIT, TIME_LIMIT, WALL_LIMIT = 0, 1, 2, 3, 4, 5, 6
 # Columns of the per-member record.
-STEPS, REJECTED, MAX_MACH, MAX_THETA, MIN_LOG_R, END_TIME, BEYOND = 0, 1, 2, 3, 4, 5, 6
-RECORD = 7
+STEPS, REJECTED, MAX_MACH, MAX_THETA, MIN_LOG_R, END_TIME, BEYOND, SMEAR = 0, 1, 2, 3, 4, 5, 6, 7
+RECORD = 8
 
 _SAFETY, _SHRINK, _GROW = 0.9, 0.15, 6.0
 _LEAST_ROOT = 1e-2 ** (1.0 / rodas5p.ORDER)
 # µs. A bounce may need steps below the spacing of doubles near t: the equations know no other time by then, and the
 # step limit bounds the work.
 _SHORTEST = 1e-18
+_LEAST_SMEARED, _MOST_SMEARED = 0.001, 0.5  # each time four times the last
 _TURNS_PER_LOOK = 64  # attempted steps between looks at the clock
 # Of ``turn``: how many so far, lanes with a member, whether all are taken, seconds so far, whether the interpolant is
 # made, and the time of day at the last look.
@@ -213,6 +214,22 @@ def _failure(lane, shared, lanes, w):
 
 
 @called
+def _again(lane, shared, lanes):
+    """Whether a member begins again, with its vapour smeared: where it condenses faster than it diffuses, the gas left
+    behind is a layer at the wall of thickness D/|Ṙ|. A grid that cannot hold it gives fractions below zero, for which
+    the equations have no solution. A diffusivity of at least ``SMEARED`` · R |Ṙ| makes the layer that part of R.
+    """
+    smeared, began = lanes.loaded.par[SMEARED, lane], lanes.began[lane]
+    if shared.dims.vapour == 0 or smeared > _MOST_SMEARED:
+        return False
+    _begin(lanes.member[lane], lane, shared, lanes)
+    lanes.loaded.par[SMEARED, lane] = max(_LEAST_SMEARED, 4.0 * smeared)
+    shared.out.record[lanes.member[lane], SMEAR] = lanes.loaded.par[SMEARED, lane]
+    lanes.began[lane] = began
+    return True
+
+
+@called
 def _end_step(shared, lanes, w):
     """Look at every lane after a step: take it or shorten it, and let go of members that are done or cannot go on."""
     members, control, turn = shared.members, shared.control, shared.scratch.turn
@@ -227,6 +244,8 @@ def _end_step(shared, lanes, w):
         else:
             _reject(lane, shared, lanes, w)
         failure = _failure(lane, shared, lanes, w)
+        if failure in (NON_FINITE, STEP_UNDERFLOW, STEP_LIMIT) and _again(lane, shared, lanes):
+            continue
         if failure != OK or lanes.observed[lane] == members.times.shape[1]:
             shared.out.status[i] = failure
             lanes.member[lane] = -1

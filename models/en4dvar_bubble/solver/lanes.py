@@ -17,7 +17,7 @@ from numba.core import cgutils, types
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
-from en4dvar.compiled import inlined
+from en4dvar.plumbing.compiled import inlined
 
 WIDTH = 8
 
@@ -263,8 +263,8 @@ def _split(typingctx, x):
         shift = ir.Constant(_IVEC, [52] * WIDTH)
         exponent = builder.sub(builder.lshr(bits, shift), ir.Constant(_IVEC, [1023] * WIDTH))
         fraction = builder.and_(bits, ir.Constant(_IVEC, [(1 << 52) - 1] * WIDTH))
-        one = ir.Constant(_IVEC, [1023 << 52] * WIDTH)
-        mantissa = builder.bitcast(builder.or_(fraction, one), _VEC)
+        unity = ir.Constant(_IVEC, [1023 << 52] * WIDTH)
+        mantissa = builder.bitcast(builder.or_(fraction, unity), _VEC)
         return context.make_tuple(builder, sig.return_type, [builder.sitofp(exponent, _VEC), mantissa])
 
     return types.UniTuple(lanes, 2)(lanes), codegen
@@ -281,11 +281,11 @@ def gather_rows(typingctx, table, index):
     def codegen(context, builder, sig, args):
         data = cgutils.create_struct_proxy(sig.args[0])(context, builder, value=args[0]).data
         offsets = builder.fptosi(args[1], _IVEC)
-        found = []
+        gathered = []
         for lane in range(WIDTH):
             where = builder.extract_element(offsets, ir.Constant(ir.IntType(32), lane))
             row = builder.bitcast(builder.gep(data, [where]), _VEC.as_pointer())
-            found.append(builder.load(row, align=8))
+            gathered.append(builder.load(row, align=8))
 
         def merged(vectors: list[Any], run: int, half: int) -> list[Any]:
             """Of each two vectors, the runs of ``run`` numbers that are in their even (0) or odd (1) places."""
@@ -299,7 +299,7 @@ def gather_rows(typingctx, table, index):
 
         columns = []
         for column in range(6):
-            vectors = found
+            vectors = gathered
             for bit in range(3):
                 vectors = merged(vectors, 1 << bit, (column >> bit) & 1)
             columns.append(vectors[0])

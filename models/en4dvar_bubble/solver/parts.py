@@ -43,14 +43,14 @@ def parted(typingctx, block, edges, count):
             cgutils.create_struct_proxy(kind)(context, builder, value=value).data
             for kind, value in zip(sig.args[:2], args[:2], strict=True)
         )
-        found = []
+        parts = []
         ends = [builder.load(builder.gep(at, [ir.Constant(_I64, i)])) for i in range(len(sig.return_type) + 1)]
         for first, end in pairwise(ends):
             part = cgutils.create_struct_proxy(sig.return_type.dtype)(context, builder)
             part.data = builder.gep(data, [builder.mul(first, ir.Constant(_I64, WIDTH))])
             part.count = builder.sub(end, first)
-            found.append(part._getvalue())
-        return context.make_tuple(builder, sig.return_type, found)
+            parts.append(part._getvalue())
+        return context.make_tuple(builder, sig.return_type, parts)
 
     return types.UniTuple(Rows(block.dtype), count.literal_value)(block, edges, count), codegen
 

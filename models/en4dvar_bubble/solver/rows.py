@@ -31,7 +31,9 @@ DIFFUSION_T = 23
 PULSE_SHIFT = 24
 PULSE_RATE = 25
 PULSE_TABLE = 26  # offset of the member's table
-PARAMETERS = 27
+SMEARED = 27  # numerical diffusivity of the vapour over R |Ṙ|; see :mod:`integrate`
+IMAGE = 28  # ±1/(2h) of a rigid or free plane at the distance h; 0: none
+PARAMETERS = 29
 # Three further rows for each memory variable: relaxation time (µs), convection, offset of its two tables.
 MEMORY = PARAMETERS
 PER_MEMORY = 3

@@ -6,7 +6,7 @@ import numba as nb
 from numba.core.types import BaseTuple, NoneType
 from numba.extending import overload
 
-from en4dvar.compiled import called, inlined
+from en4dvar.plumbing.compiled import called, inlined
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.equations import jacobian, rhs
 from en4dvar_bubble.solver.fields import general_jacobian, general_rhs

@@ -17,7 +17,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic, register_jitable
 
-from en4dvar.compiled import called
+from en4dvar.plumbing.compiled import called
 from en4dvar_bubble.solver import rodas5p
 from en4dvar_bubble.solver.lanes import Value, lanes, load, row_pointer, splat, store
 
@@ -28,9 +28,9 @@ AREA = EDGE * EDGE
 def kept_tiles(pattern: np.ndarray, places: np.ndarray) -> np.ndarray:
     """``where`` for a matrix that is not zero where ``pattern`` (n, n) says, of unknowns at ``places`` (n,)."""
     tiles = places // EDGE
-    found = np.zeros((tiles[-1] + 1, tiles[-1] + 1), dtype=bool)
-    np.logical_or.at(found, (tiles[:, None], tiles[None, :]), pattern)
-    return np.where(found, np.cumsum(found).reshape(found.shape) - 1, -1)
+    kept = np.zeros((tiles[-1] + 1, tiles[-1] + 1), dtype=bool)
+    np.logical_or.at(kept, (tiles[:, None], tiles[None, :]), pattern)
+    return np.where(kept, np.cumsum(kept).reshape(kept.shape) - 1, -1)
 
 
 @register_jitable  # for Python, which makes the arrays, a function like any other
@@ -50,14 +50,14 @@ class _Numbers:
 
     def __init__(self, context: Any, builder: Any, kind: Any, array: Any, first: Any) -> None:
         self.context, self.builder, self.kind, self.array, self.first = context, builder, kind, array, first
-        self.found: dict[int, Value] = {}
+        self.loaded: dict[int, Value] = {}
 
     def __getitem__(self, i: int) -> Value:
-        if i not in self.found:
+        if i not in self.loaded:
             row = self.builder.add(self.first, ir.Constant(self.first.type, i))
             pointer = row_pointer(self.context, self.builder, self.kind, self.array, row)
-            self.found[i] = Value(self.builder, self.builder.load(pointer, align=8))
-        return self.found[i]
+            self.loaded[i] = Value(self.builder, self.builder.load(pointer, align=8))
+        return self.loaded[i]
 
 
 def _of_registers(body: Callable[[list[Value], _Numbers, _Numbers], list[Value]]) -> Any:
@@ -70,9 +70,9 @@ def _of_registers(body: Callable[[list[Value], _Numbers, _Numbers], list[Value]]
         def codegen(context, builder, sig, args):
             kinds = sig.args
             mine = [Value(builder, value) for value in cgutils.unpack_tuple(builder, args[0])]
-            one = _Numbers(context, builder, kinds[1], args[1], args[2])
+            own = _Numbers(context, builder, kinds[1], args[1], args[2])
             other = _Numbers(context, builder, kinds[3], args[3], args[4])
-            return context.make_tuple(builder, sig.return_type, [v.value for v in body(mine, one, other)])
+            return context.make_tuple(builder, sig.return_type, [v.value for v in body(mine, own, other)])
 
         return numbers(numbers, a, types.int64, b, types.int64), codegen
 
@@ -83,8 +83,8 @@ def _loading(count: int) -> Any:
     @intrinsic
     def operation(typingctx, a, i):
         def codegen(context, builder, sig, args):
-            found = _Numbers(context, builder, sig.args[0], args[0], args[1])
-            return context.make_tuple(builder, sig.return_type, [found[k].value for k in range(count)])
+            numbers = _Numbers(context, builder, sig.args[0], args[0], args[1])
+            return context.make_tuple(builder, sig.return_type, [numbers[k].value for k in range(count)])
 
         return types.UniTuple(lanes, count)(a, types.int64), codegen
 

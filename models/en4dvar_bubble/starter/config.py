@@ -8,27 +8,29 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from en4dvar.assembly.build import build_one
+from en4dvar.assembly.find_files import find_files, with_parts
 from en4dvar.config import resolve
-from en4dvar.config.build import build_one
 from en4dvar.config.document import parse_document
-from en4dvar.config.find_files import find_files, with_parts
-from en4dvar.errors import ConfigError, DataError
-from en4dvar.files import expanded
 from en4dvar.inputs.asked import ANY, Column, DataFile, Layout, TimeStep
 from en4dvar.inputs.readers import Readings, read_series
 from en4dvar.inputs.steps import step_doubts
 from en4dvar.inputs.variables import indexed
-from en4dvar.units import UnitError, convert, parse_quantity, parse_unit
+from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.files import expanded
+from en4dvar.plumbing.hints import shown, suggest
+from en4dvar.plumbing.units import UnitError, convert, parse_quantity, parse_unit
+from en4dvar_bubble.starter.elsewhere import CHOICES
 from en4dvar_bubble.starter.look import Start
 from en4dvar_bubble.starter.page import TRACKED_COMMON, Source, quoted, yaml_text
 from en4dvar_bubble.starter.proposal import Entry, Proposal, propose, with_columns
 
 _NAMED_UNIT = re.compile(r"[_ \[(/]([a-zA-Zµμ]+)[\])]?$")
-_FRAMES = re.compile(r"(?i)(frame|bild|image|index|#|n$|nr)")
+FRAMES = re.compile(r"(?i)(frame|bild|image|index|#|n$|nr).*")
 _DIAMETER = re.compile(r"(?i)(d|diam\w*|durchmesser)([ _(\[].*)?$")
 _REST = re.compile(r"(?i)(.*\.)?r_?eq")
 AT_REST = (0.02, 0.9)  # of R_max
-_PIXELS = re.compile(r"(?i)(?<![a-z])(px|pix|pixels?)(?![a-z])|_(px|pix)")
+PIXELS = re.compile(r"(?i)(?<![a-z])(px|pix|pixels?)(?![a-z])|_(px|pix)")
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ def propose_config(
     command: str = "en4dvar_bubble.starter.propose_config",
     step_unit: str | None = None,
     rate: str | None = None,
+    medium: str = "gel",
 ) -> Proposed:
     """A commented configuration for radius histories that loads and whose data can be read.
 
@@ -67,6 +70,7 @@ def propose_config(
     folder: where the file will be; the path of the data inside it is relative to this folder.
     name: of the run, whose results go to ``runs/<name>``; default: that of the data.
     rate: of the camera's frames, e.g. ``"270 kHz"``, that the times are compared with.
+    medium: one of :data:`en4dvar_bubble.starter.elsewhere.CHOICES`, for density and speed of sound.
     errors: columns of the standard deviations of radii and times, in the units of ``radius`` and ``time``.
     command: told in the head of the file.
 
@@ -78,20 +82,22 @@ def propose_config(
     """
     if (time is None) == (time_step is None):
         raise ConfigError("give either the column of times and its unit, or a constant time step")
+    if medium not in CHOICES:
+        raise ConfigError(f"unknown medium {shown(medium)}{suggest(medium, CHOICES)}; known: {', '.join(CHOICES)}")
     source = Source(path_from(Path(folder), str(data)), time, time_step, radius, layout, errors, step_unit, rate)
     files = with_parts(
         find_files(Path.cwd(), [str(data)]), Column(*source.radius, "m"), layout, time[0] if time else None
     )
-    found, unusable = histories(files, source)
-    proposal = propose({name: (series.times, series.values) for name, series in found.items()}, start, law)
-    proposal = _with_rest(proposal, found, source.radius[1])
+    readings, unusable = histories(files, source)
+    proposal = propose({name: (series.times, series.values) for name, series in readings.items()}, start, law, medium)
+    proposal = _with_rest(proposal, readings, source.radius[1])
     if errors:
-        common = max(series.scalars.get(TRACKED_COMMON, 0.0) for series in found.values())
+        common = max(series.scalars.get(TRACKED_COMMON, 0.0) for series in readings.values())
         proposal = with_columns(proposal, errors, f"{common:g} {source.radius[1]}" if common > 0 else "")
-    proposal = replace(proposal, warnings=(*proposal.warnings, *doubts(source), *_steps(found, source), *unusable))
+    proposal = replace(proposal, warnings=(*proposal.warnings, *doubts(source), *_steps(readings, source), *unusable))
     text = yaml_text(name or run_name(str(data)), source, proposal, command)
     config = resolve(parse_document(text), Path(folder).absolute())
-    for dataset in found:
+    for dataset in readings:
         build_one(config, dataset, files[dataset])
     return Proposed(text, proposal)
 
@@ -104,7 +110,7 @@ def histories(files: Mapping[str, DataFile], source: Source) -> tuple[dict[str, 
     DataError: none can be used. UnitError: a unit that is not of its kind.
     """
     time = _times(source)
-    found: dict[str, Readings] = {}
+    readings: dict[str, Readings] = {}
     unusable: list[str] = []
     for name, file in files.items():
         try:
@@ -112,10 +118,10 @@ def histories(files: Mapping[str, DataFile], source: Source) -> tuple[dict[str, 
         except DataError as error:
             unusable.append(str(error))
         else:
-            found[name] = series
-    if not found:
+            readings[name] = series
+    if not readings:
         raise DataError("\n".join(unusable))
-    return found, unusable
+    return readings, unusable
 
 
 def _times(source: Source) -> Column | TimeStep:
@@ -127,26 +133,26 @@ def _times(source: Source) -> Column | TimeStep:
     return Column(*(source.time or ("", "s")), "s", rate=rate)
 
 
-def _steps(found: Mapping[str, Readings], source: Source) -> list[str]:
+def _steps(readings: Mapping[str, Readings], source: Source) -> list[str]:
     """Where the times of a data set contradict the file's step or the rate given, or are no frames of a film."""
     time = _times(source)
     if not isinstance(time, Column):
         return []
     told = []
-    for name, series in found.items():
+    for name, series in readings.items():
         words = step_doubts(series.times, "s", time.unit, series.scalars, time.rate)
-        told += [one.words if len(found) == 1 else f"{name}: {one.words}" for one in words]
+        told += [step.words if len(readings) == 1 else f"{name}: {step.words}" for step in words]
     return told
 
 
-def _with_rest(proposal: Proposal, found: Mapping[str, Readings], unit: str) -> Proposal:
+def _with_rest(proposal: Proposal, readings: Mapping[str, Readings], unit: str) -> Proposal:
     """The radius at rest of the files, where every one has such a scalar that suits its radii in their unit."""
-    names = {name for series in found.values() for name in series.scalars if _REST.fullmatch(name)}
+    names = {name for series in readings.values() for name in series.scalars if _REST.fullmatch(name)}
     names = {name for name in names if not indexed(name)[1]} or names  # of expts(1).Req, … one that means each its own
     if len(names) != 1:
         return proposal
     (name,) = names
-    for series in found.values():
+    for series in readings.values():
         value = series.scalars.get(name, float("nan"))
         share = convert(value, unit, "m") / float(series.values.max())
         if not AT_REST[0] < share < AT_REST[1]:
@@ -160,21 +166,22 @@ def _with_rest(proposal: Proposal, found: Mapping[str, Readings], unit: str) -> 
 
 def doubts(source: Source) -> list[str]:
     """Where the name of a column says something else than its unit, or than what it is used for."""
-    found = []
+    words = []
     for what, column in (("times", source.time), ("radii", source.radius)):
         if column is None:
             continue
         name, unit = column
-        if _PIXELS.search(name) and "*" not in unit:
-            found.append(f"{name!r} seems to hold pixels; then give --radius-unit as the size of one, such as 2.76*um")
-        if what == "times" and _FRAMES.match(name):
-            found.append(f"{name!r} seems to count frames; then give --time-step with the time between two of them")
-        if what == "radii" and _DIAMETER.match(name):
-            found.append(f"{name!r} seems to hold diameters; the model's observable is the radius: halve them")
-        named = _unit_in(name)
+        diameter, scaled = _DIAMETER.match(name), "*" in unit
+        if PIXELS.search(name) and not scaled:
+            words.append(f"{name!r} seems to hold pixels; then give, instead of a unit, --pixel with the size of one")
+        if what == "times" and FRAMES.fullmatch(name) and not scaled:
+            words.append(f"{name!r} seems to count frames; then give, instead of a unit, --frame-rate")
+        if what == "radii" and diameter and not scaled:
+            words.append(f"{name!r} seems to hold diameters; then give half of their unit, --radius-unit '0.5*{unit}'")
+        named = "" if diameter and scaled else _unit_in(name)
         if named and parse_unit(named).powers == parse_unit(unit).powers and parse_unit(named) != parse_unit(unit):
-            found.append(f"the name of column {name!r} says {named}, but its unit is given as {unit}")
-    return found
+            words.append(f"the name of column {name!r} says {named}, but its unit is given as {unit}")
+    return words
 
 
 def _unit_in(name: str) -> str:

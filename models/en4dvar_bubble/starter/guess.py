@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.errors import DataError
-from en4dvar.forward import Trajectory
-from en4dvar.state import Array
-from en4dvar_bubble.collapse import lobe
+from en4dvar.model.forward import Trajectory
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import DataError
+from en4dvar_bubble.collapse import COMMON, lobe
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.solver.driver import preset
 from en4dvar_bubble.starter.look import second_maximum
@@ -34,11 +34,20 @@ POINTS = 400
 @dataclass(frozen=True)
 class Guess:
     """``values`` SI by name; ``log_std`` how far the nodes that fit are spread (std of ln); ``misfit`` of the best
-    node in units of s. Empty where the law has neither ``G`` nor ``mu`` or no node could be run."""
+    node in units of s; ``source``, where the values are from. Empty where the law has neither ``G`` nor ``mu`` or no
+    node could be run.
+    """
 
     values: Mapping[str, float]
     log_std: Mapping[str, float]
     misfit: float
+    source: str = ""
+
+    def common(self) -> Guess:
+        """No stiffer or thicker than half of what common gels are at most: for a history that is doubted."""
+        most = COMMON._asdict()
+        values = {name: min(value, 0.5 * most.get(name, np.inf)) for name, value in self.values.items()}
+        return replace(self, values=values, source="within what gels usually are, for the collapse is doubted")
 
     @property
     def far(self) -> bool:
@@ -81,16 +90,18 @@ def first_guess(model: BubbleModel, fixed: Mapping[str, float], observed: Mappin
     logs = np.log(nodes)
     mean = weights @ logs
     spread = np.sqrt(weights @ (logs - mean) ** 2)
+    told = "R_max and collapse time" if model.start == "acoustic" else "collapse time and rebound"
     return Guess(
         {name: float(np.exp(m)) for name, m in zip(names, mean, strict=True)},
         {name: float(s) for name, s in zip(names, spread, strict=True)},
         float(np.sqrt(misfit.min())),
+        f"first guess from {told}",
     )
 
 
 def _features(times: Array, radius: Array) -> dict[str, float]:
     try:
-        found = lobe(times, radius)
+        peak = lobe(times, radius)
     except DataError:
         return {"R_max": np.nan, "t_c": np.nan, "rebound": np.nan}
-    return {"R_max": found.R_max, "t_c": found.t_c, "rebound": second_maximum(radius)}
+    return {"R_max": peak.R_max, "t_c": peak.t_c, "rebound": second_maximum(radius)}

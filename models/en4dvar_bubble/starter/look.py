@@ -12,14 +12,18 @@ from typing import Literal
 import numpy as np
 
 from en4dvar.inputs.window import minima
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 from en4dvar_bubble.collapse import Lobe, lobe
+from en4dvar_bubble.starter.scatter import bad, noise
+from en4dvar_bubble.starter.top import Top, top
 
 Start = Literal["acoustic", "laser"]
-NEAR_TOP = 0.7  # of R_max: the part of the history that the noise is estimated from
 LASER_BEGINS = 0.8  # of R_max: a history that begins above is one of a released bubble
 COLLAPSED = 0.2  # of R_max: from here on the wall of an acoustic bubble is too fast for the model
 SETTLED = 0.15  # std of ln R in the last quarter of a history that has come to rest
+UNKNOWN = 0.01  # of R_max: errors where the scatter cannot be told
+DRIFTS = 0.15  # of ln R from one quarter of a history to the next
+GAS = 0.6  # of R_max: a bubble at rest is smaller
 ACOUSTIC_BEGINS = 0.1  # of R_max: one that begins below has grown from a nucleus
 
 
@@ -27,9 +31,11 @@ ACOUSTIC_BEGINS = 0.1  # of R_max: one that begins below has grown from a nucleu
 class Look:
     """What one history shows; SI.
 
-    ``noise`` is the std of the scatter about a smooth curve near the maximum, NaN with too few samples there.
+    ``noise`` is the std of the readings' scatter (:mod:`en4dvar_bubble.starter.scatter`), NaN with too few of them;
+    ``bad`` are the readings that are none of the bubble, ``top`` is where and how high its maximum was.
     ``rebound`` is the second maximum over the first, NaN where none is seen; ``rest`` the median of the last quarter
-    of a history that rebounds and comes to rest, NaN else. ``step`` is the median time between samples; ``descent``
+    of a history that rebounds and comes to rest, NaN else; ``drift`` says in words what it does instead of resting, "".
+    ``step`` is the median time between samples; ``descent``
     the last instant of the first descent, NaN where the history ends with it. ``n_minima`` follow the maximum with a
     ``prominence`` relative to the range. ``reason`` says in words why ``start`` is
     proposed, ``clear`` whether the data leave no doubt.
@@ -38,10 +44,13 @@ class Look:
     n: int
     times: tuple[float, float]
     lobe: Lobe
+    top: Top
+    bad: tuple[int, ...]
     step: float
     noise: float
     rebound: float
     rest: float
+    drift: str
     n_minima: int
     prominence: float
     descent: float
@@ -57,26 +66,30 @@ def look(times: Array, radius: Array, start: Start | None = None) -> Look:
     ------
     DataError: no maximum with a descent after it.
     """
-    top = int(np.argmax(radius))
-    found = lobe(times, radius)
     scatter = noise(times, radius)
-    prominence, after = _minima(radius[top:], scatter)
+    odd = bad(times, radius, scatter)
+    times, radius = times[~odd], radius[~odd]
+    peak = lobe(times, radius)
+    highest = top(times, radius, scatter if np.isfinite(scatter) else UNKNOWN * float(radius.max()))
+    largest = highest.reading
+    prominence, after = _minima(radius[largest:], scatter)
     rebound = second_maximum(radius)
-    first = float(radius[0] / radius[top])
-    tail = radius[-max(3, len(radius) // 4) :]
-    settled = np.isfinite(rebound) and np.all(tail > 0) and float(np.std(np.log(tail))) < SETTLED
-    rest = float(np.median(tail)) if settled else float("nan")
+    first = float(radius[0] / radius[largest])
+    rest, drift = _rest(times, radius, peak) if np.isfinite(rebound) else (float("nan"), "")
     chosen, reason, clear = _start(first, np.isfinite(rebound))
     if start is not None and start != chosen:
         chosen, reason, clear = start, "as you say", True
     return Look(
         n=len(times),
         times=(float(times[0]), float(times[-1])),
-        lobe=found,
+        lobe=peak,
+        top=highest,
+        bad=tuple(np.flatnonzero(odd).tolist()),
         step=float(np.median(np.diff(times))),
         noise=scatter,
         rebound=rebound,
         rest=rest,
+        drift=drift,
         n_minima=after,
         prominence=prominence,
         descent=_end_of_descent(times, radius),
@@ -90,10 +103,28 @@ def _minima(radius: Array, scatter: float) -> tuple[float, int]:
     """How prominent minima have to be for two of them to be seen, well above the scatter; and how many there are."""
     spread = float(np.ptp(radius))
     for prominence in (0.1, 0.05, 0.03):
-        found = len(minima(radius, prominence))
-        if found >= 2 and (prominence == 0.1 or prominence * spread > 4 * scatter):
-            return prominence, found
+        count = len(minima(radius, prominence))
+        if count >= 2 and (prominence == 0.1 or prominence * spread > 4 * scatter):
+            return prominence, count
     return 0.1, len(minima(radius))
+
+
+def _rest(times: Array, radius: Array, peak: Lobe) -> tuple[float, str]:
+    """The radius at rest, NaN where there is none; and what a history that seemed to rest does instead, in words.
+
+    A radius that goes on growing after the oscillations is that of fragments, of gas that diffuses in, or of an edge
+    that blurs: it is no bubble of a constant amount of gas.
+    """
+    quarter = max(3, len(radius) // 4)
+    tail = radius[-quarter:]
+    if not np.all(tail > 0) or float(np.std(np.log(tail))) > SETTLED or times[-quarter] < peak.t_max + 2 * peak.t_c:
+        return float("nan"), ""
+    rest, begun = float(np.median(tail)), int(np.searchsorted(times, peak.t_max + 2 * peak.t_c))
+    before = radius[max(begun, len(radius) - 2 * quarter) : -quarter]
+    earlier = float(np.median(before)) if len(before) >= 3 else rest
+    if rest > GAS * peak.R_max or not abs(np.log(rest / max(earlier, 1e-3 * rest))) < DRIFTS:
+        return float("nan"), f"R goes from {1e6 * earlier:.3g} to {1e6 * rest:.3g} um where it should rest"
+    return rest, ""
 
 
 def _end_of_descent(times: Array, radius: Array) -> float:
@@ -106,33 +137,13 @@ def _end_of_descent(times: Array, radius: Array) -> float:
 def second_maximum(radius: Array) -> float:
     """The largest radius between the first two collapses over the maximum; NaN where there is no rebound."""
     top = int(np.argmax(radius))
-    found = minima(radius[top:]) + top
-    if not len(found):
+    indices = minima(radius[top:]) + top
+    if not len(indices):
         return float("nan")
-    last = int(found[1]) if len(found) > 1 else len(radius) - 1
-    between = radius[int(found[0]) : last + 1]
+    last = int(indices[1]) if len(indices) > 1 else len(radius) - 1
+    between = radius[int(indices[0]) : last + 1]
     peak = int(np.argmax(between))
     return float(between[peak] / radius[top]) if 0 < peak < len(between) - 1 else float("nan")
-
-
-def noise(times: Array, radius: Array) -> float:
-    """Std of the residuals about a polynomial through the samples around the maximum (above 70 % of it).
-
-    Degree four, with fewer than nine samples two; divided by the degrees of freedom left. NaN with fewer than two.
-    """
-    top = first = last = int(np.argmax(radius))
-    while first > 0 and radius[first - 1] > NEAR_TOP * radius[top]:
-        first -= 1
-    while last + 1 < len(radius) and radius[last + 1] > NEAR_TOP * radius[top]:
-        last += 1
-    t, r = times[first : last + 1], radius[first : last + 1]
-    degree = 4 if len(t) >= 9 else 2
-    left = len(t) - degree - 1
-    if left < 2:
-        return float("nan")
-    z = (t - times[top]) / np.abs(t - times[top]).max()
-    residual = r - np.polyval(np.polyfit(z, r, degree), z)
-    return float(np.sqrt(np.sum(residual**2) / left))
 
 
 def _start(first: float, rebounds: bool) -> tuple[Start, str, bool]:

@@ -8,14 +8,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from en4dvar.errors import DataError
-from en4dvar.state import Array, Parameter
-from en4dvar.units import convert
-from en4dvar_bubble.collapse import Lobe, doubt, lobe
+from en4dvar.inputs.window import minima
+from en4dvar.model.state import Array, Parameter
+from en4dvar.plumbing.errors import DataError
+from en4dvar.plumbing.units import convert
+from en4dvar_bubble.collapse import Lobe, conceivable, doubt, lobe
 from en4dvar_bubble.dynamics import R0, R_EQ, R_MAX
 from en4dvar_bubble.laws.loading import qualified
 from en4dvar_bubble.model import BubbleModel
 from en4dvar_bubble.settings import BubbleSettings
+from en4dvar_bubble.starter import elsewhere
 from en4dvar_bubble.starter.guess import Guess, first_guess
 from en4dvar_bubble.starter.look import Look, Start, look, typical
 
@@ -34,12 +36,18 @@ SIMPLER: Mapping[Start, Mapping[str, str]] = {
     "acoustic": {},
     "laser": {"gas": "polytropic", "vapour": "none", "medium_heat": "cold", "vapour_pressure": "saturated"},
 }
-LEAST_NOISE = 0.01  # of R_max: what single-bubble models agree to with good data at best
+LEAST_NOISE = 0.0005  # of R_max: no camera reads better
+USUAL_NOISE = 0.01  # of R_max: of readings too few to tell
+NOISE_LOG_STD = 0.4  # of the noise scale: a scatter is told by a dozen windows, and not alike at all radii
+TOP_WIDTH = 3.0  # standard errors of the top that the prior takes: it is not to count the readings there twice
+DISCREPANCY = "{kernel: matern-3/2, grows_beyond: 10 m/s}"
+STIFFENING = (0.12, 1.4)  # median and log_std of α: agarose 0.03 (Mancia 2021), polyacrylamide 0.48 (Yang 2020)
+LEAST_SHIFT = 0.1  # of the step between samples: of the prior of the clock
 TIMING = 0.05  # of the step between samples
 NUCLEUS = 0.5e-6  # m: order of the stress-free radii in Mancia et al. (2021), Table 1
 GAS_FRACTION = 0.12  # R_eq/R_max of laser-induced bubbles, where no radius at rest is seen
 # Bounds of the log_std of a guess: it errs by that much, so that a narrower prior would exclude what made the data.
-WIDTHS = {"G": (1.0, 1.5), "mu": (0.7, 1.2)}
+WIDTHS = {"G": (1.5, 2.0), "mu": (1.0, 1.5)}
 BETWEEN = 1.645  # standard deviations from the median to 5 and 95 %
 SAME_CLOCK = 2e-6  # s: what a first guess can be off by
 BUBBLES = (1e-7, 0.1)  # m: between these radii
@@ -70,9 +78,14 @@ class Proposal:
 
 
 def propose(
-    histories: Mapping[str, tuple[Array, Array]], start: Start | None = None, law: str | None = None
+    histories: Mapping[str, tuple[Array, Array]],
+    start: Start | None = None,
+    law: str | None = None,
+    medium: str = "gel",
 ) -> Proposal:
     """A proposal for one or several data sets: name → times (K,) s, radius (K,) m.
+
+    ``medium``: one of those of :mod:`en4dvar_bubble.starter.elsewhere`.
 
     Raises
     ------
@@ -95,9 +108,15 @@ def propose(
     other = "laser" if chosen == "acoustic" else "acoustic"
     doubt = f"start: {chosen} is only a proposal ({look.reason}); if it was {other}, say --start {other}"
     warnings = [doubt] * (not look.clear)
-    doubted = _doubted(looks, model)
+    warnings += [
+        f"{name}: {view.drift}; no radius at rest is taken from it" for name, view in looks.items() if view.drift
+    ]
+    warnings += [_bad_words(name, view) for name, view in looks.items() if view.bad]
+    doubted, believed = _doubted(looks, model), guess
     if doubted:
         warnings += doubted
+        possible = all(conceivable(view.lobe, model.medium) for view in views)
+        believed = guess.common() if possible else Guess({}, {}, 0.0)
     elif not BUBBLES[0] < look.lobe.R_max < BUBBLES[1]:
         warnings.append("no bubble has such a radius; are the units of both columns right?")
     elif guess.far:
@@ -106,22 +125,29 @@ def propose(
             + ("is the driving that of your experiment?" if chosen == "acoustic" else "are scale and frame rate right?")
         )
     return Proposal(
-        _data(chosen, look, model, {**others, **guess.values}),
+        _data(chosen, look, model, {**others, **guess.values}, histories),
         _model(law_name, chosen, look),
-        _parameters(model, chosen, look, Guess({}, {}, 0.0) if doubted else guess),
+        _parameters(model, chosen, look, believed, tops(looks, histories), medium),
         SIMPLER[chosen],
         tuple(told),
         tuple(warnings),
     )
 
 
+def _bad_words(name: str, view: Look) -> str:
+    several = len(view.bad) > 1
+    which = ", ".join(str(i + 1) for i in view.bad[:6])
+    words = f"readings {which} are no readings" if several else f"reading {which} is no reading"
+    return f"{name}: {words} of the bubble by their neighbours; a robust cost counts them less"
+
+
 def _doubted(looks: Mapping[str, Look], model: BubbleModel) -> list[str]:
     """Data sets whose scales cannot be right, one line for those with the same words."""
-    found: dict[str, list[str]] = {}
+    doubts: dict[str, list[str]] = {}
     for name, view in looks.items():
         if words := doubt(view.lobe, model.medium):
-            found.setdefault(words, []).append(name)
-    return [words if len(looks) == 1 else f"{', '.join(names)}: {words}" for words, names in found.items()]
+            doubts.setdefault(words, []).append(name)
+    return [words if len(looks) == 1 else f"{', '.join(names)}: {words}" for words, names in doubts.items()]
 
 
 def starter(start: Start, law: str | None) -> Proposal:
@@ -139,17 +165,15 @@ def starter(start: Start, law: str | None) -> Proposal:
 def with_columns(proposal: Proposal, errors: Sequence[str], common: str) -> Proposal:
     """The proposal with the errors that the data file states: columns of the std of radii and of times, and the
     ``common`` std of what moves all radii alike, "" where the file states none."""
-    kept = [entry for entry in proposal.data if entry.key not in ("  radius_std", "  time_std", "  # time_std")]
-    told = [
-        Entry("  radius_std", f"{{column: {errors[0]}}}", "each reading's own"),
-        Entry("  model_std", "1 % of maximum", "a model is rarely better; added to it in squares"),
-        Entry("  time_std", f"{{column: {errors[1]}}}", "of the exposure"),
-    ]
-    alike = [
-        Entry("reading_offset", f"{{prior: normal, mean: 0 um, std: {common}}}", "the level of the edge, of all alike"),
-        Entry("# reading_scale", "{prior: lognormal, median: 1, log_std: 0.01}", "how well is the pixel's size known?"),
-    ]
-    return replace(proposal, data=(*kept, *told), parameters=(*proposal.parameters, *alike * bool(common)))
+    own = {
+        "radius_std": Entry("  radius_std", f"{{column: {errors[0]}}}", "each reading's own"),
+        "time_std": Entry("  time_std", f"{{column: {errors[1]}}}", "of the exposure"),
+    }
+    data = tuple(own.get(entry.key.removeprefix("  # ").strip(), entry) for entry in proposal.data)
+    alike = Entry(
+        "reading_offset", f"{{prior: normal, mean: 0 um, std: {common}}}", "the level of the edge, of all alike"
+    )
+    return replace(proposal, data=data, parameters=(*proposal.parameters, *[alike] * bool(common)))
 
 
 def _built(start: Start, law: str | None) -> tuple[BubbleModel, str]:
@@ -185,6 +209,8 @@ def _typical(views: Sequence[Look]) -> Look:
         n=sum(v.n for v in views),
         times=(min(v.times[0] for v in views), max(v.times[1] for v in views)),
         lobe=Lobe(*(typical([getattr(v.lobe, k) for v in views]) for k in ("R_max", "t_max", "t_c"))),
+        bad=next((v.bad for v in views if v.bad), ()),
+        drift=next((v.drift for v in views if v.drift), ""),
         n_minima=min(v.n_minima for v in views),
         prominence=min(v.prominence for v in views),
         descent=max((v.descent for v in views if np.isfinite(v.descent)), default=float("nan")),
@@ -194,6 +220,7 @@ def _typical(views: Sequence[Look]) -> Look:
 def _others(model: BubbleModel, look: Look) -> dict[str, float]:
     """Every parameter but G and μ at the centre of its proposed prior, SI."""
     example = {name: float(v[0]) for name, v in model.law.example_values().items() if name not in WIDTHS}
+    example |= {name: STIFFENING[0] for name in example if name == "alpha"}
     if model.start == "acoustic":
         return {**example, "R0": NUCLEUS}
     return {**example, "R_eq": _rest(look), "R_max": look.lobe.R_max}
@@ -203,37 +230,88 @@ def _rest(look: Look) -> float:
     return look.rest if np.isfinite(look.rest) else GAS_FRACTION * look.lobe.R_max
 
 
-def _data(start: Start, look: Look, model: BubbleModel, theta: Mapping[str, float]) -> tuple[Entry, ...]:
+def _data(
+    start: Start,
+    look: Look,
+    model: BubbleModel,
+    theta: Mapping[str, float],
+    histories: Mapping[str, tuple[Array, Array]],
+) -> tuple[Entry, ...]:
     """Window, clock and errors."""
     if start == "laser":
-        end = f"minimum {min(look.n_minima, 2)}" if look.n_minima else "end"
-        low = f", prominence: {100 * look.prominence:g} %" if look.prominence < 0.1 else ""
         lines = [
-            Entry("window", f"{{from: R_max, to: {end}{low}}}", "what happens before R_max is not modelled"),
-            Entry("time_zero", "window", "the model's clock starts at R_max"),
+            _window(look, histories),
+            Entry("time_zero", "window", "the model's clock starts at R_max, t_s later or earlier"),
         ]
     else:
         end = _text(look.descent, "s", "us", 4) if np.isfinite(look.descent) else "end"
         words = "growth and collapse down to 20 % of R_max; then the wall is too fast for the model"
         lines = [Entry("window", f"{{from: start, to: {end}}}", words), _clock(look, model, theta)]
-    least = LEAST_NOISE * look.lobe.R_max
-    scatter = (
-        f"scatter near R_max: {_text(look.noise, 'm', 'um')}"
-        if np.isfinite(look.noise)
-        else "too few points near R_max"
-    )
-    if look.noise > least:
-        std, words = _text(look.noise, "m", "um"), scatter
-    else:
-        std, words = "1 % of maximum", f"{scatter}; a model is rarely better than 1 %"
+    std, words = "1 % of maximum", "too few readings to tell their scatter: put what you know of your camera"
+    if np.isfinite(look.noise):
+        std = _text(max(look.noise, LEAST_NOISE * look.lobe.R_max), "m", "um")
+        words = "scatter of the readings where R is smooth; sigma below scales it"
     timing = _text(TIMING * look.step, "s", "us")
     key = "  time_std" if start == "laser" else "  # time_std"  # a flash is short
+    robust = [Entry("  robust", "huber", "some readings are far from their neighbours and count less")] * bool(look.bad)
     return (
         *lines,
-        Entry("error", "", "how well a reading is known: put what you know of your camera"),
+        Entry("error", "", "how well a reading is known"),
         Entry("  radius_std", std, words),
         Entry(key, timing, "5 % of the step between frames: exposure and jitter matter where R is steep"),
+        *robust,
+        Entry("  discrepancy", DISCREPANCY, "what the model misses: its size and correlation time are estimated"),
     )
+
+
+def _window(look: Look, histories: Mapping[str, tuple[Array, Array]]) -> Entry:
+    """From the largest reading to the second minimum; by times where a reading that is none would be taken for it."""
+    end = f"minimum {min(look.n_minima, 2)}" if look.n_minima else "end"
+    low = f", prominence: {100 * look.prominence:g} %" if look.prominence < 0.1 else ""
+    words = "what happens before R_max is not modelled"
+    if look.drift and not look.n_minima:
+        words += f"; {look.drift}: end it before that"
+    if len(histories) == 1 and look.bad:
+        ((times, radius),) = histories.values()
+        times, radius = np.delete(times, look.bad), np.delete(radius, look.bad)
+        first = look.top.reading
+        last = len(times) - 1
+        if look.n_minima:
+            last = first + int(minima(radius[first:], look.prominence)[min(look.n_minima, 2) - 1])
+        limits = [_text(times[i], "s", "us", 8) for i in (first, last)]
+        return Entry("window", f"{{from: {limits[0]}, to: {limits[1]}}}", f"R_max to {end}; {words}")
+    return Entry("window", f"{{from: R_max, to: {end}{low}}}", words)
+
+
+@dataclass(frozen=True)
+class Tops:
+    """Priors of where and how high the tops of the histories are, against the first reading of the window."""
+
+    t_s: tuple[float, float]
+    R_max: tuple[str, float]
+
+
+def tops(looks: Mapping[str, Look], histories: Mapping[str, tuple[Array, Array]]) -> Tops:
+    """Mean and std (s) of the clock, mean (as text) and relative std of the height.
+
+    Of one history these are those of its top; of several, what covers the tops of all, beside the largest readings.
+    """
+    shifts, heights = [], []
+    for name, view in looks.items():
+        times, radius = (np.delete(values, view.bad) for values in histories[name])
+        reading = view.top.reading
+        shifts.append((times[reading] - view.top.time, TOP_WIDTH * view.top.time_std, view.step))
+        largest = radius[reading]
+        heights.append((view.top.height / largest - 1, TOP_WIDTH * view.top.height_std / largest))
+    shift, height = np.array(shifts), np.array(heights)
+    least = LEAST_SHIFT * float(np.mean(shift[:, 2]))
+    of_scale = elsewhere.SCALE.log_std
+    if len(looks) == 1:
+        ((_, view),) = looks.items()
+        mean = _text(view.top.height, "m", "um", 5)
+        return Tops((shift[0, 0], math.hypot(shift[0, 1], least)), (mean, math.hypot(height[0, 1], of_scale)))
+    wide = [float(np.sqrt(np.mean(np.sum(values[:, :2] ** 2, axis=1)))) for values in (shift, height)]
+    return Tops((0.0, math.hypot(wide[0], least)), ("maximum", math.hypot(wide[1], of_scale)))
 
 
 def _clock(look: Look, model: BubbleModel, theta: Mapping[str, float]) -> Entry:
@@ -268,30 +346,46 @@ def _model(law: str, start: Start, look: Look | None) -> tuple[Entry, ...]:
     return tuple(lines)
 
 
-def _parameters(model: BubbleModel, start: Start, look: Look, guess: Guess) -> tuple[Entry, ...]:
+def _parameters(
+    model: BubbleModel, start: Start, look: Look, guess: Guess, top: Tops | None, medium: str
+) -> tuple[Entry, ...]:
     lines = []
     for p in model.law.parameters:
         if p.name in guess.values:
             low, high = WIDTHS[p.name]
             width = f"{np.clip(guess.log_std[p.name], low, high):.2g}"
             value = _text(guess.values[p.name], p.unit, p.display_unit)
-            from_what = "R_max and collapse time" if start == "acoustic" else "collapse time and rebound"
             off = math.exp(BETWEEN * float(width))
-            words = f"{p.label}: first guess from {from_what}, may be off by a factor of {off:.2g}; "
+            words = f"{p.label}: {guess.source}, may be off by a factor of {off:.2g}; "
             words += "narrow it to what you knew before"
             lines.append(Entry(p.name, f"{{prior: lognormal, median: {value}, log_std: {width}}}", words))
         else:
             lines.append(_example(p, model))
-    lines += _radii(start, look)
-    std = _text(0.5e-6 if start == "acoustic" else 0.5 * look.step, "s", "us")
-    words = (
-        "the clock of the data against that of the pulse" if start == "acoustic" else "R_max falls between two frames"
+    lines += _radii(start, look, top)
+    mean, std = (0.0, 0.5e-6) if start == "acoustic" or top is None else top.t_s
+    prior = f"{{prior: normal, mean: {_text(mean, 's', 'us', 4)}, std: {_text(std, 's', 'us')}}}"
+    words = "the clock of the data against that of the pulse"
+    if start == "laser":
+        words = "the first reading of the window against the top, by a parabola through the readings about it"
+    sigma = f"{{prior: lognormal, median: 1, log_std: {NOISE_LOG_STD:g}}}"
+    return (
+        *lines,
+        Entry("t_s", prior, words),
+        Entry("sigma", sigma, "scale of the stated errors"),
+        *(
+            Entry(k.key, f"{{prior: lognormal, median: {k.median}, log_std: {k.log_std:g}}}", k.source)
+            for k in elsewhere.known(medium)
+        ),
     )
-    return (*lines, Entry("t_s", f"{{prior: normal, mean: 0 us, std: {std}}}", words))
 
 
 def _example(p: Parameter, model: BubbleModel) -> Entry:
-    """A prior about the law's example value."""
+    """A prior about the law's example value; of α one that spans the gels."""
+    if p.name == "alpha":
+        prior = f"{{prior: lognormal, median: {STIFFENING[0]:g}, log_std: {STIFFENING[1]:g}}}"
+        off = math.exp(BETWEEN * STIFFENING[1])
+        words = f"{p.label}: agarose 0.03 (Mancia 2021), polyacrylamide 0.48 (Yang 2020); may be off by a factor of "
+        return Entry(p.name, prior, f"{words}{off:.2g}; narrow it to what you know of your gel")
     value = float(model.law.example_values()[p.name][0]) if p.name in model.law.example_values() else 1.0
     text = _text(value, p.unit, p.display_unit)
     words = f"{p.label}: an example value, not from the data"
@@ -303,7 +397,7 @@ def _example(p: Parameter, model: BubbleModel) -> Entry:
     return Entry(p.name, f"{{prior: normal, mean: {text}, std: 20 %}}", words)
 
 
-def _radii(start: Start, look: Look | None) -> list[Entry]:
+def _radii(start: Start, look: Look | None, top: Tops | None = None) -> list[Entry]:
     if start == "acoustic":
         value = _text(NUCLEUS, "m", "um")
         return [
@@ -315,10 +409,15 @@ def _radii(start: Start, look: Look | None) -> list[Entry]:
         if known
         else f"{GAS_FRACTION:g} R_max: no radius at rest is seen"
     )
+    mean, std = top.R_max if top else ("maximum", 0.03)
     value, width = (_text(_rest(look), "m", "um") if look else "20 um"), 0.3 if known else 0.4
     return [
         Entry(R_EQ.name, f"{{prior: lognormal, median: {value}, log_std: {width}}}", words if look else R_EQ.label),
-        Entry(R_MAX.name, "{prior: normal, mean: maximum, std: 1 %}", "the largest radius of each data set"),
+        Entry(
+            R_MAX.name,
+            f"{{prior: normal, mean: {mean}, std: {100 * std:.2g} %}}",
+            "the top of the history, with the errors of readings and scale",
+        ),
     ]
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from en4dvar.state import Array
+from en4dvar.model.state import Array
 from en4dvar_bubble.collapse import RAYLEIGH
 from en4dvar_bubble.medium import Medium
 

@@ -1,0 +1,161 @@
+"""A page of documentation from folders of measured bubbles: intervals, readings after the window, agreement."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from records import Record
+
+HEAD = """# Measured bubbles, gel by gel
+
+This page is written by one command from folders of measured radius histories, `t_us,R_um`: each file goes through
+`init` and `run` as they are, with the law and the medium of its folder, and no number is adjusted by hand. It is
+printed as it comes out, also where that is bad.
+
+    {command}
+
+Commit {commit}. The data are public, but have no licence that would allow to ship them; where they are from stands
+with each group.
+
+How to read it. *G*, *μ*: mean ± standard deviation; a number in brackets has no interval, for the reason that follows
+it. *After the window*: how many of the readings that were not fitted lie in the 90 % bands of what was expected of
+them, and their distance from the medians in per cent of R_max (root mean square); the window ends at the second
+minimum, if there are two. χ² per degree of freedom: of ln G or ln μ about their weighted mean, 1 if bubbles of one gel
+differ by no more than their intervals say; density, scale and pressure are common to the bubbles of a folder and make
+it smaller.
+"""
+PRESSURE = re.compile(r"ambient pressure of ([\d.]+) ?MPa")
+ATMOSPHERE = 0.1  # MPa, which init takes for granted
+
+
+@dataclass(frozen=True)
+class Group:
+    """What is known of a folder: law and medium as ``init`` takes them, and ``words`` of where it is from."""
+
+    title: str
+    law: str
+    medium: str
+    words: str
+
+
+GROUPS: Mapping[str, Group] = {
+    "stiff_polyacrylamide": Group(
+        "Stiff polyacrylamide", "neo-hookean-kelvin-voigt", "polyacrylamide",
+        "Laser bubbles at 270 000 frames/s (repository IMR_data_assimilation). Published for the gel, with a density "
+        "of 1060 kg/m³: G 7.7 ± 1.1 kPa, μ 0.101 ± 0.023 Pa s (Estrada et al. 2018).",
+    ),
+    "polyacrylamide_1mhz": Group(
+        "Polyacrylamide at 1 MHz", "neo-hookean-kelvin-voigt", "polyacrylamide",
+        "Laser bubbles at a million frames a second (IMR_data_assimilation).",
+    ),
+    "paam_alginate": Group(
+        "Polyacrylamide–alginate", "neo-hookean-kelvin-voigt", "polyacrylamide-alginate",
+        "Laser bubbles at a million frames a second (BubbleDynamicsModel).",
+    ),
+    "peg_water": Group(
+        "PEG 8000 in water", "newtonian", "peg",
+        "Laser bubbles at a million frames a second in a liquid (BubbleDynamicsModel); the larger ones end in "
+        "fragments.",
+    ),
+    "water": Group(
+        "Water", "newtonian", "water",
+        "One bubble of 1.2 mm, and bubbles at ambient pressures up to 45 MPa (LIBDAR), which are stated. μ is known: "
+        "0.00089 Pa s at 25 °C.",
+    ),
+}  # fmt: skip
+
+
+def stated(text: str) -> dict[str, Any]:
+    """What the head of a file says of its experiment: keys of the configuration."""
+    match = PRESSURE.search(text.splitlines()[0])
+    if match is None or float(match[1]) == ATMOSPHERE:
+        return {}
+    return {"parameters.p_inf": {"prior": "lognormal", "median": f"{match[1]} MPa", "log_std": 0.01}}
+
+
+def page(groups: Mapping[str, Sequence[Record]], command: str) -> str:
+    """Markdown of all groups by the names of their folders, and of which commits their records are."""
+    commits = dict.fromkeys(record["commit"] for records in groups.values() for record in records)
+    parts = [HEAD.format(command=command, commit=", ".join(commits)), _overview(groups)]
+    parts += [_group(GROUPS[name], records) for name, records in groups.items()]
+    return "\n".join(parts)
+
+
+def _overview(groups: Mapping[str, Sequence[Record]]) -> str:
+    lines = [
+        "| | bubbles | intervals of G | χ² of ln G | intervals of μ | χ² of ln μ | readings after window | inside |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    every = [record for records in groups.values() for record in records]
+    for title, records in [*((GROUPS[name].title, r) for name, r in groups.items()), ("all", every)]:
+        cells = [title, str(len(records))]
+        for key in ("G", "mu"):
+            logs = intervals(records, key)
+            some = any(key in record for record in records)
+            cells += [str(len(logs)) if some else "–", f"{chi2(logs):.2f}" if len(logs) > 1 and title != "all" else "–"]
+        count, inside = after(records)
+        cells += [str(count), f"{inside:.0%}" if count else "–"]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _group(about: Group, records: Sequence[Record]) -> str:
+    solid = any("G" in record for record in records)
+    head = ["bubble", *["G, kPa"] * solid, "μ, Pa s", "after the window", "rms, % of R_max", "warnings"]
+    lines = [f"## {about.title}", "", about.words + f" Law: `{about.law}`, medium: `{about.medium}`.", ""]
+    lines += [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for record in records:
+        if "reason" in record:
+            lines.append(f"| {record['key']} | {' | '.join(['–'] * (len(head) - 2))} | {record['reason']} |")
+            continue
+        numbers = [said(record.get("G"), 1e-3)] * solid + [said(record.get("mu"), 1.0)]
+        count, share, rms = record["withheld"] or (0, 0.0, 0.0)
+        later = [f"{share * count:.0f} of {count}", f"{100 * rms:.1f}"] if count else ["–", "–"]
+        lines.append(f"| {' | '.join([record['key'], *numbers, *later, record['warnings']])} |")
+    for key, symbol, factor in (("G", "G", 1e-3), ("mu", "μ", 1.0)):
+        logs = intervals(records, key)
+        if len(logs) > 1:
+            each = np.array([factor * r[key]["mean"] for r in records if key in r and not r[key]["untrusted"]])
+            spread = f"{each.mean():.3g} ± {each.std(ddof=1):.2g} (standard deviation of the bubbles)"
+            told = f"{symbol}: {len(logs)} of {len(records)} intervals; mean {spread}"
+            told += f", weighted {factor * average(logs):.3g}"
+            lines += ["", f"{told}, χ² of ln {symbol} per degree of freedom {chi2(logs):.2f}."]
+    return "\n".join(lines) + "\n"
+
+
+def intervals(records: Sequence[Record], key: str) -> np.ndarray:
+    """Mean and standard deviation of ln θ (n, 2) of the bubbles that have an interval."""
+    logs = [record[key]["ln"] for record in records if key in record and not record[key]["untrusted"]]
+    return np.array(logs).reshape(-1, 2)
+
+
+def average(logs: np.ndarray) -> float:
+    """θ at the weighted mean of ln θ."""
+    mean, std = logs.T
+    return float(np.exp(np.sum(mean / std**2) / np.sum(1 / std**2)))
+
+
+def chi2(logs: np.ndarray) -> float:
+    """χ² about the weighted mean per degree of freedom."""
+    mean, std = logs.T
+    return float(np.sum(((mean - np.log(average(logs))) / std) ** 2) / (len(logs) - 1))
+
+
+def after(records: Sequence[Record]) -> tuple[int, float]:
+    """Readings after the windows, and the share of them in their bands."""
+    told = [record["withheld"] for record in records if record.get("withheld")]
+    count = sum(int(each[0]) for each in told)
+    return count, sum(each[0] * each[1] for each in told) / max(1, count)
+
+
+def said(number: Record | None, factor: float) -> str:
+    """Mean ± standard deviation, or the mean in brackets and why there is no interval."""
+    if number is None:
+        return "–"
+    if number["untrusted"]:
+        return f"({factor * number['mean']:.3g}) {number['untrusted']}"
+    return f"{factor * number['mean']:.3g} ± {factor * number['std']:.2g}"

@@ -1,0 +1,269 @@
+"""Recordings as laboratories make them, through ``init`` and ``run`` with nothing changed by hand.
+
+    python benchmarks/recordings.py                          24 synthetic recordings of seed 1, and a table
+    python benchmarks/recordings.py --seed 7 --start 24 --n 24 --minutes 5    a piece; the next call goes on
+    python benchmarks/recordings.py --measured ../shared/data/bubbles/stiff_polyacrylamide
+    python benchmarks/recordings.py --measured ../shared/data/bubbles/peg_water --law newtonian --medium water
+    python benchmarks/recordings.py --page bubbles.md --measured ../shared/data/bubbles/*    folders of known names
+
+Synthetic: one bubble a recording, released in a gel of 0.1 to 100 kPa and 0.01 to 1 Pa s with the full gas model of
+``init``; R_max 50 to 600 µm, 0.1 to 5 MHz, errors of 0.2 to 3 % of R_max, frames of the growth before it, gaps where
+the bubble is small, sometimes a bad reading. Density, pressure and scale are those of a laboratory and not of the
+program: drawn within what is known of them, and the file does not hold them. Printed are the share of 90 % and 50 %
+intervals that hold the truth, the standard deviation of z in ln θ, which sets have no interval and why, and those that
+are more than 3.5 standard deviations off without a word.
+
+Measured: a folder of files with columns t_us, R_um of bubbles in one material; printed are the intervals, how many
+readings after the window lie in their 90 % bands, and how far the bubbles agree, χ² of ln θ about their weighted mean
+per degree of freedom.
+
+Records are kept as JSON lines; ``--quick`` replaces the gas by an isothermal one in truth and fit, for exploring.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import hashlib
+import shlex
+import subprocess
+import sys
+import time
+import warnings
+from collections import Counter
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from click.testing import CliRunner
+from measured_page import GROUPS, after, chi2, intervals, page, said, stated
+from records import Record, fill
+
+import en4dvar
+from en4dvar.cli import main as command_line
+from en4dvar.model.forward import Failure
+from en4dvar_bubble.model import BubbleModel
+from en4dvar_bubble.settings import BubbleSettings
+
+LAWS = {"neo-hookean-kelvin-voigt": 0.5, "quadratic-kelvin-voigt": 0.3, "newtonian": 0.2}  # and how often
+FULL = {"gas": "heat", "vapour": "transport", "medium_heat": "conducting"}
+QUICK = {"gas": "isothermal", "vapour": "none", "medium_heat": "cold", "vapour_pressure": "saturated"}
+FRAMES = (6.0, 80.0)  # of a collapse, between which a camera is set
+CELLS = 4000  # instants of the model's path that readings are interpolated from
+INSIDE = {90: (0.05, 0.95), 50: (0.25, 0.75)}
+SILENT = 3.5
+NUMBERS = ("G", "mu")
+
+
+def between(stream: np.random.Generator, low: float, high: float) -> float:
+    """A number whose logarithm is uniform."""
+    return float(np.exp(stream.uniform(np.log(low), np.log(high))))
+
+
+def laboratory(stream: np.random.Generator, physics: dict[str, str]) -> tuple[str, dict[str, float], BubbleModel]:
+    """Law, true values, and the model of one experiment."""
+    law = str(stream.choice(list(LAWS), p=list(LAWS.values())))
+    truth = {"mu": between(stream, 0.01, 1.0), "R_max": between(stream, 50e-6, 600e-6)}
+    truth["R_eq"] = truth["R_max"] * float(np.exp(np.log(0.13) + 0.3 * stream.standard_normal()))
+    gel = law != "newtonian"
+    if gel:
+        truth["G"] = between(stream, 100.0, 1e5)
+    if law.startswith("quadratic"):
+        truth["alpha"] = between(stream, 0.02, 1.0)
+    density = stream.uniform(1000.0, 1060.0) if gel else stream.uniform(995.0, 1035.0)
+    constants = {"rho": f"{density} kg/m^3", "p_inf": f"{101.325 * (1 + 0.01 * stream.standard_normal())} kPa"}
+    settings = BubbleSettings.model_validate({**physics, "start": "laser", "law": law, "constants": constants})
+    return law, truth, BubbleModel.from_settings(settings)
+
+
+def recording(seed: int, physics: dict[str, str]) -> tuple[str, dict[str, float], str]:
+    """Law, true values, and the file's text."""
+    stream = np.random.default_rng([33, seed])
+    while True:
+        law, truth, model = laboratory(stream, physics)
+        medium = model.medium
+        t_c = 0.9147 * truth["R_max"] * np.sqrt(medium.rho / medium.p_inf)
+        rate = between(stream, 0.1e6, 5e6)
+        if not FRAMES[0] < rate * t_c < FRAMES[1]:
+            continue
+        times = np.linspace(0.0, 8 * t_c, CELLS)
+        (path,) = model.trajectories(model.initial_states({k: np.array([v]) for k, v in truth.items()}), times)
+        if not isinstance(path, Failure):
+            return law, truth, _filmed(stream, times, path["R"], rate, t_c)
+
+
+def _filmed(stream: np.random.Generator, times: Any, radius: Any, rate: float, t_c: float) -> str:
+    noise = between(stream, 0.002, 0.03) * radius[0]
+    grown = stream.uniform(0.2, 0.9) if stream.random() < 0.7 else 0.0  # of the collapse time, seen before R_max
+    last = min(stream.uniform(3.0, 7.5) * t_c, 256 / rate)
+    t = np.arange(-np.floor(grown * t_c * rate) + stream.random(), last * rate) / rate
+    skew = stream.uniform(-0.1, 0.3)  # growth is no mirror image of the collapse, which has the same R and R̈ at the top
+    fast = np.where(t < 0, -t * (1 - skew * t / t_c), t)
+    at = fast + 0.02 / rate * stream.standard_normal(len(t))
+    read = np.interp(np.abs(at), times, radius) + noise * stream.standard_normal(len(t))
+    small = np.interp(fast, times, radius) < 0.06 * radius[0]
+    gap = (stream.random(len(t)) < 0.01) | (small & (stream.random(len(t)) < 0.5))
+    if stream.random() < 0.2:
+        read[stream.integers(len(t))] += stream.choice([-1, 1]) * stream.uniform(6, 15) * noise
+    scale = 1 + 0.005 * stream.standard_normal()
+    kept = ~gap & (read > 0.005 * radius[0])
+    rows = [f"{1e6 * (a - t[0]):.6g},{1e6 * scale * b:.6g}" for a, b in zip(t[kept], read[kept], strict=True)]
+    return "\n".join(["t_us,R_um", *rows]) + "\n"
+
+
+def verbatim(text: str, law: str, words: list[str], quick: bool) -> Record:
+    """What ``init`` and ``run`` say of a file, from a folder of its own, beside what its head states."""
+    begun = time.process_time()
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "bubble.csv").write_text(text)
+        config = folder / "bubble.yaml"
+        asked = ["--data", str(folder / "bubble.csv"), "--time-unit", "us", "--radius-unit", "um"]
+        made = CliRunner().invoke(command_line, ["init", *asked, "--law", law, "--out", str(config), *words])
+        if made.exit_code or not config.is_file():
+            return {"reason": f"init: {made.output.strip().splitlines()[-1] if made.output else made.exception}"}
+        changes: dict[str, Any] = {"execution.workers": 1, "output.report": False}
+        changes |= {"output.directory": str(folder / "run")}
+        changes |= {f"model.{key}": value for key, value in QUICK.items()} if quick else {}
+        changes |= stated(text)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                result = en4dvar.run(config, overrides=changes)
+        except Exception as error:
+            return {"reason": f"run: {str(error).splitlines()[0] if str(error) else type(error).__name__}"}
+        with (folder / "run" / "summary.csv").open() as file:
+            rows = {row["name"]: row for row in csv.DictReader(file)}
+        found: Record = {"seconds": time.process_time() - begun, "warnings": next(iter(rows.values()))["warnings"]}
+        for key in (*NUMBERS, "alpha", "R_eq", "R_max", "t_s"):
+            if key in rows:
+                found[key] = _posterior(result.posterior[key].values.ravel(), rows[key])
+        found["withheld"] = _withheld(result.sample_stats.attrs, found["R_max"]["mean"])
+        return found
+
+
+def _withheld(stats: Any, largest: float) -> tuple[int, float, float] | None:
+    """How many readings follow the window, their share in the 90 % bands, and their rms in units of R_max."""
+    if "withheld_readings" not in stats:
+        return None
+    return int(stats["withheld_readings"]), float(stats["withheld_inside"]), float(stats["withheld_rms"]) / largest
+
+
+def _posterior(members: Any, row: dict[str, str]) -> Record:
+    members = members[np.isfinite(members)]
+    logs = np.log(np.maximum(members, 1e-300))
+    said = {str(p): float(np.quantile(members, p)) for p in (0.05, 0.25, 0.5, 0.75, 0.95)}
+    moments = {"mean": float(members.mean()), "std": float(members.std(ddof=1))}
+    return {**said, **moments, "ln": (float(logs.mean()), float(logs.std(ddof=1))), "untrusted": row["untrusted"]}
+
+
+def synthetic(seed: int, quick: bool) -> Record:
+    law, truth, text = recording(seed, QUICK if quick else FULL)
+    return {"law": law, "truth": truth, **verbatim(text, law, [], quick)}
+
+
+def table(records: list[Record]) -> None:
+    """Coverage, z, and what has no interval."""
+    seconds = [r["seconds"] for r in records if "seconds" in r]
+    print(f"{len(records)} recordings; processor seconds of a set: median {np.median(seconds or [np.nan]):.1f}")
+    print("| | sets | with interval | 90 % hold | 50 % hold | std of z | mean of z | silent > 3.5 std |")
+    print("|---|---|---|---|---|---|---|---|")
+    for key in NUMBERS:
+        sets = [r for r in records if key in r["truth"]]
+        told = [r for r in sets if key in r and not r[key]["untrusted"]]
+        z = np.array([z_of(r, key) for r in told])
+        held = [
+            sum(r[key][str(low)] <= r["truth"][key] <= r[key][str(high)] for r in told) / max(1, len(told))
+            for low, high in INSIDE.values()
+        ]
+        off = [r["key"] for r in told if abs(z_of(r, key)) > SILENT]
+        shares = " | ".join(f"{share:.0%}" for share in held)
+        moments = f"{z.std():.2f} | {z.mean():+.2f}" if len(z) else "– | –"
+        print(f"| {key} | {len(sets)} | {len(told)} | {shares} | {moments} | {', '.join(off) or 'none'} |")
+    reasons = Counter(why(r) for r in records)
+    for reason, count in reasons.most_common():
+        if reason:
+            print(f"no interval, {count}: {reason} ({', '.join(r['key'] for r in records if why(r) == reason)})")
+
+
+def z_of(record: Record, key: str) -> float:
+    mean, std = record[key]["ln"]
+    return float((np.log(record["truth"][key]) - mean) / std)
+
+
+def why(record: Record) -> str:
+    """Why a set has no interval of the viscosity, "" where it has one."""
+    return str(record["reason"] if "reason" in record else record["mu"]["untrusted"])
+
+
+def agreement(records: list[Record]) -> None:
+    """Intervals of measured bubbles, readings after their windows, and χ² of ln θ about their weighted mean."""
+    for r in records:
+        told = "; ".join(f"{k} {said(r[k], 1e-3 if k == 'G' else 1.0)}" for k in NUMBERS if k in r)
+        count, share, rms = r.get("withheld") or (0, 0.0, 0.0)
+        later = f"; after the window {share:.0%} of {count}, {100 * rms:.1f} % of R_max" if count else ""
+        print(f"{r['key']}: {told or r['reason']}{later} [{r.get('warnings', '')}] {r.get('seconds', 0):.0f} s")
+    for key in NUMBERS:
+        logs = intervals(records, key)
+        if len(logs) > 1:
+            print(
+                f"{key}: {len(logs)} of {len(records)} intervals; χ² of ln {key} per degree of freedom {chi2(logs):.2f}"
+            )
+    count, inside = after(records)
+    print(f"readings after the windows: {count}, {inside:.0%} in their 90 % bands")
+
+
+def measured(folder: Path, law: str, medium: str, o: argparse.Namespace) -> list[Record]:
+    """The records of a folder's bubbles."""
+    words = ["--medium", medium] * bool(medium)
+    mark = hashlib.sha256(f"{folder.name} {law} {words}".encode()).hexdigest()[:6]
+    files = {file.stem: file for file in sorted(folder.glob("*.csv"))}
+    path = o.records / f"{folder.name}_{mark}.jsonl"
+    at = commit()
+
+    def run(key: str) -> Record:
+        return {"commit": at, **verbatim(files[key].read_text(), law, words, o.quick)}
+
+    done = fill(path, files, run, o.minutes)
+    return list(done.values())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=1, help="of the design; each recording has a seed of its own")
+    parser.add_argument("--start", type=int, default=0)
+    parser.add_argument("--n", type=int, default=24)
+    parser.add_argument("--minutes", type=float, default=np.inf, help="start no set after so long")
+    parser.add_argument("--quick", action="store_true", help="isothermal gas in truth and fit")
+    parser.add_argument("--measured", type=Path, nargs="*", default=[], help="folders of measured bubbles instead")
+    parser.add_argument("--law", default="neo-hookean-kelvin-voigt", help="of the measured material")
+    parser.add_argument("--medium", default="", help="of the measured material, as init takes it")
+    parser.add_argument(
+        "--page", type=Path, help="write a page about folders of known names, with their law and medium"
+    )
+    parser.add_argument("--records", type=Path, default=Path("runs/recordings"), help="folder of the records")
+    o = parser.parse_args()
+    if not o.measured:
+        keys = [str(1000 * o.seed + i) for i in range(o.start, o.start + o.n)]
+        path = o.records / f"{'quick' if o.quick else 'full'}.jsonl"
+        table(list(fill(path, keys, lambda key: synthetic(int(key), o.quick), o.minutes).values()))
+    groups = {}
+    for folder in o.measured:
+        group = GROUPS.get(folder.name)
+        law, medium = (group.law, group.medium) if group and o.page else (o.law, o.medium)
+        print(f"{folder.name}, {law} {medium}")
+        groups[folder.name] = measured(folder, law, medium, o)
+        agreement(groups[folder.name])
+    if o.page:
+        o.page.write_text(page(groups, f"python {shlex.join(sys.argv)}"), encoding="utf-8")
+
+
+def commit() -> str:
+    """The commit of this file's clone."""
+    words = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
+
+
+if __name__ == "__main__":
+    main()

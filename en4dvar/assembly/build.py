@@ -1,0 +1,214 @@
+"""Settings → inverse problems: reads the data files, cuts the windows, evaluates what refers to the data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+
+from en4dvar.assembly.find_files import find_files, with_parts
+from en4dvar.assembly.reading import read_observations
+from en4dvar.config import Config, SequenceConfig
+from en4dvar.config.initial_state import Perturbed
+from en4dvar.config.parameters import Fixed, Tied, Uncertain, inside_bounds
+from en4dvar.config.series import DataPlan, SeriesPlan
+from en4dvar.data.observations import Observations
+from en4dvar.descent.field_gain import gain_of
+from en4dvar.ensemble.forecast import check_problem
+from en4dvar.inputs.asked import Column, DataFile
+from en4dvar.plumbing.errors import ConfigError, DataError, Fault
+from en4dvar.plumbing.units import UnitError, convert
+from en4dvar.priors.field_prior import FieldPrior
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.priors.varying import Varying
+from en4dvar.problem import InverseProblem, Tie, discrepancy_parameters
+
+
+def build(config: Config) -> tuple[InverseProblem, ...]:
+    """One inverse problem a data set, in the order of the paths (of a glob: sorted).
+
+    Raises
+    ------
+    ConfigError: there is no ``data:`` section, nothing is estimated, or a prior does not suit the data.
+    DataError: data files cannot be used; names every one of them.
+    """
+    plan = inverse_plan(config)
+    problems: list[InverseProblem] = []
+    unusable: list[DataError] = []
+    for name, file in data_files(plan).items():
+        try:
+            problems.append(build_one(config, name, file))
+        except DataError as error:
+            unusable.append(error)
+    if unusable:
+        raise DataError("\n".join(map(str, unusable)))
+    return tuple(problems)
+
+
+def inverse_plan(config: Config) -> DataPlan:
+    """How the observations are read. Raises :class:`ConfigError` without data or without anything to estimate."""
+    if config.data is None:
+        raise ConfigError([Fault("required: it says where the observations are", "data", config.document.file)])
+    if not config.initial_state and not any(isinstance(entry, Uncertain) for entry in config.parameters):
+        raise ConfigError([config.document.fault(("parameters",), "no parameter has a prior; nothing to estimate")])
+    return DataPlan.of(config.data, config.observable)
+
+
+def build_one(config: Config, name: str, file: DataFile) -> InverseProblem:
+    """The inverse problem of one of :func:`data_files`. Raises :class:`ConfigError`, :class:`DataError`."""
+    config.sharing.of_dataset(name)
+    return problem_of(config, read_observations(inverse_plan(config), file, name, config.weights))
+
+
+def problem_of(config: Config, observations: Observations) -> InverseProblem:
+    """The inverse problem of observations, wherever they come from. Raises :class:`ConfigError`."""
+    terms, fixed = resolve_parameters(config, observations)
+    perturbed = [start for start in config.initial_state if isinstance(start, Perturbed)]
+    terms = (*terms, *(start.term for start in perturbed), *_discrepancy(config, observations))
+    estimated = {term.parameter.name for term in terms}
+    tied = tuple(
+        Tie(e.parameter, e.to, e.factor) for e in config.parameters if isinstance(e, Tied) and e.to in estimated
+    )
+    perturbations = tuple(start.perturbation for start in perturbed)
+    fields = tuple(prior for prior in config.initial_state if isinstance(prior, FieldPrior))
+    varying = _varying(config, observations, terms)
+    asked, count = config.assimilation, len(terms) + sum(len(change.terms) for change in varying)
+    localised = bool(fields) or asked.localisation is not None
+    if asked.sampling == "exact" and asked.members <= count and not localised:
+        message = f"{asked.members} are too few for {count} parameters; at least {count + 1}"
+        raise ConfigError([config.document.fault(("assimilation", "members"), message)])
+    prior = Prior(terms, config.dependence)
+    problem = InverseProblem(config.model, config.observable, observations, prior, fixed, perturbations, tied, fields)
+    if varying:
+        problem = problem.varied(varying)
+    with config.document.placing():
+        check_problem(problem)
+    if localised:
+        with config.document.placing("assimilation", "localisation"):
+            gain_of(problem, asked)
+    return problem
+
+
+def _varying(config: Config, observations: Observations, terms: Sequence[PriorTerm]) -> list[Varying]:
+    """Parameters and model errors that vary in time. Raises :class:`ConfigError`: knots that do not suit the
+    observations.
+    """
+    model, times, by_name = config.model, observations.times, {term.parameter.name: term for term in terms}
+    asked: list[tuple[tuple[str, ...], Callable[[], Varying | None]]] = [
+        (("parameters", e.parameter.name), partial(e.walk, model, by_name[e.parameter.name], times))
+        for e in config.parameters
+        if isinstance(e, Uncertain)
+    ]
+    asked += [
+        (("model_error", process.field.name), partial(process.changes, model, times)) for process in config.model_error
+    ]
+    varying: list[Varying] = []
+    for path, make in asked:
+        with config.document.placing(*path):
+            process = make()
+        varying += [] if process is None else [process]
+    return varying
+
+
+def _discrepancy(config: Config, observations: Observations) -> tuple[PriorTerm, ...]:
+    """Priors of the discrepancy that the observations allow for."""
+    asked = (
+        None if config.data is None else DataPlan.of(config.data, config.observable).series[0].data.error.discrepancy
+    )
+    if asked is None or not observations.noise.discrepant:
+        return ()
+    first, last = observations.span
+    parameters = discrepancy_parameters(config.model, config.observable)
+    return asked.terms(parameters, float(observations.values.max()), last - first)
+
+
+def data_files(plan: DataPlan) -> dict[str, DataFile]:
+    """Name of the data set → file: the file's stem, made unique by its folders, then by a number.
+
+    A name of its own (``data.name``) goes before. Data sets of one file have the name of their part behind its name.
+    Several series name as many files each: of one data set the first series gives the name, of several they have the
+    same names in every series.
+
+    Raises
+    ------
+    DataError: no file matches a pattern, or a file is named twice; series that do not go together.
+    """
+    files_of_series = [_files_of(series) for series in plan.series]
+    first, *others = files_of_series
+    if (own := plan.series[0].data.name) is not None:
+        if len(first) != 1:
+            raise DataError(f"name: {own} is that of one data set, and there are {len(first)}; leave it out")
+        first = {own: next(iter(first.values()))}
+    for series, files in zip(plan.series[1:], others, strict=True):
+        if len(files) != len(first) or (len(first) > 1 and files.keys() != first.keys()):
+            rest = [name for name in (*first, *files) if (name in first) != (name in files)]
+            raise DataError(
+                f"series {series.name} has {len(files)} data sets, {plan.series[0].name} has {len(first)}; each data "
+                f"set needs a file of the same name in every series{f'; not so {rest[0]}' if rest else ''}"
+            )
+    return {
+        name: replace(file, others=tuple(files.get(name) or next(iter(files.values())) for files in others))
+        for name, file in first.items()
+    }
+
+
+def _files_of(series: SeriesPlan) -> dict[str, DataFile]:
+    data = series.data
+    try:
+        files = find_files(data.path.base, data.path.texts)
+    except DataError as error:
+        raise DataError(str(error), series.name) from None
+    time = data.columns.time
+    return with_parts(files, data.columns.observable, data.layout, time.name if isinstance(time, Column) else None)
+
+
+def resolve_parameters(
+    config: Config | SequenceConfig, observations: Observations | None
+) -> tuple[tuple[PriorTerm, ...], dict[str, float]]:
+    """Prior terms and fixed values, evaluated on the data where they refer to them.
+
+    Raises
+    ------
+    ConfigError: every entry that cannot be evaluated, located in the file.
+    """
+    terms: list[PriorTerm] = []
+    fixed: dict[str, float] = {}
+    faults: list[Fault] = []
+    tied: list[Tied] = []
+    for entry in config.parameters:
+        path = ("parameters", entry.parameter.name)
+        try:
+            if isinstance(entry, Fixed):
+                fixed[entry.parameter.name] = entry.value
+            elif isinstance(entry, Uncertain):
+                terms.append(entry.term(_maximum(entry, config, observations)))
+            elif isinstance(entry, Tied):
+                tied.append(entry)
+            elif observations is None:
+                raise ConfigError("the value comes from the data file, and there is none; set a value")
+            else:
+                fixed[entry.parameter.name] = entry.value(observations.scalars, observations.source)
+        except ConfigError as error:
+            faults += config.document.placed(error, *path)
+        except UnitError as error:
+            faults.append(config.document.fault(path, str(error)))
+    for entry in tied:
+        if entry.to in fixed:
+            path = ("parameters", entry.parameter.name)
+            try:
+                fixed[entry.parameter.name] = inside_bounds(fixed[entry.to] * entry.factor, entry.parameter)
+            except ConfigError as error:
+                faults.append(config.document.fault(path, str(error)))
+    if faults:
+        raise ConfigError(faults)
+    return tuple(terms), fixed
+
+
+def _maximum(entry: Uncertain, config: Config | SequenceConfig, observations: Observations | None) -> float | None:
+    """The observed maximum in the parameter's unit, where the entry asks for it."""
+    if observations is None or not entry.needs_data:
+        return None
+    if observations.parts:
+        key = "mean" if entry.spec.mean == "maximum" else "median"
+        raise ConfigError("'maximum' is defined only for a single series without places; give a value", key)
+    return convert(float(observations.values.max()), config.observable.unit, entry.parameter.unit)

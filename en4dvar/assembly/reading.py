@@ -1,0 +1,187 @@
+"""From data files to observations: readings, window, clock, errors, weights and places of each series."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.config.context import Spread
+from en4dvar.config.data import Data
+from en4dvar.config.series import DataPlan, SeriesPlan
+from en4dvar.data.noise import Noise, noise_of
+from en4dvar.data.observations import Observations
+from en4dvar.data.series import Series, balanced
+from en4dvar.inputs.asked import Column, DataFile
+from en4dvar.inputs.readers import Readings, read_series
+from en4dvar.inputs.square import read_covariance
+from en4dvar.inputs.steps import step_doubts
+from en4dvar.inputs.window import select
+from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution
+from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.files import readable
+from en4dvar.plumbing.units import convert
+
+
+def read_observations(plan: DataPlan, file: DataFile, name: str, weights: str = "sum") -> Observations:
+    """The observations (y, t, R) of one data set inside the window. Raises :class:`DataError`."""
+    files = (file, *file.others)
+    series = []
+    for series_plan, where in zip(plan.series, files, strict=True):
+        try:
+            series.append(read_one(series_plan, where, fewest=series_plan.observable.fewest if plan.alone else 1))
+        except DataError as error:
+            raise DataError(str(error), series_plan.name) from None
+    observations = Observations.of_series(series, plan.correlation, name)
+    return observations if weights == "sum" else weighted(observations, weights)
+
+
+def weighted(observations: Observations, weights: str) -> Observations:
+    """The same with the weights of ``assimilation.weights``, ``mean`` or ``balanced``, on top of their own."""
+    own = observations.weights
+    if weights == "mean":
+        return replace(observations, weights=own / len(own))
+    groups = np.concatenate([np.full(p.end - p.begin, p.group, dtype=object) for p in observations.parts] or [own * 0])
+    return replace(observations, weights=balanced(own, groups.astype(str)))
+
+
+def read_one(plan: SeriesPlan, file: DataFile, fewest: int = 3) -> Series:
+    """One series inside its window. Raises :class:`DataError`."""
+    data, path = plan.data, file.path
+    read = _readings(data, file, fewest)
+    window = _window(data, read, path)
+    times, values = read.times[window], read.values[window]
+    zero = {"file": 0.0, "window": times[0]}.get(str(data.time_zero), data.time_zero)
+    times = times - float(zero)
+    if times[0] < 0:
+        raise DataError(f"{path}: the first observation used lies {-times[0]:g} before time zero; see data.time_zero")
+
+    def beside(column: Column | None) -> Array | None:
+        return read.errors[column.name][window] if column else None
+
+    def errors(part: slice) -> Noise:
+        stated = {key: read.errors[column.name][part] for key, column in _errors(data).items()}
+        return errors_of(data, read.times[part] - float(zero), values, np.arange(len(read.times))[part], stated)
+
+    try:
+        noise, whole = errors(window), slice(window.start, None)
+        weights, places = data.weights, data.places
+        if len(times) < fewest:
+            raise DataError(f"{len(times)} usable observations in the window; at least {fewest} are needed")
+        return Series(
+            observable=plan.observable,
+            times=times,
+            values=values,
+            noise=noise,
+            weights=weights.weights(times, values, data.window.prominence, beside(weights.column)) if weights else None,
+            name=plan.name,
+            group=plan.group,
+            places=places.places(len(times), beside(places.column)) if places else None,
+            source=readable(path),
+            scalars=read.scalars,
+            doubts=_doubts(data, read),
+            continued=(read.times[whole] - float(zero), read.values[whole], errors(whole))
+            if window.stop < len(read.times) and data.error.separate and not places
+            else None,
+        )
+    except (ValueError, DataError) as error:
+        words = str(error)
+        raise DataError(words if words.startswith(str(path)) else f"{readable(path)}: {words}") from None
+
+
+def _doubts(data: Data, read: Readings) -> tuple[Caution, ...]:
+    """Warnings about implausible times of a series, where the file states them."""
+    column, times = data.columns.time, np.unique(read.times)
+    if not isinstance(column, Column) or len(times) < 3:
+        return ()
+    return step_doubts(times, column.target, column.unit, read.scalars, column.rate)
+
+
+def _errors(data: Data) -> dict[str, Column]:
+    """The columns that hold errors of readings or times."""
+    time = data.columns.time
+    clock = time if isinstance(time, Column) else time.column
+    columns = {
+        "std": data.error.column("std", data.columns.observable.unit),
+        "time_std": data.error.column("time_std", clock.unit if clock else ""),
+    }
+    return {key: column for key, column in columns.items() if column}
+
+
+def _readings(data: Data, file: DataFile, fewest: int) -> Readings:
+    """All readings of the file, with the columns that belong to them."""
+    of_weights, of_places = data.weights and data.weights.column, data.places and data.places.column
+    further = [*_errors(data).values(), *(column for column in (of_weights, of_places) if column)]
+    return read_series(
+        file.path,
+        data.columns.time,
+        data.columns.observable,
+        data.layout,
+        further,
+        file.part,
+        repeats=data.places is not None,
+        fewest=fewest,
+    )
+
+
+def _window(data: Data, read: Readings, path: Path) -> slice:
+    """Which of the readings are used. Raises :class:`DataError` where none is."""
+    asked = data.window
+    try:
+        window = select(read.times, read.values, asked.start, asked.end, asked.prominence)
+    except DataError as error:
+        raise DataError(f"{path}: {error}{_span(read.times, data)}") from None
+    if not len(read.times[window]):
+        raise DataError(f"{path}: no observation lies in the window{_span(read.times, data)}")
+    return window
+
+
+def _span(times: Array, data: Data) -> str:
+    """Where the readings are, on the file's clock."""
+    column = data.columns.time
+    if not isinstance(column, Column):
+        return ""
+    first, last = convert(times[[0, -1]], column.target, column.unit)
+    return f"; the readings go from {first:g} to {last:g} {column.unit}"
+
+
+def errors_of(
+    data: Data, times: Array, values: Array, samples: npt.NDArray[np.intp], stated: Mapping[str, Array | None]
+) -> Noise:
+    """The observation errors at ``times`` (K,); ``samples`` (K,) are the places of the observations in the series.
+
+    ``values`` are those in the window. ``stated``: ``std`` and ``time_std`` (K,) where columns of the file hold them.
+
+    A covariance file holds one row an observation of the window, or one a usable sample of the whole series.
+    """
+    error, correlation = data.error, None
+    kernel = error.discrepancy.kernel_at(times) if error.discrepancy else None
+    timing = stated.get("time_std")
+    time_std = np.full(len(times), error.time_std) if timing is None else timing
+    if error.covariance is not None:
+        covariance = read_covariance(error.covariance)
+        if len(covariance) > samples[-1] and len(covariance) != len(times):
+            covariance = covariance[np.ix_(samples, samples)]
+        if len(covariance) != len(times):
+            raise DataError(f"{error.covariance.path}: {len(covariance)} rows, but {len(times)} observations")
+        std = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(std, std)
+        np.fill_diagonal(correlation, 1.0)
+        return noise_of(std, time_std, correlation, discrepancy=kernel)
+    if error.std is None:
+        raise ConfigError("data.error: neither a std nor a covariance")
+    if isinstance(error.std, Spread):
+        std = np.full(len(times), error.std.absolute(float(values.max())))
+    else:
+        read = stated["std"]
+        assert read is not None
+        std = read
+    if error.model_std is not None:
+        std = np.hypot(std, error.model_std.absolute(float(values.max())))
+    if error.correlation_time is not None:
+        correlation = np.exp(-np.abs(np.subtract.outer(times, times)) / error.correlation_time)
+    return noise_of(std, time_std, correlation, error.huber, kernel)

@@ -1,0 +1,1 @@
+"""Measured data: observations, the series they consist of, kinds of observation errors."""

@@ -1,0 +1,304 @@
+r"""Errors beside a discrepancy of the model that is correlated in time: y = m + δ + ε.
+
+With ε as of R = D C D and δ a Gaussian process of covariance A (:mod:`en4dvar.data.noise.kernel`), whose amplitude a
+and length ℓ are parameters, δ is marginalised: y − m has the covariance R + A = L Lᵀ, v = L⁻¹(y − m),
+
+    J_o = β [ ½ vᵀv + Σ ln(L_kk/std_k) ].
+
+With M_j = L⁻¹ ∂_j(R + A) L⁻ᵀ the score of a direction j that moves the covariance is ½ (vᵀM_j v − tr M_j), the Fisher
+information F_ij = ½ tr(M_i M_j) = Q Λ Qᵀ; rows √Λ Qᵀ of S with Qᵀ score/√Λ of d give both, beside the rows L⁻¹ ∂m.
+
+Sources: Kennedy & O'Hagan (2001), J. R. Stat. Soc. B 63, 425 (discrepancy); Mardia & Marshall (1984), Biometrika 71,
+135 (score and information).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from scipy.linalg import cho_solve, solve_triangular
+
+from en4dvar.data.noise.correlated import CorrelatedNoise, Correlation
+from en4dvar.data.noise.gaussian import Noise
+from en4dvar.data.noise.kernel import Kernel
+from en4dvar.data.noise.predicted import Linearisation, Predicted
+from en4dvar.data.noise.state_space import innovations
+from en4dvar.model.state import Array
+
+AT_ONCE = 1 << 15  # elements of covariance matrices in one call: they stay in the processor's cache
+BORDER = 1e300  # beside it every square of a whitened residual is nothing
+SAME = 1e-12  # relative eigenvalue of an information that counts as none
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A way to move R + A: derivatives ∂R and ∂A (K, K), and how far each of the coordinates moves along it (N,)."""
+
+    errors: Array
+    discrepancy: Array
+    coordinates: Array
+
+
+@dataclass(frozen=True)
+class DiscrepancyNoise(Noise):
+    """Gaussian errors, correlated where there is a ``correlation``, beside a discrepancy with a ``kernel``."""
+
+    kernel: Kernel
+    correlation: Correlation | None = None
+
+    discrepant: ClassVar[bool] = True
+
+    def check(self, weights: Array) -> None:
+        super().check(weights)
+        if self.correlation is not None:
+            self.correlation.check_size(len(weights))
+        if self.kernel.times.shape != weights.shape:
+            raise ValueError(f"the kernel of the discrepancy is that of {len(self.kernel.times)} observations")
+        if np.ptp(weights) > 0:
+            raise ValueError("a discrepancy needs one weight for all observations")
+
+    @property
+    def independent(self) -> bool:
+        return False
+
+    @property
+    def words(self) -> str:
+        return f"{', correlated' if self.correlation else ''} + discrepancy"
+
+    @property
+    def needs_rates(self) -> bool:
+        return self.timed or self.kernel.grows
+
+    def attributes(self) -> dict[str, float]:
+        grows = self.kernel.grows_beyond
+        return {"discrepancy_smoothness": self.kernel.smoothness, "discrepancy_grows_beyond": grows}
+
+    def matrices(self) -> dict[str, tuple[Array, str]]:
+        if self.correlation is None:
+            return {}
+        return {"correlation": (self.correlation.matrix, "correlation of the observation errors")}
+
+    def covariance_of_errors(self, predicted: Predicted) -> Array:
+        """R (…, K, K)."""
+        s = self.error_std(predicted)
+        c = np.eye(len(self.std)) if self.correlation is None else self.correlation.matrix
+        return np.asarray(s[..., :, None] * s[..., None, :] * c)
+
+    def covariance_of_discrepancy(self, predicted: Predicted) -> Array:
+        """A (…, K, K)."""
+        amplitude, length = self._amplitude_and_length(predicted)
+        a = amplitude[..., None] * self.kernel.growth(predicted.rates)
+        return np.asarray(a[..., :, None] * a[..., None, :] * self.kernel.correlation(length))
+
+    def total_std(self, predicted: Predicted) -> Array:
+        amplitude, _ = self._amplitude_and_length(predicted)
+        return np.hypot(self.error_std(predicted), amplitude[..., None] * self.kernel.growth(predicted.rates))
+
+    def frozen(self, predicted: Predicted) -> Noise:
+        covariance = self.covariance(predicted)
+        std = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(std, std)
+        np.fill_diagonal(correlation, 1.0)
+        return CorrelatedNoise(std, np.zeros_like(std), Correlation(0.5 * (correlation + correlation.T)))
+
+    def gaussian_at(self, values: Array, predicted: Predicted) -> DiscrepancyNoise:
+        """Gaussian errors that count each reading as these do at a prediction."""
+        return self
+
+    def drawn(self, predicted: Predicted, stream: np.random.Generator) -> Array:
+        root = np.linalg.cholesky(self.covariance_of_discrepancy(predicted))
+        missed = np.einsum("...ij,...j->...i", root, stream.standard_normal(predicted.values.shape))
+        drawn: Array = super().drawn(predicted, stream) + missed
+        return drawn
+
+    def explained(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
+        """Mean and std (K,) of δ given the residual at one prediction."""
+        covariance = self.covariance_of_discrepancy(predicted)
+        root = np.linalg.cholesky(self.covariance(predicted))
+        both = np.column_stack([values - predicted.values, covariance])
+        mean, *gain = (covariance @ cho_solve((root, True), both)).T
+        variance = np.diag(covariance) - np.diag(np.array(gain))
+        return mean, np.sqrt(np.maximum(variance, 0.0))
+
+    def continued(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
+        k = len(values)
+        total = self.covariance(predicted)
+        total[range(k), range(k)] += self._more_variance(values, predicted)
+        gain = cho_solve((np.linalg.cholesky(total[:k, :k]), True), total[:k, k:])
+        mean = predicted.values[k:] + (values - predicted.values[:k]) @ gain
+        variance = np.diag(total)[k:] - np.sum(total[:k, k:] * gain, axis=0)
+        return np.asarray(mean), np.asarray(np.sqrt(np.maximum(variance, self.error_std(predicted)[k:] ** 2)))
+
+    def _more_variance(self, values: Array, predicted: Predicted) -> Array:
+        """(K,) of readings that count less than the others; of the first K of those predicted."""
+        return np.zeros(len(values))
+
+    def whitened_residual(self, values: Array, predicted: Predicted) -> Array:
+        v, _ = self._innovations(values, predicted)
+        return v
+
+    def cost(self, values: Array, weights: Array, predicted: Predicted) -> Array:
+        v, roots = self._innovations(values, predicted)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            total = weights[0] * np.sum(0.5 * v * v + np.log(roots / self.std), axis=-1)
+        return np.where(np.isfinite(total), total, np.inf)
+
+    def log_likelihood(self, values: Array, predicted: Predicted) -> Array:
+        v, roots = self._innovations(values, predicted)
+        return np.asarray(-0.5 * v * v - np.log(roots) - self._log_norm())
+
+    def log_conditional(self, values: Array, predicted: Predicted) -> Array | None:
+        """Conditional densities of N(m, R + A), as for correlated errors; NaN where that is singular to rounding."""
+
+        def conditional(runs: Predicted) -> tuple[Array]:
+            try:
+                precision = np.linalg.inv(self.covariance(runs))
+            except np.linalg.LinAlgError:
+                return (np.full_like(runs.values, np.nan),)
+            scaled = np.einsum("bij,bj->bi", precision, values - runs.values)
+            own = np.diagonal(precision, axis1=1, axis2=2)
+            return (0.5 * (np.log(own) - scaled**2 / own) - self._log_norm(),)
+
+        log_conditional: Array = self._in_parts(predicted, 1, conditional)[0]
+        return log_conditional
+
+    def log_normalisation(self, weights: Array) -> float:
+        return float(np.sum(weights * (np.log(self.std) + self._log_norm())))
+
+    def whiten(self, values: Array, weights: Array, at: Linearisation) -> tuple[Array, Array]:
+        root = np.asarray(np.linalg.cholesky(self.covariance(at.prediction)), dtype=float)
+        residual = values - at.prediction.values
+        white = solve_triangular(root, np.column_stack([residual, at.anomalies.T]), lower=True)
+        v, directions = white[:, 0], self._directions(at)
+        changes = [both_sides(root, direction.errors + direction.discrepancy) for direction in directions]
+        score = np.array([0.5 * (v @ change @ v - np.trace(change)) for change in changes])
+        return augmented(weights, white, directions, changes, score)
+
+    def precision_times(self, values: Array, weights: Array, at: Predicted, vectors: Array) -> Array:
+        root = np.linalg.cholesky(self.covariance(at))
+        return np.asarray(weights[0] * cho_solve((root, True), vectors.T).T)
+
+    def _correlated(self, v: Array) -> Array:
+        return v if self.correlation is None else self.correlation.correlated(v)
+
+    def _amplitude_and_length(self, predicted: Predicted) -> tuple[Array, Array]:
+        if predicted.discrepancy is None:
+            raise ValueError("predictions lack amplitude and length of the discrepancy")
+        return np.asarray(predicted.discrepancy[..., 0]), np.asarray(predicted.discrepancy[..., 1])
+
+    def covariance(self, predicted: Predicted) -> Array:
+        """R + A (…, K, K)."""
+        return self.covariance_of_errors(predicted) + self.covariance_of_discrepancy(predicted)
+
+    def _directions(self, at: Linearisation) -> list[Direction]:
+        """Directions in which the covariance changes: the parameters of the errors, and the rates of each of the N
+        coordinates.
+        """
+        p = at.prediction
+        errors, discrepancy = self.covariance_of_errors(p), self.covariance_of_discrepancy(p)
+        directions, nothing = [], np.zeros_like(errors)
+        if at.log_scale_anomalies is not None:
+            directions.append(Direction(2 * errors, nothing, at.log_scale_anomalies))
+        if at.log_discrepancy_anomalies is not None:
+            amplitude, length = self._amplitude_and_length(p)
+            a = amplitude * self.kernel.growth(p.rates)
+            of_length = np.outer(a, a) * self.kernel.log_length_slope(length)
+            directions.append(Direction(nothing, 2 * discrepancy, at.log_discrepancy_anomalies[:, 0]))
+            directions.append(Direction(nothing, of_length, at.log_discrepancy_anomalies[:, 1]))
+        log_s = self._log_std_anomalies(replace(at, log_scale_anomalies=None))
+        if log_s is not None and p.rates is not None and at.rate_anomalies is not None:
+            log_g = self.kernel.log_growth_slope(p.rates) * at.rate_anomalies
+            for s, g, unit in zip(log_s, log_g, np.eye(len(log_s)), strict=True):
+                directions.append(Direction(errors * np.add.outer(s, s), discrepancy * np.add.outer(g, g), unit))
+        return directions
+
+    def _in_parts(self, predicted: Predicted, arrays: int, evaluate: Callable[[Predicted], Sequence[Array]]) -> Array:
+        """(arrays, …, K) of what ``evaluate`` gives of some of the runs at a time."""
+        runs = in_rows(predicted)
+        joined = np.empty((arrays, *runs.values.shape))
+        chunk = max(1, AT_ONCE // runs.values.shape[-1] ** 2)
+        for first in range(0, len(runs.values), chunk):
+            part = slice(first, first + chunk)
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                joined[:, part] = evaluate(runs[part])
+        return joined.reshape(arrays, *predicted.values.shape)
+
+    def _innovations(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
+        """v and the diagonal of L, (…, K) each; NaN where a prediction is not finite or R + A is all but singular."""
+        if self.correlation is None and self.kernel.ordered:
+            with np.errstate(over="ignore", invalid="ignore"):
+                runs = in_rows(predicted)
+                amplitude, length = self._amplitude_and_length(runs)
+                a = amplitude[:, None] * self.kernel.growth(runs.rates)
+                errors = self.error_std(runs) ** 2 + self.kernel.nugget * a**2
+                residual, errors, a = np.broadcast_arrays(values - runs.values, errors, a)
+                v, roots = innovations(residual, errors, a, length, self.kernel.steps, self.kernel.smoothness)
+            return v.reshape(predicted.values.shape), roots.reshape(predicted.values.shape)
+        v, roots = self._in_parts(predicted, 2, lambda runs: whitened(values - runs.values, self.covariance(runs)))
+        return v, roots
+
+
+def in_rows(predicted: Predicted) -> Predicted:
+    """The same with one leading dimension."""
+    k = predicted.values.shape[-1]
+    return Predicted(
+        predicted.values.reshape(-1, k),
+        None if predicted.rates is None else predicted.rates.reshape(-1, k),
+        None if predicted.noise_scale is None else np.asarray(predicted.noise_scale).reshape(-1),
+        None if predicted.discrepancy is None else predicted.discrepancy.reshape(-1, 2),
+    )
+
+
+def whitened(residuals: Array, covariances: Array) -> tuple[Array, Array]:
+    """L⁻¹r and the diagonal of L, each (B, K), for residuals (B, K) and covariances (B, K, K); NaN where there is no L.
+
+    The Cholesky factor of a covariance that is bordered by the residual has L⁻¹r as its last row.
+    """
+    count, k = residuals.shape
+    bordered = np.empty((count, k + 1, k + 1))
+    bordered[:, :k, :k] = covariances
+    bordered[:, k, :k] = bordered[:, :k, k] = residuals
+    bordered[:, k, k] = BORDER
+    known = np.isfinite(bordered).all(axis=(1, 2))
+    bordered[~known] = np.eye(k + 1)
+    try:
+        roots = np.linalg.cholesky(bordered)
+    except np.linalg.LinAlgError:
+        roots = np.stack([_root_or_nan(matrix) for matrix in bordered])
+    roots[~known] = np.nan
+    return roots[:, k, :k], np.diagonal(roots, axis1=1, axis2=2)[:, :k]
+
+
+def _root_or_nan(matrix: Array) -> Array:
+    try:
+        return np.asarray(np.linalg.cholesky(matrix), dtype=float)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
+
+
+def both_sides(root: Array, matrix: Array) -> Array:
+    """L⁻¹ B L⁻ᵀ of a symmetric B (K, K)."""
+    half = solve_triangular(root, matrix, lower=True)
+    return np.asarray(solve_triangular(root, half.T, lower=True))
+
+
+def augmented(
+    weights: Array, white: Array, directions: Sequence[Direction], changes: Sequence[Array], score: Array
+) -> tuple[Array, Array]:
+    """d and S of the whitened residual and anomalies (K, 1 + N), with the rows of what moves the covariance below."""
+    rows, side = _information_rows(changes, score)
+    moved = rows @ np.stack([direction.coordinates for direction in directions])
+    d, sensitivity = np.concatenate([white[:, 0], side]), np.concatenate([white[:, 1:], moved])
+    return np.sqrt(weights[0]) * d, np.sqrt(weights[0]) * sensitivity
+
+
+def _information_rows(changes: Sequence[Array], score: Array) -> tuple[Array, Array]:
+    """Rows (r, D) and their right-hand side (r,): rowsᵀrows is the information of D directions, rowsᵀside the score."""
+    flat = np.array([change.ravel() for change in changes])
+    values, vectors = np.linalg.eigh(0.5 * flat @ flat.T)
+    kept = values > SAME * values[-1]
+    root = np.sqrt(values[kept])
+    return root[:, None] * vectors[:, kept].T, (score @ vectors[:, kept]) / root

@@ -1,0 +1,224 @@
+"""Gaussian errors, independent of each other: the base of every kind, which says what differs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from en4dvar.data.noise.predicted import Linearisation, Predicted
+from en4dvar.model.state import Array
+
+
+@dataclass(frozen=True)
+class ScaleSkewness:
+    """Expected third derivatives of J_o along ln σ relative to informations (:mod:`en4dvar.descent.noise_scale`).
+
+    ``of_predictions`` r_m and ``of_scale`` r_u; ``information`` of ln σ in one observation.
+    """
+
+    of_predictions: float = 2.0
+    of_scale: float = 2.0
+    information: float = 2.0
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Gaussian errors, independent of each other: C = 1, ρ(v) = ½ v².
+
+    ``std`` (K,) > 0 in the observable's unit, ``time_std`` (K,) ≥ 0 of the observation times. Arguments of the methods:
+    observed values y (K,), weights β (K,), and predictions (…, K).
+    """
+
+    std: Array
+    time_std: Array
+
+    discrepant: ClassVar[bool] = False  # whether amplitude and length of a discrepancy belong to the parameters
+
+    def check(self, weights: Array) -> None:
+        """Raise :class:`ValueError` where the errors of K observations with these weights (K,) are not well defined."""
+        for key in ("std", "time_std"):
+            if np.shape(getattr(self, key)) != weights.shape:
+                raise ValueError(f"{key} has shape {np.shape(getattr(self, key))}, not {weights.shape}")
+        if not (np.all(self.std > 0) and np.all(self.time_std >= 0)):
+            raise ValueError("std must be positive, time_std not negative")
+
+    @property
+    def words(self) -> str:
+        """The kind of these errors in a summary, behind their std."""
+        return ""
+
+    @property
+    def independent(self) -> bool:
+        """Errors are independent of each other, so that each whitened row belongs to a single reading."""
+        return True
+
+    @cached_property
+    def timed(self) -> bool:
+        """True if any observation carries a timing error."""
+        return bool(np.any(self.time_std > 0))
+
+    @property
+    def needs_rates(self) -> bool:
+        """True if R depends on the rate of the observable."""
+        return self.timed
+
+    @cached_property
+    def plain(self) -> bool:
+        """True if J_o is ½ Σ β (y − m)²/std² as long as no noise scale is given."""
+        return type(self) is Noise and not self.timed
+
+    def error_std(self, predicted: Predicted) -> Array:
+        """Total observation-error std s (…, K)."""
+        rates, scale = predicted.rates, predicted.noise_scale
+        s = self.std if rates is None else np.asarray(np.hypot(self.std, rates * self.time_std))
+        return s if scale is None else np.asarray(s * np.asarray(scale)[..., None])
+
+    def total_std(self, predicted: Predicted) -> Array:
+        """Std (…, K) of y − m: that of the errors, with what a discrepancy adds."""
+        return self.error_std(predicted)
+
+    def continued(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
+        """Mean and std of the last M of K + M readings, given ``values`` (K,) of the first; one run (K + M,)."""
+        rest = slice(len(values), None)
+        return predicted.values[rest], self.error_std(predicted)[rest]
+
+    def frozen(self, predicted: Predicted) -> Noise:
+        """Errors whose std is that at a prediction and depends on no state any more."""
+        return replace(self, std=self.error_std(predicted), time_std=np.zeros_like(self.std))
+
+    def whitened_residual(self, values: Array, predicted: Predicted) -> Array:
+        """v = R^{-1/2}(y − m) (…, K); with correlated errors v_k holds what is new in y_k."""
+        return self._decorrelated((values - predicted.values) / self.error_std(predicted))
+
+    def drawn(self, predicted: Predicted, stream: np.random.Generator) -> Array:
+        """Readings (…, K) as they may come of predictions."""
+        errors = self._correlated(self._white(stream, predicted.values.shape))
+        return np.asarray(predicted.values + self.error_std(predicted) * errors)
+
+    def influence(self, residual: Array) -> Array:
+        """ρ'(v)/v (…, K) of whitened residuals, at most 1: how much of a Gaussian observation one counts."""
+        return np.ones_like(residual)
+
+    @property
+    def counts_within(self) -> float:
+        """Standard deviations within which an observation counts in full."""
+        return math.inf
+
+    def down_weights(self, values: Array, predicted: Predicted) -> Array | None:
+        """:meth:`influence` (K,) at a prediction; None where every observation counts in full in any case."""
+        return None
+
+    def explained(self, values: Array, predicted: Predicted) -> tuple[Array, Array] | None:
+        """Mean and std (K,) of the discrepancy given the residual at one prediction; None where there is none."""
+        return None
+
+    def squares(self, values: Array, predicted: Predicted) -> Array:
+        """v ρ'(v) (…, K): squared residuals, whose expectation is 1 under the density of ρ."""
+        v = self.whitened_residual(values, predicted)
+        return np.asarray(v * v * self.influence(v))
+
+    def cost(self, values: Array, weights: Array, predicted: Predicted) -> Array:
+        """J_o (…,) of predictions; +inf where one is not finite."""
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            terms = self._loss(self.whitened_residual(values, predicted))
+            if predicted.rates is not None or predicted.noise_scale is not None:
+                terms = terms + np.log(self.error_std(predicted) / self.std)
+            total = np.add.reduce(weights * terms, axis=-1)
+        return np.where(np.isfinite(total), total, np.inf)
+
+    def log_likelihood(self, values: Array, predicted: Predicted) -> Array:
+        """Normalised log density of each observation (…, K) in its own unit, unweighted (β = 1).
+
+        With correlated errors it is that of an observation given those before it, so that the sum is the joint density.
+        """
+        v = self.whitened_residual(values, predicted)
+        density = -self._loss(v) - np.log(self.error_std(predicted)) - self._log_norm()
+        return np.asarray(density - self._log_root())
+
+    def log_conditional(self, values: Array, predicted: Predicted) -> Array | None:
+        """Normalised log density (…, K) of each observation given all others; None where the errors have none."""
+        return self.log_likelihood(values, predicted)
+
+    def log_normalisation(self, weights: Array) -> float:
+        """The excess of −Σ β_k ln p(y_k) over J_o: Σ β_k ln(std_k √2π), with correlated errors + ½ β ln det C."""
+        return float(np.sum(weights * (np.log(self.std) + self._log_norm() + self._log_root())))
+
+    def whiten(self, values: Array, weights: Array, at: Linearisation) -> tuple[Array, Array]:
+        """Whitened innovation d (K',) and whitened anomalies S (K', N); K' = K, or 2K where s depends on the state."""
+        root_weight = np.sqrt(weights)
+        s = self.error_std(at.prediction)
+        z = (values - at.prediction.values) / s
+        v = self._decorrelated(z)
+        row = root_weight * np.sqrt(self.influence(v))
+        d, sensitivity = row * v, self._whitened_anomalies(row, s, at.anomalies)
+        log_s = self._log_std_anomalies(at)
+        if log_s is None:
+            return d, sensitivity
+        of_scale, scale_sensitivity = self._scale_rows(root_weight, z, v, log_s)
+        return np.concatenate([d, of_scale]), np.concatenate([sensitivity, scale_sensitivity])
+
+    def precision_times(self, values: Array, weights: Array, at: Predicted, vectors: Array) -> Array:
+        """β R⁻¹ applied to vectors (…, K), R at the prediction, the influence of each observation included."""
+        s = self.error_std(at)
+        return np.asarray(vectors * (weights * self.influence((values - at.values) / s) / s**2))
+
+    def scale_skewness(self) -> ScaleSkewness:
+        """Expected third derivatives of J_o along ln σ, on which the mean of ln σ depends."""
+        return ScaleSkewness()
+
+    def attributes(self) -> dict[str, float]:
+        """Numbers that say of which kind the errors are, for the record."""
+        return {}
+
+    def matrices(self) -> dict[str, tuple[Array, str]]:
+        """Matrices (K, K) that belong to the kind, for the record: name → values and what they are."""
+        return {}
+
+    def _white(self, stream: np.random.Generator, shape: tuple[int, ...]) -> Array:
+        """Draws of v."""
+        return stream.standard_normal(shape)
+
+    def _correlated(self, v: Array) -> Array:
+        """Lv (…, K)."""
+        return np.asarray(v)
+
+    def _decorrelated(self, z: Array) -> Array:
+        """L⁻¹z (…, K)."""
+        return np.asarray(z)
+
+    def _whitened_anomalies(self, row: Array, s: Array, anomalies: Array) -> Array:
+        """diag(row) L⁻¹ ∂m/s (K, N)."""
+        return np.asarray((row / s)[:, None] * anomalies.T)
+
+    def _scale_rows(self, root_weight: Array, z: Array, v: Array, log_s: Array) -> tuple[Array, Array]:
+        """The rows of d and S that belong to ln s, from anomalies ∂ln s (N, K): its score is v ρ'(v) − 1."""
+        root = math.sqrt(self.scale_skewness().information)
+        of_scale = root_weight * (self.influence(z) * z * z - 1) / root
+        return of_scale, root * root_weight[:, None] * log_s.T
+
+    def _log_std_anomalies(self, at: Linearisation) -> Array | None:
+        """∂ln s (N, K), or None where s is constant."""
+        total, rate = None, at.prediction.rates
+        if rate is not None and at.rate_anomalies is not None:
+            variance = self.error_std(Predicted(at.prediction.values, rate)) ** 2
+            total = (rate * self.time_std**2 / variance) * at.rate_anomalies
+        if at.log_scale_anomalies is not None:
+            scale = np.broadcast_to(at.log_scale_anomalies[:, None], at.anomalies.shape)
+            total = scale if total is None else total + scale
+        return None if total is None else np.asarray(total)
+
+    def _loss(self, v: Array) -> Array:
+        """ρ (…, K)."""
+        return 0.5 * v * v
+
+    def _log_norm(self) -> float:
+        """ln ∫ exp(−ρ(v)) dv."""
+        return 0.5 * math.log(2 * math.pi)
+
+    def _log_root(self) -> Array | float:
+        """ln L_kk (K,)."""
+        return 0.0

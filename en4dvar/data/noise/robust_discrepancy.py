@@ -1,0 +1,207 @@
+r"""Errors with heavy tails beside a discrepancy of the model.
+
+δ cannot be integrated out of Huber's density, so it is marginalised by Laplace's approximation at its mode,
+
+    J_o = β { min_δ [ Σ ρ((r − δ)/s) + ½ δᵀA⁻¹δ ] + ½ ln det(S²/κ + A) + ½ K ln κ − Σ ln std },     r = y − m,
+
+with the expected curvature κ = E[ρ''] in place of that at each reading, which jumps where one crosses the threshold. It
+is exact for Gaussian errors (c → ∞) and without a discrepancy. At the minimum u = A⁻¹δ = ρ'(v)/s with v = (r − δ)/s;
+u solves a quadratic problem in the box |u| ≤ c/s, found by Newton's method on who is at the edge (Hintermüller, Ito &
+Kunisch 2002, SIAM J. Optim. 13, 865). Then ∂J_o/∂m = −u, and rows of d and S are those of S²/w + A, w = ρ'(v)/v.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import cho_solve, solve_triangular
+
+from en4dvar.data.noise.correlated import CorrelatedNoise
+from en4dvar.data.noise.discrepancy import DiscrepancyNoise, augmented, both_sides, whitened
+from en4dvar.data.noise.huber import HuberNoise
+from en4dvar.data.noise.predicted import Linearisation, Predicted
+from en4dvar.model.state import Array
+
+NEWTON, REWEIGHTED = 30, 500  # iterations; the latter follow where the former go round in circles
+SETTLED = 1e-13  # change of a weight
+
+
+@dataclass(frozen=True)
+class RobustDiscrepancyNoise(DiscrepancyNoise):
+    """Independent errors with exponential tails beyond ``threshold`` std, beside a discrepancy."""
+
+    threshold: float = math.inf
+
+    @cached_property
+    def huber(self) -> HuberNoise:
+        """The same errors without a discrepancy."""
+        return HuberNoise(self.std, self.time_std, self.threshold)
+
+    def check(self, weights: Array) -> None:
+        super().check(weights)
+        self.huber.check(weights)
+
+    @property
+    def words(self) -> str:
+        return f"{self.huber.words} + discrepancy"
+
+    @property
+    def counts_within(self) -> float:
+        return self.threshold
+
+    def attributes(self) -> dict[str, float]:
+        return {**self.huber.attributes(), **super().attributes()}
+
+    def frozen(self, predicted: Predicted) -> CorrelatedNoise:
+        raise NotImplementedError("a robust cost is never frozen: its scheme searches")
+
+    def gaussian_at(self, values: Array, predicted: Predicted) -> DiscrepancyNoise:
+        root = np.sqrt(self._solved(values, predicted)[1])
+        return DiscrepancyNoise(self.std / root, self.time_std / root, self.kernel)
+
+    def down_weights(self, values: Array, predicted: Predicted) -> Array:
+        return self._solved(values, predicted)[1]
+
+    def explained(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
+        u, weights = self._solved(values, predicted)
+        covariance = self.covariance_of_discrepancy(predicted)
+        total = covariance + np.diag(self.error_std(predicted) ** 2 / weights)
+        variance = np.diag(covariance) - np.sum(covariance * np.linalg.solve(total, covariance), axis=0)
+        return covariance @ u, np.sqrt(np.maximum(variance, 0.0))
+
+    def _more_variance(self, values: Array, predicted: Predicted) -> Array:
+        first = slice(len(values))
+        kernel = replace(self.kernel, times=self.kernel.times[first])
+        rates = None if predicted.rates is None else predicted.rates[first]
+        within = replace(self, std=self.std[first], time_std=self.time_std[first], kernel=kernel)
+        there = replace(predicted, values=predicted.values[first], rates=rates)
+        return np.asarray(within.error_std(there) ** 2 * (1 / within.down_weights(values, there) - 1))
+
+    def cost(self, values: Array, weights: Array, predicted: Predicted) -> Array:
+        terms = self._terms(values, predicted)
+        with np.errstate(over="ignore", invalid="ignore"):
+            total = weights[0] * np.sum(terms - np.log(self.std), axis=-1)
+        return np.where(np.isfinite(total), total, np.inf)
+
+    def log_likelihood(self, values: Array, predicted: Predicted) -> Array:
+        """Shares of the observations (…, K): a division of the joint density; single terms have no meaning."""
+        return -self._terms(values, predicted) - self._log_norm()
+
+    def log_conditional(self, values: Array, predicted: Predicted) -> None:
+        """None: the joint density is an approximation that knows no reading by itself."""
+
+    def whiten(self, values: Array, weights: Array, at: Linearisation) -> tuple[Array, Array]:
+        p = at.prediction
+        u, light = self._solved(values, p)
+        s, discrepancy = self.error_std(p), self.covariance_of_discrepancy(p)
+        root = np.linalg.cholesky(np.diag(s**2 / light) + discrepancy)
+        expected = np.asarray(np.linalg.cholesky(np.diag(s**2 / self._curvature) + discrepancy), dtype=float)
+        white = solve_triangular(root, np.column_stack([values - p.values, at.anomalies.T]), lower=True)
+        directions = self._directions(at)
+        changes = [
+            both_sides(expected, direction.errors / self._curvature + direction.discrepancy) for direction in directions
+        ]
+        # u² s²/w is vρ'(v); half of the diagonal of ∂R over s² is ∂ln s
+        score = [
+            0.5 * (u @ direction.discrepancy @ u + u**2 / light @ np.diag(direction.errors) - np.trace(change))
+            for direction, change in zip(directions, changes, strict=True)
+        ]
+        return augmented(weights, white, directions, changes, np.array(score))
+
+    def precision_times(self, values: Array, weights: Array, at: Predicted, vectors: Array) -> Array:
+        _, light = self._solved(values, at)
+        total = np.diag(self.error_std(at) ** 2 / light) + self.covariance_of_discrepancy(at)
+        return np.asarray(weights[0] * cho_solve((np.linalg.cholesky(total), True), vectors.T).T)
+
+    @cached_property
+    def _curvature(self) -> float:
+        """κ."""
+        return self.huber.expected_curvature
+
+    def _white(self, stream: np.random.Generator, shape: tuple[int, ...]) -> Array:
+        return self.huber._white(stream, shape)
+
+    def _log_norm(self) -> float:
+        return self.huber._log_norm()
+
+    def _solved(self, values: Array, predicted: Predicted) -> tuple[Array, Array]:
+        """u and w (K,) at one prediction."""
+        s, covariance = self.error_std(predicted), self.covariance_of_discrepancy(predicted)
+        u, light = solve_boxed((values - predicted.values)[None], s[None], covariance[None], self.threshold)
+        return u[0], light[0]
+
+    def whitened_residual(self, values: Array, predicted: Predicted) -> Array:
+        """(S²/w + A)^{-1/2}(y − m) (…, K)."""
+
+        def of(runs: Predicted) -> tuple[Array, ...]:
+            residual, s, covariance = self._residual(values, runs)
+            _, light = solve_boxed(residual, s, covariance, self.threshold)
+            return whitened(residual, _with_diagonal(covariance, s**2 / light))
+
+        return np.asarray(self._in_parts(predicted, 2, of)[0])
+
+    def _terms(self, values: Array, predicted: Predicted) -> Array:
+        """Terms of J_o (…, K), β and ln std apart; NaN where a prediction is not finite."""
+
+        def of(runs: Predicted) -> tuple[Array, ...]:
+            residual, s, covariance = self._residual(values, runs)
+            u, _ = solve_boxed(residual, s, covariance, self.threshold)
+            delta = np.einsum("bij,bj->bi", covariance, u)
+            _, roots = whitened(residual, _with_diagonal(covariance, s**2 / self._curvature))
+            shrunk = np.log(roots) + 0.5 * math.log(self._curvature)
+            return (np.asarray(self.huber._loss((residual - delta) / s) + 0.5 * u * delta + shrunk),)
+
+        return np.asarray(self._in_parts(predicted, 1, of)[0])
+
+    def _residual(self, values: Array, runs: Predicted) -> tuple[Array, Array, Array]:
+        """y − m and s (B, K), A (B, K, K); NaN and one where either is not finite."""
+        residual = values - runs.values
+        s, covariance = np.broadcast_to(self.error_std(runs), residual.shape), self.covariance_of_discrepancy(runs)
+        broken = np.logical_not(np.isfinite(residual + s).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
+        residual[broken] = np.nan
+        return residual, np.where(broken[:, None], 1.0, s), np.where(broken[:, None, None], 0.0, covariance)
+
+
+def _with_diagonal(covariance: Array, diagonal: Array) -> Array:
+    """Covariances (B, K, K) with variances (B, K) added."""
+    total = covariance.copy()
+    where = np.arange(covariance.shape[-1])
+    total[:, where, where] += diagonal
+    return total
+
+
+def solve_boxed(residual: Array, s: Array, covariance: Array, threshold: float) -> tuple[Array, Array]:
+    """u = ρ'(v)/s (B, K) with s v + A u = r, and the weights ρ'(v)/v (B, K)."""
+    most, total, unit = threshold / s, _with_diagonal(covariance, s**2), np.eye(s.shape[1])
+    side, u = np.zeros_like(s), np.full_like(s, np.nan)
+    going = np.isfinite(residual).all(axis=1)
+    for _ in range(NEWTON):
+        if not going.any():
+            break
+        edge = side[going] != 0
+        matrix = np.where(edge[:, :, None], unit, total[going])
+        u[going] = np.linalg.solve(matrix, np.where(edge, side[going] * most[going], residual[going])[..., None])[
+            ..., 0
+        ]
+        errors = residual - np.einsum("bij,bj->bi", covariance, u)
+        moved = np.where(np.abs(errors) > threshold * s, np.sign(errors), 0.0)
+        going = going & np.any(moved != side, axis=1)
+        side = moved
+    for i in np.flatnonzero(going):
+        u[i] = _reweighted(residual[i], s[i], covariance[i], threshold)
+    errors = residual - np.einsum("bij,bj->bi", covariance, u)
+    return u, threshold * s / np.maximum(np.abs(errors), threshold * s)
+
+
+def _reweighted(residual: Array, s: Array, covariance: Array, threshold: float) -> Array:
+    """The same u (K,) by iteratively reweighted least squares, which never fails to descend."""
+    weights, u = np.ones_like(s), np.zeros_like(s)
+    for _ in range(REWEIGHTED):
+        u = np.asarray(np.linalg.solve(np.diag(s**2 / weights) + covariance, residual), dtype=float)
+        before, weights = weights, threshold * s / np.maximum(np.abs(residual - covariance @ u), threshold * s)
+        if np.max(np.abs(weights - before)) < SETTLED:
+            break
+    return u

@@ -1,0 +1,220 @@
+"""Observations (y, t, R) of one data set: of one observable in time, or of several series, one after the other.
+
+The error of observation k is ``s_k² = std_k² + (ẏ_k · time_std_k)²``: a measured value and, where given, the instant
+it was measured at. With ``time_std`` the variance depends on the state through the rate ẏ, so the normalisation
+``ln s_k`` belongs to the cost and the Gauss–Newton step is Fisher scoring (see :mod:`en4dvar.data.noise`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.data.noise import Linearisation, Noise, Predicted, joint_noise
+from en4dvar.data.series import Part, Series
+from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution
+from en4dvar.plumbing.errors import DataError
+from en4dvar.priors.prior import LARGEST
+
+SEVERAL = ", "  # between the names of several sources
+SAME_TIME = 1e-9  # of the whole duration: times of different series that are this close are the same instant
+
+
+@dataclass(frozen=True)
+class Observations:
+    """One data set.
+
+    Attributes
+    ----------
+    times: (K,) in the model's time unit (seconds for the bubble), from the model's time zero; strictly increasing
+        within a series, of a field not decreasing.
+    values: (K,) finite, in the observable's unit.
+    noise: the observation errors (:func:`en4dvar.data.noise.noise_of` makes them of std, timing error and correlation).
+    weights: (K,) β_k ≥ 0; 1 counts an observation fully (``weights: sum``), 1/K is ``weights: mean``.
+    name: of the data set. source: where it was read from (for the record).
+    scalars: further numbers found beside the series (e.g. an equilibrium radius), as read, no units applied.
+    doubts: what makes the times of the file implausible.
+    parts: which readings belong to which series, see :meth:`of_series`; () where all are of one observable, which has
+        one value at a time.
+    continued: these readings and those after the window, which are predicted; None where there are none.
+
+    Raises
+    ------
+    DataError: shapes do not fit, fewer than 3 observations, or one of the above does not hold.
+    """
+
+    times: Array
+    values: Array
+    noise: Noise
+    weights: Array
+    name: str = "data"
+    source: str = ""
+    scalars: Mapping[str, float] = field(default_factory=dict)
+    doubts: tuple[Caution, ...] = ()
+    parts: tuple[Part, ...] = ()
+    continued: Observations | None = None
+
+    @classmethod
+    def of_series(
+        cls,
+        series: Sequence[Series],
+        correlation: Mapping[tuple[str, str], float] | None = None,
+        name: str = "data",
+    ) -> Self:
+        """Several series as one data set, their readings one series after the other.
+
+        Parameters
+        ----------
+        correlation: of the errors of two series at equal times, by their names, in either order; see
+            :func:`en4dvar.data.noise.make_noise`.
+
+        Raises
+        ------
+        DataError: names that are not unique, or that ``correlation`` mentions and no series has; errors that cannot be
+            joined; what is wrong with the observations.
+        """
+        names = [readings.name for readings in series]
+        if len(set(names)) < len(names):
+            raise DataError(f"{name}: two series have the same name; the names are {', '.join(names)}")
+        between = np.eye(len(series))
+        for (a, b), value in (correlation or {}).items():
+            if a == b or not {a, b} <= set(names):
+                raise DataError(f"{name}: a correlation of {a!r} and {b!r}; it is of two of: {', '.join(names)}")
+            i, j = names.index(a), names.index(b)
+            between[i, j] = between[j, i] = value
+        times = [readings.times for readings in series]
+        times = _same_instants(times) if len(times) > 1 else times
+        try:
+            noise = (
+                joint_noise(times, [readings.noise for readings in series], between)
+                if len(series) > 1
+                else series[0].noise
+            )
+        except ValueError as error:
+            raise DataError(f"{name}: {error}") from None
+        more = series[0].continued if len(series) == 1 else None
+        ends = np.cumsum([len(t) for t in times]).tolist()
+        parts = tuple(
+            Part(readings.name, readings.observable, end - len(readings.times), end, readings.places, readings.group)
+            for readings, end in zip(series, ends, strict=True)
+        )
+        return cls(
+            times=np.concatenate(times),
+            values=np.concatenate([readings.values for readings in series]),
+            noise=noise,
+            weights=np.concatenate([np.asarray(readings.weights) for readings in series]),
+            name=name,
+            source=SEVERAL.join(dict.fromkeys(readings.source for readings in series if readings.source)),
+            scalars={key: value for readings in series for key, value in readings.scalars.items()},
+            doubts=tuple(doubt for readings in series for doubt in readings.doubts),
+            parts=() if len(series) == 1 and series[0].places is None else parts,
+            continued=None if more is None else cls(*more, np.ones(len(more[0])), name),
+        )
+
+    def __post_init__(self) -> None:
+        where, k = self.source or self.name, len(self.times)
+        for key in ("values", "weights"):
+            if np.shape(getattr(self, key)) != (k,):
+                raise DataError(f"{where}: {key} has shape {np.shape(getattr(self, key))}, not ({k},)")
+        if k < 1:
+            raise DataError(f"{where}: no usable observation in the window")
+        if not (np.all(np.isfinite(self.times)) and np.all(np.isfinite(self.values))):
+            raise DataError(f"{where}: observations must be finite")
+        largest = float(np.max(np.abs([self.times, self.values])))
+        if not largest < LARGEST:
+            raise DataError(f"{where}: {largest:g} among the observations; is the unit right? (less than {LARGEST:g})")
+        self._check_order(where)
+        if not np.all(self.weights >= 0):
+            raise DataError(f"{where}: weights must not be negative")
+        try:
+            self.noise.check(self.weights)
+        except ValueError as error:
+            raise DataError(f"{where}: {error}") from None
+        smallest, std = float(self.std.min()), float(self.std.max())
+        if not (std < LARGEST and largest < LARGEST * smallest and smallest * LARGEST > 1):
+            raise DataError(
+                f"{where}: an error std of {smallest if std < LARGEST else std:g} beside observations up to "
+                f"{largest:g}: their ratio is too large; is the unit right?"
+            )
+
+    def _check_order(self, where: str) -> None:
+        """Raise :class:`DataError` where the times of a series do not increase."""
+        for begin, end, field_ in [(p.begin, p.end, p.places) for p in self.parts] or [(0, len(self), None)]:
+            step = np.diff(self.times[begin:end])
+            wrong = np.flatnonzero(step <= 0 if field_ is None else step < 0)
+            if len(wrong):
+                a, b = self.times[begin:end][wrong[0] : wrong[0] + 2]
+                raise DataError(f"{where}: times must increase; {a:g} is followed by {b:g}")
+
+    @cached_property
+    def instants(self) -> tuple[Array, npt.NDArray[np.intp] | slice]:
+        """The times (T,), each once and increasing, and where among them each reading (K,) was taken."""
+        if not self.parts:
+            return self.times, slice(None)
+        times, rows = np.unique(self.times, return_inverse=True)
+        return times, rows
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last time."""
+        times, _ = self.instants
+        return float(times[0]), float(times[-1])
+
+    @property
+    def std(self) -> Array:
+        """(K,) error std of the readings alone."""
+        return self.noise.std
+
+    @cached_property
+    def used(self) -> npt.NDArray[np.intp]:
+        """Which have a weight β > 0."""
+        return np.flatnonzero(self.weights > 0)
+
+    def cost(self, predicted: Predicted) -> Array:
+        """J_o (…,) of predictions (…, K); +inf where one is not finite."""
+        return self.noise.cost(self.values, self.weights, predicted)
+
+    def log_likelihood(self, predicted: Predicted) -> Array:
+        """Normalised log density of each observation (…, K) in its own unit, unweighted."""
+        return self.noise.log_likelihood(self.values, predicted)
+
+    def log_conditional(self, predicted: Predicted) -> Array | None:
+        """Log density of each observation given all others (…, K), unweighted; None where the errors have none."""
+        return self.noise.log_conditional(self.values, predicted)
+
+    def log_normalisation(self) -> float:
+        """The amount by which −Σ β_k ln p(y_k) exceeds J_o."""
+        return self.noise.log_normalisation(self.weights)
+
+    def whiten(self, at: Linearisation) -> tuple[Array, Array]:
+        """Whitened innovation d (K',) and whitened anomalies S (K', N); see :meth:`en4dvar.data.noise.Noise.whiten`."""
+        return self.noise.whiten(self.values, self.weights, at)
+
+    def precision_times(self, at: Predicted, vectors: Array) -> Array:
+        """β R⁻¹ applied to vectors (…, K), R at a prediction."""
+        return self.noise.precision_times(self.values, self.weights, at, vectors)
+
+    def chi2_per_observation(self, predicted: Predicted) -> Array:
+        """(y − m)ᵀR⁻¹(y − m) per observation with β > 0 (…,), for predictions (…, K); NaN where there is none.
+
+        With a robust cost each square is v ρ'(v), whose expectation under the density of ρ is 1 as well.
+        """
+        squares = self.noise.squares(self.values, predicted).take(self.used, axis=-1)
+        return np.asarray(np.add.reduce(squares, axis=-1) / (len(self.used) or np.nan))
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+
+def _same_instants(times: Sequence[Array]) -> list[Array]:
+    """The times of each series; those that differ by rounding alone are made equal to the earliest of them."""
+    every = np.unique(np.concatenate(times))
+    begins = np.diff(every, prepend=-np.inf) > SAME_TIME * float(np.ptp(every))
+    earliest = every[begins][np.cumsum(begins) - 1]
+    return [earliest[np.searchsorted(every, own)] for own in times]

@@ -1,0 +1,284 @@
+"""Single checks: pure functions, each silent where there is nothing to say."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from statistics import median
+
+import numpy as np
+
+from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.diagnosis.diagnostics import (
+    EMULATED_ENOUGH,
+    HARDLY_INFORMED,
+    MEAN_OFF,
+    SPREAD_OFF,
+    chi2_interval,
+    shape_warnings,
+)
+from en4dvar.diagnosis.residuals import Residuals
+from en4dvar.model.forward import ValidityLimit
+from en4dvar.model.state import Array, Parameter
+from en4dvar.plumbing.caution import Caution, Severity, caution
+from en4dvar.plumbing.units import convert
+from en4dvar.priors.prior import Prior
+
+SAME_DIRECTION = 1e-8  # relative singular value below which anomalies do not span a direction
+NEAR = 0.05  # of the width of an interval
+PILED_UP = 0.2  # share of members near a bound
+ODD = 1e-3  # probability below which residuals are told to be odd
+BEYOND = 0.1  # share of members beyond a limit of the model
+MOVED, WIDENED = 0.3, 0.5  # mean in prior std, relative variance: beyond, a posterior is not its prior
+SERIOUS: Severity = "serious"
+THERE = 0.25  # of the errors' std: a discrepancy beyond it in nearly all members is there
+NINE_OF_TEN = (0.05, 0.95)
+SILENT = 0.1  # DFS of all readings beyond it that count as none
+EXTRAPOLATED = "no action is needed for the parameters; paths beyond the limit are extrapolated"
+Findings = Iterator[Caution]
+
+
+def rank(prior: Prior, members: Array, posterior: Array) -> Findings:
+    """Ensembles (N, n), (N', n) whose anomalies span fewer directions than there are parameters."""
+    n = members.shape[1]
+    spanned = _rank((members - members.mean(axis=0)) / prior.std)
+    if spanned < n:
+        words = f"the {len(members)} prior members span {spanned} of {n} directions"
+        yield caution(
+            "rank-deficient", f"{words}: the posterior cannot move in the others and its spread there is zero"
+        )
+    elif len(posterior) <= n:
+        words = f"{len(posterior)} members of the posterior are alive, too few for the covariance of {n} parameters"
+        yield caution("rank-deficient", words)
+
+
+def fit(chi2: float, n_observations: int, total_dfs: float) -> Findings:
+    """A residual χ² (the sum over the observations) that R does not explain.
+
+    At the minimum its expectation is K − DFS, not K (Talagrand 1999): the fit has absorbed DFS of the noise.
+    """
+    degrees = max(1.0, n_observations - total_dfs)
+    low, high = chi2_interval(degrees)
+    words = f"χ² of the residuals is {chi2:.3g} where about {degrees:.3g} is expected"
+    if not chi2 <= high:
+        yield caution("misfit", f"{words}: the model does not explain the data within the stated observation error")
+    elif chi2 < low:
+        words = f"{words}: the stated observation error is larger than the scatter of the data"
+        yield caution("overstated-error", words)
+
+
+def structure(residuals: Residuals | None, robust: bool, unit: str, times: Array) -> Findings:
+    """Residuals that are not the independent numbers of one variance that they should be.
+
+    Each probability is that of a finding at least as odd where model, prior and errors are right; :data:`ODD` keeps all
+    together below half a per cent. ``times`` (K,) of all observations in ``unit``.
+    """
+    if residuals is None or not residuals.enough:
+        return
+    runs, expected = residuals.runs
+    chance = min(residuals.lag_one_chance, residuals.runs_chance)
+    if chance < ODD:
+        words = (
+            f"the residuals have a structure in time: their lag-1 autocorrelation is {residuals.lag_one:.2f}, and they "
+            f"have {runs} runs of one sign where about {expected:.0f} are expected (probability {_chance(chance)} "
+            "where the model is right): error bars are those of independent errors"
+        )
+        # what is missed moves an estimate by no more than |e| of its standard deviations
+        small = float(residuals.white @ residuals.white) < 1
+        yield caution("residual-structure", words, "caution" if small else None)
+    if residuals.collapse_chance < ODD:
+        words = (
+            "the residuals are larger where the observable changes fast (probability "
+            f"{_chance(residuals.collapse_chance)} where the errors are as stated): the times or the model err there"
+        )
+        yield caution("odd-residuals", words)
+    if not robust and residuals.outlier[1] < ODD:
+        which, probability = residuals.outlier
+        place = int(np.flatnonzero(residuals.which == which)[0])
+        words = (
+            f"the reading at {times[which]:.4g} {unit} is {abs(residuals.studentised[place]):.1f} standard deviations "
+            f"off (probability {_chance(probability)}); its leverage is {residuals.leverage[place]:.0%}"
+        )
+        yield caution("odd-residuals", words)
+
+
+def missed(analysis: Analysis) -> Findings:
+    """A discrepancy that is there: what the residuals show of it widens the intervals, what parameters absorbed does
+    not.
+    """
+    names, amplitude = analysis.problem.prior.names, next(iter(analysis.problem.discrepancy), None)
+    if amplitude is None or amplitude.name not in names:
+        return
+    low, high = np.nanquantile(analysis.posterior[:, names.index(amplitude.name)], NINE_OF_TEN)
+    error = float(np.median(analysis.error_std))
+    if low > THERE * error:
+        sizes = convert(np.array([low, high, error]), amplitude.unit, amplitude.display_unit)
+        least, most, noise = (shown(size, amplitude) for size in sizes)
+        words = (
+            f"the model misses the readings by {least} to {most} (standard deviation of the discrepancy, 5 to 95 %), "
+            f"beside errors of {noise}: the intervals allow for what shows in the residuals, not for what the "
+            "parameters have absorbed"
+        )
+        yield caution("discrepancy-found", words)
+
+
+def _chance(probability: float) -> str:
+    return f"{probability:.1g}" if probability > 1e-6 else "below 1e-6"
+
+
+def conflict(prior: Prior, centre: Array) -> Findings:
+    """A posterior centre (n,) far from the prior: 2 J_b beyond the 99.95 % point of χ²_n."""
+    z, white = (centre - prior.mean) / prior.std, prior.white(centre)
+    if float(white @ white) <= chi2_interval(len(z))[1]:
+        return
+    worst = np.argsort(-np.abs(z))
+    far = [j for j in worst if abs(z[j]) > 2] or worst[:1]
+    places = "; ".join(_far(prior, z, j) for j in far)
+    yield caution("prior-conflict", f"prior and data conflict: the minimum lies far from the prior mean ({places})")
+
+
+def _far(prior: Prior, z: Array, j: int) -> str:
+    """Where the minimum lies and where the prior does, in the display unit."""
+    term, p = prior.terms[j], prior.parameters[j]
+    at = prior.mean[j] + prior.std[j] * np.array([z[j], -1.0, 1.0])
+    value, low, high = convert(term.to_physical(at), p.unit, p.display_unit)
+    return (
+        f"{p.name} at {shown(value, p)} where the prior says {low:.3g} to {shown(high, p)}: {z[j]:+.1f} prior standard "
+        "deviations"
+    )
+
+
+def shown(value: float, p: Parameter) -> str:
+    """A value in the display unit, with that unit."""
+    return f"{value:.3g} {p.display_unit}".removesuffix(" 1")
+
+
+def at_bound(prior: Prior, members: Array, posterior: Array, failures: Sequence[str]) -> Findings:
+    """Posterior members that pile up at a bound: within 5 % of the interval's width (of a half-line's, the prior std).
+
+    Members that failed because the parameter left its bounds count as piled up. A lognormal has no bound to pile up
+    at: zero is infinitely far in ln θ. The prior's own share near the bound is no finding, three times it is.
+    """
+    for j, (term, parameter) in enumerate(zip(prior.terms, prior.parameters, strict=True)):
+        low, high = term.bounds if term.has_bound else parameter.bounds
+        if term.transform == "lognormal":
+            low = -math.inf
+        if math.isinf(low) and math.isinf(high):
+            continue
+        before, after = term.to_physical(members[:, j]), term.to_physical(posterior[:, j])
+        width = high - low if math.isfinite(high - low) else float(before.std())
+        outside = np.array([reason.startswith(f"{parameter.name} outside") for reason in failures], dtype=bool)
+        for bound, side, sign in ((low, "lower", 1), (high, "upper", -1)):
+            if not math.isfinite(bound):
+                continue
+            near = sign * (after - bound) <= NEAR * width
+            share = float(np.mean(near & (outside | (sign * (after - bound) >= 0))))
+            usual = float(np.mean(sign * (before - bound) <= NEAR * width))
+            if share >= PILED_UP and share > 3 * usual:
+                words = f"{share:.0%} of the posterior members of {parameter.name} pile up at its {side} bound"
+                at = shown(convert(bound, parameter.unit, parameter.display_unit), parameter)
+                yield caution("at-bound", f"{words} ({at})", parameters=(parameter.name,))
+
+
+def validity(limits: Sequence[ValidityLimit], extremes: Array, since: Array, times: Array, leverage: Array) -> Findings:
+    """Posterior members (N, V) whose path leaves what the model's equations assume, ``since`` (N, V) when.
+
+    Serious where readings that lie beyond inform: ``leverage`` (K,) at ``times`` (K,) is the share of each in its own
+    prediction, and sums to the DFS of the data. A bubble at rest after its collapse, say, tells nothing.
+    """
+    for v, limit in enumerate(limits if extremes.size else ()):
+        reached = extremes[:, v]
+        beyond = reached > limit.value
+        if np.mean(beyond) <= BEYOND:
+            continue
+        unit = "" if limit.unit == "1" else f" {limit.unit}"
+        words = (
+            f"{beyond.sum()} of {len(reached)} posterior members leave the model's validity: {limit.label} reaches "
+            f"{np.max(reached):.3g}{unit} (median {median(reached.tolist()):.3g}), the limit is "
+            f"{limit.value:g}{unit}"
+        )
+        later = np.mean(times >= since[:, v, None], axis=0) > BEYOND
+        informed = float(leverage[later].sum())
+        words += f"; {later.sum()} of {len(times)} readings lie beyond, with {informed:.2g} of {leverage.sum():.2g} DFS"
+        if informed > SILENT:
+            yield caution("model-validity", words)
+        else:
+            yield replace(caution("model-validity", words, "note"), advice=EXTRAPOLATED)
+
+
+def information(prior: Prior, posterior: Array, per_parameter: Array, silent: Collection[str] = ()) -> Findings:
+    """Parameters of which the data say little: neither spread nor mean of the posterior (N, n) differ from the prior's.
+
+    ``per_parameter`` (n,) is 1 − posterior over prior variance. Nothing is said of ``silent`` names: their members
+    may not be the posterior, or they need not be informed.
+    """
+    moved = np.abs(posterior.mean(axis=0) - prior.mean) / prior.std
+    for name, value, far in zip(prior.names, per_parameter, moved, strict=True):
+        if name not in silent and -WIDENED < value < HARDLY_INFORMED and far < MOVED:
+            words = f"{name} is hardly informed by the data (DFS {value:.2f}): its posterior is close to its prior"
+            yield caution("not-informed", words, parameters=(name,))
+
+
+def gaussian(prior: Prior, members: Array, shape: Mapping[str, float]) -> Findings:
+    """Members (N, n), physical and alive, whose mean or spread are not the posterior's.
+
+    Sizes are those of the numbers that are printed, for G of G and not of ln G: ``shape`` holds mean and std of the
+    emulated posterior. The finding is about the parameters that are off, and serious where one is off by much.
+    """
+    if not (words := shape_warnings(shape)):
+        return
+    sizes, off, severity = [], [], None
+    believed = shape.get("emulator_fit", 0.0) >= EMULATED_ENOUGH
+    for j, p in enumerate(prior.parameters if believed else ()):
+        std = shape.get(f"emulated_std_{p.name}", math.nan)
+        shift = (float(members[:, j].mean()) - shape.get(f"emulated_mean_{p.name}", math.nan)) / std
+        ratio = float(members[:, j].std(ddof=1)) / std
+        if abs(shift) > MEAN_OFF or abs(ratio - 1) > SPREAD_OFF:
+            off.append(p.name)
+            sizes.append(_both(p, members[:, j], shape))
+            if abs(shift) > 1 or not 0.5 < ratio < 2:
+                severity = SERIOUS
+    more = f": {'; '.join(sizes)}" if sizes else ""
+    yield caution("non-gaussian", f"{words[0]}{more}", severity, tuple(off))
+
+
+def _both(p: Parameter, members: Array, shape: Mapping[str, float]) -> str:
+    """Mean ± std of the members and of the emulated posterior, in the display unit."""
+    si = (members.mean(), members.std(ddof=1), shape[f"emulated_mean_{p.name}"], shape[f"emulated_std_{p.name}"])
+    mean, std, estimate, spread = (convert(float(v), p.unit, p.display_unit) for v in si)
+    unit = "" if p.display_unit == "1" else f" {p.display_unit}"
+    return f"{p.name} = {mean:.2g} ± {std:.2g}{unit} where it should be about {estimate:.2g} ± {spread:.2g}{unit}"
+
+
+def down_weighted(analysis: Analysis, most: int = 6) -> Findings:
+    """Observations that a robust cost counts less; ``most`` of them are listed."""
+    weights, observations, model = analysis.down_weights, analysis.problem.observations, analysis.problem.model
+    if weights is None or not np.any(weights < 1):
+        return
+    lighter = np.flatnonzero(weights < 1)
+    times = convert(observations.times, model.time_unit, model.time_display_unit)
+    worst = lighter[np.argsort(weights[lighter], kind="stable")]
+    listed = ", ".join(f"{times[k]:.4g} {model.time_display_unit} (weight {weights[k]:.2g})" for k in worst[:most])
+    more = f" and {len(worst) - most} more" if len(worst) > most else ""
+    words = (
+        f"{len(worst)} of {len(weights)} observations lie beyond {observations.noise.counts_within:g} standard "
+        f"deviations and were down-weighted (Huber): {listed}{more}"
+    )
+    yield caution("down-weighted", words)
+
+
+def weighted(analysis: Analysis) -> Findings:
+    """Weights other than 0, which leaves a reading out, and 1, which counts it once."""
+    weights = analysis.problem.observations.weights
+    odd = weights[(weights != 0) & (weights != 1)]
+    if len(odd):
+        low, high = float(odd.min()), float(odd.max())
+        span = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+        words = f"{len(odd)} of {len(weights)} observations count with weights of {span}"
+        yield caution("not-bayesian", f"{words}: the intervals are not those of the Bayesian posterior")
+
+
+def _rank(anomalies: Array) -> int:
+    values = np.linalg.svd(anomalies, compute_uv=False)
+    return int(np.sum(values > SAME_DIRECTION * values[0])) if values.size and values[0] > 0 else 0

@@ -1,0 +1,203 @@
+"""The checks: what an assimilation ended with → warnings, the worst first. Nothing is run and nothing recomputed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.diagnosis.diagnostics import UNSEEN, active_members
+from en4dvar.diagnosis.honesty import checks
+from en4dvar.diagnosis.honesty.lost import loss
+from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import CATALOGUE, Caution, caution, untrusted, worst_first
+from en4dvar.plumbing.units import convert
+from en4dvar.priors.prior import Prior
+from en4dvar.problem import InverseProblem
+
+COLLAPSED = 1 / 9  # of the mean of 2 (J − J_min) per parameter: a spread below a third of what J allows
+SHORT_STEP = 0.5  # posterior standard deviations
+OTHER_KERNEL = (
+    "the discrepancy has another shape than its kernel: try data.error.discrepancy.kernel: matern-3/2, or "
+    "grows_beyond, and compare the evidence"
+)
+NO_SPREAD = 1e-8  # of the prior's: members that agree to rounding
+
+
+@dataclass(frozen=True)
+class ControlEnsembles:
+    """The ensembles of an analysis as control vectors, that is in transformed space, and J of the posterior.
+
+    N members, n parameters. ``costs`` (N,) are +inf where a member failed, and None of a localised scheme, whose J is
+    not that of these members; whole fields are no part of it.
+    """
+
+    prior: Array  # (N, n)
+    posterior: Array  # (N, n)
+    centre: Array  # (n,)
+    costs: Array | None
+    centre_cost: float
+
+
+def examine(
+    analysis: Analysis,
+    control: ControlEnsembles,
+    worst_loss: Sequence[str] = (),
+    earlier: tuple[Caution, ...] = (),
+) -> tuple[Caution, ...]:
+    """Everything that should keep a reader from trusting the posterior, or that they should know, worst first.
+
+    ``worst_loss`` (N,) are the reasons of failure, "" for a member alive, in the iteration that lost most; ``earlier``
+    are warnings met on the way.
+    """
+    a, prior = analysis, analysis.problem.prior
+    alive = active_members(a.posterior_failures)
+    odd = _structure(a)
+    members = a.posterior[alive]
+    warnings = (
+        *earlier,
+        *a.problem.observations.doubts,
+        *doubts(a.problem, a.prior, a.prior_predictions),
+        *checks.down_weighted(a),
+        *checks.weighted(a),
+        *unfinished(a),
+        *_whole(prior, control, alive),
+        *loss("prior forecast", a.prior_failures, prior, control.prior),
+        *loss("iterations", worst_loss, prior),
+        *loss("posterior forecast", a.posterior_failures, prior, control.posterior),
+        *_fit(a, odd),
+        *odd,
+        *checks.missed(a),
+        *(checks.conflict(prior, control.centre) if control.costs is not None else ()),
+        *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
+        *_validity(a, alive),
+        *checks.gaussian(prior, members, a.shape),
+    )
+    silent = {name for name in prior.names if untrusted(warnings, name)} | _changes(a) | _beside(a)
+    little = checks.information(prior, control.posterior[alive], a.dfs_per_parameter, silent)
+    return worst_first((*warnings, *little))
+
+
+def _whole(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool_]) -> checks.Findings:
+    """Warnings about the directions and the size of an ensemble that stands for the whole covariance."""
+    if control.costs is not None:
+        yield from checks.rank(prior, control.prior, control.posterior[alive])
+        yield from collapse(prior, control, alive)
+
+
+def _changes(a: Analysis) -> set[str]:
+    """Names of the changes of parameters that vary, of which data may say little."""
+    return {term.parameter.name for change in a.problem.varying for term in change.terms}
+
+
+def _beside(a: Analysis) -> set[str]:
+    """Names of what is known from elsewhere (density, scale, …), where the model names the parameters of its path.
+
+    Readings need not inform them; the split of the error bar says what they cost.
+    """
+    asked = set(a.problem.model.path_parameters)
+    return set(a.problem.prior.names) - asked if asked else set()
+
+
+def doubts(problem: InverseProblem, members: Array, predicted: Array) -> Sequence[Caution]:
+    """The model's doubts about the observations, serious ones where it does not say.
+
+    Beside prior ``members`` (N, n), physical, and their predictions (N, K), NaN where one failed.
+    """
+    y, alive = problem.observations, np.all(np.isfinite(predicted), axis=1)
+    values = {name: np.full(alive.sum(), value) for name, value in problem.fixed.items()}
+    values |= dict(zip(problem.prior.names, members[alive].T, strict=True))
+    return [
+        doubt if isinstance(doubt, Caution) else caution("implausible-data", doubt)
+        for part in problem.parts
+        for doubt in problem.model.doubts(
+            part.observable.name, y.times[part.where], y.values[part.where], predicted[alive, part.where], values
+        )
+    ]
+
+
+def _structure(a: Analysis) -> tuple[Caution, ...]:
+    model, observations = a.problem.model, a.problem.observations
+    times = convert(observations.times, model.time_unit, model.time_display_unit)
+    robust = math.isfinite(observations.noise.counts_within)
+    warnings = tuple(checks.structure(a.residuals, robust, model.time_display_unit, times))
+    return tuple(_allowed(c, OTHER_KERNEL) for c in warnings) if a.discrepancy else warnings
+
+
+def _allowed(finding: Caution, advice: str) -> Caution:
+    """A finding about what the model misses, where an estimated discrepancy allows for that: no veto of intervals."""
+    return replace(finding, advice=advice, severity="caution" if finding.severity == "serious" else finding.severity)
+
+
+def _validity(a: Analysis, alive: npt.NDArray[np.bool_]) -> checks.Findings:
+    """Without a linearisation every reading that counts is taken to inform."""
+    limits, observations, residuals = a.problem.model.validity, a.problem.observations, a.residuals
+    which, leverage = (
+        (observations.used, np.ones(len(observations.used)))
+        if residuals is None
+        else (residuals.which, residuals.leverage)
+    )
+    if limits:
+        beyond = checks.validity(limits, a.extremes[alive], a.beyond[alive], observations.times[which], leverage)
+        yield from (_allowed(c, c.advice) for c in beyond) if a.discrepancy else beyond
+
+
+def _fit(a: Analysis, odd: Sequence[Caution]) -> checks.Findings:
+    """The size of the residuals; where they have a structure that no discrepancy explains, no scale of the errors is
+    offered as a cure.
+    """
+    last, n_used = a.iterations[-1], len(a.problem.observations.used)
+    structured = any(c.code == "residual-structure" for c in odd)
+    for warning in checks.fit(last.chi2_per_observation * n_used, n_used, last.dfs):
+        if structured and not a.problem.discrepancy and warning.code == "overstated-error":
+            warning = replace(warning, advice=CATALOGUE["residual-structure"][1])
+        yield warning
+
+
+def unfinished(analysis: Analysis) -> checks.Findings:
+    """Iterations that stopped before their own criterion; a note where the next step would have been short, or members
+    were drawn from the posterior itself afterwards, and nothing where no user would see it.
+
+    Draws and chains warn of themselves where they are too few, or find a lower J. A gradient regressed over the
+    ensemble need not vanish where J is smallest, so that variant often ends like this.
+    """
+    step_norm = analysis.iterations[-1].step_norm  # of the next step, had there been one
+    if analysis.converged or step_norm <= UNSEEN:
+        return
+    words = f"not converged: {analysis.stop_reason}"
+    if analysis.refinement:
+        words = f"the search for the minimum has {words}; members are drawn from the posterior itself, wherever that is"
+        yield replace(caution("not-converged", words, "note"), advice="no action is needed")
+    elif step_norm <= SHORT_STEP:
+        words = f"{words}; the next step would be {step_norm:.2g} posterior standard deviations"
+        advice = "no action is needed where this is little to you; else start again from another seed"
+        yield replace(caution("not-converged", words, "note"), advice=advice)
+    else:
+        yield caution("not-converged", words)
+
+
+def collapse(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool_]) -> checks.Findings:
+    """A spread far below what J allows: for a Gaussian posterior 2 (J − J_min) of its members is χ²_n, with mean n.
+
+    The lowest J met, of a member or of the centre, stands for the minimum.
+    """
+    assert control.costs is not None
+    costs = control.costs
+    alive = alive & np.isfinite(costs)
+    if alive.sum() < 2:
+        return
+    narrow = control.posterior[alive].std(axis=0) <= NO_SPREAD * prior.std
+    if narrow.any():
+        names = ", ".join(name for name, no_spread in zip(prior.names, narrow, strict=True) if no_spread)
+        words = f"the ensemble has collapsed: all members have the same {names}"
+        yield caution("ensemble-collapse", words, parameters=tuple(names.split(", ")))
+        return
+    lowest = min(control.centre_cost, float(costs[alive].min()))
+    allowed = float(np.mean(2 * (costs[alive] - lowest))) / len(control.centre)
+    if allowed < COLLAPSED:
+        words = f"its spread is about {math.sqrt(allowed):.2g} of what the data and the prior allow"
+        yield caution("ensemble-collapse", f"the ensemble has collapsed: {words}")

@@ -1,0 +1,160 @@
+r"""The residuals of a fit, compared with independent numbers of one variance, which they should be.
+
+Whitened residuals e (K,) at the minimum of J are not independent even where model, prior and R are right: the fit has
+absorbed a part of the noise. In the linear Gaussian case they are N(0, Q),
+
+    Q = I − S A⁻¹ Sᵀ,     A = (N−1) I + SᵀS,
+
+so that a ratio eᵀFe/eᵀe, which knows no scale, exceeds what was found with the probability that a quadratic form of
+known eigenvalues is positive (Imhof 1961, Biometrika 48, 419; Durbin & Watson 1971, ibid. 58, 1). The diagonal of I − Q
+is the leverage of each reading: the share of itself in its own prediction.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.model.state import Array
+
+FEWEST = 8  # readings below which nothing is said
+MOST = 500  # of them are looked at, evenly chosen blocks would tell no more
+FREQUENCIES = np.expm1(np.linspace(np.log1p(1e-4), np.log1p(400.0), 700))
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals of the K readings that count: whitened ``white`` e (K,), what the fit ``absorbed`` of their noise,
+    L (K, r) with I − Q = L Lᵀ, and the ``speed`` |ṁ| (K,) of the observable there, of several series in units of their
+    errors. ``which`` (K,) are their places in the data; ``series`` (K,) labels those among which neighbours follow each
+    other in time.
+    """
+
+    white: Array
+    absorbed: Array
+    speed: Array
+    which: npt.NDArray[np.intp]
+    series: npt.NDArray[np.intp]
+
+    @classmethod
+    def of(
+        cls,
+        white: Array,
+        sensitivity: Array,
+        prior_precision: float,
+        speed: Array,
+        which: npt.NDArray[np.intp],
+        series: npt.NDArray[np.intp] | None = None,
+    ) -> Residuals:
+        """From whitened sensitivities S (K, r), all rows of which take part in A, and N − 1.
+
+        ``white`` (K',) and ``sensitivity`` (K'', r) are those of the observations and, below, of what moves R.
+        """
+        k = len(speed)
+        hessian = prior_precision * np.eye(sensitivity.shape[1]) + sensitivity.T @ sensitivity
+        absorbed = np.linalg.solve(np.linalg.cholesky(hessian), sensitivity[:k].T).T
+        labels = np.zeros(k, dtype=np.intp) if series is None else series
+        return cls(white[:k][which], absorbed[which], speed[which], which, labels[which])
+
+    @cached_property
+    def leverage(self) -> Array:
+        """(K,) share of each reading in its own prediction."""
+        return np.asarray(np.sum(self.absorbed**2, axis=1))
+
+    @cached_property
+    def expected(self) -> Array:
+        """Q (K, K); of many readings it would fill the memory."""
+        return np.eye(len(self.white)) - self.absorbed @ self.absorbed.T
+
+    @cached_property
+    def studentised(self) -> Array:
+        """Residuals (K,) over their own expected std."""
+        return np.asarray(self.white / np.sqrt(np.maximum(1 - self.leverage, 1e-12)))
+
+    @property
+    def enough(self) -> bool:
+        """True if there is anything to be said."""
+        return FEWEST <= len(self.white) <= MOST and bool(np.all(np.isfinite(self.white)) and np.any(self.white))
+
+    @cached_property
+    def follows(self) -> npt.NDArray[np.bool_]:
+        """(K − 1,) whether a reading follows the one before it in the same series."""
+        return np.asarray(self.series[1:] == self.series[:-1])
+
+    @cached_property
+    def lag_one(self) -> float:
+        """Autocorrelation of neighbours, Σ e_k e_{k+1}/Σ e²."""
+        return float((self.white[1:] * self.follows) @ self.white[:-1] / (self.white @ self.white))
+
+    @cached_property
+    def lag_one_chance(self) -> float:
+        """Probability of so high an autocorrelation where the model is right; 1 where no reading follows another."""
+        if not self.follows.any():
+            return 1.0
+        neighbours = np.diag(self.follows.astype(float), k=1)
+        return self._chance(0.5 * (neighbours + neighbours.T))
+
+    @cached_property
+    def runs(self) -> tuple[int, float]:
+        """Runs of one sign, and how many are expected of independent residuals."""
+        positive = self.white > 0
+        n, above = len(positive), int(positive.sum())
+        changes, share = (positive[1:] != positive[:-1]) & self.follows, float(self.follows.mean())
+        return 1 + int(np.sum(changes)), 1 + 2 * above * (n - above) / n * share
+
+    @cached_property
+    def runs_chance(self) -> float:
+        """Probability of so few runs, by the normal approximation (Wald & Wolfowitz 1940, Ann. Math. Stat. 11, 147);
+        1 where no reading follows another."""
+        if not self.follows.any():
+            return 1.0
+        count, expected = self.runs
+        n = len(self.white)
+        variance = (expected - 1) * (expected - 2) / (n - 1)
+        return 0.5 * math.erfc((expected - count - 0.5) / math.sqrt(2 * variance)) if variance > 0 else 1.0
+
+    @cached_property
+    def collapse_chance(self) -> float:
+        """Probability of residuals that are so much larger where the observable moves fast."""
+        ranks = np.argsort(np.argsort(self.speed)).astype(float)
+        return self._chance(np.diag(ranks - ranks.mean())) if np.ptp(self.speed) > 0 else 1.0
+
+    @cached_property
+    def outlier(self) -> tuple[int, float]:
+        """The reading of the largest studentised residual, its place in the data, and the probability of one so large.
+
+        Of u = Q^{-1/2}e, independent normal numbers, each studentised residual is a projection, so that its square over
+        uᵀu is Beta(½, (K − 1)/2); times K for the largest of them (Bonferroni).
+        """
+        from scipy.special import betainc
+
+        k, worst = len(self.white), int(np.argmax(np.abs(self.studentised)))
+        total = float(self.white @ np.linalg.solve(self.expected, self.white))
+        share = min(1.0, float(self.studentised[worst] ** 2) / total)
+        return int(self.which[worst]), min(1.0, k * float(1 - betainc(0.5, (k - 1) / 2, share)))
+
+    def _chance(self, form: Array) -> float:
+        """P(xᵀFx/xᵀx ≥ eᵀFe/eᵀe) for x ~ N(0, Q)."""
+        ratio = float(self.white @ form @ self.white / (self.white @ self.white))
+        values, vectors = np.linalg.eigh(self.expected)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        return positive_chance(np.linalg.eigvalsh(root.T @ (form - ratio * np.eye(len(form))) @ root))
+
+
+def positive_chance(weights: Array) -> float:
+    """P(Σ λ_k z_k² > 0) of independent normal z for weights λ (K,), by Imhof's integral.
+
+    >>> round(positive_chance(np.array([1.0, -1.0])), 6), round(positive_chance(np.array([1.0, 1.0, -1.0])), 4)
+    (0.5, 0.7071)
+    """
+    scaled = weights / np.max(np.abs(weights))
+    u = FREQUENCIES
+    angle = 0.5 * np.arctan(np.outer(u, scaled)).sum(axis=1)
+    size = np.exp(0.25 * np.log1p(np.outer(u, scaled) ** 2).sum(axis=1))
+    integrand = np.sin(angle) / (u * size)
+    area = float(np.trapezoid(integrand, u)) + float(u[0]) * 0.5 * float(scaled.sum())
+    return min(1.0, max(0.0, 0.5 + area / math.pi))

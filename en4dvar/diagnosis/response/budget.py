@@ -1,0 +1,65 @@
+r"""What an error bar is made of: errors of the readings, what the model misses, how well other numbers are known.
+
+A posterior that is Gaussian, of covariance C beside a prior of covariance B = diag(b_j), follows the prior's mean by
+C B⁻¹. So that part of the variance of parameter i which comes from what was known of parameter j before is
+
+    (C B⁻¹)_ij² b_j = C_ij² / b_j,
+
+and the rest of C_ii comes from the readings. Of a number that the readings hardly tell, C_jj ≈ b_j, it is the squared
+correlation with it: what would go if that number were known exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.diagnosis.diagnostics import active_members
+from en4dvar.model.state import Array
+
+READINGS, MISSED, OWN = "the errors of the readings", "what the model misses", "its own prior"
+TOLD = 0.03  # share from which a source is named
+
+
+def shares_of_priors(posterior: Array, prior_variance: Array) -> Array:
+    """(n, n): the share of parameter i's variance that comes from the prior of parameter j.
+
+    ``posterior`` (N, n) and ``prior_variance`` (n,), both transformed; parameters independent before.
+    """
+    covariance = np.atleast_2d(np.cov(posterior.T))
+    return np.asarray(covariance**2 / (prior_variance * np.diag(covariance)[:, None]))
+
+
+def budget(a: Analysis, name: str) -> Mapping[str, float]:
+    """Sources of the variance of a parameter, transformed, the largest first, and their shares; they sum to one.
+
+    Empty where parameters were correlated before, or too few members are alive.
+    """
+    prior, alive = a.problem.prior, active_members(a.posterior_failures)
+    if prior.blocks or alive.sum() <= len(prior.names):
+        return {}
+    i = prior.names.index(name)
+    of_priors = shares_of_priors(prior.from_physical(a.posterior[alive]), prior.std**2)[i]
+    of_priors = of_priors / max(1.0, of_priors.sum())  # rounding and sampling may exceed the whole
+    shares = {OWN if j == i else other: float(of_priors[j]) for j, other in enumerate(prior.names)}
+    rest, missed = 1.0 - float(of_priors.sum()), 0.0
+    if a.discrepancy is not None:
+        errors, discrepancy, _ = a.discrepancy.shares[i]
+        missed = float(discrepancy / (errors + discrepancy)) if errors + discrepancy > 0 else 0.0
+    shares |= {READINGS: rest * (1 - missed), MISSED: rest * missed}
+    return dict(sorted(shares.items(), key=lambda source: -source[1]))
+
+
+def budget_words(a: Analysis, name: str) -> str:
+    """The budget of a parameter in a line, and which number to know better first; "" where there is none."""
+    sources = budget(a, name)
+    named = [f"{share:.0%} {source}" for source, share in sources.items() if share >= TOLD]
+    if not named:
+        return ""
+    line = f"variance of {name}: {', '.join(named)}"
+    first = next(iter(sources))
+    if first in a.problem.prior.names:
+        return f"{line}; know {first} better first"
+    return line

@@ -1,0 +1,167 @@
+"""The response to a wrong assumption: where the posterior would lie, for each alternative that the model offers.
+
+The first run of an alternative, at the mode, gives the linear response. Unless that is small anyway each further one,
+where it leads, corrects it with the same tangent (a chord iteration), until what it changes is small in every
+parameter. An alternative that does not settle within :data:`MOST_RUNS` is beyond linear response, and said to be: only
+a fit tells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from en4dvar.diagnosis.response.linear import LinearResponse
+from en4dvar.ensemble.forecast import Composite
+from en4dvar.executor import Executor
+from en4dvar.model.forward import Alternative
+from en4dvar.model.state import Array
+from en4dvar.problem import InverseProblem
+
+MOST_RUNS = 6  # of one alternative
+SETTLED = 0.1  # of each parameter's shift, and of its std: a correction below one of them counts as small
+FAR = 3.0  # posterior standard deviations that a parameter of R may move: further away a chord seems to settle anywhere
+SMALL = 0.3  # posterior standard deviations of a first step that is believed without a second
+
+
+@dataclass(frozen=True)
+class Shift:
+    """Where the posterior would go under the alternative ``name``; ``words`` complete "if …".
+
+    ``change`` (n,) of the mode in physical SI values, ``relative`` (n,) to the mode where a parameter cannot be
+    negative (else NaN), ``in_std`` (n,) in transformed space per posterior standard deviation. ``cost_change``: J there
+    minus J of the fit, positive where the data speak against the alternative. Where linear response does not tell,
+    these are NaN and ``reason`` says why. ``runs``: forward runs it took.
+    """
+
+    name: str
+    words: str
+    change: Array
+    relative: Array
+    in_std: Array
+    cost_change: float
+    runs: int
+    reason: str = ""
+
+    @property
+    def settled(self) -> bool:
+        return not self.reason
+
+    @property
+    def largest(self) -> float:
+        """The largest shift in posterior standard deviations; one that cannot be told counts as an error bar."""
+        return float(np.max(np.abs(self.in_std))) if self.settled else 1.0
+
+    @property
+    def exceeds(self) -> bool:
+        """True if a parameter goes, or may go, beyond its error bar."""
+        return self.largest > 1 or not self.settled
+
+
+def what_if(
+    problem: InverseProblem, response: LinearResponse, std: Array, cost: float, executor: Executor
+) -> tuple[Shift, ...]:
+    """The shifts of all alternatives of the problem's model: the largest first, then those unknown, then small ones.
+
+    ``std`` (n,) of the posterior, transformed; ``cost`` J at ``response.at``. A scale that is estimated has an
+    uncertainty of its own.
+    """
+    if not response.defined or not np.all(std > 0):
+        return ()
+    offered = [
+        alternative
+        for alternative in problem.alternatives
+        if alternative.values == 1.0 or not problem.has_reading_scale
+    ]
+    shifts = [_shift(problem, response, std, cost, executor, alternative) for alternative in offered]
+    return tuple(sorted(shifts, key=lambda shift: -shift.largest))
+
+
+def changed_problem(problem: InverseProblem, alternative: Alternative) -> InverseProblem:
+    """The problem under an alternative, but for the centres of priors; see :func:`prior_shift`."""
+    o = problem.observations
+    noise = replace(
+        o.noise, std=abs(alternative.values) * o.noise.std, time_std=abs(alternative.times) * o.noise.time_std
+    )
+    observations = replace(o, values=alternative.values * o.values, times=alternative.times * o.times, noise=noise)
+    fixed = {name: value * alternative.parameters.get(name, 1.0) for name, value in problem.fixed.items()}
+    return replace(problem, model=alternative.model or problem.model, observations=observations, fixed=fixed)
+
+
+def prior_shift(problem: InverseProblem, factors: Sequence[tuple[str, float]]) -> Array:
+    """Change (n,) of the prior's mean, transformed, when the physical value there is multiplied by ``factors``."""
+    prior = problem.prior
+    centre = prior.to_physical(prior.mean)
+    moved = centre.copy()
+    for name, factor in factors:
+        if name in prior.names:
+            moved[prior.names.index(name)] *= factor
+    return np.asarray(prior.from_physical(moved) - prior.mean)
+
+
+def _shift(
+    problem: InverseProblem,
+    response: LinearResponse,
+    std: Array,
+    cost: float,
+    executor: Executor,
+    alternative: Alternative,
+) -> Shift:
+    runs, unknown = 0, np.full(len(std), np.nan)
+    about = alternative.name, _words(problem, alternative)
+    try:
+        changed = changed_problem(problem, alternative)
+        of_prior = prior_shift(problem, tuple(alternative.parameters.items()))
+        composite = Composite(changed, executor)
+    except Exception as error:  # a model may offer what does not suit the problem; the reason is kept
+        return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be set up: {error}")
+    moved, reason, before = np.zeros(len(std)), "beyond linear response", np.inf
+    of_errors = np.array([name in problem.of_errors for name in problem.prior.names])
+    for attempt in range(MOST_RUNS):
+        if attempt == 0 and _same_run(problem, changed):
+            predicted = response.linear.prediction
+        else:
+            run = composite((response.at + moved)[None])
+            runs += 1
+            if run.failures[0] and attempt:  # where linear response led
+                break
+            if run.failures[0]:
+                return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be run: {run.failures[0]}")
+            predicted = run.predicted[0]
+        misfit = float(changed.observations.cost(predicted))
+        if not np.isfinite(misfit):  # parameters of R can be led where it cannot be factored
+            break
+        step, decrease = response.step(changed.observations, predicted, moved, of_prior)
+        moved = moved + step
+        correction = float(np.max(np.abs(step / std)))
+        small = SETTLED * np.maximum(1.0, np.abs(moved / std)) if attempt else np.full(len(std), SMALL)
+        if np.all(np.abs(step / std) <= small):
+            reason = ""
+        if not reason or correction > before:
+            break
+        before = correction
+    if np.any(np.abs(moved / std)[of_errors] > FAR):
+        reason = "beyond linear response"
+    if reason:
+        return Shift(*about, unknown, unknown, unknown, np.nan, runs, reason)
+    prior = problem.prior
+    z = prior.white_change(response.at + moved - step - prior.mean - of_prior)
+    there = 0.5 * float(z @ z) + misfit - decrease
+    mode, positive = prior.to_physical(response.at), prior.bounds[0] >= 0
+    change = prior.to_physical(response.at + moved) - mode
+    relative = np.divide(change, mode, out=unknown.copy(), where=positive & (mode > 0))
+    return Shift(*about, change, relative, moved / std, there - cost, runs)
+
+
+def _same_run(problem: InverseProblem, changed: InverseProblem) -> bool:
+    """True if the changed problem predicts the same, so that the run at the mode is known."""
+    same_times = np.array_equal(problem.observations.times, changed.observations.times)
+    return changed.model is problem.model and same_times and changed.fixed == problem.fixed
+
+
+def _words(problem: InverseProblem, alternative: Alternative) -> str:
+    """Those of the alternative; a parameter that is estimated is what the prior says of it."""
+    estimated = any(name in problem.prior.names for name in alternative.parameters)
+    return f"the prior said that {alternative.words}" if estimated else alternative.words

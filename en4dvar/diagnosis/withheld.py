@@ -1,0 +1,80 @@
+r"""The readings after the window, which the estimate has not seen: what it expects of them, and how that came out.
+
+Member i of the posterior, run on to the last reading, expects of a later one N(m_i + δ_i, s_i²), with what the
+residuals in the window say of the discrepancy there and of the errors
+(:meth:`~en4dvar.data.noise.Noise.continued`). The mixture over members has the distribution function
+
+    F(y) = (1/N) Σ_i Φ((y − m_i − δ_i)/s_i),
+
+whose 5 and 95 % quantiles are a band that a reading lies in with a chance of 90 %, if model, errors and posterior are
+right. Nothing was fitted to these readings: how many of them lie in their bands is the one test of a real experiment
+that no choice of priors or errors has passed beforehand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import ndtr
+
+from en4dvar.ensemble.forecast import Composite
+from en4dvar.executor import Executor
+from en4dvar.model.state import Array
+from en4dvar.problem import InverseProblem
+
+BAND = (0.05, 0.95)
+BISECTIONS = 50
+
+
+@dataclass(frozen=True)
+class Withheld:
+    """Readings ``values`` (K,) at ``times`` (K,) after the window, and 5, 50 and 95 % of what was expected (K,).
+
+    In the units of the model and of the observable. ``runs``: forward runs it took.
+    """
+
+    times: Array
+    values: Array
+    low: Array
+    median: Array
+    high: Array
+    runs: int
+
+    @property
+    def inside(self) -> float:
+        """The share of the readings that lie in their 90 % bands."""
+        return float(np.mean((self.low <= self.values) & (self.values <= self.high)))
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the readings less the medians, in the observable's unit."""
+        return float(np.sqrt(np.mean((self.values - self.median) ** 2)))
+
+
+def predict_withheld(problem: InverseProblem, members: Array, executor: Executor) -> Withheld | None:
+    """What posterior ``members`` (N, n), transformed, expect of the readings after the window.
+
+    None where there are none, or fewer than two members can be run so far.
+    """
+    within, whole = problem.observations, problem.observations.continued
+    if whole is None:
+        return None
+    run = Composite(replace(problem, observations=whole), executor)(members)
+    begin, alive = len(within), np.flatnonzero(np.isfinite(run.predicted.values).all(axis=1))
+    if len(alive) < 2:
+        return None
+    expected = [whole.noise.continued(within.values, run.predicted[int(i)]) for i in alive]
+    mean, std = (np.stack(part) for part in zip(*expected, strict=True))
+    low, median, high = (_quantile(mean, std, level) for level in (BAND[0], 0.5, BAND[1]))
+    return Withheld(whole.times[begin:], whole.values[begin:], low, median, high, len(members))
+
+
+def _quantile(mean: Array, std: Array, level: float) -> Array:
+    """(K,) of the mixture of Gaussians of equal weight with these means and standard deviations (N, K)."""
+    low, high = (mean - 8 * std).min(axis=0), (mean + 8 * std).max(axis=0)
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        below = ndtr((middle - mean) / std).mean(axis=0) < level
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return np.asarray(0.5 * (low + high))

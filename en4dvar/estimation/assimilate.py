@@ -1,0 +1,162 @@
+"""One data set from its prior ensemble to the posterior and its predictions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from en4dvar.descent.window import Descent
+from en4dvar.diagnosis import diagnostics as diag
+from en4dvar.diagnosis.analysis import Analysis, Progress
+from en4dvar.diagnosis.honesty import ControlEnsembles, examine
+from en4dvar.diagnosis.response.ledger import ledger
+from en4dvar.diagnosis.response.what_if import what_if
+from en4dvar.diagnosis.withheld import predict_withheld
+from en4dvar.ensemble.forecast import Forecast, cost, forecast, log_posterior
+from en4dvar.estimation import conclusions
+from en4dvar.estimation.conclusions import Ensembles
+from en4dvar.estimation.localised import assimilate_localised
+from en4dvar.estimation.loop_state import Keep, LoopState
+from en4dvar.estimation.stages import Sampled, Stages
+from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
+from en4dvar.plumbing.caution import caution
+from en4dvar.plumbing.errors import TooFewMembersError
+from en4dvar.problem import InverseProblem
+from en4dvar.sampling.refine import mode_cautions, that_count
+from en4dvar.schemes.settings import AssimilationSettings
+
+__all__ = ["LoopState", "assimilate", "cost", "forecast", "log_posterior"]
+
+
+def assimilate(
+    problem: InverseProblem,
+    settings: AssimilationSettings,
+    seed: int,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+    resume: LoopState | None = None,
+    keep: Keep | None = None,
+) -> Analysis:
+    """Estimate the parameters of one data set.
+
+    Parameters
+    ----------
+    seed: of every random number; the same seed gives the same bits for any executor. In a run it is
+        :func:`~en4dvar.priors.prior.own_seed` of the run's seed and the data set's name.
+    executor: where members run; default in this process.
+    progress: called with the name of the data set and the record of each round of the start, each iteration and each
+        look at the chain.
+    resume: where an earlier call with the same arguments was interrupted; the result has the same bits as without.
+    keep: called before each round of the start and each iteration, and at each look at the chain, with a function that
+        gives the state to resume from.
+
+    Raises
+    ------
+    ConfigError: the problem is not complete. TooFewMembersError: too few members survive a forecast.
+    """
+    with one_blas_thread():
+        if settings.localisation is not None or problem.fields:
+            return assimilate_localised(problem, settings, seed, executor or SerialExecutor(), progress)
+        return _through(Stages(problem, settings, seed, executor or SerialExecutor(), progress, keep), resume)
+
+
+def _through(stages: Stages, resume: LoopState | None) -> Analysis:
+    """All stages, then what is concluded from them."""
+    space, prior = stages.space, stages.problem.prior
+    prior_run, start, descent = stages.descend(resume)
+    outcome, ends = stages.searched(start, descent, prior_run)
+    looking = True
+    while True:
+        counting = that_count(outcome.minima, prior)
+        agree = len(outcome.tried) < 2 or outcome.agreed
+        descents = conclusions.descents_of(outcome, len(space.members))
+        if descents and looking:  # else they are those that were told
+            stages.tell(descents)
+        sampled = stages.sampled(ends, counting, agree, start.refinement, looking)
+        if sampled.refined is None or sampled.refined.lower is None:
+            break
+        after, ends = stages.searched_from(outcome, ends, sampled.refined.lower)
+        looking, outcome = after is not outcome, after
+    ends = sampled.ends
+    space.require_members(ends.run.failures, "posterior forecast")
+    control = ControlEnsembles(
+        space.members,
+        ends.members,
+        ends.mode,
+        space.costs(ends.members, ends.run),
+        float(space.costs(ends.mode[None], ends.central)[0]),
+    )
+    analysis = replace(
+        _concluded(stages, prior_run, outcome.descent, sampled, control),
+        modes=conclusions.modes_of(prior, counting, sampled.refined),
+        descents=descents,
+    )
+    cautions = (*start.warnings, *(sampled.refined.warnings if sampled.refined else ()))
+    if len(outcome.tried) == 1:
+        cautions = (*cautions, caution("one-descent", "one descent only: another minimum is not excluded"))
+    if counting:
+        weights = np.array([mode.weight for mode in analysis.modes])
+        cautions = (*cautions, *mode_cautions(prior, counting, weights, agree, sampled.refined))
+    return replace(analysis, cautions=examine(analysis, control, outcome.descent.worst_loss, cautions))
+
+
+def _concluded(
+    stages: Stages, prior_run: Forecast, descent: Descent, sampled: Sampled, control: ControlEnsembles
+) -> Analysis:
+    """The outcome without its minima and cautions."""
+    space, problem, ends = stages.space, stages.problem, sampled.ends
+    observations, last = problem.observations, ends.central
+    log_evidence_constant = _log_evidence_constant(stages)
+    response = conclusions.response_of(space, descent, ends.mode, last)
+    std = ends.members.std(axis=0, ddof=1)
+    shifts = what_if(problem, response, std, control.centre_cost, space.executor) if stages.settings.what_if else ()
+    path = ledger(problem, response, std) if stages.settings.what_if else None
+    withheld = predict_withheld(problem, ends.members, space.executor)
+    others = sum(shift.runs for shift in shifts) + (path.runs if path else 0)
+    space.forward_runs += others + (withheld.runs if withheld else 0)
+    ensembles = Ensembles(space.members, ends.members, ends.mode, prior_run[:-1], ends.run, last)
+    return conclusions.outcome_of(
+        problem,
+        stages.settings,
+        stages.seed,
+        ensembles,
+        fixed_parameters=stages.fixed_parameters,
+        error_std=observations.noise.total_std(last.predicted[0]),
+        trajectory_times=stages.grid,
+        iterations=descent.records,
+        dfs_per_parameter=diag.dfs_per_parameter(space.prior_variance, ends.members),
+        converged=descent.converged,
+        stop_reason=descent.stop,
+        forward_runs=space.forward_runs,
+        shape=sampled.shape,
+        down_weights=observations.noise.down_weights(observations.values, last.predicted[0]),
+        refinement=sampled.refined.summary if sampled.refined else {},
+        log_evidence=conclusions.log_evidence_of(space, descent, sampled.refined),
+        log_evidence_constant=log_evidence_constant,
+        residuals=conclusions.residuals_of(space, descent),
+        discrepancy=conclusions.discrepancy_of(space, descent, last.predicted[0]),
+        influence=conclusions.influence_of(problem, ends.run, ends.members, response, sampled.refined is None),
+        what_if=shifts,
+        withheld=withheld,
+        ledger=path,
+    )
+
+
+def _log_evidence_constant(stages: Stages) -> float | None:
+    """ln p(y) with constant parameters, NaN where these lose the ensemble; None where none varies.
+
+    It is that of an assimilation of its own, searched and, in doubt, sampled like this one. The posterior at zero
+    changes (Savage & Dickey) would spare the runs, but extrapolates the quadratic form of J from one minimum to the
+    other, which may be far away.
+    """
+    if not stages.problem.varying:
+        return None
+    settings = replace(stages.settings, what_if=False)
+    other = Stages(stages.problem.constant, settings, stages.seed, stages.space.executor, None, None)
+    try:
+        return _through(other, None).log_evidence
+    except TooFewMembersError:
+        return np.nan
+    finally:
+        stages.space.forward_runs += other.space.forward_runs

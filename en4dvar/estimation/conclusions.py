@@ -1,0 +1,175 @@
+"""Conclusions from a descent and the posterior about it: minima, evidence, residuals, influence, discrepancy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.data.noise import Predicted
+from en4dvar.descent.minima import Minimum
+from en4dvar.descent.search import Outcome
+from en4dvar.descent.variance import shares_of_variance
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.descent.window import Descent
+from en4dvar.diagnosis import diagnostics as diag
+from en4dvar.diagnosis.analysis import Analysis, Descents, Discrepancy, Mode
+from en4dvar.diagnosis.influence import Influence
+from en4dvar.diagnosis.residuals import Residuals
+from en4dvar.diagnosis.response.linear import LinearResponse
+from en4dvar.ensemble.forecast import Forecast
+from en4dvar.model.state import Array
+from en4dvar.priors.prior import Prior
+from en4dvar.problem import InverseProblem
+from en4dvar.sampling.refine import Refined
+from en4dvar.schemes.settings import AssimilationSettings
+
+
+@dataclass(frozen=True)
+class Ensembles:
+    """Members (N, n) of the parameters ``before`` and ``after``, transformed, and the ``centre`` (n,).
+
+    ``prior_run``, ``run`` and ``central`` are the forecasts of them."""
+
+    before: Array
+    after: Array
+    centre: Array
+    prior_run: Forecast
+    run: Forecast
+    central: Forecast
+
+
+def outcome_of(
+    problem: InverseProblem, settings: AssimilationSettings, seed: int, of: Ensembles, **more: Any
+) -> Analysis:
+    """The outcome of an assimilation, of its ensembles and what ``more`` there is to say."""
+    prior, prior_run, run = problem.prior, of.prior_run, of.run
+    return Analysis(
+        problem=problem,
+        settings=settings,
+        seed=seed,
+        prior=prior.to_physical(of.before),
+        posterior=prior.to_physical(of.after),
+        centre=prior.to_physical(of.centre),
+        prior_predictions=prior_run.predictions,
+        posterior_predictions=run.predictions,
+        centre_predictions=of.central.predictions[0],
+        log_likelihood=problem.observations.log_likelihood(run.predicted),
+        prior_trajectories=prior_run.path,
+        posterior_trajectories=run.path,
+        prior_failures=prior_run.failures,
+        posterior_failures=run.failures,
+        extremes=run.extremes,
+        beyond=run.beyond,
+        **more,
+    )
+
+
+def descents_of(outcome: Outcome, n_members: int) -> Descents | None:
+    """Where they ended; None where there were none to compare. Starts that are no members of the prior have number -1,
+    its mean, or -2, draws beyond the ensemble.
+    """
+    if not outcome.minima:
+        return None
+    ended = {member: number for number, minimum in enumerate(outcome.minima) for member in minimum.members}
+    return Descents(
+        members=tuple(i if i < n_members else -1 - (i > n_members) for i in outcome.tried),
+        minimum=tuple(ended.get(i, -1) for i in outcome.tried),
+        costs=tuple(minimum.cost for minimum in outcome.minima),
+        spread=outcome.minima[0].spread,
+        runs=outcome.runs,
+    )
+
+
+def modes_of(prior: Prior, minima: Sequence[Minimum], sampled: Refined | None) -> tuple[Mode, ...]:
+    """The minima that count, with their weights; by Laplace where the posterior was not sampled."""
+    logs = np.array([m.log_evidence(prior) - minima[0].log_evidence(prior) for m in minima[1:]])
+    relative = np.append(1.0, np.exp(logs))[: len(minima)]
+    weights = sampled.weights if sampled and minima else relative / relative.sum()
+    return tuple(
+        Mode(prior.to_physical(m.x), m.cost, m.descents, m.spread, float(weight))
+        for m, weight in zip(minima, weights, strict=True)
+    )
+
+
+def log_evidence_of(space: WeightSpace, descent: Descent, sampled: Refined | None) -> float:
+    """ln p(y), by the draws where the posterior was sampled and they are enough, else by Laplace."""
+    values, observations = descent.newton.hessian.singular_values, space.problem.observations
+    if sampled and np.isfinite(sampled.log_evidence):
+        return sampled.log_evidence - observations.log_normalisation()
+    return diag.log_evidence(descent.iterate.cost, values, len(space.members), observations)
+
+
+def response_of(space: WeightSpace, descent: Descent, mode: Array, central: Forecast) -> LinearResponse:
+    """How the mode (n,), whose run is ``central``, follows what it was inferred from."""
+    linear = descent.iterate.linear
+    assert linear is not None
+    linear = replace(linear, prediction=central.predicted[0])
+    directions = space.basis.T @ space.anomalies
+    return LinearResponse(mode, linear, directions, len(space.members) - 1.0, space.problem.observations)
+
+
+def residuals_of(space: WeightSpace, descent: Descent) -> Residuals | None:
+    """Residuals of the linearisation at the end; None where there is none."""
+    observations, linear = space.problem.observations, descent.iterate.linear
+    if linear is None:
+        return None
+    speed = np.abs(_rates(space.problem, linear.prediction))
+    white, sensitivity = observations.whiten(linear)
+    if observations.parts:
+        speed = speed / observations.std
+    precision = len(space.members) - 1
+    return Residuals.of(white, sensitivity, precision, speed, observations.used, _in_a_row(space.problem))
+
+
+def _in_a_row(problem: InverseProblem) -> npt.NDArray[np.intp]:
+    """(K,) a label for each series; for each reading, where it has several places."""
+    labels = np.arange(len(problem.observations))
+    for part in problem.parts:
+        if part.has_path:
+            labels[part.where] = part.begin
+    return labels
+
+
+def _rates(problem: InverseProblem, at: Predicted) -> Array:
+    """How fast each observable changes at its readings (K,), by differences where the model does not say; zero of
+    a series with several places, or fewer than two readings."""
+    if at.rates is not None:
+        return at.rates
+    rates = np.zeros_like(at.values)
+    for part in problem.parts:
+        if part.has_path and part.end - part.begin > 1:
+            rates[part.where] = np.gradient(at.values[part.where], problem.observations.times[part.where])
+    return rates
+
+
+def influence_of(
+    problem: InverseProblem, run: Forecast, members: Array, response: LinearResponse, gaussian: bool
+) -> Influence | None:
+    """Influence of each reading on the posterior ``members`` (N, n), whose ``run`` it is; None where it cannot be told.
+
+    ``gaussian``: they are draws of the Gaussian about the mode.
+    """
+    observations, prior = problem.observations, problem.prior
+    conditional = observations.log_conditional(run.predicted)
+    if conditional is None:
+        return None
+    alive = diag.active_members(run.failures) & np.isfinite(conditional).all(axis=1)
+    if alive.sum() < members.shape[1] + 2:
+        return None
+    if gaussian and observations.noise.independent and response.defined:
+        return Influence.by_tangent(prior, members[alive], response.tangent(members[alive]))
+    ratios = -observations.weights * conditional[alive]
+    return Influence.by_weights(prior.to_physical(members[alive]), ratios)
+
+
+def discrepancy_of(space: WeightSpace, descent: Descent, central: Predicted) -> Discrepancy | None:
+    """Discrepancy of the model, where the observations allow for one."""
+    observations, linear = space.problem.observations, descent.iterate.linear
+    explained = observations.noise.explained(observations.values, central)
+    if explained is None or linear is None:
+        return None
+    return Discrepancy(*explained, shares_of_variance(space, linear))

@@ -1,0 +1,148 @@
+r"""Expected information by simulated readings, each of which is explained anew.
+
+Draw i of the prior predicts m_i and is read as y_i. With z = (a, b), a what is asked and b what else is unknown,
+
+    g_i = ln p(y_i | a_i) − ln p(y_i),     p(y) = ∫ e^{−J_o} N(u; 0, I) du,     p(y | a) = ∫ e^{−J_o} N(b; 0, I) db,
+
+both by importance sampling with runs of their own about the posterior of y_i (never with those of other draws, whose
+number N would bound the result by ln N). Of M draws of weight w the logarithm of their mean is too small by
+var(w)/(2 M w̄²), which is added; what remains is O(M⁻²) (Rainforth et al. 2018, ICML, on nested estimates).
+
+Were the prediction linear with the sensitivities S of draw i, g_i would be a constant and, with the whitened errors e,
+
+    c_i = ½ q(S, e + S u) − ½ q(S_b, e + S_b b),     q(S, v) = vᵀ (I + SSᵀ)⁻¹ v.
+
+With A = I − (I + SᵀS)⁻¹ the mean of q over e and u is that of the number of readings if the part uᵀ(A − Ā)u − tr(A − Ā)
+is left out, Ā the mean over the draws; so is it of S_b. Such c has no expectation and is subtracted from g (a control
+variate): the spread that is left is that of what is not linear.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from en4dvar.estimation.design.laplace import Gains, about, precision, require_alive, standard_error
+from en4dvar.estimation.design.planned import Planned, Tangents
+from en4dvar.model.state import Array
+from en4dvar.priors.prior import member_stream
+from en4dvar.sampling.importance import Importance
+from en4dvar.sampling.mixture import StudentMixture
+
+ROUNDS = 4  # of proposals, while few draws have a weight
+ENOUGH = 25.0  # effective draws; proposals fitted to draws that they are weighed with make the integral too small
+OTHERS, PLAUSIBLE = 6, 8.0  # draws that explain the readings best, and the J above the lowest that they may promise
+FROM_PRIOR = 0.1  # share of a proposal that is the prior's: a second minimum is found, no weight is without bound
+WIDER = 1.2  # than the Gaussian that it is made of
+
+
+@dataclass(frozen=True)
+class Nested(Gains):
+    """Gains of simulated readings, less their control variate; ``linearised`` (R,) gains at the same draws,
+    ``effective`` (R,) importance draws behind each.
+    """
+
+    linearised: Array
+    effective: Array
+
+    @property
+    def correction(self) -> tuple[float, float]:
+        """Difference of the gain from Laplace's estimate at the same draws, and the standard error of that."""
+        difference = self.gains - self.linearised
+        return float(difference.mean()), standard_error(difference)
+
+
+def nested(planned: Planned, u: Array, inner: int, seed: int) -> Nested:
+    """From draws (R, n) of the prior, one simulated set of readings and ``inner`` runs (a round) each.
+
+    Raises :class:`TooFewMembersError` where the model mostly fails.
+    """
+    truths = planned.tangents(u)
+    require_alive(len(truths.at), len(u))
+    noise = planned.problem.observations.noise
+    streams = [member_stream(seed, "design readings", int(i)) for i in truths.alive]
+    values = np.stack([noise.drawn(draw.prediction, s) for draw, s in zip(truths.at, streams, strict=True)])
+    plain, effective = np.empty(len(values)), np.empty(len(values))
+    for i, (y, stream) in enumerate(zip(values, streams, strict=True)):
+        near = explaining(planned, truths, y, i)
+        known, of_known = log_integral(planned, y, truths.u[i, : planned.asked], near, inner, stream)
+        log, of_all = log_integral(planned, y, truths.u[i, :0], near, inner, stream)
+        plain[i], effective[i] = known - log, min(of_known, of_all)
+    alive = np.isfinite(plain)
+    require_alive(int(alive.sum()), len(u))
+    innovations, (_, rows) = truths.whitened(planned, values)[0], truths.whitened(planned)
+    gains = plain - control_variate(innovations, rows, truths.u, planned.asked)
+    linearised = 0.5 * np.linalg.slogdet(about(precision(rows), planned.asked))[1]
+    return Nested(gains[alive], linearised[alive], effective[alive])
+
+
+def explaining(planned: Planned, truths: Tangents, values: Array, own: int | None) -> tuple[Array, Array]:
+    """Gaussians where readings (K,) have a posterior: centres (M, n) and precisions (M, n, n).
+
+    Each is one step of Gauss and Newton away from the draw that the readings are of, its ``own``, or from one that
+    explains them.
+    """
+    observations = replace(planned.problem.observations, values=values)
+    costs = [float(observations.cost(draw.prediction)) for draw in truths.at] + 0.5 * np.sum(truths.u**2, axis=1)
+    chosen = list(dict.fromkeys([*([] if own is None else [own]), *np.argsort(costs)[:OTHERS].tolist()]))
+    explained = truths.some(chosen)
+    d, rows = explained.whitened(planned, np.tile(values, (len(explained.at), 1)))
+    matrices = precision(rows)
+    step = np.linalg.solve(matrices, (np.einsum("rki,rk->ri", rows, d) - explained.u)[..., None])[..., 0]
+    lowest = np.array(costs)[chosen] - 0.5 * np.einsum("ri,rij,rj->r", step, matrices, step)
+    plausible = lowest < lowest.min() + PLAUSIBLE
+    plausible[0] = True
+    return (explained.u + step)[plausible], matrices[plausible]
+
+
+def log_integral(
+    planned: Planned,
+    values: Array,
+    known: Array,
+    near: tuple[Array, Array],
+    inner: int,
+    stream: np.random.Generator,
+    enough: float = ENOUGH,
+    rounds: int = ROUNDS,
+) -> tuple[float, float]:
+    """ln ∫ e^{−J_o} N(·; 0, I) over the coordinates behind the ``known`` ones, and the effective draws behind it.
+
+    In at most so many ``rounds`` of ``inner`` runs, until there are ``enough`` effective draws.
+    """
+    (centres, matrices), k = near, len(known)
+    if k == len(planned.names):
+        return -float(planned.cost(values, planned.run(known[None]))[0]), np.inf
+    own = matrices[:, k:, k:]
+    shift = np.linalg.solve(own, (matrices[:, k:, :k] @ (known - centres[:, :k])[..., None]))[..., 0]
+    roots = WIDER * np.linalg.inv(np.linalg.cholesky(own)).transpose(0, 2, 1)
+    shares = np.append(np.full(len(own), (1 - FROM_PRIOR) / len(own)), FROM_PRIOR)
+    n = own.shape[1]
+    first = StudentMixture(
+        shares, np.vstack([centres[:, k:] - shift, np.zeros(n)]), np.vstack([roots, np.eye(n)[None]])
+    )
+    draws = Importance(first, stream, inner, WIDER)
+    for _ in range(rounds):
+        z = draws.draw()
+        draws.add(z, -planned.cost(values, planned.run(np.hstack([np.tile(known, (inner, 1)), z]))))
+        if draws.effective >= enough:
+            break
+    if not np.isfinite(draws.log):
+        return -np.inf, 0.0
+    return draws.log + 0.5 * (1 / draws.effective - 1 / len(draws.z)), draws.effective
+
+
+def control_variate(d: Array, rows: Array, u: Array, asked: int) -> Array:
+    """c (R,), see above, of innovations d (R, K') and sensitivities (R, K', n) at draws (R, n)."""
+    others = rows[:, :, asked:]
+    return 0.5 * (_centred(d, rows, u) - _centred(d, others, u[:, asked:]))
+
+
+def _centred(d: Array, rows: Array, u: Array) -> Array:
+    """q(S, d + S u), less what makes its mean depend on u more than in the mean over the draws."""
+    inverse = np.linalg.inv(precision(rows))
+    v = d + np.einsum("rki,ri->rk", rows, u)
+    t = np.einsum("rki,rk->ri", rows, v)
+    q = np.sum(v * v, axis=1) - np.einsum("ri,rij,rj->r", t, inverse, t)
+    apart = inverse.mean(axis=0) - inverse  # A − Ā
+    return np.asarray(q - np.einsum("ri,rij,rj->r", u, apart, u) + np.trace(apart, axis1=1, axis2=2))

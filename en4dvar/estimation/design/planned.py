@@ -1,0 +1,103 @@
+"""An experiment that is planned: its runs, in coordinates in which the prior is N(0, I) and what is asked is first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.data.noise import Linearisation
+from en4dvar.ensemble.forecast import NO_TIMES, Composite, Forecast
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.prior import standard_normal
+from en4dvar.problem import InverseProblem
+
+EPSILON = 1e-3  # size of a bundle, in prior standard deviations
+
+
+class Planned:
+    """An inverse problem whose observations say when and how well it will be measured; their values mean nothing.
+
+    ``about``: names of the parameters that are asked for, all by default. Coordinates u (…, n): x = mean + W u, W Wᵀ
+    the prior covariance, W lower triangular in the order (asked, others), so that the first ``asked`` of them are those
+    of what is asked for, whatever the others are.
+
+    Raises
+    ------
+    ConfigError: a name that is not estimated, or twice; weights other than 0 and 1, which are not Bayesian.
+    """
+
+    def __init__(self, problem: InverseProblem, about: Sequence[str] = ()):
+        names = problem.prior.names
+        about = tuple(about) or names
+        if unknown := [name for name in about if name not in names]:
+            raise ConfigError(f"{', '.join(unknown)}: not estimated; estimated are {', '.join(names)}")
+        if len(set(about)) < len(about):
+            raise ConfigError(f"{', '.join(about)}: a name is given twice")
+        if not np.isin(problem.observations.weights, (0, 1)).all():
+            raise ConfigError("weights other than 0 and 1 are not Bayesian: there is no expected information of them")
+        self.problem, self.about, self.asked = problem, about, len(about)
+        self.composite = Composite(problem)
+        order = [names.index(name) for name in (*about, *(name for name in names if name not in about))]
+        half = problem.prior.from_white_change(np.eye(len(names)))
+        covariance = (half.T @ half)[np.ix_(order, order)]
+        self.root = np.empty((len(names), len(names)))
+        self.root[order] = np.linalg.cholesky(covariance)
+        self.names = tuple(names[j] for j in order)
+        self.order = order
+        self.forward_runs = 0
+
+    def draws(self, count: int, seed: int) -> Array:
+        """(count, n) of the prior; the numbers belong to the parameters, so that designs are compared on the same."""
+        return np.column_stack([standard_normal(seed, f"design {name}", count) for name in self.names])
+
+    def control(self, u: Array) -> Array:
+        """Control vectors (…, n) of coordinates."""
+        return np.asarray(self.problem.prior.mean + u @ self.root.T)
+
+    def run(self, u: Array, grid: Array = NO_TIMES) -> Forecast:
+        """Coordinates (B, n) through F and H."""
+        self.forward_runs += len(u)
+        return self.composite(self.control(u), grid)
+
+    def cost(self, values: Array, run: Forecast) -> Array:
+        """J_o (B,) of readings (K,) for runs; +inf where one has failed."""
+        return replace(self.problem.observations, values=values).cost(run.predicted)
+
+    def tangents(self, u: Array, run: Forecast | None = None) -> Tangents:
+        """At points (R, n), by n runs beside each; those where one fails are left out."""
+        count, n = u.shape
+        run = run or self.run(u)
+        beside = self.run((u[:, None] + EPSILON * np.eye(n)).reshape(-1, n))
+        stacked = run.predicted.stacked
+        change = (beside.predicted.stacked.reshape(count, n, -1) - stacked[:, None]) / EPSILON
+        alive = np.flatnonzero(np.isfinite(stacked).all(axis=1) & np.isfinite(change).all(axis=(1, 2)))
+        where = [Linearisation.of_stacked(run.predicted[int(i)], stacked[i], change[i]) for i in alive]
+        return Tangents(alive, u[alive], tuple(where))
+
+
+@dataclass(frozen=True)
+class Tangents:
+    """Linearisations at points ``u`` (R, n); ``alive`` (R,) are their numbers among the points that were asked for."""
+
+    alive: npt.NDArray[np.intp]
+    u: Array
+    at: tuple[Linearisation, ...]
+
+    def some(self, which: Sequence[int]) -> Tangents:
+        """At some of the points."""
+        chosen = list(which)
+        return Tangents(self.alive[chosen], self.u[chosen], tuple(self.at[k] for k in chosen))
+
+    def whitened(self, planned: Planned, values: Array | None = None) -> tuple[Array, Array]:
+        """Innovations d (R, K') and sensitivities S (R, K', n) for readings (R, K); by default those predicted."""
+        observations = planned.problem.observations
+        each = [predicted.prediction.values for predicted in self.at] if values is None else values
+        parts = [
+            observations.noise.whiten(y, observations.weights, predicted)
+            for y, predicted in zip(each, self.at, strict=True)
+        ]
+        return np.stack([d for d, _ in parts]), np.stack([s for _, s in parts])

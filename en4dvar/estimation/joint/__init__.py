@@ -1,0 +1,13 @@
+r"""Problems of several experiments: quantities that experiments share, and quantities of their own.
+
+    J(s, v_1 … v_E) = ½ ‖s‖² + Σ_e [ ½ ‖v_e‖² + J_o,e(s, v_e) ]
+
+in units of the prior, which enters once for what is shared. From the bottom up: ``arrow`` (the linear algebra),
+``problem`` (who shares what), ``tangent`` (an experiment's runs), ``descent``, ``members`` (the posterior ensemble),
+``estimate``.
+"""
+
+from en4dvar.estimation.joint.estimate import JointEstimate, Single, estimate_jointly
+from en4dvar.estimation.joint.problem import JointProblem, sharing
+
+__all__ = ["JointEstimate", "JointProblem", "Single", "estimate_jointly", "sharing"]

@@ -1,0 +1,247 @@
+"""A joint estimate from single ones: where it starts, the descents, the members and what they predict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from en4dvar.descent.weight_space import require_members
+from en4dvar.ensemble.forecast import Forecast, plotting_times
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.joint.challenge import challenger
+from en4dvar.estimation.joint.descent import JointDescent, Place, assembled, cost, descend
+from en4dvar.estimation.joint.members import JointMembers, gaussian, sampled
+from en4dvar.estimation.joint.problem import JointProblem
+from en4dvar.estimation.joint.tangent import Experiment
+from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
+from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution, caution
+from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
+from en4dvar.priors.prior import Prior, own_seed
+from en4dvar.schemes import MINIMISERS
+from en4dvar.schemes.settings import AssimilationSettings
+
+TOLD = 0.5  # of J, by which descents differ that ended in different minima
+CHALLENGES = 3  # rounds of looking for lower minima of single experiments
+TRIED = 6  # experiments whose own estimate of what is shared is tried as a start
+
+
+@dataclass(frozen=True)
+class Single:
+    """The estimate of one experiment by itself: mode (n,) and posterior precision (n, n), in units of the prior."""
+
+    mode: Array
+    precision: Array
+
+    @classmethod
+    def of_physical(cls, prior: Prior, members: Array, mode: Array) -> Single:
+        """From the members (N, n) alive and the mode (n,) of a posterior. Raises ValueError outside a map's range."""
+        z = (prior.from_physical(np.vstack([members, mode])) - prior.mean) / prior.std
+        return cls(z[-1], np.linalg.inv(np.atleast_2d(np.cov(z[:-1].T))))
+
+
+@dataclass(frozen=True)
+class JointEstimate:
+    """Posterior of a joint problem.
+
+    ``members`` in units of the prior, ``mode`` where J is lowest, ``chi2`` (E,) per observation there, ``forecasts`` of
+    the N members and, last, the mode, each read at ``grids`` too; ``cautions`` why not to trust it.
+    """
+
+    joint: JointProblem
+    mode: Place
+    members: JointMembers
+    chi2: Array
+    forecasts: tuple[Forecast, ...]
+    grids: tuple[Array, ...]
+    costs: tuple[float, ...]
+    converged: bool
+    stop_reason: str
+    log_evidence: float
+    forward_runs: int
+    cautions: tuple[Caution, ...]
+
+    @property
+    def shared(self) -> Array:
+        """(N, c) members of what is shared, physical."""
+        return _physical(self.joint, self.members.border)
+
+    @property
+    def shared_mode(self) -> Array:
+        """(c,) what is shared at the mode, physical."""
+        return _physical(self.joint, self.mode.border)
+
+    def control(self, e: int) -> Array:
+        """(N + 1, n) physical members of experiment e and, last, the mode."""
+        z = _points(self.joint, self.members, self.mode, e)
+        return self.joint.experiments[e].prior.to_physical(self.joint.control(e, z))
+
+
+def estimate_jointly(
+    joint: JointProblem,
+    settings: AssimilationSettings,
+    seed: int,
+    executor: Executor | None = None,
+    singles: Sequence[Single] = (),
+    tell: Callable[[str], None] = lambda words: None,
+) -> JointEstimate:
+    """Estimate all experiments together.
+
+    Parameters
+    ----------
+    settings: members, epsilon, tolerances and ``refine`` (auto: corrected by importance where all models are cheap).
+    singles: the estimates of the experiments alone, in their order, where the descents start; made where missing.
+    tell: called with a line about each stage.
+
+    Raises
+    ------
+    ConfigError: a scheme that does not minimise J.
+    TooFewMembersError: no start can be run, or fewer members survive than ``min_active_fraction``.
+    """
+    with one_blas_thread():
+        return _Estimate(joint, settings, seed, executor or SerialExecutor(), tell).result(singles)
+
+
+class _Estimate:
+    """One estimate; see :func:`estimate_jointly`."""
+
+    def __init__(
+        self, joint: JointProblem, settings: AssimilationSettings, seed: int, executor: Executor,
+        tell: Callable[[str], None],
+    ):  # fmt: skip
+        self.joint, self.settings, self.seed, self.executor, self.tell = joint, settings, seed, executor, tell
+        if settings.own.minimiser is None:
+            others = " or ".join(MINIMISERS)
+            raise ConfigError(f"{settings.scheme} does not minimise J, as a joint estimate must; use {others}")
+        self.minimiser = scheme = settings.own.minimiser
+        self.experiments = [Experiment(joint, e, scheme.epsilon, executor) for e in range(len(joint.experiments))]
+        self.runs_of_singles = 0
+
+    def result(self, singles: Sequence[Single]) -> JointEstimate:
+        joint, experiments = self.joint, self.experiments
+        descents = self._descents(self._starts(singles or self._singles()))
+        lowest = self._challenged(min(descents, key=lambda descent: descent.at.cost))
+        self.tell(f"J {lowest.at.cost:.4g} after {len(lowest.costs) - 1} iterations, {lowest.stop}")
+        members, cautions = self._members(lowest)
+        grids = tuple(plotting_times(problem) for problem in joint.experiments)
+        forecasts = tuple(
+            experiment.run(_points(joint, members, lowest.at.place, experiment.e), grids[experiment.e])
+            for experiment in experiments
+        )
+        self._require(forecasts)
+        if not lowest.converged:
+            cautions.append(caution("not-converged", f"the joint estimate has not converged: {lowest.stop}"))
+        if _agreeing(descents) < 2:
+            words = f"none of {len(descents) - 1} further descents of the joint estimate ended in its lowest minimum"
+            cautions.append(caution("starts-disagree", words))
+        normalisation = sum(problem.observations.log_normalisation() for problem in joint.experiments)
+        return JointEstimate(
+            joint=joint,
+            mode=lowest.at.place,
+            members=members,
+            chi2=np.array(
+                [
+                    float(problem.observations.chi2_per_observation(form.central.predicted)[0])
+                    for problem, form in zip(joint.experiments, lowest.at.forms, strict=True)
+                ]
+            ),
+            forecasts=forecasts,
+            grids=grids,
+            costs=tuple(lowest.costs),
+            converged=lowest.converged,
+            stop_reason=lowest.stop,
+            log_evidence=members.log_evidence - normalisation,
+            forward_runs=self.runs_of_singles + sum(experiment.forward_runs for experiment in experiments),
+            cautions=tuple(cautions),
+        )
+
+    def _singles(self) -> list[Single]:
+        """Each experiment by itself."""
+        settings = replace(self.settings, refine="none", emulator="off", what_if=False)
+        singles = []
+        for problem in self.joint.experiments:
+            self.tell(f"{problem.observations.name} alone")
+            analysis = assimilate(problem, settings, own_seed(self.seed, problem.observations.name), self.executor)
+            self.runs_of_singles += analysis.forward_runs
+            alive = np.isfinite(analysis.posterior).all(axis=1)
+            singles.append(Single.of_physical(problem.prior, analysis.posterior[alive], analysis.centre))
+        return singles
+
+    def _starts(self, singles: Sequence[Single]) -> list[Place]:
+        """Where the quadratic forms of the single estimates meet, and where what is shared is as in one of them."""
+        joint = self.joint
+        likelihoods = [single.precision - np.eye(len(single.mode)) for single in singles]
+        arrow, shared_pull, own_pulls = assembled(
+            joint, likelihoods, [single.precision @ single.mode for single in singles]
+        )
+        x, y = arrow.solve(shared_pull, own_pulls)
+        starts = [Place(x, tuple(y))]
+        for e in np.linspace(0, len(singles) - 1, min(TRIED, len(singles))).astype(int).tolist():
+            shared, _ = joint.columns(e)
+            own_value = x.copy()
+            own_value[joint.of_border(e)] = singles[e].mode[shared]
+            rest_modes = tuple(single.mode[joint.columns(i)[1]] for i, single in enumerate(singles))
+            starts.append(Place(own_value, rest_modes))
+        return starts
+
+    def _descents(self, starts: Sequence[Place]) -> list[JointDescent]:
+        """From one start after the other, that of lowest J first, until two have ended in the lowest minimum."""
+        costs = np.array([cost(self.joint, self.experiments, start) for start in starts])
+        descents = list[JointDescent]()
+        for i in np.argsort(costs, kind="stable"):
+            if np.isfinite(costs[i]):
+                descents += self._descended(starts[i])
+            if _agreeing(descents) >= 2:
+                break
+        if not descents:
+            raise TooFewMembersError("the joint estimate: one of the experiments cannot be run from any start")
+        return descents
+
+    def _descended(self, start: Place) -> list[JointDescent]:
+        """One descent; none where the start cannot be run."""
+        descent = descend(self.joint, self.experiments, start, self.minimiser)
+        return [descent] if descent else []
+
+    def _challenged(self, lowest: JointDescent) -> JointDescent:
+        """Or the descent from a lower minimum that single experiments have, looked for where runs are cheap."""
+        for _ in range(CHALLENGES if all(problem.model.cheap for problem in self.joint.experiments) else 0):
+            place = challenger(self.experiments, lowest.at, self.seed)
+            lower = self._descended(place) if place else []
+            if not lower or lower[0].at.cost >= lowest.at.cost:
+                break
+            lowest = lower[0]
+        return lowest
+
+    def _members(self, lowest: JointDescent) -> tuple[JointMembers, list[Caution]]:
+        laplace = gaussian(lowest.at, self.seed, self.settings.members)
+        if self.settings.refine == "none" or not all(problem.model.cheap for problem in self.joint.experiments):
+            return laplace, []
+        members = sampled(self.joint, self.experiments, lowest.at, self.seed, self.settings.members)
+        if members is not None:
+            return members, []
+        words = "the joint posterior is far from Gaussian, and importance sampling did not reach it"
+        return laplace, [caution("non-gaussian", words)]
+
+    def _require(self, forecasts: Sequence[Forecast]) -> None:
+        for problem, run in zip(self.joint.experiments, forecasts, strict=True):
+            needed = math.ceil(self.settings.min_active_fraction * (len(run) - 1))
+            require_members(problem, run.failures[:-1], needed, "forecast of the joint posterior")
+
+
+def _agreeing(descents: Sequence[JointDescent]) -> int:
+    """How many descents ended in the lowest minimum."""
+    lowest = min((descent.at.cost for descent in descents), default=np.inf)
+    return sum(descent.at.cost - lowest < TOLD for descent in descents)
+
+
+def _points(joint: JointProblem, members: JointMembers, mode: Place, e: int) -> Array:
+    """(N + 1, n) members of experiment e and, last, the mode, in units of its prior."""
+    return joint.standard(e, np.vstack([members.border, mode.border]), np.vstack([members.own[e], mode.own[e]]))
+
+
+def _physical(joint: JointProblem, z: Array) -> Array:
+    columns = [term.to_physical(term.mean + term.std * z[..., j]) for j, term in enumerate(joint.terms)]
+    return np.stack(columns, axis=-1)

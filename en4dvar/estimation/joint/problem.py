@@ -1,0 +1,119 @@
+"""Who shares what: inverse problems, and the quantities that have one value in several of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from en4dvar.ensemble.forecast import check_problem
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.hints import suggest
+from en4dvar.priors.prior import PriorTerm
+from en4dvar.problem import InverseProblem
+
+EVERYONE = ""  # the group of a quantity that all experiments share
+
+
+@dataclass(frozen=True)
+class JointProblem:
+    """``experiments`` and, for each, ``groups``: name of a parameter that it shares → with which group.
+
+    Parameters of one name and one group have one value; it has a single prior, which must be the same in all
+    experiments of the group. Models, windows, errors and the parameters of their own may differ.
+
+    Raises
+    ------
+    ConfigError: fewer than two experiments, two of one name, a shared parameter that an experiment does not estimate,
+        nothing shared, or priors that differ or are correlated.
+    """
+
+    experiments: tuple[InverseProblem, ...]
+    groups: tuple[Mapping[str, str], ...]
+
+    def __post_init__(self) -> None:
+        names = [problem.observations.name for problem in self.experiments]
+        if again := sorted({name for name in names if names.count(name) > 1}):
+            raise ConfigError(f"data sets of a joint estimate need different names: {', '.join(again)} twice")
+        for problem, groups in zip(self.experiments, self.groups, strict=True):
+            check_problem(problem)
+            if problem.fields:
+                raise ConfigError(f"{problem.observations.name}: whole fields cannot be estimated jointly")
+            if problem.prior.blocks:
+                raise ConfigError(f"{problem.observations.name}: a joint estimate needs priors that are not correlated")
+            if missing := sorted(set(groups) - set(problem.prior.names)):
+                raise ConfigError(f"{problem.observations.name}: {', '.join(missing)}: shared, but not estimated there")
+        if not self.shared:
+            raise ConfigError("a joint estimate shares at least one parameter")
+        for key, terms in self._terms.items():
+            if any(term != terms[0] for term in terms):
+                raise ConfigError(f"{self.words(key)}: its prior must be the same in all experiments that share it")
+
+    @property
+    def shared(self) -> tuple[tuple[str, str], ...]:
+        """(name, group) of what is shared, in order of appearance."""
+        return tuple(self._terms)
+
+    @property
+    def terms(self) -> tuple[PriorTerm, ...]:
+        """The priors of what is shared."""
+        return tuple(terms[0] for terms in self._terms.values())
+
+    def of_border(self, e: int) -> list[int]:
+        """Which of the shared quantities experiment e has, in the order of its control vector."""
+        groups = self.groups[e]
+        return [self.shared.index((name, groups[name])) for name in self.experiments[e].prior.names if name in groups]
+
+    def columns(self, e: int) -> tuple[list[int], list[int]]:
+        """Where the shared and the own quantities stand in the control vector of experiment e."""
+        names, groups = self.experiments[e].prior.names, self.groups[e]
+        return (
+            [j for j, name in enumerate(names) if name in groups],
+            [j for j, name in enumerate(names) if name not in groups],
+        )
+
+    def standard(self, e: int, border: Array, own: Array) -> Array:
+        """Control vectors (…, n) of experiment e, in units of its prior, of border (…, c) and own quantities."""
+        shared, rest = self.columns(e)
+        z = np.empty((*np.shape(border)[:-1], len(shared) + len(rest)))
+        z[..., shared] = border[..., self.of_border(e)]
+        z[..., rest] = own
+        return z
+
+    def control(self, e: int, z: Array) -> Array:
+        """Control vectors (…, n) of experiment e from those in units of its prior."""
+        prior = self.experiments[e].prior
+        return np.asarray(prior.mean + prior.std * z)
+
+    @staticmethod
+    def words(key: tuple[str, str]) -> str:
+        """A shared quantity as it is called in tables."""
+        name, group = key
+        return f"{name} ({group})" if group else name
+
+    @cached_property
+    def _terms(self) -> dict[tuple[str, str], list[PriorTerm]]:
+        terms: dict[tuple[str, str], list[PriorTerm]] = {}
+        for problem, groups in zip(self.experiments, self.groups, strict=True):
+            for term in problem.prior.terms:
+                if term.parameter.name in groups:
+                    terms.setdefault((term.parameter.name, groups[term.parameter.name]), []).append(term)
+        return terms
+
+
+def sharing(experiments: Sequence[InverseProblem], names: Sequence[str]) -> JointProblem:
+    """Experiments of which those that estimate one of the parameters ``names`` have it in common.
+
+    Raises :class:`ConfigError`, also where fewer than two do.
+    """
+    if len(experiments) < 2:
+        raise ConfigError("a joint estimate takes at least two data sets")
+    for name in names:
+        if sum(name in problem.prior.names for problem in experiments) < 2:
+            known = sorted({name for problem in experiments for name in problem.prior.names})
+            raise ConfigError(f"{name}: cannot be shared, for no two data sets estimate it{suggest(name, known)}")
+    groups = tuple({name: EVERYONE for name in names if name in problem.prior.names} for problem in experiments)
+    return JointProblem(tuple(experiments), groups)

@@ -1,0 +1,315 @@
+r"""The population of a campaign's data sets, whatever their law, start, errors and priors.
+
+All quantities are in white coordinates of each data set's own prior (:meth:`~en4dvar.priors.prior.Prior.white`):
+hyperpriors then have no unit, ν ~ N(prior mean, (``mean_std`` prior std)²) and τ ~ half-normal(``spread``
+prior std), and what is a data set's own (a radius, a time shift, the scale of its errors) may have a prior of its own
+in each. Each data set is sampled by itself (:mod:`~en4dvar.estimation.population.own`), and what its draws say of the
+population enters the hierarchy (:mod:`~en4dvar.estimation.population.hierarchy`) as a likelihood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from en4dvar.ensemble.forecast import check_problem
+from en4dvar.estimation.population.effort import Effort
+from en4dvar.estimation.population.empirical import Empirical, empirical
+from en4dvar.estimation.population.estimate import FEWEST_SETS as FEWEST_SETS
+from en4dvar.estimation.population.estimate import Population, moments
+from en4dvar.estimation.population.hierarchy import Hierarchy, HierarchyDraws
+from en4dvar.estimation.population.hyper import HyperPrior
+from en4dvar.estimation.population.own import OwnDraws, OwnLikelihood, own_draws, own_likelihoods
+from en4dvar.executor import Executor, one_blas_thread
+from en4dvar.model.state import Array, Parameter
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.plumbing.hints import suggest
+from en4dvar.priors.prior import Prior, PriorTerm, member_stream
+from en4dvar.problem import InverseProblem
+from en4dvar.sampling.mixture import effective_number, resampled
+
+DETERMINED = 0.9  # of the hyperprior's variance, taken away by the data
+IN_IT = 0.2  # of the largest exponent: a parameter that is part of a combination
+HALF_NORMAL_VARIANCE = 1 - 2 / np.pi
+NEAR = 5  # draws of a data set among which one is chosen for what is its own
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Physical draws (M, p) of the population mean, of the standard deviation between data sets, and of the next one;
+    in units of the prior ``nu`` and ``tau``.
+    """
+
+    mean: Array
+    between: Array
+    next: Array
+    nu: Array
+    tau: Array
+
+
+@dataclass(frozen=True)
+class CampaignPopulation:
+    """The population of ``names`` in ``problems``: ``posterior`` and ``prior`` draws; ``sets`` (M, S, n) physical, each
+    data set given all of them; ``estimate`` in units of the prior.
+
+    ``common``: names of the quantities with one value in all data sets, ``theta`` (M, c) their draws in units of the
+    prior. ``belongs`` (S,): probability that each data set is of the population. ``empirical``: for each of ``names``
+    the median of the data sets one by one. ``left_out``: data sets that could not be sampled, and why.
+    """
+
+    problems: tuple[InverseProblem, ...]
+    hyper: HyperPrior
+    estimate: Population
+    posterior: Draws
+    prior: Draws
+    sets: Array
+    common: tuple[str, ...] = ()
+    theta: Array = field(default_factory=lambda: np.empty((0, 0)))
+    belongs: Array = field(default_factory=lambda: np.empty(0))
+    empirical: tuple[Empirical, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.estimate.names
+
+    @property
+    def terms(self) -> tuple[PriorTerm, ...]:
+        """Priors of ``names``, the same in all data sets."""
+        return terms_of(self.problems, self.names)
+
+    @property
+    def learned(self) -> tuple[Array, Array]:
+        """(p,) each: what share of the hyperprior's variance of ν and of τ the data have taken away."""
+        nu, tau = self.posterior.nu, self.posterior.tau
+        return (
+            1 - nu.var(axis=0) / self.hyper.mean_std**2,
+            1 - tau.var(axis=0) / (HALF_NORMAL_VARIANCE * self.hyper.spread**2),
+        )
+
+    @property
+    def parts(self) -> tuple[Array, Array]:
+        """(p,) each: the standard deviation of the population's mean that is left where the common quantities are
+        known, and what these add, by regression of the draws.
+        """
+        apart, theta = self.posterior.mean - self.posterior.mean.mean(axis=0), self.theta
+        if not theta.shape[1]:
+            return apart.std(axis=0), np.zeros(apart.shape[1])
+        centred = theta - theta.mean(axis=0)
+        told = centred @ np.linalg.lstsq(centred, apart, rcond=None)[0]
+        return (apart - told).std(axis=0), told.std(axis=0)
+
+    def without_hyperprior(self, seed: int) -> tuple[Draws, float]:
+        """Draws as they are where ν and τ are equally likely everywhere, and how many of them count.
+
+        From the posterior's draws, weighed; fewer than
+        :data:`~en4dvar.estimation.population.estimate.FEWEST` say that the hyperprior decides.
+        """
+        d, h = self.posterior, self.hyper
+        logs = 0.5 * np.sum((d.nu / h.mean_std) ** 2 + (d.tau / h.spread) ** 2, axis=1)
+        weights = np.exp(logs - logs.max())
+        taken = resampled(weights / weights.sum(), len(weights), member_stream(seed, "without hyperprior"))
+        kept = Draws(d.mean[taken], d.between[taken], d.next[taken], d.nu[taken], d.tau[taken])
+        return kept, effective_number(weights) / len(weights) * self.estimate.size
+
+    def combinations(self) -> tuple[Combination, ...]:
+        """Combinations of the means that the data determine where they do not determine each mean by itself."""
+        if np.all(self.learned[0] >= DETERMINED):
+            return ()
+        values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(self.posterior.nu.T)) / self.hyper.mean_std**2)
+        scales = np.array([term.std for term in self.terms])
+        combinations = []
+        for value, vector in zip(values, vectors.T, strict=True):
+            slopes = vector / scales  # Σ v_j z_j = Σ (v_j / s_j) x_j + …
+            slopes = slopes / slopes[np.argmax(np.abs(vector))]
+            kept = np.abs(vector) > IN_IT * np.abs(vector).max()
+            if 1 - value >= DETERMINED and kept.sum() > 1:
+                std = float((self.posterior.nu[:, kept] * scales[kept] @ slopes[kept]).std())
+                parts = tuple((self.names[j], float(slopes[j])) for j in np.flatnonzero(kept))
+                combinations.append(Combination(parts, std))
+        return tuple(combinations)
+
+
+@dataclass(frozen=True)
+class Combination:
+    """Σ a_j x_j of transformed population means, known to ``std``: of lognormal ones a product Π θ_j^{a_j}."""
+
+    parts: tuple[tuple[str, float], ...]
+    std: float
+
+
+def terms_of(problems: Sequence[InverseProblem], names: Sequence[str]) -> tuple[PriorTerm, ...]:
+    """Priors of ``names``. Raises :class:`ConfigError`: not estimated in all problems, or with other priors."""
+    shared_terms = []
+    for name in names:
+        for problem in problems:
+            if name not in problem.prior.names:
+                words = f"{name}: not estimated in {problem.observations.name}{suggest(name, problem.prior.names)}"
+                raise ConfigError(words)
+        terms = [p.prior.terms[p.prior.names.index(name)] for p in problems]
+        if any(term != terms[0] for term in terms):
+            raise ConfigError(f"{name}: its prior must be the same in all data sets of a population")
+        shared_terms.append(terms[0])
+    return tuple(shared_terms)
+
+
+def require_population(problems: Sequence[InverseProblem], names: Sequence[str]) -> None:
+    """Raises :class:`ConfigError`, see :func:`population_of`."""
+    terms_of(problems, names)
+    for problem in problems:
+        name = problem.observations.name
+        check_problem(problem)
+        if problem.prior.names != problems[0].prior.names:
+            raise ConfigError(f"{name}: a population needs the same parameters in all data sets")
+        if problem.varying or problem.fields:
+            raise ConfigError(f"{name}: a population needs parameters that do not vary in time or space")
+        if correlated := [n for block in problem.prior.blocks for n in block.names if n in names]:
+            raise ConfigError(f"{name}: {correlated[0]}: a population needs a prior that is not correlated")
+
+
+def common_to(problems: Sequence[InverseProblem], names: Sequence[str]) -> tuple[str, ...]:
+    """Parameters with one value in all data sets: those that are declared so (:attr:`Parameter.common`), not of
+    ``names``, and have the same uncorrelated prior in all.
+    """
+    first = problems[0].prior
+    correlated = {name for problem in problems for block in problem.prior.blocks for name in block.names}
+    return tuple(
+        term.parameter.name
+        for j, term in enumerate(first.terms)
+        if term.parameter.common
+        and term.parameter.name not in {*names, *correlated}
+        and all(problem.prior.terms[j] == term for problem in problems)
+    )
+
+
+def population_of(
+    problems: Sequence[InverseProblem],
+    start: Sequence[Array],
+    names: Sequence[str],
+    seed: int,
+    *,
+    executor: Executor | None = None,
+    hyper: HyperPrior | None = None,
+    effort: Effort | None = None,
+    tell: Callable[[str], None] = lambda words: None,
+) -> CampaignPopulation:
+    """The population of ``names`` behind data sets of the same parameters.
+
+    Parameters
+    ----------
+    start: of each data set control vectors (N_i, n) near its posterior, in white coordinates of its prior.
+    hyper: in units of the prior's standard deviations. tell: called with a line about each data set.
+
+    Raises
+    ------
+    ConfigError: fewer than 3 data sets; other parameters in one than in another, or such as vary in time; a prior of
+        ``names`` that is correlated, or not the same in all. ValueError: fewer than 3 data sets have successful runs.
+    """
+    if len(problems) < FEWEST_SETS:
+        raise ConfigError(f"a population needs at least {FEWEST_SETS} data sets")
+    require_population(problems, names)
+    with one_blas_thread():
+        drawn, left_out = _sampled(problems, start, seed, executor, tell)
+        return _campaign(drawn, left_out, start, problems, names, seed, hyper or HyperPrior(), effort or Effort())
+
+
+def _sampled(
+    problems: Sequence[InverseProblem], start: Sequence[Array], seed: int, executor: Executor | None,
+    tell: Callable[[str], None],
+) -> tuple[dict[int, OwnDraws], dict[str, str]]:  # fmt: skip
+    """Draws of each data set by its number, and why others have none."""
+    drawn: dict[int, OwnDraws] = {}
+    left_out: dict[str, str] = {}
+    for s, (problem, members) in enumerate(zip(problems, start, strict=True)):
+        name = problem.observations.name
+        try:
+            drawn[s] = own_draws(problem, members, seed, executor)
+        except ValueError as error:
+            left_out[name] = str(error)
+            tell(f"{name}: left out, {error}")
+        else:
+            tell(f"{name}: {drawn[s].forward_runs} forward runs, {drawn[s].effective:.0f} effective draws")
+    if len(drawn) < FEWEST_SETS:
+        raise ValueError(f"only {len(drawn)} of {len(problems)} data sets can be sampled; the first is {left_out}")
+    return drawn, left_out
+
+
+def _campaign(
+    drawn: Mapping[int, OwnDraws], left_out: Mapping[str, str], start: Sequence[Array],
+    campaign: Sequence[InverseProblem], names: Sequence[str], seed: int, scales: HyperPrior, effort: Effort,
+) -> CampaignPopulation:  # fmt: skip
+    """The population of the data sets that could be sampled."""
+    problems = tuple(campaign[s] for s in drawn)
+    terms, columns = terms_of(problems, names), problems[0].prior.names
+    common = common_to(problems, names)
+    varying, shared = [columns.index(name) for name in names], [columns.index(name) for name in common]
+    sets = [problem.observations.name for problem in problems]
+    likelihoods = own_likelihoods(list(drawn.values()), varying, shared, seed, sets)
+    white = white_prior(names)
+    estimated = Hierarchy(likelihoods, white, scales).sampled(seed, effort)
+    stream = member_stream(seed, "hyperprior")
+    nu, tau = stream.standard_normal(estimated.nu.shape), np.abs(stream.standard_normal(estimated.nu.shape))
+    z = _sets(estimated, list(drawn.values()), likelihoods, varying, shared, member_stream(seed, "sets given all"))
+    evidence = estimated.log_evidence + sum(draws.log_evidence for draws in drawn.values())
+    runs = sum(draws.forward_runs for draws in drawn.values())
+    sizes = estimated.effective, float(sum(draws.effective for draws in drawn.values()))
+    estimate = Population(tuple(names), white, estimated.nu, estimated.tau, z, sizes, evidence, runs)
+    physical = [entry.prior.to_physical(entry.prior.from_white(z[:, s])) for s, entry in enumerate(problems)]
+    return CampaignPopulation(
+        problems=problems,
+        hyper=scales,
+        estimate=estimate,
+        posterior=_draws(terms, estimated.nu, estimated.tau, member_stream(seed, "next")),
+        prior=_draws(terms, scales.mean_std * nu, scales.spread * tau, stream),
+        sets=np.stack(physical, axis=1),
+        common=common,
+        theta=estimated.theta,
+        belongs=estimated.belongs,
+        empirical=_empirical(terms, [start[s][:, varying] for s in drawn], likelihoods, seed),
+        left_out=left_out,
+    )
+
+
+def _empirical(
+    terms: Sequence[PriorTerm], members: Sequence[Array], likelihoods: Sequence[OwnLikelihood], seed: int
+) -> tuple[Empirical, ...]:
+    """The median over data sets of each parameter, from members (N_i, p) of each."""
+    middle = np.array([np.median(z, axis=0) for z in members])
+    slopes = np.array([likelihood.slopes for likelihood in likelihoods])
+    variance = np.array([z.var(axis=0, ddof=1) for z in members]) - np.sum(slopes**2, axis=2)
+    std, shared = np.sqrt(np.maximum(variance, 0.0)), np.sqrt(np.sum(slopes.mean(axis=0) ** 2, axis=1))
+    return tuple(empirical(term, middle[:, j], std[:, j], float(shared[j]), seed) for j, term in enumerate(terms))
+
+
+def _sets(
+    estimated: HierarchyDraws, drawn: Sequence[OwnDraws], likelihoods: Sequence[OwnLikelihood], varying: Sequence[int],
+    shared: Sequence[int], stream: np.random.Generator,
+) -> Array:  # fmt: skip
+    """Control vectors (M, S, n) of each data set given all, white: what is neither of the population nor common is as
+    in one of the data set's own draws whose x − Bθ is nearest.
+    """
+    z = np.empty((*estimated.x.shape[:2], drawn[0].z.shape[1]))
+    for s, (draws, likelihood) in enumerate(zip(drawn, likelihoods, strict=True)):
+        scale = likelihood.adjusted.std(axis=0)
+        _, near = cKDTree(likelihood.adjusted / scale).query(estimated.x[:, s] / scale, k=NEAR)
+        chosen = near[np.arange(len(near)), stream.integers(NEAR, size=len(near))]
+        z[:, s] = draws.z[chosen]
+        z[:, s, list(varying)] = estimated.x[:, s] + estimated.theta @ likelihood.slopes.T
+        z[:, s, list(shared)] = estimated.theta
+    return z
+
+
+def white_prior(names: Sequence[str]) -> Prior:
+    """N(0, I) of parameters with these names."""
+    return Prior(tuple(PriorTerm.normal(Parameter(name, "1"), 0.0, 1.0) for name in names))
+
+
+def _draws(terms: Sequence[PriorTerm], nu: Array, tau: Array, stream: np.random.Generator) -> Draws:
+    """Physical draws of white ν and τ (M, p)."""
+    mean, std = np.array([term.mean for term in terms]), np.array([term.std for term in terms])
+    x = mean + std * (nu + tau * stream.standard_normal(nu.shape))
+    following = np.stack([term.to_physical(x[:, j]) for j, term in enumerate(terms)], axis=1)
+    return Draws(*moments(terms, mean + std * nu, std * tau), following, nu, tau)

@@ -1,0 +1,165 @@
+r"""Mean ν and spread τ of a population from the likelihoods of its data sets, with common quantities and odd ones.
+
+    x_i ~ (1 − ε) N(ν, diag τ²) + ε π(x),     θ ~ N(0, I),     data_i ~ L_i(x_i − B_i θ)
+
+in white coordinates of the prior π. A data set is odd with probability ε: then its parameters are drawn from the prior
+as if it belonged to no population (Hogg, Bovy & Lang 2010, arXiv:1008.4686), so that one bubble of another gel moves
+the mean little and widens the spread not at all; how probably each belongs is part of the answer. θ are quantities with
+one value in all data sets, whose uncertainty therefore no number of data sets averages out.
+
+With L_i in units of its evidence (:mod:`~en4dvar.estimation.population.own`) the density of h = (ν, ln τ, θ) is
+
+    p(h) Π_i [ (1 − ε) ∫ L_i(x) N(x; ν − B_i θ, τ²) dx + ε ],
+
+every integral in closed form. Walkers find where it is, and importance weights of draws from a mixture fitted to them
+give independent draws and the evidence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from en4dvar.estimation.population.effort import Effort
+from en4dvar.estimation.population.hyper import Hyper, HyperPrior
+from en4dvar.estimation.population.mixtures import Mixture, condition, draw_conditioned, log_marginal
+from en4dvar.estimation.population.own import OwnLikelihood
+from en4dvar.model.state import Array
+from en4dvar.plumbing.compiled import kernel
+from en4dvar.priors.prior import Prior, member_stream
+from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
+from en4dvar.sampling.walkers import advance
+
+MOVES = 5  # of one half of the walkers while the other stands still
+FIT = 3000  # positions that the proposal is fitted to
+
+
+@dataclass(frozen=True)
+class HierarchyDraws:
+    """Draws of ν and τ (M, p), θ (M, c), and of x_i − B_i θ (M, S, p) given them; ``belongs`` (S,) the probabilities
+    that the data sets are of the population; ``effective`` draws and ``log_evidence`` in units of the sets' own.
+    """
+
+    nu: Array
+    tau: Array
+    theta: Array
+    x: Array
+    belongs: Array
+    effective: float
+    log_evidence: float
+
+
+class Hierarchy:
+    """The posterior density of h = (ν, ln τ, θ); ``prior`` is N(0, I) of the p parameters that vary."""
+
+    def __init__(self, likelihoods: Sequence[OwnLikelihood], prior: Prior, scales: HyperPrior):
+        self.likelihoods, self.odd = likelihoods, scales.odd
+        self.p, self.c = likelihoods[0].slopes.shape
+        self.hyper = Hyper(prior, list(range(self.p)), scales)
+
+    def log_ratios(self, h: Array) -> Array:
+        """(B, S) ln of the marginal likelihood of each data set in the population, over that under its own prior."""
+        mean, variance = self.hyper.population(h[:, : 2 * self.p])
+        theta = h[:, 2 * self.p :]
+        columns = [
+            log_marginal([likelihood.mixture], mean - theta @ likelihood.slopes.T, variance)
+            for likelihood in self.likelihoods
+        ]
+        return np.stack(columns, axis=1)
+
+    def log_density(self, h: Array) -> Array:
+        """(B,), of all data in units of the sets' own evidences."""
+        logs: Array = self.hyper.log_density(h[:, : 2 * self.p]) - 0.5 * np.sum(h[:, 2 * self.p :] ** 2, axis=1)
+        logs -= 0.5 * self.c * math.log(2 * math.pi)
+        inside = np.isfinite(logs)
+        logs[inside] += self._mixed(self.log_ratios(h[inside])).sum(axis=1)
+        return logs
+
+    def belongs(self, h: Array) -> Array:
+        """(B, S) probabilities that each data set is of the population h."""
+        ratios = self.log_ratios(h)
+        return np.asarray(np.exp(ratios + math.log1p(-self.odd) - self._mixed(ratios)))
+
+    def sampled(self, seed: int, effort: Effort) -> HierarchyDraws:
+        """Deterministic in ``seed``. Raises :class:`ValueError`: no population that was tried explains the data."""
+        stream = member_stream(seed, "population")
+        h, logs = self._weighed(self._walked(stream, effort), stream, effort)
+        if effective_number(_weights(logs)) < effort.effective:  # once more, from what the weights say
+            weights = _weights(logs)
+            again = h[resampled(weights / weights.sum(), FIT, stream)]
+            second, its_logs = self._weighed(again, stream, effort)
+            if effective_number(_weights(its_logs)) > effective_number(weights):
+                h, logs = second, its_logs
+        weights = _weights(logs)
+        taken = h[resampled(weights / weights.sum(), effort.draws, stream)]
+        belongs, p = self.belongs(taken), self.p
+        evidence = float(logs.max()) + math.log(float(weights.mean()))
+        nu, tau, theta = taken[:, :p], np.exp(taken[:, p : 2 * p]), taken[:, 2 * p :]
+        x = self._given(taken, belongs, stream)
+        return HierarchyDraws(nu, tau, theta, x, belongs.mean(axis=0), effective_number(weights), evidence)
+
+    def _mixed(self, ratios: Array) -> Array:
+        if not self.odd:
+            return ratios
+        return np.asarray(np.logaddexp(ratios + math.log1p(-self.odd), math.log(self.odd)))
+
+    def _walked(self, stream: np.random.Generator, effort: Effort) -> Array:
+        """(D, 2p + c) positions of walkers, the first third left out."""
+
+        def cost(h: Array) -> Array:
+            logs = self.log_density(h)
+            return np.asarray(np.where(np.isnan(logs), np.inf, -logs))
+
+        walkers = effort.hyper_walkers
+        start = np.hstack([self.hyper.scattered(walkers, stream), stream.standard_normal((walkers, self.c))])
+        halves = list(start.reshape(2, walkers // 2, -1))
+        costs, kept = [cost(part) for part in halves], []
+        for number in range(effort.hyper_rounds):
+            for i in (0, 1):
+                halves[i], costs[i] = advance(cost, halves[i], costs[i], halves[1 - i], stream, MOVES)
+            if number >= effort.hyper_rounds // 3:
+                kept += halves
+        return np.concatenate(kept)
+
+    def _weighed(self, at: Array, stream: np.random.Generator, effort: Effort) -> tuple[Array, Array]:
+        """Draws h (B, 2p + c) of a mixture fitted to positions, and logs of their weights."""
+        chosen = at[np.linspace(0, len(at) - 1, FIT).astype(int)]
+        proposal = StudentMixture.fitted(chosen, stream, effort.hyper_components)
+        h = proposal.draw(effort.draws, stream)
+        logs = self.log_density(h) - proposal.log_density(h)
+        if not np.isfinite(logs.max()):
+            raise ValueError("none of the populations that were drawn explains the data")
+        return h, logs
+
+    def _given(self, h: Array, belongs: Array, stream: np.random.Generator) -> Array:
+        """Draws (M, S, p) of x_i − B_i θ given h and the data: of the population, or of the prior where it is odd."""
+        mean, variance = self.hyper.population(h[:, : 2 * self.p])
+        theta, x = h[:, 2 * self.p :], np.empty((len(h), len(self.likelihoods), self.p))
+        for s, likelihood in enumerate(self.likelihoods):
+            own = stream.uniform(size=len(h)) > belongs[:, s]
+            middle = np.where(own[:, None], 0.0, mean) - theta @ likelihood.slopes.T
+            spread = np.where(own[:, None], 1.0, variance)
+            numbers, uniform = stream.standard_normal((len(h), self.p)), stream.uniform(size=len(h))
+            _draw(likelihood.mixture, middle, spread, numbers, uniform, x[:, s])
+        return x
+
+
+def _weights(logs: Array) -> Array:
+    return np.asarray(np.exp(logs - logs.max()))
+
+
+@kernel
+def _draw(mixture: Mixture, mean: Array, variance: Array, numbers: Array, uniform: Array, out: Array) -> None:
+    """Draws ``out`` (B, p) of L(x) N(x; mean, variance) from standard normal ``numbers``, which are overwritten."""
+    n_parts, n = mixture.linear.shape
+    middle, root, logs = np.empty((n_parts, n)), np.zeros((n_parts, n, n)), np.empty(n_parts)
+    for b in range(mean.shape[0]):
+        for m in range(n_parts):
+            part = condition(mixture.precision[m], mixture.linear[m], mean[b], variance[b], middle[m], root[m])
+            logs[m] = mixture.constant[m] + part
+        cumulated = np.cumsum(np.exp(logs - logs.max()))
+        chosen = min(np.searchsorted(cumulated, uniform[b] * cumulated[-1]), n_parts - 1)
+        draw_conditioned(middle[chosen], root[chosen], numbers[b], out[b])

@@ -1,0 +1,191 @@
+r"""What each data set says by itself about the parameters of a population: draws of its own posterior, as a likelihood.
+
+The draws follow p(y|x) π(x) with the data set's own prior π, by adaptive importance sampling with forward runs from its
+members and from the prior (:mod:`en4dvar.sampling.importance`), so that all modes count by their weight and any kind of
+observation errors is taken as it is: the scale of the errors and a discrepancy are further parameters of the data set.
+Where too few draws are effective, walkers go on from them (:mod:`en4dvar.sampling.walkers`).
+
+Of the coordinates x that vary and the quantities θ that all data sets have in common (a density, a scale) the draws
+tell how x moves with θ, to first order: the likelihood is one of x − Bθ, which gives the regression of x on θ in the
+posterior the slopes (I − C) B, where C is the covariance of x given θ and the prior of x is N(0, I). What the data tell
+of θ itself is left aside: it keeps its prior. A Gaussian mixture describes x − Bθ; dividing by the prior N(0, I + BBᵀ)
+leaves the likelihood of the data set, with which :mod:`~en4dvar.estimation.population.hierarchy` works.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from en4dvar.ensemble.forecast import Composite
+from en4dvar.estimation.population.mixtures import Mixture
+from en4dvar.executor import Executor
+from en4dvar.model.state import Array
+from en4dvar.priors.prior import member_stream, own_seed
+from en4dvar.problem import InverseProblem
+from en4dvar.sampling.importance import Importance, standard
+from en4dvar.sampling.mixture import StudentMixture, fit_gaussians, resampled
+from en4dvar.sampling.walkers import advance
+
+DRAWS, MOST_ROUNDS = 400, 24  # of a round of importance sampling, and the most rounds
+ENOUGH = 400.0  # effective draws that end the rounds
+KEPT = 2000  # equally likely draws of each data set
+WALKERS, MOVES, WALKED = 80, 5, 16  # moves of half of them while the other half stands still, and turns of both
+MOST_PARTS, ROUNDS = 4, 60  # components of a mixture; rounds of expectation maximisation
+NARROWEST = 0.03  # standard deviation of what is drawn about the members, in units of the prior
+INFORMED = 0.1  # least share of the prior's variance that the data take away, for a slope to be read from draws
+
+
+@dataclass(frozen=True)
+class OwnDraws:
+    """Equally likely draws ``z`` (D, n) of one posterior, in white coordinates of its prior.
+
+    ``log_evidence``: ln ∫ exp(−J_o) π dz; ``effective``: the number of independent draws that they are worth at least.
+    """
+
+    z: Array
+    log_evidence: float
+    effective: float
+    forward_runs: int
+
+
+@dataclass(frozen=True)
+class OwnLikelihood:
+    """The likelihood of one data set in p coordinates x given c common quantities θ, in units of its evidence.
+
+    ``mixture``: of x − ``slopes`` θ, with slopes (p, c); ``adjusted`` (D, p): the draws of x − Bθ.
+    """
+
+    mixture: Mixture
+    slopes: Array
+    adjusted: Array
+
+
+def own_draws(problem: InverseProblem, start: Array, seed: int, executor: Executor | None = None) -> OwnDraws:
+    """Draws of one posterior, from members (N, n) of it in white coordinates.
+
+    The same for a data set whatever others there are. Raises :class:`ValueError` where no run succeeds.
+    """
+    composite, prior, runs = Composite(problem, executor), problem.prior, 0
+    seed = own_seed(seed, problem.observations.name)
+
+    def log_likelihood(z: Array) -> Array:
+        nonlocal runs
+        runs += len(z)
+        return np.asarray(-problem.observations.cost(composite(prior.from_white(z)).predicted))
+
+    def cost(z: Array) -> Array:
+        return np.asarray(0.5 * np.sum(z**2, axis=1) - log_likelihood(z))
+
+    sampler = Importance(_about(start), member_stream(seed, "population: own draws"), DRAWS)
+    for _ in range(MOST_ROUNDS):
+        z = sampler.draw()
+        sampler.add(z, log_likelihood(z))
+        if sampler.effective >= ENOUGH:
+            break
+    if not math.isfinite(sampler.log):
+        raise ValueError("no forward run about its members succeeded")
+    stream = member_stream(seed, "population: kept draws")
+    if sampler.effective >= ENOUGH:
+        return OwnDraws(sampler.z[resampled(sampler.shares, KEPT, stream)], sampler.log, sampler.effective, runs)
+    walked = _walked(sampler, cost, stream)
+    return OwnDraws(walked, sampler.log, max(sampler.effective, float(WALKERS)), runs)
+
+
+def _about(start: Array) -> StudentMixture:
+    """The prior and, as often, Student t about members (N, n)."""
+    n = start.shape[1]
+    covariance = np.cov(start, rowvar=False).reshape(n, n) + NARROWEST**2 * np.eye(n)
+    wide = standard(n)
+    return StudentMixture(
+        np.full(2, 0.5),
+        np.vstack([wide.centre, start.mean(axis=0)]),
+        np.concatenate([wide.root, np.linalg.cholesky(covariance)[None]]),
+    )
+
+
+def _walked(sampler: Importance, cost: object, stream: np.random.Generator) -> Array:
+    """(D, n) positions of walkers on exp(−cost), which start at draws by their weights."""
+    at = stream.permutation(resampled(sampler.shares, WALKERS, stream))
+    offset = 0.5 * sampler.z.shape[1] * math.log(2 * math.pi)
+    halves = list(sampler.z[at].reshape(2, WALKERS // 2, -1))
+    costs = list((-sampler.target[at] - offset).reshape(2, -1))
+    kept = []
+    for turn in range(WALKED):
+        for i in (0, 1):
+            halves[i], costs[i] = advance(cost, halves[i], costs[i], halves[1 - i], stream, MOVES)  # type: ignore[arg-type]
+        if turn >= WALKED // 4:
+            kept += [half.copy() for half in halves]
+    return np.concatenate(kept)
+
+
+def own_likelihoods(
+    drawn: Sequence[OwnDraws], varying: Sequence[int], common: Sequence[int], seed: int, names: Sequence[str]
+) -> list[OwnLikelihood]:
+    """The likelihoods in the coordinates ``varying`` given those in ``common``; ``seed`` and the data sets' ``names``
+    name the streams.
+    """
+    each = [(draws.z[:, list(varying)], draws.z[:, list(common)]) for draws in drawn]
+    slopes = _pooled(
+        *zip(*(_slopes(*both, draws.effective) for both, draws in zip(each, drawn, strict=True)), strict=True)
+    )
+    return [
+        _likelihood(x - theta @ b.T, b, draws.effective, member_stream(own_seed(seed, name), "population: mixture"))
+        for (x, theta), b, draws, name in zip(each, slopes, drawn, names, strict=True)
+    ]
+
+
+def _likelihood(adjusted: Array, slopes: Array, effective: float, stream: np.random.Generator) -> OwnLikelihood:
+    share, centre, covariance = _fitted(adjusted, effective, stream)
+    std = np.sqrt(1 + np.sum(slopes**2, axis=1))
+    return OwnLikelihood(Mixture.divided(centre, covariance, np.log(share), np.zeros(len(std)), std), slopes, adjusted)
+
+
+def _slopes(x: Array, theta: Array, effective: float) -> tuple[Array, Array]:
+    """B (p, c) of posterior draws x (D, p) and θ (D, c), and the variances (p, c) of its elements."""
+    if not theta.shape[1]:
+        return np.zeros((x.shape[1], 0)), np.zeros((x.shape[1], 0))
+    apart, centred = x - x.mean(axis=0), theta - theta.mean(axis=0)
+    of_posterior = np.linalg.lstsq(centred, apart, rcond=None)[0].T
+    left = np.atleast_2d(np.cov((apart - centred @ of_posterior.T).T))
+    values, vectors = np.linalg.eigh(np.eye(len(left)) - left)
+    undone = vectors @ (vectors.T / np.maximum(values, INFORMED)[:, None])
+    variance = np.outer(np.diag(undone @ left @ undone.T), 1 / centred.var(axis=0)) / effective
+    return np.asarray(undone @ of_posterior), variance
+
+
+def _pooled(slopes: Sequence[Array], variances: Sequence[Array]) -> Array:
+    """(S, p, c): each slope is drawn towards the mean of all by the share of their scatter that is error of the draws.
+
+    Errors of the slopes that differ from set to set would else look like information about θ.
+    """
+    each, mean = np.array(slopes), np.mean(slopes, axis=0)
+    scatter = each.var(axis=0, ddof=1)
+    kept = 1 - np.mean(variances, axis=0) / np.maximum(scatter, np.finfo(float).tiny)
+    return np.asarray(mean + np.maximum(kept, 0.0) * (each - mean))
+
+
+def _fitted(x: Array, effective: float, stream: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Shares, means and covariances of the mixture of as many Gaussians as Schwarz' criterion grants draws (D, p)."""
+    p, best, lowest = x.shape[1], None, np.inf
+    for parts in range(1, MOST_PARTS + 1):
+        share, centre, covariance = fit_gaussians(x, stream, parts, ROUNDS)
+        kept = share > 1e-6
+        share, centre, covariance = share[kept] / share[kept].sum(), centre[kept], covariance[kept]
+        numbers = parts * (1 + p + p * (p + 1) / 2) - 1
+        criterion = -effective * _log_density(x, share, centre, covariance).mean() + 0.5 * numbers * math.log(effective)
+        if criterion < lowest:
+            best, lowest = (share, centre, covariance), criterion
+    assert best is not None
+    return best
+
+
+def _log_density(x: Array, share: Array, centre: Array, covariance: Array) -> Array:
+    """(D,) of a Gaussian mixture at points (D, p)."""
+    root = np.linalg.cholesky(covariance)
+    z = np.linalg.solve(root, (x - centre[:, None]).transpose(0, 2, 1))
+    logs = np.log(share) - np.log(np.einsum("mii->mi", root)).sum(axis=1) - 0.5 * x.shape[1] * math.log(2 * math.pi)
+    return np.asarray(np.logaddexp.reduce(logs[:, None] - 0.5 * np.sum(z**2, axis=1), axis=0))

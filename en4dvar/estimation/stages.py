@@ -1,0 +1,246 @@
+"""The stages of an assimilation: prior forecast, start, iterations, search for other minima, refinement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from en4dvar.descent.loop import minimise
+from en4dvar.descent.marginal import marginal_members
+from en4dvar.descent.minima import Minimum, merged
+from en4dvar.descent.noise_scale import mean_beyond_mode
+from en4dvar.descent.search import Outcome, Search, SearchState, from_draw
+from en4dvar.descent.start import StartState, choose_start
+from en4dvar.descent.weight_space import WeightSpace
+from en4dvar.descent.window import DataWindow, Descent
+from en4dvar.diagnosis import diagnostics as diag
+from en4dvar.diagnosis.analysis import Progress, Record
+from en4dvar.ensemble.forecast import Forecast, check_problem, plotting_times
+from en4dvar.estimation.loop_state import Keep, LoopState, Refinement
+from en4dvar.executor import Executor
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.problem import InverseProblem
+from en4dvar.sampling.mcmc import ChainState
+from en4dvar.sampling.refine import Refined, in_doubt, refined, samples
+from en4dvar.sampling.shape import CLEARED, examine_shape
+from en4dvar.schemes import MINIMISERS
+from en4dvar.schemes.base import Weights
+from en4dvar.schemes.settings import AssimilationSettings
+
+
+@dataclass(frozen=True)
+class Ends:
+    """An ensemble (N, n), transformed, about the ``mode`` (n,) of J, and what came of running both."""
+
+    members: Array
+    mode: Array
+    run: Forecast
+    central: Forecast
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """The posterior's ensemble; how it was sampled, or the ``shape`` of one that was not."""
+
+    ends: Ends
+    refined: Refined | None
+    shape: Mapping[str, float]
+
+
+class Stages:
+    """One data set, in the order of the methods; each keeps a state to resume from as it goes on."""
+
+    def __init__(
+        self,
+        problem: InverseProblem,
+        settings: AssimilationSettings,
+        seed: int,
+        executor: Executor,
+        progress: Progress | None,
+        keep: Keep | None,
+    ):
+        self.fixed_parameters = check_problem(problem)
+        self.problem, self.settings, self.seed = problem, settings, seed
+        self.progress, self._keep = progress, keep
+        self.scheme, self.minimiser = settings.own, settings.own.minimiser
+        robust = np.isfinite(problem.observations.noise.counts_within)
+        estimated = any(p.name in problem.prior.names for p in problem.discrepancy)
+        if self.minimiser is None and (problem.has_noise_scale or robust or estimated):
+            raise ConfigError(
+                f"{settings.scheme} takes Gaussian errors of known covariance: neither sigma nor a robust cost nor a "
+                f"discrepancy; use {' or '.join(MINIMISERS)}"
+            )
+        self.space = WeightSpace(problem, settings, seed, executor)
+        self.grid = plotting_times(problem)
+
+    def descend(self, resume: LoopState | None = None) -> tuple[Forecast, LoopState, Descent]:
+        """The prior forecast, where the iterations started, and their end."""
+        space = self.space
+        prior_run = space.forecast(np.vstack([space.members, space.mean]), self.grid)
+        space.require_members(prior_run[:-1].failures, "prior forecast")
+        if not self.settings.stochastic_model:
+            space.check_repeats(prior_run, self.grid)
+        start = self.start(prior_run, resume) if resume is None or resume.descent is None else resume
+        return prior_run, start, self.iterate(start, prior_run)
+
+    def start(self, prior_run: Forecast, resume: LoopState | None) -> LoopState:
+        """The state from which the iterations go on."""
+        space = self.space
+        if self.minimiser is None:
+            return LoopState(space.forward_runs, descent=Descent(Weights.prior(len(space.members))))
+        if resume is not None:
+            space.forward_runs = resume.forward_runs
+
+        def keep(comparison: Callable[[], StartState]) -> None:
+            self.keep(lambda: LoopState(space.forward_runs, comparison()))
+
+        before = resume.comparison if resume else None
+        begun = choose_start(space, self.minimiser, prior_run, self.seed, before, keep, self.tell)
+        for record in begun.descent.records:
+            self.tell(record)
+        return LoopState(space.forward_runs, None, begun.descent, begun.minima, begun.tried, begun.warnings)
+
+    def iterate(self, state: LoopState, prior_run: Forecast) -> Descent:
+        """The end of the iterations."""
+        space = self.space
+        space.forward_runs = state.forward_runs
+        assert state.descent is not None
+        descent = state.descent.kept
+
+        def keep() -> None:
+            kept = replace(state, forward_runs=space.forward_runs, descent=descent.kept)
+            self.latest = kept
+            self.keep(lambda: kept)
+
+        window = DataWindow(space, self.seed, keep, self.tell, prior_run, self.grid)
+        minimise(window, [descent])
+        return descent
+
+    def searched(self, start: LoopState, descent: Descent, prior_run: Forecast) -> tuple[Outcome, Ends]:
+        """All minima, the lowest descent, and the ensemble about it.
+
+        After the first descents one from a member far from the minimum looks for another. Of a cheap model, or for a
+        chain, many are tried where there is one or where J of the posterior members is not that of a Gaussian, and
+        draws beyond the ensemble where the lowest J is higher than noise and prior explain; of another model some,
+        where the lowest minimum is that of one descent alone.
+        """
+        space, scheme, before = self.space, self.minimiser, self.latest.descent
+        assert before is not None
+        if scheme is None:
+            return Outcome(descent, before, (), ()), self.gaussian(descent)
+        begun, minima = start.search or SearchState(), start.minima
+        if start.search is None:
+            minima = merged([Minimum.of(space, descent), *minima])
+        outcome = Outcome(descent, before, minima, start.tried, begun.runs, begun.over)
+        if scheme.starts < 2 or not scheme.economical(space.basis):
+            return outcome, self.gaussian(descent)
+        if start.search is not None:
+            space.forward_runs = start.forward_runs
+        search = Search(space, scheme, prior_run, self.seed, begun, self.keep_search, self.tell)
+        outcome = search.challenged(outcome)
+        if not (self.settings.refine == "mcmc" or samples(space)):
+            outcome = search.settled(outcome)
+            return outcome, self.gaussian(outcome.descent)
+        ends = self.gaussian(outcome.descent)
+        if begun.over > 1 and not begun.lower:
+            space.forward_runs = start.forward_runs  # they were counted before the second round
+        fit = diag.gaussianity(ends.members, ends.mode, space.costs(ends.members, ends.run))["gaussian_fit"]
+        rest = search.rest(outcome)
+        if rest and (len(outcome.minima) > 1 or not fit >= CLEARED):
+            outcome, ends = self.rather(search.round(outcome, rest), outcome, ends)
+        return self.rather(search.widened(outcome), outcome, ends)
+
+    def rather(self, after: Outcome, outcome: Outcome, ends: Ends) -> tuple[Outcome, Ends]:
+        """What was found ``after`` a round, and the ensemble about it: that of before where it is no lower descent."""
+        return after, ends if after.descent is outcome.descent else self.gaussian(after.descent)
+
+    def searched_from(self, outcome: Outcome, ends: Ends, x: Array) -> tuple[Outcome, Ends]:
+        """The same, after a descent from a draw x (n,) of the posterior that lies lower than all minima."""
+        after = from_draw(self.space, outcome, x, self.seed, self.tell)
+        return self.rather(after, outcome, ends)
+
+    def keep_search(self, state: Callable[[], tuple[Outcome, SearchState]]) -> None:
+        runs = self.space.forward_runs
+
+        def kept() -> LoopState:
+            outcome, search = state()
+            return replace(
+                self.latest,
+                forward_runs=runs,
+                descent=outcome.before,
+                minima=outcome.minima,
+                tried=outcome.tried,
+                search=search,
+            )
+
+        self.latest = kept()
+        self.keep(lambda: self.latest)
+
+    def gaussian(self, descent: Descent) -> Ends:
+        """The ensemble at the end of a descent, and its forecast."""
+        space, problem = self.space, self.problem
+        transform = descent.newton.hessian.economical_transform if self.minimiser else descent.weights.T
+        ends = space.ensemble(descent.weights.w, transform)
+        members, mode = ends[:-1], ends[-1]
+        members = members + mean_beyond_mode(problem, mode, members, descent.records[-1].dfs)
+        if self.minimiser is None:  # the last ensemble that was run is the posterior
+            return Ends(members, mode, descent.iterate.members, descent.iterate.central)
+        if problem.discrepancy and descent.iterate.linear is not None:
+            members = marginal_members(space, descent.iterate.linear, mode, members, self.seed)
+        final = space.forecast(np.vstack([members, mode]), self.grid)
+        return Ends(members, mode, final[:-1], final[-1:])
+
+    def sampled(
+        self, ends: Ends, minima: Sequence[Minimum], agree: bool, earlier: Refinement | None, looking: bool
+    ) -> Sampled:
+        """The ensemble, sampled where that is asked for or there is a doubt.
+
+        ``agree``: descents from different members ended in the lowest of the ``minima`` that count. ``earlier``: where
+        a chain was interrupted. ``looking``: end at a draw that lies lower than all minima.
+        """
+        space = self.space
+        if self.settings.refine != "mcmc":
+            cheap = samples(space)
+            # with a discrepancy emulated J costs as much as true J: where that may be sampled, it tells
+            settle = not (cheap and self.problem.discrepancy)
+            costs = space.costs(ends.members, ends.run)
+            shape = examine_shape(space, ends.members, ends.mode, costs, self.seed, settle)
+            if not (cheap and minima and in_doubt(minima, agree, shape)):
+                return Sampled(ends, None, shape)
+        sampled = self.refine(ends.members, minima, earlier, looking)
+        if sampled.lower is not None:
+            return Sampled(ends, sampled, {})
+        run = space.forecast(sampled.members, self.grid)
+        central = ends.central if self.minimiser else space.forecast(ends.mode[None], self.grid)
+        return Sampled(Ends(sampled.members, ends.mode, run, central), sampled, {})
+
+    def refine(self, posterior: Array, minima: Sequence[Minimum], earlier: Refinement | None, looking: bool) -> Refined:
+        """What takes the place of the posterior ensemble (N, n); for the rest see :meth:`sampled`."""
+        space = self.space
+
+        def cost(x: Array) -> Array:
+            return space.costs(x, space.forecast(x))
+
+        def keep(state: ChainState) -> None:
+            self.keep(lambda: replace(self.latest, refinement=Refinement(state, space.forward_runs)))
+
+        def resume() -> ChainState | None:
+            """What came before the chain is made again after an interruption, from the same runs."""
+            if earlier is None:
+                return None
+            space.forward_runs = earlier.forward_runs
+            return earlier.chain
+
+        look = self.tell
+        return refined(space, cost, posterior, minima, self.seed, looking=looking, resume=resume, keep=keep, look=look)
+
+    def keep(self, state: Callable[[], LoopState]) -> None:
+        if self._keep is not None:
+            self._keep(state)
+
+    def tell(self, record: Record) -> None:
+        if self.progress is not None:
+            self.progress(self.problem.observations.name, record)

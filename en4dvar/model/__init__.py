@@ -1,0 +1,1 @@
+"""Forward models: state and parameters, the interface, batches, functions and programs as models."""

@@ -1,0 +1,350 @@
+"""The forward model: a state-vector operator F, seen through an observation operator H.
+
+A model author writes ``layout``, ``parameters``, ``initial_state`` and ``step``; everything else has a default.
+A model that can integrate many members at once overrides ``trajectories``, the fast path, and may then do without
+``step``.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import ClassVar, Protocol, Self, runtime_checkable
+
+import numpy as np
+
+from en4dvar.model.state import Array, Field, Parameter, StateLayout
+from en4dvar.plumbing.caution import Caution
+from en4dvar.plumbing.user_code import reason_of
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One member's path: ``states`` (K, n_state) at ``times`` (K,) in seconds (or the model's own time unit)."""
+
+    times: Array
+    states: Array
+    layout: StateLayout
+
+    def __getitem__(self, name: str) -> Array:
+        """The field ``name`` along the path: (K,) or (K, size)."""
+        return self.layout.part(self.states, name)
+
+    def largest(self, name: str) -> float:
+        """The largest value of a quantity of the model's ``validity`` along the path; by default |field of that name|.
+
+        A model whose quantity peaks between the stored instants overrides this.
+        """
+        return float(np.max(np.abs(self[name])))
+
+    def beyond(self, limit: ValidityLimit) -> float:
+        """When the path first exceeds a limit, +inf where it does not: the first stored instant that does.
+
+        Where it does between them only, or the quantity is no field, the whole path counts. A model that knows better
+        overrides this.
+        """
+        if not self.largest(limit.name) > limit.value:
+            return math.inf
+        if limit.name not in self.layout.names:
+            return -math.inf
+        over = np.abs(self[limit.name]).reshape(len(self.times), -1).max(axis=1) > limit.value
+        return float(self.times[np.argmax(over)]) if over.any() else -math.inf
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A member that could not be integrated. A value, never an exception: it is carried through the iterations."""
+
+    reason: str
+    time: float = float("nan")
+
+
+@dataclass(frozen=True)
+class ValidityLimit:
+    """A quantity that must stay below ``value`` along a path for the model's own assumptions to hold.
+
+    The model computes on beyond it; a result says where its members went (see :mod:`en4dvar.diagnosis.honesty`).
+    ``label`` is in words, e.g. "Mach number of the wall"; ``source`` says where the limit comes from.
+    """
+
+    name: str
+    value: float
+    unit: str = "1"
+    label: str = ""
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "label", self.label or self.name)
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """The same experiment with one assumption changed: what a result would be then is told beside it.
+
+    ``words`` complete "if …", e.g. "the pulse were 5 % stronger". ``model`` takes the place of the model, with the same
+    parameters and observables; ``values`` and ``times`` multiply the observations and their errors; ``parameters`` are
+    factors of a parameter's value where it is fixed, of the centre of its prior where it is estimated. One about the
+    readings of an ``observable`` is told where all readings are of that.
+    """
+
+    name: str
+    words: str
+    model: ForwardModel | None = None
+    values: float = 1.0
+    times: float = 1.0
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    observable: str = ""
+
+
+@dataclass(frozen=True)
+class PathQuantity:
+    """A quantity that acts along a path, e.g. a strain rate: ``trajectory[name]`` (K,) in ``unit``; its size is of
+    interest.
+    """
+
+    name: str
+    unit: str
+    label: str = ""
+    symbol: str = ""
+    display_unit: str = ""
+
+    def __post_init__(self) -> None:
+        for key, value in (("symbol", self.name), ("display_unit", self.unit), ("label", self.name)):
+            object.__setattr__(self, key, getattr(self, key) or value)
+
+
+@runtime_checkable
+class ObservationOperator(Protocol):
+    """H: maps a trajectory to predictions (Ny,), one per observation time.
+
+    One with an attribute ``batched = True`` gives, by the same expression, (N, Ny) for a
+    :class:`~en4dvar.model.batch.Batch`, whose fields have members as their first axis.
+    """
+
+    def __call__(self, trajectory: Trajectory) -> Array: ...
+
+
+@runtime_checkable
+class RateOperator(Protocol):
+    """The time derivative of an observation operator's output (Ny,); needed where ``time_std`` is given."""
+
+    def rate(self, trajectory: Trajectory) -> Array: ...
+
+
+@dataclass(frozen=True)
+class StateField:
+    """H that reads one scalar field of the state, and its rate from another field where the model has it.
+
+    >>> import numpy as np
+    >>> from en4dvar.model.state import Field
+    >>> layout = StateLayout((Field("x"), Field("v")))
+    >>> path = Trajectory(np.array([0.0, 1.0]), np.array([[1.0, 2.0], [3.0, 4.0]]), layout)
+    >>> StateField("x", rate_of="v")(path), StateField("x", rate_of="v").rate(path)
+    (array([1., 3.]), array([2., 4.]))
+    """
+
+    name: str
+    rate_of: str | None = None
+    batched: ClassVar[bool] = True
+
+    def __call__(self, trajectory: Trajectory) -> Array:
+        return trajectory[self.name]
+
+    def rate(self, trajectory: Trajectory) -> Array:
+        """Time derivative of the observable (K,). Raises NotImplementedError where the model has none."""
+        if self.rate_of is None:
+            raise NotImplementedError(f"the model does not provide d({self.name})/dt")
+        return trajectory[self.rate_of]
+
+
+@dataclass(frozen=True)
+class Observable:
+    """A quantity that can be measured: its name in YAML and netCDF, its units, and the operator H that predicts it.
+
+    ``positive``: it cannot be zero, so that zeros before the first reading of a file say that there was nothing yet.
+    ``fewest`` readings make a data set: 1 of a quantity of the whole path, 3 of one that is followed in time.
+    """
+
+    name: str
+    unit: str
+    operator: ObservationOperator
+    symbol: str = ""
+    display_unit: str = ""
+    label: str = ""
+    positive: bool = False
+    fewest: int = 3
+
+    def __post_init__(self) -> None:
+        for key, value in (("symbol", self.name), ("display_unit", self.unit), ("label", self.name)):
+            object.__setattr__(self, key, getattr(self, key) or value)
+
+
+@dataclass(frozen=True)
+class Shared:
+    """A batch that is ready to be integrated by any number of threads.
+
+    Threads that call ``work``, which releases the interpreter, share the members among themselves; when all calls have
+    returned, ``results`` gives the N trajectories or failures. Who did what makes no difference to them.
+    """
+
+    work: Callable[[], object]
+    results: Callable[[], Sequence[Trajectory | Failure]]
+
+
+class ForwardModel(ABC):
+    """F. Subclasses set ``parameters``, ``layout`` and ``observables`` (the first is the default).
+
+    ``time_unit`` / ``time_display_unit`` label the time axis of observations. ``batch`` is the number of members the
+    fast path likes to get at once (executors cut chunks at multiples of it); ``compiled`` says that ``trajectories``
+    releases the interpreter lock, so that threads serve it. ``autonomous`` says that F depends on elapsed time alone:
+    sequential schemes may start ``trajectories`` at any instant, where otherwise they repeat ``step``. ``validity``
+    names quantities and the limits beyond which the equations do not hold; :meth:`doubts` judges observations before a
+    run. ``alternatives`` are assumptions that could
+    be otherwise, for :mod:`en4dvar.diagnosis.response.what_if`; ``path_quantities`` and ``path_parameters``, names
+    of fields of the state that act along the path and not only at its start, are for
+    :mod:`en4dvar.diagnosis.response.ledger`. ``optional_parameters`` are numbers that are known unless
+    ``parameters:`` names them: :meth:`with_parameters` is the model in which they are parameters too.
+
+    ``defaults`` are values (SI) of parameters that ``parameters:`` need not name.
+
+    A model that has settings in YAML also has ``Settings`` (a pydantic model of its ``model:`` section) and
+    ``from_settings``; without them the class is called without arguments. In a sequence, parameters that the state
+    carries are fields with their names: RMSE and spread are over the others.
+    """
+
+    parameters: tuple[Parameter, ...]
+    layout: StateLayout
+    observables: tuple[Observable, ...]
+    defaults: Mapping[str, float] = MappingProxyType({})
+    time_unit: str = "s"
+    time_display_unit: str = "s"
+    batch: int = 1
+    compiled: bool = False
+    autonomous: ClassVar[bool] = False
+    validity: tuple[ValidityLimit, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
+    path_quantities: tuple[PathQuantity, ...] = ()
+    path_parameters: tuple[str, ...] = ()
+    optional_parameters: tuple[Parameter, ...] = ()
+
+    def with_parameters(self, names: Collection[str]) -> ForwardModel:
+        """This model with those of its ``optional_parameters`` that are in ``names`` among its ``parameters``.
+
+        Models that have such parameters override it.
+        """
+        return self
+
+    def __new__(cls, *arguments: object, **named: object) -> Self:
+        if cls.step is ForwardModel.step and cls.trajectories is ForwardModel.trajectories:
+            raise TypeError(f"{cls.__name__} has neither step nor trajectories; write one of them")
+        return super().__new__(cls)
+
+    @property
+    def resumable(self) -> bool:
+        """True if a member can go on from its state at any instant."""
+        kind = type(self)
+        return kind.step is not ForwardModel.step or kind.resumed is not ForwardModel.resumed
+
+    @property
+    def threaded(self) -> bool:
+        """True if threads serve it, since ``trajectories`` releases the interpreter lock. True of compiled models."""
+        return self.compiled
+
+    @property
+    def dense(self) -> bool:
+        """True if a path may be asked for between the observations at next to no cost, for smooth curves in plots.
+
+        Otherwise it is asked for at the observations alone. True of compiled models unless they say otherwise.
+        """
+        return self.compiled
+
+    @property
+    def cheap(self) -> bool:
+        """True if ten thousand runs take seconds, so that a doubt about a posterior is settled by sampling it.
+
+        True of compiled models unless they say otherwise.
+        """
+        return self.compiled
+
+    @abstractmethod
+    def initial_state(self, theta: Mapping[str, float]) -> Array:
+        """State vector (n_state,) at time zero for the physical parameters ``theta``, parameters appended."""
+
+    def initial_states(self, theta: Mapping[str, Array]) -> Array:
+        """State vectors (N, n_state) of N members, parameters as name → (N,). This default repeats the above."""
+        n_members = len(next(iter(theta.values())))
+        return np.stack([self.initial_state({k: float(v[i]) for k, v in theta.items()}) for i in range(n_members)])
+
+    def step(self, x: Array, t0: float, t1: float) -> Array:
+        """F_{t1←t0}: advance one state (n_state,). May raise; the caller turns it into a :class:`Failure`.
+
+        A model that overrides :meth:`trajectories` needs no step, but what resumes a state at any instant does: schemes
+        of a series and parameters that vary in time.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no step: it cannot be resumed from a state on its way")
+
+    def trajectories(self, x: Array, times: Array) -> Sequence[Trajectory | Failure]:
+        """Integrate a batch of members from time zero.
+
+        Parameters
+        ----------
+        x: initial states (N, n_state).
+        times: increasing observation times (K,), or (N, K) where each member has its own.
+
+        Returns
+        -------
+        N items in the order of the members. This default repeats :meth:`step`.
+        """
+        own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+        return [self._march(x[i], own[i]) for i in range(len(x))]
+
+    def resumed(self, x: Array, start: Array, times: Array) -> Sequence[Trajectory | Failure]:
+        """:meth:`trajectories` from states ``x`` (N, n_state) at ``start`` (N,) instead of time zero.
+
+        At those of the ``times`` (N, K) that lie before its start a member is where it started. This default repeats
+        :meth:`step`.
+        """
+        return [self._march(x[i], np.maximum(times[i], start[i]), float(start[i])) for i in range(len(x))]
+
+    def share(self, x: Array, times: Array) -> Shared | None:
+        """:meth:`trajectories` of states (N, n_state) as work that threads share, where the model can; else None."""
+        return None
+
+    def doubts(
+        self, observable: str, times: Array, values: Array, predicted: Array, members: Mapping[str, Array]
+    ) -> Sequence[str | Caution]:
+        """Why observations ``values`` (K,) at ``times`` (K,) cannot be what they say, in words, or as a warning where
+        that is less than serious; by default nothing.
+
+        ``predicted`` (N, K) is the same of the prior members that could be run, ``members`` are their parameters by
+        name, (N,) each, physical and SI. Asked before a run and told with its
+        warnings: the place for scales and units that only the model can judge.
+        """
+        return ()
+
+    def _march(self, x: Array, times: Array, start: float = 0.0) -> Trajectory | Failure:
+        states = np.empty((len(times), self.layout.size))
+        x, t = np.array(x, dtype=float), start  # a step may work in place; the ensemble stays as it is
+        for k, t_next in enumerate(times):
+            if t_next != t:
+                try:
+                    x = np.asarray(self.step(x, t, float(t_next)), dtype=float)
+                except BaseException as error:  # a model may fail in any way; the reason is kept
+                    return Failure(reason_of(error), t)
+                t = float(t_next)
+            if x.shape != (self.layout.size,):
+                return Failure(f"step returned shape {x.shape}, expected ({self.layout.size},)", t)
+            if not np.all(np.isfinite(x)):
+                return Failure("non-finite state", t)
+            states[k] = x
+        return Trajectory(np.asarray(times, dtype=float), states, self.layout)
+
+
+def field_of(model: ForwardModel, observable: Observable) -> Field | None:
+    """The field of the state that an observable reads, where it reads one as it is."""
+    if not isinstance(observable.operator, StateField):
+        return None
+    return next((block for block in model.layout if block.name == observable.operator.name), None)

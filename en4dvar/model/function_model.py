@@ -1,0 +1,130 @@
+"""A plain function ``f(parameters, times) -> values`` as a forward model.
+
+The state of such a model is its parameters; the path is what the function returns, seen at the times it was asked for.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import CodeType
+from typing import Any
+
+import numpy as np
+
+from en4dvar.model.forward import Failure, ForwardModel, Observable, Trajectory
+from en4dvar.model.state import Array, Field, Parameter, StateLayout
+from en4dvar.plumbing.user_code import reason_of
+
+Function = Callable[[dict[str, float], Array], Any]
+
+
+@dataclass(frozen=True)
+class Returned:
+    """H: what the function returned under a name."""
+
+    name: str
+
+    def __call__(self, trajectory: Trajectory) -> Array:
+        return trajectory[self.name]
+
+
+class FunctionModel(ForwardModel):
+    """``function(parameters, times)`` gives one number a time: an array (K,), or a dict of one a name.
+
+    Parameters
+    ----------
+    function: gets ``parameters``, a dict of name → float in the parameters' own units, and ``times`` (K,); it may raise
+        or return NaN, which loses that member. It is called once a member and keeps nothing between calls.
+    parameters: what the function reads.
+    observables: name → unit of what it returns; the first is the default.
+    dense: whether times beside the observations cost next to nothing, for smooth curves in plots. A function that is
+        not dense is asked for the observation times alone.
+    """
+
+    def __init__(
+        self,
+        function: Function,
+        parameters: Sequence[Parameter],
+        observables: Mapping[str, str],
+        time_unit: str = "1",
+        dense: bool = False,
+    ):
+        self.function, self.parameters = function, tuple(parameters)
+        self.observables = tuple(Observable(name, unit, Returned(name), fewest=1) for name, unit in observables.items())
+        self.time_unit = self.time_display_unit = time_unit
+        self._dense = dense
+        self.layout = StateLayout((Field("theta", len(self.parameters)),))
+        self._path = StateLayout(tuple(Field(observable.name, unit=observable.unit) for observable in self.observables))
+
+    @property
+    def dense(self) -> bool:
+        """The choice of the constructor."""
+        return self._dense
+
+    def initial_state(self, theta: Mapping[str, float]) -> Array:
+        """The parameters themselves, in the order of :attr:`parameters`."""
+        return np.array([theta[p.name] for p in self.parameters])
+
+    def trajectories(self, x: Array, times: Array) -> Sequence[Trajectory | Failure]:
+        own = np.broadcast_to(times, (len(x), np.shape(times)[-1]))
+        return [self._run(theta, np.array(at)) for theta, at in zip(x, own, strict=True)]
+
+    def _run(self, theta: Array, times: Array) -> Trajectory | Failure:
+        parameters = {p.name: float(value) for p, value in zip(self.parameters, theta, strict=True)}
+        try:
+            returned = self.function(parameters, times.copy())
+            columns = returned if isinstance(returned, Mapping) else self._alone(returned)
+            states = np.stack([_values(columns, name, len(times)) for name in self._path.names], axis=1)
+        except BaseException as error:  # a function may fail in any way; the reason is kept
+            return Failure(reason_of(error))
+        return Trajectory(times, states, self._path)
+
+    def _alone(self, values: Any) -> Mapping[str, Any]:
+        """Values without a name are those of the only observable. Raises ValueError where there are more."""
+        if len(self._path.names) > 1:
+            words = " and ".join(self._path.names)
+            raise ValueError(f"the function returned one array, but {words} were observed; return a dict of arrays")
+        return {self._path.names[0]: values}
+
+
+def _values(columns: Mapping[str, Any], name: str, count: int) -> Array:
+    """One observable of what a function returned. Raises ValueError, in words for its author."""
+    if name not in columns:
+        raise ValueError(f"the function returned {', '.join(map(str, columns)) or 'nothing'}, but no {name!r}")
+    values = np.asarray(columns[name], dtype=float)
+    if values.shape != (count,):
+        raise ValueError(f"the function returned shape {values.shape} for {name}, expected ({count},), one per time")
+    return values
+
+
+def name_of(function: object) -> str:
+    """``module:name`` of a function, or of the class of an object that can be called."""
+    while isinstance(function, functools.partial):
+        function = function.func
+    kind = function if hasattr(function, "__qualname__") else type(function)
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def digest_of(function: object) -> str:
+    """SHA-256 of what a function says: its file or, of one that was typed in, its compiled code.
+
+    Values that it reads from outside are not part of it.
+    """
+    while isinstance(function, functools.partial):
+        function = function.func
+    called: Any = function if hasattr(function, "__code__") else vars(type(function)).get("__call__", function)
+    code = getattr(called, "__code__", None)
+    try:
+        text = inspect.getsource(inspect.unwrap(called))
+    except (OSError, TypeError):
+        text = repr(_content(code)) if isinstance(code, CodeType) else name_of(function)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _content(code: CodeType) -> tuple[Any, ...]:
+    constants = tuple(_content(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts)
+    return code.co_code, constants, code.co_names

@@ -1,0 +1,209 @@
+"""A control file of PEST or PEST++ (``.pst``) as the arguments of :func:`en4dvar.estimate`.
+
+Priors are those of PEST++'s ensemble smoother: ``parval1`` in the middle and bounds four standard deviations apart
+(option ``par_sigma_range``), of the logarithm where ``partrans`` is ``log``; at the bounds they are cut off. The std of
+an observation is 1/weight; those of weight 0 are left out. Prior information counts as further observations. What would
+change the estimate and is not known here is an error that names it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from en4dvar.model.programs import pest
+from en4dvar.model.programs.control_file import OBSERVATIONS, PARAMETERS, ControlFile, PestRow, read_control, text_of
+from en4dvar.model.programs.refused import refuse
+from en4dvar.plumbing.errors import ConfigError
+
+RANGE = 4.0  # standard deviations between the bounds: PEST++ (White et al. 2020), option par_sigma_range
+OBSERVED = "observations"
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[edED][+-]?\d+)?"
+_TERM = re.compile(rf"\s*([+-]?)\s*({_NUMBER})\s*\*\s*(?:(log)\s*\(\s*([^\s()]+)\s*\)|([^\s()*=]+))\s*", re.IGNORECASE)
+
+
+def from_pest(path: str | Path, files: Sequence[str] = (), *, prior_information: bool = True) -> dict[str, Any]:
+    """``model``, ``data``, ``priors`` and ``error`` of a control file, for ``en4dvar.estimate(**from_pest(path))``.
+
+    Observations, and behind them prior information, count as readings 1, 2, 3, … in the order of the control file.
+    Names of parameters are in lower case, with ``_`` for what is neither letter nor digit.
+
+    Parameters
+    ----------
+    files: beside the control file, copied into each scratch directory: whatever the model needs besides its templates.
+    prior_information: whether it counts; PEST++'s ensemble smoother leaves it out.
+
+    Raises
+    ------
+    ConfigError: it cannot be read (with the line), or asks for what is not known here.
+    """
+    control = read_control(Path(path).absolute())
+    rows = control.rows("parameter data", PARAMETERS)
+    observed = [row for row in control.rows("observation data", OBSERVATIONS) if _weight(row) > 0]
+    parameters = _parameters(control, [row for row in rows if len(row.cells) > 2])
+    parents = {row.word("parnme"): row.word("partrans") for row in rows if len(row.cells) == 2}
+    equations = _equations(control, parameters) if prior_information else []
+    refuse(control, rows, observed, bool(equations))
+    readings = [
+        *(_Reading(r.number("obsval"), r.number("standard_deviation", 1 / _weight(r))) for r in observed),
+        *equations,
+    ]
+    if not readings:
+        raise ConfigError(f"{control.path}: no observation has a weight above 0")
+    templates, instructions = _files(control)
+    return {
+        "model": {
+            "command": control.lines("model command line")[0].cells["line"],
+            "shell": True,
+            "parameters": {name: _scaling(row) for name, row in parameters.items()},
+            "templates": templates,
+            "files": [str(control.file(file)) for file in files],
+            "outputs": {
+                OBSERVED: {
+                    "instructions": instructions,
+                    "delimiters": control.options.get("additional_ins_delimiters", ""),
+                    OBSERVED: [row.word("obsnme") for row in observed],
+                    "combinations": [reading.terms for reading in equations],
+                }
+            },
+            "time_unit": "1",
+        },
+        "data": {
+            "time": np.arange(1.0, len(readings) + 1),
+            OBSERVED: np.array([reading.value for reading in readings]),
+        },
+        "priors": {name: _prior(control, row, parameters, parents) for name, row in parameters.items()},
+        "error": np.array([reading.std for reading in readings]),
+    }
+
+
+class _Reading(NamedTuple):
+    """An observation, or an equation of prior information with its ``terms``."""
+
+    value: float
+    std: float
+    terms: Mapping[str, float] = {}
+
+
+def _weight(row: PestRow) -> float:
+    """Raises :class:`ConfigError` where it is negative."""
+    weight = row.number("weight")
+    if weight < 0:
+        raise ConfigError(f"{row.where}: the weight {weight:g} is negative")
+    return weight
+
+
+def _parameters(control: ControlFile, rows: Sequence[PestRow]) -> dict[str, PestRow]:
+    """Name as it is here → row. Raises :class:`ConfigError` where two become one."""
+    named: dict[str, PestRow] = {}
+    for row in rows:
+        name = pest.identifier(row.word("parnme"))
+        if name in named:
+            words = f"{named[name].word('parnme')} and {row.word('parnme')} are both {name!r} here"
+            raise ConfigError(f"{row.where}: {words}; rename one of them")
+        named[name] = row
+    if not named:
+        raise ConfigError(f"{control.path}: no parameter in '* parameter data'")
+    return named
+
+
+def _scaling(row: PestRow) -> dict[str, float]:
+    """What of scale and offset is not trivial. Raises :class:`ConfigError`."""
+    scale, offset = row.number("scale", 1.0), row.number("offset", 0.0)
+    if scale == 0:
+        raise ConfigError(f"{row.where}: the scale of {row.word('parnme')} is 0")
+    return {**({"scale": scale} if scale != 1 else {}), **({"offset": offset} if offset else {})}
+
+
+def _prior(control: ControlFile, row: PestRow, parameters: Mapping[str, PestRow], parents: Mapping[str, str]) -> Any:
+    """What ``priors`` says of a parameter. Raises :class:`ConfigError`."""
+    name, kind, value = row.word("parnme"), row.word("partrans"), row.number("parval1")
+    if kind == "fixed":
+        return value
+    if kind == "tied":
+        to = pest.identifier(row.word("partied") or parents.get(name, ""))
+        if to not in parameters or parameters[to].word("partrans") == "tied":
+            raise ConfigError(f"{row.where}: {name} is tied to no parameter that is estimated or fixed")
+        if parameters[to].number("parval1") == 0:
+            raise ConfigError(f"{row.where}: {name} is tied to {to}, whose parval1 is 0")
+        return {"tied": to, "factor": value / parameters[to].number("parval1")}
+    if kind not in ("log", "none"):
+        raise ConfigError(f"{row.where}: parameter {name} is {kind!r}; log, none, fixed and tied are known")
+    low, high = row.number("parlbnd"), row.number("parubnd")
+    if not (low <= value <= high and low < high):
+        raise ConfigError(f"{row.where}: parval1 of {name} is {value:g}, outside of its bounds {low:g} and {high:g}")
+    if kind == "log" and not low > 0:
+        raise ConfigError(f"{row.where}: {name} is log, but its lower bound {low:g} is not above 0")
+    span = math.log(high / low) if kind == "log" else high - low
+    stated = row.number("standard_deviation", 0.0) * (math.log(10) if kind == "log" else 1)  # PEST's log is log10
+    std = stated or span / control.number("par_sigma_range", RANGE)
+    bounds = {"lower": low, "upper": high}
+    if kind == "log":
+        return {"prior": "lognormal", "median": value, "log_std": std, **bounds}
+    return {"prior": "normal", "mean": value, "std": std, **bounds}
+
+
+def _equations(control: ControlFile, parameters: Mapping[str, PestRow]) -> list[_Reading]:
+    """Prior information, ``label factor * name + factor * log(name) = value weight group``. Raises ConfigError."""
+    lines = [(row.where, row.cells["line"].partition(" ")[2]) for row in control.lines("prior information")]
+    for row in control.tables("prior information"):
+        equation, weight = row.cells.get("equation", ""), row.cells.get("weight", "")
+        lines.append((row.where, f"{equation} {weight}"))
+    return [reading for where, text in lines if (reading := _equation(where, text, parameters))]
+
+
+def _equation(where: str, text: str, parameters: Mapping[str, PestRow]) -> _Reading | None:
+    """None where its weight is 0."""
+    left, _, right = text.rpartition("=")
+    terms: dict[str, float] = {}
+    at = 0
+    while term := _TERM.match(left, at):
+        sign, factor, log, of_log, plain = term.groups()
+        name = pest.identifier(of_log or plain)
+        if name not in parameters:
+            raise ConfigError(f"{where}: prior information on {of_log or plain}, which is no parameter")
+        key = f"log10({name})" if log else name
+        terms[key] = terms.get(key, 0.0) + float(f"{sign}1") * float(factor.lower().replace("d", "e"))
+        at = term.end()
+    numbers = PestRow(where, dict(zip(("value", "weight"), right.split(), strict=False)))
+    if at < len(left.rstrip()) or not terms:
+        raise ConfigError(f"{where}: {text.strip()!r} is no equation of prior information")
+    weight = _weight(numbers)
+    return _Reading(numbers.number("value"), 1 / weight, terms) if weight else None
+
+
+def _files(control: ControlFile) -> tuple[dict[str, str], dict[str, list[str]]]:
+    """Input file → template, and output file → instruction files. Raises :class:`ConfigError`."""
+    both = _pairs(control, "model input/output")
+    inputs, outputs = _pairs(control, "model input"), _pairs(control, "model output")
+    for pair in both:
+        (outputs if pest.is_instructions(text_of(control.file(pair[0]))) else inputs).append(pair)
+    templates: dict[str, str] = {}
+    for own, file in inputs:
+        if file in templates:
+            raise ConfigError(f"{control.path}: two templates become {file}")
+        templates[file] = str(control.file(own))
+    instructions: dict[str, list[str]] = {}
+    for own, file in outputs:
+        instructions.setdefault(file, []).append(str(control.file(own)))
+    if not instructions:
+        raise ConfigError(f"{control.path}: no instruction file")
+    return templates, instructions
+
+
+def _pairs(control: ControlFile, section: str) -> list[tuple[str, str]]:
+    """Template or instructions, and the file of the model. Raises :class:`ConfigError`."""
+    pairs = []
+    for row in control.rows(section, ["pest_file", "model_file", "more"]):
+        if not {"pest_file", "model_file"} <= set(row.cells) or "more" in row.cells:
+            raise ConfigError(f"{row.where}: a line of '* {section}' holds two names of files")
+        own, file = row.cells["pest_file"], row.cells["model_file"].strip("\"'").replace("\\", "/")
+        if Path(file).is_absolute() or ".." in Path(file).parts:
+            raise ConfigError(f"{row.where}: {file} lies outside of the folder that the model runs in")
+        pairs.append((own, str(Path(file))))
+    return pairs

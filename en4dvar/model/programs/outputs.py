@@ -1,0 +1,143 @@
+"""Numbers out of the files that a program leaves: a column, a key of JSON, a pattern, PEST's instructions."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from en4dvar.model.programs import pest
+from en4dvar.model.programs.errors import ProgramError
+from en4dvar.model.state import Array
+from en4dvar.plumbing.files import read_plain, read_text
+from en4dvar.plumbing.hints import listed, short
+
+LONGEST = 256_000_000  # bytes of an output
+COMMENT = ("#", "%", "//")
+
+
+@dataclass(frozen=True)
+class ProgramOutput:
+    """Where the values of one observable are: in ``file`` of the scratch directory, by one of the four ways.
+
+    column: header of a column of text, or its number from 1. key: dotted path into JSON. pattern: regular expression
+    with one group, every match a value. instructions: output file → instruction files of PEST, each of the
+    ``observations``, by default all, a value; ``delimiters`` separate numbers there as blanks do. With ``time``, a
+    column or key of times, values are interpolated linearly at those that are asked for; without it there is one value
+    a time.
+    """
+
+    file: str
+    column: str | int | None = None
+    key: str | None = None
+    pattern: str | None = None
+    instructions: Mapping[str, Sequence[Path]] | None = None
+    time: str | int | None = None
+    observations: tuple[str, ...] | None = None
+    delimiters: str = ""
+
+    def read(self, folder: Path, times: Array) -> Array:
+        """The values at ``times`` (K,). Raises :class:`ProgramError`."""
+        text = "" if self.instructions else _text(folder, self.file)
+        values = self._instructed(folder, self.instructions) if self.instructions else self._values(text)
+        if self.time is None:
+            if len(values) != len(times):
+                raise ProgramError(
+                    f"{self.file}: {len(values)} values for {len(times)} times; name the column of times"
+                )
+            return values
+        own = _column(text, self.time, self.file) if self.column is not None else _key(text, str(self.time), self.file)
+        return _at(times, own, values, self.file)
+
+    def _values(self, text: str) -> Array:
+        if self.column is not None:
+            return _column(text, self.column, self.file)
+        if self.key is not None:
+            return _key(text, self.key, self.file)
+        assert self.pattern is not None
+        return _numbers(re.findall(self.pattern, text, re.MULTILINE), self.file)
+
+    def _instructed(self, folder: Path, instructions: Mapping[str, Sequence[Path]]) -> Array:
+        values: dict[str, float] = {}
+        for file, paths in instructions.items():
+            text = _text(folder, file)
+            for path in paths:
+                values |= pest.read(_instructions(path), text, file, path.name, self.delimiters)
+        names = list(values) if self.observations is None else [name.lower() for name in self.observations]
+        return np.array([values[name] for name in names])
+
+
+def _text(folder: Path, file: str) -> str:
+    try:
+        return read_plain(folder / file, LONGEST).decode("utf-8", errors="replace")
+    except OSError as error:
+        raise ProgramError(f"no output file {file}: {error.strerror}") from None
+
+
+@functools.cache
+def _instructions(path: Path) -> str:
+    return read_text(path)
+
+
+def _at(times: Array, own: Array, values: Array, file: str) -> Array:
+    if len(own) != len(values) or len(own) < 1 or not np.all(np.diff(own) > 0):
+        raise ProgramError(f"{file}: {len(own)} times for {len(values)} values, or times that do not increase")
+    slack = 1e-9 * max(abs(own[0]), abs(own[-1]))
+    if times[0] < own[0] - slack or times[-1] > own[-1] + slack:
+        raise ProgramError(
+            f"{file}: times from {own[0]:g} to {own[-1]:g}, but {times[0]:g} to {times[-1]:g} are needed"
+        )
+    return np.asarray(np.interp(times, own, values))
+
+
+def _column(text: str, column: str | int, file: str) -> Array:
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith(COMMENT)]
+    if not lines:
+        raise ProgramError(f"{file}: is empty")
+    delimiter = max((",", ";", "\t"), key=lines[0].count)
+    rows = list(csv.reader(lines, delimiter=delimiter)) if delimiter in lines[0] else [line.split() for line in lines]
+    header = [cell.strip() for cell in rows[0]]
+    if isinstance(column, int):
+        at, first = column - 1, 0 if _is_number(header[min(column, len(header)) - 1]) else 1
+    elif column in header:
+        at, first = header.index(column), 1
+    else:
+        raise ProgramError(f"{file}: no column {column!r}; the columns are: {listed(header)}")
+    if at >= min(len(row) for row in rows[first:] or [header]):
+        raise ProgramError(f"{file}: no column {column} in every line")
+    return _numbers([row[at] for row in rows[first:]], file)
+
+
+def _key(text: str, key: str, file: str) -> Array:
+    try:
+        node: Any = json.loads(text)
+    except ValueError as error:
+        raise ProgramError(f"{file}: not JSON: {error}") from None
+    for part in key.split("."):
+        try:
+            node = node[int(part)] if isinstance(node, list) else node[part]
+        except (KeyError, IndexError, ValueError, TypeError):
+            raise ProgramError(f"{file}: no key {key!r}, for there is no {part!r}") from None
+    return _numbers(node if isinstance(node, list) else [node], file)
+
+
+def _numbers(texts: list[Any], file: str) -> Array:
+    for value in texts:
+        if not _is_number(value):
+            raise ProgramError(f"{file}: {short(str(value))!r} is no number")
+    return np.array([float(value) for value in texts])
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return True

@@ -1,0 +1,263 @@
+"""Template and instruction files of PEST and PEST++, as their users have them.
+
+Doherty, J., "PEST: Model-Independent Parameter Estimation, User Manual Part I", and the manual of PEST++, sections on
+template and instruction files. A parameter space is as wide as its delimiters say, and holds as many digits as fit. The
+instructions are ``ln``, ``@marker@`` (primary and secondary), ``w``, ``tn``, ``!name!`` and ``!dum!``, ``[name]a:b``,
+``(name)a:b`` and, at the start of a line, ``&``; anything else is an error.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from en4dvar.model.programs.errors import ProgramError
+
+_OBSERVATION = re.compile(r"!([^!]+)!|[\[(]([^\])]+)[\])]([1-9]\d*):([1-9]\d*)")
+_ADVANCE = re.compile(r"[lL]([1-9]\d*)")
+_MOVE = re.compile(r"[wW]|[tT][1-9]\d*")
+_NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+))(?:[ed]([+-]?\d+))?", re.IGNORECASE)
+_NO_LETTER = re.compile(r"([+-]?(?:\d+\.\d*|\.\d+))([+-]\d{3})")  # Fortran leaves out the E of 1.5E-101
+
+
+def is_template(text: str) -> bool:
+    """Whether the first line says that this is a template of PEST."""
+    return _begins(text, ("ptf ", "jtf "))
+
+
+def is_instructions(text: str) -> bool:
+    """Whether the first line says that these are instructions of PEST."""
+    return _begins(text, ("pif ", "jif "))
+
+
+def _begins(text: str, words: tuple[str, ...]) -> bool:
+    """With one of the words and a sign, which delimits what follows."""
+    return text[:4].lower() in words and not text[4:5].isspace() and text[4:5] != ""
+
+
+def identifier(name: str) -> str:
+    """The name of a parameter of PEST as it is here: lower case, and ``_`` for what is neither letter nor digit.
+
+    >>> identifier("K1"), identifier("hk:i-0"), identifier("1st")
+    ('k1', 'hk_i_0', '_1st')
+    """
+    plain = re.sub(r"\W", "_", name.strip().lower())
+    return plain if plain.isidentifier() else f"_{plain}"
+
+
+def parameters_of(text: str) -> set[str]:
+    """Names of the parameters of a template, each as :func:`identifier` has it. Raises :class:`ProgramError`."""
+    for number, line in enumerate(text.splitlines()[1:], 2):
+        if line.count(_sign(text)) % 2:
+            raise ProgramError(f"line {number}: one {_sign(text)} without another")
+    return {identifier(space[1]) for space in _spaces(text).finditer(text.partition("\n")[2])}
+
+
+def filled(text: str, parameters: Mapping[str, float]) -> str:
+    """The input file; each space holds its parameter in its own width. Raises :class:`ProgramError`."""
+    values = {identifier(name): value for name, value in parameters.items()}
+
+    def number(space: re.Match[str]) -> str:
+        return fitted(values[identifier(space[1])], len(space[0])).rjust(len(space[0]))
+
+    return _spaces(text).sub(number, text.partition("\n")[2])
+
+
+def fitted(value: float, width: int) -> str:
+    """A number in at most ``width`` characters, with as many digits as fit. Raises :class:`ProgramError`.
+
+    >>> fitted(0.1, 20), fitted(2 / 3, 8), fitted(-123456.789, 7)
+    ('0.1', '0.666667', '-123457')
+    """
+    if len(repr(value)) <= width:
+        return repr(value)
+    for digits in range(17, 0, -1):
+        text = f"{value:.{digits}g}"
+        for form in (text, text.replace("e-0", "e-").replace("e+0", "e+")):
+            if len(form) <= width:
+                return form
+    raise ProgramError(f"{value!r} does not fit into {width} characters of a template")
+
+
+def _spaces(text: str) -> re.Pattern[str]:
+    sign = re.escape(_sign(text))
+    return re.compile(f"{sign}([^{sign}\n]+){sign}")
+
+
+def _sign(text: str) -> str:
+    """The delimiter that the first line names. Raises :class:`ProgramError`."""
+    sign = text.partition("\n")[0][4:].strip()
+    if len(sign) != 1 or sign.isalnum() or sign in "!()[]:&":
+        raise ProgramError(f"the first line names {sign or 'nothing'!r} as the delimiter; write e.g. {text[:3]} ~")
+    return sign
+
+
+class Line(NamedTuple):
+    """A line of instructions with those that continue it: its number, and its items."""
+
+    number: int
+    items: tuple[str, ...]
+
+
+@functools.lru_cache(maxsize=64)
+def parsed(instructions: str, source: str = "instructions") -> tuple[Line, ...]:
+    """The lines of an instruction file, ``source`` by name. Raises :class:`ProgramError` at what is no instruction."""
+    sign = re.escape(_sign(instructions))
+    item = re.compile(f"{sign}[^{sign}]*{sign}|[^\\s{sign}]+|{sign}.*")
+    lines: list[Line] = []
+    names: set[str] = set()
+    for number, text in enumerate(instructions.splitlines()[1:], 2):
+        items = tuple(match[0] for match in item.finditer(text))
+        if not items:
+            continue
+        begins = items[0] == "&" and bool(lines)
+        for place, each in enumerate(items[1:] if begins else items):
+            _check(each, _sign(instructions), begins or place > 0, f"{source}:{number}")
+            name = _named(each)
+            if name in names:
+                raise ProgramError(f"{source}:{number}: {name} is read twice")
+            names |= {name} - {""}
+        if begins:
+            lines[-1] = Line(lines[-1].number, (*lines[-1].items, *items[1:]))
+        else:
+            lines.append(Line(number, items))
+    return tuple(lines)
+
+
+def _check(item: str, sign: str, within: bool, where: str) -> None:
+    """Raise :class:`ProgramError` unless this is an instruction; ``within`` a line others stand than at its start."""
+    marker = len(item) > 2 and item[0] == item[-1] == sign
+    observed = _OBSERVATION.fullmatch(item)
+    if observed and observed[3] and int(observed[3]) > int(observed[4]):
+        raise ProgramError(f"{where}: the columns of {item} do not increase")
+    if within and not (marker or observed or _MOVE.fullmatch(item)):
+        raise ProgramError(f"{where}: {item!r} is no instruction of PEST")
+    if not within and not (marker or _ADVANCE.fullmatch(item)):
+        raise ProgramError(f"{where}: a line of instructions begins with a marker or l1, l2, …; not with {item!r}")
+
+
+def observations_of(instructions: str, source: str = "instructions") -> list[str]:
+    """Names of the observations that instructions read, in order. Raises :class:`ProgramError`."""
+    return [name for line in parsed(instructions, source) for item in line.items if (name := _named(item))]
+
+
+def read(
+    instructions: str, output: str, where: str, source: str = "instructions", delimiters: str = ""
+) -> dict[str, float]:
+    """Observation → value, read from the text of an output file.
+
+    ``where`` names that in messages, ``source`` the instructions. ``delimiters``: characters that separate numbers as
+    blanks and commas do, PEST++'s ``additional_ins_delimiters``.
+
+    Raises :class:`ProgramError`.
+    """
+    cursor = _Cursor(output.splitlines(), where, re.escape(delimiters))
+    values: dict[str, float] = {}
+    for line in parsed(instructions, source):
+        cursor.advance(line.items[0])
+        k = 1
+        while k < len(line.items):
+            item, following = line.items[k], line.items[k + 1 : k + 2]
+            if (name := _named(item)) or _OBSERVATION.fullmatch(item):
+                text = cursor.observed(item, _marker(following[0]) if following else "")
+                if name:
+                    values[name] = _number(text, name, cursor.place)
+            elif not cursor.moved(item):
+                if not all(_marker(each) for each in line.items[:k]):
+                    raise ProgramError(f"{cursor.place}: no {_marker(item)!r} behind column {cursor.column}")
+                cursor.advance(line.items[0])  # the markers belong to a line further down
+                k = 0
+            k += 1
+    return values
+
+
+def _named(item: str) -> str:
+    """The observation that an item reads, "" where it reads none."""
+    observed = _OBSERVATION.fullmatch(item)
+    name = (observed[1] or observed[2]).lower() if observed else ""
+    return "" if name == "dum" else name
+
+
+def _marker(item: str) -> str:
+    """The text of a marker, "" of another item."""
+    others = _OBSERVATION.fullmatch(item) or _MOVE.fullmatch(item) or _ADVANCE.fullmatch(item)
+    return "" if others else item[1:-1]
+
+
+class _Cursor:
+    """Where instructions have come to in the ``lines`` of an output file: ``row``, ``column``."""
+
+    def __init__(self, lines: Sequence[str], where: str, delimiters: str):
+        self.lines, self.where = lines, where
+        self.row, self.column = -1, 0
+        self.blank = re.compile(f"[\\s{delimiters}]+")
+        self.token = re.compile(f"[^\\s,{delimiters}]+")
+
+    @property
+    def place(self) -> str:
+        """File and line, for messages."""
+        return f"{self.where}:{self.row + 1}"
+
+    def advance(self, item: str) -> None:
+        """Down to the line that the first item leads to. Raises :class:`ProgramError`."""
+        if counted := _ADVANCE.fullmatch(item):
+            self.row, self.column = self.row + int(counted[1]), 0
+            if self.row >= len(self.lines):
+                raise ProgramError(f"{self.where}: has {len(self.lines)} lines, but line {self.row + 1} is to be read")
+            return
+        marker = _marker(item)
+        for row in range(self.row + 1, len(self.lines)):
+            if marker in self.lines[row]:
+                self.row, self.column = row, self.lines[row].index(marker) + len(marker)
+                return
+        raise ProgramError(f"{self.where}: no {marker!r} below line {self.row + 1}")
+
+    def moved(self, item: str) -> bool:
+        """Along the line, by ``w``, ``tn`` or a secondary marker, False where there is none.
+
+        Raises :class:`ProgramError`.
+        """
+        line = self.lines[self.row]
+        if item in ("w", "W"):
+            blank = self.blank.search(line, self.column)
+            if blank is None:
+                raise ProgramError(f"{self.place}: no blank behind column {self.column}")
+            self.column = blank.end()
+            return True
+        if _MOVE.fullmatch(item):
+            self.column = int(item[1:])
+            return True
+        at = line.find(_marker(item), self.column)
+        if at >= 0:
+            self.column = at + len(_marker(item))
+        return at >= 0
+
+    def observed(self, item: str, until: str) -> str:
+        """The text of an observation, which ends at the marker ``until`` if one follows; the cursor goes behind it."""
+        line, observed = self.lines[self.row], _OBSERVATION.fullmatch(item)
+        assert observed is not None
+        if observed[1]:
+            token = self.token.search(line, self.column)
+            end = token.end() if token else self.column
+            if token and until and (cut := line.find(until, token.start(), token.end())) > token.start():
+                end = cut
+            text = line[token.start() : end] if token else ""
+        else:
+            first, end = int(observed[3]) - 1, int(observed[4])
+            text = line[first:end]
+            if item[0] == "(":  # the whole of what begins or lies in the columns
+                tokens = (token for token in self.token.finditer(line) if token.end() > first)
+                token = next(tokens, None)
+                inside = token is not None and token.start() < end
+                text, end = (token[0], token.end()) if token is not None and inside else ("", end)
+        self.column = end
+        return text
+
+
+def _number(text: str, name: str, where: str) -> float:
+    number = _NUMBER.fullmatch(text.strip()) or _NO_LETTER.fullmatch(text.strip())
+    if number is None:
+        raise ProgramError(f"{where}: {text.strip() or 'nothing'!r} is not a number for {name}")
+    return float(f"{number[1]}e{number[2] or 0}")

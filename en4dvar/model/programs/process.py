@@ -1,0 +1,167 @@
+"""One run of a program: a scratch directory of its own, its input files, the process, what it leaves.
+
+Between the estimated parameters and the program stand scale and offset, and sums that need no program.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from en4dvar.model.programs.errors import ProgramError
+from en4dvar.model.programs.outputs import ProgramOutput
+from en4dvar.model.programs.template import filled
+from en4dvar.model.state import Array
+from en4dvar.plumbing.children import Child, TimeLimitError, require_going_on, scratch, within
+
+OUTPUT = "output"  # the file that {output} names
+STDOUT = "stdout"  # what the program prints, as a file
+LAST_WORDS = 300  # characters of the standard error in a reason
+LONGEST_ERRORS = 10_000  # bytes of it that are looked at
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Program:
+    """A command as a function of parameters and times; the same numbers for the same arguments, wherever it runs.
+
+    ``words``: program and arguments, in which ``{input}``, ``{output}`` and ``{NAME}`` of a parameter are filled in; a
+    single one with ``shell``, which then runs it. ``templates``: input file → template, the first is ``{input}``.
+    ``files`` are copied into the scratch directory, whose parent is ``scratch``. It runs again ``retries`` times where
+    it fails.
+    """
+
+    words: tuple[str, ...]
+    templates: Mapping[str, Path]
+    outputs: Mapping[str, ProgramOutput]
+    files: tuple[Path, ...] = ()
+    environment: Mapping[str, str] = field(default_factory=dict)
+    time_limit: float | None = None
+    retries: int = 0
+    shell: bool = False
+    scratch: Path | None = None
+
+    def __call__(self, parameters: Mapping[str, float], times: Array) -> dict[str, Array]:
+        """Observable → values (K,). Raises :class:`ProgramError`: the last attempt failed, with its reason."""
+        for attempt in range(self.retries + 1):
+            try:
+                return self._attempt(parameters, times)
+            except ProgramError:
+                if attempt == self.retries:
+                    raise
+        raise AssertionError
+
+    def _attempt(self, parameters: Mapping[str, float], times: Array) -> dict[str, Array]:
+        """One run. What this process does for it, and what the program does, are together within the time limit."""
+        require_going_on()
+        end = None if self.time_limit is None else time.monotonic() + self.time_limit
+
+        def within_limit(call: Callable[[], T]) -> T:
+            return call() if end is None else within(end - time.monotonic(), call)
+
+        try:
+            with scratch(self.scratch) as folder:
+                within_limit(lambda: self._fill(folder, parameters, times))
+                self._run(folder, parameters, end)
+                outputs = self.outputs.items()
+                return within_limit(lambda: {name: output.read(folder, times) for name, output in outputs})
+        except OSError as error:
+            raise ProgramError(f"{error.filename or 'scratch folder'}: {error.strerror}") from None
+        except (TimeLimitError, subprocess.TimeoutExpired):
+            raise ProgramError(f"not done after {self.time_limit:g} s") from None
+
+    def _fill(self, folder: Path, parameters: Mapping[str, float], times: Array) -> None:
+        for file in self.files:
+            shutil.copy(file, folder)
+        for name, template in self.templates.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(filled(template, parameters, times), encoding="utf-8")
+
+    def _run(self, folder: Path, parameters: Mapping[str, float], end: float | None) -> None:
+        values = {name: repr(float(value)) for name, value in parameters.items()}
+        values |= {"input": next(iter(self.templates), ""), "output": OUTPUT}
+        words = [fill(word, values) for word in self.words]
+        words = ["/bin/sh", "-c", *words] if self.shell else words
+        with (folder / STDOUT).open("wb") as printed, tempfile.TemporaryFile(dir=folder) as said:
+            with Child(words, folder, self.environment, printed, said) as child:
+                status = child.wait(None if end is None else end - time.monotonic())
+            if status:
+                said.seek(max(0, said.seek(0, os.SEEK_END) - LONGEST_ERRORS))
+                advice = " (now and then? retries: 2 runs it again)" if status < 0 and not self.retries else ""
+                raise ProgramError(_why(status, said.read()) + advice)
+
+
+def fill(word: str, values: Mapping[str, str]) -> str:
+    """A word of a command with ``{name}`` replaced by what is known; other braces stay."""
+    for name, value in values.items():
+        word = word.replace(f"{{{name}}}", value)
+    return word
+
+
+def split(command: str, shell: bool) -> tuple[str, ...]:
+    """The words of a command. Raises ValueError where quotes are left open or there is none."""
+    words = (command,) if shell else tuple(shlex.split(command))
+    if not words or not words[0].strip():
+        raise ValueError("write the program and its arguments")
+    return words
+
+
+def _why(status: int, errors: bytes) -> str:
+    lines = [line.strip() for line in errors.decode("utf-8", "replace").splitlines() if line.strip()]
+    said = f": {lines[-1][-LAST_WORDS:]}" if lines else ""
+    if status < 0:
+        try:
+            name = signal.Signals(-status).name
+        except ValueError:
+            name = str(-status)
+        return f"the program was ended by signal {name}{said}"
+    return f"the program ended with exit status {status}{said}"
+
+
+LOGARITHM = "log10("  # how a term log10(name) of a combination begins
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """``program`` gets scale · value + offset of the parameters in ``scaled``.
+
+    ``combinations``: observable → linear combinations of the parameters as they are estimated, name or log10(name) →
+    factor, whose values stand behind those that the program gives.
+    """
+
+    program: Program
+    scaled: Mapping[str, tuple[float, float]]
+    combinations: Mapping[str, Sequence[Mapping[str, float]]]
+
+    def __call__(self, parameters: Mapping[str, float], times: Array) -> dict[str, Array]:
+        """Observable → values (K,). Raises :class:`ProgramError`."""
+        same = (1.0, 0.0)
+        inputs = {n: self.scaled.get(n, same)[0] * v + self.scaled.get(n, same)[1] for n, v in parameters.items()}
+        more = {
+            name: np.array([sum(factor * _term(key, parameters) for key, factor in terms.items()) for terms in several])
+            for name, several in self.combinations.items()
+        }
+        count = len(times) - max((len(values) for values in more.values()), default=0)
+        returned = self.program(inputs, times[: max(count, 0)])
+        return {name: np.concatenate([values, more.get(name, [])]) for name, values in returned.items()}
+
+
+def _term(key: str, parameters: Mapping[str, float]) -> float:
+    if not key.startswith(LOGARITHM):
+        return parameters[key]
+    value = parameters[key[len(LOGARITHM) : -1]]
+    if not value > 0:
+        raise ProgramError(f"{key}: {value:g} has no logarithm")
+    return math.log10(value)

@@ -1,0 +1,77 @@
+"""Parameters into the input files of a program.
+
+A template is the input file with ``{{ name }}`` where a parameter belongs (Jinja's language, in its sandbox); one whose
+first line is ``ptf`` and a sign is in PEST's language. Numbers are written with all their digits.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+from jinja2 import StrictUndefined, TemplateError
+from jinja2.meta import find_undeclared_variables
+from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+from en4dvar.model.programs import pest
+from en4dvar.model.programs.errors import ProgramError
+from en4dvar.model.state import Array
+from en4dvar.plumbing.files import read_text
+from en4dvar.plumbing.hints import suggest
+
+TIMES = "times"
+SUFFIXES = (".j2", ".tpl", ".template")
+
+
+def input_name(template: Path) -> str:
+    """The name of the file that a template becomes: without the suffix that says it is one."""
+    return template.stem if template.suffix in SUFFIXES else template.name
+
+
+def check_template(template: Path, names: Collection[str]) -> None:
+    """Raise ValueError, in words, where a template cannot be read or names an unknown parameter."""
+    text = _text(template)
+    if pest.is_template(text):
+        names = {pest.identifier(name) for name in names}
+        try:
+            wanted: Collection[str] = pest.parameters_of(text)
+        except ProgramError as error:
+            raise ValueError(f"{template}: {error}") from None
+    else:
+        try:
+            wanted = find_undeclared_variables(_environment().parse(text))
+        except TemplateError as error:
+            line = getattr(error, "lineno", None)
+            raise ValueError(f"{template}{f':{line}' if line else ''}: {error}") from None
+    for name in sorted(wanted):
+        if name not in names and name != TIMES:
+            raise ValueError(f"{template}: {name!r} is no parameter of the model{suggest(name, names)}")
+
+
+def filled(template: Path, parameters: Mapping[str, float], times: Array) -> str:
+    """The input file of a member; ``times`` (K,) are where it is observed."""
+    text = _text(template)
+    if pest.is_template(text):
+        return pest.filled(text, parameters)
+    values: dict[str, Any] = {name: float(value) for name, value in parameters.items()}
+    return str(_compiled(text).render(values | {TIMES: times.tolist()}))
+
+
+@functools.cache
+def _text(template: Path) -> str:
+    try:
+        return read_text(template)
+    except OSError as error:
+        raise ValueError(f"{template}: {error.strerror}") from None
+
+
+@functools.cache
+def _environment() -> ImmutableSandboxedEnvironment:
+    return ImmutableSandboxedEnvironment(undefined=StrictUndefined, keep_trailing_newline=True)
+
+
+@functools.cache
+def _compiled(text: str) -> Any:
+    return _environment().from_string(text)

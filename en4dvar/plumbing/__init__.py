@@ -1,0 +1,1 @@
+"""The foundation of all other packages: errors, units, files, tables, warnings, kernels, code of users."""

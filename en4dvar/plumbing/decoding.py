@@ -1,0 +1,210 @@
+"""Files of anybody that a library decodes: in a child process, within limits of processor time and memory.
+
+A workbook of 300 kB may become 13 GB, a movie may send its library in circles or crash it. What decodes them runs in a
+child, which is kept for the next file, and is ended where it takes more than it may. The limits count what the child
+does, not how long it waits, so that a busy machine or a slow disk refuses nothing. Where the system knows no such
+limits (Windows), only a crash stays in the child.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import pickle
+import signal
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import IO, Any
+
+from en4dvar.plumbing.children import Child, limit_memory, limit_time
+from en4dvar.plumbing.errors import DataError, En4dvarError
+from en4dvar.plumbing.files import here, in_bytes, open_plain
+
+Decoder = Callable[..., Iterator[Any]]
+DOUBT = "it is damaged, or not what it says it is"
+_SIZE = struct.Struct("<Q")
+_VALUE, _END, _FAULT = range(3)
+_idle: list[_Child] = []
+_changing = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """What a decoder may take: ``seconds`` of processor time for each value that it gives, ``memory`` in bytes beyond
+    what the child has at its start, files of at most ``size`` bytes.
+    """
+
+    seconds: int = 20
+    memory: int = 2_000_000_000
+    size: int = 2_000_000_000
+
+
+class DecodeError(Exception):
+    """What a library said that could not decode a file; the caller knows where it stood."""
+
+
+def require_plain(path: Path, size: int) -> None:
+    """Raises :class:`DataError` where a file is none that can be read to its end: a pipe, a device, too large."""
+    try:
+        with open_plain(path) as file:
+            length = os.fstat(file.fileno()).st_size
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror or error}") from None
+    if length > size:
+        raise DataError(f"{path}: {in_bytes(length)}; at most {in_bytes(size)} are read")
+
+
+def decoded(decoder: Decoder, path: Path, *arguments: Any, allowed: Allowed = Allowed()) -> Iterator[Any]:
+    """The values of ``decoder(path, *arguments)``, a function of a module that gives them one by one, in a child.
+
+    Raises
+    ------
+    DataError: the file is none, or takes more than it may, or ends the process that decodes it; and what the decoder
+        raises as such. DecodeError: anything else that it raises, in words.
+    """
+    require_plain(path, allowed.size)
+    with _changing:
+        child = _idle.pop() if _idle else None
+    if child is None or child.process.poll() is not None:
+        child = _Child()
+    done = False
+    with child:
+        try:
+            child.send((f"{decoder.__module__}:{decoder.__qualname__}", (path, *arguments), allowed, here()))
+            while True:
+                kind, value = child.receive(path, allowed)
+                if kind == _VALUE:
+                    yield value
+                    continue
+                done = True
+                if kind == _FAULT:
+                    raise value
+                return
+        finally:
+            child.kept = done
+
+
+def decoded_whole(decoder: Decoder, path: Path, *arguments: Any, allowed: Allowed = Allowed()) -> Any:
+    """The only value of a decoder. Raises as :func:`decoded`."""
+    (value,) = decoded(decoder, path, *arguments, allowed=allowed)
+    return value
+
+
+class _Child(Child):
+    """A process that decodes one file after the other; on leaving it is ended unless it is to be ``kept``."""
+
+    def __init__(self) -> None:
+        words = [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()"]
+        super().__init__(words, output=subprocess.PIPE, input=subprocess.PIPE)
+        self.kept = False
+
+    def __exit__(self, *exception: object) -> None:
+        if not self.kept:
+            super().__exit__(*exception)
+            self.close()
+            return
+        self.forget()
+        self.kept = False
+        with _changing:
+            _idle.append(self)
+
+    def close(self) -> None:
+        for pipe in (self.process.stdin, self.process.stdout):
+            if pipe is not None:
+                with suppress(OSError):
+                    pipe.close()
+
+    def send(self, request: Any) -> None:
+        assert self.process.stdin is not None
+        with suppress(OSError):  # it is gone: told when its answer is read
+            _write(self.process.stdin, request)
+
+    def receive(self, path: Path, allowed: Allowed) -> Any:
+        """The next message. Raises :class:`DataError` where the child is gone."""
+        assert self.process.stdout is not None
+        try:
+            return _read(self.process.stdout)
+        except (EOFError, OSError):
+            status = self.wait(None)
+        if hasattr(signal, "SIGXCPU") and status == -signal.SIGXCPU:
+            words = f"takes more than {allowed.seconds} s of processor time to be read"
+        else:
+            words = f"ends the process that reads it ({_named(status)})"
+        raise DataError(f"{path}: {words}; {DOUBT}")
+
+
+@atexit.register
+def _end_idle() -> None:
+    """End the children that wait for the next file."""
+    while _idle:
+        with _idle.pop():
+            pass
+
+
+def _named(status: int) -> str:
+    with suppress(ValueError):
+        if status < 0:
+            return f"signal {signal.Signals(-status).name}"
+    return f"exit status {status}"
+
+
+def _write(pipe: IO[bytes], message: Any) -> None:
+    content = pickle.dumps(message, protocol=5)
+    pipe.write(_SIZE.pack(len(content)))
+    pipe.write(content)
+    pipe.flush()
+
+
+def _read(pipe: IO[bytes]) -> Any:
+    """Raises EOFError."""
+    head = pipe.read(_SIZE.size)
+    if len(head) < _SIZE.size:
+        raise EOFError
+    (size,) = _SIZE.unpack(head)
+    content = pipe.read(size)
+    if len(content) < size:
+        raise EOFError
+    return pickle.loads(content)
+
+
+def serve() -> None:
+    """What the child does: one request after the other, until there is nobody to ask."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    os.dup2(nowhere, 1)  # what a library prints is no answer
+    with suppress(EOFError, OSError):
+        while True:
+            name, arguments, allowed, folder = _read(requests)
+            with suppress(OSError):  # names of files mean what they mean there
+                os.chdir(folder)
+            _write(answers, _served(name, arguments, allowed, answers))
+
+
+def _served(name: str, arguments: tuple[Any, ...], allowed: Allowed, answers: IO[bytes]) -> tuple[int, Any]:
+    """Give the values of a decoder; the last message of them."""
+    module, _, function = name.partition(":")
+    try:
+        decoder = getattr(import_module(module), function)
+        limit_memory(allowed.memory)
+        limit_time(allowed.seconds)
+        for value in decoder(*arguments):
+            _write(answers, (_VALUE, value))
+            limit_time(allowed.seconds)
+    except MemoryError:
+        words = (
+            f"takes more than {in_bytes(allowed.memory)} of memory to be read; it is damaged, or not what it says it is"
+        )
+        return _FAULT, DataError(f"{arguments[0]}: {words}")
+    except En4dvarError as error:
+        return _FAULT, DataError(str(error))
+    except Exception as error:
+        return _FAULT, DecodeError(" ".join(str(error).split())[:300] or type(error).__name__)
+    return _END, None

@@ -1,0 +1,58 @@
+"""Sections whose keys are described by the text below each of them."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from functools import cache
+from inspect import cleandoc, getsource
+from itertools import pairwise
+from typing import Any
+
+from pydantic import BaseModel
+
+
+class Described(BaseModel):
+    """A model in whose JSON schema the text below a key is its description, unless its field has one.
+
+    Pydantic's ``use_attribute_docstrings`` reads the file of a section for each section as the program starts, which
+    adds 0.4 s to the 1.6 s of processor time of ``en4dvar validate``; these are read where a schema is asked for.
+    """
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
+        schema: dict[str, Any] = handler(core_schema)
+        keys = handler.resolve_ref_schema(schema)["properties"]
+        for name, text in _texts(cls).items():
+            field = cls.model_fields.get(name)
+            if field and field.description is None:
+                keys[field.alias or name]["description"] = text
+        return schema
+
+
+def _texts(section: type) -> dict[str, str]:
+    """Key → text below it, in the class or the nearest of those that it inherits from."""
+    texts: dict[str, str] = {}
+    for kind in reversed(section.__mro__):
+        if issubclass(kind, Described):
+            texts |= _texts_of(kind.__module__).get(kind.__qualname__, {})
+    return texts
+
+
+@cache
+def _texts_of(module: str) -> dict[str, dict[str, str]]:
+    """Class → key → text below it, in the file of a module. A class made in memory has descriptions in its fields."""
+    try:
+        file = ast.parse(getsource(sys.modules[module]))
+    except (OSError, TypeError):  # the interpreter's own prompt
+        return {}
+    return {kind.name: dict(_below(kind)) for kind in file.body if isinstance(kind, ast.ClassDef)}
+
+
+def _below(kind: ast.ClassDef) -> Iterator[tuple[str, str]]:
+    for key, text in pairwise(kind.body):
+        if isinstance(key, ast.AnnAssign) and isinstance(key.target, ast.Name) and isinstance(text, ast.Expr):
+            words = text.value.value if isinstance(text.value, ast.Constant) else None
+            if isinstance(words, str):
+                yield key.target.id, cleandoc(words)

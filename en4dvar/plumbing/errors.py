@@ -1,0 +1,66 @@
+"""Errors a user can cause, each with the exit code of the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+class En4dvarError(Exception):
+    """Base class: the message alone tells where and what to do; the CLI prints it without a traceback."""
+
+    exit_code = 1
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault in a configuration: ``file:line:col: path: message``."""
+
+    message: str
+    path: str = ""
+    file: str = ""
+    line: int = 0
+    column: int = 0
+
+    def __str__(self) -> str:
+        where = ":".join(str(part) for part in (self.file, self.line, self.column) if part)
+        path = "" if where.removeprefix("--set ") == self.path else self.path
+        return ": ".join(part for part in (where, path, self.message) if part)
+
+
+class ConfigError(En4dvarError):
+    """The configuration cannot be used; carries every problem found, not only the first.
+
+    ``path``: the key of a single problem, which is told by its message.
+    """
+
+    exit_code = 2
+
+    def __init__(self, problems: Sequence[Fault] | str, path: str = ""):
+        self.problems = (Fault(problems, path),) if isinstance(problems, str) else tuple(problems)
+        super().__init__("\n".join(str(p) for p in self.problems))
+
+
+class DataError(En4dvarError):
+    """A data file cannot be used; ``series`` is the name of the one it holds, where the data are several."""
+
+    exit_code = 2
+
+    def __init__(self, message: str, series: str = ""):
+        self.series = series
+        super().__init__(message)
+
+    def __reduce__(self) -> tuple[type[DataError], tuple[str, str]]:
+        return type(self), (str(self), self.series)
+
+
+class OutputError(En4dvarError):
+    """The run directory cannot be used."""
+
+    exit_code = 2
+
+
+class TooFewMembersError(En4dvarError):
+    """Too few members survived a forecast for the ensemble statistics to mean anything."""
+
+    exit_code = 3

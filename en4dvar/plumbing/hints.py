@@ -1,0 +1,105 @@
+"""Suggestions for misspelt names and missing files."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
+from pathlib import Path
+from reprlib import Repr
+
+_SHORT = Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, 80, 80
+LONGEST = 2000  # characters of one message
+FEW = 8  # names that are suggested at most
+
+
+def shown(value: object) -> str:
+    """``value`` as Python writes it, on one line and short however long it is."""
+    return _SHORT.repr(value)
+
+
+def brief(text: str, longest: int = LONGEST) -> str:
+    """``text``, its middle left out where it is long.
+
+    >>> brief("a" * 50 + "z" * 50, longest=20)
+    'aaaaaaaaaa … (80 characters) … zzzzzzzzzz'
+    """
+    half = longest // 2
+    return text if len(text) <= longest else f"{text[:half]} … ({len(text) - 2 * half} characters) … {text[-half:]}"
+
+
+def suggest(word: object, known: Iterable[str] | Mapping[str, object]) -> str:
+    """``"; did you mean 'x'?"``, or else the list of what is known, or nothing.
+
+    ``known``: the names, or each with what it means in words. A part of a name counts before a misspelt name.
+
+    >>> suggest("neohookean", ["zener-neo-hookean", "neo-hookean-kelvin-voigt"])
+    "; did you mean 'neo-hookean-kelvin-voigt'?"
+    >>> suggest("viscosity", {"G": "shear modulus", "mu": "viscosity"}), suggest("mue", {"G": "", "mu": ""})
+    ("; did you mean 'mu'?", "; did you mean 'mu'?")
+    """
+    names, text = list(known), str(word)
+    words = {name: known[name] if isinstance(known, Mapping) else "" for name in names}
+    meant = _meant(
+        _letters(text), {name: meaning if isinstance(meaning, str) else "" for name, meaning in words.items()}
+    )
+    close = get_close_matches(text, names, 1, 0.6) if len(text) < LONGEST else []  # quadratic in the length
+    if nearest := meant or close:
+        return f"; did you mean {' or '.join(map(repr, nearest))}?"
+    return f"; known: {', '.join(names)}" if names else ""
+
+
+def _meant(letters: str, known: Mapping[str, str]) -> list[str]:
+    """The few names that begin with ``letters``, else those that hold them, else those whose meaning does."""
+    if not 2 < len(letters) < LONGEST:
+        return []
+    begin = [name for name in known if _letters(name).startswith(letters)]
+    within = [name for name in known if letters in _letters(name)]
+    of_meaning = [name for name, words in known.items() if letters in _letters(words)]
+    matches = begin or within or of_meaning
+    return matches if len(matches) <= FEW else []
+
+
+def _letters(text: str) -> str:
+    return "".join(filter(str.isalnum, text.lower()))
+
+
+def natural(path: Path) -> tuple[list[list[str | int]], Path]:
+    """Key to sort files by: as :func:`numbered`, part by part, whatever their suffixes."""
+    return [numbered(part) for part in path.with_suffix("").parts], path
+
+
+@functools.lru_cache(maxsize=1024)  # the folders of many files are the same
+def numbered(name: str) -> list[str | int]:
+    """Key to sort by: numbers in a name by their size, so that ``bubble10`` comes after ``bubble2``.
+
+    >>> sorted(["bubble10", "bubble2"], key=numbered)
+    ['bubble2', 'bubble10']
+    """
+    return [int(s) if i % 2 else s for i, s in enumerate(re.split(r"([0-9]{1,40})", name))]
+
+
+def short(text: str, most: int = 60) -> str:
+    """A name or value as a message can quote it."""
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+def listed(names: Iterable[str], most: int = 30) -> str:
+    """Names with commas between; of many the first, and how many more there are."""
+    known = [short(name) for name in names]
+    more = f" and {len(known) - most} more" if len(known) > most else ""
+    return f"{', '.join(known[:most])}{more}"
+
+
+def no_such_file(path: Path) -> str:
+    """``"<path>: no such file"`` and what lies beside it: similar names, else files of the same kind."""
+    try:
+        beside = sorted(p.name for p in path.parent.iterdir() if p.is_file())
+    except OSError:
+        return brief(f"{path}: no such file; the folder {path.parent} cannot be read")
+    close = get_close_matches(path.name, beside, 3, 0.6) or [b for b in beside if Path(b).suffix == path.suffix][:5]
+    if not close:
+        return brief(f"{path}: no such file")
+    return f"{path}: no such file; the folder holds {', '.join(close)}"

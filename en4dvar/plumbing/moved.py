@@ -1,0 +1,85 @@
+"""Former names of modules: an import by one gives the module at its new place, the same object, and says so."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from importlib import import_module
+from importlib.abc import Loader
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
+
+# new package → the modules and packages of ``en4dvar`` that moved into it with 1.1
+HOMES = {
+    "plumbing": "errors hints units files tables caution kernel_cache compiled user_code user_file described",
+    "model": "state forward batch function_model programs",
+    "priors": "prior parameter_map dependence field_prior varying",
+    "data": "observations noise",
+    "diagnosis": "analysis residuals influence diagnostics response honesty",
+    "estimation": "assimilate stages localised loop_state conclusions summary joint population design",
+}
+MOVED = {f"en4dvar.{name}": f"en4dvar.{home}.{name}" for home, names in HOMES.items() for name in names.split()}
+MOVED |= {f"en4dvar.config.{n}": f"en4dvar.assembly.{n}" for n in ("build", "build_sequence", "reading", "find_files")}
+MOVED |= {f"en4dvar.{old}": f"en4dvar.{new}" for new, several in {
+    "config.data": "config.window", "config.error": "config.error_std config.discrepancy",
+    "config.sharing": "config.population", "config.models": "config.symbols", "data.noise.make": "data.noise.joint",
+    "descent.step_control": "descent.settling", "executor.chunks": "executor.shared",
+    "model.programs.process": "model.programs.adjusted", "series.moments": "series.outcome",
+}.items() for old in several.split()}  # fmt: skip
+MOVED |= {"en4dvar.cycling": "en4dvar.series", "en4dvar.storage": "en4dvar.results"}
+
+# names that moved by themselves, with what they are called today
+NAMES = {
+    "en4dvar.problem.AssimilationSettings": "en4dvar.schemes.settings.AssimilationSettings",
+    "en4dvar.problem.Localising": "en4dvar.schemes.settings.Localisation",
+}
+
+
+def former_name(module: str, name: str) -> Any:
+    """What a module had under a name of version 1.0, for its ``__getattr__``. Raises :class:`AttributeError`."""
+    old = f"{module}.{name}"
+    if old not in NAMES:
+        raise AttributeError(f"module {module!r} has no attribute {name!r}")
+    warn(old, NAMES[old], 3)
+    home, _, new = NAMES[old].rpartition(".")
+    return getattr(import_module(home), new)
+
+
+def new_name(module: str) -> str | None:
+    """The name of today for a module that moved, or for one below it; None where it did not move."""
+    for old, new in MOVED.items():
+        if module == old or module.startswith(f"{old}."):
+            return new + module[len(old) :]
+    return None
+
+
+def warn(old: str, new: str, level: int) -> None:
+    """Tell the caller ``level`` frames up, frames of the import system left out, where a name went."""
+    warnings.warn(f"{old} is now {new}; the old name goes with 2.0", DeprecationWarning, stacklevel=level + 1)
+
+
+class FormerNames(Loader):
+    """Finds modules by their former names, and loads them from where they are."""
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        new = new_name(name)
+        if new is None:
+            return None
+        warn(name, new, 2)
+        return ModuleSpec(name, self, origin=new)
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        module = import_module(spec.origin or "")
+        spec.loader_state = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Nothing is executed a second time; the import system has set a specification that is not the module's own."""
+        module.__spec__ = module.__spec__.loader_state if module.__spec__ else None
+
+
+def install() -> None:
+    """Make former names importable; a second call does nothing."""
+    if not any(isinstance(finder, FormerNames) for finder in sys.meta_path):
+        sys.meta_path.insert(0, FormerNames())

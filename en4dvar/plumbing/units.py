@@ -1,0 +1,260 @@
+"""Units: the few dozen symbols that data files and settings need, SI prefixes, products, quotients and powers.
+
+A unit is a factor to SI and a vector of exponents of the base dimensions. Factors are exact rationals: ``"1.4 um"`` is
+the same double as ``1.4e-6``. Temperatures in °C are not units of this kind (they have an offset) and are refused.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from difflib import get_close_matches
+from fractions import Fraction
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, overload
+
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.hints import shown
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    Array = npt.NDArray[np.float64]
+
+BASE = ("m", "kg", "s", "K", "A", "mol")
+
+
+class UnitError(En4dvarError, ValueError):
+    """A unit is missing, unknown, or of the wrong dimension. A ``ValueError`` too, so that pydantic collects it."""
+
+    exit_code = 2
+
+
+@dataclass(frozen=True)
+class Unit:
+    """``factor`` converts to SI; ``powers`` are the exponents of m, kg, s, K, A, mol."""
+
+    factor: Fraction
+    powers: tuple[int, ...]
+
+    def __mul__(self, other: Unit) -> Unit:
+        return Unit(self.factor * other.factor, tuple(a + b for a, b in zip(self.powers, other.powers, strict=True)))
+
+    def __pow__(self, exponent: int) -> Unit:
+        return Unit(self.factor**exponent, tuple(p * exponent for p in self.powers))
+
+
+ONE = Unit(Fraction(1), (0,) * len(BASE))
+
+
+def _unit(factor: str, **powers: int) -> Unit:
+    return Unit(Fraction(factor), tuple(powers.get(b, 0) for b in BASE))
+
+
+PREFIXED = {
+    "m": _unit("1", m=1),
+    "g": _unit("1e-3", kg=1),
+    "s": _unit("1", s=1),
+    "K": _unit("1", K=1),
+    "A": _unit("1", A=1),
+    "mol": _unit("1", mol=1),
+    "Hz": _unit("1", s=-1),
+    "fps": _unit("1", s=-1),
+    "N": _unit("1", m=1, kg=1, s=-2),
+    "Pa": _unit("1", m=-1, kg=1, s=-2),
+    "J": _unit("1", m=2, kg=1, s=-2),
+    "W": _unit("1", m=2, kg=1, s=-3),
+    "V": _unit("1", m=2, kg=1, s=-3, A=-1),
+    "bar": _unit("1e5", m=-1, kg=1, s=-2),
+    "L": _unit("1e-3", m=3),
+    "P": _unit("0.1", m=-1, kg=1, s=-1),  # poise, so that cP is read
+}
+UNPREFIXED = {
+    "1": ONE,
+    "%": _unit("1e-2"),
+    "ppm": _unit("1e-6"),
+    "rad": ONE,
+    "min": _unit("60", s=1),
+    "h": _unit("3600", s=1),
+    "atm": _unit("101325", m=-1, kg=1, s=-2),
+}
+PREFIXES = {"T": 12, "G": 9, "M": 6, "k": 3, "h": 2, "d": -1, "c": -2, "m": -3, "u": -6, "n": -9, "p": -12, "f": -15}
+
+LARGEST_POWER, LONGEST = 12, 100  # of a symbol; characters of a unit
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?(?![\d.])")
+_TOKEN = re.compile(
+    r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)(?=\s*\*\s*[A-Za-z%(])|"
+    r"(?P<symbol>[A-Za-z%]+|1(?![\d.]))(?:(?:\^|\*\*)?(?P<power>[+-]?\d+))?|(?P<op>[*/()]))\s*"
+)
+_SUPERSCRIPT = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+
+
+def _symbol(name: str) -> Unit:
+    if name in UNPREFIXED:
+        return UNPREFIXED[name]
+    if name in PREFIXED:
+        return PREFIXED[name]
+    if name[:1] in PREFIXES and name[1:] in PREFIXED:
+        scale = Unit(Fraction(10) ** PREFIXES[name[0]], ONE.powers)
+        return scale * PREFIXED[name[1:]]
+    raise UnitError(f"unknown unit {name!r}{_did_you_mean(name)}")
+
+
+def _did_you_mean(name: str) -> str:
+    words = {"micron": "um", "sec": "s", "usec": "us", "msec": "ms", "hz": "Hz", "degC": "K", "C": "K", "percent": "%"}
+    known = [*UNPREFIXED, *PREFIXED, *(p + u for p in PREFIXES for u in PREFIXED)]
+    same_letters = [k for k in known if k.lower() == name.lower()]
+    close = [words[name]] if name in words else same_letters[:1] or get_close_matches(name, known, 1, 0.6)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+@lru_cache(maxsize=1024)
+def parse_unit(text: str) -> Unit:
+    """The unit written as ``text``: ``"Pa s"``, ``"W/(m K^2)"``, ``"1/us"``, ``"m s-1"``, ``"%"``, ``"1"``.
+
+    ``"2.76*um"`` is a unit as well, such as a pixel, and ``"1/(270*kHz)"``, the time between two frames.
+
+    A product after a quotient (``"W/m K"``) is refused as ambiguous. Raises :class:`UnitError`.
+    """
+    if len(text) > LONGEST:
+        raise UnitError(f"cannot read unit {text[:20]!r}…: {len(text)} characters")
+    clean = text.replace("µ", "u").replace("μ", "u").replace("·", "*").translate(_SUPERSCRIPT)
+    tokens: list[re.Match[str]] = []
+    at = 0
+    while at < len(clean):
+        match = _TOKEN.match(clean, at)
+        if match is None:
+            raise UnitError(f"cannot read unit {text!r} at {clean[at:]!r}")
+        tokens.append(match)
+        at = match.end()
+    unit, end = _product(tokens, 0, text)
+    if end != len(tokens):
+        raise UnitError(f"cannot read unit {text!r}: unbalanced ')'")
+    if not 1e-90 < unit.factor < 1e90:
+        raise UnitError(f"cannot read unit {text!r}: a unit is a positive multiple of another")
+    return unit
+
+
+def as_unit(quantity: str, unit: str) -> str:
+    """A positive quantity in whatever has the dimension of ``unit``, as a unit itself. Raises :class:`UnitError`.
+
+    >>> as_unit("2.76 um", "m"), as_unit("2.7e5 1/s", "Hz")
+    ('2.76*um', '2.7e5*(1/s)')
+    """
+    if not parse_quantity(quantity, unit) > 0:
+        raise UnitError(f"{shown(quantity)} is not positive")
+    number = _NUMBER.match(quantity.strip())
+    assert number is not None
+    symbol = quantity.strip()[number.end() :].strip()
+    return f"{number[0].lstrip('+')}*{symbol if symbol.isalpha() else f'({symbol})'}"
+
+
+def _product(tokens: list[re.Match[str]], i: int, text: str) -> tuple[Unit, int]:
+    """Factors up to a closing bracket or the end; returns the unit and the index where it stopped."""
+    unit, operator, divided = ONE, "", False
+    expects_factor = True
+    while i < len(tokens):
+        op = tokens[i]["op"]
+        if op == ")":
+            break
+        if op in ("*", "/"):
+            if expects_factor:
+                raise UnitError(f"cannot read unit {text!r}: {op!r} without a unit before it")
+            operator, expects_factor, i = op, True, i + 1
+            continue
+        if tokens[i]["number"]:
+            factor = Unit(Fraction(tokens[i]["number"]), ONE.powers)
+            if not expects_factor:
+                raise UnitError(f"cannot read unit {text!r}: a number stands before a unit")
+        elif op == "(":
+            factor, i = _product(tokens, i + 1, text)
+            if i == len(tokens):
+                raise UnitError(f"cannot read unit {text!r}: unbalanced '('")
+        else:
+            power = tokens[i]["power"] or "1"
+            if len(power) > 3 or abs(int(power)) > LARGEST_POWER:
+                raise UnitError(f"cannot read unit {text!r}: no unit has the power {power}")
+            factor = _symbol(tokens[i]["symbol"]) ** int(power)
+        if divided and operator != "/":
+            raise UnitError(f"ambiguous unit {text!r}: write brackets, as in 'W/(m K)'")
+        divided = divided or operator == "/"
+        unit = unit * factor ** (-1 if operator == "/" else 1)
+        operator, expects_factor, i = "", False, i + 1
+    if expects_factor:
+        raise UnitError(f"cannot read unit {text!r}: a unit is missing")
+    return unit, i
+
+
+@lru_cache(maxsize=1024)
+def _factor(from_unit: str, to_unit: str) -> Fraction:
+    source, target = parse_unit(from_unit), parse_unit(to_unit)
+    if source.powers != target.powers:
+        raise UnitError(f"unit {from_unit!r} cannot be converted to {to_unit!r}")
+    return source.factor / target.factor
+
+
+@overload
+def convert(value: float, from_unit: str, to_unit: str) -> float: ...
+@overload
+def convert(value: Array, from_unit: str, to_unit: str) -> Array: ...
+def convert(value: float | Array, from_unit: str, to_unit: str) -> float | Array:
+    """``value`` (a number or an array) of ``from_unit``, expressed in ``to_unit``. Raises :class:`UnitError`."""
+    factor = _factor(from_unit, to_unit)
+    # Dividing by 1e6 rounds once, multiplying by 1e-6 twice.
+    return value * float(factor) if factor >= 1 else value / float(1 / factor)
+
+
+def parse_quantity(value: str | float, unit: str) -> float:
+    """A quantity such as ``"0.42 kPa"`` or ``"2.5 µs"``, expressed in ``unit``.
+
+    A number without unit is accepted only where ``unit`` is dimensionless. Raises :class:`UnitError`.
+
+    >>> parse_quantity("0.42 kPa", "Pa"), parse_quantity("1 %", "1"), parse_quantity(3, "1")
+    (420.0, 0.01, 3.0)
+    """
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise UnitError(f"{shown(value)} is not a quantity; write a number and a unit such as '1 {unit}'")
+    text = str(value).strip()
+    number = _NUMBER.match(text)
+    if number is None:
+        raise UnitError(f"{shown(value)} is not a quantity; write a number and a unit such as '1 {unit}'")
+    if len(number[0]) > LONGEST:
+        raise UnitError(f"{shown(value)}: a number of {len(number[0])} characters")
+    symbol = text[number.end() :].strip()
+    if not symbol and parse_unit(unit).powers != ONE.powers:
+        raise UnitError(f"{text} has no unit; write e.g. '{text} {unit}'")
+    try:
+        factor = _factor(symbol or "1", unit)
+    except UnitError as error:
+        raise UnitError(f"{shown(text)}: {error}") from None
+    try:
+        return float(Fraction(number[0]) * factor)
+    except OverflowError:
+        raise UnitError(f"{shown(text)}: larger than any number of the computer") from None
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Pydantic annotation: ``Annotated[float, Quantity("Pa")]`` reads ``"0.42 kPa"`` as 420.0, dumps JSON with unit."""
+
+    unit: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        from pydantic_core import core_schema
+
+        parse_unit(self.unit)
+        dump = core_schema.plain_serializer_function_ser_schema(self._write, when_used="json")
+        return core_schema.no_info_before_validator_function(self._read, handler(float), serialization=dump)
+
+    def __get_pydantic_json_schema__(self, core_schema: Any, handler: Any) -> dict[str, Any]:
+        """A number with a unit is text in YAML; without one it is accepted only where there is no unit."""
+        if self.unit == "1":
+            return {"type": ["number", "string"]}
+        return {"type": "string", "pattern": r"^\s*[+-]?[\d.]", "x-unit": self.unit}
+
+    def _read(self, value: Any) -> float:
+        return parse_quantity(value, self.unit)
+
+    def _write(self, value: float) -> str | float:
+        return value if self.unit == "1" else f"{value!r} {self.unit}"

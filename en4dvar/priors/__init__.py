@@ -1,0 +1,1 @@
+"""Prior distributions: parameters and their maps, dependence, fields, variation in time."""

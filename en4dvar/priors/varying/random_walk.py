@@ -1,0 +1,149 @@
+"""A parameter that is constant between knots and changes there: a random walk from piece to piece.
+
+    x_0 ~ N(mean, std²),     x_k = x_{k−1} + c_k,     c_k ~ N(0, q²)
+
+in the transformed space of the parameter, whose prior is that of x_0. The changes c_k are parameters of the control
+vector like any other, independent of each other and of x_0, so that J, its minimisation, the ensemble and the evidence
+are what they are without; the values of the pieces are their sums. Where q is estimated it is a parameter as well, with
+a half-normal prior, and the c_k / q ~ N(0, 1) take the place of the c_k, so that all are still independent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from en4dvar.model.forward import ForwardModel
+from en4dvar.model.state import Array, Field, Parameter
+from en4dvar.plumbing.units import convert
+from en4dvar.priors.prior import PriorTerm
+
+SCALE = {"normal": "", "lognormal": "ln", "logit": "logit"}  # what a change is one of; else of the Gaussian score
+
+
+@dataclass(frozen=True)
+class RandomWalk:
+    """``first`` is the prior of the first piece, ``changes`` (m) are those of the changes at the ``knots`` (m,).
+
+    The knots are in the model's time, increasing and positive. ``spread`` is the prior of the changes' standard
+    deviation where that is estimated; they then count it.
+    """
+
+    first: PriorTerm
+    knots: tuple[float, ...]
+    changes: tuple[PriorTerm, ...]
+    spread: PriorTerm | None = None
+
+    @classmethod
+    def of(
+        cls, model: ForwardModel, first: PriorTerm, knots: Sequence[float], std: float, estimated: bool = False
+    ) -> RandomWalk:
+        """With changes N(0, std²) in the transformed space of ``first``. Raises :class:`ConfigError`.
+
+        ``estimated``: ``std`` is that of the half-normal prior of their standard deviation.
+        """
+
+        def change(k: int, knot: float) -> PriorTerm:
+            p = _change(model, first, k, knot)
+            if estimated:
+                p = replace(p, unit="1", display_unit="1", label=f"{p.label}, in its standard deviations")
+            return PriorTerm.normal(p, 0.0, 1.0 if estimated else std)
+
+        spread = PriorTerm.half_normal(_spread(first), std) if estimated else None
+        return cls(first, tuple(knots), tuple(change(k, knot) for k, knot in enumerate(knots, 1)), spread)
+
+    @property
+    def terms(self) -> tuple[PriorTerm, ...]:
+        """Priors of the quantities that join the control vector."""
+        return (*([self.spread] if self.spread else []), *self.changes)
+
+    @property
+    def parameter(self) -> Parameter:
+        """The parameter that varies."""
+        return self.first.parameter
+
+    @property
+    def name(self) -> str:
+        """Name of the parameter."""
+        return self.parameter.name
+
+    @property
+    def pieces_name(self) -> str:
+        """Name of the values of all pieces, in the state and in result files."""
+        return f"{self.name}_pieces"
+
+    @property
+    def label(self) -> str:
+        """The varying quantity in words."""
+        return self.parameter.label
+
+    @property
+    def own(self) -> Field:
+        """Where the state of a run keeps the values of the pieces."""
+        return Field(self.pieces_name, len(self.knots) + 1, self.parameter.unit)
+
+    def values(self, theta: Mapping[str, Array]) -> Array:
+        """:meth:`pieces`. Raises ValueError where one lies outside of the parameter's bounds."""
+        p, pieces = self.parameter, self.pieces(theta)
+        if not np.all((pieces >= p.bounds[0]) & (pieces <= p.bounds[1]) & np.isfinite(pieces)):
+            raise ValueError(f"a piece of {p.name} outside [{p.bounds[0]:g}, {p.bounds[1]:g}] {p.unit}")
+        return pieces
+
+    def pieces(self, theta: Mapping[str, Array]) -> Array:
+        """Physical values (…, m + 1) of the pieces, from those of the parameter and of its changes, (…,) by name.
+
+        NaN where the parameter is outside of the range of its transform.
+        """
+        term, value = self.first, np.asarray(theta[self.name], dtype=float)
+        low, high = term.range
+        inside = (value > low) & (value < high)
+        centre = term.to_physical(np.array(term.mean))
+        first = np.where(inside, term.from_physical(np.where(inside, value, centre)), np.nan)
+        std = theta[self.spread.parameter.name] if self.spread else 1.0
+        changes = [std * theta[term.parameter.name] for term in self.changes]
+        return self.first.to_physical(np.cumsum(np.stack([first, *changes], axis=-1), axis=-1))
+
+
+def clock(model: ForwardModel, knot: float) -> str:
+    """An instant of the model in words."""
+    unit = "" if model.time_display_unit == "1" else f" {model.time_display_unit}"
+    return f"{convert(knot, model.time_unit, model.time_display_unit):.6g}{unit}"
+
+
+def _change(model: ForwardModel, first: PriorTerm, k: int, knot: float) -> Parameter:
+    """The change at the k-th knot, counted from one."""
+    p, scale, (unit, shown) = first.parameter, SCALE.get(first.transform, "score"), _units(first)
+    if len(p.symbol) > 2 and p.symbol[0] == p.symbol[-1] == "$":
+        function = rf"\mathrm{{{scale}}} " if scale else ""
+        symbol = rf"$\Delta_{{{k}}}({function}{p.symbol[1:-1]})$"
+    else:
+        symbol = f"Δ{k} {scale} {p.symbol}".replace("  ", " ")
+    return Parameter(
+        f"{p.name}_change_{k}",
+        unit,
+        label=f"change of {scale} {p.label} at {clock(model, knot)}".replace("  ", " "),
+        symbol=symbol,
+        display_unit=shown,
+        source="random walk of a parameter that varies in time",
+    )
+
+
+def _spread(first: PriorTerm) -> Parameter:
+    """The standard deviation of the changes."""
+    p, (unit, shown) = first.parameter, _units(first)
+    return Parameter(
+        f"{p.name}_change_std",
+        unit,
+        bounds=(0.0, math.inf),
+        label=f"std of the changes of {SCALE.get(first.transform, 'score')} {p.label}".replace("  ", " "),
+        display_unit=shown,
+        source="random walk of a parameter that varies in time",
+    )
+
+
+def _units(first: PriorTerm) -> tuple[str, str]:
+    """Unit and display unit of a change."""
+    return (first.parameter.unit, first.parameter.display_unit) if first.transform == "normal" else ("1", "1")

@@ -1,0 +1,246 @@
+"""``posterior.nc`` of a campaign: the results of its data sets side by side along the dimension ``dataset``.
+
+It is written by streaming, a block of data sets at a time. Dimensions follow the results of the data sets, in the
+ArviZ schema, with ``dataset`` in front; ``time`` becomes ``observation`` (padded with NaN to the longest data set) and
+the observation times a variable. Scalars that judge a fit become variables of ``sample_stats``. The paths between the
+observations, the iterations, the descents and the modes stay in ``datasets.pack``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.results.checkpoint import digest
+from en4dvar.results.netcdf import Groups, Variable, attributes_of, netcdf_file
+from en4dvar.results.pack import Pack
+from en4dvar.results.packed import Alike, Content, PackedLayout, opened, unpacked, unpacked_together
+from en4dvar.results.seal import check_seal
+
+GROUPS = (
+    "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "observation_errors",
+    "constant_data", "sample_stats", "log_likelihood",
+)  # fmt: skip
+_PATHS = frozenset(f"/{name}" for name in GROUPS)
+LEFT_OUT = {"path_time", "iteration", "mode", "descent"}
+RENAMED = {"time": "observation", "time_column": "observation_column"}  # padded to the longest data set
+PARAMETER = "parameter"
+FAILURES = "failed_datasets"  # root attribute: JSON of name → reason
+MADE_OF = "datasets_sha256"  # root attribute: digest of the results in the file
+BLOCK = 1 << 22  # bytes of results that are written at once
+
+
+class DamagedError(OutputError):
+    """Results that cannot be read any more; ``names`` are those of their data sets."""
+
+    def __init__(self, names: Sequence[str], reason: str):
+        super().__init__(reason)
+        self.names = names
+
+
+@dataclass
+class _Layout:
+    """What the file must have room for: the results as a whole, of which one is in memory at a time."""
+
+    widest: Groups = field(default_factory=dict)  # the (first) data set with most parameters
+    n_parameters: int = -1
+    n_observations: int = 0
+    scalars: dict[str, dict[str, Any]] = field(default_factory=lambda: {group: {} for group in GROUPS})
+    seen: set[tuple[PackedLayout, tuple[str, ...]]] = field(default_factory=set)
+
+    def add(self, content: bytes) -> None:
+        """One that varies in time has the more parameters the longer the window, one that was sampled more scalars."""
+        result = opened(content)
+        kind = result.layout, tuple(key for attributes in result.attributes for key in attributes)
+        if kind in self.seen:  # as most are: there is nothing new in it
+            return
+        self.seen.add(kind)
+        sizes, n_parameters = result.layout.sizes, result.layout.sizes["/sample_stats"][PARAMETER]
+        if n_parameters > self.n_parameters:
+            self.widest, self.n_parameters = unpacked(content, _PATHS), n_parameters
+        said = dict(zip(sizes, result.attributes, strict=True))
+        for name, kinds in self.scalars.items():
+            self.n_observations = max(self.n_observations, sizes[f"/{name}"].get("time", 0))
+            for key, value in said[f"/{name}"].items():
+                kinds.setdefault(key, str if isinstance(value, str) else np.dtype(float))
+
+
+def save_campaign(
+    path: Path, pack: Pack, sources: Mapping[str, str], attributes: Mapping[str, Any], failures: Mapping[str, str]
+) -> Path:
+    """Write the campaign's file; one that is there already, of the same results, is left as it is.
+
+    Parameters
+    ----------
+    sources: name of the data set → its name in the ``pack``, in order; not empty.
+    attributes: of the root. failures: name of the data set without a posterior → reason.
+
+    Raises
+    ------
+    DamagedError: results cannot be read. OutputError: the file cannot be written.
+    """
+    digests = [pack.entries[stem].content_digest for stem in sources.values()]
+    made_of = digest(json.dumps([digests, [*sources], failures]).encode())
+    if _holds(path, made_of):
+        return path
+    layout = _layout(pack, sources)
+    told = {FAILURES: json.dumps(failures, ensure_ascii=False), MADE_OF: made_of}
+    with netcdf_file(path) as partial, netCDF4.Dataset(partial, "w", format="NETCDF4") as target:
+        target.setncatts({**attributes, **told})
+        _define(target, layout, len(sources))
+        for begin, names, contents in _blocks(pack, sources):
+            alike = unpacked_together(contents, _PATHS)
+            for group in GROUPS:
+                _write(target[group], begin, names, alike)
+    return path
+
+
+def _holds(path: Path, made_of: str) -> bool:
+    try:
+        return path.exists() and _root_attribute(path, MADE_OF) == made_of
+    except OutputError:  # damaged: it is written anew
+        return False
+
+
+def _layout(pack: Pack, sources: Mapping[str, str]) -> _Layout:
+    layout, damaged, reasons = _Layout(), [], []
+    for name, stem in sources.items():
+        try:
+            layout.add(pack.content(stem))
+        except (OutputError, KeyError, ValueError) as error:  # the last two: written by somebody else
+            damaged.append(name)
+            reasons.append(str(error))
+    if damaged:
+        raise DamagedError(damaged, "\n".join(reasons))
+    return layout
+
+
+def _blocks(pack: Pack, sources: Mapping[str, str]) -> Iterator[tuple[int, list[str], list[Content]]]:
+    """Place of the first, names and contents of as many data sets as are written at once."""
+    begin, size = 0, 0
+    names: list[str] = []
+    block: list[Content] = []
+    for name, stem in sources.items():
+        content = pack.content(stem, check=False)  # it was for the layout
+        if block and size + len(content) > BLOCK:
+            yield begin, names, block
+            begin, size, names, block = begin + len(names), 0, [], []
+        names.append(name)
+        block.append(opened(content))
+        size += len(content)
+    yield begin, names, block
+
+
+def failed_datasets(path: Path) -> dict[str, str]:
+    """Name of the data set without a posterior → reason, from a campaign's file; empty where there is no such file."""
+    if not path.is_file():
+        return {}
+    return {str(k): str(v) for k, v in json.loads(_root_attribute(path, FAILURES) or "{}").items()}
+
+
+def _root_attribute(path: Path, name: str) -> str:
+    """ "" where the file has none. Raises :class:`OutputError`."""
+    check_seal(path)
+    try:
+        with netCDF4.Dataset(path) as file:
+            return str(getattr(file, name, ""))
+    except OSError as error:
+        raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
+
+
+def _define(target: netCDF4.Dataset, layout: _Layout, n_datasets: int) -> None:
+    """Groups, dimensions, variables and coordinates, as of the widest data set, and the scalars of all."""
+    for name in GROUPS:
+        source, group = layout.widest[f"/{name}"], target.createGroup(name)
+        group.createDimension("dataset", n_datasets)
+        kept = {key: v for key, v in source.every.items() if not LEFT_OUT & {*v.dims, key}}
+        for dim in sorted({dim for variable in kept.values() for dim in variable.dims}):
+            group.createDimension(RENAMED.get(dim, dim), layout.n_observations if dim in RENAMED else source.sizes[dim])
+        _create(group, "dataset", np.dtype(object), ("dataset",), {"units": "1", "long_name": "data set"})
+        for key, variable in kept.items():
+            own = key not in variable.dims or key == "time"  # of each data set
+            dims = tuple(RENAMED.get(dim, dim) for dim in variable.dims)
+            kind = variable.values.dtype
+            made = _create(group, key, kind, ("dataset", *dims) if own else dims, attributes_of(variable), own)
+            if not own:
+                made[...] = variable.values
+        for key, kind in layout.scalars[name].items():
+            variable_name = f"{key}_total" if key in group.variables else key  # a parameter's share keeps its name
+            about = {"units": "1", "long_name": key.replace("_", " "), "attribute": key}
+            _create(group, variable_name, np.dtype(kind), ("dataset",), about, padded=True)
+
+
+def _create(
+    group: netCDF4.Group,
+    name: str,
+    kind: np.dtype[Any],
+    dims: tuple[str, ...],
+    attributes: Mapping[str, Any],
+    padded: bool = False,
+) -> netCDF4.Variable[Any]:
+    """A variable; where it is ``padded``, floats that are missing are NaN."""
+    fill = np.nan if padded and kind.kind == "f" else None
+    stored = str if kind.kind in "OU" else np.dtype(np.int8) if kind.kind == "b" else kind
+    made = group.createVariable(name, stored, dims, fill_value=fill)
+    made.setncatts(attributes)
+    made.set_auto_maskandscale(False)
+    return made
+
+
+def _write(group: netCDF4.Group, begin: int, names: Sequence[str], block: Sequence[Alike]) -> None:
+    """The values of consecutive data sets; what one lacks stays missing."""
+    variables = [alike.groups[group.path].every for alike in block]
+    names_here = group[PARAMETER][...].tolist() if PARAMETER in group.variables else []
+    places = [_places(names_here, source) for source in variables]
+    for variable in group.variables.values():
+        if variable.dimensions[:1] != ("dataset",):
+            continue
+        kind, shape = object if variable.dtype is str else variable.dtype, variable.shape[1:]
+        rows = np.full((len(names), *shape), _missing(variable), dtype=kind)
+        if variable.name == "dataset":
+            rows[:] = names
+        elif "attribute" in variable.ncattrs():
+            key = variable.getncattr("attribute")
+            for alike in block:
+                for i, attributes in zip(alike.places, alike.attributes, strict=True):
+                    if key in attributes[group.path]:
+                        rows[i] = attributes[group.path][key]
+        else:
+            for alike, own, place in zip(block, variables, places, strict=True):
+                if variable.name in own:
+                    _place(rows, alike.places, own[variable.name], place)
+        if kind is not object or (rows != "").any():  # text that is not written is empty
+            variable[begin : begin + len(names)] = rows
+
+
+def _place(rows: np.ndarray[Any, Any], which: list[int], variable: Variable, places: list[int] | None) -> None:
+    """Put the values of data sets that are alike into their rows of a variable, each parameter in its place."""
+    if rows.shape[1:] == variable.values.shape[1:] and (places is None or PARAMETER not in variable.dims):
+        rows[which] = variable.values
+    elif variable.values.size:  # no parameter, no value
+        where = (
+            places if places and dim == PARAMETER else slice(n)
+            for dim, n in zip(variable.dims, variable.values.shape[1:], strict=True)
+        )  # fmt: skip
+        own = rows[which]
+        own[(slice(None), *where)] = variable.values
+        rows[which] = own
+
+
+def _missing(variable: netCDF4.Variable[Any]) -> Any:
+    if variable.dtype is str:
+        return ""
+    return getattr(variable, "_FillValue", netCDF4.default_fillvals[np.dtype(variable.dtype).str[1:]])
+
+
+def _places(names: list[str], source: Mapping[str, Variable]) -> list[int] | None:
+    """Where the parameters of a data set stand among those of the campaign, None where they are the same."""
+    own = source[PARAMETER].values[0].tolist() if PARAMETER in source else names
+    return None if own == names else [names.index(name) for name in own]

@@ -1,0 +1,164 @@
+"""Variables and attributes of a result file, each declared once: name, dimensions, unit, meaning, and its values.
+
+Writing follows the declarations (:func:`lay_out`), and so do the check of a file that is read
+(:mod:`en4dvar.results.complete`) and the reference page of the documentation.
+
+A name may hold a placeholder, as in ``{parameter}_centre``. Such a variable exists once for each item of a scope (each
+parameter, each series), whose names take the places of all placeholders in its name and its dimensions.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.model.state import Parameter
+from en4dvar.results.netcdf import Group, Variable, netcdf_attributes
+
+MEMBER = "chain draw"
+_PLACEHOLDER = re.compile(r"\{(\w+)\}")
+
+
+@dataclass(frozen=True)
+class Item:
+    """A parameter, a series or the like for which variables are declared.
+
+    ``held``: the object that its values are taken from; ``names``: what takes the place of each placeholder; ``label``:
+    its name in prose; ``about``: its ``units``, ``display_units``, ``symbol`` and so on.
+    """
+
+    held: Any
+    names: Mapping[str, str]
+    label: str = ""
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+
+ONCE = Item(None, {})
+Scopes = Mapping[str, Callable[[Any], Iterable[Item]]]
+"""For each placeholder that can begin a name, the items that a subject has of it."""
+
+
+@dataclass(frozen=True)
+class UnitRule:
+    """A rule for the unit of a variable, and for how it is shown.
+
+    ``words`` tell it in the reference page; ``attributes`` are those of a subject and an item; ``keys`` of them are in
+    every file.
+    """
+
+    words: str
+    attributes: Callable[[Any, Item], Mapping[str, Any]]
+    keys: tuple[str, ...] = ("units",)
+
+
+@dataclass(frozen=True)
+class When:
+    """The condition under which a variable is written, in words and as a test of a subject and an item."""
+
+    words: str
+    holds: Callable[[Any, Item], bool]
+
+
+OWN = UnitRule("its own", lambda _, item: item.about, ("units", "display_units", "symbol"))
+NUMBER = UnitRule("1", lambda _, item: {"units": "1"})
+TEXT = UnitRule("", lambda _, item: {"units": ""})
+ALWAYS = When("", lambda _, item: True)
+
+
+@dataclass(frozen=True)
+class Declared:
+    """A variable. ``meaning``: its ``long_name``, with ``{label}`` for that of the item.
+
+    ``values``: of the subject, and of the item where the name has a placeholder. ``needed``: a file without it is no
+    result. ``fill`` and ``single`` as of :class:`~en4dvar.results.netcdf.Variable`.
+    """
+
+    name: str
+    dims: str
+    meaning: str
+    values: Callable[..., Any]
+    unit: UnitRule = NUMBER
+    when: When = ALWAYS
+    needed: bool = False
+    fill: bool = True
+    single: bool = False
+
+    @cached_property
+    def scope(self) -> str:
+        """The placeholder that begins the name, or "" of a variable that exists once."""
+        first = _PLACEHOLDER.search(self.name)
+        return first.group(1) if first else ""
+
+    def of(self, subject: Any, item: Item) -> Variable:
+        """The variable of an item."""
+        values = self.values(subject) if item is ONCE else self.values(subject, item)
+        about = {**self.unit.attributes(subject, item), "long_name": self.meaning.format(label=item.label)}
+        dims = tuple(self.dims.format(**item.names).split())
+        return Variable(dims, np.asarray(values), netcdf_attributes(about), self.fill, self.single)
+
+    def expanded(self, names: Mapping[str, Sequence[Mapping[str, str]]]) -> Iterator[str]:
+        """The names of the variables, from the names of the items of each scope."""
+        if not self.scope:
+            yield self.name
+        for of_item in names.get(self.scope, ()):
+            yield self.name.format(**of_item)
+
+
+@dataclass(frozen=True)
+class Attribute:
+    """An attribute of a group; where ``value`` gives None there is none, and of a mapping each item is one."""
+
+    name: str
+    meaning: str
+    value: Callable[[Any], Any]
+    needed: bool = False
+
+
+Table = Sequence[Declared]
+
+
+def lay_out(table: Table, subject: Any, scopes: Scopes) -> dict[str, Variable]:
+    """The variables that a subject has, by name."""
+    variables = {}
+    for declared in table:
+        for item in scopes[declared.scope](subject) if declared.scope else (ONCE,):
+            if declared.when.holds(subject, item):
+                variables[declared.name.format(**item.names)] = declared.of(subject, item)
+    return variables
+
+
+def group_of(
+    variables: Mapping[str, Variable], coordinates: Mapping[str, Variable], attributes: Mapping[str, Any] | None = None
+) -> Group:
+    """A group of variables with those of the coordinates that belong to their dimensions."""
+    dims = dict.fromkeys(dim for variable in variables.values() for dim in variable.dims)
+    own = {dim: coordinates[dim] for dim in dims if dim in coordinates}
+    return Group(variables, own, netcdf_attributes(attributes or {}))
+
+
+def attributes_of(table: Iterable[Attribute], subject: Any) -> dict[str, Any]:
+    """The attributes that a subject has."""
+    values: dict[str, Any] = {}
+    for declared in table:
+        value = declared.value(subject)
+        if isinstance(value, Mapping):
+            values |= value
+        elif value is not None:
+            values[declared.name] = value
+    return values
+
+
+def text(words: Iterable[str]) -> npt.NDArray[np.object_]:
+    """Words as an array, also where there are none."""
+    return np.array(list(words), dtype=object)
+
+
+def shown_as(p: Parameter) -> dict[str, Any]:
+    """UnitRule and appearance of a parameter."""
+    return {"units": p.unit, "display_units": p.display_unit, "symbol": p.symbol}

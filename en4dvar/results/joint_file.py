@@ -1,0 +1,206 @@
+"""A joint estimate ⇄ ``joint.nc``: members of what is shared and of each data set's own, the fits, and what each data
+set said alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from en4dvar.estimation.joint.estimate import JointEstimate
+from en4dvar.model.state import Array, Parameter
+from en4dvar.plumbing.caution import Caution, worst_first
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.units import convert
+from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, to_bytes, understood, variable
+from en4dvar.results.xarrays import tree_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+FILE = "joint.nc"
+QUANTILES = (0.05, 0.5, 0.95)
+_DRAWS = ("chain", "draw")
+
+
+@dataclass(frozen=True)
+class Alone:
+    """What one data set said by itself: physical members (N, n) of its parameters ``names``."""
+
+    names: tuple[str, ...]
+    members: Array
+
+
+def save_joint(path: Path, estimate: JointEstimate, alone: Sequence[Alone], attributes: Mapping[str, Any]) -> Path:
+    """Write the file; it appears complete or not at all. Raises :class:`OutputError`."""
+    return to_bytes(joint_groups(estimate, alone, attributes)).write(path)
+
+
+def joint_groups(estimate: JointEstimate, alone: Sequence[Alone], attributes: Mapping[str, Any]) -> Groups:
+    """All of the file."""
+    names = [experiment.observations.name for experiment in estimate.joint.experiments]
+    datasets = {"dataset": variable("dataset", np.array(names, dtype=object), "", "data set")}
+    root = {
+        **attributes,
+        "converged": int(estimate.converged),
+        "stop_reason": estimate.stop_reason,
+        "log_evidence": estimate.log_evidence,
+        "forward_runs": estimate.forward_runs,
+        "effective_draws": estimate.members.effective,
+        "warnings": "\n".join(c.line for c in worst_first(estimate.cautions)),
+    }
+    return {
+        "/": Group(attrs=root),
+        "/posterior": Group(_shared(estimate) | _own(estimate, names), datasets),
+        "/prior": Group(_prior(estimate)),
+        "/alone": Group(_alone(estimate, alone), datasets),
+        "/fit": Group(_fit(estimate), datasets),
+    }
+
+
+def shared_name(key: tuple[str, str]) -> str:
+    """Variable of a shared quantity: its name, and its group where that is not everyone."""
+    name, group = key
+    plain = "".join(c if c.isalnum() else "_" for c in group)
+    return f"{name}_{plain}" if plain else name
+
+
+def _about(p: Parameter) -> dict[str, Any]:
+    return {"symbol": p.symbol, "display_units": p.display_unit}
+
+
+def _shared(estimate: JointEstimate) -> dict[str, Variable]:
+    variables = {}
+    for j, ((_, group), term) in enumerate(zip(estimate.joint.shared, estimate.joint.terms, strict=True)):
+        p = term.parameter
+        label = f"{p.label}, {group}" if group else p.label
+        mode = float(estimate.shared_mode[j])
+        name = shared_name(estimate.joint.shared[j])
+        variables[name] = variable(_DRAWS, estimate.shared[None, :, j], p.unit, label, mode=mode, **_about(p))
+    return variables
+
+
+def _own(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
+    """(chain, draw, dataset) of the parameters that data sets have of their own, NaN where one has it not."""
+    count = len(estimate.members.border)
+    values: dict[str, Array] = {}
+    parameters: dict[str, Parameter] = {}
+    for e, experiment in enumerate(estimate.joint.experiments):
+        members = estimate.control(e)[:-1]
+        for j in estimate.joint.columns(e)[1]:
+            p = experiment.prior.parameters[j]
+            values.setdefault(p.name, np.full((1, count, len(names)), np.nan))[0, :, e] = members[:, j]
+            parameters[p.name] = p
+    taken = {shared_name(key) for key in estimate.joint.shared}
+    return {
+        f"{name}_own" if name in taken else name: variable(
+            (*_DRAWS, "dataset"), array, parameters[name].unit, parameters[name].label, **_about(parameters[name])
+        )
+        for name, array in values.items()
+    }
+
+
+def _prior(estimate: JointEstimate) -> dict[str, Variable]:
+    """Quantiles (quantile,) of the priors of what is shared."""
+    z = np.array([-1.6448536, 0.0, 1.6448536])
+    return {
+        shared_name(key): variable("quantile", term.to_physical(term.mean + term.std * z), term.parameter.unit, "prior")
+        for key, term in zip(estimate.joint.shared, estimate.joint.terms, strict=True)
+    }
+
+
+def _alone(estimate: JointEstimate, alone: Sequence[Alone]) -> dict[str, Variable]:
+    """Quantiles (dataset, quantile) of each shared parameter as each data set has it by itself."""
+    result = {}
+    for j, key in enumerate(estimate.joint.shared):
+        rows = np.full((len(alone), len(QUANTILES)), np.nan)
+        for e, single in enumerate(alone):
+            if estimate.joint.groups[e].get(key[0]) == key[1]:
+                values = single.members[:, single.names.index(key[0])]
+                rows[e] = np.quantile(values[np.isfinite(values)], QUANTILES)
+        unit = estimate.joint.terms[j].parameter.unit
+        result[shared_name(key)] = variable(("dataset", "quantile"), rows, unit, "5, 50 and 95 % of a data set alone")
+    return result
+
+
+def _fit(estimate: JointEstimate) -> dict[str, Variable]:
+    """Observations and predictive bands of each data set, padded with NaN, in display units."""
+    experiments = estimate.joint.experiments
+    most = max(len(experiment.observations) for experiment in experiments)
+    times, values = np.full((2, len(experiments), most), np.nan)
+    bands = np.full((len(experiments), max(map(len, estimate.grids)), 4), np.nan)
+    for e, (experiment, run, grid) in enumerate(zip(experiments, estimate.forecasts, estimate.grids, strict=True)):
+        to_time = (experiment.model.time_unit, experiment.model.time_display_unit)
+        to_value = (experiment.observable.unit, experiment.observable.display_unit)
+        k = len(experiment.observations)
+        times[e, :k] = convert(experiment.observations.times, *to_time)
+        values[e, :k] = convert(experiment.observations.values, *to_value)
+        bands[e, : len(grid), 0] = convert(grid, *to_time)
+        alive = run.path[:-1][run.active[:-1]]
+        bands[e, : len(grid), 1:] = convert(np.quantile(alive, QUANTILES, axis=0).T, *to_value)
+    labels = np.array([experiment.observable.label for experiment in experiments], dtype=object)
+    units = np.array([experiment.observable.display_unit for experiment in experiments], dtype=object)
+    time_units = np.array([experiment.model.time_display_unit for experiment in experiments], dtype=object)
+    alive_counts = np.array([int(run.active[:-1].sum()) for run in estimate.forecasts])
+    return {
+        "chi2_per_observation": variable("dataset", estimate.chi2, "1", "misfit per observation at the mode"),
+        "alive": variable("dataset", alive_counts, "1", "members alive"),
+        "observable": variable("dataset", labels, "", "what was observed"),
+        "unit": variable("dataset", units, "", "unit of values and bands"),
+        "time_unit": variable("dataset", time_units, "", "unit of times"),
+        "time": variable(("dataset", "observation"), times, "1", "times of the observations"),
+        "value": variable(("dataset", "observation"), values, "1", "observations"),
+        "band": variable(("dataset", "point", "what"), bands, "1", "time; 5, 50 and 95 % of the members there"),
+    }
+
+
+@dataclass(frozen=True)
+class StoredGroups:
+    """A file about several data sets together: a thin view of ``tree``."""
+
+    tree: xr.DataTree
+
+    @property
+    def cautions(self) -> tuple[Caution, ...]:
+        """Warnings of the estimate, the worst first."""
+        return worst_first(map(Caution.parse, str(self.tree.attrs["warnings"]).splitlines()))
+
+    def group(self, name: str) -> xr.Dataset:
+        """The variables of a group."""
+        return self.tree.children[name].to_dataset()
+
+
+@dataclass(frozen=True)
+class StoredJoint(StoredGroups):
+    """A file of :func:`save_joint`, with the groups ``posterior``, ``prior``, ``alone`` and ``fit``."""
+
+    @property
+    def datasets(self) -> tuple[str, ...]:
+        """Names of the data sets."""
+        return tuple(map(str, self.group("fit")["dataset"].values))
+
+    @property
+    def shared(self) -> tuple[str, ...]:
+        """Names of the variables of what is shared."""
+        return tuple(str(name) for name in self.group("prior").data_vars)
+
+
+def load_joint(path: Path) -> StoredJoint:
+    """Read the file into memory. Raises :class:`OutputError`: it is none, cut short or altered."""
+    joint = StoredJoint(load_groups(path, ("posterior", "prior", "alone", "fit"), "a joint estimate"))
+    with understood(path):
+        _ = joint.datasets, joint.cautions
+    return joint
+
+
+def load_groups(path: Path, groups: Sequence[str], what: str) -> xr.DataTree:
+    """A file with ``groups`` in memory. Raises :class:`OutputError`: it is not ``what``, cut short or altered."""
+    held = read_groups(path)
+    if {f"/{group}" for group in groups} - set(held):
+        raise OutputError(f"{path}: not {what}")
+    with understood(path):
+        return tree_of(held)

@@ -1,0 +1,274 @@
+"""Groups of variables ⇄ NETCDF4 files, several times faster than through xarray's file backend.
+
+All definitions come before all data: HDF5 then lays out its metadata once. The encoding is xarray's own (NaN as fill
+value of floats, truth values as bytes with ``dtype: bool``, text as variable-length strings), so that every reader
+sees the same. A file is made in memory: a worker far away can do it, and a file system is touched once.
+
+:class:`Group` and :class:`Variable` are what the program works with: the import of xarray takes as long as an estimate.
+:mod:`~en4dvar.results.xarrays` shows them through it.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.plumbing.files import atomic_path
+from en4dvar.results.seal import SealedBytes, check_seal, seal_file
+
+_LOCK = threading.Lock()  # the netCDF library is not safe to use from several threads
+_MORE = 1 << 18  # bytes; more than the library had left to write
+_INITIAL_SIZE = 1 << 19  # bytes beside those of large variables; grows as needed
+_LARGE = 1 << 24  # bytes of a variable
+
+
+class MissingError(OutputError, KeyError):
+    """A file with a good seal, which anybody can make, lacks what a result has."""
+
+    __str__ = Exception.__str__
+
+
+class Said(dict[str, Any]):
+    """Attributes of a file that is read. Raises :class:`MissingError` for one that is not there."""
+
+    def __missing__(self, key: str) -> Any:
+        raise MissingError(f"not a result of en4dvar: no attribute {key!r}")
+
+
+@contextmanager
+def understood(path: Path) -> Iterator[None]:
+    """Within, what a file with a good seal holds is read; whatever is wrong with it is an :class:`OutputError`."""
+    try:
+        yield
+    except OutputError:
+        raise
+    except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, MemoryError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise OutputError(f"{path}: not a result of en4dvar: {reason[:300]}") from error
+
+
+@dataclass(frozen=True)
+class Variable:
+    """Values along named dimensions: floats, integers, truth values or text. ``fill``: NaN means a missing value.
+
+    ``single``: floats are stored in single precision; fields are large, so they are converted as they are written.
+    """
+
+    dims: tuple[str, ...]
+    values: np.ndarray[Any, Any]
+    attrs: Mapping[str, Any]
+    fill: bool = True
+    single: bool = False
+
+    @property
+    def stored(self) -> np.ndarray[Any, Any]:
+        """The values as a file holds them."""
+        return self.values.astype(np.float32) if self.single else self.values
+
+
+@dataclass(frozen=True)
+class Group:
+    """Variables, and coordinates of its dimensions, by name."""
+
+    variables: Mapping[str, Variable] = field(default_factory=dict)
+    coords: Mapping[str, Variable] = field(default_factory=dict)
+    attrs: Mapping[str, Any] = field(default_factory=dict)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.variables or name in self.coords
+
+    def __getitem__(self, name: str) -> Variable:
+        """A variable or a coordinate. Raises :class:`MissingError`."""
+        if name not in self:
+            raise MissingError(f"not a result of en4dvar: no variable {name!r}")
+        return self.variables[name] if name in self.variables else self.coords[name]
+
+    @property
+    def every(self) -> dict[str, Variable]:
+        """Variables and coordinates."""
+        return {**self.variables, **self.coords}
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Length of every dimension."""
+        return {dim: size for v in self.every.values() for dim, size in zip(v.dims, v.values.shape, strict=True)}
+
+    def check(self) -> None:
+        """Raise :class:`ValueError`, as xarray does, where variables do not agree on the length of a dimension, or
+        where a name is that of a variable and of a coordinate.
+        """
+        if both := self.variables.keys() & self.coords.keys():
+            raise ValueError(f"{', '.join(sorted(both))}: both a variable and a coordinate")
+        sizes = self.sizes
+        for name, v in self.every.items():
+            if v.values.shape != tuple(sizes[dim] for dim in v.dims):
+                raise ValueError(f"{name} has the shape {v.values.shape}, its dimensions have other sizes")
+
+
+def netcdf_attributes(attributes: Mapping[Any, Any]) -> dict[str, Any]:
+    """Attributes as netCDF can hold them: truth values become 0/1, absent ones "", other objects their text."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, bool | np.bool_):
+            return int(value)
+        if value is None:
+            return ""
+        return value if isinstance(value, str | int | float | np.number | np.ndarray) else str(value)
+
+    return {str(key): plain(value) for key, value in attributes.items()}
+
+
+def variable(
+    dims: str | tuple[str, ...],
+    values: Any,
+    units: str,
+    long_name: str,
+    *,
+    fill: bool = True,
+    single: bool = False,
+    **attrs: Any,
+) -> Variable:
+    """A variable with what CF asks of it."""
+    dims = (dims,) if isinstance(dims, str) else dims
+    attributes = netcdf_attributes({"units": units, "long_name": long_name, **attrs})
+    return Variable(dims, np.asarray(values), attributes, fill, single)
+
+
+Groups = Mapping[str, Group]
+"""By path, the root ``/`` first."""
+
+
+def to_bytes(groups: Groups) -> SealedBytes:
+    """The file of the groups; its last line seals it."""
+    sizes = [v.values.nbytes // (1 + v.single) for group in groups.values() for v in group.variables.values()]
+    memory = _INITIAL_SIZE + sum(size for size in sizes if size > _LARGE)  # growing takes it twice
+    with _LOCK:
+        file = netCDF4.Dataset("in-memory.nc", "w", format="NETCDF4", memory=memory)
+        try:
+            data = [item for path, group in groups.items() for item in _define(file, path, group)]
+            for variable, values in data:
+                _write(variable, values)
+        except BaseException:
+            file.close()
+            raise
+        content = file.close()
+    return SealedBytes.of(content)
+
+
+def _write(variable: Any, values: np.ndarray[Any, Any]) -> None:
+    """A block of rows at a time: what the library has to convert is never there twice."""
+    if values.nbytes <= _LARGE:
+        variable[...] = values if values.ndim else values[()]
+        return
+    rows = max(1, _LARGE * len(values) // values.nbytes)
+    for first in range(0, len(values), rows):
+        variable[first : first + rows] = values[first : first + rows]
+
+
+def read_groups(path: Path) -> dict[str, Group]:
+    """The groups of a sealed file by their paths, in memory; the file can be replaced while they are in use.
+
+    Raises
+    ------
+    OutputError: it is none of ours, cut short or altered (see :mod:`en4dvar.results.seal`), or its variables do not
+        agree with each other.
+    """
+    check_seal(path)
+    try:
+        with understood(path), _LOCK, netCDF4.Dataset(path) as file:
+            file.set_auto_maskandscale(False)
+            groups = dict(_read(file))
+            for group in groups.values():
+                group.check()
+            return groups
+    except (RuntimeError, OSError) as error:
+        raise OutputError(f"{path}: not a readable netCDF file: {getattr(error, 'strerror', '') or error}") from None
+
+
+def _read(group: Any) -> Iterator[tuple[str, Group]]:
+    """A group of a file and those in it, by path."""
+    attributes = _said(group)
+    listed = [str(attributes.pop("coordinates", ""))]  # xarray lists here those that are no dimension
+    held = {}
+    for name, variable in group.variables.items():
+        held[name], also = _read_variable(variable)
+        listed.append(also)
+    aside = {*group.dimensions, *" ".join(listed).split()}
+    variables, coords = ({name: v for name, v in held.items() if (name in aside) == part} for part in (False, True))
+    yield group.path, Group(variables, coords, attributes)
+    for child in group.groups.values():
+        yield from _read(child)
+
+
+def _read_variable(variable: Any) -> tuple[Variable, str]:
+    """With the names of coordinates that xarray lists beside it."""
+    about = _said(variable)
+    fill, listed = "_FillValue" in about, str(about.pop("coordinates", ""))
+    about.pop("_FillValue", None)
+    values = np.asarray(variable[...], dtype=object if variable.dtype is str else None)
+    if about.get("dtype") == "bool":
+        del about["dtype"]
+        values = values.astype(bool)
+    return Variable(variable.dimensions, values, about, fill), listed
+
+
+def _said(held: Any) -> dict[str, Any]:
+    """Attributes of a group or variable."""
+    return Said({key: held.getncattr(key) for key in held.ncattrs()})
+
+
+@contextmanager
+def netcdf_file(path: Path) -> Iterator[Path]:
+    """A partial file to be written through the netCDF library; on leaving it is sealed and takes its place.
+
+    Raises :class:`OutputError` as :func:`~en4dvar.plumbing.files.atomic_path`.
+    """
+    with atomic_path(path) as partial:
+        try:
+            yield partial
+        except (RuntimeError, OSError) as error:  # of the operating system's reason the library tells "HDF error"
+            _write_more(partial)
+            raise OutputError(f"{path}: cannot be written: {error}") from None
+        seal_file(partial)
+
+
+def _write_more(partial: Path) -> None:
+    """Fail as the library did, with the operating system's reason: disk or quota full, a device that is broken."""
+    with partial.open("ab") as file:
+        file.write(bytes(_MORE))
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def attributes_of(variable: Variable) -> dict[str, Any]:
+    """With what tells that a variable holds truth values, which netCDF knows as bytes."""
+    return {**variable.attrs, **({"dtype": "bool"} if variable.values.dtype == bool else {})}
+
+
+def _define(file: netCDF4.Dataset, path: str, content: Group) -> Iterator[tuple[Any, Any]]:
+    """Define a group; yields its variables with the values to be written."""
+    group = file if path == "/" else file.createGroup(path)
+    group.setncatts(dict(content.attrs))
+    if beside := [name for name, v in content.coords.items() if v.dims != (name,)]:  # xarray's list of coordinates
+        group.setncattr("coordinates", " ".join(beside))
+    for name, size in content.sizes.items():
+        group.createDimension(name, size)
+    for name, variable in (*content.variables.items(), *content.coords.items()):
+        values, attributes = variable.values, attributes_of(variable)
+        if values.dtype == bool:
+            values = values.astype(np.int8)
+        kind = str if values.dtype.kind in "OU" else np.dtype(np.float32) if variable.single else values.dtype
+        missing = values.dtype.kind == "f" and variable.fill and name in content.variables
+        target = group.createVariable(name, kind, variable.dims, fill_value=np.nan if missing else None)
+        target.set_auto_maskandscale(False)
+        target.setncatts(attributes)
+        yield target, values.astype(object) if kind is str else values

@@ -1,0 +1,177 @@
+"""A population ⇄ ``population.nc``: draws of mean, spread and the next data set, those of each data set given all, and
+what each said alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from en4dvar.estimation.population.campaign import CampaignPopulation, Combination, Draws
+from en4dvar.model.state import Array, Parameter
+from en4dvar.plumbing.caution import Caution, worst_first
+from en4dvar.priors.prior import PriorTerm
+from en4dvar.results.joint_file import QUANTILES, StoredGroups, load_groups
+from en4dvar.results.netcdf import Group, Groups, Variable, to_bytes, understood, variable
+
+FILE = "population.nc"
+WORDS = {"mean": "mean of the population", "between": "standard deviation between data sets", "next": "the next one"}
+_DRAWS = ("chain", "draw")
+
+
+def save_population(
+    path: Path, population: CampaignPopulation, alone: Sequence[Array], cautions: Sequence[Caution],
+    attributes: Mapping[str, Any],
+) -> Path:  # fmt: skip
+    """Write the file; it appears complete or not at all. ``alone``: physical members (N_i, n) of each data set.
+
+    Raises :class:`OutputError`.
+    """
+    return to_bytes(population_groups(population, alone, cautions, attributes)).write(path)
+
+
+def population_groups(
+    population: CampaignPopulation, alone: Sequence[Array], cautions: Sequence[Caution], attributes: Mapping[str, Any]
+) -> Groups:
+    """All of the file."""
+    names = np.array([problem.observations.name for problem in population.problems], dtype=object)
+    datasets = {"dataset": variable("dataset", names, "", "data set")}
+    free, effective = population.without_hyperprior(int(attributes["seed"]))
+    root = {
+        **attributes,
+        "parameters": " ".join(population.names),
+        "hyperprior_mean_std": population.hyper.mean_std,
+        "hyperprior_spread": population.hyper.spread,
+        "hyperprior_odd": population.hyper.odd,
+        "common": " ".join(population.common),
+        "effective_draws": population.estimate.size,
+        "effective_draws_without_hyperprior": effective,
+        "log_evidence": population.estimate.log_evidence
+        - sum(p.observations.log_normalisation() for p in population.problems),
+        "forward_runs": population.estimate.forward_runs,
+        "combinations": "\n".join(map(combination_line, population.combinations())),
+        "warnings": "\n".join(c.line for c in worst_first(cautions)),
+    }
+    return {
+        "/": Group(attrs=root),
+        "/posterior": Group(_draws(population, population.posterior) | _sets(population), datasets),
+        "/prior": Group(_draws(population, population.prior)),
+        "/without_hyperprior": Group(_draws(population, free)),
+        "/alone": Group(_alone(population, alone) | _belongs(population), datasets),
+        "/empirical": Group(_empirical(population)),
+    }
+
+
+def combination_line(combination: Combination) -> str:
+    """``0.05 G 1 alpha 0.98``: the standard deviation, then names and exponents."""
+    return " ".join([f"{combination.std:.17g}", *(f"{name} {exponent:.17g}" for name, exponent in combination.parts)])
+
+
+def _about(p: Parameter) -> dict[str, Any]:
+    return {"symbol": p.symbol, "display_units": p.display_unit, "label": p.label}
+
+
+def _draws(population: CampaignPopulation, draws: Draws) -> dict[str, Variable]:
+    learned = dict(zip(("mean", "between"), population.learned, strict=True))
+    result = {}
+    for j, term in enumerate(population.terms):
+        p = term.parameter
+        for what, words in WORDS.items():
+            values = getattr(draws, what)[None, :, j]
+            more: dict[str, Any] = {"transform": term.transform}
+            if what in learned:
+                more["learned"] = float(learned[what][j])
+            if what == "mean" and draws is population.posterior:
+                more["std_between"], more["std_common"] = (float(part[j]) for part in population.parts)
+            result[f"{p.name}_{what}"] = variable(_DRAWS, values, p.unit, f"{p.label}: {words}", **_about(p), **more)
+    return result
+
+
+def _belongs(population: CampaignPopulation) -> dict[str, Variable]:
+    """(dataset,) how probably each data set is of the population."""
+    words = "probability that the data set is of the population"
+    return {"belongs": variable("dataset", population.belongs, "1", words)} if len(population.belongs) else {}
+
+
+def _empirical(population: CampaignPopulation) -> dict[str, Variable]:
+    """(quantile,) of the median over the data sets one by one."""
+    result = {}
+    for term, median in zip(population.terms, population.empirical, strict=True):
+        p = term.parameter
+        parts: dict[str, Any] = {"std_between": median.between, "std_common": median.common}
+        words = f"{p.label}: 5, 50 and 95 % of the median of the data sets one by one"
+        result[p.name] = variable("quantile", median.quantiles, p.unit, words, **_about(p), **parts)
+    return result
+
+
+def _sets(population: CampaignPopulation) -> dict[str, Variable]:
+    """(chain, draw, dataset) of every parameter, given all data."""
+    terms: tuple[PriorTerm, ...] = population.problems[0].prior.terms
+    return {
+        p.name: variable((*_DRAWS, "dataset"), population.sets[None, :, :, j], p.unit, p.label, **_about(p))
+        for j, p in enumerate(term.parameter for term in terms)
+    }
+
+
+def _alone(population: CampaignPopulation, alone: Sequence[Array]) -> dict[str, Variable]:
+    """Quantiles (dataset, quantile) of the parameters of the population as each data set has them by itself."""
+    result = {}
+    for term in population.terms:
+        p = term.parameter
+        rows = [
+            np.quantile(members[:, problem.prior.names.index(p.name)], QUANTILES)
+            for problem, members in zip(population.problems, alone, strict=True)
+        ]
+        result[p.name] = variable(("dataset", "quantile"), np.array(rows), p.unit, "5, 50 and 95 % of a data set alone")
+    return result
+
+
+@dataclass(frozen=True)
+class StoredPopulation(StoredGroups):
+    """A file of :func:`save_population`: a thin view of ``tree``."""
+
+    @property
+    def datasets(self) -> tuple[str, ...]:
+        """Names of the data sets."""
+        return tuple(map(str, self.group("alone")["dataset"].values))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters of the population."""
+        return tuple(str(self.tree.attrs["parameters"]).split())
+
+    @property
+    def common(self) -> tuple[str, ...]:
+        """Quantities that have one value in all data sets."""
+        return tuple(str(self.tree.attrs.get("common", "")).split())
+
+    @property
+    def belongs(self) -> dict[str, float]:
+        """Data set → probability that it is of the population; empty in files of version 1.0."""
+        alone = self.group("alone")
+        if "belongs" not in alone:
+            return {}
+        return dict(zip(self.datasets, map(float, alone["belongs"].values), strict=True))
+
+    @property
+    def combinations(self) -> tuple[Combination, ...]:
+        """What the data determine together and not one by one."""
+        combinations = []
+        for line in str(self.tree.attrs["combinations"]).splitlines():
+            std, *rest = line.split()
+            parts = tuple((name, float(a)) for name, a in zip(rest[::2], rest[1::2], strict=True))
+            combinations.append(Combination(parts, float(std)))
+        return tuple(combinations)
+
+
+def load_population(path: Path) -> StoredPopulation:
+    """Read the file into memory. Raises :class:`OutputError`: it is none, cut short or altered."""
+    groups = ("posterior", "prior", "without_hyperprior", "alone")
+    population = StoredPopulation(load_groups(path, groups, "a population"))
+    with understood(path):
+        _ = population.datasets, population.names, population.combinations, population.cautions
+    return population

@@ -1,0 +1,210 @@
+"""Ensemble moments along a sequential run, taken of many cycles at once, and the outcome that holds them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from en4dvar.data.noise import Correlation
+from en4dvar.data.noise.discrepancy import whitened
+from en4dvar.model.state import Array
+from en4dvar.series.series import CycleSeries
+
+BLOCK = 64  # ensembles kept until their moments are taken, at most
+BLOCK_SIZE = 2_000_000  # numbers in them, at most
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Ensemble mean and standard deviation (K, n_state) at the observation times; NaN where there is none.
+
+    ``rank`` is that of the truth among the N members, counted from ½ to N + ½ and divided by N + 1; (K, 0) without one.
+    """
+
+    mean: Array
+    std: Array
+    rank: Array
+
+    @classmethod
+    def empty(cls, cycles: int, size: int, ranked: bool) -> Moments:
+        return cls(*(np.full((cycles, width), np.nan) for width in (size, size, size if ranked else 0)))
+
+    def until(self, cycle: int) -> Moments:
+        """Copy of the rows before ``cycle``."""
+        return Moments(self.mean[:cycle].copy(), self.std[:cycle].copy(), self.rank[:cycle].copy())
+
+
+class MomentsRecorder:
+    """Collects ensembles (N, n) and takes their moments in blocks: on small states the calls cost more than the sums.
+
+    The moments of a cycle do not depend on which cycles share its block.
+    """
+
+    def __init__(self, cycles: int, size: int, before: Moments | None = None, truth: Array | None = None):
+        self._truth = truth
+        self._moments = Moments.empty(cycles, size, truth is not None)
+        if before is not None:
+            self._moments.mean[: len(before.mean)] = before.mean
+            self._moments.std[: len(before.std)] = before.std
+            self._moments.rank[: len(before.rank)] = before.rank
+        self._cycles: list[int] = []
+        self._scales: list[float] = []
+        self._ensembles = np.empty((0, 0, size))
+
+    def put(self, cycle: int, ensemble: Array, scale: float = 1.0) -> None:
+        """Record an ensemble; its standard deviation is multiplied by ``scale``."""
+        if ensemble.shape != self._ensembles.shape[1:] or len(self._cycles) == len(self._ensembles):
+            self._flush()
+            block = max(1, min(BLOCK, BLOCK_SIZE // ensemble.size))
+            if (block, *ensemble.shape) != self._ensembles.shape:
+                self._ensembles = np.empty((block, *ensemble.shape))
+        self._ensembles[len(self._cycles)] = ensemble
+        self._cycles.append(cycle)
+        self._scales.append(scale)
+
+    def moments(self) -> Moments:
+        """The moments of everything recorded so far."""
+        self._flush()
+        return self._moments
+
+    def _flush(self) -> None:
+        if not self._cycles:
+            return
+        ensembles = self._ensembles[: len(self._cycles)]
+        n_members = ensembles.shape[1]
+        mean = np.add.reduce(ensembles, axis=1) / n_members
+        anomalies = ensembles - mean[:, None]
+        variance = np.einsum("kij,kij->kj", anomalies, anomalies) / (n_members - 1)
+        self._moments.mean[self._cycles] = mean
+        scales = np.array(self._scales)[:, None]
+        self._moments.std[self._cycles] = scales * np.sqrt(variance)
+        if self._truth is not None:
+            error = self._truth[self._cycles] - mean
+            below = np.count_nonzero(scales[:, None] * anomalies < error[:, None], axis=1)
+            self._moments.rank[self._cycles] = (below + 0.5) / (n_members + 1)
+        self._cycles.clear()
+        self._scales.clear()
+
+
+class InnovationRecorder(MomentsRecorder):
+    """Moments of predictions (N, p) of a series; and of its observations (K, p) ranks and, ``of_data``, evidence (K,).
+
+    A rank is the probability that the mixture of the members' Gaussians gives to what lies below the observation: the
+    share of members below it, errors of the observations added, without the chance of a draw. NaN where there is none.
+    """
+
+    def __init__(self, series: CycleSeries, of_data: bool, before: Moments | None = None):
+        cycles, size = series.values.shape
+        super().__init__(cycles, size, before)
+        self._series, self._of_data = series, of_data
+        self._std = np.broadcast_to(series.std, series.values.shape)
+        self._ranks, self._evidence = np.full(series.values.shape, np.nan), np.full(len(series.times), np.nan)
+
+    def resume(self, ranks: Array, evidence: Array) -> None:
+        """Take over what was recorded before."""
+        self._ranks[: len(ranks)], self._evidence[: len(evidence)] = ranks, evidence
+
+    @property
+    def ranks(self) -> Array:
+        """The ranks of everything recorded so far."""
+        self._flush()
+        return self._ranks
+
+    @property
+    def evidence(self) -> Array:
+        """The evidence of everything recorded so far."""
+        self._flush()
+        return self._evidence
+
+    def _flush(self) -> None:
+        if not self._cycles:
+            return
+        from scipy.special import ndtr
+
+        at = list(self._cycles)
+        super()._flush()
+        gaps = self._ensembles[: len(at)]  # the members are not needed any more: memory is not asked for again
+        np.subtract(self._series.values[at][:, None], gaps, out=gaps)
+        gaps /= self._std[at][:, None]
+        if self._of_data:
+            self._evidence[at] = log_evidence(gaps, self._std[at], self._series.correlation)
+        self._ranks[at] = ndtr(gaps, out=gaps).mean(axis=1)
+
+
+def log_evidence(gaps: Array, std: Array, correlation: Correlation | None) -> Array:
+    """ln N(y; ȳ, P + R) (B,) of observations before they are assimilated, ȳ and P of the members' predictions.
+
+    ``gaps`` (B, N, p): (y − predictions) / ``std`` (B, p), NaN where nothing was observed.
+    """
+    _, n_members, p = gaps.shape
+    there, d = np.isfinite(gaps[:, 0]), gaps.mean(axis=1)
+    s = gaps - d[:, None]
+    s /= np.sqrt(n_members - 1)
+    if not there.all():
+        d, s = np.where(there, d, 0.0), np.where(there[:, None], s, 0.0)
+    log_norm = np.sum(np.where(there, np.log(std) + 0.5 * np.log(2 * np.pi), 0.0), axis=1)
+    if correlation is not None:
+        for k, among in enumerate(there):
+            part = Correlation(correlation.matrix[np.ix_(among, among)])
+            d[k, among], s[k][:, among] = part.decorrelated(d[k, among]), part.decorrelated(s[k][:, among].T).T
+            log_norm[k] += np.sum(np.log(np.diag(part.root)))
+    if p <= n_members:
+        v, roots = whitened(d, np.eye(p) + np.swapaxes(s, 1, 2) @ s)
+        square = np.sum(v**2, axis=1)
+    else:  # (I + SᵀS)⁻¹ = I − Sᵀ (I + SSᵀ)⁻¹ S
+        v, roots = whitened(np.einsum("kij,kj->ki", s, d), np.eye(n_members) + s @ np.swapaxes(s, 1, 2))
+        square = np.sum(d**2, axis=1) - np.sum(v**2, axis=1)
+    return np.asarray(-0.5 * square - np.sum(np.log(roots), axis=1) - log_norm)
+
+
+@dataclass(frozen=True)
+class SequentialState:
+    """All that the rest of a run depends on, besides its arguments, and what it has found so far.
+
+    ``cycle`` observation times are done; ``ensemble`` (N', n_state + changes) stands at ``start`` (0: time zero, k:
+    observation time k). Random numbers are drawn by cycle, so that no generator has a state.
+    """
+
+    cycle: int
+    start: int
+    ensemble: Array
+    forecast: Moments
+    analysis: Moments
+    smoothed: Moments
+    predicted: Moments
+    ranks: Array
+    evidence: Array
+    iterations: Array
+    effective: Array
+    kept: tuple[tuple[int, Array], ...]
+    forward_runs: int
+    failures: tuple[str, ...] = ()
+    trail: tuple[Array, ...] = ()
+
+
+@dataclass(frozen=True)
+class SequentialResult:
+    """The result of a run: moments of forecast, analysis (by y_1…y_k) and smoothed ensemble (by y_1…y_{k+L}).
+
+    The last L smoothed rows of the IEnKS, unless ``to_end``, and all of a filter without a smoother are NaN.
+    ``predicted``: moments (K, p) of the forecast where it was observed. ``ranks`` (K, p): share of the members, with
+    the errors of the observations, that lie below the observation, NaN where there was none. ``evidence`` (K,): log
+    density of the observations of a time given those before, of the Gaussian of the forecast; NaN in a twin experiment.
+    ``iterations`` (K,) forecasts of the window. ``effective`` (K,): members that the weights of a particle filter
+    leave, NaN: all. ``members`` (N', n) the final ensemble at the start of the last window; ``kept``: index of a time →
+    analysis members (N', n), physical; ``failures`` the reasons of the members lost.
+    """
+
+    forecast: Moments
+    analysis: Moments
+    smoothed: Moments
+    predicted: Moments
+    ranks: Array
+    evidence: Array
+    iterations: Array
+    effective: Array
+    members: Array
+    kept: tuple[tuple[int, Array], ...] = ()
+    failures: tuple[str, ...] = ()
+    forward_runs: int = 0

@@ -1,0 +1,133 @@
+"""A series to assimilate: what is known at time zero, what was observed, and how it is assimilated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from en4dvar.data.observations import Observations
+from en4dvar.data.series import Part, Series
+from en4dvar.executor import Executor
+from en4dvar.model.forward import Observable
+from en4dvar.model.state import Array
+from en4dvar.series.aligned import aligned
+from en4dvar.series.moments import SequentialResult, SequentialState
+from en4dvar.series.sequential import run_sequential
+from en4dvar.series.series import CycleSeries
+from en4dvar.series.settings import SequentialSettings
+from en4dvar.series.start import InitialEnsemble
+
+UNEXPECTED = 1.5  # root mean square of normalised innovations that calls for a warning, or its inverse
+
+
+@dataclass(frozen=True)
+class SeriesProblem:
+    """``observables`` are the p outputs that ``series`` holds; ``members`` N."""
+
+    start: InitialEnsemble
+    observables: tuple[Observable, ...]
+    series: CycleSeries
+    settings: SequentialSettings
+    members: int
+    name: str = "series"
+
+    @classmethod
+    def of_series(
+        cls,
+        start: InitialEnsemble,
+        series: Sequence[Series],
+        settings: SequentialSettings,
+        members: int,
+        name: str = "series",
+    ) -> SeriesProblem:
+        """The problem of readings of one or several observables, each series with its own times. Raises
+        :class:`DataError`.
+        """
+        return cls.of(start, series[0].observable, Observations.of_series(series, name=name), settings, members)
+
+    @classmethod
+    def of(
+        cls,
+        start: InitialEnsemble,
+        observable: Observable,
+        data: Observations,
+        settings: SequentialSettings,
+        members: int,
+    ) -> SeriesProblem:
+        """The problem of a data set; ``observable`` is that of one without parts. Raises :class:`DataError`."""
+        whole = Part(observable.name, observable, 0, len(data))
+        observables, series = aligned(data, data.parts or (whole,))
+        settings = replace(settings, to_end=True, innovations=True, coordinates=start.coordinates)
+        return cls(start, observables, series, settings, members, data.name)
+
+    @property
+    def without_evidence(self) -> str:
+        """Why the densities of the observations do not multiply to an evidence; "" where they do."""
+        scheme = self.settings.scheme
+        if self.settings.localisation is not None:
+            return "its analyses are localised, the covariance of its forecasts is not"
+        if scheme.shift > 1:
+            return "it assimilates the observations of several times at once"
+        if not scheme.cycled or scheme.resamples:
+            return "its scheme knows no Gaussian forecast"
+        return ""
+
+
+@dataclass(frozen=True)
+class SeriesResult:
+    """The result of assimilating a series."""
+
+    problem: SeriesProblem
+    seed: int
+    run: SequentialResult
+
+    @property
+    def normalised(self) -> Array:
+        """(K, p) innovations over their expected standard deviations, √(forecast + observation variance)."""
+        return normalised_innovations(self.problem.series, self.run)
+
+    @property
+    def log_evidence(self) -> float:
+        """ln p(y) by the forecasts' Gaussians, of one observation time after the other; NaN where there is none."""
+        return float("nan") if self.problem.without_evidence else float(np.sum(self.run.evidence))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Reasons not to trust the spread."""
+        squares = self.normalised[np.isfinite(self.normalised)] ** 2
+        size = float(np.sqrt(squares.mean())) if len(squares) else 1.0
+        if size > UNEXPECTED:
+            return (
+                f"innovations are {size:.2g} times as large as forecast and errors say: the ensemble is too sure of "
+                "itself; give model_error, inflation or larger errors",
+            )
+        if size < 1 / UNEXPECTED:
+            return (f"innovations are only {size:.2g} times what forecast and errors say: these are too large",)
+        return ()
+
+
+def normalised_innovations(series: CycleSeries, run: SequentialResult) -> Array:
+    """(K, p) innovations over their expected standard deviations, NaN in gaps."""
+    return np.asarray((series.values - run.predicted.mean) / np.hypot(run.predicted.std, series.std))
+
+
+def assimilate_series(
+    problem: SeriesProblem,
+    seed: int = 0,
+    executor: Executor | None = None,
+    on_cycle: Callable[[int], None] | None = None,
+    resume: SequentialState | None = None,
+    keep: Callable[[Callable[[], SequentialState]], None] | None = None,
+) -> SeriesResult:
+    """Assimilate a series of observations. The same seed gives the same bits for any executor.
+
+    ``on_cycle``, ``resume`` and ``keep`` as for :func:`~en4dvar.series.sequential.run_sequential`, its errors too.
+    """
+    members = problem.start.members(problem.members, seed, exact=True)
+    run = run_sequential(
+        problem.start.model, problem.observables, members, problem.series, problem.settings, seed, executor, on_cycle,
+        resume, keep,
+    )  # fmt: skip
+    return SeriesResult(problem, seed, run)

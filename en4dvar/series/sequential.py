@@ -1,0 +1,348 @@
+"""Sequential assimilation of a long series, cycle by cycle: filters, and smoothers on a sliding window.
+
+The ensemble stands at the start of a window that reaches ``lag`` observation times ahead. A cycle runs it to the newest
+observations, iterates the scheme's weights at the start, inflates, and moves the window on by ``shift`` times; a filter
+is a window without length. The control vector is the whole state, parameters included, and with a model error what it
+changed in the window.
+
+With ``mda_weights`` an observation is assimilated in every window that holds it, by a share each time. What a cycle
+says of the states is then that of a second analysis beside it, with the shares that are still missing.
+
+A member that cannot be integrated is dropped and the window done again with the survivors, so that the statistics stay
+those of one ensemble; its reason is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+
+from en4dvar.descent.loop import minimise
+from en4dvar.ensemble.linalg import centre
+from en4dvar.ensemble.repeat import check_repeats
+from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
+from en4dvar.model.forward import ForwardModel, Observable
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import TooFewMembersError
+from en4dvar.priors.prior import member_stream
+from en4dvar.schemes.base import Weights
+from en4dvar.series.model_error import fresh_noise
+from en4dvar.series.moments import InnovationRecorder, Moments, MomentsRecorder, SequentialResult, SequentialState
+from en4dvar.series.moving import Flow, MembersLost
+from en4dvar.series.rotation import Rotations, rotate
+from en4dvar.series.series import CycleSeries as CycleSeries
+from en4dvar.series.settings import SequentialSettings as SequentialSettings
+from en4dvar.series.window import Ahead, Batch, CycleDescent, CycleWindow
+
+ALL = slice(None)
+Rows = npt.NDArray[np.intp] | slice  # of an ensemble: those that survive
+
+
+def run_sequential(
+    model: ForwardModel,
+    observables: Sequence[Observable],
+    members: Array,
+    series: CycleSeries,
+    settings: SequentialSettings,
+    seed: int = 0,
+    executor: Executor | None = None,
+    on_cycle: Callable[[int], None] | None = None,
+    resume: SequentialState | None = None,
+    keep: Callable[[Callable[[], SequentialState]], None] | None = None,
+    truth: Array | None = None,
+) -> SequentialResult:
+    """Assimilate ``series`` into ``members`` (N, n_state), the ensemble at time zero.
+
+    The operators of ``observables`` act at each instant by itself; their outputs side by side are the p predictions.
+
+    Parameters
+    ----------
+    members: in ``settings.coordinates``. seed: of the rotations and model errors.
+    on_cycle: called with the index of the last observation time of each cycle, from 0.
+    resume: where an earlier call with the same arguments was interrupted; the result has the same bits as without.
+    keep: called after each cycle with a function that gives the state to resume from.
+    truth: (K, n_state) in a twin experiment, for its rank among the members.
+
+    Raises
+    ------
+    TooFewMembersError: the ensemble is lost. ValueError: localisation with correlated errors, a square root of the
+        model error with a smoother. ConfigError: the model gives other numbers when a member is run again.
+    """
+    if settings.localisation is not None and series.correlation is not None:
+        raise ValueError("localisation needs observations with independent errors")
+    error = settings.model_error
+    if error is not None and error.form == "square-root" and settings.scheme.lag:
+        raise ValueError("the square root of a model error is that of a filter; a smoother estimates the error")
+    with one_blas_thread():
+        run = _Run(
+            model, tuple(observables), members, series, settings, seed, executor or SerialExecutor(), resume, truth
+        )
+        if not settings.stochastic_model:
+            run.check_repeats()
+        while run.done < len(series.times):
+            run.cycle()
+            if on_cycle is not None:
+                on_cycle(run.done - 1)
+            if keep is not None:
+                keep(run.state)
+        return run.result()
+
+
+class _Run:
+    """The ensemble at the start of the window and what has been recorded."""
+
+    def __init__(
+        self,
+        model: ForwardModel,
+        observables: tuple[Observable, ...],
+        members: Array,
+        series: CycleSeries,
+        settings: SequentialSettings,
+        seed: int,
+        executor: Executor,
+        resume: SequentialState | None,
+        truth: Array | None,
+    ):
+        self.series, self.settings, self.scheme, self.seed = series, settings, settings.scheme, seed
+        self.initial_members, size = members.shape
+        self.error = settings.model_error
+        times = [0.0, *series.times.tolist()]
+        self.flow = Flow(model, observables, times, executor, settings.coordinates, self.error)
+        self.rotations = Rotations(seed, self.initial_members) if settings.rotation else None
+        cycles = len(series.times)
+        self.iterations, self.effective = np.zeros(cycles), np.full(cycles, np.nan)
+        self.trail: list[Array] = []
+        self.ensemble, self.start = members, 0  # start: k is the k-th observation time
+        self.failures: list[str] = []
+        self.kept: list[tuple[int, Array]] = []
+        earlier: tuple[Moments | None, ...] = (None, None, None)
+        self.done = 0
+        if resume is not None:
+            self.ensemble, self.start, self.flow.runs = resume.ensemble, resume.start, resume.forward_runs
+            self.failures, self.kept, self.done = list(resume.failures), list(resume.kept), resume.cycle
+            self.iterations[: resume.cycle], self.effective[: resume.cycle] = resume.iterations, resume.effective
+            self.trail = list(resume.trail)
+            earlier = resume.forecast, resume.analysis, resume.smoothed
+        self.before, self.after, self.smooth = (MomentsRecorder(cycles, size, moments, truth) for moments in earlier)
+        self.predicted = InnovationRecorder(series, truth is None, resume.predicted if resume else None)
+        if resume is not None:
+            self.predicted.resume(resume.ranks, resume.evidence)
+
+    def state(self) -> SequentialState:
+        done = self.done  # the next forecast may be there already
+        before, predicted = (recorder.moments().until(done + 1) for recorder in (self.before, self.predicted))
+        after, smooth = (recorder.moments().until(done) for recorder in (self.after, self.smooth))
+        ranks, evidence = (numbers[: done + 1].copy() for numbers in (self.predicted.ranks, self.predicted.evidence))
+        return SequentialState(
+            done, self.start, self.ensemble, before, after, smooth, predicted, ranks, evidence,
+            self.iterations[:done].copy(), self.effective[:done].copy(), tuple(self.kept), self.flow.runs,
+            tuple(self.failures), tuple(self.trail),
+        )  # fmt: skip
+
+    def result(self) -> SequentialResult:
+        if self.settings.smoother is not None:
+            self.settings.smoother.ended(self.trail, len(self.iterations) - 1, self.put_smoothed)
+        before, after, smooth = (recorder.moments() for recorder in (self.before, self.after, self.smooth))
+        return SequentialResult(
+            before, after, smooth, self.predicted.moments(), self.predicted.ranks, self.predicted.evidence,
+            self.iterations, self.effective, self.ensemble, tuple(self.kept), tuple(self.failures), self.flow.runs,
+        )  # fmt: skip
+
+    def cycle(self) -> None:
+        """Assimilate the next observations and move the window to its next start."""
+        first, newest = self.done + 1, min(self.done + self.scheme.shift, len(self.series.times))
+        members = self.forecast(first, newest)
+        repeated = len(self.scheme.mda_weights) > 1
+        batch = self.shares(newest) if repeated else [(i, 1.0) for i in range(first, newest + 1)]
+        rows, window, descent = self.analyse(members, batch)
+        members = members[rows]
+        self.iterations[newest - 1] = descent.iteration
+        self.effective[newest - 1] = getattr(descent.step, "effective", np.nan)
+        mean, anomalies = window.posterior(descent)
+        posterior = mean + anomalies if repeated else self.ensemble
+        transform = descent.weights.T
+        if self.rotations is not None:
+            turned = self.rotations.of_cycle(newest - 1, len(anomalies))
+            anomalies = rotate(anomalies, turned)
+            if self.settings.smoother is not None:
+                transform = rotate(transform, turned)
+        if self.settings.smoother is not None:
+            weights, analysis = descent.weights.w + transform, mean + anomalies
+            self.settings.smoother.passed(self.trail, newest - 1, members, analysis, weights, self.put_smoothed)
+        self.ensemble = mean + self.settings.inflation.apply(members, anomalies)
+        if not repeated or first == 1:
+            self.record_ahead([at for at in window.ahead if at.index >= first])
+        complete = self.completed(posterior, newest) if repeated else self.ensemble
+        self.advance(complete, first, newest, repeated)
+        if not self.scheme.cycled:
+            self.ensemble = members
+        self.done = newest
+
+    def forecast(self, first: int, newest: int) -> Array:
+        """The members that are to be analysed: of a filter at the newest time, else with the changes up to there."""
+        members = self.ensemble
+        if self.scheme.lag == 0:
+            _, (members,) = self.run(members, [newest])
+            self.start = newest
+            if self.error is None:
+                return members
+            if self.error.form == "square-root":
+                return self.error.widened(members, self.flow.elapsed(newest))
+            return self.flow.changed(members, self.noise(members, newest), newest)
+        for index in range(first, newest + 1) if self.error else ():
+            members = np.hstack([members, self.noise(members, index)])
+        return members
+
+    def noise(self, members: Array, index: int) -> Array:
+        """Standard normal changes (N, q) of the state at the time of ``index``, independent of what members hold."""
+        assert self.error is not None
+        stream = member_stream(self.seed, "model error", index)
+        draws = stream.standard_normal((self.initial_members, len(self.error.where)))
+        return fresh_noise(centre(members)[1], draws[: len(members)])
+
+    def shares(self, newest: int, missing: bool = False) -> Batch:
+        """Which observations count in the window that ends at the ``newest``, and how much; or how much is missing."""
+        shares = np.array(self.scheme.mda_weights)
+        if missing:
+            shares = 1 - np.cumsum(shares)
+        oldest = max(self.start, newest - len(shares)) + 1
+        return [(i, float(shares[newest - i])) for i in range(oldest, newest + 1) if shares[newest - i] > 1e-12]
+
+    def completed(self, posterior: Array, newest: int) -> Array:
+        """The members after the shares of the observations that later windows will give."""
+        missing = self.shares(newest, missing=True)
+        if not missing:
+            return posterior
+        rows, window, descent = self.analyse(posterior, missing)
+        self.ensemble = self.ensemble[rows]
+        mean, anomalies = window.posterior(descent)
+        return np.asarray(mean + anomalies)
+
+    def advance(self, complete: Array, first: int, newest: int, repeated: bool) -> None:
+        """Record what the ``complete`` members at the start say of later times, and move the ensemble on."""
+        lag, last = self.scheme.lag, len(self.series.times)
+        next_start = min(newest, max(self.start, newest + self.scheme.shift - lag)) if lag else newest
+        smoothed = range(max(self.start, 1), next_start)
+        if lag and newest == last and self.settings.to_end:
+            smoothed = range(max(self.start, 1), last + 1)
+        if self.start in smoothed:
+            self.smooth.put(self.start - 1, self.physical(complete[:, : self.flow.size]))
+        beyond = repeated and newest < last
+        if beyond and self.error is not None:
+            complete = np.hstack([complete, self.noise(complete, newest + 1)])
+        wanted = {next_start, *smoothed, *range(first, newest + 1), *((newest + 1,) if beyond else ())}
+        indices = sorted(i for i in wanted if i >= self.start)
+        rows, states = self.run(complete, indices)
+        self.ensemble = self.ensemble[rows]
+        at = dict(zip(indices, states, strict=True))
+        for index in range(first, newest + 1):
+            self.after.put(index - 1, self.physical(at[index]))
+        for index in smoothed:
+            if index > self.start:
+                self.smooth.put(index - 1, self.physical(at[index]))
+        if beyond:
+            ahead = at[newest + 1]
+            self.record_ahead([Ahead(newest + 1, ahead, self.flow.predict(ahead, newest + 1), 1.0)])
+        self.keep_members(first, newest, at[newest])
+        if repeated:
+            rows, (moved,) = self.run(self.ensemble, [next_start])
+            self.ensemble = self.ensemble[rows]
+        else:
+            moved = at[next_start]
+        changes = (next_start - self.start) * len(self.error.where) if self.error and lag else 0
+        rest = self.ensemble[:, self.flow.size + changes :]
+        self.ensemble = np.hstack([moved, rest]) if rest.size else moved
+        self.start = next_start
+
+    def keep_members(self, first: int, newest: int, states: Array) -> None:
+        every, last = self.settings.members_every, len(self.series.times)
+        if newest == last or (every and any(i % every == 0 for i in range(first, newest + 1))):
+            self.kept.append((newest - 1, self.physical(states)))
+
+    def put_smoothed(self, cycle: int, states: Array) -> None:
+        self.smooth.put(cycle, self.physical(states))
+
+    def physical(self, states: Array) -> Array:
+        return self.settings.coordinates.to_physical(states)
+
+    def record_ahead(self, expected: Sequence[Ahead]) -> None:
+        """What was expected of observations before they were assimilated."""
+        for at in expected:
+            self.before.put(at.index - 1, self.physical(at.states), 1 / at.width)
+            if not self.settings.innovations:
+                continue
+            predicted = at.predicted
+            if at.width != 1:
+                mean, anomalies = centre(predicted)
+                predicted = mean + anomalies / at.width
+            self.predicted.put(at.index - 1, predicted)
+
+    def check_repeats(self) -> None:
+        """Two members, over the first interval, twice: in one order and in the other; no cycle uses these runs.
+
+        Raises :class:`ConfigError`: they differ.
+        """
+        flow, start = self.flow, self.start
+        end = next((i for i in range(start + 1, len(flow.times)) if flow.times[i] > flow.times[start]), None)
+        if end is None:
+            return
+
+        def run(members: list[int]) -> tuple[Array, list[str]]:
+            states, failures = np.full((len(members), flow.size), np.nan), [""] * len(members)
+            for row, i in enumerate(members):  # one by one: where one is lost, the other is not
+                try:
+                    states[row] = flow.move(self.ensemble[[i], : flow.size], start, [end])[0, 0]
+                except MembersLost as lost:
+                    (failures[row],) = lost.reasons
+            return states, failures
+
+        both = [0, len(self.ensemble) - 1]
+        states, failures = run(both)
+        check_repeats(flow.model, states, failures, lambda again: run([both[i] for i in again]))
+
+    def analyse(self, members: Array, batch: Batch) -> tuple[Rows, CycleWindow, CycleDescent]:
+        """Which rows of the members survive, their window, and its descent; members lost are dropped from the prior."""
+        rows: Rows = ALL
+        while True:
+            alive = members[rows]
+            window = CycleWindow(
+                self.flow, self.series, alive, self.start, batch, self.settings.localisation,
+                self.scheme, partial(self.stream, len(alive)),
+            )  # fmt: skip
+            descent = CycleDescent(Weights.prior(len(alive)))
+            try:
+                minimise(window, [descent])
+            except MembersLost as lost:
+                rows = self.survivors(rows, lost.reasons)
+                continue
+            return rows, window, descent
+
+    def stream(self, n_members: int, name: str, size: int) -> Array:
+        """Standard normal numbers (N, size), a stream a member."""
+        return np.stack([member_stream(self.seed, name, i).standard_normal(size) for i in range(n_members)])
+
+    def run(self, members: Array, indices: Sequence[int]) -> tuple[Rows, list[Array]]:
+        """Which rows survive, and the states (N', n) at the times of ``indices``."""
+        rows: Rows = ALL
+        while True:
+            try:
+                return rows, self.flow.forecast(members[rows], self.start, indices)
+            except MembersLost as lost:
+                rows = self.survivors(rows, lost.reasons)
+
+    def survivors(self, rows: Rows, failed: Sequence[str]) -> Rows:
+        """Those of ``rows`` that did not fail. Raises :class:`TooFewMembersError`."""
+        self.failures += [reason for reason in failed if reason]
+        left = self.initial_members - len(self.failures)
+        needed = max(2, int(np.ceil(self.settings.min_active_fraction * self.initial_members)))
+        if left < needed:
+            raise TooFewMembersError(
+                f"{len(self.failures)} of {self.initial_members} members failed, at least {needed} must survive; "
+                f"the last: {self.failures[-1]}"
+            )
+        alive = np.flatnonzero([not reason for reason in failed])
+        self.trail = [ensembles[..., alive, :] for ensembles in self.trail]
+        return alive if isinstance(rows, slice) else rows[alive]

@@ -1,0 +1,77 @@
+"""The ensemble of a series at time zero: parameters from their prior, the state around what the model says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from en4dvar.model.forward import ForwardModel
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import En4dvarError
+from en4dvar.plumbing.user_code import reason_of
+from en4dvar.priors.prior import Prior, member_stream, whiten_sample
+from en4dvar.series.coordinates import EnsembleCoordinates
+
+
+@dataclass(frozen=True)
+class InitialEnsemble:
+    """The prior at time zero: the model's initial state plus N(0, ``initial_std``²), by field, and the parameters.
+
+    ``prior`` draws parameters, ``fixed`` are the values of the others. In the ensemble's coordinates, where a positive
+    field is its logarithm, of which ``initial_std`` then is the standard deviation.
+    """
+
+    model: ForwardModel
+    initial_std: Mapping[str, float]
+    prior: Prior | None = None
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    coordinates: EnsembleCoordinates = field(default_factory=EnsembleCoordinates)
+
+    def members(self, n_members: int, seed: int, exact: bool = False) -> Array:
+        """(N, n_state) in the ensemble's coordinates, each from its own stream.
+
+        ``exact``: mean and covariance are those that are drawn from, where there are enough members for that.
+        """
+        return self.drawn([member_stream(seed, "initial state", i) for i in range(n_members)], exact)
+
+    def drawn(self, streams: Sequence[np.random.Generator], exact: bool = False) -> Array:
+        """(N, n_state), as :meth:`members`, from random numbers of ``streams`` (N). Raises :class:`En4dvarError`."""
+        model, prior, n = self.model, self.prior, len(streams)
+        std = np.concatenate([np.full(f.size, self.initial_std.get(f.name, 0.0)) for f in model.layout])
+        of_prior = np.array([stream.standard_normal(len(prior.terms)) for stream in streams]) if prior else None
+        of_state = np.array([stream.standard_normal(model.layout.size) for stream in streams])
+        free = std > 0
+        if exact and n > (of_prior.shape[1] if of_prior is not None else 0) + free.sum():
+            both = [] if of_prior is None else [of_prior]
+            whole = whiten_sample(np.hstack([*both, of_state[:, free]]))
+            of_prior = None if of_prior is None else whole[:, : of_prior.shape[1]]
+            of_state[:, free] = whole[:, len(whole[0]) - int(free.sum()) :]
+        x = None if prior is None or of_prior is None else prior.from_white(of_prior)
+        origin = np.zeros((n, model.layout.size))
+        for column, term in self.coordinates.terms:
+            assert prior is not None
+            assert x is not None
+            origin[:, column] = x[:, prior.names.index(term.parameter.name)]
+        states = self.coordinates.from_physical(self._initial(x, n)[:, None], origin)[:, 0]
+        disturbed: Array = states + std * of_state
+        return disturbed
+
+    def _initial(self, x: Array | None, n_members: int) -> Array:
+        """The model's states (N, n_state) for control vectors (N, n) of the prior."""
+        model = self.model
+        theta = {name: np.full(n_members, value) for name, value in self.fixed.items()}
+        if self.prior is not None and x is not None:
+            theta |= dict(zip(self.prior.names, self.prior.to_physical(x).T, strict=True))
+        try:
+            states = np.array(
+                model.initial_states(theta) if theta else [model.initial_state({})] * n_members, dtype=float
+            )
+        except BaseException as error:  # a model may fail in any way
+            raise En4dvarError(f"the initial state cannot be made: {reason_of(error)}") from error
+        if states.shape != (n_members, model.layout.size):
+            raise En4dvarError(
+                f"initial_state returned shape {states.shape[1:]}, but the layout has ({model.layout.size},)"
+            )
+        return states

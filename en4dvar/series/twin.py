@@ -1,0 +1,214 @@
+"""Twin experiments: a truth is drawn and observed, and the assimilation is judged against it.
+
+The truth and every member start from the model's initial state plus independent N(0, initial_std²) in the dynamic
+variables; a parameter with a prior is drawn from it, for the truth and for each member. The state that is estimated
+includes such parameters. RMSE and spread are over the dynamic variables, which share a unit:
+
+    RMSE_k = √ mean_j (x̄_j − x_j^true)²,   spread_k = √ mean_j σ_j².
+
+Random numbers: one stream for the truth, one for the errors of the observations, one a member.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from en4dvar.data.noise import Correlation
+from en4dvar.executor import Executor, SerialExecutor
+from en4dvar.model.forward import ForwardModel, Observable, Trajectory
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError, En4dvarError
+from en4dvar.priors.prior import Prior, member_stream
+from en4dvar.series.moments import Moments, SequentialResult, SequentialState
+from en4dvar.series.moving import Flow, MembersLost, predictions
+from en4dvar.series.sequential import run_sequential
+from en4dvar.series.series import CycleSeries
+from en4dvar.series.settings import SequentialSettings
+from en4dvar.series.start import InitialEnsemble
+
+OVERCONFIDENT = 0.5  # spread over RMSE of an ensemble that has lost the truth
+
+
+@dataclass(frozen=True)
+class TwinExperiment:
+    """The truth's model is the members' model. ``error_std`` and ``initial_std`` are one number an observable or field.
+    ``error_correlation`` (p, p) is that of the errors of one instant, None: independent.
+
+    Observations are taken every ``interval`` (the model's time unit); the first ``burn_in`` of ``cycles`` do not count
+    in averages. ``fixed`` are the values of the parameters that ``prior`` does not draw.
+    """
+
+    model: ForwardModel
+    sequential: SequentialSettings
+    members: int
+    cycles: int
+    interval: float
+    error_std: Mapping[str, float]
+    initial_std: Mapping[str, float]
+    burn_in: int = 0
+    error_correlation: Correlation | None = None
+    prior: Prior | None = None
+    fixed: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def start(self) -> InitialEnsemble:
+        """The prior at time zero, of the truth and of each member."""
+        return InitialEnsemble(self.model, self.initial_std, self.prior, self.fixed, self.sequential.coordinates)
+
+    @property
+    def observables(self) -> tuple[Observable, ...]:
+        """Those of the model that are observed."""
+        return tuple(o for o in self.model.observables if o.name in self.error_std)
+
+    @property
+    def dynamic(self) -> Array:
+        """(n_state,) bool: the variables that are not parameters."""
+        constant = {p.name for p in self.model.parameters}
+        return np.concatenate([np.full(f.size, f.name not in constant) for f in self.model.layout])
+
+    @property
+    def times(self) -> Array:
+        """(K,) observation times."""
+        return np.asarray(self.interval * np.arange(1, self.cycles + 1), dtype=float)
+
+
+@dataclass(frozen=True)
+class Score:
+    """RMSE and spread (K,) of one kind of estimate and their means after the burn-in; NaN where there is none."""
+
+    rmse: Array
+    spread: Array
+    mean_rmse: float
+    mean_spread: float
+
+
+@dataclass(frozen=True)
+class TwinResult:
+    """``truth`` (K, n_state) at ``series.times``, the observations and what the assimilation made of them."""
+
+    experiment: TwinExperiment
+    seed: int
+    truth: Array
+    series: CycleSeries
+    run: SequentialResult
+
+    @property
+    def scores(self) -> dict[str, Score]:
+        """Scores of the forecast, the analysis and (with a lag) the smoothed ensemble."""
+        kinds = {"forecast": self.run.forecast, "analysis": self.run.analysis}
+        if self.experiment.sequential.smooths:
+            kinds["smoothed"] = self.run.smoothed
+        return {name: self._score(moments) for name, moments in kinds.items()}
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Reasons why the scores mean less than they seem to."""
+        warnings = []
+        fields, prior = self.experiment.model.layout, self.experiment.prior
+        names = np.array([f.name for f in fields for _ in range(f.size)])
+        hidden = [value for name, value in self.experiment.fixed.items() if name not in fields.names]
+        still = self.experiment.dynamic & (np.ptp(self.truth, axis=0) == 0)
+        if prior is None or {*prior.names} <= {*fields.names}:
+            still &= np.isin(self.truth[0], hidden)
+        if still.any():
+            warnings.append(
+                f"{still.sum()} variables of {', '.join(dict.fromkeys(names[still]))} never change and have the values "
+                "of parameters, but count in RMSE and spread; give each parameter in the state a field with its name"
+            )
+        if alone := int(np.sum(self.run.effective < 2)):
+            warnings.append(
+                f"in {alone} of {len(self.run.effective)} cycles one member had nearly all of the weight; give more "
+                "members, more jitter or larger observation errors"
+            )
+        score = self.scores["analysis"]
+        if score.mean_spread < OVERCONFIDENT * score.mean_rmse:
+            ratio = score.mean_spread / score.mean_rmse
+            warnings.append(
+                f"the spread of the analysis is {ratio:.2g} of its RMSE: the ensemble is far too sure of itself; give "
+                "more members, inflation or localisation"
+            )
+        return tuple(warnings)
+
+    def _score(self, moments: Moments) -> Score:
+        where, counted = self.experiment.dynamic, slice(self.experiment.burn_in, None)
+        rmse = np.sqrt(np.mean((moments.mean - self.truth)[:, where] ** 2, axis=1))
+        spread = np.sqrt(np.mean(moments.std[:, where] ** 2, axis=1))
+        known = np.isfinite(rmse[counted])
+        means = [float(np.mean(values[counted][known])) if known.any() else float("nan") for values in (rmse, spread)]
+        return Score(rmse, spread, *means)
+
+
+def observe_truth(experiment: TwinExperiment, seed: int) -> tuple[Array, CycleSeries]:
+    """The truth (K, n_state) and its observations.
+
+    Raises
+    ------
+    En4dvarError: the truth cannot be integrated. ConfigError: the correlation of the errors does not fit.
+    """
+    model, times = experiment.model, experiment.times
+    states = _truth(experiment, seed)
+    outcome = Trajectory(times, states, model.layout)
+    exact = predictions(experiment.observables, outcome)
+    widths = [predictions([o], outcome).shape[1] for o in experiment.observables]
+    std = np.repeat([experiment.error_std[o.name] for o in experiment.observables], widths)
+    noise = member_stream(seed, "observation error").standard_normal(exact.shape)
+    if experiment.error_correlation is not None:
+        try:
+            experiment.error_correlation.check_size(len(std))
+        except ValueError as error:
+            raise ConfigError(f"twin.error_correlation: {error}") from None
+        noise = experiment.error_correlation.correlated(noise)
+    return states, CycleSeries(times, exact + std * noise, std, experiment.error_correlation)
+
+
+def _truth(experiment: TwinExperiment, seed: int) -> Array:
+    """(K, n_state), with a model error where the members have one. Raises :class:`En4dvarError`."""
+    model, error = experiment.model, experiment.sequential.model_error
+    start = experiment.start.drawn([member_stream(seed, "truth")])
+    coordinates = experiment.start.coordinates
+    times = [0.0, *experiment.times.tolist()]
+    flow = Flow(model, experiment.observables, times, SerialExecutor(), coordinates, error)
+    try:
+        if error is None:
+            (states,) = flow.move(start, 0, range(1, len(times)))
+            return coordinates.to_physical(states)
+        draws = member_stream(seed, "model error of the truth").standard_normal((experiment.cycles, len(error.where)))
+        path = [start]
+        for k, noise in enumerate(draws, 1):
+            path.append(flow.changed(flow.move(path[-1], k - 1, [k])[:, 0], noise[None], k))
+    except MembersLost as lost:
+        raise En4dvarError(f"the truth cannot be integrated: {lost.reasons[0]}") from None
+    return coordinates.to_physical(np.concatenate(path[1:]))
+
+
+def initial_ensemble(experiment: TwinExperiment, seed: int) -> Array:
+    """Members (N, n_state) at time zero, each from its own stream."""
+    return experiment.start.members(experiment.members, seed)
+
+
+def conduct(
+    experiment: TwinExperiment,
+    seed: int,
+    executor: Executor | None = None,
+    on_cycle: Callable[[int], None] | None = None,
+    resume: SequentialState | None = None,
+    keep: Callable[[Callable[[], SequentialState]], None] | None = None,
+) -> TwinResult:
+    """Draw a truth, observe it, assimilate the observations. The same seed gives the same bits for any executor.
+
+    ``resume`` and ``keep`` as for :func:`~en4dvar.series.sequential.run_sequential`.
+
+    Raises
+    ------
+    TooFewMembersError: the ensemble is lost. En4dvarError: the truth cannot be integrated.
+    """
+    truth, series = observe_truth(experiment, seed)
+    members = initial_ensemble(experiment, seed)
+    run = run_sequential(
+        experiment.model, experiment.observables, members, series, experiment.sequential, seed, executor, on_cycle,
+        resume, keep, truth,
+    )  # fmt: skip
+    return TwinResult(experiment, seed, truth, series, run)

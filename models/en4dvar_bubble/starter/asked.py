@@ -1,0 +1,172 @@
+"""What ``en4dvar init`` is told about the columns of a file, what their names tell, and which options are missing."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from en4dvar.inputs.asked import Layout
+from en4dvar.inputs.contents import Contents, read_contents
+from en4dvar.plumbing.errors import ConfigError, DataError
+from en4dvar.plumbing.units import as_unit, convert
+from en4dvar_bubble.starter.config import FRAMES, PIXELS
+from en4dvar_bubble.starter.page import TRACKED, TRACKED_COLUMNS
+from en4dvar_bubble.starter.summaries import summary_rows
+
+_TIME = re.compile(r"(?i)t|time|t[ _(\[].*|time[ _(\[].*")
+_STEP = re.compile(r"(?i)delta_?t|dt|t_?step|time_?step")
+_SIZE = re.compile(r"(?i)delta_?x|dx|pixel_?size|(um|m)_?per_?(px|pixel)|px_?2_?(um|m)")
+_AS_PIXELS, _AS_FRAMES = ("px", "pixel", "pixels"), ("frame", "frames")
+_RADIUS = re.compile(r"(?i)r|radius|radii|rnew|roft|r[ _(\[].*|radius[ _(\[].*")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """The ``contents`` of a file, and the options about its columns as they were given; None is one that was not."""
+
+    contents: Contents
+    time_unit: str | None = None
+    radius_unit: str | None = None
+    time_column: str | None = None
+    radius_column: str | None = None
+    time_step: str | None = None
+    frame_rate: str | None = None
+    pixel: str | None = None
+
+    @property
+    def tracked(self) -> bool:
+        """Whether the file is a table of 'en4dvar track', which says everything itself, and nobody says otherwise."""
+        options = (value for name, value in vars(self).items() if name != "contents")
+        return {*TRACKED_COLUMNS} <= self.contents.columns.keys() and not any(options)
+
+    @property
+    def step(self) -> str | None:
+        """The scalar of the file that is the time between two readings, where nothing else gives their times."""
+        return None if self.time_column or self.time_step else _only(_STEP, self.contents.scalars)
+
+    def shown(self, name: str) -> str:
+        """A column or scalar and what it holds, in words."""
+        if name not in self.contents.columns:
+            return f"{name} ({self.contents.scalars.get(name, np.nan):g})"
+        values = self.contents.columns[name]
+        finite = values[np.isfinite(values)]
+        span = f"{finite.min():g} to {finite.max():g}" if len(finite) else "none of them finite"
+        return f"{name} ({len(values)} values, {span})"
+
+    def by_names(self) -> Asked:
+        """With the columns whose names tell what they are; pixels and frames as units.
+
+        Raises :class:`UnitError`, and :class:`ConfigError` for options that contradict each other.
+        """
+        if self.tracked:
+            return self
+        names = self.contents.columns
+        time, radius = self.time_column, self.radius_column or _only(_RADIUS, names)
+        if self.time_step is None:
+            time = time or _only(_TIME, names)
+            if len(names) == 2:  # one tells what the other is
+                first, second = names
+                other = {first: second, second: first}
+                time, radius = time or other.get(radius or ""), radius or other.get(time or "")
+            if _only(_STEP, self.contents.scalars) is None:
+                time = time or _only(FRAMES, names)
+        return replace(self, time_column=time, radius_column=radius)._of_camera()
+
+    def _of_camera(self) -> Asked:
+        asked = self
+        if asked.pixel is not None:
+            if asked.radius_unit not in (None, *_AS_PIXELS):
+                raise ConfigError("--pixel makes pixels the unit of radii: give it, or --radius-unit, not both")
+            asked = replace(asked, radius_unit=as_unit(asked.pixel, "m"))
+        if asked.frame_rate is not None and asked._in_frames:
+            asked = replace(asked, time_unit=f"1/({as_unit(asked.frame_rate, 'Hz')})", frame_rate=None)
+        return asked
+
+    @property
+    def _in_frames(self) -> bool:
+        named = FRAMES.fullmatch(self.time_column or "")
+        return self.time_unit in _AS_FRAMES or bool(self.time_unit is None and named)
+
+    def needed(self) -> list[tuple[str, str, str]]:
+        """Options that are missing: each with what stands for its value, and a hint, "" where there is none."""
+        if self.tracked:
+            return []
+        missing = []
+        if self.time_step is None:
+            time = self.time_column or self.step
+            if time is None:
+                missing.append(("--time-column", "NAME", ""))
+            if self._in_frames:
+                missing.append(("--frame-rate", "RATE", f"e.g. '270 kHz', where {time} counts frames"))
+            elif self.time_unit is None:
+                missing.append(("--time-unit", "UNIT", "e.g. us"))
+        if self.radius_column is None:
+            others = [name for name in self.contents.columns if name != self.time_column]
+            alike = _numbered(others) if len(others) < len(self.contents.columns) else ""
+            missing.append(("--radius-column", alike or "NAME", "each of these columns is a bubble" if alike else ""))
+        size = _only(_SIZE, self.contents.scalars)
+        named = self.radius_unit is None and (size or PIXELS.search(self.radius_column or ""))
+        if named or self.radius_unit in _AS_PIXELS:
+            example = "'2.76 um'" if size is None else f"'{self.contents.scalars[size]:g} m' if {size} is in m"
+            missing.append(("--pixel", "LENGTH", f"the size of one, e.g. {example}; or --radius-unit UNIT"))
+        elif self.radius_unit is None:
+            missing.append(("--radius-unit", "UNIT", "e.g. um"))
+        return missing
+
+    def incomplete(self, file: Path, advice: str) -> ConfigError:
+        """The error that names what is :meth:`needed`."""
+        needed = self.needed()
+        columns_lack = any(option.endswith("column") for option, _, _ in needed)
+        if columns_lack and (rows := summary_rows(self.contents.columns)):
+            return ConfigError(f"{file}: {rows}")
+        options = ", ".join(f"{option} {value}{f' ({hint})' if hint else ''}" for option, value, hint in needed)
+        columns = ", ".join(self.contents.columns) or "none"
+        message = f"{file}: columns with numbers: {columns}; units are never guessed: add {options}"
+        return ConfigError("\n".join([*(self.contents.others.values() if columns_lack else ()), message, advice]))
+
+    def columns(self) -> dict[str, Any]:
+        """Columns and units as ``propose_config`` takes them. Raises :class:`UnitError`: one is not of its kind."""
+        if self.tracked:
+            return {"radius": TRACKED.radius, "time": TRACKED.time, "errors": TRACKED.errors}
+        radius = (self.radius_column, self.radius_unit)
+        convert(1.0, str(self.radius_unit), "m")
+        if self.time_step is not None:
+            return {"radius": radius, "time_step": self.time_step}
+        convert(1.0, str(self.time_unit), "s")
+        if self.step is not None:
+            return {"radius": radius, "time_step": self.step, "step_unit": self.time_unit}
+        return {"radius": radius, "time": (self.time_column, self.time_unit), "rate": self.frame_rate}
+
+
+def first_with_columns(files: Sequence[Path], layout: Layout) -> tuple[Path, Contents, Layout]:
+    """The first file that holds columns of numbers, and with its decimal sign. Raises :class:`DataError`: none does."""
+    points, commas = (replace(layout, decimal=sign) for sign in (".", ","))
+    faults: list[str] = []
+    for file in files:
+        try:
+            contents, with_commas = (read_contents(file, signs) for signs in (points, commas))
+        except DataError as error:
+            faults.append(str(error))
+            continue
+        if len(with_commas.columns) > len(contents.columns):
+            return file, with_commas, commas
+        if contents.columns:
+            return file, contents, points
+        faults.append(next(iter(contents.others.values()), f"{file}: no column holds numbers"))
+    raise DataError("\n".join(faults))
+
+
+def _only(pattern: re.Pattern[str], names: Iterable[str]) -> str | None:
+    fitting = [name for name in names if pattern.fullmatch(name.rpartition(".")[2])]
+    return fitting[0] if len(fitting) == 1 else None
+
+
+def _numbered(names: Sequence[str]) -> str:
+    """The pattern with ``*`` of names that differ by a number only, as ``R_1``, ``R_2``, …; "" where they do not."""
+    patterns = {re.sub(r"\d+", "*", name, count=1) for name in names}
+    return patterns.pop() if len(patterns) == 1 < len(names) else ""

@@ -1,0 +1,49 @@
+"""What an experiment knows from elsewhere than from its radii, and how well: density, speed of sound, pressure, scale.
+
+The collapse time fixes R_max √(ρ/(p_∞ + ~G)), so that an error of one per cent of scale or of density is one of G of a
+per cent or half a per cent of the ambient pressure: 1 or 0.5 kPa, for every bubble alike. What is not known exactly is
+estimated with a prior that says how well it is known; the data hardly change it, and its uncertainty is in every
+interval.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from en4dvar.model.state import READING_SCALE
+from en4dvar_bubble.media import MEDIA, known_medium
+
+ANY = "gel"
+CHOICES = (ANY, *MEDIA)
+"""Media that may be named; the first stands for any gel or solution that is mostly water."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """A quantity as it stands in a configuration: its key, median with unit, std of its logarithm, and the source."""
+
+    key: str
+    median: str
+    log_std: float
+    source: str
+
+
+SCALE = Known(READING_SCALE.name, "1", 0.005, "size of a pixel: a calibration target tells it to about 0.5 %")
+PRESSURE = Known("p_inf", "101.3 kPa", 0.01, "weather moves it by 1 %, 100 m of height take 1.2 %: give yours")
+_OF_ANY = (
+    Known("rho", "1030 kg/m^3", 0.017, "density: from water, 997, to what rheometry codes take for gels, 1060 to 1064"),
+    Known("c", "1510 m/s", 0.015, "speed of sound: from water, 1497 m/s, to gels of 15 % of polymer, 1540 m/s"),
+)
+
+
+def known(medium: str) -> Sequence[Known]:
+    """What is known of an experiment in one of the :data:`CHOICES`."""
+    of_medium = _OF_ANY
+    if medium != ANY:
+        it = known_medium(medium)
+        of_medium = (
+            Known("rho", f"{it.rho:.4g} kg/m^3", float(f"{it.rho_log_std:.2g}"), f"density of {medium}: {it.source}"),
+            Known("c", f"{it.c:.4g} m/s", float(f"{it.c_log_std:.2g}"), f"speed of sound in {medium}"),
+        )
+    return (*of_medium, PRESSURE, SCALE)

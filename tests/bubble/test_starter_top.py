@@ -1,0 +1,75 @@
+"""What ``init`` reads off a history, against histories whose top, errors and bad readings are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from en4dvar_bubble.starter.look import look
+from en4dvar_bubble.starter.scatter import bad, noise
+from en4dvar_bubble.starter.top import Top, top
+
+_PATH = solve_ivp(
+    lambda _, y: [y[1], (-1 - 1.5 * y[1] ** 2) / y[0]], (0, 0.9), [1.0, 0.0], dense_output=True, rtol=1e-10
+)
+
+
+def history(stream: np.random.Generator, per_collapse: float, noise_std: float, grown: float) -> tuple:
+    """Rayleigh's collapse, integrated, its top at 0 and 1, seen from ``grown`` before it; growth is 10 % slower."""
+    t = np.arange(-grown, 0.85, 0.9147 / per_collapse) + 0.9147 / per_collapse * stream.random()
+    at = np.where(t < 0, -t * (1 + 0.1 * t), t)
+    return t, _PATH.sol(np.clip(at, 0, 0.89))[0] + noise_std * stream.standard_normal(len(t))
+
+
+@pytest.mark.parametrize("grown", [0.0, 0.5, 0.8])
+@pytest.mark.parametrize(("per_collapse", "noise_std"), [(9, 0.005), (20, 0.02), (60, 0.01), (60, 0.03)])
+def test_the_top_lies_where_its_errors_say(per_collapse: float, noise_std: float, grown: float) -> None:
+    stream = np.random.default_rng(3)
+    tops: list[Top] = []
+    for _ in range(40):
+        t, r = history(stream, per_collapse, noise_std, grown)
+        tops.append(top(t, r, noise_std))
+    z = np.array([[one.time / one.time_std, (one.height - 1) / one.height_std] for one in tops])
+    assert np.all(np.abs(z).mean(axis=0) < 1.2)
+    assert np.mean(np.abs(z) > 3) < 0.04  # the prior takes three of them as its standard deviation
+    if grown and per_collapse > 10:  # and they are errors of a fit, not those of the largest reading
+        largest = np.sqrt(noise_std / 0.42) * 0.9147
+        assert np.median([one.time_std for one in tops]) < 0.5 * largest
+
+
+@pytest.mark.parametrize("per_collapse", [9, 20, 60])
+def test_scatter_is_told_whatever_the_bubble_does(per_collapse: float) -> None:
+    stream = np.random.default_rng(5)
+    found = []
+    for _ in range(40):
+        t, r = history(stream, per_collapse, 0.01, 0.8)
+        found.append(noise(t, r))
+    assert np.median(found) == pytest.approx(0.01, rel=0.15)
+
+
+def test_a_reading_that_is_none_is_told_and_not_taken_for_the_top() -> None:
+    stream = np.random.default_rng(7)
+    t, r = history(stream, 30, 0.01, 0.8)
+    assert not bad(t, r, noise(t, r)).any()
+    where = int(np.argmin(np.abs(t - 0.35)))
+    r[where] += 0.4
+    assert np.flatnonzero(bad(t, r, noise(t, r))).tolist() == [where]
+    seen = look(t, 1e-4 * r)
+    assert seen.bad == (where,)
+    assert seen.top.height == pytest.approx(1e-4, rel=0.02)
+
+
+def test_fragments_are_no_bubble_at_rest() -> None:
+    """After its oscillations the radius grows from 40 to 90 µm, as that of a cloud does."""
+    t = np.arange(250) * 1e-6
+    r = 240e-6 * np.clip(1 - (t / 25e-6 - 1) ** 2, 0, 1) ** 0.4
+    r = np.maximum(
+        r, np.where(t > 51e-6, 130e-6 * np.abs(np.sin((t - 51e-6) / 8e-6)) * np.exp(-(t - 50e-6) / 15e-6), 0)
+    )
+    rest = np.maximum(r, 30e-6 + 1e-7 * (t > 1))
+    assert look(t, rest).rest == pytest.approx(30e-6, rel=0.02)
+    grows = np.maximum(r, np.where(t > 80e-6, 40e-6 + 50e-6 * (t - 80e-6) / 170e-6, 30e-6))
+    seen = look(t, grows)
+    assert np.isnan(seen.rest)
+    assert "where it should rest" in seen.drift

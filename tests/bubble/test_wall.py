@@ -1,0 +1,100 @@
+"""A plane near the bubble: an independent integration, Rattray's collapse time, two equal bubbles by another code."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from en4dvar_bubble import WATER_25C, Accuracy, BubbleModel, get_law, simulate
+from en4dvar_bubble.collapse import RAYLEIGH
+from en4dvar_bubble.driving import tabulated
+from en4dvar_bubble.dynamics import Wall
+
+APECSS = Path(__file__).resolve().parents[3] / "shared" / "reference" / "apecss"
+TIGHT = Accuracy(nodes=12, rtol=1e-9)
+WATER = {"mu": 1e-3, "R_max": 200e-6, "R_eq": 40e-6}
+TIMES = np.linspace(0, 60e-6, 241)
+
+
+def path(wall, gas="polytropic", values=WATER, times=TIMES, **options):
+    data = simulate("newtonian", values, times, start="laser", gas=gas, wall=wall, accuracy=TIGHT, **options)
+    assert not data.status.any()
+    return data.R[0].values
+
+
+def scipy_path(sign, h):
+    """Keller–Miksis in SI with the image's pressure ±ρ/(2h) (R² R̈ + 2 R Ṙ²), polytropic gas."""
+    m, (mu, R_max, R_eq) = WATER_25C, WATER.values()
+    gas = (m.p_inf + 2 * m.S / R_eq) * (R_eq / R_max) ** 3
+
+    def rates(t, y):
+        R, V = y
+        p = gas * (R_max / R) ** (3 * m.kappa)
+        P = p - m.p_inf - 2 * m.S / R - 4 * mu * V / R
+        slope = -3 * m.kappa * p * V / R + 2 * m.S * V / R**2 + 4 * mu * V**2 / R**2  # of P, but for R̈
+        right = (1 + V / m.c) * P / m.rho + R / (m.rho * m.c) * slope - 1.5 * (1 - V / (3 * m.c)) * V**2
+        right -= sign * R * V**2 / h
+        return V, right / ((1 - V / m.c) * R + 4 * mu / (m.rho * m.c) + sign * R**2 / (2 * h))
+
+    return solve_ivp(rates, (0, TIMES[-1]), (R_max, 0.0), "Radau", TIMES, rtol=1e-11, atol=1e-14).y[0]
+
+
+@pytest.mark.parametrize(("kind", "sign"), [("rigid", 1), ("free", -1)])
+def test_against_scipy(kind, sign):
+    R, exact = path(Wall(500e-6, kind)), scipy_path(sign, 500e-6)
+    assert np.abs(R - exact).max() < 2e-6 * 200e-6
+    assert np.abs(path(None) - exact).max() > 1e-2 * 200e-6  # the wall is seen
+
+
+def collapse_time(wall):
+    """Of a bubble with hardly any gas in an ideal liquid, over R_max √(ρ/p_∞)."""
+    ideal = replace(WATER_25C, S=0.0)
+    values = {"mu": 0.0, "R_max": 1e-3, "R_eq": 5e-5}
+    times = np.linspace(0.88, 1.1, 16_001) * 1e-3 * np.sqrt(ideal.rho / ideal.p_inf)
+    R = path(wall, values=values, times=times, medium=ideal, radial="rayleigh-plesset")
+    return times[np.argmin(R)] / (1e-3 * np.sqrt(ideal.rho / ideal.p_inf))
+
+
+def test_rattray():
+    """To first order the collapse takes 1 + 0.205 R_max/h times as long (Rattray 1951)."""
+    alone, slopes = collapse_time(None), []
+    assert alone == pytest.approx(RAYLEIGH, rel=2e-3)
+    for h in (20e-3, 10e-3):
+        slopes.append((collapse_time(Wall(h)) / alone - 1) * h / 1e-3)
+    assert 2 * slopes[0] - slopes[1] == pytest.approx(0.205, abs=0.004)
+    assert collapse_time(Wall(20e-3, "free")) < alone
+
+
+@pytest.mark.parametrize("gas", ["polytropic", "heat"])
+def test_far_away_there_is_none(gas):
+    np.testing.assert_allclose(path(Wall(1e6), gas), path(None, gas), rtol=0, atol=1e-7 * 200e-6)
+
+
+def test_the_distance_may_be_a_parameter():
+    law = get_law("newtonian")
+    model = BubbleModel(law, "polytropic", "laser", wall=Wall(1e-3)).with_parameters(["wall_distance"])
+    values = {name: np.full(2, value) for name, value in WATER.items()} | {"wall_distance": np.array([400e-6, 1e-3])}
+    R = model.integrate(model.initial_states(values), np.tile(TIMES, (2, 1)))["R"]
+    for i, h in enumerate(values["wall_distance"]):
+        fixed = simulate("newtonian", WATER, TIMES, start="laser", gas="polytropic", wall=Wall(h))
+        assert np.array_equal(R[i], fixed.R[0])
+    assert "wall_distance" not in [p.name for p in replace(model, wall=None, named=()).optional_parameters]
+    with pytest.raises(ValueError, match="reaches the wall"):
+        model.initial_states(values | {"wall_distance": np.full(2, 150e-6)})
+
+
+@pytest.mark.skipif(not APECSS.exists(), reason="../shared/reference/apecss is not there")
+@pytest.mark.parametrize("apart", [200, 800])
+def test_two_equal_bubbles_are_one_at_a_wall(apart, tmp_path):
+    """Computed by the program APECSS 1.8, without the sound's delay between the two."""
+    t, R = np.loadtxt(APECSS / f"two_equal_bubbles_{apart}um.csv", delimiter=",", skiprows=1).T * 1e-6
+    medium = replace(WATER_25C, rho=1000.0, c=1500.0, p_inf=1e5, S=0.0728)
+    clock = np.linspace(0, t[-1], 3000)
+    wave = tabulated(clock, 60e3 * np.sin(2 * np.pi * 15.7e3 * clock))
+    options = {"driving": wave, "gas": "polytropic", "medium": medium, "accuracy": TIGHT}
+    pair = simulate("newtonian", {"mu": 1.002e-3, "R0": 10e-6}, t[1:], wall=Wall(apart * 0.5e-6), **options).R[0].values
+    assert np.abs(pair - R[1:]).max() < 1e-4 * 10e-6

@@ -1,0 +1,170 @@
+"""Problems built to end badly, one for each warning, and problems that end well."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from toys import Decay, Fragile, Toy, Vectorised, Wave, make_problem, with_discrepancy, with_noise
+
+from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.model.forward import ValidityLimit
+from en4dvar.model.state import Parameter
+from en4dvar.priors.prior import PriorTerm
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
+
+TWO = ("a", "b")
+
+
+class Violent(Vectorised):
+    """Says of itself that it does not hold where |y| exceeds 0.9 m."""
+
+    validity = (ValidityLimit("y", 0.9, "m", "largest excursion", "a test"),)
+
+
+class Doubtful(Vectorised):
+    """Does not believe a reading that no prior member comes near."""
+
+    def doubts(self, observable, times, values, predicted, members):
+        assert (len(times), len(times)) == (len(values), predicted.shape[1])
+        assert {name: len(value) for name, value in members.items()} == dict.fromkeys(TWO, len(predicted))
+        return [f"no {observable} is like this"] * bool(len(predicted))
+
+
+class Product(Toy):
+    """y = a b: the data know the product alone, so the posterior is a bent ridge."""
+
+    def curve(self, theta, t):
+        a, b = theta
+        return float(a * b)
+
+    def rate(self, theta, t):
+        return 0.0
+
+
+class Signless(Toy):
+    """y = a² t: the data do not know the sign of a."""
+
+    def curve(self, theta, t):
+        return float(theta[0] ** 2 * t)
+
+    def rate(self, theta, t):
+        return float(theta[0] ** 2)
+
+
+def signless() -> InverseProblem:
+    return make_problem(Signless(("a",)), (1.0,), prior=(PriorTerm.normal(Parameter("a", "m"), 0.0, 1.0),))
+
+
+def run(problem: InverseProblem, **settings: object) -> Analysis:
+    return assimilate(problem, AssimilationSettings(**settings), 1)  # type: ignore[arg-type]
+
+
+def linear(truth: tuple[float, ...] = (1.0, 0.5), **options: object) -> InverseProblem:
+    return make_problem(Vectorised(TWO), truth, **options)
+
+
+def bounded(truth: float, term: Callable[[Parameter], PriorTerm], bounds: tuple[float, float]) -> InverseProblem:
+    model = Vectorised(TWO)
+    a = Parameter("a", "m", bounds=bounds)
+    return make_problem(model, (truth, 0.5), prior=(term(a), PriorTerm.normal(model.parameters[1], 0.5, 1.0)))
+
+
+def many(n: int, **options: object) -> InverseProblem:
+    return make_problem(Vectorised(tuple(f"p{i}" for i in range(n))), (1.0,) * n, k=3 * n, std=0.01, **options)
+
+
+def outlier() -> InverseProblem:
+    problem = linear()
+    values = problem.observations.values.copy()
+    values[3] += 0.8
+    return replace(problem, observations=with_noise(replace(problem.observations, values=values), huber=1.5))
+
+
+def bent(std: float = 0.05) -> InverseProblem:
+    """Data with a slow wave that the model lacks, smaller than the error that is stated."""
+    problem = make_problem(Vectorised(TWO), (1.0, 0.5), k=40, std=std)
+    y = problem.observations
+    rough = np.random.default_rng(5).standard_normal(40)
+    exact = y.values - std * np.random.default_rng(1).standard_normal(40)
+    return replace(problem, observations=replace(y, values=exact + std * (0.9 * np.sin(5 * y.times) + 0.3 * rough)))
+
+
+def waved(height: float) -> InverseProblem:
+    """Data with a slow wave of so many errors that the model lacks, but a discrepancy allows for."""
+    problem = make_problem(Vectorised(TWO), (1.0, 0.5), k=40, std=0.05)
+    y = problem.observations
+    wave = 0.05 * height * np.sin(5 * y.times)
+    seen = replace(problem, observations=replace(y, values=y.values + wave))
+    return with_discrepancy(seen, amplitude=(0.025, 1.5), length=(0.2, 0.7))
+
+
+def spiked() -> InverseProblem:
+    problem = make_problem(Vectorised(TWO), (1.0, 0.5), k=40)
+    values = problem.observations.values.copy()
+    values[12] += 0.8
+    return replace(problem, observations=replace(problem.observations, values=values))
+
+
+def chain_not_converged() -> Analysis:
+    return run(linear(), refine="mcmc", members=12)
+
+
+PROVOKED: dict[str, Callable[[], Analysis]] = {
+    "not-converged": lambda: run(
+        make_problem(Wave(), [1.5, 1.2], scale=0.4), members=16, max_iterations=1, start="prior-mean"
+    ),
+    "ensemble-collapse": lambda: run(many(40), members=4, sampling="random", scheme="es-mda"),
+    "rank-deficient": lambda: run(many(8), members=6, sampling="random"),
+    "misfit": lambda: run(replace_std(linear(scale=100.0), 0.01)),
+    "overstated-error": lambda: run(replace_std(linear(scale=100.0), 10.0)),
+    "prior-conflict": lambda: run(linear(scale=0.02, std=0.001)),
+    "implausible-data": lambda: run(make_problem(Doubtful(TWO), (1.0, 0.5))),
+    "model-validity": lambda: run(make_problem(Violent(TWO), (1.0, 0.5))),
+    "members-lost": lambda: run(
+        make_problem(Fragile(0.2, names=TWO), (-1.0, 0.5)), members=40, min_active_fraction=0.2
+    ),
+    "at-bound": lambda: run(bounded(1.6, lambda a: PriorTerm.logit(a, (0.0, 1.0), 0.5, 1.5), (0.0, 1.0))),
+    "non-gaussian": lambda: run(make_problem(Product(TWO), (1.0, 1.0), std=0.1)),
+    "several-modes": lambda: run(signless(), members=16),
+    "starts-disagree": lambda: run(make_problem(Wave(), [1.5, 3.0], scale=2.5), members=4),
+    "residual-structure": lambda: run(bent()),
+    "odd-residuals": lambda: run(spiked()),
+    "discrepancy-found": lambda: run(waved(3.0)),
+    "one-descent": lambda: run(linear(), starts=1),
+    "start-moved": lambda: run(
+        make_problem(Fragile(-0.9, names=TWO), (-1.0, 0.5)), start="prior-mean", min_active_fraction=0.2
+    ),
+    "down-weighted": lambda: run(outlier()),
+    "not-bayesian": lambda: run(make_problem(Vectorised(TWO), (1.0, 0.5), weights=1 / 9)),
+    "not-informed": lambda: run(linear(scale=0.01, std=0.5)),
+}
+
+
+def replace_std(problem: InverseProblem, std: float) -> InverseProblem:
+    problem.observations.std[:] = std
+    return problem
+
+
+def well_specified(model: Toy, terms: tuple[PriorTerm, ...], std: float, count: int, seed: int) -> list[InverseProblem]:
+    """Experiments whose truth is drawn from the prior and whose noise is as stated."""
+    prior = make_problem(model, (1.0,) * len(terms), prior=terms).prior
+    truths = prior.to_physical(prior.sample(count, seed, "random"))
+    return [make_problem(model, truth, prior=terms, seed=seed + 1 + i, std=std, k=9) for i, truth in enumerate(truths)]
+
+
+def linear_experiments(count: int, seed: int) -> list[InverseProblem]:
+    model = Vectorised(("a", "b", "c"))
+    terms = tuple(PriorTerm.normal(p, 0.5, 1.0) for p in model.parameters)
+    return well_specified(model, terms, 0.3, count, seed)
+
+
+def decay_experiments(count: int, seed: int) -> list[InverseProblem]:
+    model = Decay()
+    a, b = model.parameters
+    return well_specified(
+        model, (PriorTerm.lognormal(a, 1.2, 0.3), PriorTerm.lognormal(b, 1.0, 0.3)), 0.05, count, seed
+    )

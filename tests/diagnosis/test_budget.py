@@ -1,0 +1,23 @@
+"""What an error bar is made of, against a linear problem whose parts are known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from en4dvar.diagnosis.response.budget import shares_of_priors
+from en4dvar.ensemble.linalg import with_moments
+
+
+def test_shares_are_those_of_a_linear_problem() -> None:
+    """y = a + 2 b + c + e: the variance of a is that of e, of b and of c, but for what its wide prior takes."""
+    before = np.array([1e4, 0.25, 1.0])
+    rows, noise = np.array([1.0, 2.0, 1.0]), 0.5
+    covariance = np.linalg.inv(np.diag(1 / before) + np.outer(rows, rows) / noise)
+    members = with_moments(np.random.default_rng(1).standard_normal((20, 3)), np.zeros(3), covariance)
+    shares = shares_of_priors(members, before)
+    parts = np.array([noise, 4 * 0.25, 1.0])  # of e, b, c in a = y − 2 b − c − e
+    assert shares[0, 1:] == pytest.approx(parts[1:] / parts.sum(), rel=1e-3)
+    assert shares[0, 0] < 1e-3
+    gain = covariance @ rows / noise  # each row: what priors and readings bring sums to the whole
+    assert shares.sum(axis=1) + gain**2 * noise / np.diag(covariance) == pytest.approx(1.0)

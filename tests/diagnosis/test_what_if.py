@@ -1,0 +1,164 @@
+"""Where the posterior goes under an alternative: closed forms of linear models, and failures as values."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from toys import Decay, Linear, make_problem, with_noise
+
+from en4dvar.diagnosis.response.what_if import MOST_RUNS
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.summary import remarks
+from en4dvar.model.forward import Alternative, Failure
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.schemes.settings import AssimilationSettings
+
+SETTINGS = AssimilationSettings(members=12)
+
+
+class Offset(Linear):
+    """Linear, with a term that no parameter can take up."""
+
+    def __init__(self, size=0.0, **options):
+        super().__init__(**options)
+        self.size = size
+
+    def curve(self, theta, t):
+        return super().curve(theta, t) + self.size * t**2
+
+
+class Refuses(Linear):
+    def trajectories(self, x, times):
+        return [Failure("too stiff", 0.1)] * len(x)
+
+
+def offering(problem, *alternatives):
+    problem.model.alternatives = alternatives
+    return problem
+
+
+def design(model, times, names):
+    """(K, n) of a linear model."""
+    return np.array([[model.curve(row, t) for row in np.eye(names)] for t in times])
+
+
+def posterior_mean(H, y, covariance, mean, variance):
+    precision = H.T @ np.linalg.solve(covariance, H) + np.diag(1 / variance)
+    right = H.T @ np.linalg.solve(covariance, y) + mean / variance
+    return np.linalg.solve(precision, right)
+
+
+def closed_form(problem, offset=0.0, factor=1.0, prior_shift=0.0):
+    """The change of the posterior mean of the linear toy, from the normal equations alone."""
+    o, prior = problem.observations, problem.prior
+    H = design(Linear(prior.names), o.times, len(prior.names))
+    correlation = getattr(o.noise, "correlation", None)
+    C = np.eye(len(o)) if correlation is None else correlation.matrix
+    R = np.outer(o.std, o.std) * C
+    before = posterior_mean(H, o.values, R, prior.mean, prior.std**2)
+    changed = factor * o.values - offset * o.times**2
+    return posterior_mean(H, changed, factor**2 * R, prior.mean + prior_shift, prior.std**2) - before
+
+
+def shift_of(problem, seed=1):
+    (shift,) = assimilate(problem, SETTINGS, seed).what_if
+    return shift
+
+
+@pytest.mark.parametrize("correlated", [False, True])
+def test_another_model_moves_a_linear_posterior_as_in_closed_form(correlated):
+    problem = make_problem(Linear(("a", "b", "c")), [1.0, 0.5, -0.3])
+    if correlated:
+        times = problem.observations.times
+        C = np.exp(-np.abs(np.subtract.outer(times, times)) / 0.4)
+        problem = replace(problem, observations=with_noise(problem.observations, correlation=C))
+    other = Offset(0.3, names=("a", "b", "c"))
+    shift = shift_of(offering(problem, Alternative("offset", "there were drag", other)))
+    expected = closed_form(problem, offset=0.3)
+    assert np.abs(expected).max() > 0.1
+    np.testing.assert_allclose(shift.change, expected, rtol=0, atol=1e-10)
+    assert shift.reason == ""
+    assert shift.runs == 2
+
+
+def test_another_scale_of_the_readings_in_closed_form():
+    problem = make_problem(Linear(("a", "b")), [1.0, 0.5])
+    shift = shift_of(offering(problem, Alternative("scale", "all were larger", values=1.2)))
+    np.testing.assert_allclose(shift.change, closed_form(problem, factor=1.2), rtol=0, atol=1e-10)
+
+
+def test_the_centre_of_a_prior_in_closed_form_and_in_words():
+    problem = make_problem(Linear(("a", "b")), [1.0, 0.5], std=2.0)
+    shift = shift_of(offering(problem, Alternative("a", "a were 50 % larger", parameters={"a": 1.5})))
+    moved = np.array([0.5 * problem.prior.mean[0], 0.0])
+    np.testing.assert_allclose(shift.change, closed_form(problem, prior_shift=moved), rtol=0, atol=1e-10)
+    assert shift.words == "the prior said that a were 50 % larger"
+
+
+def test_a_fixed_value_in_closed_form():
+    whole = make_problem(Linear(("a", "b")), [1.0, 0.5])
+    problem = replace(whole, prior=Prior(whole.prior.terms[:1]), fixed={"b": 0.5})
+    shift = shift_of(offering(problem, Alternative("b", "b were 10 % larger", parameters={"b": 1.1})))
+    H = design(Linear(("a", "b")), whole.observations.times, 2)
+    precision = H[:, 0] @ H[:, 0] / 0.1**2 + 1 / problem.prior.std[0] ** 2
+    np.testing.assert_allclose(shift.change, -H[:, 0] @ H[:, 1] * 0.05 / 0.1**2 / precision, rtol=0, atol=1e-10)
+    assert shift.words == "b were 10 % larger"
+
+
+def test_another_clock_comes_close_to_a_fit_that_is_done_again():
+    problem = make_problem(Decay(), [1.0, 0.8], std=0.02, k=15)
+    shift = shift_of(offering(problem, Alternative("clock", "time went slower", times=1.05)))
+    o = problem.observations
+    again = replace(problem, model=Decay(), observations=replace(o, times=1.05 * o.times))
+    done = assimilate(again, SETTINGS, 1)
+    before = assimilate(replace(problem, model=Decay()), SETTINGS, 1)
+    change = done.centre - before.centre
+    np.testing.assert_allclose(shift.change, change, rtol=0.05, atol=0.02 * np.abs(change).max())
+    gained = done.iterations[-1].cost - before.iterations[-1].cost
+    assert shift.cost_change == pytest.approx(gained, abs=0.05)
+
+
+def test_relative_changes_are_of_what_cannot_be_negative():
+    problem = make_problem(Linear(("a", "b")), [1.0, 0.5])
+    a = replace(problem.prior.parameters[0], bounds=(0.0, np.inf))
+    terms = (PriorTerm.lognormal(a, 1.0, 0.5), problem.prior.terms[1])
+    shift = shift_of(offering(replace(problem, prior=Prior(terms)), Alternative("scale", "…", values=1.01)))
+    assert shift.relative[0] == pytest.approx(0.01, rel=0.2)
+    assert np.isnan(shift.relative[1])
+
+
+def test_what_cannot_be_run_or_told_has_a_reason_and_stands_before_what_is_small():
+    problem = make_problem(Decay(), [1.0, 0.8], std=0.01, k=15)
+    problem = offering(
+        problem,
+        Alternative("small", "little changed", values=1.001),
+        Alternative("stiff", "it were stiff", Refuses()),
+        Alternative("far", "all were upside down", values=-30.0),
+        Alternative("odd", "it had other parameters", Linear(("c",))),
+    )
+    analysis = assimilate(problem, SETTINGS, 1)
+    reasons = {shift.name: shift.reason for shift in analysis.what_if}
+    assert reasons["stiff"] == "cannot be run: too stiff"
+    assert reasons["far"] == "beyond linear response"
+    assert reasons["odd"].startswith("cannot be run")
+    assert reasons["small"] == ""
+    assert analysis.what_if[-1].name == "small"
+    assert all(np.isnan(shift.change).all() for shift in analysis.what_if[:-1])
+    assert all(shift.runs <= MOST_RUNS for shift in analysis.what_if)
+    assert any("only another fit tells" in line for line in remarks(analysis))
+
+
+def test_the_posterior_is_the_same_and_its_runs_are_counted():
+    plain = make_problem(Linear(("a", "b")), [1.0, 0.5])
+    first = assimilate(plain, SETTINGS, 3)
+    other = offering(make_problem(Linear(("a", "b")), [1.0, 0.5]), Alternative("offset", "…", Offset(5.0)))
+    second = assimilate(other, SETTINGS, 3)
+    assert np.array_equal(first.posterior, second.posterior)
+    assert second.forward_runs == first.forward_runs + second.what_if[0].runs
+    assert first.what_if == ()
+    assert assimilate(other, replace(SETTINGS, what_if=False), 3).what_if == ()
+    (line,) = remarks(second)
+    assert line.startswith("what if …: ")
+    assert "std)" in line

@@ -1,0 +1,190 @@
+"""Populations with common quantities, odd data sets, uncertain errors: closed forms of a linear hierarchy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+from toys import Vectorised, make_problem, with_discrepancy
+
+from en4dvar.data.noise import noise_of
+from en4dvar.estimation.population import HyperPrior
+from en4dvar.estimation.population.campaign import population_of
+from en4dvar.estimation.population.empirical import empirical, median_of
+from en4dvar.model.forward import Failure
+from en4dvar.model.state import NOISE_SCALE, Parameter
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.priors.prior import Prior, PriorTerm, member_stream
+from en4dvar.runs.population_run import _cautions
+
+STD, SETS, SLOPE = 0.3, 8, 0.5
+A, B = (Parameter(name, "m") for name in "ab")
+D = Parameter("d", "m", common=True)
+OF_A, OF_B, OF_D = PriorTerm.normal(A, 0.6, 0.9), PriorTerm.normal(B, 0.2, 0.5), PriorTerm.normal(D, 0.0, 0.4)
+HYPER = HyperPrior(1.0, 0.5, odd=0.0)
+
+
+class Shifted(Vectorised):
+    """y = a + d/2 + b cos(t + 1/3): the data never tell a from d."""
+
+    def __init__(self):
+        super().__init__()
+        self.parameters = (A, B, D)
+
+    def initial_state(self, theta):
+        values = np.array([theta["a"] + SLOPE * theta["d"], theta["b"]])
+        return np.concatenate([[self.curve(values, 0.0), self.rate(values, 0.0)], values])
+
+
+class Broken(Shifted):
+    """Cannot integrate anything."""
+
+    def trajectories(self, x, times):
+        return [Failure("too stiff", 0.1)] * len(x)
+
+
+def campaign(truths, d=0.3, seed=4, terms=(OF_A, OF_B, OF_D), std=STD):
+    """Data sets with b = 0.4 each, errors of ``std``."""
+    model, toy, problems = Shifted(), Vectorised(), []
+    for s, a in enumerate(truths):
+        one = make_problem(toy, (a + SLOPE * d, 0.4), std=std, seed=100 * seed + s, k=6 + s % 3)
+        observations = replace(one.observations, name=f"set{s}")
+        problems.append(replace(one, model=model, observations=observations, prior=Prior(terms)))
+    return problems
+
+
+def likely(problems, std=STD):
+    """Of each data set mean and variance of a + d/2, b integrated over its prior."""
+    found = []
+    for p in problems:
+        column = np.cos(p.observations.times + 1 / 3)
+        C = std**2 * np.eye(len(column)) + OF_B.std**2 * np.outer(column, column)
+        solved = np.linalg.solve(C, np.column_stack([np.ones(len(column)), p.observations.values - 0.2 * column]))
+        information = solved[:, 0].sum()
+        found.append((solved[:, 1].sum() / information, 1 / information))
+    return np.array(found).T
+
+
+def exact(problems, hyper, common=OF_D.std):
+    """Mean and std of ν, and mean of τ, on a grid of m = ν + d/2 and τ: given m the data say nothing of ν."""
+    m, tau = np.linspace(-3, 4, 281), np.geomspace(1e-3, 3, 121)
+    of_nu, of_d = (0.9 * hyper.mean_std) ** 2, (SLOPE * common) ** 2
+    log = norm(0.6, np.sqrt(of_nu + of_d)).logpdf(m)[:, None] - 0.5 * (tau / (0.9 * hyper.spread)) ** 2
+    wide = np.sqrt(0.9**2 + of_d)
+    for best, variance in likely(problems).T:
+        inside = norm(best, np.sqrt(variance + tau**2)).logpdf(m[:, None])
+        outside = norm(0.6, np.sqrt(variance + wide**2)).logpdf(best)
+        odd = np.log(hyper.odd) + outside if hyper.odd else -np.inf
+        log = log + np.logaddexp(np.log1p(-hyper.odd) + inside, odd)
+    weights = np.exp(log - log.max()) * np.gradient(tau)
+    weights /= weights.sum()
+    share, left = of_nu / (of_nu + of_d), of_nu * of_d / (of_nu + of_d)
+    middle, variance = weights.sum(axis=1) @ m, weights.sum(axis=1) @ m**2
+    variance -= middle**2
+    return 0.6 + share * (middle - 0.6), np.sqrt(share**2 * variance + left), weights.sum(axis=0) @ tau
+
+
+def members(problems):
+    return [0.5 * member_stream(s, "start").standard_normal((30, len(p.prior.names))) for s, p in enumerate(problems)]
+
+
+def truths(spread, count=SETS, seed=1):
+    return 1.0 + spread * np.random.default_rng(seed).standard_normal(count)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.5])
+def test_what_is_common_does_not_average_out(spread):
+    problems = campaign(truths(spread))
+    found = population_of(problems, members(problems), ["a"], 2, hyper=HYPER)
+    mean, std, between = exact(problems, HYPER)
+    assert found.common == ("d",)
+    assert found.posterior.mean.mean() == pytest.approx(mean, abs=0.15 * std)
+    assert found.posterior.mean.std() == pytest.approx(std, rel=0.07)
+    assert found.posterior.between.mean() == pytest.approx(between, rel=0.1)
+    own, shared = found.parts
+    assert shared[0] == pytest.approx(SLOPE * OF_D.std, rel=0.1)
+    assert np.hypot(own[0], shared[0]) == pytest.approx(found.posterior.mean.std(), rel=1e-6)
+    of_own = OF_D if spread else replace(OF_D, parameter=Parameter("d", "m"))
+    if not spread:  # a quantity of its own in each data set averages out, and the interval becomes too narrow
+        alone = campaign(truths(spread), terms=(OF_A, OF_B, of_own))
+        assert population_of(alone, members(alone), ["a"], 2, hyper=HYPER).posterior.mean.std() < 0.8 * std
+
+
+def test_an_odd_data_set_is_named_and_moves_nothing():
+    values = truths(0.1)
+    values[3] = -1.8
+    problems, hyper = campaign(values), replace(HYPER, odd=0.05)
+    found = population_of(problems, members(problems), ["a"], 2, hyper=hyper)
+    assert found.belongs[3] < 0.05
+    assert np.delete(found.belongs, 3).min() > 0.8
+    (one,) = (c for c in _cautions(found) if c.code == "odd-data-set")
+    assert "set3" in one.words
+    assert "set2" not in one.words
+    mean, std, between = exact(problems, hyper)
+    assert found.posterior.mean.mean() == pytest.approx(mean, abs=0.15 * std)
+    assert found.posterior.mean.std() == pytest.approx(std, rel=0.1)
+    assert found.posterior.between.mean() == pytest.approx(between, rel=0.15)
+    strict = population_of(problems, members(problems), ["a"], 2, hyper=HYPER)
+    assert np.median(strict.posterior.tau) > 2 * np.median(found.posterior.tau)
+
+
+def test_uncertain_errors_are_quantities_of_each_data_set():
+    """A scale of the errors that is all but known changes nothing; a wide one, a timing error and a discrepancy are
+    taken as they are.
+    """
+    values = truths(0.3)
+    known = (OF_A, OF_B, OF_D, PriorTerm.lognormal(NOISE_SCALE, 1.0, 0.01))
+    problems = campaign(values, terms=known)
+    found = population_of(problems, members(problems), ["a"], 2, hyper=HYPER)
+    mean, std, _ = exact(problems, HYPER)
+    assert found.posterior.mean.mean() == pytest.approx(mean, abs=0.15 * std)
+    assert found.posterior.mean.std() == pytest.approx(std, rel=0.1)
+    robust = [with_discrepancy(p, sigma=0.4, huber=2.0, amplitude=(0.03, 0.5)) for p in campaign(values)]
+    timed = [replace(p, observations=replace(p.observations, noise=timing(p.observations))) for p in campaign(values)]
+    for uncertain in (robust, timed):
+        taken = population_of(uncertain, members(uncertain), ["a"], 2, hyper=HYPER)
+        assert taken.posterior.mean.mean() == pytest.approx(mean, abs=0.5 * std)
+
+
+def timing(observations):
+    return noise_of(observations.std, np.full(len(observations), 0.02))
+
+
+def test_data_sets_that_cannot_be_sampled_are_named():
+    problems = campaign(truths(0.2))
+    problems[2] = replace(problems[2], model=Broken())
+    found = population_of(problems, members(problems), ["a"], 2, hyper=HYPER)
+    assert list(found.left_out) == ["set2"]
+    assert len(found.problems) == SETS - 1
+    assert any("set2 is left out" in c.words for c in _cautions(found))
+
+
+def test_parameters_must_be_the_same_in_all():
+    problems = campaign(truths(0.2))
+    other = (OF_A, OF_D, OF_B)
+    problems[1] = replace(problems[1], prior=Prior(other))
+    with pytest.raises(ConfigError, match="set1: a population needs the same parameters"):
+        population_of(problems, members(problems), ["a"], 2)
+
+
+@pytest.mark.parametrize("count", [3, 6, 20])
+def test_the_median_of_data_sets_holds_the_truth_as_often_as_it_says(count):
+    """Sets of std 0.5 ± 0.3 about 0, with a common error of std 0.4."""
+    rng, inside = np.random.default_rng(count), []
+    term = PriorTerm.lognormal(Parameter("G", "Pa"), 1000.0, 1.0)
+    for trial in range(300):
+        std = 0.3 * rng.uniform(0.5, 1.5, count)
+        middle = 0.5 * rng.standard_normal(count) + std * rng.standard_normal(count) + 0.4 * rng.standard_normal()
+        low, _, high = empirical(term, middle, std, 0.4, trial).quantiles
+        inside.append(low < 1000.0 < high)
+    assert 0.84 < np.mean(inside) < 0.98
+
+
+def test_a_weighted_median():
+    x, std = np.array([0.0, 1.0, 2.0, 30.0]), np.full(4, 0.1)
+    middle, spread = median_of(x, std, member_stream(1, "a"))
+    assert middle == pytest.approx(1.5)
+    assert spread < x.std()
+    assert median_of(np.array([0.0, 1.0, 2.0]), np.array([0.01, 50.0, 50.0]), member_stream(1, "a"))[0] < 1.0

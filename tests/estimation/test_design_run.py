@@ -1,0 +1,272 @@
+"""``en4dvar design`` from a file: bits, files, resume, words."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from run_files import TESTS
+from toys import Vectorised
+
+import en4dvar
+from en4dvar.cli import main
+from en4dvar.model.forward import ValidityLimit
+from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError, OutputError
+from en4dvar.report.design import front, readings_text, remarks
+from en4dvar.runs import design_run
+from en4dvar.runs.design_run import run_design
+
+PAGE = {"output.report": True}
+
+
+def _plan(**design):
+    """Without the page: drawing it takes longer than what it shows; those who look at it ask with ``PAGE``."""
+    return {
+        "name": "plan",
+        "seed": 3,
+        "model": {"name": "toys:Vectorised"},
+        "data": {
+            "path": "not yet measured.csv",
+            "columns": {"time": {"name": "t", "unit": "s"}, "y": {"name": "y", "unit": "m"}},
+            "error": {"y_std": "0.3 m"},
+        },
+        "parameters": {
+            "a": {"prior": "lognormal", "median": "1 m", "log_std": 0.5},
+            "b": {"prior": "normal", "mean": "0.2 m", "std": "1 m"},
+        },
+        "design": {
+            "times": {"from": "0.1 s", "to": "2.5 s", "step": "0.4 s"},
+            "knobs": {
+                "error": {"key": "data.error.y_std", "values": ["0.1 m", "1 m"]},
+                "every": {"key": "design.times.step", "values": ["0.2 s", "0.4 s", "0.8 s"]},
+            },
+            "draws": 20,
+            "simulated": 20,
+            "inner": 50,
+            **design,
+        },
+        "output": {"report": False},
+    }
+
+
+def _same(one, other):
+    assert [row.settings for row in one.rows] == [row.settings for row in other.rows]
+    for a, b in zip(one.rows, other.rows, strict=True):
+        assert (a.result.gain, a.result.error, a.result.method) == (b.result.gain, b.result.error, b.result.method)
+        np.testing.assert_array_equal(a.result.std, b.result.std)
+        np.testing.assert_array_equal(a.result.fan, b.result.fan)
+
+
+@pytest.mark.slow
+def test_every_combination_and_the_file_itself(tmp_path):
+    found, directory = run_design(_plan(), out=tmp_path / "out", overrides=PAGE)
+    assert [row.settings for row in found.rows][:3] == [
+        {},
+        {"error": "0.1 m", "every": "0.2 s"},
+        {"error": "0.1 m", "every": "0.4 s"},
+    ]
+    gains = {tuple(row.settings.values()): row.result.gain for row in found.rows}
+    assert gains["0.1 m", "0.2 s"] > gains["0.1 m", "0.4 s"] > gains["1 m", "0.4 s"] > gains["1 m", "0.8 s"]
+    assert gains["0.1 m", "0.2 s"] - gains["1 m", "0.2 s"] == pytest.approx(2 * np.log(10), abs=0.6)  # two parameters
+    rows = list(csv.DictReader((directory / "designs.csv").read_text().splitlines()))
+    assert len(rows) == 7
+    assert float(rows[0]["gain_nats"]) == max(gains.values())
+    assert [len(row.result.times) for row in front(found)] == [4, 7, 13]
+    page = (directory / "design.html").read_text()
+    assert page.count("<svg") == 3
+    assert "a to ±" in page
+
+
+@pytest.mark.parametrize("executor", ["threads", "processes"])
+@pytest.mark.slow
+def test_the_same_bits_on_any_workers(tmp_path, executor):
+    one, _ = run_design(_plan(method="nested"), out=tmp_path / "one", overrides={"execution.executor": "serial"})
+    settings = {"execution.executor": executor, "execution.workers": 2}
+    other, _ = run_design(_plan(method="nested"), out=tmp_path / "other", overrides=settings)
+    _same(one, other)
+
+
+@pytest.mark.slow
+def test_resumed(tmp_path, monkeypatch):
+    """Stopped after three designs, it goes on with the fourth, to the same bits."""
+    whole, _ = run_design(_plan(), out=tmp_path / "whole")
+    settings, done = {"execution.executor": "serial", "execution.checkpoint_every": 0}, []
+
+    def stop(count, total):
+        done.append(count)
+        if len(done) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_design(_plan(), out=tmp_path / "out", overrides=settings, on_design=stop)
+    calls, evaluate = [], design_run.evaluate
+    monkeypatch.setattr(design_run, "evaluate", lambda *args: calls.append(1) or evaluate(*args))
+    again, _ = run_design(_plan(), out=tmp_path / "out", overrides=settings, resume=True)
+    _same(whole, again)
+    assert len(calls) == 7 - 3 + 4  # the checks of auto follow
+    with pytest.raises(OutputError, match="force"):
+        run_design(_plan(), out=tmp_path / "out")
+
+
+def test_chosen_readings_tell_more_than_as_many_at_a_fixed_rate(tmp_path):
+    chosen = {"times": {"from": "0.1 s", "to": "2.5 s", "step": "0.1 s"}, "knobs": {}, "choose": {"readings": 6}}
+    found, _ = run_design(_plan(**chosen), out=tmp_path / "chosen")
+    fixed, _ = run_design(_plan(knobs={}, times={"from": "0.1 s", "to": "2.5 s", "step": "0.48 s"}), out=tmp_path / "f")
+    assert len(found.rows[0].result.times) == len(fixed.rows[0].result.times) == 6
+    assert found.rows[0].result.gain > fixed.rows[0].result.gain + 0.2
+
+
+def test_experiments_alike(tmp_path):
+    found, _ = run_design(_plan(knobs={}, about=["a"], experiments=[1, 4], method="laplace"), out=tmp_path / "out")
+    one, four = (row.result for row in found.rows)
+    assert (one.alike, four.alike) == (1, 4)
+    assert four.gain > one.gain
+    assert [row.price for row in found.rows] == [7, 28]
+
+
+def test_a_design_that_cannot_be_made(tmp_path):
+    """It is named, and the others are compared."""
+    knobs = {"start": {"key": "design.times.to", "values": ["2.5 s", "1e9 s"]}}
+    with pytest.raises(ConfigError, match="steps; give between 2 and a million"):
+        run_design(_plan(knobs=knobs), out=tmp_path / "out")
+    choose = {"n": {"key": "design.choose.readings", "values": [3, 50]}}
+    found, _ = run_design(_plan(knobs=choose, choose={"readings": 3}), out=tmp_path / "out")
+    assert [bool(row.failure) for row in found.rows] == [False, False, True]
+    assert "no 50 of 7 readings" in found.rows[2].failure
+
+
+class Bounded(Vectorised):
+    """Valid where |y| is below 2 m."""
+
+    validity = (ValidityLimit("y", 2.0),)
+
+
+def test_what_a_design_must_keep_to(tmp_path):
+    """More readings than the camera holds, a price too high: left out before the best is looked for, and named."""
+    within = {"readings": 7, "price": 12}
+    found, _ = run_design(_plan(within=within, experiments=[1, 2], method="laplace"), out=tmp_path / "out")
+    assert {(len(row.result.times), row.result.alike) for row in found.rows if row.result} == {(7, 1), (4, 1), (4, 2)}
+    told = "\n".join(remarks(found))
+    assert "error 0.1 m, every 0.2 s; error 1 m, every 0.2 s: 13 readings: more than design.within.readings = 7" in told
+    assert "a price of 13: more than design.within.price = 12" in told
+
+
+@pytest.mark.parametrize(("most", "kept"), [(0.9, True), (0.05, False)])
+def test_designs_that_leave_what_the_model_is_valid_for(tmp_path, most, kept):
+    plan = {**_plan(knobs={}, within={"beyond": most}, method="laplace"), "model": {"name": f"{__name__}:Bounded"}}
+    if kept:
+        assert 0.1 < run_design(plan, out=tmp_path / "out")[0].rows[0].result.beyond < 0.9
+    else:
+        with pytest.raises(ConfigError, match=r"leaves what the model is valid for: more than design\.within\.beyond"):
+            run_design(plan, out=tmp_path / "out")
+
+
+def test_when_to_stop(tmp_path):
+    """Readings that tell nothing to speak of: it is said."""
+    found, directory = run_design(
+        _plan(knobs={}), out=tmp_path / "out", overrides={"data.error.y_std": "40 m", "design.method": "linear", **PAGE}
+    )
+    assert "less than design.enough = 0.1: no experiment among these is worth making" in remarks(found)[0]
+    assert "is worth making" in (directory / "design.html").read_text()
+
+
+def test_what_is_taken_to_the_lab(tmp_path):
+    """When to read: a rate, or each chosen instant."""
+    found, _ = run_design(_plan(knobs={}, method="laplace"), out=tmp_path / "out")
+    assert readings_text(found, found.rows[0]) == "7 from 0.1 to 2.5 s, every 0.4 s"
+    assert not remarks(found)
+    three = _plan(knobs={}, choose={"readings": 3}, method="laplace")
+    found, directory = run_design(three, out=tmp_path / "three", overrides=PAGE)
+    taken = ", ".join(f"{t:.4g}" for t in found.rows[0].result.times)
+    assert readings_text(found, found.rows[0]) == f"3, at {taken} s"
+    assert f"3, at {taken} s" in (directory / "design.html").read_text()
+
+
+def test_as_a_command(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plan.yaml").write_text(json.dumps(_plan()))
+    outcome = CliRunner().invoke(main, ["design", "plan.yaml", "--set", "output.report=true"])
+    assert outcome.exit_code == 0, outcome.output
+    assert "what is known" in outcome.output
+    assert (tmp_path / "runs/plan_design/design.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"about": ["c"]}, "c: not estimated; estimated are a, b"),
+        ({"times": "often"}, "design.times: expected 'key: value' lines"),
+        ({"knobs": {"x": {"key": "no such", "values": [1]}}}, "design.knobs.x.key"),
+        ({"knobs": {"x": {"key": "parameters.zz", "values": [1]}}}, "zz"),
+        ({"draws": 3}, "design.draws"),
+        ({"method": "guess"}, "design.method"),
+        ({"experiments": []}, "design.experiments"),
+        ({"knobs": {k: {"key": "seed", "values": list(range(100))} for k in "ab"}}, "10000 combinations; at most 2000"),
+    ],
+)
+def test_bad_input(tmp_path, change, message):
+    with pytest.raises(En4dvarError, match=message):
+        run_design(_plan(**change), out=tmp_path / "out")
+
+
+def test_the_shipped_linear_plan_is_the_closed_form(tmp_path):
+    found, _ = run_design(
+        TESTS.parent / "configs" / "linear_design.yaml",
+        overrides={"design.method": "laplace", "output.report": False},
+        out=tmp_path / "line",
+    )
+    for row in found.rows:
+        H = np.column_stack([np.ones_like(row.result.times), row.result.times])
+        posterior = np.linalg.inv(np.diag([0.25, 1.0]) + H.T @ H / 0.25)
+        assert row.result.gain == pytest.approx(-0.5 * np.log(posterior[1, 1]), abs=1e-8)
+        assert row.result.std[0] == pytest.approx(np.sqrt(posterior[1, 1]), rel=1e-8)
+    assert len(found.rows) == 7
+
+
+def test_two_rates_one_after_the_other(tmp_path):
+    times = {"from": "0.5 s", "to": "1 s", "step": "0.1 s", "then": {"to": "2 s", "step": "0.5 s"}}
+    knobs = {"late": {"key": "design.times.then.step", "values": ["0.25 s"]}}
+    found, _ = run_design(_plan(knobs=knobs, times=times), out=tmp_path / "two")
+    own, finer = (row.result.times for row in found.rows)
+    np.testing.assert_allclose(own, [0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.5, 2.0])
+    np.testing.assert_allclose(finer, [0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.25, 1.5, 1.75, 2.0])
+    with pytest.raises(ConfigError, match=r"design\.times"):
+        run_design(_plan(knobs={}, times={**times, "then": {"to": "0.7 s", "step": "0.5 s"}}), out=tmp_path / "no")
+
+
+def test_times_or_a_file_of_them(tmp_path):
+    plan = _plan(knobs={})
+    del plan["design"]["times"]
+    with pytest.raises(DataError, match=r"not yet measured\.csv: no such file"):
+        run_design(plan, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    plan["data"]["path"], plan["design"]["method"] = str(tmp_path / "measured.csv"), "linear"
+    (tmp_path / "measured.csv").write_text("t,y\n0.1,1\n0.5,1\n0.9,1\n")
+    three, _ = run_design(plan, out=tmp_path / "out")
+    assert len(three.rows[0].result.times) == 3
+    (tmp_path / "measured.csv").write_text("t,y\n0.1,1\n0.5,1\n0.9,1\n1.3,1\n")
+    with pytest.raises(OutputError, match="cannot be resumed to the same result"):
+        run_design(plan, out=tmp_path / "out", resume=True)
+
+
+def test_after_a_run_there_is_less_to_learn(tmp_path):
+    """The gain of two experiments is that of the first, and that of the second after it (a linear model)."""
+    plan = _plan(knobs={}, about=["b"], method="linear")
+    plan["parameters"]["a"] = {"prior": "normal", "mean": "1 m", "std": "0.001 m"}  # known, so that b is all there is
+    times = np.arange(0.1, 2.6, 0.4)
+    rows = [f"{t:.3f},{1 + 0.2 * np.cos(t + 1 / 3):.6f}" for t in times]
+    (tmp_path / "measured.csv").write_text("\n".join(["t,y", *rows]))
+    measured = {**plan, "data": {**plan["data"], "path": str(tmp_path / "measured.csv")}}
+    en4dvar.run({**measured, "output": {"directory": str(tmp_path / "run"), "report": False}})
+    before, _ = run_design(plan, out=tmp_path / "before")
+    next_one, _ = run_design(plan, out=tmp_path / "next", after=tmp_path / "run")
+    plan["design"] |= {"method": "laplace", "experiments": [2]}
+    twice, _ = run_design(plan, out=tmp_path / "twice")
+    one, other, both = (found.rows[0].result.gain for found in (before, next_one, twice))
+    assert other < 0.5 < 1.5 < one
+    assert one + other == pytest.approx(both, abs=0.02)
+    with pytest.raises(En4dvarError, match="nowhere"):
+        run_design(plan, out=tmp_path / "bad", after=tmp_path / "nowhere")

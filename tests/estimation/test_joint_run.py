@@ -1,0 +1,77 @@
+"""``en4dvar joint`` on finished runs of the toy oscillator."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from run_files import make_campaign
+from toy_config import csv_text, write_toy
+
+from en4dvar.cli import main
+from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.results.joint_file import load_joint
+from en4dvar.runs.joint_run import join
+from en4dvar.runs.runner import run_campaign
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory):
+    """Three oscillators of one spring, whose amplitudes are their own."""
+    folder = tmp_path_factory.mktemp("campaign")
+    path = make_campaign(folder, n=3)
+    for i in range(3):
+        (folder / "data" / f"set{i}.csv").write_text(csv_text(k=2.4))
+    return run_campaign(path, overrides=_quiet(folder)).directory
+
+
+def _quiet(folder):
+    return {"output.report": False, "output.directory": str(folder / "run")}
+
+
+def test_files_and_table(campaign, tmp_path):
+    result = CliRunner().invoke(main, ["joint", str(campaign), "--share", "k", "--out", str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    assert "k" in result.output
+    found = load_joint(tmp_path / "out" / "joint.nc")
+    posterior = found.group("posterior")
+    assert found.shared == ("k",)
+    assert posterior["k"].dims == ("chain", "draw")
+    assert posterior["A"].dims == ("chain", "draw", "dataset")
+    assert abs(float(posterior["k"].mean()) - 2.4) < 0.05
+    alone = found.group("alone")["k"].values
+    width = np.quantile(posterior["k"], 0.95) - np.quantile(posterior["k"], 0.05)
+    assert width < 0.8 * np.min(alone[:, 2] - alone[:, 0])  # three say more than one: 1/√3 = 0.58
+    page = (tmp_path / "out" / "joint.html").read_text()
+    assert "What they share" in page
+    assert "set2" in page
+
+
+def test_two_runs_with_one_name_of_a_data_set(campaign, tmp_path):
+    other = run_campaign(write_toy(tmp_path), overrides=_quiet(tmp_path)).directory
+    found, _ = join([other, other], ["k"], tmp_path / "out")
+    assert found.datasets == ("toy", "toy_2")
+
+
+def test_the_same_bits_again(campaign, tmp_path):
+    first, _ = join([campaign], ["k"], tmp_path / "a")
+    again, _ = join([campaign], ["k"], tmp_path / "b", workers=2)
+    assert first.group("posterior").identical(again.group("posterior"))
+
+
+def test_bad_questions(campaign, tmp_path):
+    with pytest.raises(ConfigError, match=r"q: cannot be shared, for no two data sets.*"):
+        join([campaign], ["q"], tmp_path)
+    with pytest.raises(OutputError, match="no such file"):
+        join([tmp_path / "nothing"], ["k"], tmp_path)
+    result = CliRunner().invoke(main, ["joint", str(campaign), "--share", "c"])
+    assert result.exit_code == 2
+    assert "Traceback" not in result.output
+
+
+def test_a_damaged_file_is_refused(campaign, tmp_path):
+    join([campaign], ["k"], tmp_path)
+    path = tmp_path / "joint.nc"
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(OutputError, match=r"joint\.nc"):
+        load_joint(path)

@@ -1,0 +1,160 @@
+"""``en4dvar population`` on finished runs of the toy oscillator, and what is said of the draws."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from run_files import make_campaign
+from scipy.stats import norm
+from toys import Vectorised, make_problem
+
+from en4dvar.cli import main
+from en4dvar.estimation.population import Effort, HyperPrior
+from en4dvar.estimation.population.campaign import CampaignPopulation, Draws, population_of
+from en4dvar.estimation.population.estimate import Population
+from en4dvar.plumbing.errors import ConfigError, OutputError
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.results.population_file import load_population
+from en4dvar.runs.population_run import population
+from en4dvar.runs.runner import run_campaign
+
+STD, SETS = 0.3, 6
+SMALL = Effort(rounds=36, refits=1, degree=2, components=2, hyper_walkers=32, draws=1500, exact=400)
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory):
+    """Four oscillators whose springs differ."""
+    folder = tmp_path_factory.mktemp("population")
+    overrides = {"output.report": False, "output.directory": str(folder / "run")}
+    return run_campaign(make_campaign(folder, n=4), overrides=overrides).directory
+
+
+@pytest.fixture(scope="module")
+def found(campaign, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out")
+    return population([campaign], ["k"], out, effort=SMALL)[0], out
+
+
+def test_files_and_the_answer(found):
+    stored, folder = found
+    assert stored.names == ("k",)
+    posterior = stored.group("posterior")
+    assert posterior["k_mean"].dims == ("chain", "draw")
+    assert posterior["A"].dims == ("chain", "draw", "dataset")
+    page = (folder / "population.html").read_text()
+    assert "varies by" in page
+    assert "k_mean" not in page
+    rows = (folder / "population.csv").read_text().splitlines()
+    assert rows[1].startswith("mean of the population,k,")
+    assert "set3,k," in "\n".join(rows)
+    assert r"\toprule" in (folder / "population.tex").read_text()
+    assert 1.5 < float(posterior["k_mean"].median()) < 2.2  # the springs are 1.6 to 2.05
+
+
+def test_the_next_spring_is_less_certain_than_the_mean(found):
+    posterior = found[0].group("posterior")
+    assert posterior["k_next"].std() > 1.2 * posterior["k_mean"].std()
+    assert posterior["k_mean"].attrs["learned"] > 0.8
+    assert found[0].combinations == ()
+
+
+@pytest.mark.slow
+def test_the_command_and_a_damaged_file(campaign, tmp_path, monkeypatch):
+    monkeypatch.setattr("en4dvar.estimation.population.campaign.Effort", lambda: SMALL)
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(main, ["population", str(campaign), "--of", "k"])
+    assert result.exit_code == 0, result.output
+    assert "mean of the population" in result.output
+    path = campaign.parent / "population_run" / "population.nc"
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(OutputError, match=r"population\.nc"):
+        load_population(path)
+
+
+def test_bad_questions(campaign, tmp_path):
+    with pytest.raises(ConfigError, match=r"q: not estimated in"):
+        population([campaign], ["q"], tmp_path)
+    result = CliRunner().invoke(main, ["population", str(campaign), "--of", "c"])
+    assert result.exit_code == 2
+    assert "Traceback" not in result.output
+
+
+def linear(seed: int = 4) -> list:
+    """y = a + b cos(t + 1/3) + noise; a varies; b has a prior of its own in every set, centred wherever it likes."""
+    rng, model = np.random.default_rng(seed), Vectorised()
+    truths = [(1.0 + 0.5 * rng.standard_normal(), 0.4 + 0.1 * s) for s in range(SETS)]
+    a, b = model.parameters
+    return [
+        replace(
+            make_problem(model, truth, std=STD, seed=s, k=4 + s % 3),
+            prior=Prior((PriorTerm.normal(a, 0.6, 0.9), PriorTerm.normal(b, 0.2 + 0.1 * s, 0.5 - 0.05 * s))),
+        )
+        for s, truth in enumerate(truths)
+    ]
+
+
+def exact(problems, hyper):
+    """Weights of (ν, τ) on a grid, and the exact moments of each a given ν, τ."""
+    nu, tau = np.linspace(-3, 4, 141), np.geomspace(1e-2, 3, 61)
+    total = norm(0.6, 0.9 * hyper.mean_std).logpdf(nu)[:, None] - 0.5 * (tau / (0.9 * hyper.spread)) ** 2
+    means, variances = [], []
+    for p in problems:
+        t, term = p.observations.times, p.prior.terms[1]
+        column = np.cos(t + 1 / 3)
+        C = STD**2 * np.eye(len(t)) + term.std**2 * np.outer(column, column)
+        y = p.observations.values - term.mean * column
+        information, best = np.linalg.solve(C, np.ones(len(t))).sum(), 0.0
+        best = np.linalg.solve(C, y).sum() / information
+        total = total + norm(best, np.sqrt(1 / information + tau[None] ** 2)).logpdf(nu[:, None])
+        variance = 1 / (information + tau**-2.0)
+        means.append(variance * (information * best + nu[:, None] / tau**2))
+        variances.append(np.broadcast_to(variance, means[-1].shape))
+    weights = np.exp(total - total.max()) * np.gradient(tau)
+    return weights / weights.sum(), nu, tau, np.array(means), np.array(variances)
+
+
+def test_what_is_determined_together_only():
+    """2 a + b is sharp, a and b are not: in units of their priors (std 0.5 and 1) it is the sum of both."""
+    rng, model = np.random.default_rng(1), Vectorised()
+    a, b = model.parameters
+    prior = Prior((PriorTerm.normal(a, 0.0, 0.5), PriorTerm.normal(b, 0.0, 1.0)))
+    problems = (replace(make_problem(model, [1.0, 0.4]), prior=prior),)
+    free, sharp = rng.standard_normal((2, 4000))
+    nu = np.stack([(free + 0.01 * sharp) / np.sqrt(2), (-free + 0.01 * sharp) / np.sqrt(2)], axis=1)
+    tau = np.abs(0.5 * rng.standard_normal(nu.shape))
+    draws = Draws(nu, tau, nu, nu, tau)
+    estimate = Population(("a", "b"), prior, nu, tau, nu[:, None], (400.0, 400.0), 0.0, 0)
+    found = CampaignPopulation(problems, HyperPrior(), estimate, draws, draws, nu[:, None])
+    (one,) = found.combinations()
+    exponents = dict(one.parts)
+    assert exponents["a"] / exponents["b"] == pytest.approx(2.0, rel=0.02)
+    together = exponents["a"] * 0.5 * nu[:, 0] + exponents["b"] * nu[:, 1]
+    assert one.std == pytest.approx(together.std())
+    assert one.std < 0.03
+    kept, effective = found.without_hyperprior(1)
+    assert kept.nu[:, 0].std() > 0.9 * nu[:, 0].std()
+    assert effective < 200
+
+
+@pytest.mark.slow
+def test_a_linear_hierarchy_with_priors_of_their_own():
+    problems, hyper = linear(), HyperPrior(1.0, 0.5)
+    start = [0.3 * np.random.default_rng(s).standard_normal((20, 2)) for s in range(SETS)]
+    found = population_of(problems, start, ["a"], 2, hyper=hyper, effort=replace(SMALL, degree=1, exact=1500))
+    weights, nu, tau, means, variances = exact(problems, hyper)
+    size = np.sqrt(found.estimate.size)
+    mean = weights.sum(axis=1) @ nu
+    std = np.sqrt(weights.sum(axis=1) @ nu**2 - mean**2)
+    assert found.posterior.mean.mean() == pytest.approx(mean, abs=4 * std / size)
+    assert found.posterior.between.mean() == pytest.approx(weights.sum(axis=0) @ tau, rel=0.1)
+    for s in range(SETS):  # what each data set is, given all of them
+        middle = np.sum(weights * means[s])
+        spread = np.sqrt(np.sum(weights * (variances[s] + means[s] ** 2)) - middle**2)
+        assert found.sets[:, s, 0].mean() == pytest.approx(middle, abs=4 * spread / size)
+        assert found.sets[:, s, 0].std() == pytest.approx(spread, rel=0.15)
+    following = np.sqrt(np.sum(weights * (nu[:, None] ** 2 + tau**2)) - mean**2)
+    assert found.posterior.next.std() == pytest.approx(following, rel=0.15)

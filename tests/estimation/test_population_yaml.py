@@ -1,0 +1,114 @@
+"""``population:`` in a configuration: single estimates and then the population behind them, in one run."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from execution_models import Stops
+from run_files import assert_same_results, configuration, interrupt, make_campaign
+
+from en4dvar.cli import main
+from en4dvar.estimation.population import Effort, HyperPrior
+from en4dvar.plumbing.errors import ConfigError
+from en4dvar.results.population_file import load_population
+from en4dvar.runs.engine import write_report
+from en4dvar.runs.population_run import population
+from en4dvar.runs.runner import run_campaign
+
+SMALL = Effort(
+    rounds=30, refits=1, degree=2, components=2, hyper_walkers=16, hyper_rounds=30, draws=400, exact=100, passes=1
+)
+ASKED = "population: {of: [k], mean_std: 2, spread: 0.7}\n"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _small():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("en4dvar.estimation.population.campaign.Effort", lambda: SMALL)
+        yield
+
+
+def springs(folder, asked=ASKED, n=4, model="toy_models:Oscillator"):
+    """Oscillators whose springs differ."""
+    path = make_campaign(folder, n, model)
+    path.write_text(path.read_text() + asked)
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run with a population, and what it printed."""
+    folder = tmp_path_factory.mktemp("springs")
+    path, run = springs(folder), folder / "run"
+    result = CliRunner().invoke(main, ["run", str(path), "--out", str(run), "--no-report"])
+    assert result.exit_code == 0, result.output
+    return run, result.output
+
+
+@pytest.mark.slow
+def test_a_run_ends_with_its_population(finished):
+    run, output = finished
+    assert "mean of the population" in output
+    within = load_population(run / "population.nc")
+    assert within.tree.attrs["hyperprior_mean_std"] == 2.0
+    assert 1.5 < float(within.group("posterior")["k_mean"].median()) < 2.2  # the springs are 1.6 to 2.05
+
+
+@pytest.mark.slow
+def test_it_is_what_the_command_says_and_has_a_page(finished, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished[0], run)
+    within = load_population(run / "population.nc")
+    after, _ = population([run], ["k"], tmp_path / "after", hyper=HyperPrior(2.0, 0.7))
+    for name, values in after.group("posterior").data_vars.items():
+        assert np.array_equal(values, within.group("posterior")[name]), name
+    write_report(run)
+    assert 'href="population.html"' in (run / "report.html").read_text()
+    listed = (run / ".en4dvar-files").read_text()
+    assert all(name in listed for name in ("population.nc", "population.html", "population.csv", "population.tex"))
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_to_the_same_bits(tmp_path):
+    path = springs(tmp_path, model="execution_models:Stops")
+    whole = run_campaign(configuration(path, tmp_path / "whole"))
+    told = interrupt(path, tmp_path / "cut", Stops.calls - 3)  # in the midst of the population's forward runs
+    assert "4 of 4 data sets are done" in told
+    assert not (tmp_path / "cut" / "population.nc").exists()
+    run_campaign(configuration(path, tmp_path / "cut"), resume=True)
+    assert_same_results(whole.directory, tmp_path / "cut")
+
+
+@pytest.mark.parametrize(
+    ("n", "asked", "words"),
+    [
+        (3, "population: {of: [q]}\n", r"yaml:\d+:\d+: population\.of\.0: q: not estimated"),
+        (3, "population: {of: [c]}\n", r"yaml:\d+:\d+: population\.of\.0: c: not estimated"),
+        (3, "population: {of: [A]}\n", r"A: its prior depends on the data set"),
+        (3, "population: {of: []}\n", r"yaml:\d+:\d+: population\.of: "),
+        (3, "population: {of: [k], spread: 0}\n", r"yaml:\d+:\d+: population\.spread: "),
+        (2, ASKED, r"yaml:\d+:\d+: population: a population needs at least 3 data sets, not 2"),
+    ],
+)  # fmt: skip
+def test_what_has_no_population_is_told_before_anything_is_computed(tmp_path, n, asked, words):
+    path = springs(tmp_path, asked, n)
+    with pytest.raises(ConfigError, match=words):
+        run_campaign(configuration(path, tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_errors_of_any_kind(tmp_path):
+    """A discrepancy whose amplitude and length are quantities of each data set."""
+    path = springs(tmp_path)
+    text = path.read_text().replace("position_std: 2 um", "position_std: 2 um, discrepancy: estimated")
+    assert "discrepancy" in text
+    path.write_text(text)
+    run = run_campaign(configuration(path, tmp_path / "run")).directory
+    stored = load_population(run / "population.nc")
+    assert 1.4 < float(stored.group("posterior")["k_mean"].median()) < 2.4
+    assert set(stored.belongs) == {"set0", "set1", "set2", "set3"}
+    low, middle, high = stored.group("empirical")["k"].values
+    assert low < middle < high

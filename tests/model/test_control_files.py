@@ -1,0 +1,275 @@
+"""A control file of PEST becomes an estimate: its parameters, observations and weights."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import en4dvar
+from en4dvar.model.programs.control import from_pest
+from en4dvar.model.programs.model import CommandModel, CommandSettings
+
+PUBLIC = Path(__file__).parents[2].parent / "shared" / "reference" / "pest"
+
+CONTROL = f"""pcf
+* control data
+restart estimation
+3 4 1 0 1
+1 1 single point
+* parameter groups
+pg relative 0.01 0.0 switch 2.0 parabolic
+* parameter data
+A log factor 1.0 0.1 10.0 pg 1.0 0.0 1
+b none relative 0.0 -4.0 4.0 pg 1.0 0.0 1
+c fixed factor 2.0 1.0 3.0 pg 1.0 0.0 1
+* observation groups
+og
+* observation data
+h1 3.5 10.0 og
+h2 4.5 10.0 og
+bad 99.0 0.0 og
+h3 5.5 5.0 og
+* model command line
+{sys.executable} -S line.py
+* model input/output
+line.tpl run/line.in
+line.ins line.out
+"""
+PROGRAM = """
+a, b, c = (float(word) for word in open("run/line.in"))
+open("line.out", "w").write("".join(f"{c + a * t + b} \\n" for t in (1, 2, 3, 3)))
+"""
+
+
+@pytest.fixture
+def control(tmp_path):
+    (tmp_path / "line.pst").write_text(CONTROL)
+    (tmp_path / "line.tpl").write_text("ptf ~\n~        a           ~\n~      b             ~\n~ c  ~\n")
+    (tmp_path / "line.ins").write_text("pif @\nl1 !h1!\nl1 !h2!\nl1 !h3!\nl1 !bad!\n")
+    (tmp_path / "line.py").write_text(PROGRAM)
+    return tmp_path / "line.pst"
+
+
+def test_a_control_file_says_what_to_estimate_from_what(control):
+    found = from_pest(control, ["line.py"])
+    assert found["priors"] == {
+        "a": {"prior": "lognormal", "median": 1.0, "log_std": math.log(100) / 4, "lower": 0.1, "upper": 10.0},
+        "b": {"prior": "normal", "mean": 0.0, "std": 2.0, "lower": -4.0, "upper": 4.0},
+        "c": 2.0,
+    }
+    np.testing.assert_array_equal(found["data"]["observations"], [3.5, 4.5, 5.5])
+    np.testing.assert_allclose(found["error"], [0.1, 0.1, 0.2])
+    result = en4dvar.estimate(**found, progress=False, assimilation={"members": 8})
+    assert result.posterior["a"].mean() == pytest.approx(1.0, abs=0.15)
+    np.testing.assert_allclose(
+        result.dataset("posterior_predictive")["observations"].mean(("chain", "draw")), [3.5, 4.5, 5.5], atol=0.1
+    )
+
+
+RICH = """pcf
+* control data
+restart estimation   # a comment
+4 5 1 1 1
+2 2 single point
+* parameter data
+hk:1-a log factor 2.0 0.5 10.0 pg -1.0 10.0 1
+b none relative 0.0 -4.0 4.0 pg 2.5 0.0 1
+t tied factor 3.0 0.0 0.0 pg 1.0 0.0 1
+c fixed factor 2.0 1.0 3.0 pg 1.0 0.0 1
+t hk:1-a
+* observation data
+H1 3.5 10.0 og
+h2 4.5 4.0 og
+unused 1 0.0 l_og
+* model command line
+cat in/one.dat in/two.dat > out.dat; cp out.dat more.dat
+* model input/output
+one.tpl in\\one.dat
+two.tpl in\\two.dat
+out.ins out.dat
+more.ins more.dat
+* prior information
+pi1 1.0 * log(hk:1-a) - 2.5E-1 * b
+& = 0.3 5.0 regul
+pi2 1.0 * b = 0.3 0.0 regul
+++par_sigma_range(6) ies_num_reals(50)
+"""
+TABLES = {
+    "par.csv": "parnme,partrans,parval1,parlbnd,parubnd,scale,offset,partied,standard_deviation,x\n"
+    "hk:1-a,log,2,0.5,10,-1,10,,,1\nb,none,0,-4,4,2.5,,,,\nt,tied,3,0,0,,,hk:1-a,,\nc,fixed,2,1,3,,,,,\n",
+    "obs.dat": "obsnme obsval weight obgnme\nh1 3.5 10 og\nh2 4.5 4 og\nunused 1 0 missing\n",
+    "in.csv": "pest_file,model_file\none.tpl,in/one.dat\ntwo.tpl,in/two.dat\n",
+    "out.csv": "pest_file,model_file\nout.ins,out.dat\nmore.ins,more.dat\n",
+    "pi.csv": "pilbl,equation,weight,obgnme\npi1,1.0 * log(hk:1-a) - 0.25 * b = 0.3,5.0,r\npi2,1.0*b=0.3,0,r\n",
+}
+SECOND = """pcf version=2
+* control data keyword
+pestmode estimation
+par_sigma_range 6
+* parameter data external
+par.csv
+* observation data external
+obs.dat sep w missing_value missing
+* model command line
+cat in/one.dat in/two.dat > out.dat; cp out.dat more.dat
+* model input external
+in.csv
+* model output external
+out.csv
+* prior information external
+pi.csv
+"""
+
+
+@pytest.fixture
+def rich(tmp_path):
+    (tmp_path / "rich.pst").write_text(RICH.replace("\\\\", "\\"))
+    (tmp_path / "second.pst").write_text(SECOND)
+    for name, text in TABLES.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "one.tpl").write_text("ptf ~\n~   HK:1-a                ~\n~ t                         ~\n")
+    (tmp_path / "two.tpl").write_text("ptf #\n#  b                        #\n# c    #\n")
+    (tmp_path / "out.ins").write_text("pif @\nl1 !h1!\n")
+    (tmp_path / "more.ins").write_text("pif @\nl3 !h2!\n")
+    return tmp_path / "rich.pst"
+
+
+def test_scales_ties_several_files_and_prior_information(rich):
+    found = from_pest(rich)
+    output = found["model"]["outputs"]["observations"]
+    assert found["priors"]["hk_1_a"] == {
+        "prior": "lognormal", "median": 2.0, "log_std": pytest.approx(math.log(20) / 6), "lower": 0.5, "upper": 10.0
+    }  # fmt: skip
+    assert found["priors"]["t"] == {"tied": "hk_1_a", "factor": 1.5}
+    assert found["model"]["parameters"] == {
+        "hk_1_a": {"scale": -1.0, "offset": 10.0},
+        "b": {"scale": 2.5},
+        "t": {},
+        "c": {},
+    }
+    assert output["combinations"] == [{"log10(hk_1_a)": 1.0, "b": -0.25}]
+    np.testing.assert_array_equal(found["data"]["observations"], [3.5, 4.5, 0.3])
+    np.testing.assert_allclose(found["error"], [0.1, 0.25, 0.2])
+    assert len(from_pest(rich, prior_information=False)["error"]) == 2
+    model = CommandModel(CommandSettings.model_validate(found["model"]))
+    (path,) = model.trajectories([[2.0, 3.0, 4.0, 5.0]], found["data"]["time"])
+    assert path["observations"] == pytest.approx([8.0, 7.5, math.log10(2) - 0.75], rel=1e-12)
+
+
+def test_version_2_with_external_tables_says_the_same(rich):
+    first, second = from_pest(rich), from_pest(rich.with_name("second.pst"))
+    for each in (first, second):
+        each["data"] = {key: values.tolist() for key, values in each["data"].items()}
+        each["error"] = each["error"].tolist()
+    assert first == second
+
+
+def test_one_observation_is_enough_and_bounds_hold(rich):
+    """One reading that asks for hk:1-a = 14, above its upper bound of 10."""
+    text = RICH.replace("\\\\", "/").replace("h2 4.5 4.0", "h2 4.5 0.0").replace("H1 3.5 10.0", "h1 -4.0 2.0")
+    rich.write_text(text)
+    asked = from_pest(rich, prior_information=False)
+    result = en4dvar.estimate(**asked, progress=False, assimilation={"members": 12})
+    drawn = result.posterior["hk_1_a"].values
+    assert np.median(drawn) > 9
+    assert drawn.max() < 10
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("restart estimation", "restart regularisation", "prior_information=False leaves it out"),
+        ("restart estimation", "restart pareto", "mode pareto is not known here"),
+        ("* model input/output", "second.bat\n* model input/output", "2 model commands"),
+        ("++par", "++parcov(prior.cov) par", "option parcov: give correlations as prior_correlation"),
+        ("++par", "++ies_par_en(prior.jcb) par", "option ies_par_en: a prior ensemble is that of prior="),
+        ("++par", "++obscov(noise.cov) par", "option obscov"),
+        ("4.5 4.0 og", "4.5 4.0 less_than", "group less_than holds inequalities"),
+        (
+            "* observation data",
+            "* observation groups\nog og.cov\n* observation data",
+            "group og has a covariance, og.cov",
+        ),
+        ("2.0 0.5 10.0 pg -1.0", "2.0 0.5 10.0 pg 0.0", "the scale of hk:1-a is 0"),
+        ("2.0 0.5 10.0", "20 0.5 10.0", "parval1 of hk:1-a is 20, outside of its bounds 0.5 and 10"),
+        ("2.0 0.5 10.0", "2.0 0.0 10.0", "hk:1-a is log, but its lower bound 0 is not above 0"),
+        ("t hk:1-a\n", "", "t is tied to no parameter that is estimated or fixed"),
+        ("b none", "hk-1:a none", "hk:1-a and hk-1:a are both 'hk_1_a' here"),
+        ("1.0 * log(hk:1-a)", "1.0 * log(hk:1-b)", "prior information on hk:1-b, which is no parameter"),
+        ("1.0 * log(hk:1-a)", "1.0 ^ log(hk:1-a)", "is no equation of prior information"),
+        ("in\\two.dat", "..\\two.dat", "lies outside of the folder that the model runs in"),
+        ("* prior information", "* prior beliefs", "no section of a control file is called 'prior beliefs'"),
+        ("4.5 4.0 og", "4.5 -4.0 og", "the weight -4 is negative"),
+    ],
+)
+def test_what_would_change_the_estimate_is_refused_by_name(rich, old, new, words):
+    text = RICH.replace("\\\\", "\\")
+    assert old in text
+    rich.write_text(text.replace(old, new))
+    with pytest.raises(en4dvar.ConfigError) as caught:
+        from_pest(rich)
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("table", "old", "new", "words"),
+    [
+        ("par.csv", "-1,10,,,1\n", "-1,10,,,\n", None),
+        ("par.csv", ",standard_deviation", ",mean", None),
+        ("par.csv", "b,none,0,-4,4,2.5,,,,", "b,none,0,-4,4,2.5,,,0.75,", None),
+        ("par.csv", "b,none,0,-4,4,2.5,,,,", "b,none,0,-4,4,2.5", "par.csv:3: 6 cells, but 10 columns"),
+        ("obs.dat", "obgnme\nh1 3.5 10 og", "cycle\nh1 3.5 10 2", "column cycle: the cycles of pestpp-da"),
+        ("in.csv", "model_file", "file", "a line of '* model input' holds two names of files"),
+    ],
+)
+def test_external_tables(rich, table, old, new, words):
+    assert old in TABLES[table]
+    (rich.parent / table).write_text(TABLES[table].replace(old, new))
+    if words is None:
+        std = from_pest(rich.with_name("second.pst"))["priors"]["b"]["std"]
+        assert std == pytest.approx(0.75 if "0.75" in new else 8 / 6)
+        return
+    with pytest.raises(en4dvar.ConfigError) as caught:
+        from_pest(rich.with_name("second.pst"))
+    assert words in str(caught.value)
+
+
+@pytest.mark.skipif(not PUBLIC.is_dir(), reason=f"no {PUBLIC}")
+def test_public_control_files_are_read_or_refused_by_name():
+    read = 0
+    for path in sorted(PUBLIC.rglob("*.pst")):
+        try:
+            found = from_pest(path, prior_information=False)
+        except en4dvar.ConfigError:
+            continue
+        read += 1
+        text = path.read_text().lower()
+        lines = text.split("* observation data")[1].split("* model command line")[0].splitlines()
+        counted = [words for line in lines if (words := line.split()) and float(words[2]) > 0]
+        assert found["model"]["outputs"]["observations"]["observations"] == [words[0] for words in counted]
+        np.testing.assert_allclose(1 / found["error"], [float(words[2]) for words in counted])
+    assert read >= 8  # most of the others name templates that are not there
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("pcf", "pst", "line.pst: the first line of a control file is pcf"),
+        ("b none", "b tied", "line.pst:10: b is tied to no parameter that is estimated or fixed"),
+        ("-4.0", "low", "line.pst:10: 'low' where b has a number (parlbnd)"),
+        ("99.0 0.0", "99.0", "line.pst:17: 'og' where bad has a number (weight)"),
+        ("* model command line", "* command", "line.pst:19: no section of a control file is called 'command'"),
+        ("* model command line", "* svd assist", "line.pst: no section '* model command line'"),
+        ("line.ins line.out", "", "line.pst: no instruction file"),
+        ("line.tpl", "none.tpl", "none.tpl: No such file or directory"),
+    ],
+)
+def test_what_cannot_be_read_is_told_with_its_line(control, old, new, words):
+    control.write_text(CONTROL.replace(old, new))
+    with pytest.raises(en4dvar.ConfigError) as caught:
+        from_pest(control)
+    assert str(caught.value).endswith(words)

@@ -1,0 +1,127 @@
+"""Every kind of run in the registry: it writes what it declares and nothing else, and never replaces a foreign file."""
+
+from __future__ import annotations
+
+import re
+from fnmatch import fnmatch
+from pathlib import Path
+
+import drift_series
+import pytest
+import yaml
+from click.testing import CliRunner, Result
+from rows import row
+from run_files import make_campaign
+from test_twin_sweep import CONFIG as RING
+
+from en4dvar.cli import main
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.report import TABLES
+from en4dvar.runs.kinds import KINDS, kind_in, kind_named
+from en4dvar.runs.replacement import LISTING
+from en4dvar.runs.rundir import OF_EVERY_RUN, RunDirectory
+from en4dvar.runs.session import IDENTITY
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+WORKED = {  # as `en4dvar` is called, in a folder with the files of `prepared`
+    "estimate": ("run", "campaign/toy.yaml"),
+    "sequence": ("run", "series/drift.yaml", "--set", "output.figures=true"),
+    "twin": ("run", "ring.yaml"),
+    "design": ("design", CONFIGS / "linear_design.yaml"),
+    "sweep-twin": (
+        "sweep-twin", "ring.yaml", "--vary", "assimilation.members=[8, 9]", "--seeds", "1", "--workers", "1",
+    ),
+    "joint": ("joint", "done", "--share", "k"),
+    "population": ("population", "done", "--of", "k"),
+}  # fmt: skip
+IN_PLACE = ("joint", "population")  # replace an earlier result without --force
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Configurations, and a finished campaign of three data sets."""
+    folder = tmp_path_factory.mktemp("kinds")
+    (folder / "campaign").mkdir()
+    make_campaign(folder / "campaign", 3)
+    (folder / "series").mkdir()
+    drift_series.write(folder / "series")
+    (folder / "ring.yaml").write_text(yaml.safe_dump(RING))
+    done = call(folder, "run", "campaign/toy.yaml", "--out", "done", "--no-report")
+    assert done.exit_code == 0, done.output
+    return folder
+
+
+def call(folder: Path, *words: object) -> Result:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        return CliRunner().invoke(main, [str(word) for word in words])
+
+
+def declared(name: str) -> tuple[str, ...]:
+    kind = kind_named(name)
+    return (*([] if name in IN_PLACE else OF_EVERY_RUN), *kind.files, *kind.pages)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_every_kind_is_tried() -> None:
+    assert WORKED.keys() == KINDS.keys()
+
+
+@pytest.mark.parametrize("name", WORKED)
+def test_what_is_written_is_declared(prepared: Path, tmp_path: Path, name: str) -> None:
+    out = tmp_path / "out"
+    done = call(prepared, *WORKED[name], "--out", out)
+    assert done.exit_code == 0, done.output
+    written = set(contents(out)) - {LISTING}
+    assert {file for file in written if not any(fnmatch(file, known) for known in (*declared(name), IDENTITY))} == set()
+    assert set((out / LISTING).read_text().splitlines()) == written
+    assert kind_in(out) is kind_named(name)
+    if kind_named(name).pages:
+        page = call(prepared, "report", out)
+        assert page.exit_code == 0, page.output
+    if name in ("twin", "joint"):  # the directory is the same for all
+        again = call(prepared, *WORKED[name], "--out", out, *([] if name in IN_PLACE else ["--force"]))
+        assert again.exit_code == 0, again.output
+        assert set(contents(out)) - {LISTING} == written
+
+
+@pytest.mark.fault("own-files")
+@pytest.mark.parametrize("name", WORKED)
+def test_a_foreign_file_is_never_replaced(prepared: Path, tmp_path: Path, name: str) -> None:
+    """By no kind, under no name that it declares; of these two are tried as a user would."""
+    kind = kind_named(name)
+    for number, pattern in enumerate(declared(name)):
+        out = tmp_path / str(number)
+        mine = out / pattern.replace("*", "mine")
+        mine.parent.mkdir(parents=True)
+        mine.write_text("mine\n")
+        told = row("own-files").message.format(run=out, file=mine.relative_to(out).as_posix())
+        with (
+            pytest.raises(OutputError, match=re.escape(told)),
+            RunDirectory.open(out, "beside" if name in IN_PLACE else "force", (*kind.files, *kind.pages)),
+        ):
+            pass
+        if pattern in (kind.result, (*kind.files, *kind.pages)[-1]):
+            words = (*WORKED[name], "--out", out, *([] if name in IN_PLACE else ["--force"]))
+            refused = call(prepared, *words)
+            assert (str(refused.exit_code), told in refused.stderr) == (row("own-files").exit_code, True), (
+                refused.output
+            )
+        assert contents(out) == {mine.relative_to(out).as_posix(): b"mine\n"}
+
+
+def test_a_page_replaces_no_foreign_file(prepared: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert call(prepared, "run", "campaign/toy.yaml", "--out", out, "--no-report").exit_code == 0
+    (out / "report.html").write_text("mine")
+    told = call(prepared, "report", out)
+    assert told.exit_code == 2
+    assert "report.html was not written by a run" in told.stderr
+    assert (out / "report.html").read_text() == "mine"
+
+
+def test_the_tables_of_a_report_are_declared() -> None:
+    assert set(TABLES) <= set(kind_named("estimate").pages)

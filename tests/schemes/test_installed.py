@@ -1,0 +1,71 @@
+"""A scheme of another package: used by its name, with its keys; one that cannot be loaded is told."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+QUICK_START = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
+SCHEME = """
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+from annotated_types import Ge
+from en4dvar.schemes import ESMDA
+
+@dataclass(frozen=True)
+class Patient(ESMDA):
+    words: ClassVar[str] = "ES-MDA, and patient"
+    patience: Annotated[int, Ge(0), "How long it waits."] = 3
+"""
+
+
+@pytest.fixture
+def package(tmp_path):
+    """The environment of a process that finds the package ``patient`` installed."""
+    (tmp_path / "patient.py").write_text(SCHEME)
+    about = tmp_path / "patient-1.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: patient\nVersion: 1\n")
+    entries = "patient = patient:Patient\netkf = patient:Patient\nlost = nowhere:Lost\nnumber = math:pi\n"
+    (about / "entry_points.txt").write_text(f"[en4dvar.schemes]\n{entries}")
+    config = yaml.safe_load(QUICK_START.read_text(encoding="utf-8"))
+    config["data"]["path"] = str(QUICK_START.parent / config["data"]["path"])
+    config["output"] = {"report": False}
+    config["assimilation"] = {"scheme": "patient", "patience": 4}
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump(config))
+    return {**os.environ, "PYTHONPATH": str(tmp_path)}
+
+
+def called(*words, environment, folder):
+    return subprocess.run(
+        [sys.executable, *words], cwd=folder, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
+    )
+
+
+def test_it_runs_by_its_name_and_its_keys_are_checked(package, tmp_path):
+    done = called("-m", "en4dvar.cli", "run", "own.yaml", environment=package, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    resolved = yaml.safe_load((tmp_path / "runs" / "quickstart" / "config.resolved.yaml").read_text())
+    assert resolved["assimilation"]["scheme"] == "patient"
+    assert resolved["assimilation"]["patience"] == 4
+    text = (tmp_path / "own.yaml").read_text()
+    (tmp_path / "own.yaml").write_text(text.replace("patience: 4", "patience: -1"))
+    refused = called("-m", "en4dvar.cli", "validate", "own.yaml", environment=package, folder=tmp_path)
+    assert refused.returncode == 2
+    assert "assimilation.patience" in refused.stderr
+    (tmp_path / "own.yaml").write_text(text.replace("scheme: patient", "scheme: etkf"))
+    refused = called("-m", "en4dvar.cli", "validate", "own.yaml", environment=package, folder=tmp_path)
+    assert "scheme etkf does not read it; it is a key of patient" in refused.stderr  # not replaced
+
+
+def test_one_that_cannot_be_loaded_is_told_and_left_out(package, tmp_path):
+    done = called("-m", "en4dvar.cli", "validate", "own.yaml", environment=package, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "scheme 'lost' (nowhere:Lost) cannot be loaded: ModuleNotFoundError" in done.stderr
+    assert "scheme 'number' (math:pi) cannot be loaded: TypeError: it is not a subclass" in done.stderr
