@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.stats import binomtest
@@ -14,7 +15,7 @@ from scipy.stats import binomtest
 from en4dvar.diagnosis.ranks import BAND, Uniform, uniform_ranks
 from en4dvar.plumbing.files import read_text, write_text
 from en4dvar.plumbing.tables import table
-from en4dvar.report.chart import POINTS, Chart, Panel, in_columns
+from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.drawing import draw
 from en4dvar.report.html import render
 from en4dvar.report.text import figure_text
@@ -166,10 +167,10 @@ def curves(calibration: Calibration) -> Chart:
         panel.rule(0.0)
         panel.line(x, uniform.distribution(calibration.column("rank", j)) - x, "centre" if verdict.off else "posterior")
         panels.append(panel)
-    return in_columns(panels, 4.4 * POINTS)
+    return in_columns(panels, 4.4 * POINTS, 3, PAGE)
 
 
-def write_calibration(folder: Path, about: Mapping[str, Any] | None = None) -> Path:
+def write_calibration(folder: Path) -> Path:
     """Write ``calibration.html`` from ``calibration.csv``. Raises :class:`OutputError`."""
     calibration = load_calibration(folder)
     figures: Sequence[tuple[str, str, Chart]] = [("ranks", CURVES, curves(calibration))] if calibration.verdicts else []
@@ -189,7 +190,8 @@ def write_calibration(folder: Path, about: Mapping[str, Any] | None = None) -> P
 def load_calibration(folder: Path) -> Calibration:
     """What ``calibration.csv`` of a folder says. Raises :class:`OutputError`."""
     quantities, sets = read_sets(folder / "calibration.csv")
-    return Calibration(folder.resolve().name, quantities, sets, folder)
+    named = re.search(r"^name: *(.+)$", _configuration(folder), re.MULTILINE)
+    return Calibration(named[1] if named else folder.resolve().name, quantities, sets, folder)
 
 
 def _configuration(folder: Path) -> str:

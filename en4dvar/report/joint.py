@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from en4dvar.diagnosis.intervals import METHOD, member_quantiles
 from en4dvar.plumbing.caution import untrusted
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import csv_text, table
@@ -60,7 +61,7 @@ def _estimate(joint: StoredJoint, name: str, values: xr.DataArray, dataset: str)
     about = values.attrs
     unit, shown = str(about["units"]), str(about["display_units"])
     members = convert(values.values.ravel(), unit, shown)
-    q05, q50, q95 = map(float, np.quantile(members, QUANTILES))
+    q05, q50, q95 = map(float, member_quantiles(members, QUANTILES))
     mean, std = float(members.mean()), float(members.std(ddof=1))
     doubted = untrusted(joint.cautions, name)
     label, symbol = str(about["long_name"]), str(about["symbol"])
@@ -92,7 +93,7 @@ def forest(groups: StoredGroups, datasets: Sequence[str], common: Mapping[str, x
     for name, draws in common.items():
         about = draws.attrs
         units = str(about["units"]), str(about["display_units"])
-        low, middle, high = convert(np.quantile(draws.values, QUANTILES), *units)
+        low, middle, high = convert(member_quantiles(draws.values, QUANTILES), *units)
         panel = Panel(with_unit(str(about["symbol"]), units[1]), ylim=(-float(count), 1.0))
         panel.yticks, panel.y_names = (range(0, -count, -1), [figure_text(d) for d in datasets]) if named else ((), ())
         if not untrusted(groups.cautions, name):
@@ -103,7 +104,9 @@ def forest(groups: StoredGroups, datasets: Sequence[str], common: Mapping[str, x
         panel.intervals(rows[has, 0], rows[has, 2], -has, "prior")
         panel.dots(rows[has, 1], -has, "prior", 3.0)
         if "dataset" in posterior.get(name, draws).dims:
-            low, middle, high = convert(posterior[name].quantile(QUANTILES, ("chain", "draw")).values, *units)
+            low, middle, high = convert(
+                posterior[name].quantile(QUANTILES, ("chain", "draw"), method=METHOD).values, *units
+            )
             panel.intervals(low[has], high[has], -has - 0.3, "posterior")
             panel.dots(middle[has], -has - 0.3, "posterior", 2.0)
         panel.x_logarithmic = bool(np.all(rows[has] > 0) and rows[has].max() > 20 * rows[has].min())

@@ -20,6 +20,7 @@ import yaml
 
 from en4dvar.assembly.build import build_one, data_files, inverse_plan
 from en4dvar.config import Config, load_config
+from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.ensemble.forecast import Composite
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.executor import Executor
@@ -139,7 +140,7 @@ class CalibrationKind(RunKind[Calibration]):
         write_sets(run.directory.at(self.result), self._quantities(), told)
         if self.config.report:
             self.page(run.directory.work)
-        return replace(load_calibration(run.directory.work), name=self.config.name, directory=self.directory)
+        return replace(load_calibration(run.directory.work), directory=self.directory)
 
     @classmethod
     def page(cls, folder: Path, datasets: Any = (), workers: int = 1, figures: bool = False) -> Path:
@@ -216,5 +217,5 @@ def _compared(
         z = (at - draws.mean(axis=0)) / draws.std(axis=0, ddof=1)
         rank = np.where(np.isfinite(at), np.sum(draws < at, axis=0), np.nan)
     serious = tuple(dict.fromkeys(c.code for c in analysis.cautions if c.severity == "serious"))
-    quantiles = np.quantile(shown[:-1], LEVELS, axis=0)
+    quantiles = member_quantiles(shown[:-1], LEVELS, axis=0)
     return Judged(number, name, shown[-1], quantiles, z, rank, len(members), serious)

@@ -1,4 +1,4 @@
-"""``en4dvar calibrate``: right configurations pass, wrong errors are seen, and what is kept goes on to the same bits."""
+"""``en4dvar calibrate``: right configurations pass, wrong errors are seen, what is kept goes on to the same bits."""
 
 from __future__ import annotations
 
