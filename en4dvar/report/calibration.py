@@ -57,13 +57,12 @@ class Verdict:
         """What is wrong, in a sentence; "" where nothing is seen."""
         if not self.off:
             return ""
-        values, what = ("the values", "intervals") if self.quantity != FIT else ("sums of squares", "their spread")
-        too = [f"{values} are too {'low' if self.mean > 0 else 'high'}"] if abs(self.mean) > APART else []
-        too += [f"{what} too {'narrow' if self.std > 1 else 'wide'}"] if abs(self.std - 1) > WIDTH else []
-        off = " and ".join(too) or "the shape of the posterior is off"
         if self.quantity == FIT:
-            return f"the fit of the readings: {off}; the errors in data.error are not those of the readings"
-        return f"{self.quantity}: {off}"
+            size = "larger" if self.mean > 0 else "smaller"
+            return f"the errors of the readings are {size} than data.error says (ranks of the fit)"
+        too = [f"values are too {'low' if self.mean > 0 else 'high'}"] if abs(self.mean) > APART else []
+        too += [f"intervals are too {'narrow' if self.std > 1 else 'wide'}"] if abs(self.std - 1) > WIDTH else []
+        return f"{self.quantity}: {' and '.join(too) or 'the shape of the posterior is off'}"
 
 
 @dataclass(frozen=True)

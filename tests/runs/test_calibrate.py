@@ -40,15 +40,15 @@ def test_a_right_configuration_passes(toy, tmp_path):
     assert result.summary().shape[0] == 3
 
 
-@pytest.mark.parametrize(("std", "words"), [("2.6 um", "too narrow"), ("1.4 um", "too wide")])
-def test_errors_of_a_wrong_size_are_seen(toy, tmp_path, std, words):
+@pytest.mark.parametrize(("std", "size"), [("2.6 um", "larger"), ("1.4 um", "smaller")])
+def test_errors_of_a_wrong_size_are_seen(toy, tmp_path, std, size):
     result = sixty(toy, tmp_path / "out", sets=100, made_with={"data.error.position_std": std})
     fit = next(verdict for verdict in result.verdicts if verdict.quantity == FIT)
     assert fit.off
-    assert any("the errors in data.error are not those of the readings" in remark for remark in result.remarks)
+    assert f"the errors of the readings are {size} than data.error says (ranks of the fit)" in result.remarks
     others = [verdict for verdict in result.verdicts if verdict.quantity != FIT]
     wide = np.mean([verdict.std for verdict in others])
-    assert wide > 1.1 if words == "too narrow" else wide < 0.9
+    assert wide > 1.1 if size == "larger" else wide < 0.9
 
 
 def test_a_value_that_is_wrong_is_seen(toy, tmp_path):
