@@ -35,8 +35,8 @@ def doubts(
     elif agreed.chance < DIFFER:
         by = f" by {agreed.scatter:.1f} times what their errors explain" if agreed.degrees else ""
         words = (
-            f"the data sets differ{by} (probability {_chance(agreed.chance)} if they share one value): the interval of one "
-            "shared value is too narrow"
+            f"the data sets differ{by} (probability {_chance(agreed.chance)} if they share one value): the "
+            "interval of one shared value is too narrow"
         )
         yield caution("data-sets-differ", words)
     yield from _misfits(joint, chi2, kept)
