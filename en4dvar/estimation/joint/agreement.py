@@ -100,8 +100,8 @@ def _squares(said: Sequence[Said], rest: Collection[int]) -> tuple[Array, Array]
         others, at = [said[i] for i in rest if i != e], own.compared
         if not (len(at) and others):
             continue
-        precision = np.eye(len(own.pull)) + sum(one.precision for one in others)
-        pull = sum((one.pull for one in others), start=np.zeros(len(own.pull)))
+        precision = np.eye(len(own.pull)) + sum(other.precision for other in others)
+        pull = sum((other.pull for other in others), start=np.zeros(len(own.pull)))
         without, with_it = np.linalg.inv(precision), np.linalg.inv(precision + own.precision)
         change = (without @ pull - with_it @ (pull + own.pull))[at]
         inverse = np.linalg.inv(np.linalg.cholesky(without[np.ix_(at, at)]))
