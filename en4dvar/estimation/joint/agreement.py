@@ -35,7 +35,7 @@ OF_MEDIAN = 0.4  # efficiency of a median of squares, as a share of their degree
 
 
 @dataclass(frozen=True)
-class Said:
+class Statement:
     """What one experiment says of what is shared: ``precision`` Λ (c, c) and ``pull`` h (c,), in units of the prior;
     ``compared``: which of the shared quantities others have too.
     """
@@ -93,7 +93,7 @@ def is_odd(joint: JointProblem, singles: Sequence[Single], e: int, square: float
     return bool(_chance(square, freedom, *scatter) * len(said) < ODD)
 
 
-def _squares(said: Sequence[Said], rest: Collection[int]) -> tuple[Array, Array]:
+def _squares(said: Sequence[Statement], rest: Collection[int]) -> tuple[Array, Array]:
     """z² of each experiment against those of ``rest`` but itself, and along how many directions; NaN along none."""
     squares, freedom = np.full(len(said), np.nan), np.zeros(len(said))
     for e, own in enumerate(said):
@@ -112,7 +112,7 @@ def _squares(said: Sequence[Said], rest: Collection[int]) -> tuple[Array, Array]
     return squares, freedom
 
 
-def _scatter(said: Sequence[Said], rest: Collection[int]) -> tuple[float, float]:
+def _scatter(said: Sequence[Statement], rest: Collection[int]) -> tuple[float, float]:
     """The variance of experiments among themselves over that of their errors, by the median, and how many degrees of
     freedom it has; 1 and 0 where the errors explain it.
     """
@@ -135,7 +135,7 @@ def _chance(square: float, freedom: float, scatter: float, degrees: float) -> fl
     return float(fdtrc(freedom, degrees, square / (freedom * scatter)))
 
 
-def _alone(joint: JointProblem, e: int, single: Single) -> Said:
+def _alone(joint: JointProblem, e: int, single: Single) -> Statement:
     """By its estimate alone, whose prior of what is shared is divided out."""
     (shared, own), at, c = joint.columns(e), joint.of_border(e), len(joint.shared)
     schur = single.precision[np.ix_(shared, shared)]
@@ -148,4 +148,4 @@ def _alone(joint: JointProblem, e: int, single: Single) -> Said:
     precision[np.ix_(at, at)] = (vectors * np.maximum(values, 0.0)) @ vectors.T
     pull[at] = (vectors * np.where(values > 0, values + 1, 0.0)) @ vectors.T @ single.mode[shared]
     others = [j for j in at if sum(j in joint.of_border(i) for i in range(len(joint.experiments))) > 1]
-    return Said(precision, pull, np.array(others, dtype=int))
+    return Statement(precision, pull, np.array(others, dtype=int))
