@@ -80,7 +80,7 @@ def trust(result: StoredResult) -> str:
     stats, worst = result.group("sample_stats").attrs, worst_first(result.cautions)
     if worst and worst[0].severity != "note":
         return ""
-    size, _ = judge_chi2(*(float(stats[key]) for key in ("chi2_per_observation", "n_weighted", "dfs")))
+    size, _ = judge_chi2(float(stats["chi2_per_observation"]), int(stats["n_weighted"]), float(stats["dfs"]))
     words = f"No warnings: the {size.partition(';')[0]}{_neighbours_words(result)}."
     if moved := len(exceeding(stored_shifts(result))):
         which = "one assumption matters" if moved == 1 else f"{moved} assumptions matter"
