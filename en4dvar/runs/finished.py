@@ -15,7 +15,8 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, Severity, caution
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.problem import InverseProblem
-from en4dvar.results.store import StoredResult, load_stored, result_files
+from en4dvar.results.run_results import result_files
+from en4dvar.results.store import StoredResult, load_stored
 from en4dvar.runs.trust import Ask, of_strangers
 
 CARRIED = ("implausible-data", "misfit", "residual-structure", "model-validity")
