@@ -141,7 +141,7 @@ def remarks(a: Analysis) -> tuple[str, ...]:
 def _moved(parameters: Iterable[Parameter], shift: Shift) -> str:
     """The parameters beyond their error bar under an alternative."""
     if shift.reason:
-        return f"only another fit tells ({shift.reason})"
+        return f"a fit with it tells ({shift.reason})"
     words = []
     for p, change, relative, in_std in zip(parameters, shift.change, shift.relative, shift.in_std, strict=True):
         if abs(in_std) > 1:

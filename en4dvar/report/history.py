@@ -97,9 +97,9 @@ def _data(panel: Panel, result: StoredResult, series: SeriesShown) -> None:
     for band in BANDS:
         (_along if curve else _bars)(panel, result, series, band)
     if curve:
-        panel.line(series.x, series.centre, "centre", 0.9, label="centre")
+        panel.line(series.x, series.centre, "centre", 0.9, label="best fit")
     else:
-        panel.dots(series.x, series.centre, "centre", 5.0, label="centre", kind="dashes")
+        panel.dots(series.x, series.centre, "centre", 5.0, label="best fit", kind="dashes")
     if len(series.x) > MANY:  # one outline instead of a bar for each
         panel.band(series.x, series.data - series.std, series.data + series.std, "ink", 0.3, "data ± std")
     else:

@@ -294,7 +294,7 @@ def test_overview_of_many_data_sets_stays_small(analysis):
     sets[7_777] = replace(sets[7_777], cautions=one.cautions)
     html = render_overview(sets, {}, {}, draw(overview_figures(sets)))
     assert len(html.encode()) < 3e6
-    assert html.count("<tr>") == LISTED + 1
+    assert html.count("<tr>") == LISTED + 1 + 4  # the heading, and the numbers of four parameters
     assert '<th scope="row">set 7777</th>' in html
     assert "Of 20000 data sets the 2000 with the gravest warnings are listed" in html
 
