@@ -173,7 +173,7 @@ def settings_of(case: Case, size: int, n: int) -> SequentialSettings:
             "EnKF-N": AsDapper() if case.variant == "DAPPER's" else EnKFN(),
             "ETKF": ETKF(),
             "EnKF": EnKF(),
-            "particles": BootstrapFilter(),
+            "particles": BootstrapFilter(jitter=case.members ** (-1 / (n + 4))),  # the bandwidth of DAPPER
         }
         scheme = filters[case.scheme]
     local, error, moves = None, None, np.arange(size) < n
