@@ -9,6 +9,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from diagnosis.provoked import PROVOKED, TWO, Signless, bent, chain_not_converged, linear, replace_std, run
+from diagnosis.test_triggers import OF_SEVERAL
 from toys import Vectorised, make_observations, make_problem, with_discrepancy, with_noise
 
 from en4dvar.diagnosis.analysis import Analysis
@@ -211,5 +212,5 @@ def test_what_is_set_already_is_not_advised():
 
 
 def test_every_code_of_the_catalogue_is_followed_somewhere():
-    elsewhere = {"chain-not-converged", "odd-data-set"}  # above; of a population, where nothing but a word is asked for
+    elsewhere = {"chain-not-converged", *OF_SEVERAL}  # above; and those of many data sets
     assert set(CATALOGUE) == {*PROVOKED, *elsewhere}
