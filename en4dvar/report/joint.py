@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from en4dvar.diagnosis.intervals import METHOD, member_quantiles
 from en4dvar.plumbing.caution import Caution, untrusted
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import csv_text, table
@@ -68,7 +69,7 @@ def _estimate(
     about = values.attrs
     unit, shown = str(about["units"]), str(about["display_units"])
     members = convert(values.values.ravel(), unit, shown)
-    q05, q50, q95 = map(float, np.quantile(members, QUANTILES))
+    q05, q50, q95 = map(float, member_quantiles(members, QUANTILES))
     mean, std = float(members.mean()), float(members.std(ddof=1))
     label, symbol = str(about["long_name"]), str(about["symbol"])
     return JointRow(name, label, symbol, dataset, mean, std, q05, q50, q95, shown, untrusted(cautions, name), without)
@@ -124,7 +125,7 @@ def forest(
     for name, draws in common.items():
         about = draws.attrs
         units = str(about["units"]), str(about["display_units"])
-        low, middle, high = convert(np.quantile(draws.values, QUANTILES), *units)
+        low, middle, high = convert(member_quantiles(draws.values, QUANTILES), *units)
         panel = Panel(with_unit(str(about["symbol"]), units[1]), ylim=(-float(count), 1.0))
         panel.yticks, panel.y_names = (range(0, -count, -1), [figure_text(d) for d in datasets]) if named else ((), ())
         if not untrusted(groups.cautions, name):
@@ -138,7 +139,9 @@ def forest(
         panel.intervals(rows[has, 0], rows[has, 2], -has, "prior")
         panel.dots(rows[has, 1], -has, "prior", 3.0)
         if "dataset" in posterior.get(name, draws).dims:
-            low, middle, high = convert(posterior[name].quantile(QUANTILES, ("chain", "draw")).values, *units)
+            low, middle, high = convert(
+                posterior[name].quantile(QUANTILES, ("chain", "draw"), method=METHOD).values, *units
+            )
             panel.intervals(low[has], high[has], -has - 0.3, "posterior")
             panel.dots(middle[has], -has - 0.3, "posterior", 2.0)
         panel.x_logarithmic = bool(np.all(rows[has] > 0) and rows[has].max() > 20 * rows[has].min())

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.estimation.joint.estimate import JointEstimate
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, worst_first
@@ -128,7 +129,7 @@ def _alone(estimate: JointEstimate, alone: Sequence[Alone]) -> dict[str, Variabl
         for e, single in enumerate(alone):
             if estimate.joint.groups[e].get(key[0]) == key[1]:
                 values = single.members[:, single.names.index(key[0])]
-                rows[e] = np.quantile(values[np.isfinite(values)], QUANTILES)
+                rows[e] = member_quantiles(values, QUANTILES)
         unit = estimate.joint.terms[j].parameter.unit
         result[shared_name(key)] = variable(("dataset", "quantile"), rows, unit, "5, 50 and 95 % of a data set alone")
     return result
@@ -148,7 +149,7 @@ def _fit(estimate: JointEstimate) -> dict[str, Variable]:
         values[e, :k] = convert(experiment.observations.values, *to_value)
         bands[e, : len(grid), 0] = convert(grid, *to_time)
         alive = run.path[:-1][run.active[:-1]]
-        bands[e, : len(grid), 1:] = convert(np.quantile(alive, QUANTILES, axis=0).T, *to_value)
+        bands[e, : len(grid), 1:] = convert(member_quantiles(alive, QUANTILES, axis=0).T, *to_value)
     labels = np.array([experiment.observable.label for experiment in experiments], dtype=object)
     units = np.array([experiment.observable.display_unit for experiment in experiments], dtype=object)
     time_units = np.array([experiment.model.time_display_unit for experiment in experiments], dtype=object)
