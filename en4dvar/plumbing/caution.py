@@ -69,7 +69,8 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
     ),
     "discrepancy-found": (
         "caution",
-        "look at the what-if table, and compare with other models, before quoting a value",
+        "before quoting a value look at the what-if table and compare other models (en4dvar compare); only a model "
+        "that has what is missing removes this",
     ),
     "not-bayesian": (
         "caution",
@@ -78,7 +79,10 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
     ),
     "overstated-error": ("caution", "state the observation error as it is (or estimate sigma); intervals are too wide"),
     "not-informed": ("note", "do not quote it as measured: fix it, or add data that depend on it"),
-    "down-weighted": ("note", "look at these observations; they count less than the others"),
+    "down-weighted": (
+        "note",
+        "no action is needed: these readings count less than the others; look at them before quoting a value",
+    ),
     "one-descent": (
         "note",
         "set assimilation.starts: 2 or more, with linearisation: bundle and more members than parameters; or compare "
