@@ -256,6 +256,7 @@ def _refined(background: Background, samples: Sequence[Frame]) -> Background:
         places = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
         if not places or share_changed(tiles, background.noise) > CHANGED:
             continue
+        image = background.steadied(image, tiles, places[0][0])
         quiet = np.abs(image) < 5 * background.noise
         for circle, _ in places:
             quiet &= (x - circle.x) ** 2 + (y - circle.y) ** 2 > (1.3 * circle.R + 10) ** 2
