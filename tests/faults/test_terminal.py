@@ -17,7 +17,7 @@ from rows import row
 from run_files import assert_same_results, command, configuration, environment, make_campaign, run_cli
 
 from en4dvar.results.run_results import result_files
-from en4dvar.runs.interrupt import terminate_as_interrupt
+from en4dvar.runs.interrupt import heeded, terminate_as_interrupt
 from en4dvar.runs.runner import run_campaign
 
 CTRL_C = b"\x03"
@@ -186,6 +186,34 @@ def test_nohup_stays_in_force():
         assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+class Ends:
+    """Its end is where a signal arrives."""
+
+    def __init__(self, number):
+        self.number = number
+
+    def __del__(self):
+        os.kill(os.getpid(), self.number)
+
+
+def _end_and_wait(number):
+    Ends(number)
+    for _ in range(500):
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.fault("interrupt")
+def test_a_stop_where_nothing_can_be_raised_is_raised_behind_it(number):
+    """Python tells of an exception at the end of an object, and of one in some compiled code, and goes on."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with heeded(print), terminate_as_interrupt(), pytest.raises(KeyboardInterrupt):
+            _end_and_wait(number)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("kind", ["processes", "dask"])
