@@ -4,7 +4,7 @@ Every attack is a command in a process of its own, given files that were damaged
 no checksum tells), or stopped at a random moment. It holds where the command ends within its time with an exit code of
 ours and words, without a traceback; where no data set that a run has kept vanishes without a word; where a stop is
 heeded within two seconds, nothing that the command has started is left, and --resume ends in the same bits. Whatever
-does not hold is printed once for each place it comes from, and its files are kept below ``runs/siege``.
+does not hold is printed with the place it comes from, and its files are kept below ``runs/siege``.
 """
 
 from __future__ import annotations
@@ -338,16 +338,17 @@ def main() -> int:
         siege.base.mkdir()
         siege.prepare()
         print(f"commit {git_commit(Path(__file__))}, seed {asked.seed}, from {asked.first}, {cpu_model()}", flush=True)
-        begin, number = time.monotonic(), asked.first
+        begin, number, latest = time.monotonic(), asked.first, 0.0
         while time.monotonic() - begin < asked.seconds:
             for kind in kinds:
                 outcome, fault = besiege(siege, kind, asked.seed, number)
                 counts[kind][outcome] += 1
-                if fault and not places[place := place_of(fault)]:
-                    print(f"{kind} {number}: {place}", flush=True)
                 if fault:
-                    places[place_of(fault)] += 1
+                    place, latest = place_of(fault), time.monotonic() - begin
+                    places[place] += 1
+                    print(f"{latest:.0f} s: {kind} {number}: {place}", flush=True)
             number += 1
+        print(f"{time.monotonic() - begin - latest:.0f} s since the last finding, or the beginning")
         siege.children.close()
     print("| attacks | tried | done | refused | stopped or killed | findings |\n|---|---|---|---|---|---|")
     for kind, count in (*counts.items(), ("in all", sum(counts.values(), Counter()))):
