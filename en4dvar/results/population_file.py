@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.estimation.population.campaign import CampaignPopulation, Combination, Draws
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, worst_first
@@ -123,7 +124,7 @@ def _alone(population: CampaignPopulation, alone: Sequence[Array]) -> dict[str, 
     for term in population.terms:
         p = term.parameter
         rows = [
-            np.quantile(members[:, problem.prior.names.index(p.name)], QUANTILES)
+            member_quantiles(members[:, problem.prior.names.index(p.name)], QUANTILES)
             for problem, members in zip(population.problems, alone, strict=True)
         ]
         result[p.name] = variable(("dataset", "quantile"), np.array(rows), p.unit, "5, 50 and 95 % of a data set alone")

@@ -87,7 +87,7 @@ class PopulationKind(TogetherKind):
             raise TooFewMembersError(f"no population: {error}") from None
         tell(f"{population.estimate.forward_runs} forward runs, {population.estimate.size:.0f} effective draws")
         used = [s for s in sets if s.name not in population.left_out]
-        cautions = (*_cautions(population), *carried(used, "caution"))
+        cautions = (*_cautions(population), *carried(used))
         save_population(path, population, [s.members for s in used], cautions, {**attributes, "seed": config.seed})
 
     @classmethod
