@@ -185,8 +185,10 @@ def _do(task: Task) -> Outcome:
     ended.set()  # before its number can be that of another
     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
     seconds = time.monotonic() - began
-    told, _, operations = told.rstrip("\n").rpartition("\n") if code >= 0 else (told, "", "0")
-    return Outcome(code, told, int(operations), seconds)
+    lines, _, operations = told.rstrip("\n").rpartition("\n")
+    if code < 0 or not operations.isdigit():  # ended where it stood
+        return Outcome(code, told, 0, seconds)
+    return Outcome(code, lines, int(operations), seconds)
 
 
 def _of_few(draw: Callable[..., Any]) -> Callable[..., Any]:
