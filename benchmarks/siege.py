@@ -144,7 +144,8 @@ def kept(siege: Siege, folder: Path, rng: np.random.Generator) -> Attack:
 def resumed(siege: Siege, folder: Path, rng: np.random.Generator) -> Attack:
     """The same, and ``--resume``: it mends, to the same bits, or says by name what it cannot."""
     run = siege.copy("campaign", folder / "campaign")
-    files = [p for p in sorted(run.rglob("*")) if p.is_file()]
+    tables = (".csv", ".log")  # which are for people, and are written anew by report
+    files = [p for p in sorted(run.rglob("*")) if p.is_file() and p.suffix not in tables]
     path = files[rng.integers(len(files))]
     path.write_bytes(damage.of_bytes(path.read_bytes(), rng))
     task = Task(["run", str(siege.base / "toy.yaml"), "--out", str(run), "--resume", "--no-report"])

@@ -135,7 +135,7 @@ class EstimateKind(RunKind[Campaign]):
             PopulationKind(asked.of, asked.hyper).within(work, executor)
         if work.good() and self.config.report:
             self.page(run.directory.work, workers=self.report_workers, figures=self.config.figures)
-        else:
+        elif not run.directory.at(SUMMARY).exists():  # it is there where there was nothing left to estimate
             work.summarise()
         return work.campaign()
 
