@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from types import TracebackType
 from typing import Any
 
 PATIENCE = 1.0  # s for the program to answer a signal by itself
@@ -81,7 +82,7 @@ def heeded(end: Callable[[str], object]) -> Iterator[None]:
         raise KeyboardInterrupt
 
     _answered.clear()
-    tell_ignored = sys.unraisablehook
+    tell_ignored, tell_error = sys.unraisablehook, sys.excepthook
 
     def once_more(ignored: sys.UnraisableHookArgs) -> None:
         if issubclass(ignored.exc_type, KeyboardInterrupt):
@@ -89,16 +90,20 @@ def heeded(end: Callable[[str], object]) -> Iterator[None]:
         else:
             tell_ignored(ignored)
 
+    def tell(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if not issubclass(kind, KeyboardInterrupt):  # compiled code that ignores it tells of it twice
+            tell_error(kind, error, trace)
+
     come, written = os.pipe()
     os.set_blocking(written, False)
     threading.Thread(target=_listen, args=(come, end), daemon=True).start()
     before = signal.set_wakeup_fd(written, warn_on_full_buffer=False)
     signal.signal(signal.SIGINT, interrupt)
-    sys.unraisablehook = once_more
+    sys.unraisablehook, sys.excepthook = once_more, tell
     try:
         yield
     finally:
-        sys.unraisablehook = tell_ignored
+        sys.unraisablehook, sys.excepthook = tell_ignored, tell_error
         signal.signal(signal.SIGINT, handler)
         signal.set_wakeup_fd(before)
         os.close(written)
