@@ -26,7 +26,7 @@ from cheap_model import write_campaign
 from en4dvar.results.pack import read_result
 from en4dvar.results.packed import unpacked
 from en4dvar.results.provenance import cpu_model, git_commit
-from en4dvar.results.store import result_files
+from en4dvar.results.run_results import result_files
 
 HERE = Path(__file__).resolve().parent
 ALLOWED = {0, 1}  # exit codes: 1 where data sets have failed, as they must

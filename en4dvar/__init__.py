@@ -49,11 +49,13 @@ if TYPE_CHECKING:
     from en4dvar.priors.prior import Prior as Prior
     from en4dvar.priors.prior import PriorTerm as PriorTerm
     from en4dvar.problem import InverseProblem as InverseProblem
+    from en4dvar.report.calibration import Calibration as Calibration
     from en4dvar.report.compare import Comparison as Comparison
     from en4dvar.report.compare import compare_runs as compare_runs
     from en4dvar.report.export import export_table as export_table
     from en4dvar.report.result import Result as Result
     from en4dvar.report.result import load_result as load_result
+    from en4dvar.runs.calibration_run import calibrate as calibrate
     from en4dvar.runs.campaign import Campaign as Campaign
     from en4dvar.runs.checks import validate as validate
     from en4dvar.runs.engine import write_report as write_report
@@ -78,6 +80,8 @@ if TYPE_CHECKING:
 _HOME = {
     "model.batch": ("Batch",),
     "runs.campaign": ("Campaign",),
+    "runs.calibration_run": ("calibrate",),
+    "report.calibration": ("Calibration",),
     "descent.preview": ("Preview", "preview"),
     "runs.checks": ("validate",),
     "report.compare": ("Comparison", "compare_runs"),

@@ -14,6 +14,7 @@ from typing import Any
 
 import click
 
+from en4dvar.commands.calibrate import calibrate
 from en4dvar.commands.common import Failed, give_up_output, printable, to_continue
 from en4dvar.commands.design import design
 from en4dvar.commands.joint import joint
@@ -137,8 +138,8 @@ def main() -> None:
 
 
 for command in (
-    compare, design, export, joint, models, population, report, rerun, run, schema, simulate, sweep_twin, validate,
-    warm_up,
+    calibrate, compare, design, export, joint, models, population, report, rerun, run, schema, simulate,
+    sweep_twin, validate, warm_up,
 ):  # fmt: skip
     main.add_command(command)
 

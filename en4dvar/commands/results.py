@@ -112,6 +112,7 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
       en4dvar export runs/quickstart --latex --out table.tex
     """
     from en4dvar.report.export import export_table, posterior_file
+    from en4dvar.results.run_results import LackingError
     from en4dvar.results.series_file import series_file
 
     cycles = series_file(run_dir)
@@ -127,7 +128,13 @@ def export(run_dir: Path, kind: Literal["csv", "latex", "members", "netcdf"], ou
 
         text = cycles_table(cycles, kind)
     else:
-        text = export_table(run_dir, kind)
+        try:
+            text = export_table(run_dir, kind)
+        except LackingError as error:
+            if isinstance(error.rest, str):
+                refuse_to_replace(out, force)
+                deliver(error.rest, out, "table")
+            raise
     refuse_to_replace(out, force)
     deliver(text, out, "table")
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import HARDLY_INFORMED, active_members, change_words
+from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.diagnosis.response.budget import budget_words
 from en4dvar.diagnosis.response.what_if import Shift
 from en4dvar.model.state import Array, Parameter
@@ -76,7 +77,7 @@ class ParameterSummary:
         """
         prior_mean, prior_std = _moments(prior)
         mean, std = _moments(posterior)
-        q05, q50, q95 = map(float, np.quantile(posterior, (0.05, 0.5, 0.95)) if posterior.size else (np.nan,) * 3)
+        q05, q50, q95 = map(float, member_quantiles(posterior, (0.05, 0.5, 0.95)) if posterior.size else (np.nan,) * 3)
         centre = convert(centre, p.unit, p.display_unit)
         words, doubted = informed_words(p.name, dfs, cautions), untrusted(cautions, p.name)
         modal = not doubted and of_several_modes(cautions, p.name)
@@ -140,7 +141,7 @@ def remarks(a: Analysis) -> tuple[str, ...]:
 def _moved(parameters: Iterable[Parameter], shift: Shift) -> str:
     """The parameters beyond their error bar under an alternative."""
     if shift.reason:
-        return f"only another fit tells ({shift.reason})"
+        return f"a fit with it tells ({shift.reason})"
     words = []
     for p, change, relative, in_std in zip(parameters, shift.change, shift.relative, shift.in_std, strict=True):
         if abs(in_std) > 1:

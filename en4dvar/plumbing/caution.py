@@ -22,6 +22,10 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
         "say what you know in the prior",
     ),
     "misfit": ("serious", "look at the residuals: model, window or stated observation error must change"),
+    "data-sets-differ": (
+        "serious",
+        "ask how much they vary and not for one value (en4dvar population), or state errors as large as they are",
+    ),
     "residual-structure": (
         "serious",
         "let the data tell what the model misses (data.error.discrepancy: estimated), choose another model, or a "
@@ -52,8 +56,12 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
     "at-bound": ("caution", "widen the bound if physics allows it; else quote a limit, not mean ± std"),
     "odd-data-set": (
         "caution",
-        "look at its data, scale and frame rate and at its residuals; say in every quotation that it was not of the "
-        "population",
+        "look at its data, scale and frame rate and at its residuals; say in every quotation that it is left out",
+    ),
+    "trend": (
+        "caution",
+        "look for a wrong scale, a wall, a drift or a term that the law lacks; what all data sets have alike no number "
+        "of them averages out",
     ),
     "odd-residuals": (
         "caution",
@@ -61,7 +69,8 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
     ),
     "discrepancy-found": (
         "caution",
-        "look at the what-if table, and compare with other models, before quoting a value",
+        "before quoting a value look at the what-if table and compare other models (en4dvar compare); only a model "
+        "that has what is missing removes this",
     ),
     "not-bayesian": (
         "caution",
@@ -70,7 +79,10 @@ CATALOGUE: dict[str, tuple[Severity, str]] = {
     ),
     "overstated-error": ("caution", "state the observation error as it is (or estimate sigma); intervals are too wide"),
     "not-informed": ("note", "do not quote it as measured: fix it, or add data that depend on it"),
-    "down-weighted": ("note", "look at these observations; they count less than the others"),
+    "down-weighted": (
+        "note",
+        "no action is needed: these readings count less than the others; look at them before quoting a value",
+    ),
     "one-descent": (
         "note",
         "set assimilation.starts: 2 or more, with linearisation: bundle and more members than parameters; or compare "
@@ -91,6 +103,10 @@ TRIGGERS = {
     ),
     "misfit": (
         "χ² is larger than the errors explain, except once in two thousand times; K − DFS is expected for K readings"
+    ),
+    "data-sets-differ": (
+        "the values that data sets give for what they share differ by more than their errors explain, except once in a "
+        "thousand times"
     ),
     "residual-structure": (
         "neighbouring residuals resemble each other, as they would once in a thousand times by chance; a caution "
@@ -122,7 +138,14 @@ TRIGGERS = {
         "at least a fifth of the posterior members lie within 5 % of the interval's width from a bound, and more than "
         "three times the prior's share"
     ),
-    "odd-data-set": ("a data set of a population belongs to it with a probability below 0.5, or could not be sampled"),
+    "odd-data-set": (
+        "a data set of a population belongs to it with a probability below 0.5, or could not be sampled; in a joint "
+        "estimate, where it is serious, one disagrees with all others as once in a hundred campaigns by chance"
+    ),
+    "trend": (
+        "values of single data sets rise or fall with their order, largest reading or frame rate, as once in a hundred "
+        "campaigns by chance"
+    ),
     "odd-residuals": (
         "residuals are larger where the observable changes fast, or one is an outlier; by chance this would happen "
         "once in a thousand times"

@@ -19,17 +19,19 @@ from en4dvar.plumbing.hints import suggest
 from en4dvar.plumbing.tables import write_csv
 from en4dvar.report.drawing import draw
 from en4dvar.report.figures import all_figures
-from en4dvar.report.overview import SetSummary, overview_figures, render_overview
+from en4dvar.report.overview import Headline, SetSummary, overview_figures, render_overview
 from en4dvar.report.page import IDENTIFIERS, render_set
 from en4dvar.report.responses import ENTRY_COLUMNS, SHIFT_COLUMNS, Lines, response_lines
 from en4dvar.report.varying import PIECE_COLUMNS, piece_lines
 from en4dvar.report.withheld import COLUMNS as WITHHELD_COLUMNS
 from en4dvar.report.withheld import withheld_lines
 from en4dvar.results.campaign_file import failed_datasets
-from en4dvar.results.joint_file import FILE
+from en4dvar.results.joint_file import FILE, load_joint
 from en4dvar.results.pack import PACK
 from en4dvar.results.population_file import FILE as POPULATION
-from en4dvar.results.store import StoredResult, load_stored, result_files
+from en4dvar.results.population_file import load_population
+from en4dvar.results.run_results import RunResults
+from en4dvar.results.store import StoredResult, load_stored
 
 PAGES = 40  # data sets of a campaign with a page from the start
 SHARE = 20  # pages that are worth the start of a process
@@ -51,27 +53,32 @@ def write_pages(run_dir: str | Path, datasets: Sequence[str] = (), workers: int 
 
     Raises
     ------
-    OutputError: there is nothing to read, a name is unknown, or the directory cannot be written.
+    OutputError: there is nothing to read, a name is unknown, or the directory cannot be written. LackingError: results
+        of data sets cannot be read; the page of the others, ``rest``, names them.
     """
     run_dir = Path(run_dir)
     if not run_dir.is_dir():
         raise OutputError(f"{run_dir}: no such run directory")
-    stored, whole = result_files(run_dir), run_dir / "posterior.nc"
-    if stored == [whole]:
+    stored = RunResults(run_dir)
+    whole = stored.whole
+    if stored.files == [whole]:
         result = load_stored(whole)
         write_csv(run_dir / "summary.csv", summary_rows([(result.name, result.rows, result.cautions)], {}))
         _write_tables(run_dir, [_lines(result)])
         figures = draw(all_figures(result), IDENTIFIERS, inside(run_dir, "figures") if files else None)
         return write_text(run_dir / "report.html", render_set(result, figures, copies=files))
     sets, lines = [], []
-    for path in stored:
-        result = load_stored(path)
+    for path, result in stored:
         sets.append(SetSummary.of(result, path.name))
         lines.append(_lines(result))
+    if not sets:
+        stored.require()
     _write_tables(run_dir, lines)
-    failures = failed_datasets(whole)
+    failures = failed_datasets(whole) | stored.lacking
     write_csv(run_dir / "summary.csv", summary_rows(((s.name, s.rows.values(), s.cautions) for s in sets), failures))
-    return _write_campaign(run_dir, sets, failures, _asked(run_dir, sets, datasets), workers, files)
+    page = _write_campaign(run_dir, sets, failures, _asked(run_dir, sets, datasets), workers, files)
+    stored.require(page)
+    return page
 
 
 def _lines(result: StoredResult) -> tuple[Lines, ...]:
@@ -118,10 +125,25 @@ def _write_campaign(
             elif isinstance(value, Exception):
                 raise value
     figures = draw(overview_figures(sets), folder=inside(run_dir, "figures") if files else None)
-    joint = JOINT_FILES[0] if (run_dir / FILE).exists() else ""
-    population = POPULATION_FILES[0] if (run_dir / POPULATION).exists() else ""
     pages = {s.stem: quote(f"pages/{s.stem}.html") for s in paged}
-    return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures, joint, population))
+    return write_text(run_dir / "report.html", render_overview(sets, pages, failures, figures, _headlines(run_dir)))
+
+
+def _headlines(run_dir: Path) -> list[Headline]:
+    """What the data sets say together, where the run estimated it."""
+    from en4dvar.report import joint, population  # with the estimates themselves, which other pages do not need
+
+    headlines = []
+    if (run_dir / POPULATION).exists():
+        of = load_population(run_dir / POPULATION)
+        words = "The population behind them"
+        lines = population.sentences(of)
+        headlines.append(Headline(POPULATION_FILES[0], words, lines, population.figure(of), population.caption(of)))
+    if (run_dir / FILE).exists():
+        shared = load_joint(run_dir / FILE)
+        lines = tuple(joint.joint_lines(shared))
+        headlines.append(Headline(JOINT_FILES[0], "All of them together", lines, joint.figure(shared), joint.CAPTION))
+    return headlines
 
 
 def _write_page(run_dir: Path, stem: str, copies: str | None, trail: Sequence[tuple[str, str]]) -> None:

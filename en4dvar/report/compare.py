@@ -23,7 +23,8 @@ from en4dvar.plumbing.caution import Caution, codes
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.tables import table
 from en4dvar.report.text import fixed
-from en4dvar.results.store import StoredResult, load_stored, result_files
+from en4dvar.results.run_results import result_files
+from en4dvar.results.store import StoredResult, load_stored
 
 MOST_WARNINGS = 12  # on the terminal
 MEANINGLESS = (

@@ -20,7 +20,8 @@ from en4dvar.plumbing.caution import Caution, codes
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.report.text import number_like, plain_number, untrusted_words
-from en4dvar.results.store import StoredResult, load_stored, require_settled, result_files
+from en4dvar.results.run_results import RunResults
+from en4dvar.results.store import StoredResult, require_settled
 
 _COMMANDS = (
     f"{GREEK}|mathrm|mathit|mathbf|mathsf|mathcal|rm|it|text|frac|sqrt|hat|bar|tilde|dot|ddot|vec|overline|infty|partial|"
@@ -55,17 +56,25 @@ def export_table(run_dir: str | Path, kind: Kind = "csv") -> str:
 
     Raises
     ------
-    OutputError: the directory holds no results.
+    OutputError: the directory holds no results. LackingError: it lacks some, which are named; ``rest`` is the table of
+        the others.
     """
-    files = result_files(Path(run_dir))
-    if files == [Path(run_dir) / "posterior.nc"]:
+    stored = RunResults(Path(run_dir))
+    if stored.files == [stored.whole]:
         posterior_file(run_dir)  # says what is missing
-    results = map(load_stored, files)  # one is in memory at a time
+    text = _table((result for _, result in stored), kind)  # one is in memory at a time
+    stored.require(text)
+    return text
+
+
+def _table(results: Iterable[StoredResult], kind: Kind) -> str:
     if kind == "members":
         return _members_csv(results)
+    rows = ((r.name, r.rows, r.cautions) for r in results)
     if kind == "latex":
-        return latex_table([(r.name, r.rows, r.cautions) for r in results])
-    return csv_text(summary_rows(((r.name, r.rows, r.cautions) for r in results), {}))
+        sets = list(rows)
+        return latex_table(sets) if sets else ""
+    return csv_text(summary_rows(rows, {}))
 
 
 def posterior_file(run_dir: str | Path) -> Path:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from en4dvar.model.state import Array
+from en4dvar.plumbing.units import convert
 from en4dvar.report import fields, readings, varying, withheld
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, Row, in_columns
 from en4dvar.report.drawing import Captioned
@@ -22,13 +23,17 @@ def histograms(result: StoredResult) -> Chart:
     """Posterior over prior, one panel a parameter scaled to its peak. Bar: 5–95 %, ticks: members, line: centre."""
     panels = []
     for row in result.rows:
-        prior, posterior = result.members("prior", row.name), result.members("posterior", row.name)
+        exact, posterior = _prior_density(result, row.name), result.members("posterior", row.name)
+        prior = result.members("prior", row.name)
         value, doubt = f"{estimate(row, '')} {pretty_unit(row.unit)}".rstrip(), " (?)" if row.untrusted else ""
         panel = Panel(
             with_unit(row.symbol, row.unit), title=f"{value}{doubt}", title_colour="posterior", xticks=4, yticks=(),
             left=False, xlim=_reach(prior, posterior), ylim=(-0.14, 1.2),
         )  # fmt: skip
-        panel.histogram(prior, "prior", alpha=0.35)
+        if exact is None:
+            panel.histogram(prior, "prior", alpha=0.35)
+        else:
+            panel.band(*exact, "prior", 0.35)
         panel.histogram(posterior, "posterior", alpha=0.6)
         panel.dots(posterior, np.full(posterior.shape, -0.06), "posterior", 3.0, kind="ticks")
         if not row.untrusted:
@@ -36,6 +41,24 @@ def histograms(result: StoredResult) -> Chart:
         panel.upright(row.centre, "centre", dash="--")
         panels.append(panel)
     return in_columns(panels, 3.6 * POINTS)
+
+
+def _prior_density(result: StoredResult, name: str) -> tuple[Array, Array, Array] | None:
+    """Of the prior itself: values, zeros and density there, scaled to its peak; None where the file lacks it.
+
+    The probability of each step between stored values over its width is exact whatever the parameter's map is.
+    """
+    stats = result.group("sample_stats")
+    if "prior_value" not in stats:
+        return None
+    from scipy.special import ndtr
+
+    about, place = result.parameters[name].attrs, stats["parameter"].values.tolist().index(name)
+    values = convert(np.asarray(stats["prior_value"].values[place]), about["units"], about["display_units"])
+    density = np.diff(ndtr(stats["prior_score"].values)) / np.diff(values)
+    x = np.concatenate([values[:1], values[:-1] + np.diff(values) / 2, values[-1:]])
+    density = np.concatenate([density[:1], density, density[-1:]]) / density.max()
+    return x, np.zeros_like(x), density
 
 
 def residuals(result: StoredResult) -> Chart:
@@ -46,7 +69,7 @@ def residuals(result: StoredResult) -> Chart:
         result.of_readings("sample_stats", key) for key in ("whitened_residual", "studentised", "leverage")
     )
     counts = np.isfinite(white)
-    top = Panel(label, "whitened residual", legend=len(result.axes) > 1)
+    top = Panel(label, "residual / std", legend=len(result.axes) > 1)
     top.rule(0)
     for axis, (series, colour) in zip(result.axes, readings.each_series(result), strict=True):
         chosen = series[counts[series]]
@@ -123,17 +146,18 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
     if parameters:
         yield (
             "posterior",
-            "Posterior (blue) over prior (grey), each scaled to its peak. Bar: 5–95 % of the posterior, none and (?) "
-            "where it is not to be trusted; ticks: members; dashed: the centre, where J is smallest.",
+            "What is known after the readings (posterior, blue) and what was before (prior, grey), each scaled to its "
+            "peak. Bar: the 90 % interval, with (?) and no bar where it is not to be trusted; ticks: the members that "
+            "stand for the posterior; dashed: the best fit.",
             histograms(result),
         )
     if "/fields" in result.groups:
         yield "fields", fields.CAPTION, fields.maps(result)
     yield (
         "history",
-        "Data with their standard deviation, noise-free predictions of the prior and posterior ensembles (bands hold "
-        "50 and 90 % of the members) and of the centre (line through its values at the observation times). Below: "
-        "residual of the centre over its standard deviation."
+        "Readings with their standard deviation; what was thought possible before them (prior, grey) and what is after "
+        "(posterior, blue: bands of 50 and 90 %, without the errors of readings); the best fit (line through its "
+        "values at the readings). Below: reading minus best fit, in standard deviations of the reading."
         + (" Each series has its own panels." if len(result.axes) > 1 else ""),
         history(result),
     )
@@ -145,11 +169,13 @@ def all_figures(result: StoredResult) -> Iterator[Captioned]:
             "What varies in time: median and 5–95 % of the posterior (blue) over 5–95 % of the prior (grey).",
             varying.bands(result),
         )
-    if f"{result.observable}_whitened_residual" in result.group("sample_stats"):
+    if len(readings.whitened(result)):
         yield (
             "residuals",
-            "Residuals of the centre, whitened: in time (below it a discrepancy, mean ± std), their "
-            "autocorrelation (band: 95 % of independent numbers), against normal quantiles; leverages.",
+            "Residuals of the best fit, in standard deviations and freed of the correlation of their errors "
+            "(whitened): in time (below it a discrepancy, mean ± std); their correlation with those 1, 2, … readings "
+            "later (band: 95 % of independent numbers); against normal quantiles; leverage, the share of each "
+            "reading in its own prediction.",
             residuals(result),
         )
     if f"{result.observable}_prior_distance" in result.group("sample_stats"):
@@ -179,15 +205,22 @@ def _discrepancy(result: StoredResult, time: Array, label: str) -> Panel:
     return panel
 
 
+def neighbours(white: Array) -> tuple[Array, float]:
+    """Correlation of residuals (K,) that lie 1, 2, … apart, and what 95 % of independent ones do not exceed."""
+    lags = max(1, min(15, len(white) // 3)) if len(white) > 1 else 0
+    size = float(white @ white) or 1.0
+    return np.array([float(white[lag:] @ white[:-lag]) / size for lag in range(1, lags + 1)]), 1.96 / math.sqrt(
+        len(white) or 1
+    )
+
+
 def _autocorrelation(white: Array) -> Panel:
-    lags = max(1, min(15, len(white) // 3))
-    correlation = [float(white[lag:] @ white[:-lag]) / float(white @ white) for lag in range(1, lags + 1)]
-    limit = 1.96 / math.sqrt(len(white))
+    correlation, limit = neighbours(white)
     ylim = min(-0.6, *correlation), max(1.0, *correlation)
-    panel = Panel("lag", "autocorrelation", xticks=4, whole=True, ylim=ylim)
+    panel = Panel("readings apart", "correlation", xticks=4, whole=True, ylim=ylim)
     panel.span(-limit, limit, "posterior", 0.16)
     panel.rule(0)
-    panel.bars(np.arange(1, lags + 1), 0, correlation, "ink", 1.2)
+    panel.bars(np.arange(1, len(correlation) + 1), 0, correlation, "ink", 1.2)
     return panel
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.model.state import Array
 from en4dvar.report.chart import POINTS, Chart, Panel, Row
 from en4dvar.report.text import shown, with_unit
@@ -96,9 +97,9 @@ def _data(panel: Panel, result: StoredResult, series: SeriesShown) -> None:
     for band in BANDS:
         (_along if curve else _bars)(panel, result, series, band)
     if curve:
-        panel.line(series.x, series.centre, "centre", 0.9, label="centre")
+        panel.line(series.x, series.centre, "centre", 0.9, label="best fit")
     else:
-        panel.dots(series.x, series.centre, "centre", 5.0, label="centre", kind="dashes")
+        panel.dots(series.x, series.centre, "centre", 5.0, label="best fit", kind="dashes")
     if len(series.x) > MANY:  # one outline instead of a bar for each
         panel.band(series.x, series.data - series.std, series.data + series.std, "ink", 0.3, "data ± std")
     else:
@@ -125,12 +126,8 @@ def _along(panel: Panel, result: StoredResult, series: SeriesShown, band: Band) 
     seen = np.isfinite(values).any(axis=0)
     if not seen.any():
         return
-    finite = np.isfinite(values[:, seen])
-    whole = finite.all(axis=1)
-    if (whole | ~finite.any(axis=1)).all():  # as nanquantile, which goes from instant to instant
-        low, high = np.quantile(values[whole][:, seen], band.levels, axis=0)
-    else:
-        low, high = np.nanquantile(values[:, seen], band.levels, axis=0)
+    alive = np.isfinite(values).any(axis=1)
+    low, high = member_quantiles(values[alive][:, seen], band.levels, axis=0)
     panel.band(shown(held["path_time"])[seen], low, high, band.colour, band.alpha, band.label)
 
 
@@ -140,7 +137,7 @@ def _bars(panel: Panel, result: StoredResult, series: SeriesShown, band: Band) -
     alive = np.isfinite(values).all(axis=1)
     if not alive.any():
         return
-    low, high = np.quantile(values[alive], band.levels, axis=0)
+    low, high = member_quantiles(values[alive], band.levels, axis=0)
     panel.bars(series.x, low, high, band.colour, 4.0 if len(series.x) <= FEW else 2.0, band.alpha, band.label)
 
 

@@ -9,14 +9,15 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from en4dvar.plumbing.caution import untrusted
+from en4dvar.diagnosis.intervals import METHOD, member_quantiles
+from en4dvar.plumbing.caution import Caution, untrusted
 from en4dvar.plumbing.files import write_text
 from en4dvar.plumbing.tables import csv_text, table
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import COLUMN, PAGE, POINTS, Chart, Panel, in_columns
 from en4dvar.report.html import render
 from en4dvar.report.svg import svg
-from en4dvar.report.text import figure_text, with_unit
+from en4dvar.report.text import figure_text, number_like, pretty_unit, with_unit
 from en4dvar.results.joint_file import QUANTILES, StoredGroups, StoredJoint
 
 MOST_FITS = 12  # panels of the figure
@@ -26,7 +27,9 @@ FITS = "Observations and 5–95 % of the joint posterior's predictions."
 
 @dataclass(frozen=True)
 class JointRow:
-    """One number of the joint estimate in its display unit; ``dataset`` "" for what is shared."""
+    """One number of the joint estimate in its display unit; ``dataset`` "" for what is shared, ``without`` the names of
+    the odd data sets where they are left out.
+    """
 
     name: str
     label: str
@@ -39,50 +42,80 @@ class JointRow:
     q95: float
     unit: str
     untrusted: tuple[str, ...]
+    without: str = ""
     modal: bool = False
 
 
 def estimates(joint: StoredJoint) -> tuple[JointRow, ...]:
-    """What is shared, then what is each data set's own."""
-    posterior, rows = joint.group("posterior"), []
+    """What is shared, without the odd data sets too, then what is each data set's own."""
+    posterior, odd, rows = joint.group("posterior"), ", ".join(joint.odd), []
     for name, values in posterior.data_vars.items():
         if "dataset" not in values.dims:
-            rows.append(_estimate(joint, str(name), values, ""))
+            rows.append(_estimate(joint.cautions, str(name), values))
             continue
         for dataset in joint.datasets:
             own = values.sel(dataset=dataset)
             if np.isfinite(own.values).any():
-                rows.append(_estimate(joint, str(name), own, dataset))
-    return tuple(sorted(rows, key=lambda row: bool(row.dataset)))
+                rows.append(_estimate(joint.cautions, str(name), own, dataset))
+    if odd:
+        rest = joint.group("without").data_vars.items()
+        rows += [_estimate(joint.cautions_without, str(name), values, without=odd) for name, values in rest]
+    return tuple(sorted(rows, key=lambda row: (bool(row.dataset), not row.dataset and row.name)))
 
 
-def _estimate(joint: StoredJoint, name: str, values: xr.DataArray, dataset: str) -> JointRow:
+def _estimate(
+    cautions: Sequence[Caution], name: str, values: xr.DataArray, dataset: str = "", without: str = ""
+) -> JointRow:
     about = values.attrs
     unit, shown = str(about["units"]), str(about["display_units"])
     members = convert(values.values.ravel(), unit, shown)
-    q05, q50, q95 = map(float, np.quantile(members, QUANTILES))
+    q05, q50, q95 = map(float, member_quantiles(members, QUANTILES))
     mean, std = float(members.mean()), float(members.std(ddof=1))
-    doubted = untrusted(joint.cautions, name)
     label, symbol = str(about["long_name"]), str(about["symbol"])
-    return JointRow(name, label, symbol, dataset, mean, std, q05, q50, q95, shown, doubted)
+    return JointRow(name, label, symbol, dataset, mean, std, q05, q50, q95, shown, untrusted(cautions, name), without)
+
+
+def joint_lines(joint: StoredJoint) -> list[str]:
+    """What is shared, a line each, for the page of the campaign."""
+    lines = []
+    for e in (e for e in estimates(joint) if not e.dataset):
+        unit = f" {pretty_unit(e.unit)}" if e.unit != "1" else ""
+        without = f" without {e.without}" if e.without else f", one value in {len(joint.datasets)} data sets"
+        interval = f"5–95 %: {number_like(e.q05, e.std)} … {number_like(e.q95, e.std)}{unit}"
+        doubt = f"not to be trusted: {', '.join(e.untrusted)}" if e.untrusted else interval
+        lines.append(f"{e.label} {e.name} = {number_like(e.q50, e.std)}{unit} ({doubt}){without}")
+    return lines
+
+
+def figure(joint: StoredJoint) -> str:
+    """All data sets over what they share, as SVG."""
+    shared = {name: joint.group("posterior")[name] for name in joint.shared}
+    return svg(forest(joint, joint.datasets, shared), "forest", CAPTION)
 
 
 def joint_table(joint: StoredJoint) -> str:
     """What is shared, for the terminal."""
     rows = [
-        (e.name, e.unit, f"{e.mean:.4g}", *(["–"] * 4 if e.untrusted else _numbers(e)))
+        (_called(e), e.unit, f"{e.mean:.4g}", *(["–"] * 4 if e.untrusted else _numbers(e)))
         for e in estimates(joint)
         if not e.dataset
     ]
     return table([("shared", "unit", "mean", "std", "5 %", "50 %", "95 %"), *rows])
 
 
+def _called(e: JointRow) -> str:
+    return f"{e.name} without {e.without}" if e.without else e.name
+
+
 def _numbers(e: JointRow) -> list[str]:
     return [f"{value:.4g}" for value in (e.std, e.q05, e.q50, e.q95)]
 
 
-def forest(groups: StoredGroups, datasets: Sequence[str], common: Mapping[str, xr.DataArray]) -> Chart:
-    """Each data set alone, and the draws of what is ``common``, one panel each.
+def forest(
+    groups: StoredGroups, datasets: Sequence[str], common: Mapping[str, xr.DataArray],
+    reference: Mapping[str, tuple[float, float]] | None = None,
+) -> Chart:  # fmt: skip
+    """Each data set alone, and the draws of what is ``common``, one panel each; of some a ``reference`` of others.
 
     Where the posterior has the parameter for each data set too, that is drawn below what the data set says alone.
     """
@@ -92,18 +125,23 @@ def forest(groups: StoredGroups, datasets: Sequence[str], common: Mapping[str, x
     for name, draws in common.items():
         about = draws.attrs
         units = str(about["units"]), str(about["display_units"])
-        low, middle, high = convert(np.quantile(draws.values, QUANTILES), *units)
+        low, middle, high = convert(member_quantiles(draws.values, QUANTILES), *units)
         panel = Panel(with_unit(str(about["symbol"]), units[1]), ylim=(-float(count), 1.0))
         panel.yticks, panel.y_names = (range(0, -count, -1), [figure_text(d) for d in datasets]) if named else ((), ())
         if not untrusted(groups.cautions, name):
             panel.band([low, high], np.full(2, -count), np.ones(2), "posterior", 0.2)
         panel.line([middle, middle], [-count, 1], "posterior")
+        if reference and name in reference:
+            value = convert(reference[name][0], *units)
+            panel.line([value, value], [-count, 1], "ink", dash=":")
         rows = convert(alone[name].values, *units)
         has = np.flatnonzero(np.isfinite(rows[:, 1]))
         panel.intervals(rows[has, 0], rows[has, 2], -has, "prior")
         panel.dots(rows[has, 1], -has, "prior", 3.0)
         if "dataset" in posterior.get(name, draws).dims:
-            low, middle, high = convert(posterior[name].quantile(QUANTILES, ("chain", "draw")).values, *units)
+            low, middle, high = convert(
+                posterior[name].quantile(QUANTILES, ("chain", "draw"), method=METHOD).values, *units
+            )
             panel.intervals(low[has], high[has], -has - 0.3, "posterior")
             panel.dots(middle[has], -has - 0.3, "posterior", 2.0)
         panel.x_logarithmic = bool(np.all(rows[has] > 0) and rows[has].max() > 20 * rows[has].min())
@@ -127,13 +165,30 @@ def fits(joint: StoredJoint) -> Chart:
     return in_columns(panels, 3.6 * POINTS, width=PAGE)
 
 
+@dataclass(frozen=True)
+class SetRow:
+    """One data set under the shared values: misfit per reading, and how far it is from all others alone."""
+
+    name: str
+    chi2: float
+    distance: float
+    chance: float
+    odd: bool
+
+
+def _sets(joint: StoredJoint) -> list[SetRow]:
+    fit, absent = joint.group("fit"), np.full(len(joint.datasets), np.nan)
+    columns = [fit[c].values if c in fit else absent for c in ("chi2_per_observation", "distance", "chance")]
+    rows = zip(joint.datasets, *columns, strict=True)
+    return [SetRow(name, float(chi2), float(z), float(p), name in joint.odd) for name, chi2, z, p in rows]
+
+
 def write_joint(joint: StoredJoint, folder: Path) -> Path:
     """Write ``joint.html`` and ``joint.csv``. Returns the path of the page. Raises :class:`OutputError`."""
     rows = estimates(joint)
-    columns = ("name", "dataset", "mean", "std", "q05", "q50", "q95", "unit")
+    columns = ("name", "dataset", "without", "mean", "std", "q05", "q50", "q95", "unit")
     cells = [[getattr(e, c) for c in columns] + [" ".join(e.untrusted)] for e in rows]
     write_text(folder / "joint.csv", csv_text([[*columns, "warnings"], *cells]))
-    fit, shared = joint.group("fit"), {name: joint.group("posterior")[name] for name in joint.shared}
     page = render(
         "joint.html.j2",
         title="Joint estimate",
@@ -143,11 +198,11 @@ def write_joint(joint: StoredJoint, folder: Path) -> Path:
         count=len(joint.datasets),
         shared=[e for e in rows if not e.dataset],
         own=[e for e in rows if e.dataset],
-        forest=svg(forest(joint, joint.datasets, shared), "forest", CAPTION),
+        forest=figure(joint),
         caption=CAPTION,
         fits=svg(fits(joint), "fits", FITS),
         fits_caption=FITS + (f" The first {MOST_FITS}." if len(joint.datasets) > MOST_FITS else ""),
-        misfits=list(zip(joint.datasets, map(float, fit["chi2_per_observation"].values), strict=True)),
+        sets=_sets(joint),
         attributes=joint.tree.attrs,
         cautions=[(c, "") for c in joint.cautions],
     )

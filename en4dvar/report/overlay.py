@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.estimation.summary import CSV_COLUMNS, csv_cells
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import OutputError
@@ -50,7 +51,7 @@ def _panel(estimates: Sequence[ComparedEstimate], runs: Sequence[str]) -> Panel:
             continue
         panel.histogram(values, _colour(i), alpha=0.25)
         if not any(e.summary.untrusted for e in estimates if e.run == run):
-            low, high = np.quantile(values, (0.05, 0.95))
+            low, high = member_quantiles(values, (0.05, 0.95))
             panel.line([low, high], np.full(2, 1.08 + 0.09 * i), _colour(i), 2.0)
     return panel
 

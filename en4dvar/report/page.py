@@ -8,10 +8,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from en4dvar.diagnosis.diagnostics import chi2_interval
+from en4dvar.plumbing.caution import worst_first
 from en4dvar.plumbing.units import convert
+from en4dvar.report import readings
 from en4dvar.report.drawing import Drawing
+from en4dvar.report.figures import neighbours
 from en4dvar.report.html import render
-from en4dvar.report.readings import reading_words
 from en4dvar.report.responses import exceeding, stored_ledger, stored_shifts
 from en4dvar.report.text import number_like, plain_number
 from en4dvar.report.varying import stored_walks, verdict
@@ -50,6 +52,7 @@ def render_set(
         stats=judged.attrs,
         rows=result.rows,
         dfs_words=DFS_WORDS,
+        trust=trust(result),
         cautions=result.cautions,
         tiles=_tiles(result),
         shares=_shares(result),
@@ -57,12 +60,12 @@ def render_set(
         what_if=(what_if := stored_shifts(result)),
         exceeding=exceeding(what_if),
         entries=stored_ledger(result),
-        readings=reading_words(result),
+        readings=readings.reading_words(result),
         withheld=withheld_words(result),
         walks=stored_walks(result),
         verdict=verdict(result),
         identifiers=IDENTIFIERS,
-        figures=figures,
+        drawn={name: (caption, svg) for name, caption, svg in figures},
         modes=_modes(result),
         lost=[(i, str(reason)) for i, reason in enumerate(judged["failure_reason"].values.ravel()) if reason],
         iterations=_iterations(result),
@@ -70,6 +73,28 @@ def render_set(
         settings=_settings(result),
         provenance=provenance_rows(attributes),
     )
+
+
+def trust(result: StoredResult) -> str:
+    """How far the numbers may be trusted, in one or two sentences; "" where warnings say it."""
+    stats, worst = result.group("sample_stats").attrs, worst_first(result.cautions)
+    if worst and worst[0].severity != "note":
+        return ""
+    size, _ = judge_chi2(float(stats["chi2_per_observation"]), int(stats["n_weighted"]), float(stats["dfs"]))
+    words = f"No warnings: the {size.partition(';')[0]}{_neighbours_words(result)}."
+    if moved := len(exceeding(stored_shifts(result))):
+        which = "one assumption matters" if moved == 1 else f"{moved} assumptions matter"
+        words += f" They hold for what was assumed: {which} by more than an error bar, see below."
+    return words
+
+
+def _neighbours_words(result: StoredResult) -> str:
+    """Whether neighbouring residuals are related more than independent errors are in 95 of 100 data sets."""
+    correlation, limit = neighbours(readings.whitened(result))
+    if not len(correlation) or abs(correlation[0]) <= limit:
+        return " and neighbouring residuals are unrelated" if len(correlation) else ""
+    alike = "resemble each other" if correlation[0] > 0 else "alternate in sign"
+    return f", but neighbouring residuals {alike} (correlation {plain_number(float(correlation[0]), 2)}): look at them"
 
 
 def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
@@ -91,10 +116,10 @@ def _tiles(result: StoredResult) -> list[tuple[str, str, str, bool]]:
     )
     ended = "by its own criterion" if s["converged"] else "not converged"
     return [
-        ("Fit, NRMSE", number_like(nrmse, 0.01), "1 is perfect, 0 is no better than a constant", not nrmse >= 0.9),
+        ("Fit", number_like(nrmse, 0.01), "NRMSE: 1 is perfect, 0 is no better than a constant", not nrmse >= 0.9),
         ("χ² per observation", plain_number(chi2, 3), chi2_words, chi2_odd),
-        ("Information, DFS", *information, False),
-        ("Members alive", f"{alive} of {members}", "of the posterior ensemble", alive < members),
+        ("Information", *information, False),
+        ("Members that ran", f"{alive} of {members}", "of the posterior ensemble", alive < members),
         ("Iterations", str(s["n_iterations"]), f"{ended}: {s['stop_reason']}", not s["converged"]),
         *_descents(s),
     ]
@@ -108,7 +133,7 @@ def _descents(stats: Mapping[str, Any]) -> list[tuple[str, str, str, bool]]:
     words = (
         f"ended in the lowest minimum. {stats['descents']}; {stats['search_runs']} forward runs looked for another one"
     )
-    return [("Descents", f"{agreeing} of {total}", words, agreeing < 2)]
+    return [("Starts that agree", f"{agreeing} of {total}", words, agreeing < 2)]
 
 
 def judge_chi2(chi2: float, n_observations: int, dfs: float, structured: bool = False) -> tuple[str, bool]:

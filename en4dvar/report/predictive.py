@@ -9,6 +9,7 @@ import numpy as np
 
 from en4dvar.data.series import Part
 from en4dvar.descent.preview import Preview
+from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.model.state import Array
 from en4dvar.plumbing.units import convert
 from en4dvar.report.chart import COLUMN, POINTS, Chart, Panel, in_columns
@@ -54,7 +55,7 @@ def _panel(preview: Preview, part: Part, path: Array | None) -> Panel:
     panel = Panel(with_unit("time", model.time_display_unit), with_unit(label, shown_unit))
     if len(paths) > 1:
         for levels, alpha, words in (((0.05, 0.95), 0.3, "prior 90 %"), ((0.25, 0.75), 0.45, "50 %")):
-            low, high = np.quantile(paths, levels, axis=0)
+            low, high = member_quantiles(paths, levels, axis=0)
             if path is None:
                 panel.bars(times, low, high, "prior", 3.0, alpha, words)
             else:

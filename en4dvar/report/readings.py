@@ -15,8 +15,9 @@ from en4dvar.results.store import StoredResult
 
 CAPTION = (
     "What each reading does. Above, one panel a parameter: change of the posterior mean, in posterior standard "
-    "deviations, if that reading alone is left out; nothing is drawn where only another fit tells. Below: distance of "
-    "the reading from what the prior predicts, in the standard deviation of both; beyond 3 they are in conflict."
+    "deviations, if that reading alone is left out; nothing is drawn where that takes a fit without it. Below: "
+    "distance of the reading from what the prior predicts, in the standard deviation of both; beyond 3 they are in "
+    "conflict."
 )
 FAR = 3.0  # std between a reading and the prior that are told
 
@@ -38,6 +39,14 @@ def times(result: StoredResult) -> Array:
 def time_label(result: StoredResult) -> str:
     """Of an axis of :func:`times`."""
     return with_unit("time", result.group("observed_data")[result.axes[0].time].attrs["display_units"])
+
+
+def whitened(result: StoredResult) -> Array:
+    """(K',) residuals of the readings that count, whitened; none of a result whose readings are few or of a field."""
+    if f"{result.observable}_whitened_residual" not in result.group("sample_stats"):
+        return np.empty(0)
+    white = result.of_readings("sample_stats", "whitened_residual")
+    return white[np.isfinite(white)]
 
 
 def each_series(result: StoredResult, alone: str = "ink") -> list[tuple[npt.NDArray[np.intp], str]]:
@@ -90,7 +99,7 @@ def _most_moving(result: StoredResult) -> Markup:
         result.of_readings("sample_stats", f"influence_{key}", shared=True) for key in ("in_std", "change", "how")
     )
     if not np.isfinite(in_std).any():
-        return Markup("What leaving out a reading would change only another fit tells: each of them decides too much.")
+        return Markup("Each reading decides so much that only a fit without it tells what it changes.")
     j, k = np.unravel_index(int(np.nanargmax(np.abs(in_std))), in_std.shape)
     row = result.rows[int(j)]
     about = result.parameters[row.name].attrs
@@ -101,7 +110,7 @@ def _most_moving(result: StoredResult) -> Markup:
         _time(result, int(k)), symbol_html(row.symbol), signed(size), pretty_unit(row.unit), fixed(abs(in_std[j, k]), 1)
     )
     blank = int(np.sum(how == UNKNOWN))
-    return words + (f" For {blank} of {in_std.shape[1]} readings only another fit tells." if blank else "")
+    return words + (f" For {blank} of {in_std.shape[1]} readings it takes a fit without them to tell." if blank else "")
 
 
 def _farthest(result: StoredResult) -> Markup:

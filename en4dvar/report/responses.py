@@ -138,7 +138,8 @@ def sentence(shifts: Sequence[StoredShift]) -> str:
     """What an alternative would do to the parameters that it moves beyond their error bar."""
     first = shifts[0]
     if first.reason:
-        return f"if {first.words}, only another fit tells ({first.reason})"
+        words = "the numbers may change by more than their error bars; a fit with it tells"
+        return f"if {first.words}, {words} ({first.reason})"
     moved = sorted((s for s in shifts if s.exceeds), key=lambda s: -abs(s.in_std))
     parts = [
         Markup("{} would be {} {} ({} times its error bar)").format(

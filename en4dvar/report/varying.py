@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from en4dvar.diagnosis.diagnostics import change_words
+from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import untrusted
 from en4dvar.plumbing.units import convert
@@ -67,7 +68,7 @@ def _stored_walk(result: StoredResult, name: str) -> StoredWalk:
         values = np.asarray(result.groups[f"/{group}"].variables[name + PIECES].values[0], dtype=float)
         values = values[result.alive] if group == "posterior" else values
         values = values[np.isfinite(values).all(axis=1)]
-        levels = np.quantile(values, LEVELS, axis=0) if len(values) else np.full((3, len(begins)), np.nan)
+        levels = member_quantiles(values, LEVELS, axis=0) if len(values) else np.full((3, len(begins)), np.nan)
         return convert(levels, about["units"], shown)
 
     after = quantiles("posterior")

@@ -145,6 +145,16 @@ def failed_datasets(path: Path) -> dict[str, str]:
     return {str(k): str(v) for k, v in json.loads(_root_attribute(path, FAILURES) or "{}").items()}
 
 
+def datasets_in(path: Path) -> list[str]:
+    """The data sets in a campaign's file, in order; none where there is no such file, or it cannot be read."""
+    try:
+        check_seal(path)
+        with netCDF4.Dataset(path) as file:
+            return list(map(str, file["posterior"]["dataset"][...].tolist()))
+    except (OutputError, OSError, LookupError, AttributeError):
+        return []
+
+
 def _root_attribute(path: Path, name: str) -> str:
     """ "" where the file has none. Raises :class:`OutputError`."""
     check_seal(path)

@@ -20,9 +20,10 @@ import yaml
 
 from en4dvar.inputs.asked import DataFile
 from en4dvar.model.forward import ForwardModel
-from en4dvar.results.checkpoint import digest, file_digest
+from en4dvar.results.checkpoint import FOLDER, digest, file_digest
 from en4dvar.results.provenance import package_versions
 
+IDENTITY = f"{FOLDER}/run"  # in a run directory
 PACKAGES = ("en4dvar", "numpy", "scipy", "numba", "llvmlite")
 _NO_NUMBERS = ("execution", "output")
 _PRIOR_FILES = ("prior", "prior_correlation")  # sections that name files

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.estimation.joint.estimate import JointEstimate
 from en4dvar.model.state import Array, Parameter
 from en4dvar.plumbing.caution import Caution, worst_first
@@ -51,15 +52,22 @@ def joint_groups(estimate: JointEstimate, alone: Sequence[Alone], attributes: Ma
         "log_evidence": estimate.log_evidence,
         "forward_runs": estimate.forward_runs,
         "effective_draws": estimate.members.effective,
-        "warnings": "\n".join(c.line for c in worst_first(estimate.cautions)),
+        "warnings": _lines(estimate),
     }
-    return {
+    groups = {
         "/": Group(attrs=root),
         "/posterior": Group(_shared(estimate) | _own(estimate, names), datasets),
         "/prior": Group(_prior(estimate)),
         "/alone": Group(_alone(estimate, alone), datasets),
-        "/fit": Group(_fit(estimate), datasets),
+        "/fit": Group(_fit(estimate) | _agreement(estimate, names), datasets),
     }
+    if estimate.without:
+        groups["/without"] = Group(_shared(estimate.rest), attrs={"warnings": _lines(estimate.rest)})
+    return groups
+
+
+def _lines(estimate: JointEstimate) -> str:
+    return "\n".join(c.line for c in worst_first(estimate.cautions))
 
 
 def shared_name(key: tuple[str, str]) -> str:
@@ -121,7 +129,7 @@ def _alone(estimate: JointEstimate, alone: Sequence[Alone]) -> dict[str, Variabl
         for e, single in enumerate(alone):
             if estimate.joint.groups[e].get(key[0]) == key[1]:
                 values = single.members[:, single.names.index(key[0])]
-                rows[e] = np.quantile(values[np.isfinite(values)], QUANTILES)
+                rows[e] = member_quantiles(values, QUANTILES)
         unit = estimate.joint.terms[j].parameter.unit
         result[shared_name(key)] = variable(("dataset", "quantile"), rows, unit, "5, 50 and 95 % of a data set alone")
     return result
@@ -141,7 +149,7 @@ def _fit(estimate: JointEstimate) -> dict[str, Variable]:
         values[e, :k] = convert(experiment.observations.values, *to_value)
         bands[e, : len(grid), 0] = convert(grid, *to_time)
         alive = run.path[:-1][run.active[:-1]]
-        bands[e, : len(grid), 1:] = convert(np.quantile(alive, QUANTILES, axis=0).T, *to_value)
+        bands[e, : len(grid), 1:] = convert(member_quantiles(alive, QUANTILES, axis=0).T, *to_value)
     labels = np.array([experiment.observable.label for experiment in experiments], dtype=object)
     units = np.array([experiment.observable.display_unit for experiment in experiments], dtype=object)
     time_units = np.array([experiment.model.time_display_unit for experiment in experiments], dtype=object)
@@ -158,6 +166,22 @@ def _fit(estimate: JointEstimate) -> dict[str, Variable]:
     }
 
 
+def _agreement(estimate: JointEstimate, names: Sequence[str]) -> dict[str, Variable]:
+    """Each data set against all others, as the estimate without the odd ones has it."""
+    agreed = estimate.agreement
+    odd = np.array([int(name in estimate.odd) for name in names])
+    distance = variable("dataset", np.sqrt(agreed.squares), "1", "from the value of all others, in standard deviations")
+    return {
+        "distance": distance,
+        "chance": variable("dataset", agreed.chances, "1", "probability of a larger distance if all share one value"),
+        "odd": variable("dataset", odd, "1", "1: left out in the group without"),
+    }
+
+
+def _parsed(attributes: Mapping[Any, Any]) -> tuple[Caution, ...]:
+    return worst_first(map(Caution.parse, str(attributes["warnings"]).splitlines()))
+
+
 @dataclass(frozen=True)
 class StoredGroups:
     """A file about several data sets together: a thin view of ``tree``."""
@@ -167,7 +191,7 @@ class StoredGroups:
     @property
     def cautions(self) -> tuple[Caution, ...]:
         """Warnings of the estimate, the worst first."""
-        return worst_first(map(Caution.parse, str(self.tree.attrs["warnings"]).splitlines()))
+        return _parsed(self.tree.attrs)
 
     def group(self, name: str) -> xr.Dataset:
         """The variables of a group."""
@@ -176,7 +200,7 @@ class StoredGroups:
 
 @dataclass(frozen=True)
 class StoredJoint(StoredGroups):
-    """A file of :func:`save_joint`, with the groups ``posterior``, ``prior``, ``alone`` and ``fit``."""
+    """A file of :func:`save_joint`: groups posterior, prior, alone, fit, and, without odd data sets, without."""
 
     @property
     def datasets(self) -> tuple[str, ...]:
@@ -188,12 +212,24 @@ class StoredJoint(StoredGroups):
         """Names of the variables of what is shared."""
         return tuple(str(name) for name in self.group("prior").data_vars)
 
+    @property
+    def odd(self) -> tuple[str, ...]:
+        """Names of the data sets that do not share the values of the others."""
+        fit = self.group("fit")  # of which a file of an earlier version has no such column
+        odd = fit["odd"].values if "odd" in fit else np.zeros(len(self.datasets))
+        return tuple(name for name, is_odd in zip(self.datasets, odd, strict=True) if is_odd)
+
+    @property
+    def cautions_without(self) -> tuple[Caution, ...]:
+        """Warnings of the estimate without the odd data sets."""
+        return _parsed(self.group("without").attrs)
+
 
 def load_joint(path: Path) -> StoredJoint:
     """Read the file into memory. Raises :class:`OutputError`: it is none, cut short or altered."""
     joint = StoredJoint(load_groups(path, ("posterior", "prior", "alone", "fit"), "a joint estimate"))
     with understood(path):
-        _ = joint.datasets, joint.cautions
+        _ = joint.datasets, joint.cautions, joint.odd
     return joint
 
 

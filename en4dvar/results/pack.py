@@ -3,7 +3,8 @@
 A record is a line (format, checksum of the rest of the line, name, fingerprint, sizes and SHA-256 of what follows),
 then how the data set ended, then its groups. What is there is known from the lines alone: a record that was cut short
 by a kill or a full disk is the last one and is overwritten, and damage ends at the next line that can be read. Of
-several records of a name the last one counts. The result of a data set has an address like that of a file:
+several records of a name the last one counts. What ought to be there is known elsewhere
+(:mod:`~en4dvar.results.run_results`). The result of a data set has an address like that of a file:
 ``datasets.pack/<name>``.
 """
 
@@ -12,8 +13,11 @@ from __future__ import annotations
 import functools
 import json
 import os
+import re
 import time
+import unicodedata
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -28,7 +32,9 @@ VERSION = "1"
 FLUSH_EVERY = 1.0  # s; what a loss of power may take, a kill takes nothing
 _MAGIC = b"\nen4dvar-pack "
 _LONGEST = 4096  # bytes of a line
-_BLOCK = 1 << 20  # bytes that are searched at once
+_BLOCK = 1 << 20  # bytes that are searched at once, at most
+_RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")  # names of devices on Windows
+_LONGEST_NAME = 120  # bytes; file systems allow 255, and temporary names are longer
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +55,7 @@ class Entry:
 
 
 class Pack:
-    """The pack of a run at work, the only one that writes to it.
+    """The pack of a run at work, the only one that writes to it; ``whole``: there is nothing in it but records.
 
     Raises :class:`OutputError` where the file cannot be read, or is none.
     """
@@ -57,9 +63,10 @@ class Pack:
     def __init__(self, path: Path):
         self.path = path
         self.entries: dict[str, Entry] = {}
+        self.whole = True
         self._end, self._flushed = 0, time.monotonic()
         if path.exists():
-            self.entries, self._end = _scan(path)
+            self.entries, self._end, self.whole = _scan(path)
 
     def append(self, name: str, fingerprint: str, outcome: bytes, content: bytes, content_digest: str) -> None:
         """Add a record. Raises :class:`OutputError`; the file is then as it was."""
@@ -100,21 +107,46 @@ def read_outcome(path: Path, name: str, entry: Entry) -> bytes:
     return _read(path, name, entry.begin + entry.line, entry.outcome_size, entry.outcome_digest)
 
 
+def file_names(names: Iterable[str]) -> dict[str, str]:
+    """Name of the data set → name of a file, without suffix, that every file system takes and that is unique there.
+
+    Letters of any script stay; blanks and signs become ``_``; names that differ only in case or accents' encoding get
+    a number.
+
+    >>> file_names(["gel 1", "gel/1", "Gel_1", "ゲル"])
+    {'gel 1': 'gel_1', 'gel/1': 'gel_1_2', 'Gel_1': 'Gel_1_3', 'ゲル': 'ゲル'}
+    """
+    used: set[str] = set()
+    chosen = {}
+    for name in names:
+        base = re.sub(r"[^\w.+-]", "_", unicodedata.normalize("NFC", name)).lstrip(".") or "_"
+        base = base.encode("utf-8")[:_LONGEST_NAME].decode("utf-8", "ignore").rstrip(".")
+        base = f"_{base}" if _RESERVED.fullmatch(base) else base
+        candidate, number = base, 1
+        while candidate.casefold() in used:
+            number += 1
+            candidate = f"{base}_{number}"
+        used.add(candidate.casefold())
+        chosen[name] = candidate
+    return chosen
+
+
 def results_of(pack: Path) -> list[Path]:
     """The addresses of the results in a pack, in the order of their names and numbers. Raises :class:`OutputError`."""
-    held = [name for name, entry in _opened(pack).entries.items() if entry.content_size]
+    held = [name for name, entry in known_pack(pack).entries.items() if entry.content_size]
     return [pack / name for name in sorted(sorted(held), key=numbered)]
 
 
 def read_result(address: Path) -> bytes:
     """The groups at an address. Raises :class:`OutputError`."""
-    pack = _opened(address.parent)
+    pack = known_pack(address.parent)
     if address.name not in pack.entries:
         raise OutputError(f"{address}: no such result: it was never written, is cut short or was altered")
     return pack.content(address.name)
 
 
-def _opened(path: Path) -> Pack:
+def known_pack(path: Path) -> Pack:
+    """A pack that is read, once for all that is asked of it. Raises :class:`OutputError`."""
     try:
         status = path.stat()
     except OSError as error:
@@ -152,25 +184,32 @@ def _read(path: Path, name: str, begin: int, size: int, expected: str) -> bytes:
     return content
 
 
-def _scan(path: Path) -> tuple[dict[str, Entry], int]:
-    """The whole records by name, and where the last of them ends."""
+def _scan(path: Path) -> tuple[dict[str, Entry], int, bool]:
+    """The records by name, where the last of them ends, and whether there is nothing else.
+
+    Where no record follows another, the next line is looked for from that one's own line on: bytes may have gone.
+    """
     entries: dict[str, Entry] = {}
-    end = place = 0
+    end = place = looked = 0
+    whole = True
     try:
         with open_plain(path) as file:
             size = os.fstat(file.fileno()).st_size
-            _check_version(path, file.read(_LONGEST))
+            begin = file.read(_LONGEST)
             while place < size:
                 file.seek(place)
                 name, entry = _entry(file.readline(1) + file.readline(_LONGEST), place)
                 if entry is None or entry.end > size:
-                    place = _next(file, place + 1, size)
+                    whole, place = False, _next(file, looked + 1, size)
+                    looked = place
                 else:
-                    entries[name] = entry
-                    end = place = entry.end
+                    entries[name], looked = entry, place
+                    place, end = entry.end, max(end, entry.end)
     except OSError as error:
         raise OutputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    return entries, end
+    if not entries:
+        _check_version(path, begin)
+    return entries, end, whole
 
 
 def _check_version(path: Path, begin: bytes) -> None:
@@ -198,12 +237,14 @@ def _entry(line: bytes, begin: int) -> tuple[str, Entry | None]:
 
 def _next(file: BinaryIO, place: int, size: int) -> int:
     """Where the next line begins, or ``size``."""
+    length = _LONGEST  # the next line may be near, and the file full of them
     while place < size:
         file.seek(place)
-        block = file.read(_BLOCK)
+        block = file.read(length)
         if (at := block.find(_MAGIC)) >= 0:
             return place + at
-        if len(block) < _BLOCK:
+        if len(block) < length:
             break
         place += len(block) - len(_MAGIC)
+        length = min(2 * length, _BLOCK)
     return size

@@ -12,6 +12,7 @@ from en4dvar.diagnosis.diagnostics import active_members
 from en4dvar.diagnosis.influence import prior_distance
 from en4dvar.diagnosis.response.what_if import Shift
 from en4dvar.model.state import Array
+from en4dvar.priors.prior import Prior
 from en4dvar.results.declared import MEMBER, NUMBER, OWN, Declared, Item, Table, UnitRule, text
 from en4dvar.results.scopes import (
     CELL_TIME,
@@ -26,9 +27,16 @@ from en4dvar.results.scopes import (
     of_series,
 )
 
+SCORES = np.linspace(-4.0, 4.0, 81)  # standard scores at which a prior is kept
 SHARES = ("errors", "discrepancy", "prior")
 EACH_UNIT = "each in the unit of its parameter"
 WITHOUT = "change of the posterior mean if the reading is left out"
+
+
+def _prior_values(prior: Prior) -> Array:
+    """(n, scores) of the parameters, each by itself."""
+    return np.reshape([term.to_physical(term.mean + term.std * SCORES) for term in prior.terms], (-1, len(SCORES)))
+
 
 MEMBERS = (
     Declared("active", MEMBER, "member survived the posterior forecast",
@@ -42,6 +50,8 @@ MEMBERS = (
     Declared("centre", "parameter", f"value at the minimum of J, {EACH_UNIT}", lambda a: a.centre, needed=True),
     Declared("dfs", "parameter", "degrees of freedom for signal of the parameter", lambda a: a.dfs_per_parameter,
              needed=True),
+    Declared("prior_value", "parameter prior_score", f"value at which its prior has the standard score, {EACH_UNIT}",
+             lambda a: _prior_values(a.problem.prior)),
     Declared("{series}_centre", "{time}", "{label}, prediction at the minimum of J",
              of_series(lambda a: a.centre_predictions), OWN, needed=True),
     Declared("{limit}_reached", MEMBER, "{label}", lambda a, i: a.extremes[None, :, i.held], LIMIT),

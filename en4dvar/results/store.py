@@ -22,7 +22,7 @@ from en4dvar.results.beside import joined
 from en4dvar.results.complete import check_complete, of_members
 from en4dvar.results.groups import build_groups
 from en4dvar.results.netcdf import Group, Groups, Variable, read_groups, understood
-from en4dvar.results.pack import PACK, read_result, results_of
+from en4dvar.results.pack import PACK, read_result
 from en4dvar.results.packed import unpacked
 from en4dvar.results.record import observations_of
 
@@ -172,23 +172,6 @@ def require_settled(run_dir: Path) -> None:
             f"{run_dir}: a run was killed while its files took the place of an earlier run's; 'en4dvar run' with "
             "--resume finishes that"
         )
-
-
-def result_files(run_dir: Path) -> list[Path]:
-    """Where the results of a run directory's data sets are, by name; of a single one ``posterior.nc``, which need not
-    exist.
-
-    Raises :class:`OutputError` as :func:`require_settled`, and of a campaign of an earlier version.
-    """
-    require_settled(run_dir)
-    if (run_dir / PACK).exists():
-        return results_of(run_dir / PACK) or [run_dir / "posterior.nc"]
-    if (run_dir / "datasets").is_dir():
-        raise OutputError(
-            f"{run_dir}: a campaign of an earlier version of en4dvar, with a file for each data set in datasets/; run "
-            "it again, or read these files one by one (load_result)"
-        )
-    return [run_dir / "posterior.nc"]
 
 
 def load_stored(path: str | Path) -> StoredResult:

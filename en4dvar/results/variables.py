@@ -16,7 +16,7 @@ from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.response.ledger import QUANTILES
 from en4dvar.model.state import Array
 from en4dvar.results.declared import MEMBER, OWN, Declared, Item, Table, text
-from en4dvar.results.sample_stats import SAMPLE_STATS, shifts
+from en4dvar.results.sample_stats import SAMPLE_STATS, SCORES, shifts
 from en4dvar.results.scopes import AT, FIXED, PATH, PIECE_TIME, PLACE, PLACED, ROBUST, TIME, WITHHELD, of_series
 
 
@@ -156,6 +156,7 @@ COORDINATES = (
     _coordinate("iteration", "iteration", lambda a: [r.iteration for r in a.iterations]),
     _coordinate("alternative", "assumption that could be otherwise", lambda a: text(s.name for s in shifts(a))),
     _coordinate("path_parameter", "acts along the path", lambda a: text(a.ledger.parameters if a.ledger else ())),
+    _coordinate("prior_score", "standard score under the prior", lambda a: SCORES),
     _coordinate("quantile", "quantile under the weights", lambda a: QUANTILES),
     _coordinate("{walk}_piece", "begin of the piece", lambda _, i: (0.0, *i.held.knots), unit=PIECE_TIME),
 )

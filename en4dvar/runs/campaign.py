@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
-import unicodedata
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,9 +17,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from en4dvar.report.result import Result
-
-_RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")  # names of devices on Windows
-_LONGEST = 120  # bytes; file systems allow 255, and temporary names are longer
 
 
 @dataclass(frozen=True)
@@ -105,27 +100,3 @@ class Campaign:
             if outcome.name == name and outcome.file is not None:
                 return load_result(outcome.file)
         raise KeyError(name)
-
-
-def file_names(names: Iterable[str]) -> dict[str, str]:
-    """Name of the data set → name of a file, without suffix, that every file system takes and that is unique there.
-
-    Letters of any script stay; blanks and signs become ``_``; names that differ only in case or accents' encoding get
-    a number.
-
-    >>> file_names(["gel 1", "gel/1", "Gel_1", "ゲル"])
-    {'gel 1': 'gel_1', 'gel/1': 'gel_1_2', 'Gel_1': 'Gel_1_3', 'ゲル': 'ゲル'}
-    """
-    used: set[str] = set()
-    chosen = {}
-    for name in names:
-        base = re.sub(r"[^\w.+-]", "_", unicodedata.normalize("NFC", name)).lstrip(".") or "_"
-        base = base.encode("utf-8")[:_LONGEST].decode("utf-8", "ignore").rstrip(".")
-        base = f"_{base}" if _RESERVED.fullmatch(base) else base
-        candidate, number = base, 1
-        while candidate.casefold() in used:
-            number += 1
-            candidate = f"{base}_{number}"
-        used.add(candidate.casefold())
-        chosen[name] = candidate
-    return chosen

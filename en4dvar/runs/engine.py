@@ -54,13 +54,15 @@ def write_report(path: str | Path, datasets: Sequence[str] = (), workers: int = 
     Raises
     ------
     OutputError: there is no result, it is damaged, the directory cannot be written, or a file that no run wrote would
-        be replaced.
+        be replaced. LackingError: results of some data sets cannot be read; the page names them.
     """
     with RunDirectory.open(path, "report") as directory:
         kind = kind_in(directory.work)
         directory.claim(*(name for name in kind.pages if figures or name not in FIGURES))
-        page = kind.page(directory.work, datasets, workers, figures)
-        directory.publish()
+        try:
+            page = kind.page(directory.work, datasets, workers, figures)
+        finally:
+            directory.publish()
     if page is None:
         raise OutputError(f"{path}: a run of {kind.name}, which has no page")
     return page

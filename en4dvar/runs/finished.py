@@ -15,7 +15,8 @@ from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, Severity, caution
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.problem import InverseProblem
-from en4dvar.results.store import StoredResult, load_stored, result_files
+from en4dvar.results.run_results import result_files
+from en4dvar.results.store import StoredResult, load_stored
 from en4dvar.runs.trust import Ask, of_strangers
 
 CARRIED = ("implausible-data", "misfit", "residual-structure", "model-validity")
@@ -62,11 +63,11 @@ def finished(run_dirs: Sequence[Path], trust: bool, ask: Ask | None) -> tuple[Co
     return first, list(_named_apart(sets))
 
 
-def carried(sets: Sequence[Finished], severity: Severity = "serious") -> Iterator[Caution]:
+def carried(sets: Sequence[Finished], spoilt: float = 1.0) -> Iterator[Caution]:
     """Serious warnings of single data sets that hold for an estimate of all of them too, each code once.
 
-    ``severity``: what they are there. An estimate that sees the scatter between data sets, and lets odd ones be odd, is
-    not spoilt by what spoils a single interval.
+    They are serious there where more than the share ``spoilt`` of the data sets has them. An estimate that tests its
+    data sets against each other is not spoilt by what spoils a single interval.
     """
     for code in CARRIED:
         of_it = [(s.name, c) for s in sets for c in s.cautions if c.code == code and c.severity == "serious"]
@@ -74,6 +75,7 @@ def carried(sets: Sequence[Finished], severity: Severity = "serious") -> Iterato
             names = [name for name, _ in of_it]
             others = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
             told = f"{', '.join(names[:MOST_NAMES])}{others}: {of_it[0][1].words}"
+            severity: Severity = "serious" if len(of_it) > spoilt * len(sets) else "caution"
             yield caution(code, f"of single data sets, {told}", severity)
 
 

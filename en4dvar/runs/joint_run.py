@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from en4dvar.config import Config
-from en4dvar.estimation.joint.estimate import Single, estimate_jointly
+from en4dvar.estimation.joint import JointEstimate, Single, estimate_jointly
 from en4dvar.estimation.joint.problem import JointProblem, sharing
 from en4dvar.executor import Executor
 from en4dvar.plumbing.errors import ConfigError
@@ -19,6 +19,8 @@ from en4dvar.results.joint_file import FILE, Alone, StoredJoint, load_joint, sav
 from en4dvar.runs.finished import Finished, carried
 from en4dvar.runs.together import Tell, TogetherKind
 from en4dvar.runs.trust import Ask
+
+SPOILT = 1 / 3  # of the data sets: where more are warned of alike, the warning is serious for all together
 
 
 def join(
@@ -71,7 +73,7 @@ class JointKind(TogetherKind):
         joint = sharing(problems, self.names) if self.names else JointProblem(problems, groups)
         singles = [Single.of_physical(dataset.problem.prior, dataset.members, dataset.centre) for dataset in sets]
         estimated = estimate_jointly(joint, config.assimilation, config.seed, executor, singles, tell)
-        estimated = replace(estimated, cautions=(*estimated.cautions, *carried(sets)))
+        estimated = _with_carried(estimated, sets)
         alone = [Alone(dataset.problem.prior.names, dataset.members) for dataset in sets]
         shared = " ".join(dict.fromkeys(name for name, _ in joint.shared))
         save_joint(path, estimated, alone, {**attributes, "seed": config.seed, "shared": shared})
@@ -81,3 +83,11 @@ class JointKind(TogetherKind):
         from en4dvar.report.joint import write_joint  # with matplotlib, whose import takes longer than a page
 
         return write_joint(load_joint(folder / FILE), folder)
+
+
+def _with_carried(estimate: JointEstimate, sets: Sequence[Finished]) -> JointEstimate:
+    """With the warnings of its data sets."""
+    without = estimate.without
+    if without is not None:
+        without = _with_carried(without, [s for s in sets if s.name not in estimate.odd])
+    return replace(estimate, cautions=(*estimate.cautions, *carried(sets, SPOILT)), without=without)

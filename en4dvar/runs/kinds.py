@@ -13,6 +13,7 @@ KINDS = {
     "twin": "en4dvar.runs.twin_run:TwinKind",
     "design": "en4dvar.runs.design_run:DesignKind",
     "sweep-twin": "en4dvar.runs.twin_sweep:SweepKind",
+    "calibrate": "en4dvar.runs.calibration_run:CalibrationKind",
     "joint": "en4dvar.runs.joint_run:JointKind",
     "population": "en4dvar.runs.population_run:PopulationKind",
 }

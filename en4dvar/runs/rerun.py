@@ -24,8 +24,9 @@ from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.campaign_file import failed_datasets
 from en4dvar.results.fingerprint import Identity, digest_of, identity
 from en4dvar.results.provenance import provenance
+from en4dvar.results.run_results import result_files
 from en4dvar.results.series_file import read_series, series_file
-from en4dvar.results.store import StoredResult, load_stored, result_files
+from en4dvar.results.store import StoredResult, load_stored
 from en4dvar.runs.cycles import Cycles
 from en4dvar.runs.sequence_run import SequenceKind
 from en4dvar.runs.trust import Ask, of_strangers

@@ -9,12 +9,11 @@ from typing import Any, TypeVar
 from en4dvar.plumbing.errors import ConfigError, OutputError
 from en4dvar.plumbing.files import write_text
 from en4dvar.results.checkpoint import FOLDER, CheckpointError, read_checkpoint, write_checkpoint
-from en4dvar.results.fingerprint import Identity
+from en4dvar.results.fingerprint import IDENTITY, Identity
 from en4dvar.runs.progress import RunLog
 from en4dvar.runs.rundir import OF_EVERY_RUN, Mode, RunDirectory
 
 S = TypeVar("S")
-IDENTITY = f"{FOLDER}/run"
 
 
 @dataclass

@@ -20,9 +20,9 @@ from en4dvar.plumbing.files import atomic_path, readable, remove_file
 from en4dvar.plumbing.tables import csv_text
 from en4dvar.results.checkpoint import FOLDER, Keeper, file_digest
 from en4dvar.results.codec import decode_text, encode_text
-from en4dvar.results.pack import PACK, Entry, Pack, read_outcome
+from en4dvar.results.pack import PACK, Entry, Pack, file_names, read_outcome
 from en4dvar.results.seal import SealedBytes
-from en4dvar.runs.campaign import Campaign, DatasetOutcome, file_names
+from en4dvar.runs.campaign import Campaign, DatasetOutcome
 from en4dvar.runs.jobs import Common, Estimate, FileJob, Job, Told, estimate, estimate_and_tell
 from en4dvar.runs.outcomes import Outcomes
 from en4dvar.runs.progress import LiveProgress, describe
@@ -135,18 +135,23 @@ class Worklist:
         )
 
     def recall(self) -> None:
-        """Take over what an earlier run finished, without reading it; what has failed is tried again, and a record that
-        cannot be trusted is not used.
+        """Take over what an earlier run finished, compared with its checksums; what has failed is tried again, and a
+        record that cannot be trusted is not used.
         """
+        finished = not self.alone and self.run.directory.at("posterior.nc").exists()
         left = {f"{FOLDER}/{path.name}" for path in self.run.directory.at(FOLDER).iterdir()}
         for d in self.sets:
             entry = self.pack.entries.get(d.stem)
+            if entry is None and finished:
+                self.estimate_again([d.name])
             if entry is None or self._failed(entry):
                 continue
             try:
                 if entry.fingerprint != self._fingerprint(d):
                     raise OutputError(f"{self.pack.path / d.stem}: belongs to another run")
                 read_outcome(self.pack.path, d.stem, entry)
+                if not self.alone:
+                    self.pack.content(d.stem)
             except OutputError as error:
                 self.run.notice(f"{error}; {d.name} is estimated again")
                 continue

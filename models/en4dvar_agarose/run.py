@@ -13,8 +13,7 @@ import numpy as np
 
 from en4dvar.assembly.build import build
 from en4dvar.estimation.assimilate import assimilate
-from en4dvar.estimation.joint import estimate_jointly, sharing
-from en4dvar.estimation.joint.estimate import Single
+from en4dvar.estimation.joint import Single, estimate_jointly, sharing
 from en4dvar.estimation.population import Population, estimate_population
 from en4dvar.executor import Executor, make_executor
 from en4dvar.model.forward import ForwardModel

@@ -57,9 +57,16 @@ def test_a_screen_reader_is_told_what_everything_is(opened, pages, kind):
         assert seen.page.locator(landmark).count() == 1
 
 
+def test_a_fit_is_told_on_three_screens_before_anything_is_unfolded(opened, pages):
+    """It took 5 600 pixels, of which the fit itself was the last 2 200."""
+    page = opened(pages["single"], width=1280).page
+    assert page.evaluate("document.querySelector('#d0-history').getBoundingClientRect().bottom") < 1600
+    assert page.evaluate("document.documentElement.scrollHeight") < 2800
+
+
 def test_the_table_of_data_sets_names_its_rows_and_can_be_skipped_by_key(opened, pages):
     page = opened(pages["campaign"]).page
-    assert page.get_by_role("rowheader").count() == 3
+    assert page.locator("table.sets").get_by_role("rowheader").count() == 3
     link = page.get_by_role("link", name="Skip the table")
     while not link.evaluate("e => e === document.activeElement"):
         page.keyboard.press("Tab")

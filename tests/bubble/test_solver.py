@@ -208,7 +208,7 @@ class TestFailures:
     @pytest.mark.slow
     @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="a system without it")
     def test_a_member_may_take_its_time_though_the_process_was_suspended(self):
-        """It crawls for 8 s. Were 10 s of sleep counted, it would end at once when woken, after half a second's work."""
+        """It crawls for 8 s. Were 10 s of sleep counted, it would end when woken, after half a second's work."""
         command = [sys.executable, "-c", CRAWL]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert process.stdout.readline() == "begins\n"

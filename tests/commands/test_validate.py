@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 from toy_config import csv_text, write_toy
@@ -15,6 +14,7 @@ from en4dvar.assembly.build import build
 from en4dvar.cli import main
 from en4dvar.config import load_config
 from en4dvar.descent.preview import preview
+from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.report.predictive import prior_predictive
 from en4dvar.runs.checks import validate
 
@@ -121,7 +121,7 @@ def test_what_the_figure_shows(tmp_path: Path) -> None:
     ((panel,),) = (row.panels for row in prior_predictive([one]).rows)
     assert panel.ylabel == "position $x$ (µm)"
     band = next(mark for mark in panel.marks if mark.kind == "band")
-    assert band.top.max() == pytest.approx(1e6 * np.quantile(one.run.path, 0.95, axis=0).max(), rel=1e-9)
+    assert band.top.max() == pytest.approx(1e6 * member_quantiles(one.run.path, 0.95, axis=0).max(), rel=1e-9)
     assert sum(len(row.panels) for row in prior_predictive([one] * 9).rows) == 6
 
 

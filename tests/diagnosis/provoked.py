@@ -102,6 +102,13 @@ def waved(height: float) -> InverseProblem:
     return with_discrepancy(seen, amplitude=(0.025, 1.5), length=(0.2, 0.7))
 
 
+def half_known() -> InverseProblem:
+    """What the prior says of b is far better than what the data could say."""
+    model = Vectorised(TWO)
+    a, b = model.parameters
+    return make_problem(model, (1.0, 0.5), prior=(PriorTerm.normal(a, 0.8, 1.0), PriorTerm.normal(b, 0.5, 0.001)))
+
+
 def spiked() -> InverseProblem:
     problem = make_problem(Vectorised(TWO), (1.0, 0.5), k=40)
     values = problem.observations.values.copy()
@@ -140,7 +147,7 @@ PROVOKED: dict[str, Callable[[], Analysis]] = {
     ),
     "down-weighted": lambda: run(outlier()),
     "not-bayesian": lambda: run(make_problem(Vectorised(TWO), (1.0, 0.5), weights=1 / 9)),
-    "not-informed": lambda: run(linear(scale=0.01, std=0.5)),
+    "not-informed": lambda: run(half_known()),
 }
 
 

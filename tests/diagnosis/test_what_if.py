@@ -141,13 +141,13 @@ def test_what_cannot_be_run_or_told_has_a_reason_and_stands_before_what_is_small
     analysis = assimilate(problem, SETTINGS, 1)
     reasons = {shift.name: shift.reason for shift in analysis.what_if}
     assert reasons["stiff"] == "cannot be run: too stiff"
-    assert reasons["far"] == "beyond linear response"
+    assert reasons["far"] == "too large a change to extrapolate"
     assert reasons["odd"].startswith("cannot be run")
     assert reasons["small"] == ""
     assert analysis.what_if[-1].name == "small"
     assert all(np.isnan(shift.change).all() for shift in analysis.what_if[:-1])
     assert all(shift.runs <= MOST_RUNS for shift in analysis.what_if)
-    assert any("only another fit tells" in line for line in remarks(analysis))
+    assert any("a fit with it tells" in line for line in remarks(analysis))
 
 
 def test_the_posterior_is_the_same_and_its_runs_are_counted():

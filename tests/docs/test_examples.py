@@ -62,7 +62,7 @@ def test_the_long_commands_of_readme_run(command, tmp_path):
 
 
 def test_readme_has_long_commands():
-    assert len(long_commands()) == 6
+    assert len(long_commands()) == 7
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)

@@ -11,6 +11,7 @@ from toys import Decay, Fragile, Linear, Vectorised, make_observations
 from en4dvar.estimation.joint import estimate
 from en4dvar.estimation.joint.arrow import Arrow
 from en4dvar.estimation.joint.problem import JointProblem, sharing
+from en4dvar.estimation.joint.single import Single
 from en4dvar.model.forward import Trajectory
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.priors.dependence import Dependence
@@ -184,7 +185,7 @@ def test_an_experiment_in_the_wrong_minimum_of_its_own_is_found():
         )
         for e, c in enumerate(truths)
     ]
-    singles = [estimate.Single(np.array([0.5, -1.0]), np.diag([100.0, 100.0])) for _ in problems]
+    singles = [Single(np.array([0.5, -1.0]), np.diag([100.0, 100.0])) for _ in problems]
     found = estimate.estimate_jointly(sharing(problems, ("a",)), SETTINGS, seed=3, singles=singles)
     np.testing.assert_allclose([found.control(e)[-1, 1] for e in range(8)], truths, atol=0.1)
     assert found.chi2.max() < 1

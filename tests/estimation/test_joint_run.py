@@ -75,3 +75,38 @@ def test_a_damaged_file_is_refused(campaign, tmp_path):
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(OutputError, match=r"joint\.nc"):
         load_joint(path)
+
+
+ERRORS = {
+    "timing": "position_std: 2 um, time_std: 0.1 ms",
+    "robust": "position_std: 2 um, robust: huber",
+    "correlated": "position_std: 2 um, correlation_time: 5 ms",
+    "discrepancy": "position_std: 2 um, time_std: 0.1 ms, discrepancy: estimated",
+    "robust discrepancy": "position_std: 2 um, robust: huber, discrepancy: estimated",
+}
+
+
+@pytest.mark.parametrize("error", [*(pytest.param(name, marks=pytest.mark.slow) for name in ERRORS), "sigma"])
+def test_errors_of_every_kind(error, tmp_path):
+    """One of five oscillators has a spring 15 % stiffer: it is named, and the estimate without it finds that of the
+    others.
+    """
+    rng, path = np.random.default_rng(1), make_campaign(tmp_path, n=5)
+    for i in range(5):
+        clean = csv_text(k=2.76 if i == 2 else 2.4).splitlines()
+        noisy = [f"{t},{float(x) + 2 * rng.standard_normal():.6g}" for t, x in (line.split(",") for line in clean[2:])]
+        (tmp_path / "data" / f"set{i}.csv").write_text("\n".join([*clean[:2], *noisy]) + "\n")
+    text = path.read_text()
+    if error == "sigma":
+        text = text.replace("  A: {", "  sigma: {prior: lognormal, median: 1, log_std: 0.5}\n  A: {")
+    else:
+        text = text.replace("position_std: 2 um", ERRORS[error])
+    path.write_text(text.replace("members: 8", "members: 24"))
+    run = run_campaign(path, overrides=_quiet(tmp_path)).directory
+    found, page = join([run], ["k"], tmp_path / "out")
+    assert found.odd == ("set2",)
+    rest = found.group("without")["k"]
+    assert abs(float(rest.mean()) - 2.4) < 3 * float(rest.std())
+    assert float(rest.std()) < 0.03
+    assert "without set2" in page.read_text()
+    assert ",set2," in (tmp_path / "out" / "joint.csv").read_text()

@@ -86,6 +86,10 @@ ROWS = tuple(
          "the file is not read; --resume estimates it again"),
         ("result-older", "a result file of another version",
          "{file}: result format 0; this version of en4dvar reads 1", "2", "the file stays as it is"),
+        ("pack-damaged", "the results of a campaign (`datasets.pack`) are damaged anywhere, cut short or gone",
+         "{run}: no result that can be read of {data set} ({reason}); 'en4dvar run' with --resume estimates what is "
+         "missing", "1 (export, report: the others are given), 2",
+         "every data set that is intact; the others are missed by name, and --resume estimates them to the same bits"),
         ("two-runs", "two runs in one directory",
          "{run}: in use by process {pid} on {machine}; wait for it to end, or give another --out", "2",
          "the first run"),

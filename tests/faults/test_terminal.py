@@ -16,7 +16,7 @@ import pytest
 from rows import row
 from run_files import assert_same_results, command, configuration, environment, make_campaign, run_cli
 
-from en4dvar.results.store import result_files
+from en4dvar.results.run_results import result_files
 from en4dvar.runs.interrupt import terminate_as_interrupt
 from en4dvar.runs.runner import run_campaign
 

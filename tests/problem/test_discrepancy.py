@@ -227,7 +227,7 @@ def test_an_alternative_that_leads_to_a_huge_discrepancy_is_beyond_linear_respon
     linear = Linearisation.of_stacked(like, like.stacked, np.ones((2, like.stacked.shape[0])))
     response = Leading(x, linear, np.eye(2, 4), 11.0, problem.observations)
     (shift,) = what_if(problem, response, np.ones(4), 0.0, SerialExecutor())
-    assert shift.reason == "beyond linear response"
+    assert shift.reason == "too large a change to extrapolate"
     assert shift.runs == 2
 
 

@@ -63,11 +63,11 @@ def test_no_scale_is_offered_as_a_cure_of_structure():
     problem = bent()
     problem.observations.std[:] *= 4
     cautions = {c.code: c for c in run(problem).cautions}
-    assert "estimate sigma" not in cautions["overstated-error"].advice
+    assert "parameters.sigma" not in cautions["overstated-error"].advice
     assert "discrepancy" in cautions["overstated-error"].advice
     found = run(with_discrepancy(problem, amplitude=(0.05, 1.0), length=(0.3, 0.7)))
     (told,) = (c for c in found.cautions if c.code == "overstated-error")
-    assert "estimate sigma" in told.advice  # beside a discrepancy it is the cure
+    assert "parameters.sigma" in told.advice  # beside a discrepancy it is the cure
 
 
 def test_a_discrepancy_takes_the_structure():

@@ -11,6 +11,7 @@ from run_files import add_to_pack
 from toys import Linear, make_problem
 
 from en4dvar.cli import main
+from en4dvar.diagnosis.intervals import member_quantiles
 from en4dvar.estimation.assimilate import assimilate
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.priors.prior import Prior, PriorTerm
@@ -164,6 +165,6 @@ def test_page_figure_and_tables(tmp_path, monkeypatch):
     assert row.panels[0].entries() == ["one", "two"]
     bars = next(mark.x for mark in row.panels[0].marks if mark.size == 2.0)
     pooled = np.concatenate([e.members for e in comparison.estimates if (e.run, e.summary.name) == ("one", "a")])
-    assert list(bars) == pytest.approx(list(np.quantile(pooled, (0.05, 0.95))))
+    assert list(bars) == pytest.approx(list(member_quantiles(pooled, (0.05, 0.95))))
     again = CliRunner().invoke(main, ["compare", *map(str, runs), "--out", str(out), "--no-report"])
     assert "report" not in again.output

@@ -15,9 +15,9 @@ from en4dvar.commands.run import _tell
 from en4dvar.plumbing.errors import DataError, OutputError, TooFewMembersError
 from en4dvar.report.result import load_result
 from en4dvar.results.campaign_file import GROUPS, save_campaign
-from en4dvar.results.pack import PACK, Pack, read_outcome, results_of
+from en4dvar.results.pack import PACK, Pack, file_names, read_outcome, results_of
 from en4dvar.runs import outcomes
-from en4dvar.runs.campaign import Campaign, DatasetOutcome, file_names
+from en4dvar.runs.campaign import Campaign, DatasetOutcome
 from en4dvar.runs.engine import write_report
 from en4dvar.runs.outcomes import Outcomes
 from en4dvar.runs.runner import run_campaign

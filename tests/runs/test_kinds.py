@@ -31,6 +31,7 @@ WORKED = {  # as `en4dvar` is called, in a folder with the files of `prepared`
     "sweep-twin": (
         "sweep-twin", "ring.yaml", "--vary", "assimilation.members=[8, 9]", "--seeds", "1", "--workers", "1",
     ),
+    "calibrate": ("calibrate", "campaign/toy.yaml", "--sets", "3"),
     "joint": ("joint", "done", "--share", "k"),
     "population": ("population", "done", "--of", "k"),
 }  # fmt: skip

@@ -201,7 +201,7 @@ def record(part):
     ("change", "told"),
     [
         (record("ending"), "datasets.pack/set0: damaged or altered since it was written"),
-        (record("content"), "datasets.pack/set0: missing or changed since it was written; estimated again"),
+        (record("content"), "datasets.pack/set0: damaged or altered since it was written"),
         (record("line"), ""),  # nobody knows that it was there
         (lambda pack: pack.unlink(), ""),
         (lambda pack: pack.write_bytes(pack.read_bytes()[:-1]), ""),

@@ -79,10 +79,11 @@ def structure(residuals: Residuals | None, robust: bool, unit: str, times: Array
     runs, expected = residuals.runs
     chance = min(residuals.lag_one_chance, residuals.runs_chance)
     if chance < ODD:
+        few = f", in {runs} runs of one sign where about {expected:.0f} are expected"
         words = (
-            f"the residuals have a structure in time: their lag-1 autocorrelation is {residuals.lag_one:.2f}, and they "
-            f"have {runs} runs of one sign where about {expected:.0f} are expected (probability {_chance(chance)} "
-            "where the model is right): error bars are those of independent errors"
+            "the residuals have a structure in time: neighbours resemble each other (their correlation is "
+            f"{residuals.lag_one:.2f}{few if residuals.runs_chance < ODD else ''}; probability {_chance(chance)} where "
+            "the model is right): error bars are those of independent errors"
         )
         # what is missed moves an estimate by no more than |e| of its standard deviations
         small = float(residuals.white @ residuals.white) < 1

@@ -12,19 +12,16 @@ import numpy.typing as npt
 from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.diagnosis.diagnostics import UNSEEN, active_members
 from en4dvar.diagnosis.honesty import checks
+from en4dvar.diagnosis.honesty.advice import advised
 from en4dvar.diagnosis.honesty.lost import loss
 from en4dvar.model.state import Array
-from en4dvar.plumbing.caution import CATALOGUE, Caution, caution, untrusted, worst_first
+from en4dvar.plumbing.caution import Caution, caution, untrusted, worst_first
 from en4dvar.plumbing.units import convert
 from en4dvar.priors.prior import Prior
 from en4dvar.problem import InverseProblem
 
 COLLAPSED = 1 / 9  # of the mean of 2 (J − J_min) per parameter: a spread below a third of what J allows
 SHORT_STEP = 0.5  # posterior standard deviations
-OTHER_KERNEL = (
-    "the discrepancy has another shape than its kernel: try data.error.discrepancy.kernel: matern-3/2, or "
-    "grows_beyond, and compare the evidence"
-)
 NO_SPREAD = 1e-8  # of the prior's: members that agree to rounding
 
 
@@ -56,7 +53,6 @@ def examine(
     """
     a, prior = analysis, analysis.problem.prior
     alive = active_members(a.posterior_failures)
-    odd = _structure(a)
     members = a.posterior[alive]
     warnings = (
         *earlier,
@@ -69,8 +65,8 @@ def examine(
         *loss("prior forecast", a.prior_failures, prior, control.prior),
         *loss("iterations", worst_loss, prior),
         *loss("posterior forecast", a.posterior_failures, prior, control.posterior),
-        *_fit(a, odd),
-        *odd,
+        *_fit(a),
+        *_structure(a),
         *checks.missed(a),
         *(checks.conflict(prior, control.centre) if control.costs is not None else ()),
         *checks.at_bound(prior, control.prior, control.posterior, a.posterior_failures),
@@ -79,7 +75,7 @@ def examine(
     )
     silent = {name for name in prior.names if untrusted(warnings, name)} | _changes(a) | _beside(a)
     little = checks.information(prior, control.posterior[alive], a.dfs_per_parameter, silent)
-    return worst_first((*warnings, *little))
+    return advised(a, worst_first((*warnings, *little)))
 
 
 def _whole(prior: Prior, control: ControlEnsembles, alive: npt.NDArray[np.bool_]) -> checks.Findings:
@@ -125,12 +121,12 @@ def _structure(a: Analysis) -> tuple[Caution, ...]:
     times = convert(observations.times, model.time_unit, model.time_display_unit)
     robust = math.isfinite(observations.noise.counts_within)
     warnings = tuple(checks.structure(a.residuals, robust, model.time_display_unit, times))
-    return tuple(_allowed(c, OTHER_KERNEL) for c in warnings) if a.discrepancy else warnings
+    return tuple(map(_allowed, warnings)) if a.discrepancy else warnings
 
 
-def _allowed(finding: Caution, advice: str) -> Caution:
+def _allowed(finding: Caution) -> Caution:
     """A finding about what the model misses, where an estimated discrepancy allows for that: no veto of intervals."""
-    return replace(finding, advice=advice, severity="caution" if finding.severity == "serious" else finding.severity)
+    return replace(finding, severity="caution" if finding.severity == "serious" else finding.severity)
 
 
 def _validity(a: Analysis, alive: npt.NDArray[np.bool_]) -> checks.Findings:
@@ -143,19 +139,12 @@ def _validity(a: Analysis, alive: npt.NDArray[np.bool_]) -> checks.Findings:
     )
     if limits:
         beyond = checks.validity(limits, a.extremes[alive], a.beyond[alive], observations.times[which], leverage)
-        yield from (_allowed(c, c.advice) for c in beyond) if a.discrepancy else beyond
+        yield from map(_allowed, beyond) if a.discrepancy else beyond
 
 
-def _fit(a: Analysis, odd: Sequence[Caution]) -> checks.Findings:
-    """The size of the residuals; where they have a structure that no discrepancy explains, no scale of the errors is
-    offered as a cure.
-    """
+def _fit(a: Analysis) -> checks.Findings:
     last, n_used = a.iterations[-1], len(a.problem.observations.used)
-    structured = any(c.code == "residual-structure" for c in odd)
-    for warning in checks.fit(last.chi2_per_observation * n_used, n_used, last.dfs):
-        if structured and not a.problem.discrepancy and warning.code == "overstated-error":
-            warning = replace(warning, advice=CATALOGUE["residual-structure"][1])
-        yield warning
+    return checks.fit(last.chi2_per_observation * n_used, n_used, last.dfs)
 
 
 def unfinished(analysis: Analysis) -> checks.Findings:

@@ -117,7 +117,7 @@ def _shift(
         composite = Composite(changed, executor)
     except Exception as error:  # a model may offer what does not suit the problem; the reason is kept
         return Shift(*about, unknown, unknown, unknown, np.nan, runs, f"cannot be set up: {error}")
-    moved, reason, before = np.zeros(len(std)), "beyond linear response", np.inf
+    moved, reason, before = np.zeros(len(std)), "too large a change to extrapolate", np.inf
     of_errors = np.array([name in problem.of_errors for name in problem.prior.names])
     for attempt in range(MOST_RUNS):
         if attempt == 0 and _same_run(problem, changed):
@@ -143,7 +143,7 @@ def _shift(
             break
         before = correction
     if np.any(np.abs(moved / std)[of_errors] > FAR):
-        reason = "beyond linear response"
+        reason = "too large a change to extrapolate"
     if reason:
         return Shift(*about, unknown, unknown, unknown, np.nan, runs, reason)
     prior = problem.prior

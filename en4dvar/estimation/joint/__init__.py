@@ -4,10 +4,11 @@ r"""Problems of several experiments: quantities that experiments share, and quan
 
 in units of the prior, which enters once for what is shared. From the bottom up: ``arrow`` (the linear algebra),
 ``problem`` (who shares what), ``tangent`` (an experiment's runs), ``descent``, ``members`` (the posterior ensemble),
-``estimate``.
+``agreement`` (is one odd?), ``estimate``.
 """
 
-from en4dvar.estimation.joint.estimate import JointEstimate, Single, estimate_jointly
+from en4dvar.estimation.joint.estimate import JointEstimate, estimate_jointly
 from en4dvar.estimation.joint.problem import JointProblem, sharing
+from en4dvar.estimation.joint.single import Single
 
 __all__ = ["JointEstimate", "JointProblem", "Single", "estimate_jointly", "sharing"]

@@ -47,6 +47,16 @@ class ArrowSystem:
     arrow: Arrow
     slope: tuple[Array, list[Array]]
 
+    @property
+    def own_costs(self) -> Array:
+        """(E,) J_o of each experiment, and J_b of what is its own."""
+        return np.array([form.cost + 0.5 * float(v @ v) for form, v in zip(self.forms, self.place.own, strict=True)])
+
+    def chi2(self, joint: JointProblem) -> Array:
+        """(E,) misfit per observation of each experiment."""
+        of_each = zip(joint.experiments, self.forms, strict=True)
+        return np.array([float(p.observations.chi2_per_observation(f.central.predicted)[0]) for p, f in of_each])
+
     def step(self) -> ArrowStep:
         """That of Gauss and Newton."""
         a, b = self.slope

@@ -11,16 +11,19 @@ import numpy as np
 from en4dvar.descent.weight_space import require_members
 from en4dvar.ensemble.forecast import Forecast, plotting_times
 from en4dvar.estimation.assimilate import assimilate
+from en4dvar.estimation.joint.agreement import AT_MOST, Agreement, agreement, is_odd, oddest
 from en4dvar.estimation.joint.challenge import challenger
 from en4dvar.estimation.joint.descent import JointDescent, Place, assembled, cost, descend
+from en4dvar.estimation.joint.doubts import doubts
 from en4dvar.estimation.joint.members import JointMembers, gaussian, sampled
 from en4dvar.estimation.joint.problem import JointProblem
+from en4dvar.estimation.joint.single import Single
 from en4dvar.estimation.joint.tangent import Experiment
 from en4dvar.executor import Executor, SerialExecutor, one_blas_thread
 from en4dvar.model.state import Array
 from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
-from en4dvar.priors.prior import Prior, own_seed
+from en4dvar.priors.prior import own_seed
 from en4dvar.schemes import MINIMISERS
 from en4dvar.schemes.settings import AssimilationSettings
 
@@ -30,25 +33,12 @@ TRIED = 6  # experiments whose own estimate of what is shared is tried as a star
 
 
 @dataclass(frozen=True)
-class Single:
-    """The estimate of one experiment by itself: mode (n,) and posterior precision (n, n), in units of the prior."""
-
-    mode: Array
-    precision: Array
-
-    @classmethod
-    def of_physical(cls, prior: Prior, members: Array, mode: Array) -> Single:
-        """From the members (N, n) alive and the mode (n,) of a posterior. Raises ValueError outside a map's range."""
-        z = (prior.from_physical(np.vstack([members, mode])) - prior.mean) / prior.std
-        return cls(z[-1], np.linalg.inv(np.atleast_2d(np.cov(z[:-1].T))))
-
-
-@dataclass(frozen=True)
 class JointEstimate:
     """Posterior of a joint problem.
 
     ``members`` in units of the prior, ``mode`` where J is lowest, ``chi2`` (E,) per observation there, ``forecasts`` of
-    the N members and, last, the mode, each read at ``grids`` too; ``cautions`` why not to trust it.
+    the N members and, last, the mode, each read at ``grids`` too; ``cautions`` why not to trust it. ``agreement`` of
+    each experiment with all others; ``without`` the oddest of them the same estimate, None where none is odd.
     """
 
     joint: JointProblem
@@ -63,6 +53,18 @@ class JointEstimate:
     log_evidence: float
     forward_runs: int
     cautions: tuple[Caution, ...]
+    agreement: Agreement
+    without: JointEstimate | None = None
+
+    @property
+    def odd(self) -> tuple[str, ...]:
+        """Names of the experiments that do not share the values of the others."""
+        return tuple(name for name in self.joint.names if name not in self.rest.joint.names)
+
+    @property
+    def rest(self) -> JointEstimate:
+        """The estimate without any odd experiment."""
+        return self.without.rest if self.without else self
 
     @property
     def shared(self) -> Array:
@@ -118,11 +120,12 @@ class _Estimate:
             raise ConfigError(f"{settings.scheme} does not minimise J, as a joint estimate must; use {others}")
         self.minimiser = scheme = settings.own.minimiser
         self.experiments = [Experiment(joint, e, scheme.epsilon, executor) for e in range(len(joint.experiments))]
-        self.runs_of_singles = 0
+        self.other_runs = 0
 
-    def result(self, singles: Sequence[Single]) -> JointEstimate:
-        joint, experiments = self.joint, self.experiments
-        descents = self._descents(self._starts(singles or self._singles()))
+    def result(self, singles: Sequence[Single], most: int | None = None) -> JointEstimate:
+        """Of which at ``most`` so many experiments are left out as odd."""
+        joint, experiments, singles = self.joint, self.experiments, singles or self._singles()
+        descents = self._descents(self._starts(singles))
         lowest = self._challenged(min(descents, key=lambda descent: descent.at.cost))
         self.tell(f"J {lowest.at.cost:.4g} after {len(lowest.costs) - 1} iterations, {lowest.stop}")
         members, cautions = self._members(lowest)
@@ -137,26 +140,47 @@ class _Estimate:
         if _agreeing(descents) < 2:
             words = f"none of {len(descents) - 1} further descents of the joint estimate ended in its lowest minimum"
             cautions.append(caution("starts-disagree", words))
+        most = int(AT_MOST * len(experiments)) if most is None else most
+        alone = np.array([self._alone(e, single) for e, single in enumerate(singles)])
+        without = self._without(lowest.at.cost, singles, alone, most) if most else None
+        names = without.rest.joint.names if without else joint.names
+        kept = [e for e, name in enumerate(joint.names) if name in names]
+        agreed = agreement(joint, singles, kept, 2 * np.maximum(lowest.at.own_costs - alone, 0))
+        cautions += doubts(joint, lowest.at.chi2(joint), agreed, kept, singles)
         normalisation = sum(problem.observations.log_normalisation() for problem in joint.experiments)
         return JointEstimate(
             joint=joint,
             mode=lowest.at.place,
             members=members,
-            chi2=np.array(
-                [
-                    float(problem.observations.chi2_per_observation(form.central.predicted)[0])
-                    for problem, form in zip(joint.experiments, lowest.at.forms, strict=True)
-                ]
-            ),
+            chi2=lowest.at.chi2(joint),
             forecasts=forecasts,
             grids=grids,
             costs=tuple(lowest.costs),
             converged=lowest.converged,
             stop_reason=lowest.stop,
             log_evidence=members.log_evidence - normalisation,
-            forward_runs=self.runs_of_singles + sum(experiment.forward_runs for experiment in experiments),
+            forward_runs=self.other_runs + sum(experiment.forward_runs for experiment in experiments),
             cautions=tuple(cautions),
+            agreement=agreed,
+            without=without,
         )
+
+    def _alone(self, e: int, single: Single) -> float:
+        """J_o + J_b of its own quantities at an experiment's mode alone."""
+        own = single.mode[self.joint.columns(e)[1]]
+        return float(self.experiments[e].costs(single.mode[None])[0] + 0.5 * own @ own)
+
+    def _without(self, cost: float, singles: Sequence[Single], alone: Array, most: int) -> JointEstimate | None:
+        """The estimate without the oddest experiment, if J is then lower by more than chance explains."""
+        e = oddest(self.joint, singles)
+        if e is None:
+            return None
+        kept = [i for i in range(len(singles)) if i != e]
+        self.tell(f"once more without {self.joint.names[e]}")
+        estimate = _Estimate(self.joint.of(kept), self.settings, self.seed, self.executor, self.tell)
+        rest = estimate.result([singles[i] for i in kept], most - 1)
+        self.other_runs += rest.forward_runs
+        return rest if is_odd(self.joint, singles, e, 2 * (cost - rest.costs[-1] - alone[e])) else None
 
     def _singles(self) -> list[Single]:
         """Each experiment by itself."""
@@ -165,7 +189,7 @@ class _Estimate:
         for problem in self.joint.experiments:
             self.tell(f"{problem.observations.name} alone")
             analysis = assimilate(problem, settings, own_seed(self.seed, problem.observations.name), self.executor)
-            self.runs_of_singles += analysis.forward_runs
+            self.other_runs += analysis.forward_runs
             alive = np.isfinite(analysis.posterior).all(axis=1)
             singles.append(Single.of_physical(problem.prior, analysis.posterior[alive], analysis.centre))
         return singles

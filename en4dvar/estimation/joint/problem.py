@@ -62,6 +62,15 @@ class JointProblem:
         """The priors of what is shared."""
         return tuple(terms[0] for terms in self._terms.values())
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the experiments."""
+        return tuple(problem.observations.name for problem in self.experiments)
+
+    def of(self, kept: Sequence[int]) -> JointProblem:
+        """The same of some of the experiments."""
+        return JointProblem(tuple(self.experiments[e] for e in kept), tuple(self.groups[e] for e in kept))
+
     def of_border(self, e: int) -> list[int]:
         """Which of the shared quantities experiment e has, in the order of its control vector."""
         groups = self.groups[e]

@@ -96,6 +96,7 @@ def yaml_text(name: str, source: Source, proposal: Proposal, command: str) -> st
         *_comparison(name, proposal.simpler),
         "parameters: # a prior is estimated, a quantity such as 'mu: 0.1 Pa s' is fixed",
         *_section(proposal.parameters),
+        *proposal.population,
         "assimilation:",
         "  members: 48",
         "  draws: 400 # effective ones where the posterior is sampled: its mean is known to 5 % of its std",

@@ -1,0 +1,248 @@
+"""What to do about a warning in this very configuration: options as they stand in YAML, values in the user's units.
+
+The catalogue says what can be done in general. Here each advice leaves out what is done already, so that following it
+does not bring the same words back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from en4dvar.data.noise.kernel import SMOOTHNESS
+from en4dvar.diagnosis.analysis import Analysis
+from en4dvar.model.state import NOISE_SCALE, Parameter
+from en4dvar.plumbing.caution import CATALOGUE, Caution
+from en4dvar.plumbing.units import convert
+
+MANY = 48  # members that start far enough apart
+ENOUGH = 30  # iterations beyond which more of them seldom help
+SHARE = 0.1  # of the members beyond a limit of the model, from when on the window is too long
+CAUSES = ("rank-deficient", "ensemble-collapse", "not-converged", "at-bound")  # of residuals that are odd
+SIGMA = "estimate their size (parameters.sigma: {prior: lognormal, median: 1, log_std: 0.5})"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One warning of an analysis, and the ``codes`` of all that it has."""
+
+    a: Analysis
+    caution: Caution
+    codes: frozenset[str]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Those it is about."""
+        return tuple(p for p in self.a.parameters if p.name in self.caution.parameters)
+
+    @property
+    def scatter(self) -> float:
+        """Of the residuals over the stated errors, as one factor."""
+        last, used = self.a.iterations[-1], len(self.a.problem.observations.used)
+        return math.sqrt(last.chi2_per_observation * used / max(1.0, used - last.dfs))
+
+    @property
+    def stated(self) -> float:
+        """The error of a reading, the median of all, SI."""
+        return float(np.median(self.a.error_std))
+
+    @property
+    def absurd(self) -> bool:
+        """Whether the stated error is larger than half of what the readings span: hardly an error, perhaps its unit."""
+        return self.stated > 0.5 * float(np.ptp(self.a.observations.values)) and self.scatter < SHARE
+
+    @property
+    def cause(self) -> str:
+        """What has to be settled before the residuals tell anything, "" where nothing has."""
+        first = next((code for code in CAUSES if code in self.codes), "")
+        return f"settle the warning {first} first, which may be the reason" if first else ""
+
+    def reading(self, value: float) -> str:
+        """A size of readings in their display unit."""
+        observable = self.a.problem.observable
+        return f"{convert(value, observable.unit, observable.display_unit):.2g} {observable.display_unit}"
+
+    def moment(self, value: float) -> str:
+        """A time in the display unit."""
+        model = self.a.problem.model
+        return f"{convert(value, model.time_unit, model.time_display_unit):.4g} {model.time_display_unit}"
+
+
+def advised(a: Analysis, cautions: Sequence[Caution]) -> tuple[Caution, ...]:
+    """The warnings with the advice of this configuration, where the catalogue's alone has been given."""
+    codes = frozenset(c.code for c in cautions)
+    return tuple(
+        replace(c, advice=ADVICE[c.code](Case(a, c, codes)))
+        if c.code in ADVICE and c.advice == CATALOGUE[c.code][1]
+        else c
+        for c in cautions
+    )
+
+
+def _not_converged(case: Case) -> str:
+    now = getattr(case.a.settings.own, "max_iterations", ENOUGH)
+    if now < ENOUGH:
+        return f"set assimilation.max_iterations: {max(20, 2 * now)} (it is {now})"
+    return "narrow the priors of what the data hardly tell, or set assimilation.refine: mcmc, which needs no minimum"
+
+
+def _members(case: Case) -> str:
+    settings, n = case.a.settings, len(case.a.parameters)
+    wanted = [f"assimilation.members: {2 * n + 2} (there are {n} parameters)"] * (settings.members <= 2 * n)
+    wanted += ["assimilation.sampling: exact"] * (settings.sampling != "exact")
+    wanted += ["assimilation.scheme: en4dvar, which minimises J"] * (settings.scheme != "en4dvar")
+    return f"do not quote the intervals; set {' and '.join(wanted or ['assimilation.refine: mcmc'])}"
+
+
+def _misfit(case: Case) -> str:
+    if cause := case.cause:
+        return cause
+    if case.a.observations.noise.discrepant:
+        return "widen the prior of data.error.discrepancy.amplitude, choose another model, or a shorter window"
+    if "residual-structure" in case.codes:
+        return _structure(case)
+    if "odd-residuals" in case.codes and _may_be_robust(case):
+        return "see the advice about single readings; look at the residuals before a larger error is stated"
+    larger = (
+        f"state an error of about {case.reading(case.scatter * case.stated)} ({case.reading(case.stated)} is stated)"
+    )
+    return (
+        f"look at the residuals; if the readings scatter as much as they do, {larger}, or {SIGMA}; if not, the model "
+        "or the window must change"
+    )
+
+
+def _overstated(case: Case) -> str:
+    scatter = case.reading(case.scatter * case.stated)
+    if case.absurd:
+        return (
+            f"check the unit of data.error: {case.reading(case.stated)} is stated, the residuals scatter by {scatter}"
+        )
+    if "residual-structure" in case.codes and not case.a.problem.discrepancy:
+        return CATALOGUE["residual-structure"][1]
+    also = "" if NOISE_SCALE.name in case.a.problem.prior.names else f", or {SIGMA}"
+    return f"state an error of about {scatter} ({case.reading(case.stated)} is stated){also}; intervals are too wide"
+
+
+def _structure(case: Case) -> str:
+    if case.absurd:
+        return _overstated(case)
+    if cause := case.cause:
+        return cause
+    kernel = getattr(case.a.observations.noise, "kernel", None)
+    if kernel is None:
+        return CATALOGUE["residual-structure"][1]
+    smoother = sorted((nu, name) for name, nu in SMOOTHNESS.items() if nu > kernel.smoothness)
+    other = f"kernel: {smoother[0][1]}" if smoother else "grows_beyond" if not kernel.grows else ""
+    if other:
+        return f"the discrepancy has another shape than its kernel: try data.error.discrepancy.{other}"
+    return "no kernel has the shape of what is missed: end the window earlier (data.window), or choose another model"
+
+
+def _may_be_robust(case: Case) -> bool:
+    noise = case.a.observations.noise
+    return noise.independent and not math.isfinite(noise.counts_within)
+
+
+def _odd(case: Case) -> str:
+    if not case.caution.words.startswith("the reading"):
+        if case.a.observations.noise.discrepant:
+            return _structure(case)
+        sure = not case.a.observations.noise.time_std.any()
+        first = "state how uncertain the times are (data.error.time_std)" if sure else "a larger data.error.time_std"
+        return f"{first}; if the times are right, the model errs where the observable changes fast"
+    if _may_be_robust(case):
+        return "look at this reading; set data.error.robust: huber, with which such readings count less"
+    return "look at this reading; if it is wrong, delete its line from the data file and say so"
+
+
+def _validity(case: Case) -> str:
+    a, times = case.a, np.sort(case.a.observations.times[case.a.observations.used])
+    left = np.quantile(a.beyond.min(axis=1), SHARE, method="lower")
+    kept = times[times < left]
+    if len(kept) <= len(a.parameters):
+        return f"choose a model that is valid there: too few readings ({len(kept)}) come before for a shorter window"
+    return (
+        f"end the window before (data.window: {{to: {case.moment(kept[-1])}}}), or choose a model that is valid there"
+    )
+
+
+def _bound(case: Case) -> str:
+    prior = case.a.problem.prior
+    own = [p.name for p in case.parameters if prior.terms[prior.names.index(p.name)].has_bound]
+    if not own:
+        return "quote a limit, not mean ± std: no action is needed, the model allows no values beyond"
+    return (
+        f"widen the bounds of the prior (parameters.{own[0]}) if physics allows it; else quote a limit, not mean ± std"
+    )
+
+
+def _conflict(case: Case) -> str:
+    prior = case.a.problem.prior
+    x = np.array([float(t.from_physical(np.array(v))) for t, v in zip(prior.terms, case.a.centre, strict=True)])
+    z = np.abs(x - prior.mean) / prior.std
+    j = int(np.argmax(z))
+    factor = math.ceil(z[j] / 2)
+    return (
+        f"check units and data; if both are right, make the prior of {prior.names[j]} about {factor} times as wide "
+        f"(parameters.{prior.names[j]}) and say so"
+    )
+
+
+def _modes(case: Case) -> str:
+    name = case.caution.parameters[0] if case.caution.parameters else case.a.parameters[0].name
+    apart = f"what is known from elsewhere, as bounds of the prior (parameters.{name}), tells them apart"
+    if case.caution.severity == "serious" and case.a.settings.refine != "mcmc":
+        return f"set assimilation.refine: mcmc, which draws from all of them; {apart}"
+    return f"quote the quantiles or each mode by itself, not mean ± std; {apart}"
+
+
+def _starts(case: Case) -> str:
+    """More starts than a few a member find nothing new."""
+    starts, members = int(getattr(case.a.settings.own, "starts", 1)), case.a.settings.members
+    if members < MANY:
+        return f"set assimilation.members: {MANY} and assimilation.starts: {2 * max(starts, 2)}"
+    if starts < MANY // 4:
+        return f"set assimilation.starts: {2 * max(starts, 2)} (it is {starts}), or narrow the priors"
+    return "narrow the priors, or set assimilation.refine: mcmc, which does not hang on where descents end"
+
+
+def _one_descent(case: Case) -> str:
+    own, n = case.a.settings.own, len(case.a.parameters)
+    wanted = ["assimilation.starts: 2"] * (getattr(own, "starts", 2) < 2)
+    wanted += ["assimilation.linearisation: bundle"] * (getattr(own, "linearisation", "bundle") != "bundle")
+    wanted += [f"assimilation.members: {2 * n + 2}"] * (case.a.settings.members <= n + 1)
+    return f"set {' and '.join(wanted)}" if wanted else "compare with another seed"
+
+
+def _chain(case: Case) -> str:
+    guided = case.a.settings.emulator == "on"
+    first = "" if guided else "set assimilation.emulator: on, which guides the chain, or "
+    return f"do not quote these intervals; {first}run again with more data or narrower priors"
+
+
+def _silent(case: Case) -> str:
+    p = case.parameters[0]
+    return f"do not quote {p.name} as measured: fix it (parameters.{p.name}: a value), or add data that depend on it"
+
+
+ADVICE: dict[str, Callable[[Case], str]] = {
+    "not-converged": _not_converged,
+    "ensemble-collapse": _members,
+    "rank-deficient": _members,
+    "misfit": _misfit,
+    "overstated-error": _overstated,
+    "residual-structure": _structure,
+    "odd-residuals": _odd,
+    "model-validity": _validity,
+    "chain-not-converged": _chain,
+    "at-bound": _bound,
+    "prior-conflict": _conflict,
+    "several-modes": _modes,
+    "starts-disagree": _starts,
+    "one-descent": _one_descent,
+    "not-informed": _silent,
+}

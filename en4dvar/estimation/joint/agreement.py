@@ -1,0 +1,151 @@
+r"""Does each experiment agree with all others about what they share?
+
+What experiment e says alone of the shared s is, to second order, exp(−½ sᵀΛ_e s + h_eᵀs), its own quantities eliminated
+and the prior divided out. Without it the others know s with the precision S_e = I + Σ_{i≠e} Λ_i; how far it is from
+them is measured by what it would change there and what it adds to the precision,
+
+    z_e² = δᵀ (S_e⁻¹ − S⁻¹)⁻ δ,      δ = S_e⁻¹ Σ_{i≠e} h_i − S⁻¹ Σ_i h_i,      S = S_e + Λ_e,
+
+for Λ_e of full rank the squared difference of its own value and that of the others, in units of their covariances
+together; it follows χ² if all share one s. The experiment of the largest z_e is then left out and the joint estimate
+made again, which needs no quadratic form: 2 (J − J_without − J_alone), the prior of s counted once, is z_e² of linear
+experiments. Only where both are improbable the experiment is odd; and the rest is tested in the same way (Hawkins 1980,
+Identification of Outliers, ch. 5). Where the others scatter by more than their errors themselves, both are compared
+with the others' median by an F distribution: of data sets that all differ, none is odd.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import chdtrc, fdtrc, gammaincinv
+
+from en4dvar.estimation.joint.problem import JointProblem
+from en4dvar.estimation.joint.single import Single
+from en4dvar.model.state import Array
+
+ODD = 0.01  # probability below which an experiment is odd, that any of a campaign be so by chance
+AT_MOST = 1 / 3  # of the experiments: more are no exceptions
+TOLD = 0.01  # least share of the precision that an experiment must bring along a direction to be compared along it
+SCATTER = 0.01  # probability below which the others are taken to scatter by more than their errors
+OF_MEDIAN = 0.4  # efficiency of a median of squares, as a share of their degrees of freedom
+
+
+@dataclass(frozen=True)
+class Statement:
+    """What one experiment says of what is shared: ``precision`` Λ (c, c) and ``pull`` h (c,), in units of the prior;
+    ``compared``: which of the shared quantities others have too.
+    """
+
+    precision: Array
+    pull: Array
+    compared: npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """``squares`` z² (E,) of each experiment against others, along ``freedom`` (E,) directions, and ``chances`` (E,)
+    that it be as large if they share one value; NaN where there is nothing to compare.
+
+    ``deviances`` (E,): 2 (J_o + J_b of its own quantities) more than alone; ``chance``: that those of all be so large
+    if they share one value. ``scatter`` of the others in units of their errors, known with so many ``degrees``, 0 where
+    the errors explain it.
+    """
+
+    squares: Array
+    freedom: Array
+    chances: Array
+    deviances: Array
+    chance: float
+    scatter: float
+    degrees: float
+
+
+def agreement(joint: JointProblem, singles: Sequence[Single], rest: Collection[int], deviances: Array) -> Agreement:
+    """Of each experiment with those of ``rest``, by the single estimates."""
+    said = [_alone(joint, e, single) for e, single in enumerate(singles)]
+    squares, freedom = _squares(said, rest)
+    scatter, degrees = _scatter(said, rest)
+    chances = np.array([_chance(z, k, scatter, degrees) for z, k in zip(squares, freedom, strict=True)])
+    shared = len({j for e in rest for j in joint.of_border(e)})
+    more = max(1, sum(len(joint.of_border(e)) for e in rest) - shared)
+    together = float(chdtrc(more, deviances[list(rest)].sum()))
+    return Agreement(squares, freedom, chances, deviances, together, float(np.sqrt(scatter)), degrees)
+
+
+def oddest(joint: JointProblem, singles: Sequence[Single]) -> int | None:
+    """The experiment that is farthest from all others, if that is improbable."""
+    each = range(len(singles))
+    squares, freedom = _squares([_alone(joint, e, singles[e]) for e in each], each)
+    with np.errstate(invalid="ignore"):
+        e = int(np.argmax(np.nan_to_num(squares / freedom)))
+    return e if is_odd(joint, singles, e, float(squares[e])) else None
+
+
+def is_odd(joint: JointProblem, singles: Sequence[Single], e: int, square: float) -> bool:
+    """Whether the z² of an experiment is improbably large beside the scatter of the others."""
+    said = [_alone(joint, i, single) for i, single in enumerate(singles)]
+    scatter = _scatter(said, [i for i in range(len(said)) if i != e])
+    freedom = _squares(said, range(len(said)))[1][e]
+    return bool(_chance(square, freedom, *scatter) * len(said) < ODD)
+
+
+def _squares(said: Sequence[Statement], rest: Collection[int]) -> tuple[Array, Array]:
+    """z² of each experiment against those of ``rest`` but itself, and along how many directions; NaN along none."""
+    squares, freedom = np.full(len(said), np.nan), np.zeros(len(said))
+    for e, own in enumerate(said):
+        others, at = [said[i] for i in rest if i != e], own.compared
+        if not (len(at) and others):
+            continue
+        precision = np.eye(len(own.pull)) + sum(other.precision for other in others)
+        pull = sum((other.pull for other in others), start=np.zeros(len(own.pull)))
+        without, with_it = np.linalg.inv(precision), np.linalg.inv(precision + own.precision)
+        change = (without @ pull - with_it @ (pull + own.pull))[at]
+        inverse = np.linalg.inv(np.linalg.cholesky(without[np.ix_(at, at)]))
+        shares, vectors = np.linalg.eigh(inverse @ (without - with_it)[np.ix_(at, at)] @ inverse.T)
+        along = (vectors.T @ inverse @ change)[shares > TOLD]
+        if len(along):
+            squares[e], freedom[e] = float(np.sum(along**2 / shares[shares > TOLD])), len(along)
+    return squares, freedom
+
+
+def _scatter(said: Sequence[Statement], rest: Collection[int]) -> tuple[float, float]:
+    """The variance of experiments among themselves over that of their errors, by the median, and how many degrees of
+    freedom it has; 1 and 0 where the errors explain it.
+    """
+    squares, freedom = (values[list(rest)] for values in _squares(said, rest))
+    z, k = squares[freedom > 0], freedom[freedom > 0]
+    degrees = float(k.sum() - len({j for e in rest for j in said[e].compared}))
+    if degrees < 1:
+        return 1.0, 0.0
+    chance = chdtrc(degrees, z.sum() * degrees / k.sum())  # each is compared with a mean of which it is no part
+    variance = float(np.median(z / (2 * gammaincinv(k / 2, 0.5))))
+    return (variance, OF_MEDIAN * degrees) if chance < SCATTER and variance > 1 else (1.0, 0.0)
+
+
+def _chance(square: float, freedom: float, scatter: float, degrees: float) -> float:
+    """The probability of a z² at least as large beside others that scatter so."""
+    if not freedom:
+        return float("nan")
+    if not degrees:
+        return float(chdtrc(freedom, square))
+    return float(fdtrc(freedom, degrees, square / (freedom * scatter)))
+
+
+def _alone(joint: JointProblem, e: int, single: Single) -> Statement:
+    """By its estimate alone, whose prior of what is shared is divided out."""
+    (shared, own), at, c = joint.columns(e), joint.of_border(e), len(joint.shared)
+    schur = single.precision[np.ix_(shared, shared)]
+    if own:
+        edge = single.precision[np.ix_(own, shared)]
+        schur = schur - edge.T @ np.linalg.solve(single.precision[np.ix_(own, own)], edge)
+    values, vectors = np.linalg.eigh(schur - np.eye(len(schur)))
+    precision, pull = np.zeros((c, c)), np.zeros(c)
+    # members are few: along a direction that they say nothing of the difference may turn negative
+    precision[np.ix_(at, at)] = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    pull[at] = (vectors * np.where(values > 0, values + 1, 0.0)) @ vectors.T @ single.mode[shared]
+    others = [j for j in at if sum(j in joint.of_border(i) for i in range(len(joint.experiments))) > 1]
+    return Statement(precision, pull, np.array(others, dtype=int))

@@ -1,0 +1,76 @@
+"""What a joint estimate says against itself: data sets that are odd, differ, are not fitted, or follow a trend."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+
+import numpy as np
+
+from en4dvar.diagnosis.diagnostics import chi2_interval
+from en4dvar.estimation.joint.agreement import Agreement
+from en4dvar.estimation.joint.problem import JointProblem
+from en4dvar.estimation.joint.single import Single
+from en4dvar.estimation.trends import trends
+from en4dvar.model.state import Array
+from en4dvar.plumbing.caution import Caution, caution
+
+MOST_NAMES = 6
+LEAST = 1e-16  # probability that is told in figures
+DIFFER = 1e-3  # probability below which data sets are said not to share one value
+
+
+def doubts(
+    joint: JointProblem, chi2: Array, agreed: Agreement, kept: Collection[int], singles: Sequence[Single]
+) -> Iterator[Caution]:
+    """Warnings of a joint estimate about its data sets, with χ² (E,) per reading; those not ``kept`` are odd."""
+    odd = [
+        f"{name} (χ² {chi2[e]:.3g} per reading, {agreed.squares[e] ** 0.5:.1f} standard deviations from all others, "
+        f"probability {_chance(agreed.chances[e])})"
+        for e, name in enumerate(joint.names)
+        if e not in kept
+    ]
+    if odd:
+        words = f"{_several(odd)} {'does' if len(odd) == 1 else 'do'} not share the values of the others"
+        yield caution("odd-data-set", f"{words}: the estimate without stands beside", "serious")
+    elif agreed.chance < DIFFER:
+        by = f" by {agreed.scatter:.1f} times what their errors explain" if agreed.degrees else ""
+        words = (
+            f"the data sets differ{by} (probability {_chance(agreed.chance)} if they share one value): the "
+            "interval of one shared value is too narrow"
+        )
+        yield caution("data-sets-differ", words)
+    yield from _misfits(joint, chi2, kept)
+    yield from _trends(joint, singles)
+
+
+def _misfits(joint: JointProblem, chi2: Array, kept: Collection[int]) -> Iterator[Caution]:
+    """χ² of data sets under the shared values, beyond what their errors explain."""
+    beyond = []
+    for e in kept:
+        readings = len(joint.experiments[e].observations.used)
+        if chi2[e] * readings > chi2_interval(max(1.0, readings - len(joint.columns(e)[1])))[1]:
+            beyond.append(f"{joint.names[e]} ({chi2[e]:.3g})")
+    if beyond:
+        words = f"χ² per reading under the shared values is larger than the errors explain: {_several(beyond)}"
+        yield caution("misfit", words)
+
+
+def _trends(joint: JointProblem, singles: Sequence[Single]) -> Iterator[Caution]:
+    """Of the shared parameters as the data sets have them alone, in units of the prior."""
+    names = list(dict.fromkeys(name for name, _ in joint.shared))
+    values = np.full((len(singles), len(names)), np.nan)
+    for e, single in enumerate(singles):
+        own = joint.experiments[e].prior.names
+        for j, name in enumerate(names):
+            if name in joint.groups[e]:
+                values[e, j] = single.mode[own.index(name)]
+    return trends(joint.experiments, values, names)
+
+
+def _chance(value: float) -> str:
+    return f"{value:.1g}" if value > LEAST else f"below {LEAST:.0g}"
+
+
+def _several(words: Sequence[str]) -> str:
+    more = f" and {len(words) - MOST_NAMES} more" if len(words) > MOST_NAMES else ""
+    return ", ".join(words[:MOST_NAMES]) + more

@@ -1,0 +1,200 @@
+"""Is the posterior calibrated? What the ranks of many truths among posterior members say: table, figure, page."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.stats import binomtest
+
+from en4dvar.diagnosis.ranks import BAND, Uniform, uniform_ranks
+from en4dvar.plumbing.files import read_text, write_text
+from en4dvar.plumbing.tables import table
+from en4dvar.report.chart import PAGE, POINTS, Chart, Panel, in_columns
+from en4dvar.report.drawing import draw
+from en4dvar.report.html import render
+from en4dvar.report.text import figure_text
+from en4dvar.results.calibration_file import FIT, Judged, read_sets
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+LEVEL = 0.01  # of the tests of all quantities together, by Holm's rule
+APART, WIDTH = 0.2, 0.1  # mean of z, and std of z from 1, by which what is off is told
+CURVES = (
+    "Share of the sets whose truth has a lower rank among the members, less that of uniform ranks. A calibrated "
+    f"posterior stays within the band, {100 * BAND:.0f} of 100 times throughout. A curve that rises and falls: its "
+    "intervals are too wide; that falls and rises: too narrow; above: its values are too high; below: too low."
+)
+HEAD = ("quantity", "sets", "p of uniform ranks", "mean of z", "std of z", "50 % intervals hold", "90 % intervals hold")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the sets say of one quantity: the chance ``p`` of ranks as far from uniform, mean and standard deviation of
+    z, and how many of the ``sets`` the central 50 and 90 % intervals hold.
+    """
+
+    quantity: str
+    unit: str
+    sets: int
+    p: float
+    mean: float
+    std: float
+    half: int
+    most: int
+    off: bool
+    """Whether that is too far from uniform, of all quantities together."""
+
+    @property
+    def words(self) -> str:
+        """What is wrong, in a sentence; "" where nothing is seen."""
+        if not self.off:
+            return ""
+        if self.quantity == FIT:
+            size = "larger" if self.mean > 0 else "smaller"
+            return f"the errors of the readings are {size} than data.error says (ranks of the fit)"
+        too = [f"values are too {'low' if self.mean > 0 else 'high'}"] if abs(self.mean) > APART else []
+        too += [f"intervals are too {'narrow' if self.std > 1 else 'wide'}"] if abs(self.std - 1) > WIDTH else []
+        return f"{self.quantity}: {' and '.join(too) or 'the shape of the posterior is off'}"
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """``sets`` of synthetic readings, estimated, whose truths are known; ``quantities`` are (name, unit)."""
+
+    name: str
+    quantities: tuple[tuple[str, str], ...]
+    sets: tuple[Judged, ...]
+    directory: Path
+
+    @property
+    def good(self) -> list[Judged]:
+        """Those with a posterior."""
+        return [judged for judged in self.sets if not judged.failure]
+
+    @cached_property
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """One a quantity that has a truth."""
+        known = [j for j in range(len(self.quantities)) if np.isfinite(self.good[0].rank[j])] if self.good else []
+        p = {j: self._reference(j).p_value(self.column("rank", j)) for j in known}
+        off: set[int] = set()
+        for left, j in zip(range(len(known), 0, -1), sorted(known, key=p.__getitem__), strict=True):
+            if p[j] * left > LEVEL:
+                break
+            off.add(j)
+        return tuple(self._verdict(j, p[j], j in off) for j in known)
+
+    @property
+    def remarks(self) -> list[str]:
+        """What is to be known beside the table: what is off, what failed, what was doubted."""
+        told = [verdict.words for verdict in self.verdicts if verdict.off]
+        if self.good and not told:
+            told = [f"{len(self.good)} sets show no sign that the posterior is not calibrated"]
+        for reason in dict.fromkeys(judged.failure for judged in self.sets if judged.failure):
+            count = sum(judged.failure == reason for judged in self.sets)
+            told.append(f"{count} of {len(self.sets)} sets have no posterior: {reason}")
+        codes = [code for judged in self.good for code in judged.cautions]
+        told += [
+            f"{codes.count(code)} of {len(self.good)} sets have the serious warning '{code}'"
+            for code in dict.fromkeys(codes)
+        ]
+        return told
+
+    def column(self, what: str, j: int) -> np.ndarray:
+        """``truth``, ``z`` or ``rank`` (S,) of a quantity over the good sets."""
+        return np.array([getattr(judged, what)[j] for judged in self.good])
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """The table, without its head."""
+        return [
+            (v.quantity, str(v.sets), f"{v.p:.2g}", f"{v.mean:+.2f}", f"{v.std:.2f}", _held(v.half, v.sets),
+             _held(v.most, v.sets)) for v in self.verdicts
+        ]  # fmt: skip
+
+    def summary(self) -> pd.DataFrame:
+        """A row a quantity."""
+        import pandas as pd
+
+        return pd.DataFrame([vars(verdict) for verdict in self.verdicts])
+
+    def plot(self) -> Figure:
+        """The distribution of the ranks of each quantity, less that of uniform ones."""
+        from en4dvar.report.paper import on_paper  # matplotlib takes time to import
+
+        return on_paper(curves(self))
+
+    def __str__(self) -> str:
+        return table([HEAD, *self.rows()])
+
+    def __repr__(self) -> str:
+        return f"<Calibration of {self.name}: {len(self.good)} of {len(self.sets)} sets, in {self.directory}>"
+
+    def _reference(self, j: int) -> Uniform:
+        return uniform_ranks(len(self.good), self.good[0].members)
+
+    def _verdict(self, j: int, p: float, off: bool) -> Verdict:
+        z, truth = self.column("z", j), self.column("truth", j)
+        low, lower, upper, high = np.array([judged.quantiles[:, j] for judged in self.good]).T
+        half, most = int(np.sum((lower <= truth) & (truth <= upper))), int(np.sum((low <= truth) & (truth <= high)))
+        std = float(z.std(ddof=1)) if len(z) > 1 else float("nan")
+        return Verdict(*self.quantities[j], len(z), p, float(z.mean()), std, half, most, off)
+
+
+def _held(count: int, sets: int) -> str:
+    """A share with its 95 % interval."""
+    interval = binomtest(count, sets).proportion_ci(0.95, "wilson")
+    return f"{100 * count / sets:.0f} % ({100 * interval.low:.0f} to {100 * interval.high:.0f})"
+
+
+def curves(calibration: Calibration) -> Chart:
+    """The distribution of the ranks of each quantity, less that of uniform ones, and the band of these."""
+    panels, names = [], [name for name, _ in calibration.quantities]
+    for verdict in calibration.verdicts:
+        j = names.index(verdict.quantity)
+        uniform = uniform_ranks(verdict.sets, calibration.good[0].members)
+        x, (low, high) = uniform.shares, uniform.band
+        title = f"{figure_text(verdict.quantity)}: p = {verdict.p:.2g}"
+        panel = Panel("rank of the truth, 0 to 1", "difference of shares", title=title, xlim=(0.0, 1.0))
+        panel.band(x, low - x, high - x, "prior", 0.25)
+        panel.rule(0.0)
+        panel.line(x, uniform.distribution(calibration.column("rank", j)) - x, "centre" if verdict.off else "posterior")
+        panels.append(panel)
+    return in_columns(panels, 4.4 * POINTS, 3, PAGE)
+
+
+def write_calibration(folder: Path) -> Path:
+    """Write ``calibration.html`` from ``calibration.csv``. Raises :class:`OutputError`."""
+    calibration = load_calibration(folder)
+    figures: Sequence[tuple[str, str, Chart]] = [("ranks", CURVES, curves(calibration))] if calibration.verdicts else []
+    page = render(
+        "calibration.html.j2",
+        title=f"Calibration of {calibration.name}",
+        calibration=calibration,
+        head=HEAD,
+        level=LEVEL,
+        figures=draw(figures),
+        charts=True,
+        configuration=_configuration(folder),
+    )
+    return write_text(folder / "calibration.html", page)
+
+
+def load_calibration(folder: Path) -> Calibration:
+    """What ``calibration.csv`` of a folder says. Raises :class:`OutputError`."""
+    quantities, sets = read_sets(folder / "calibration.csv")
+    named = re.search(r"^name: *(.+)$", _configuration(folder), re.MULTILINE)
+    return Calibration(named[1] if named else folder.resolve().name, quantities, sets, folder)
+
+
+def _configuration(folder: Path) -> str:
+    try:
+        return read_text(folder / "config.resolved.yaml")
+    except OSError:
+        return ""

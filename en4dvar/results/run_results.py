@@ -1,0 +1,133 @@
+"""The results of a run directory: those that are there, and by name those that ought to be.
+
+What a campaign ought to hold is known from three places: the lines of its pack, the names of its data sets in
+``checkpoints/run``, and those in ``posterior.nc``. Whichever is damaged, no data set vanishes without a word.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from en4dvar.plumbing.errors import OutputError
+from en4dvar.results.campaign_file import datasets_in
+from en4dvar.results.checkpoint import CheckpointError, read_checkpoint
+from en4dvar.results.fingerprint import IDENTITY, Identity
+from en4dvar.results.pack import PACK, Pack, file_names, known_pack, read_result, results_of
+from en4dvar.results.store import StoredResult, load_stored, require_settled
+
+MOST_NAMES = 20
+ABSENT = "not there: lost, or not estimated yet"
+NAMELESS = "some data set"
+
+
+class LackingError(OutputError):
+    """Data sets of a run cannot be read, which the message names; ``rest`` is what was made of the others (a text, the
+    path of a page), None where nothing was.
+    """
+
+    def __init__(self, message: str, rest: str | Path | None = None):
+        super().__init__(message)
+        self.rest = rest
+        self.exit_code = 2 if rest is None else 1
+
+
+class RunResults:
+    """The results of a run directory, in the order of their names; of a single data set ``posterior.nc``, which need
+    not exist.
+
+    ``files``: where they are. ``lacking``: data sets of a campaign that cannot be read → why; those whose content is
+    damaged are added as they are read.
+
+    Raises :class:`OutputError` as :func:`~en4dvar.results.store.require_settled`, and of a campaign of an earlier
+    version.
+    """
+
+    def __init__(self, run_dir: Path):
+        require_settled(run_dir)
+        self.run_dir, self.whole = run_dir, run_dir / "posterior.nc"
+        self.lacking: dict[str, str] = {}
+        self._read = False
+        planned = _planned(run_dir)
+        self._names = {stem: name for name, stem in file_names(planned).items()}
+        pack = run_dir / PACK
+        if not pack.exists() and (run_dir / "datasets").is_dir():
+            raise OutputError(
+                f"{run_dir}: a campaign of an earlier version of en4dvar, with a file for each data set in datasets/; "
+                "run it again, or read these files one by one (load_result)"
+            )
+        self.files: list[Path] = []
+        if pack.exists() or len(planned) > 1:
+            self.files = results_of(pack) if pack.exists() else []
+            self._look_for(planned, known_pack(pack) if pack.exists() else Pack(pack))
+        if not (self.files or self.lacking):
+            self.files = [self.whole]
+
+    def _look_for(self, planned: list[str], pack: Pack) -> None:
+        estimated = datasets_in(self.whole)
+        held = {name for name, entry in pack.entries.items() if entry.content_size}
+        for name, stem in file_names(planned or estimated).items():
+            if stem not in (held if name in estimated else pack.entries):
+                self.lacking[name] = ABSENT
+        if not (planned or estimated or pack.whole):
+            self.lacking[NAMELESS] = "its name is lost"
+
+    def __iter__(self) -> Iterator[tuple[Path, StoredResult]]:
+        """Each is read when its turn comes. Raises :class:`OutputError` of a single data set."""
+        for path in self.files:
+            try:
+                result = load_stored(path)
+            except OutputError as error:
+                self._lack(path, error)
+            else:
+                self._read = True
+                yield path, result
+
+    def _lack(self, path: Path, error: OutputError) -> None:
+        if path == self.whole:
+            raise error
+        self.lacking[self._names.get(path.name, path.name)] = str(error).removeprefix(f"{path}: ")
+
+    def check(self) -> None:
+        """Compare every result with its checksum. Raises :class:`LackingError` where one cannot be read."""
+        for path in self.files:
+            if path != self.whole:
+                try:
+                    read_result(path)
+                except OutputError as error:
+                    self._lack(path, error)
+        self.require()
+
+    def require(self, rest: str | Path | None = None) -> None:
+        """Raise :class:`LackingError` where data sets cannot be read; ``rest`` is what was made of others."""
+        if not self.lacking:
+            return
+        told = [f"{name} ({reason})" for name, reason in list(self.lacking.items())[:MOST_NAMES]]
+        if len(self.lacking) > MOST_NAMES:
+            told.append(f"and {len(self.lacking) - MOST_NAMES} more")
+        raise LackingError(
+            f"{self.run_dir}: no result that can be read of {', '.join(told)}; "
+            "'en4dvar run' with --resume estimates what is missing",
+            rest if self._read else None,
+        )
+
+
+def result_files(run_dir: Path) -> list[Path]:
+    """Where the results of a run directory's data sets are, by name; of a single one ``posterior.nc``, which need not
+    exist.
+
+    Raises :class:`OutputError` as :class:`RunResults`; :class:`LackingError` where one that ought to be there cannot be
+    read.
+    """
+    results = RunResults(run_dir)
+    results.check()
+    return results.files
+
+
+def _planned(run_dir: Path) -> list[str]:
+    """The data sets of the run, in order; none where it does not say, or that is damaged."""
+    try:
+        identity = read_checkpoint(run_dir / IDENTITY, "run", Identity)
+    except CheckpointError:
+        return []
+    return [name for name, _ in identity.data] if identity else []

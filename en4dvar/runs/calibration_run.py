@@ -1,0 +1,221 @@
+"""The kind of run that asks whether posteriors are calibrated: synthetic sets, each estimated, and judged by ranks.
+
+A truth is drawn from the prior of the user's own configuration, readings from the model at that truth with the user's
+own errors, at the times of the user's own data; then the set is estimated as any other. Of a correct posterior the rank
+of each truth among the members is uniform (:mod:`~en4dvar.diagnosis.ranks`). The half sum of squares J_o of the
+readings is a quantity like the parameters: it tells errors of a wrong size, which ranks of parameters hardly see
+(Modrák et al. 2023, Bayesian Anal., doi:10.1214/23-BA1404).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from en4dvar.assembly.build import build_one, data_files, inverse_plan
+from en4dvar.config import Config, load_config
+from en4dvar.diagnosis.intervals import member_quantiles
+from en4dvar.ensemble.forecast import Composite
+from en4dvar.estimation.assimilate import assimilate
+from en4dvar.executor import Executor
+from en4dvar.executor.chunks import CommonValue
+from en4dvar.inputs.asked import DataFile
+from en4dvar.model.state import Array
+from en4dvar.plumbing.errors import ConfigError, DataError, En4dvarError
+from en4dvar.plumbing.units import convert
+from en4dvar.plumbing.user_code import reason_of
+from en4dvar.priors.prior import member_stream, own_seed
+from en4dvar.problem import InverseProblem
+from en4dvar.report.calibration import Calibration, load_calibration, write_calibration
+from en4dvar.results.calibration_file import FIT, LEVELS, Judged, write_sets
+from en4dvar.results.checkpoint import FOLDER, Keeper, digest
+from en4dvar.runs.engine import conduct_run
+from en4dvar.runs.kind import RunKind
+from en4dvar.runs.session import Session
+
+STATE = f"{FOLDER}/calibration"
+ATTEMPTS = 100  # truths that the model cannot run are drawn again so often
+FEWEST = 2
+
+
+def calibrate(
+    config: str | Path | Mapping[str, Any],
+    sets: int = 200,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    made_with: Mapping[str, Any] | None = None,
+    out: str | Path | None = None,
+    force: bool = False,
+    resume: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+    command: str = "",
+) -> Calibration:
+    """Estimate synthetic data sets made by a configuration itself, and say whether its intervals are right.
+
+    Writes ``calibration.csv`` and a page to ``out``, by default runs/<name>_calibration. Resumed with more ``sets`` it
+    goes on; what is done stays.
+
+    Parameters
+    ----------
+    config, overrides: as of :func:`en4dvar.run`. The data files say when readings are taken and how good they are; of
+        several the sets take turns.
+    made_with: values for dotted keys with which the readings are made, though not estimated: another law, larger
+        errors. Shows what a wrong assumption does to the intervals.
+    progress: called with the number of sets that are done and of all.
+
+    Raises
+    ------
+    ConfigError, DataError: the configuration cannot be used, or its readings and those ``made_with`` other values are
+        not at the same times. OutputError: ``out`` cannot be used.
+    """
+    if sets < FEWEST:
+        raise ConfigError(f"{sets} sets tell nothing; give at least {FEWEST}, better 200")
+    own = load_config(config, overrides)
+    made = load_config(config, {**(overrides or {}), **made_with}) if made_with else own
+    changed = yaml.safe_dump({"made_with": {k: str(v) for k, v in made_with.items()}}) if made_with else ""
+    path = Path(out) if out else own.directory.with_name(f"{own.directory.name}_calibration")
+    own = replace(own, directory=path, resolved=own.resolved + changed)
+    return conduct_run(CalibrationKind(own, made, sets, progress), force, resume, command)
+
+
+@dataclass(frozen=True)
+class CalibrationState:
+    """The sets that are done, in the order in which they ended."""
+
+    done: tuple[Judged, ...] = ()
+
+
+@dataclass(frozen=True)
+class CalibrationKind(RunKind[Calibration]):
+    """A configuration, and the one that readings are ``made`` with; each of the ``sets`` is a unit of work."""
+
+    name = "calibrate"
+    result = "calibration.csv"
+    files = (result, STATE)
+    pages = ("calibration.html",)
+
+    config: Config
+    made: Config
+    sets: int
+    progress: Callable[[int, int], None] | None = None
+
+    @cached_property
+    def data(self) -> Mapping[str, DataFile]:
+        return data_files(inverse_plan(self.config))
+
+    def check(self) -> None:
+        for name, file in self.data.items():
+            problem, maker = build_one(self.config, name, file), build_one(self.made, name, file)
+            if problem.fields or maker.fields:
+                raise ConfigError("calibrate: fields that are estimated cell by cell have no ranks to test")
+            if not np.array_equal(problem.observations.times, maker.observations.times):
+                raise DataError(f"{name}: the readings that are made are not at the times of those that are estimated")
+
+    def kept(self) -> str:
+        return f"the sets that are done are kept in {self.directory}"
+
+    def conduct(self, run: Session, executor: Executor) -> Calibration:
+        fingerprint = digest(run.identity.settings.encode() + repr(run.identity.data).encode())
+        state = run.restore(STATE, fingerprint, CalibrationState, "all sets are estimated again") or CalibrationState()
+        keeper = Keeper(run.directory.at(STATE), fingerprint, self.config.execution.checkpoint_every)
+        done = list(state.done)
+        known = {judged.number for judged in done}
+        left, common = [i for i in range(1, self.sets + 1) if i not in known], CommonValue(self._common())
+        for i, judged in executor.map(_judged, ((common, number) for number in left)):
+            if isinstance(judged, Exception):
+                judged = Judged(left[i], "", *_NOTHING, failure=reason_of(judged))
+            done.append(judged)
+            run.log.write(f"set {judged.number}: {judged.failure or 'estimated'}")
+            keeper.keep(lambda: CalibrationState(tuple(done)))
+            if self.progress:
+                self.progress(len(done), self.sets)
+        keeper.write(CalibrationState(tuple(done)))
+        told = sorted((judged for judged in done if judged.number <= self.sets), key=lambda judged: judged.number)
+        write_sets(run.directory.at(self.result), self._quantities(), told)
+        if self.config.report:
+            self.page(run.directory.work)
+        return replace(load_calibration(run.directory.work), directory=self.directory)
+
+    @classmethod
+    def page(cls, folder: Path, datasets: Any = (), workers: int = 1, figures: bool = False) -> Path:
+        return write_calibration(folder)
+
+    def _common(self) -> _Common:
+        return _Common(self.config, self.made, tuple(self.data.items()))
+
+    def _quantities(self) -> list[tuple[str, str]]:
+        name, file = next(iter(self.data.items()))
+        prior = build_one(self.config, name, file).prior
+        return [*((p.name, p.display_unit or p.unit) for p in prior.parameters), (FIT, "1")]
+
+
+_NOTHING = (np.empty(0), np.empty((4, 0)), np.empty(0), np.empty(0), 0)
+
+
+@dataclass(frozen=True)
+class _Common:
+    """What all sets need; pickled once."""
+
+    config: Config
+    made: Config
+    files: tuple[tuple[str, DataFile], ...]
+
+
+def _judged(common: CommonValue[_Common], number: int) -> Judged:
+    """Draw set ``number``, estimate it, and compare with its truth; text says why it cannot be."""
+    held = common.value
+    name, file = held.files[(number - 1) % len(held.files)]
+    seed = own_seed(held.config.seed, f"calibration {number}")
+    problem, maker = build_one(held.config, name, file), build_one(held.made, name, file)
+    try:
+        truth, readings = draw_set(maker, seed)
+        observed = replace(problem.observations, values=readings, continued=None, name=f"{name}_{number}")
+        return _compared(replace(problem, observations=observed), held.config, seed, truth, number, name)
+    except En4dvarError as error:
+        return Judged(number, name, *_NOTHING, failure=str(error))
+
+
+def draw_set(maker: InverseProblem, seed: int) -> tuple[dict[str, float], Array]:
+    """A truth, physical values by name, and readings (K,) of it.
+
+    Raises :class:`En4dvarError` where the model can run none of the truths that are drawn.
+    """
+    stream, composite = member_stream(seed, "truth"), Composite(maker)
+    reason = ""
+    for _ in range(ATTEMPTS):
+        x = maker.prior.from_white(stream.standard_normal((1, len(maker.prior.names))))
+        run = composite(x)
+        reason = run.failures[0]
+        if not reason:
+            values = maker.prior.to_physical(x)[0]
+            truth = {**maker.fixed, **dict(zip(maker.prior.names, map(float, values), strict=True))}
+            return truth, maker.observations.noise.drawn(run.predicted[0], stream)
+    raise En4dvarError(f"no truth drawn from the prior can be run in {ATTEMPTS} attempts: {reason}")
+
+
+def _compared(
+    problem: InverseProblem, config: Config, seed: int, truth: Mapping[str, float], number: int, name: str
+) -> Judged:
+    """Ranks, quantiles and z of every parameter and of J_o."""
+    prior, observations = problem.prior, problem.observations
+    analysis = assimilate(problem, replace(config.assimilation, what_if=False), seed)
+    members = prior.from_physical(analysis.posterior)
+    known = np.array([truth.get(p.name, np.nan) for p in prior.parameters])
+    x = np.vstack([members, prior.from_physical(known[None])])
+    run = Composite(problem)(x)
+    fits = observations.cost(run.predicted)
+    physical = zip(prior.to_physical(x).T, prior.parameters, strict=True)
+    shown = np.column_stack([*(convert(v, p.unit, p.display_unit or p.unit) for v, p in physical), fits])
+    draws, at = (white := np.column_stack([x, fits]))[:-1], white[-1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        z = (at - draws.mean(axis=0)) / draws.std(axis=0, ddof=1)
+        rank = np.where(np.isfinite(at), np.sum(draws < at, axis=0), np.nan)
+    serious = tuple(dict.fromkeys(c.code for c in analysis.cautions if c.severity == "serious"))
+    quantiles = member_quantiles(shown[:-1], LEVELS, axis=0)
+    return Judged(number, name, shown[-1], quantiles, z, rank, len(members), serious)

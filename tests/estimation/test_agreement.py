@@ -1,0 +1,119 @@
+"""Joint estimates test themselves: each data set against all others, against estimates made again without it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from toys import Vectorised, make_observations
+
+from en4dvar.estimation.joint import estimate_jointly, sharing
+from en4dvar.estimation.joint.doubts import DIFFER
+from en4dvar.estimation.trends import trends
+from en4dvar.plumbing.caution import codes
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.problem import InverseProblem
+from en4dvar.schemes.settings import AssimilationSettings
+
+SETTINGS = AssimilationSettings(what_if=False, emulator="off", refine="none")
+ERROR = 0.1
+
+
+def campaign(shifts, seed=0, std=ERROR, names=("a", "b")):
+    """Lines y = a + b t, of which ``a`` is 0.5 and so much more, and ``b`` is each data set's own."""
+    rng, model = np.random.default_rng(seed), Vectorised(names=names)
+    prior = Prior(tuple(PriorTerm.normal(p, 0.0, 1.0) for p in model.parameters))
+    problems = []
+    for e, shift in enumerate(shifts):
+        times = np.sort(rng.uniform(0.1, 2.5, 8 + e % 4))
+        truth = np.array([0.5 + shift, *rng.standard_normal(len(names) - 1)])
+        j = np.arange(len(names))
+        values = np.cos(times[:, None] * j + j**2 / 3) @ truth + ERROR * rng.standard_normal(len(times))
+        data = make_observations(times, values, std=std, name=f"set{e}")
+        problems.append(InverseProblem(model, model.observables[0], data, prior))
+    return problems
+
+
+def joint(problems):
+    return estimate_jointly(sharing(problems, ["a"]), SETTINGS, seed=1)
+
+
+def test_the_distance_is_that_of_an_estimate_made_without_the_data_set():
+    problems = campaign([0.0] * 6)
+    whole = joint(problems).agreement
+    for e in (0, 3, 5):
+        rest = joint([p for i, p in enumerate(problems) if i != e])
+        alone = joint([problems[e], replace(flat(problems[e]))])
+        value, variance = (np.array([f(one.shared[:, 0]) for one in (alone, rest)]) for f in (np.mean, variance_of))
+        precision = 1 / variance[0] - 1  # without the prior, N(0, 1)
+        own = value[0] / variance[0] / precision
+        expected = (own - value[1]) ** 2 / (1 / precision + variance[1])
+        assert whole.squares[e] == pytest.approx(expected, rel=1e-6)
+
+
+def variance_of(members):
+    return np.var(members, ddof=1)
+
+
+def flat(problem):
+    """The same with readings that say nothing."""
+    o = problem.observations
+    return replace(problem, observations=replace(o, noise=replace(o.noise, std=1e7 + o.std), name="flat"))
+
+
+def test_an_odd_data_set_is_named_and_the_estimate_made_without_it():
+    problems = campaign([0.0] * 7 + [0.6, 0.0])
+    with_it, rest = joint(problems), joint([p for p in problems if p.observations.name != "set7"])
+    assert with_it.odd == ("set7",)
+    assert with_it.without is not None
+    np.testing.assert_allclose(with_it.without.shared_mode, rest.shared_mode, rtol=0, atol=1e-10)
+    (told,) = [c for c in with_it.cautions if c.code == "odd-data-set"]
+    assert told.severity == "serious"
+    assert "set7 (χ²" in told.words
+    assert not rest.odd
+    assert "odd-data-set" not in codes(rest.cautions)
+
+
+def test_clean_campaigns_name_none_and_their_squares_follow_chi_squared():
+    found = [joint(campaign([0.0] * 5, seed)) for seed in range(12)]
+    agreed = [one.agreement for one in found]
+    squares = np.concatenate([a.squares for a in agreed])
+    assert sum(bool(one.odd) for one in found) <= 1  # of one in a hundred
+    assert squares.mean() == pytest.approx(1, abs=4 * np.sqrt(2 / len(squares)))
+    assert sum(a.chance < DIFFER for a in agreed) <= 1
+
+
+def test_data_sets_that_all_differ_are_not_odd_but_differ():
+    rng = np.random.default_rng(5)
+    found = joint(campaign(0.5 * rng.standard_normal(10)))
+    assert not found.odd
+    assert "data-sets-differ" in codes(found.cautions)
+    assert found.agreement.scatter > 2
+
+
+def test_a_misfit_under_the_shared_value_is_told():
+    found = joint(campaign([0.0] * 4, std=ERROR / 3))
+    (told,) = [c for c in found.cautions if c.code == "misfit"]
+    assert "χ² per reading" in told.words
+
+
+def test_nothing_is_compared_where_nothing_is_told():
+    """A data set whose readings say nothing of what is shared, and one that has it alone."""
+    problems = campaign([0.0] * 3)
+    found = joint([*problems, flat(problems[0])])
+    assert np.isnan(found.agreement.squares[3])
+    assert np.isnan(found.agreement.chances[3])
+    assert np.isfinite(found.agreement.squares[:3]).all()
+
+
+def test_a_trend_with_the_order_is_told():
+    problems = campaign(np.linspace(0, 1, 8))
+    (told,) = [c for c in joint(problems).cautions if c.code == "trend"]
+    assert "rises with the order of the data sets" in told.words
+
+
+def test_trends_by_chance_are_rare():
+    rng, problems = np.random.default_rng(3), campaign([0.0] * 8)
+    told = [list(trends(problems, rng.standard_normal((8, 2)), ["a", "b"])) for _ in range(100)]
+    assert sum(map(bool, told)) <= 4  # of one in a hundred

@@ -1,0 +1,113 @@
+"""What the page of a fit says before anything is unfolded: numbers, trust, the fit, the prior itself, what if."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import lognorm, norm, uniform
+
+from en4dvar.model.state import Parameter
+from en4dvar.plumbing.caution import caution
+from en4dvar.priors.prior import Prior, PriorTerm
+from en4dvar.report.drawing import draw
+from en4dvar.report.figures import all_figures, histograms, neighbours
+from en4dvar.report.page import render_set, trust
+from en4dvar.report.result import Result
+
+JARGON = ("whitened", "leverage", "descent", "members alive", "DFS", "NRMSE", "χ²")
+
+
+def with_terms(analysis, *terms):
+    """The analysis as if the priors of its first parameters were these."""
+    kept = analysis.problem.prior.terms[len(terms) :]
+    return replace(analysis, problem=replace(analysis.problem, prior=Prior((*terms, *kept))))
+
+
+def densities(analysis):
+    """(values, density scaled to its peak) of the prior in each panel, in display units."""
+    rows = histograms(Result.from_analysis(analysis, {})).rows
+    bands = [
+        next(m for m in p.marks if m.kind == "band" and m.colour == "prior") for r in rows for p in r.panels if p.marks
+    ]
+    return [(band.x, band.top) for band in bands]
+
+
+def test_the_prior_is_drawn_as_its_density_and_not_from_draws(analysis):
+    p = Parameter("G", "Pa", display_unit="kPa", label="modulus")
+    cases = (
+        (PriorTerm.lognormal(p, 2000.0, 0.5), lognorm(0.5, scale=2.0), np.exp(np.log(2.0) - 0.25)),
+        (PriorTerm.normal(p, 2000.0, 300.0), norm(2.0, 0.3), 2.0),
+        (PriorTerm.uniform(p, (1000.0, 5000.0)), uniform(1.0, 4.0), 2.0),
+    )
+    for term, exact, peak in cases:
+        x, density = densities(with_terms(analysis, term))[0]
+        inner = slice(2, -2)
+        np.testing.assert_allclose(density[inner], exact.pdf(x[inner]) / exact.pdf(peak), atol=0.006)
+        assert x[0] == pytest.approx(exact.ppf(norm.cdf(-4)))
+        assert x[-1] == pytest.approx(exact.ppf(norm.cdf(4)))
+
+
+def test_a_result_of_before_shows_the_draws_that_it_holds(analysis):
+    result = Result.from_analysis(analysis, {})
+    group = result.groups["/sample_stats"]
+    kept = {name: variable for name, variable in group.variables.items() if name != "prior_value"}
+    old = Result({**result.groups, "/sample_stats": replace(group, variables=kept)})
+    heights = np.unique(histograms(old).rows[0].panels[0].marks[0].top)
+    assert len(heights) < 12  # steps
+
+
+def page_of(analysis):
+    result = Result.from_analysis(analysis, {})
+    return render_set(result, draw(all_figures(result)), copies=False)
+
+
+def test_the_page_answers_in_the_order_of_the_questions(analysis):
+    page = page_of(replace(analysis, cautions=()))
+    body = page[page.index("<body>") :]
+    places = [
+        body.index(mark)
+        for mark in ('class="lead"', 'class="verdict"', 'id="d0-history"', 'id="d0-posterior"', "<h2>More")
+    ]
+    assert places == sorted(places)
+    first = body[: body.index("<h2>More")]
+    assert first.count("90 %: ") == len(analysis.parameters)
+    shown = re.sub(r"<[^>]+>", " ", re.sub(r"<details.*?</details>|title=\"[^\"]*\"", "", first, flags=re.S))
+    assert [word for word in JARGON if word.lower() in shown.lower()] == []
+    assert 'id="d0-iterations"' in body[body.index("<details") :]
+
+
+def test_warnings_stand_where_else_the_trust_is_told(analysis):
+    page = page_of(replace(analysis, cautions=(caution("misfit", "it misfits"),)))
+    assert 'class="verdict"' not in page
+    assert page.index("it misfits") < page.index('id="d0-history"')
+
+
+def with_residuals(analysis, white):
+    result = Result.from_analysis(replace(analysis, cautions=()), {})
+    group = result.groups["/sample_stats"]
+    name = f"{result.observable}_whitened_residual"
+    variable = replace(group["dfs"], dims=(result.axes[0].time,), values=np.asarray(white))
+    return Result({**result.groups, "/sample_stats": replace(group, variables={**group.variables, name: variable})})
+
+
+def test_residuals_that_leave_their_band_are_not_called_unrelated(analysis):
+    k = len(analysis.observations)
+    independent = np.random.default_rng(1).standard_normal(k)
+    words = trust(with_residuals(analysis, independent))
+    assert "unrelated" in words
+    alternating = independent + 2.0 * (-1.0) ** np.arange(k)
+    correlation, limit = neighbours(alternating)
+    assert correlation[0] < -limit
+    words = trust(with_residuals(analysis, alternating))
+    assert "unrelated" not in words
+    assert "alternate in sign" in words
+    assert "resemble each other" in trust(with_residuals(analysis, np.cumsum(independent)))
+
+
+def test_the_band_of_neighbours_holds_19_of_20_independent_series():
+    rng = np.random.default_rng(3)
+    outside = [abs(c[0]) > limit for c, limit in (neighbours(rng.standard_normal(100)) for _ in range(2000))]
+    assert np.mean(outside) == pytest.approx(0.05, abs=0.015)

@@ -1,0 +1,108 @@
+"""``en4dvar calibrate``: right configurations pass, wrong errors are seen, what is kept goes on to the same bits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from toy_config import write_toy
+
+import en4dvar
+from en4dvar.cli import main
+from en4dvar.config import load_config
+from en4dvar.plumbing.errors import ConfigError, DataError, OutputError
+from en4dvar.report.calibration import load_calibration
+from en4dvar.results.calibration_file import FIT, Judged
+
+QUIET = {"output.report": False, "assimilation.members": 24}
+
+
+@pytest.fixture
+def toy(tmp_path):
+    return write_toy(tmp_path, ("mean: maximum, std: 1 %", "mean: 100 um, std: 3 um"))
+
+
+def sixty(toy, out, **options):
+    return en4dvar.calibrate(toy, options.pop("sets", 60), overrides=QUIET, out=out, **options)
+
+
+def test_a_right_configuration_passes(toy, tmp_path):
+    result = sixty(toy, tmp_path / "out")
+    assert [verdict.quantity for verdict in result.verdicts] == ["A", "k", FIT]
+    assert not any(verdict.off for verdict in result.verdicts)
+    assert result.remarks == ["60 sets show no sign that the posterior is not calibrated"]
+    (position,) = np.flatnonzero([name == "A" for name, _ in result.quantities])
+    truths = (result.column("truth", position) - 100) / 3  # um, drawn from the prior
+    assert abs(truths.mean()) < 4 / np.sqrt(60)
+    assert 0.7 < truths.std() < 1.4
+    assert result.summary().shape[0] == 3
+
+
+@pytest.mark.parametrize(("std", "size"), [("2.6 um", "larger"), ("1.4 um", "smaller")])
+def test_errors_of_a_wrong_size_are_seen(toy, tmp_path, std, size):
+    result = sixty(toy, tmp_path / "out", sets=100, made_with={"data.error.position_std": std})
+    fit = next(verdict for verdict in result.verdicts if verdict.quantity == FIT)
+    assert fit.off
+    assert f"the errors of the readings are {size} than data.error says (ranks of the fit)" in result.remarks
+    others = [verdict for verdict in result.verdicts if verdict.quantity != FIT]
+    wide = np.mean([verdict.std for verdict in others])
+    assert wide > 1.1 if size == "larger" else wide < 0.9
+
+
+def test_a_value_that_is_wrong_is_seen(toy, tmp_path):
+    """A damping that the readings have and the estimate has not moves k."""
+    result = sixty(toy, tmp_path / "out", sets=40, made_with={"parameters.c": "0.03 N s/m"})
+    assert any(verdict.off for verdict in result.verdicts)
+
+
+def test_more_sets_leave_the_first_as_they_were_for_any_workers(toy, tmp_path):
+    whole = sixty(toy, tmp_path / "whole", sets=9)
+    sixty(toy, tmp_path / "parts", sets=4)
+    with pytest.raises(OutputError, match="made_with"):
+        sixty(toy, tmp_path / "parts", sets=9, resume=True, made_with={"parameters.c": "0.03 N s/m"})
+    sixty(toy, tmp_path / "parts", sets=9, resume=True)
+    threads = en4dvar.calibrate(
+        toy, 9, overrides={**QUIET, "execution.executor": "processes", "execution.workers": 2}, out=tmp_path / "two"
+    )
+    text = (tmp_path / "whole" / "calibration.csv").read_bytes()
+    assert (tmp_path / "parts" / "calibration.csv").read_bytes() == text
+    assert (tmp_path / "two" / "calibration.csv").read_bytes() == text
+    assert len(threads.sets) == len(whole.sets) == 9
+
+
+def test_sets_without_a_posterior_are_told(toy, tmp_path):
+    result = sixty(toy, tmp_path / "out", sets=3)
+    failed = replace(result, sets=(*result.sets, Judged(4, "toy", *[np.empty(0)] * 4, 0, (), "lost")))
+    assert "1 of 4 sets have no posterior: lost" in failed.remarks
+    assert len(failed.good) == 3
+
+
+def test_what_cannot_be_done_is_told(toy, tmp_path):
+    with pytest.raises(ConfigError, match="give at least 2"):
+        sixty(toy, tmp_path / "out", sets=1)
+    with pytest.raises(DataError, match="not at the times"):
+        sixty(toy, tmp_path / "out", made_with={"data.window": {"end": "100 ms"}})
+    with pytest.raises(ConfigError, match="unknown key"):
+        sixty(toy, tmp_path / "out", made_with={"data.windo": 3})
+    (tmp_path / "out").mkdir(exist_ok=True)
+    (tmp_path / "out" / "calibration.csv").write_text("set,data_set\n1,\n")
+    with pytest.raises(OutputError, match="not a table of 'en4dvar calibrate'"):
+        load_calibration(tmp_path / "out")
+
+
+def test_the_command_prints_the_table_and_writes_the_page(toy, tmp_path):
+    out = tmp_path / "out"
+    words = ["calibrate", str(toy), "--sets", "12", "--out", str(out), "--set", "assimilation.members=24"]
+    done = CliRunner().invoke(main, words)
+    assert done.exit_code == 0, done.output
+    assert "p of uniform ranks" in done.stdout
+    assert "12 sets show no sign" in done.stderr
+    page = (out / "calibration.html").read_text()
+    assert "Calibration of" in page
+    assert page.count("<svg") >= 1
+    assert load_config(out / "config.resolved.yaml").name == "toy"
+    (out / "calibration.html").unlink()
+    assert CliRunner().invoke(main, ["report", str(out)]).exit_code == 0
+    assert (out / "calibration.html").exists()
