@@ -27,7 +27,7 @@ COMPONENTS = 4
 FITTED = 2000  # points that few parts are fitted to
 SETTLED, PARTS = 150.0, 8  # the same of proposals to a power of the posterior
 EACH = 4  # effective draws for each coordinate of a component: fitted to fewer it is flat in some direction
-MOST = 3.0  # times √D mean weights of D draws: more than that none counts (Ionides 2008, J. Comput. Graph. Stat. 17, 295)
+MOST = 3.0  # times √D mean weights of D draws: more than that none counts (Ionides 2008)
 
 
 def standard(n: int) -> StudentMixture:
@@ -142,7 +142,10 @@ class Settling(Importance):
 
 
 class Settled(Importance):
-    """Draws of one proposal that stays. The largest of their weights are cut off, but not those behind ``log``."""
+    """Draws of one proposal that stays. The largest of their weights are cut off, but not those behind ``log``.
+
+    Source: Ionides (2008), J. Comput. Graph. Stat. 17, 295.
+    """
 
     def draw(self) -> Array:
         return self.proposals[0].draw(self.count, self.stream)
