@@ -27,6 +27,8 @@ import numpy as np
 from en4dvar.model.forward import Observable
 from en4dvar.priors.prior import member_stream
 from en4dvar.schemes.base import Draw, Evaluation, Scheme, Step, Weights
+from en4dvar.schemes.bootstrap_filter import BootstrapFilter
+from en4dvar.schemes.enkf import EnKF
 from en4dvar.schemes.enkf_n import EnKFN
 from en4dvar.schemes.etkf import ETKF
 from en4dvar.schemes.ienks import IEnKS
@@ -60,8 +62,9 @@ L96 = System("L96", Lorenz96.from_settings(Lorenz96Settings()), 0.05, 1, 1.0, 0.
 
 @dataclass(frozen=True)
 class Case:
-    """``scheme``: ETKF, EnKF-N or the lag of an IEnKS. ``seen``: every how many variables are observed.
+    """``scheme``: ETKF, EnKF (perturbed observations), EnKF-N, particles, or the lag of an IEnKS.
 
+    ``seen``: every how many variables are observed.
     ``noise``: variance per unit of time of an additive model error, of the truth too, and its ``form`` in the ensemble.
     ``radius``: of the localisation, as DAPPER counts. ``variant``: of the EnKF-N. By default each program's
     own; with ``xN=2`` DAPPER's assumes a sample twice as large; ``DAPPER's`` in both programs.
@@ -102,6 +105,11 @@ CASES = [
     Case(L96, 15, "ETKF", 1.05, seen=2, radius=4.0),
     Case(L96, 40, "ETKF", 1.02, noise=0.2),
     Case(L96, 40, "ETKF", 1.02, noise=0.2, form="square-root"),
+    Case(L96, 400, "ETKF", 1.0),
+    Case(L96, 40, "EnKF", 1.06),
+    Case(L96, 400, "EnKF", 1.0),
+    Case(L63, 500, "particles"),
+    Case(L63, 2000, "particles"),
 ]
 
 
@@ -161,7 +169,12 @@ def settings_of(case: Case, size: int, n: int) -> SequentialSettings:
     if isinstance(case.scheme, int):
         scheme: Scheme = IEnKS(case.scheme, tolerance=case.system.tolerance)
     else:
-        filters = {"EnKF-N": AsDapper() if case.variant == "DAPPER's" else EnKFN(), "ETKF": ETKF()}
+        filters = {
+            "EnKF-N": AsDapper() if case.variant == "DAPPER's" else EnKFN(),
+            "ETKF": ETKF(),
+            "EnKF": EnKF(),
+            "particles": BootstrapFilter(jitter=case.members ** (-1 / (n + 4))),  # the bandwidth of DAPPER
+        }
         scheme = filters[case.scheme]
     local, error, moves = None, None, np.arange(size) < n
     if case.radius:
@@ -174,7 +187,7 @@ def settings_of(case: Case, size: int, n: int) -> SequentialSettings:
     return SequentialSettings(
         scheme,
         Inflation(case.inflation),
-        rotation=not isinstance(scheme, AsDapper),
+        rotation=not isinstance(scheme, AsDapper | BootstrapFilter | EnKF),
         localisation=local,
         model_error=error,
     )
@@ -225,7 +238,7 @@ def theirs(case: Case, truth: np.ndarray, y: np.ndarray, seed: int, lean: bool) 
         hmm.Obs = type(hmm)(hmm.Dyn, observed, hmm.tseq, hmm.X0).Obs
     if case.noise:
         hmm.Dyn.noise = GaussRV(C=case.noise, M=n)
-    options: dict[str, Any] = {"N": case.members, "infl": case.inflation, "rot": True}
+    options: dict[str, Any] = {"N": case.members, "infl": case.inflation, "rot": case.scheme != "EnKF"}
     if case.form == "square-root":
         options["fnoise_treatm"] = "Sqrt-Core"
     if isinstance(case.scheme, int):
@@ -234,8 +247,10 @@ def theirs(case: Case, truth: np.ndarray, y: np.ndarray, seed: int, lean: bool) 
         method = methods.LETKF(loc_rad=case.radius, **options)
     elif case.scheme == "EnKF-N":
         method = methods.EnKF_N(xN=2.0 if case.variant == "xN=2" else 1.0, **options)
+    elif case.scheme == "particles":  # resampled in every cycle, as ours, and moved about as far
+        method = methods.PartFilt(N=case.members, NER=1.0, reg=1.0)
     else:
-        method = methods.EnKF("Sqrt", **options)
+        method = methods.EnKF("PertObs" if case.scheme == "EnKF" else "Sqrt", **options)
     set_seed(1 + seed)
     began = time.process_time()
     method.assimilate(hmm, truth, y, liveplots=False)

@@ -115,13 +115,14 @@ def nasty(kind: str, number: int) -> dict[str, Array]:
     """
     filmed = film_nasty(kind, number)
     try:
-        readings = track(replace(movie_of(filmed.frames), rate=1.0), point=filmed.point).readings
+        movie, kind_of = replace(movie_of(filmed.frames), rate=1.0), KINDS[kind]
+        readings = track(movie, point=filmed.point, exposure=kind_of.exposure).readings
     except DataError:
         nothing = np.full(len(filmed.frames), np.nan)
         return {"wrong": nothing, "score": nothing, "own": nothing, "good": filmed.good}
     radius, std = np.array([(r.radius, r.errors.std) if r.used else (np.nan, np.nan) for r in readings]).T
     candidates = [np.where(np.isnan(truth), 1e3, radius - truth) for truth in filmed.radius]
-    at_most = 1 if KINDS[kind].marked else len(candidates)  # without a mark any bubble will do, if it is the same one
+    at_most = 1 if kind_of.marked else len(candidates)  # without a mark any bubble will do, if it is the same one
     wrong = min(candidates[:at_most], key=lambda off: float(np.nansum(np.abs(off))))
     wrong[np.isnan(radius)] = np.nan
     near = (np.abs(wrong) <= np.maximum(5 * std, 2)) & filmed.good

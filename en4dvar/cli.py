@@ -61,6 +61,13 @@ class Commands(click.Group):
                 os._exit(end.code if isinstance(end.code, int) else 1)
             raise
 
+    def make_context(self, *args: Any, **options: Any) -> click.Context:
+        """Stopped before a command has begun, the program ends as it does later."""
+        try:
+            return super().make_context(*args, **options)
+        except KeyboardInterrupt:
+            raise Failed("interrupted", 130) from None
+
     def invoke(self, ctx: click.Context) -> Any:
         output = _output()
         try:

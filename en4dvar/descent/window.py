@@ -33,6 +33,7 @@ from en4dvar.schemes.base import (
     Runs,
     Step,
     Weights,
+    dense,
     gauss_newton,
     regression,
 )  # fmt: skip
@@ -296,7 +297,7 @@ class DataWindow(Objective[Descent]):
         if self.scheme.done(count - 1, taken):
             descent.stop, descent.converged = f"{count} assimilations", True
         basis = self.space.basis  # of the weights of the mean, those that move no parameter are no part of J_b
-        descent.weights = Weights(basis @ (basis.T @ taken.weights.w), taken.weights.T)
+        descent.weights = Weights(basis @ (basis.T @ taken.weights.w), dense(taken.weights.T))
 
     def _run_ensemble(self, descent: Descent) -> Runs | None:
         space = self.space

@@ -83,6 +83,22 @@ class ThinTransform:
 
 
 @dataclass(frozen=True)
+class LowRank:
+    """I + ``left`` ``right`` (N, N), of (N, k) and (k, N): as :class:`ThinTransform`, without a matrix of N rows."""
+
+    left: Array
+    right: Array
+
+    def __matmul__(self, columns: Array) -> Array:
+        return np.asarray(columns + self.left @ (self.right @ columns))
+
+    @property
+    def dense(self) -> Array:
+        """As a matrix."""
+        return np.asarray(np.eye(len(self.left)) + self.left @ self.right)
+
+
+@dataclass(frozen=True)
 class Hessian:
     """A = (N−1) I + SᵀS through one decomposition of the whitened anomalies S (K', N): every analysis starts here.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from en4dvar.inputs.contents import read_contents
 from en4dvar.inputs.opened import require_file
 from en4dvar.model.state import Array
-from en4dvar.plumbing.decoding import require_plain
+from en4dvar.plumbing.decoding import Allowed, DecodeError, decoded_whole
 from en4dvar.plumbing.errors import DataError
 from en4dvar.plumbing.hdf5 import ForeignDataError, require_whole
 from en4dvar.plumbing.hints import listed, suggest
@@ -69,9 +69,19 @@ def _of_table(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, st
 
 
 def _of_netcdf(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, str]]:
+    """As a process of its own reads it."""
+    allowed = Allowed(60, 4_000_000_000, LARGEST)
+    try:
+        members: dict[str, tuple[Array, str]] = decoded_whole(netcdf_members, path, list(names), allowed=allowed)
+    except DecodeError as error:
+        raise DataError(f"{path}: cannot be read as netCDF: {error}") from None
+    return members
+
+
+def netcdf_members(path: Path, names: Sequence[str]) -> Iterator[dict[str, tuple[Array, str]]]:
+    """The numbers of each name, with their unit. Raises :class:`DataError`."""
     import netCDF4  # a tenth of a second that other files do not need
 
-    require_plain(path, LARGEST)
     try:
         require_whole(path)
         with netCDF4.Dataset(path) as file:
@@ -88,7 +98,7 @@ def _of_netcdf(path: Path, names: Mapping[str, Any]) -> dict[str, tuple[Array, s
                 values = _numbers(path, variable)
                 values = values[alive] if alive is not None and len(alive) == len(values) else values
                 members[name] = values, str(getattr(variable, "units", ""))
-            return members
+            yield members
     except (OSError, RuntimeError, ForeignDataError) as error:
         raise DataError(f"{path}: cannot be read as netCDF: {error}") from None
 

@@ -19,10 +19,9 @@ import numpy as np
 
 from en4dvar.plumbing.errors import OutputError
 from en4dvar.results.checkpoint import digest
-from en4dvar.results.netcdf import Groups, Variable, attributes_of, netcdf_file
+from en4dvar.results.netcdf import Groups, Variable, attributes_of, netcdf_file, opened_netcdf, read_sealed
 from en4dvar.results.pack import Pack
 from en4dvar.results.packed import Alike, Content, PackedLayout, opened, unpacked, unpacked_together
-from en4dvar.results.seal import check_seal
 
 GROUPS = (
     "prior", "posterior", "prior_predictive", "posterior_predictive", "observed_data", "observation_errors",
@@ -148,21 +147,27 @@ def failed_datasets(path: Path) -> dict[str, str]:
 def datasets_in(path: Path) -> list[str]:
     """The data sets in a campaign's file, in order; none where there is no such file, or it cannot be read."""
     try:
-        check_seal(path)
-        with netCDF4.Dataset(path) as file:
-            return list(map(str, file["posterior"]["dataset"][...].tolist()))
-    except (OutputError, OSError, LookupError, AttributeError):
+        return read_sealed(datasets_of, path) if path.is_file() else []
+    except OutputError:
         return []
+
+
+def datasets_of(path: Path) -> Iterator[str]:
+    """Their names, as they are read."""
+    with opened_netcdf(path) as file:
+        yield from map(str, file["posterior"]["dataset"][...].tolist())
 
 
 def _root_attribute(path: Path, name: str) -> str:
     """ "" where the file has none. Raises :class:`OutputError`."""
-    check_seal(path)
-    try:
-        with netCDF4.Dataset(path) as file:
-            return str(getattr(file, name, ""))
-    except OSError as error:
-        raise OutputError(f"{path}: not a readable netCDF file: {error.strerror or error}") from None
+    (value,) = read_sealed(attribute_of, path, name)
+    return str(value)
+
+
+def attribute_of(path: Path, name: str) -> Iterator[str]:
+    """An attribute of the root."""
+    with opened_netcdf(path) as file:
+        yield str(getattr(file, name, ""))
 
 
 def _define(target: netCDF4.Dataset, layout: _Layout, n_datasets: int) -> None:

@@ -7,14 +7,18 @@ so that the process may end wherever it stands.
 
 from __future__ import annotations
 
+import _thread
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from types import TracebackType
 from typing import Any
 
 PATIENCE = 1.0  # s for the program to answer a signal by itself
+AGAIN = 0.05  # s; here and now it would be raised where nothing can be, once more
 _answered = threading.Event()
 _kept: list[Callable[[], str]] = []  # what a stop has to say of the runs under way
 
@@ -64,7 +68,8 @@ def tell_interrupt(kept: Callable[[], str]) -> Iterator[None]:
 def heeded(end: Callable[[str], object]) -> Iterator[None]:
     """Within, in the main thread: a stop that compiled code keeps the program from answering ends in ``end(words)``.
 
-    That is called in a thread of its own, :data:`PATIENCE` after the signal, with what is kept, "" before a run has
+    One that arrives where nothing can be raised (the end of an object, some compiled code) is raised again behind it.
+    ``end`` is called in a thread of its own, :data:`PATIENCE` after the signal, with what is kept, "" before a run has
     begun; it is to end the process.
     """
     handler = signal.getsignal(signal.SIGINT)
@@ -77,14 +82,28 @@ def heeded(end: Callable[[str], object]) -> Iterator[None]:
         raise KeyboardInterrupt
 
     _answered.clear()
+    tell_ignored, tell_error = sys.unraisablehook, sys.excepthook
+
+    def once_more(ignored: sys.UnraisableHookArgs) -> None:
+        if issubclass(ignored.exc_type, KeyboardInterrupt):
+            threading.Timer(AGAIN, _thread.interrupt_main).start()
+        else:
+            tell_ignored(ignored)
+
+    def tell(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if not issubclass(kind, KeyboardInterrupt):  # compiled code that ignores it tells of it twice
+            tell_error(kind, error, trace)
+
     come, written = os.pipe()
     os.set_blocking(written, False)
     threading.Thread(target=_listen, args=(come, end), daemon=True).start()
     before = signal.set_wakeup_fd(written, warn_on_full_buffer=False)
     signal.signal(signal.SIGINT, interrupt)
+    sys.unraisablehook, sys.excepthook = once_more, tell
     try:
         yield
     finally:
+        sys.unraisablehook, sys.excepthook = tell_ignored, tell_error
         signal.signal(signal.SIGINT, handler)
         signal.set_wakeup_fd(before)
         os.close(written)

@@ -16,6 +16,7 @@ from en4dvar.executor import Executor
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.results.checkpoint import FOLDER
 from en4dvar.results.joint_file import FILE, Alone, StoredJoint, load_joint, save_joint
+from en4dvar.results.netcdf import understood
 from en4dvar.runs.finished import Finished, carried
 from en4dvar.runs.together import Tell, TogetherKind
 from en4dvar.runs.trust import Ask
@@ -82,7 +83,8 @@ class JointKind(TogetherKind):
     def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
         from en4dvar.report.joint import write_joint  # with matplotlib, whose import takes longer than a page
 
-        return write_joint(load_joint(folder / FILE), folder)
+        with understood(folder / FILE):
+            return write_joint(load_joint(folder / FILE), folder)
 
 
 def _with_carried(estimate: JointEstimate, sets: Sequence[Finished]) -> JointEstimate:

@@ -20,6 +20,7 @@ from en4dvar.plumbing.caution import Caution, caution
 from en4dvar.plumbing.errors import ConfigError, TooFewMembersError
 from en4dvar.problem import InverseProblem
 from en4dvar.results.checkpoint import FOLDER
+from en4dvar.results.netcdf import understood
 from en4dvar.results.population_file import FILE, StoredPopulation, load_population, save_population
 from en4dvar.runs.finished import Finished, carried
 from en4dvar.runs.together import Tell, TogetherKind
@@ -95,7 +96,8 @@ class PopulationKind(TogetherKind):
     def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
         from en4dvar.report.population import write_population  # with matplotlib
 
-        return write_population(load_population(folder / FILE), folder)
+        with understood(folder / FILE):
+            return write_population(load_population(folder / FILE), folder)
 
 
 def require_population(config: Config, problem: InverseProblem, count: int) -> None:

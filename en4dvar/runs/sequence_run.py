@@ -16,7 +16,7 @@ from en4dvar.inputs.asked import DataFile
 from en4dvar.plumbing.errors import ConfigError
 from en4dvar.report.outcomes import SequenceOutcome
 from en4dvar.results.checkpoint import FOLDER
-from en4dvar.results.netcdf import Group
+from en4dvar.results.netcdf import Group, understood
 from en4dvar.results.series_file import sequence_csv, sequence_group
 from en4dvar.runs.cycles import Cycles, Keep
 from en4dvar.runs.engine import conduct_run
@@ -88,7 +88,8 @@ class SequenceKind(Cycles[SeriesResult]):
     def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
         from en4dvar.report.sequence import write_sequence_report
 
-        return write_sequence_report(folder, figures)
+        with understood(folder / cls.result):
+            return write_sequence_report(folder, figures)
 
 
 def sequence_summary(config: SequenceConfig, problem: SeriesProblem) -> str:

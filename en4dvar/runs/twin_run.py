@@ -11,7 +11,7 @@ from en4dvar.executor import Executor
 from en4dvar.model.forward import ForwardModel
 from en4dvar.report.outcomes import TwinOutcome
 from en4dvar.results.checkpoint import FOLDER
-from en4dvar.results.netcdf import Group
+from en4dvar.results.netcdf import Group, understood
 from en4dvar.results.series_file import twin_csv, twin_group
 from en4dvar.runs.cycles import Cycles, Keep
 from en4dvar.runs.engine import conduct_run
@@ -72,7 +72,8 @@ class TwinKind(Cycles[TwinResult]):
     def page(cls, folder: Path, datasets: Sequence[str] = (), workers: int = 1, figures: bool = False) -> Path:
         from en4dvar.report.twin import write_twin_report
 
-        return write_twin_report(folder, figures)
+        with understood(folder / cls.result):
+            return write_twin_report(folder, figures)
 
 
 def twin_summary(config: TwinConfig) -> str:

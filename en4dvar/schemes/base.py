@@ -13,7 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal, Protocol, cast
+from functools import lru_cache
+from typing import Annotated, Any, ClassVar, Literal, Protocol, cast
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
@@ -34,7 +35,8 @@ class Draw(Protocol):
 class Weights:
     """An ensemble in weight space: ensemble weights ``w`` (N,) and ensemble transform ``T`` (N, N).
 
-    T is (0, 0) where members are many and the scheme does not read it. A bundle has ``wider`` times its size ε.
+    T of a filter may be anything that multiplies anomalies as a matrix does and has it as ``dense``. T is (0, 0) where
+    members are many and the scheme does not read it. A bundle has ``wider`` times its size ε.
     """
 
     w: Array
@@ -45,13 +47,25 @@ class Weights:
     @classmethod
     def prior(cls, n_members: int) -> Weights:
         """w = 0, T = I."""
-        identity = np.eye(n_members)
+        identity = _identity(n_members)
         return cls(np.zeros(n_members), identity, identity)
 
     @property
     def rows(self) -> Array:
         """(N, N): member i is x̄0 + X0ᵀ rows[i]."""
-        return np.asarray(self.w + self.T)
+        return np.asarray(self.w + dense(self.T))
+
+
+def dense(transform: Any) -> Array:
+    """A transform as a matrix (N, N)."""
+    return np.asarray(transform if isinstance(transform, np.ndarray) else transform.dense)
+
+
+@lru_cache(maxsize=4)
+def _identity(n: int) -> Array:
+    identity = np.eye(n)
+    identity.flags.writeable = False
+    return identity
 
 
 @dataclass(frozen=True)

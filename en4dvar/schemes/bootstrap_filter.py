@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -46,12 +46,36 @@ class BootstrapFilter(ETKF):
         n = len(weights.w)
         shares = likelihood_shares(evaluation)
         start = float(ndtr(draw("resampling", 1)[0, 0]))
-        rows = np.eye(n)[systematic(shares, start)]
-        if self.jitter:
-            noise = centre(draw("jitter", n))[1] * np.sqrt(shares)
-            rows = rows + self.jitter * (noise - np.outer(noise.sum(axis=1), shares))
-        w, transform = centre(rows)
+        index = systematic(shares, start)
+        w = np.bincount(index, minlength=n) / n
+        transform = cast(Array, Resampled(index, w, shares, self.jitter, draw))
         return Step(Weights(w, transform), math.sqrt(n - 1) * float(np.linalg.norm(w)), 1 / float(shares @ shares))
+
+
+@dataclass(frozen=True)
+class Resampled:
+    """The transform that takes the members of these ``index`` (N,), about their mean of weights ``w`` (N,), and moves
+    them by draws of the covariance that ``shares`` (N,) give, ``jitter`` times its root.
+    """
+
+    index: npt.NDArray[np.intp]
+    w: Array
+    shares: Array
+    jitter: float
+    draw: Draw
+
+    def __matmul__(self, anomalies: Array) -> Array:
+        moved = anomalies[self.index] - self.w @ anomalies
+        if not self.jitter:
+            return np.asarray(moved)
+        spread = np.sqrt(self.shares)[:, None] * (anomalies - self.shares @ anomalies)
+        root = np.linalg.qr(spread, mode="r")
+        return np.asarray(moved + self.jitter * centre(self.draw("jitter", len(root)))[1] @ root)
+
+    @property
+    def dense(self) -> Array:
+        """As a matrix (N, N), without the jitter, which earlier states have no part in."""
+        return np.asarray(np.eye(len(self.w))[self.index] - self.w)
 
 
 def likelihood_shares(evaluation: Evaluation) -> Array:

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import numpy as np
 
-from en4dvar.ensemble.linalg import Hessian
+from en4dvar.ensemble.linalg import Hessian, LowRank
 from en4dvar.model.state import Array
 from en4dvar.schemes.base import Draw, Evaluation, GaussNewtonStep, Step, Weights
 from en4dvar.schemes.etkf import ETKF
@@ -42,5 +42,9 @@ class EnKF(ETKF):
         hessian, n = Hessian.of(evaluation.S), len(weights.w)
         shift = hessian.solve(evaluation.d @ evaluation.S)
         noise = math.sqrt(n / (n - 1)) * draw("perturbed observations")
-        transform = perturbed_transform(hessian, evaluation.S, noise, weights.T)
+        if len(evaluation.S) < n:
+            innovations = noise - noise.mean(axis=0) - evaluation.S.T
+            transform = cast(Array, LowRank(innovations, hessian.solve(evaluation.S)))  # T = I before
+        else:
+            transform = perturbed_transform(hessian, evaluation.S, noise, weights.T)
         return Step(Weights(weights.w + shift, transform), hessian.norm(shift))

@@ -28,7 +28,7 @@ from en4dvar.model.forward import ForwardModel, Observable
 from en4dvar.model.state import Array
 from en4dvar.plumbing.errors import TooFewMembersError
 from en4dvar.priors.prior import member_stream
-from en4dvar.schemes.base import Weights
+from en4dvar.schemes.base import Weights, dense
 from en4dvar.series.model_error import fresh_noise
 from en4dvar.series.moments import InnovationRecorder, Moments, MomentsRecorder, SequentialResult, SequentialState
 from en4dvar.series.moving import Flow, MembersLost
@@ -163,13 +163,13 @@ class _Run:
         self.effective[newest - 1] = getattr(descent.step, "effective", np.nan)
         mean, anomalies = window.posterior(descent)
         posterior = mean + anomalies if repeated else self.ensemble
-        transform = descent.weights.T
         if self.rotations is not None:
             turned = self.rotations.of_cycle(newest - 1, len(anomalies))
             anomalies = rotate(anomalies, turned)
-            if self.settings.smoother is not None:
-                transform = rotate(transform, turned)
         if self.settings.smoother is not None:
+            transform = dense(descent.weights.T)
+            if self.rotations is not None:
+                transform = rotate(transform, turned)
             weights, analysis = descent.weights.w + transform, mean + anomalies
             self.settings.smoother.passed(self.trail, newest - 1, members, analysis, weights, self.put_smoothed)
         self.ensemble = mean + self.settings.inflation.apply(members, anomalies)
@@ -321,8 +321,8 @@ class _Run:
             return rows, window, descent
 
     def stream(self, n_members: int, name: str, size: int) -> Array:
-        """Standard normal numbers (N, size), a stream a member."""
-        return np.stack([member_stream(self.seed, name, i).standard_normal(size) for i in range(n_members)])
+        """Standard normal numbers (N, size), of each member the same however many follow it."""
+        return member_stream(self.seed, name).standard_normal((n_members, size))
 
     def run(self, members: Array, indices: Sequence[int]) -> tuple[Rows, list[Array]]:
         """Which rows survive, and the states (N', n) at the times of ``indices``."""

@@ -79,14 +79,13 @@ class CycleWindow(Objective[CycleDescent]):
     def run(self, descent: CycleDescent) -> Runs:
         """The members of the scheme through the window. Raises :class:`MembersLost`."""
         scheme = self.scheme
-        rows = scheme.members(descent.weights)
         if descent.iteration == 0:  # here w = 0 and the members are those of the window, or close to their mean
-            width = float(rows[0, 0])
+            width = 1.0 if scheme.filters else float(scheme.members(descent.weights)[0, 0])
             members = self.members if width == 1 else self.mean + width * self.anomalies
         elif self.local:
             members = self.local.members(scheme.members)
         else:
-            members = self.mean + rows @ self.anomalies
+            members = self.mean + scheme.members(descent.weights) @ self.anomalies
         states = self.flow.forecast(members, self.start, self.indices)
         each = [self.flow.predict(at, index) for at, index in zip(states, self.indices, strict=True)]
         predicted = each[0] if len(each) == 1 else np.hstack(each)

@@ -24,6 +24,7 @@ Image = npt.NDArray[Any]  # brightness (H, W), of any precision
 DEAD = 0.25  # of the brightness about it: where a background shows nothing of a bubble, as writing does
 STRUCTURE = 0.1  # of that brightness: structure that a bubble darkens as it does the rest
 FLICKER = 0.2  # of the brightness: what a lamp may change from frame to frame
+LAMP = 0.25  # logarithm of the ratio of brightness of two frames that differ by their lamp
 LIVELY = 0.4  # share of the rim of a patch that changes in a bubble, not in what stands still
 OFTEN = 0.1  # of the frames: in how many it does
 RESTLESS, LEAST_PAIRS = 0.25, 5  # share and number of steps from frame to frame in which writing changes
@@ -148,10 +149,15 @@ def smooth_surface(frames: Sequence[Frame]) -> Array:
     return surface
 
 
+def _lit_as(frame: Image, other: Image) -> Image:
+    """A frame (H, W) in the light of another, where their lamp's brightness differs no more than it flickers."""
+    lamp = max(float(np.median(other)), 1e-6) / max(float(np.median(frame)), 1e-6)
+    return frame * (lamp if abs(math.log(lamp)) < LAMP else 1.0)
+
+
 def _changed(frame: Image, other: Image, noise: float, side: int = 5) -> npt.NDArray[np.bool_]:
     """Where two frames differ by more than noise, in means over squares, whatever the lamp does (H, W)."""
-    lamp = float(np.median(frame)) / max(float(np.median(other)), 1e-6)
-    off = ndimage.uniform_filter(frame - (lamp if abs(lamp - 1) < FLICKER else 1.0) * other, side)
+    off = ndimage.uniform_filter(frame - _lit_as(other, frame), side)
     return np.asarray(np.abs(off) > max(7 * noise / side, 0.06 * float(np.median(other))))
 
 
@@ -217,7 +223,10 @@ def _with_sign(
     level: Array, samples: Sequence[Frame], noise: float, empty: int, blind: npt.NDArray[np.bool_]
 ) -> Background:
     """Dark on bright, relative to the background; or bright on dark, as it is: by what differs most in most frames."""
-    votes = [float(np.percentile(d, 99.5) + np.percentile(d, 0.5)) for d in ((f - level)[~blind] for f in samples)]
+    votes = [
+        float(np.percentile(d, 99.5) + np.percentile(d, 0.5))
+        for d in ((_lit_as(f, level) - level)[~blind] for f in samples)
+    ]
     if float(np.median([v for v in votes if abs(v) > 4 * noise] or [-1.0])) > 0:
         full = _full(samples, level)
         gain = np.full_like(level, -1.0 / full)
@@ -247,6 +256,7 @@ def _refined(background: Background, samples: Sequence[Frame]) -> Background:
         places = locate(tiles, background.noise / TILE, LEAST_CONTRAST)
         if not places or share_changed(tiles, background.noise) > CHANGED:
             continue
+        image = background.steadied(image, tiles, places[0][0])
         quiet = np.abs(image) < 5 * background.noise
         for circle, _ in places:
             quiet &= (x - circle.x) ** 2 + (y - circle.y) ** 2 > (1.3 * circle.R + 10) ** 2

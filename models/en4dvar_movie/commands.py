@@ -76,7 +76,8 @@ def track(
     point = place(choice["bubble"])
     part = watched(opened, choice["region"], choice["mask"])
     with _bar(opened.count) as progress:
-        track = track_movie(opened, workers or available_cores(), fixed, progress, scale.flashes, point, part)
+        shutter = scale.exposure if scale.exposure > 0 else 0.0
+        track = track_movie(opened, workers or available_cores(), fixed, progress, scale.flashes, point, part, shutter)
     for note in (*opened.notes, *track.notes):
         click.echo(f"note: {note}", err=True)
     words = command_line()

@@ -72,6 +72,7 @@ def track(
     flashes: tuple[float, ...] = (0.0,),
     point: tuple[float, float] | None = None,
     watched: npt.NDArray[np.bool_] | None = None,
+    exposure: float = 0.0,
 ) -> Track:
     """Readings of a bubble in every frame, or at every flash of each; the same numbers for any number of workers.
 
@@ -80,6 +81,7 @@ def track(
     point: x and y within the bubble, in some frame; by default the bubble is that of the laser's spot, or the one whose
         wall travels furthest.
     watched: (H, W) the part of the frames that is looked at.
+    exposure: how long light falls on a frame, s; 0 if it is not known.
 
     Raises
     ------
@@ -109,7 +111,7 @@ def track(
     if point is not None and (not bubbles or bubbles[0].distance(*point)[0] > AWAY):
         raise DataError(f"{movie.path}: no bubble is seen near {point[0]:g},{point[1]:g} in any frame")
     read = [
-        tuple(_readings(looks, bubbles, n, fixed if n == 0 else {}, optics, (movie.rate, flashes)))
+        tuple(_readings(looks, bubbles, n, fixed if n == 0 else {}, optics, (movie.rate, flashes, exposure)))
         for n in range(max(len(bubbles), 1))
     ]
     return Track(read[0], background, optics, flashes, tuple(read[1:]), tuple(notes))
@@ -121,7 +123,7 @@ def _readings(
     number: int,
     corrections: Mapping[int, Correction],
     optics: Optics,
-    times: tuple[float, Sequence[float]],
+    times: tuple[float, Sequence[float], float],
 ) -> Iterator[Reading]:
     """Readings of one of the bubbles, or of a movie without any."""
     bubble = bubbles[number] if bubbles else Chain(())
@@ -132,12 +134,13 @@ def _readings(
         _sightings(of_frame[look.frame]) if look.frame in of_frame else [Sighting(look.frame, None, why[look.frame])]
         for look in looks
     ]
-    rate, flashes = times
+    rate, flashes, exposure = times
     if len(flashes) > 1:
         sightings = ordered(sightings, rate, flashes)
     flat = [circle for circles in sightings for circle in circles]
     doubtful.update({c.frame: c.doubt for c in bubble.candidates if c.doubt})
-    yield from readings_of(flat, optics, corrections, doubtful)
+    share = exposure * rate if len(flashes) == 1 else 0.0
+    yield from readings_of(flat, optics, corrections, doubtful, share)
 
 
 def _sightings(candidate: Candidate) -> list[Sighting]:
@@ -177,13 +180,17 @@ def in_order(
 
 
 def readings_of(
-    sightings: Sequence[Sighting], optics: Optics, corrections: Mapping[int, Correction], doubtful: Mapping[int, str]
+    sightings: Sequence[Sighting],
+    optics: Optics,
+    corrections: Mapping[int, Correction],
+    doubtful: Mapping[int, str],
+    exposure: float,
 ) -> Iterator[Reading]:
     """Radii with their errors, and what is left out by hand or for a doubt that no correction removes."""
     out = {frame for frame, correction in corrections.items() if correction.out}
     doubted = {frame: words for frame, words in doubtful.items() if frame not in corrections}
     good = [None if s.frame in doubted or s.frame in out else s.outline for s in sightings]
-    errors = errors_of(good, optics)
+    errors = errors_of(good, optics, exposure)
     for sighting, outline, error in zip(sightings, good, errors, strict=True):
         correction, doubt = corrections.get(sighting.frame), doubted.get(sighting.frame, "")
         if correction is not None and correction.out:

@@ -9,6 +9,8 @@ the amplitude of mode 2 (the mean of a degree-2 harmonic over a great circle has
 3σ²/4 = a²/2). Two numbers tell a², so that 90 % intervals take Student's t with 2 degrees of freedom. Where a frame's
 own a does not stand out of its noise, that of neighbouring frames together may.
 
+Exposure: over an exposure of length T the mean radius lies T² R̈/24 from that in its middle.
+
 Turning: an edge that moves one way during the exposure has its half level where it is in the middle of it. One that
 turns there, as in a collapse, sweeps a range of √12 blurs and is at its end in the middle: √3 blurs from the half
 level.
@@ -49,14 +51,22 @@ class Errors:
 NOTHING = Errors(float("nan"), float("nan"), float("nan"))
 
 
-def errors_of(outlines: Sequence[Outline | None], optics: Optics) -> list[Errors]:
-    """Errors of each frame; of those without an outline :data:`NOTHING`."""
-    hidden = _hidden(outlines)
+def errors_of(outlines: Sequence[Outline | None], optics: Optics, exposure: float = 0.0) -> list[Errors]:
+    """Errors of each frame, of which the exposure takes a share; of those without an outline :data:`NOTHING`."""
+    hidden = _hidden(outlines) + _bent(outlines, exposure)
     turns = _turns(outlines)
     return [
         _errors(o, ratio, variance, turned, optics) if o is not None else NOTHING
         for o, ratio, variance, turned in zip(outlines, _smoothed(outlines), hidden, turns, strict=True)
     ]
+
+
+def _bent(outlines: Sequence[Outline | None], exposure: float) -> Array:
+    """Variance of the radius (K,) for its curvature in time over the exposure, as three frames in a row show it."""
+    radii = np.array([np.nan if o is None else o.circle.R for o in outlines])
+    variance = np.zeros(len(radii))
+    variance[1:-1] = np.nan_to_num((exposure**2 * np.diff(radii, 2) / 24) ** 2)
+    return variance
 
 
 def _turns(outlines: Sequence[Outline | None]) -> list[bool]:

@@ -27,6 +27,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+STOPS = (signal.SIGINT, signal.SIGTERM)
 TESTS = Path(__file__).resolve().parents[1]
 USED_LATER = (
     "dask.array", "distributed", "fontTools.subset", "matplotlib.backends.backend_agg",
@@ -116,7 +117,6 @@ def _child(task: Task, told: int) -> None:
     os.dup2(full if task.full == "both" else told, 2)
     os.dup2(full if task.full else os.open(os.devnull, os.O_WRONLY), 1)
     signal.alarm(task.seconds)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     if task.mark:
         os.environ["EN4DVAR_TEST_MARK"] = os.environ["TMPDIR"] = task.mark
         tempfile.tempdir = None
@@ -131,6 +131,8 @@ def _child(task: Task, told: int) -> None:
     sys.argv = ["en4dvar", *task.words]
     code = 99
     try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
         if task.words[0] == "python":  # a function of a module of the tests, of what follows
             from importlib import import_module as module
 
@@ -140,6 +142,8 @@ def _child(task: Task, told: int) -> None:
             main(task.words)
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
+    except KeyboardInterrupt:  # before the command has begun
+        code = 130
     except BaseException:
         traceback.print_exc()
     with contextlib.suppress(OSError):
@@ -166,9 +170,11 @@ def _do(task: Task) -> Outcome:
     if task.copy:
         shutil.copytree(task.copy, task.to)
     read, write = os.pipe()
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)  # a command begins before it is stopped
     pid = os.fork()
     if pid == 0:
         _child(task, write)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
     os.close(write)
     began = time.monotonic() + task.after
     ended = threading.Event()
@@ -179,8 +185,10 @@ def _do(task: Task) -> Outcome:
     ended.set()  # before its number can be that of another
     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
     seconds = time.monotonic() - began
-    told, _, operations = told.rstrip("\n").rpartition("\n") if code >= 0 else (told, "", "0")
-    return Outcome(code, told, int(operations), seconds)
+    lines, _, operations = told.rstrip("\n").rpartition("\n")
+    if code < 0 or not operations.isdigit():  # ended where it stood
+        return Outcome(code, told, 0, seconds)
+    return Outcome(code, lines, int(operations), seconds)
 
 
 def _of_few(draw: Callable[..., Any]) -> Callable[..., Any]:

@@ -12,7 +12,18 @@ from test_control_files import CONTROL, PROGRAM
 
 import en4dvar
 from en4dvar.model.programs.control import from_pest
+from en4dvar.plumbing.errors import En4dvarError
 from en4dvar_movie.scene import Scene, render
+
+STUDY = """\
+name: s
+seed: 1
+synthetic: false
+sweep: {trajectories: 500, step: 0.2 us, rounds: 1}
+population: {rounds: 30, passes: 1, draws: 200, exact: 50}
+gels:
+  a: {nh: nh.yaml, qlkv: qlkv.yaml}
+"""
 
 
 def pest_case(folder: Path) -> None:
@@ -31,6 +42,25 @@ def estimate_pest(control: str, out: str) -> None:
         return
     asked["model"]["time_limit"] = "5 s"
     en4dvar.estimate(**asked, progress=False, assimilation={"members": 5, "max_iterations": 2}, directory=out)
+
+
+def pest(control: str, out: str) -> None:
+    """The same as a command, with its exit code."""
+    try:
+        estimate_pest(control, out)
+    except En4dvarError as error:
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_code)
+
+
+def small_study(folder: Path, configs: Path) -> None:
+    """One gel, two laws, three bubbles."""
+    folder.mkdir()
+    data = configs / "data" / "agarose_twin" / "agarose_03_0[1-3].csv"
+    for law in ("nh", "qlkv"):
+        text = (configs / f"agarose_03_{law}.yaml").read_text().replace("data/agarose_twin/agarose_03_*.csv", str(data))
+        (folder / f"{law}.yaml").write_text(text.replace("members: 48", "members: 16"))
+    (folder / "study.yaml").write_text(STUDY)
 
 
 def movies(folder: Path) -> None:

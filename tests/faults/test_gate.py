@@ -18,7 +18,7 @@ import tifffile
 from click.testing import CliRunner
 from PIL import Image
 from rows import row
-from run_files import configuration
+from run_files import configuration, make_campaign
 from test_commands import TWIN
 from toy_config import write_toy
 
@@ -30,12 +30,14 @@ from en4dvar.inputs.square import read_square
 from en4dvar.model.programs.control import from_pest
 from en4dvar.model.programs.template import check_template
 from en4dvar.plumbing.decoding import Allowed, decoded_whole
-from en4dvar.plumbing.errors import DataError, En4dvarError
+from en4dvar.plumbing.errors import DataError, En4dvarError, OutputError
 from en4dvar.plumbing.user_file import load
 from en4dvar.report.result import load_result
+from en4dvar.results import netcdf, seal
 from en4dvar.results.checkpoint import read_checkpoint
+from en4dvar.results.netcdf import read_sealed
 from en4dvar.results.seal import seal_file
-from en4dvar.runs.runner import run
+from en4dvar.runs.runner import run, run_campaign
 from en4dvar_movie.corrections import read_corrections
 from en4dvar_movie.frames import open_movie
 
@@ -291,6 +293,50 @@ def test_a_series_with_a_good_seal_that_lacks_something(twin: Path, tmp_path: Pa
     done = CliRunner().invoke(main, ["export", str(tmp_path / "run"), "--latex"])
     assert done.exit_code == 2, done.output
     assert "not a result of en4dvar" in done.output
+
+
+@pytest.mark.parametrize("how", ["crash", "time"])
+@pytest.mark.fault("decoding")
+def test_a_sealed_file_that_takes_its_library_down(twin: Path, tmp_path: Path, monkeypatch, how: str) -> None:
+    """Unless this process has written it itself, another one reads it."""
+    file = Path(shutil.copy(twin / "twin.nc", tmp_path))
+    assert read_sealed(who_reads, file) == [os.getpid()]
+    monkeypatch.setattr(seal, "WRITTEN", set())
+    assert read_sealed(who_reads, file) != [os.getpid()]
+    monkeypatch.setattr(netcdf, "Allowed", lambda *_: Allowed(seconds=1))
+    with pytest.raises(OutputError) as error:
+        read_sealed(misbehave, file, how)
+    assert str(error.value).startswith(f"{file}: ")
+    assert row("decoding").told(str(error.value))
+
+
+def who_reads(path: Path):
+    """The process that does."""
+    yield os.getpid()
+
+
+@pytest.fixture(scope="module")
+def together(tmp_path_factory) -> Path:
+    """A joint estimate and a population."""
+    folder = tmp_path_factory.mktemp("together")
+    run_campaign(configuration(make_campaign(folder, 3), folder / "run", executor="serial"))
+    for kind, option in (("joint", "--share"), ("population", "--of")):
+        words = [kind, str(folder / "run"), option, "k", "--out", str(folder / kind)]
+        assert CliRunner().invoke(main, words).exit_code == 0
+    return folder
+
+
+@pytest.mark.parametrize(("kind", "what"), [("joint", "fit/band"), ("population", "posterior/k_mean")])
+@pytest.mark.fault("result-incomplete")
+@pytest.mark.slow
+def test_an_estimate_of_several_with_a_good_seal_that_lacks_something(
+    together: Path, tmp_path: Path, kind: str, what: str
+) -> None:
+    out = shutil.copytree(together / kind, tmp_path / "out")
+    _resealed(out / f"{kind}.nc", lambda held: held.__delitem__(what))
+    done = CliRunner().invoke(main, ["report", str(out)])
+    assert done.exit_code == 2, done.output
+    assert row("result-incomplete").told(done.output)
 
 
 PST = """pcf

@@ -8,6 +8,7 @@ import re
 import select
 import signal
 import subprocess
+import sys
 import termios
 import time
 
@@ -16,8 +17,9 @@ import pytest
 from rows import row
 from run_files import assert_same_results, command, configuration, environment, make_campaign, run_cli
 
+from en4dvar.cli import Commands, main
 from en4dvar.results.run_results import result_files
-from en4dvar.runs.interrupt import terminate_as_interrupt
+from en4dvar.runs.interrupt import heeded, terminate_as_interrupt
 from en4dvar.runs.runner import run_campaign
 
 CTRL_C = b"\x03"
@@ -186,6 +188,59 @@ def test_nohup_stays_in_force():
         assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+class Ends:
+    """Its end is where a signal arrives."""
+
+    def __init__(self, number):
+        self.number = number
+
+    def __del__(self):
+        os.kill(os.getpid(), self.number)
+
+
+def _end_and_wait(number):
+    Ends(number)
+    for _ in range(500):
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.fault("interrupt")
+def test_a_stop_where_nothing_can_be_raised_is_raised_behind_it(number):
+    """Python tells of an exception at the end of an object, and of one in some compiled code, and goes on."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with heeded(print), terminate_as_interrupt(), pytest.raises(KeyboardInterrupt):
+            _end_and_wait(number)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_compiled_code_that_ignores_a_stop_prints_no_traceback(capfd):
+    """Cython gives what it ignores to ``sys.excepthook`` first."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with heeded(print):
+            sys.excepthook(KeyboardInterrupt, KeyboardInterrupt("stop"), None)
+            sys.excepthook(ValueError, ValueError("of something else"), None)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    told = capfd.readouterr().err
+    assert "of something else" in told
+    assert "KeyboardInterrupt" not in told
+
+
+@pytest.mark.fault("interrupt-early")
+def test_a_stop_before_a_command_has_begun(monkeypatch):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Commands, "parse_args", stopped)
+    with pytest.raises(SystemExit) as ended:
+        main(["models"])
+    assert ended.value.code == 130
 
 
 @pytest.mark.parametrize("kind", ["processes", "dask"])

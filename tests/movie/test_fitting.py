@@ -7,7 +7,8 @@ import pytest
 from scipy.special import ndtr
 
 from en4dvar_movie.fitting import fit_outline
-from en4dvar_movie.outline import Circle, Optics
+from en4dvar_movie.outline import Circle, Optics, Outline
+from en4dvar_movie.uncertainty import errors_of
 
 CONTRAST = -0.5
 
@@ -55,3 +56,15 @@ def test_nothing_fits_an_image_of_noise():
     noise = image(1e-9, 1.0, np.random.default_rng(1))
     found = fit_outline(noise, Circle(30, 30, 12), Optics(CONTRAST, 1.2, 0.002))
     assert found is None or abs(found[0].contrast) < 0.2 or found[0].circle.R < 3
+
+
+def test_curvature_in_time_over_the_exposure_is_an_error():
+    """Of R = a t² over an exposure of T frames the mean is a T²/12 above the middle, by integration."""
+    a, T = 0.8, 0.5
+    outlines = [
+        Outline(Circle(0, 0, 20 + a * t**2), 1.2, CONTRAST, 0.01, np.zeros((2, 0)), 1e-6, 1.0, 0.0, 0.0, 1.0)
+        for t in np.arange(-3.0, 4.0)
+    ]
+    still, moving = (errors_of(outlines, Optics(CONTRAST, 1.2, 0.002), share)[3].std for share in (0.0, T))
+    sample = np.linspace(-T / 2, T / 2, 100_001)
+    assert np.sqrt(moving**2 - still**2) == pytest.approx(np.mean(a * sample**2), rel=1e-3)

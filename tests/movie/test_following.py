@@ -37,6 +37,11 @@ def test_the_laser_s_bubble_is_followed_beside_whatever_else_is_there(kind):
     assert not np.any((np.abs(of["wrong"]) > 2) & (np.abs(of["score"]) > 5))
 
 
+def test_a_lamp_that_flickers_does_not_make_a_bubble_bright():
+    of = nasty("flicker", 8)
+    assert np.isfinite(of["wrong"][of["good"].astype(bool)]).mean() > 0.9
+
+
 @pytest.mark.parametrize("kind", ["interlaced", "two flashes"])
 def test_frames_of_two_images_are_doubted(kind):
     filmed = film(kind, 2)

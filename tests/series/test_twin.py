@@ -269,21 +269,22 @@ def test_a_smoother_of_few_members_needs_localisation():
     assert rmse(smoother) < 1.05 * rmse(etkf) < 0.5 < 2.0 < rmse(everywhere)
 
 
-PUBLISHED = [  # DAPPER 1.7.1, its suggested settings: analysis RMSE in long runs
-    (lorenz63, ETKF(), {"members": 10}, 0.60),
-    (lorenz63, IEnKS(1), {"members": 10}, 0.31),
-    (lorenz96, ETKF(), {"members": 25}, 0.18),
-    (lorenz96, IEnKS(1), {"members": 25}, 0.181),
-    (lorenz96, IEnKS(4), {"members": 25}, 0.177),
-    (lorenz96, ETKF(), {"members": 40, "inflation": 1.01}, 0.18),
-    (lorenz96, IEnKS(1), {"members": 40, "inflation": 1.01}, 0.18),
+PUBLISHED = [  # DAPPER 1.7.1, its suggested settings: analysis RMSE in long runs; and how many seeds tell 5 % for sure
+    (lorenz63, ETKF(), {"members": 10}, 0.60, 24),
+    (lorenz63, IEnKS(1), {"members": 10}, 0.31, 8),
+    (lorenz96, ETKF(), {"members": 25}, 0.18, 2),
+    (lorenz96, IEnKS(1), {"members": 25}, 0.181, 2),
+    (lorenz96, IEnKS(4), {"members": 25}, 0.177, 2),
+    (lorenz96, ETKF(), {"members": 40, "inflation": 1.01}, 0.18, 2),
+    (lorenz96, IEnKS(1), {"members": 40, "inflation": 1.01}, 0.18, 2),
 ]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("system", "scheme", "options", "published"), PUBLISHED)
-def test_published_rmse(system, scheme, options, published):
-    """Within 5 %. Runs of Lorenz-96 scatter by 2 %: two seeds. Lorenz-63 loses its way now and then, by 4 %: eight."""
+@pytest.mark.parametrize(("system", "scheme", "options", "published", "seeds"), PUBLISHED)
+def test_published_rmse(system, scheme, options, published, seeds):
+    """Within 5 %. Lorenz-63 loses its way now and then: its ETKF scatters by 8 % from seed to seed (32 seeds: 0.593 ±
+    0.009), and on another processor, which rounds differently, a seed is another run.
+    """
     experiment = system(scheme, 3000, burn_in=300, **options)
-    seeds = range(8 if system is lorenz63 else 2)
-    assert np.mean([rmse(experiment, seed) for seed in seeds]) < 1.05 * published
+    assert np.mean([rmse(experiment, seed) for seed in range(seeds)]) < 1.05 * published

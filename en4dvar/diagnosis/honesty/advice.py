@@ -17,6 +17,7 @@ from en4dvar.diagnosis.analysis import Analysis
 from en4dvar.model.state import NOISE_SCALE, Parameter
 from en4dvar.plumbing.caution import CATALOGUE, Caution
 from en4dvar.plumbing.units import convert
+from en4dvar.schemes import MINIMISERS
 
 MANY = 48  # members that start far enough apart
 ENOUGH = 30  # iterations beyond which more of them seldom help
@@ -93,7 +94,7 @@ def _members(case: Case) -> str:
     settings, n = case.a.settings, len(case.a.parameters)
     wanted = [f"assimilation.members: {2 * n + 2} (there are {n} parameters)"] * (settings.members <= 2 * n)
     wanted += ["assimilation.sampling: exact"] * (settings.sampling != "exact")
-    wanted += ["assimilation.scheme: en4dvar, which minimises J"] * (settings.scheme != "en4dvar")
+    wanted += [f"assimilation.scheme: {MINIMISERS[0]}, which minimises J"] * (settings.own.minimiser is None)
     return f"do not quote the intervals; set {' and '.join(wanted or ['assimilation.refine: mcmc'])}"
 
 
