@@ -8,7 +8,7 @@ on the posterior from outside. q is the mixture of all rounds (Cornuet, Marin, M
 798). Coordinates z are those in which the prior is N(0, 1).
 
 Such a mixture is dense where the draws lie that it was fitted to, which makes the weights of these too small; and where
-none of them lies nothing tells that something is missing. :class:`Settling` therefore fits its proposals to a power of
+none of them lies nothing tells that something is missing. :class:`ClosingDraws` therefore fits its proposals to a power of
 the posterior, with covariances that few draws do not make flat, and judges the posterior by draws of the last proposal
 alone, made afresh: their mean weight is unbiased.
 """
@@ -111,7 +111,7 @@ class Importance:
         return replace(fitted, root=self.wider * fitted.root)
 
 
-class Settling(Importance):
+class ClosingDraws(Importance):
     """Proposals are fitted to the posterior to the power of ``wider``⁻², which of a Gaussian is wider by that factor,
     and of another shape most where that has tails.
     """
@@ -141,7 +141,7 @@ class Settling(Importance):
         return StudentMixture.fitted(self.z[where], self.stream, parts, alike=2 * n * len(where) / effective)
 
 
-class Settled(Importance):
+class FixedDraws(Importance):
     """Draws of one proposal that stays. The largest of their weights are cut off, but not those behind ``log``.
 
     Source: Ionides (2008), J. Comput. Graph. Stat. 17, 295.

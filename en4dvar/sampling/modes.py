@@ -17,7 +17,7 @@ from en4dvar.descent.minima import Minimum
 from en4dvar.ensemble.linalg import with_moments
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import Prior, member_stream
-from en4dvar.sampling.importance import Importance, Settled, Settling
+from en4dvar.sampling.importance import Importance, FixedDraws, ClosingDraws
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 
 DRAWS = 400  # of a round
@@ -107,12 +107,14 @@ def sample_modes(
         return sampler.lowest >= below
 
     sampler: Importance
-    sampler = first = Settling(_about(prior, minima), member_stream(seed, "modes"), DRAWS, WIDER ** min(1.0, FEW / n))
+    sampler = first = ClosingDraws(
+        _about(prior, minima), member_stream(seed, "modes"), DRAWS, WIDER ** min(1.0, FEW / n)
+    )
     rounds, going = 1, more(first)
     while going and rounds < most and not (rounds >= closing and first.near):
         rounds, going = rounds + 1, more(first)
     if going:
-        sampler = Settled(first.next_proposal(), first.stream, DRAWS)
+        sampler = FixedDraws(first.next_proposal(), first.stream, DRAWS)
         while going and (not len(sampler.z) or (_unsettled(sampler, enough) and rounds < most)):
             rounds, going = rounds + 1, more(sampler)
     if not np.isfinite(sampler.log):
