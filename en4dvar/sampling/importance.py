@@ -8,9 +8,9 @@ on the posterior from outside. q is the mixture of all rounds (Cornuet, Marin, M
 798). Coordinates z are those in which the prior is N(0, 1).
 
 Such a mixture is dense where the draws lie that it was fitted to, which makes the weights of these too small; and where
-none of them lies nothing tells that something is missing. :class:`ClosingDraws` therefore fits its proposals to a power of
-the posterior, with covariances that few draws do not make flat, and judges the posterior by draws of the last proposal
-alone, made afresh: their mean weight is unbiased.
+none of them lies nothing tells that something is missing. :class:`ClosingDraws` therefore fits its proposals to a power
+of the posterior, with covariances that few draws do not make flat; what judges the posterior are :class:`FixedDraws` of
+the last proposal alone, made afresh: their mean weight is unbiased.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from en4dvar.descent.minima import Minimum
 from en4dvar.ensemble.linalg import with_moments
 from en4dvar.model.state import Array
 from en4dvar.priors.prior import Prior, member_stream
-from en4dvar.sampling.importance import Importance, FixedDraws, ClosingDraws
+from en4dvar.sampling.importance import ClosingDraws, FixedDraws, Importance
 from en4dvar.sampling.mixture import StudentMixture, effective_number, resampled
 
 DRAWS = 400  # of a round
